@@ -26,12 +26,11 @@ from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
-import torch
 from numpy import ndarray
 
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import CheckpointError, expect
-from benchnav.core.quantiles import LEVELS, QuantileDistribution
+from benchnav.core.quantiles import LEVELS, QuantileDistribution, quantiles_at
 from benchnav.core.terrain import Observation
 from benchnav.models.base import TraversabilityModel
 
@@ -110,9 +109,7 @@ def recalibrated(distribution: TraversabilityDistribution, table: ConformalTable
         distribution: of shape [*B, H, W].
         table: from `fit_table`.
     """
-    values = torch.stack([distribution.quantile(value) for value in table.values], -3)
-    ordered = values.clamp(0, 1).cummax(-3).values  # of which rounding may have changed the order
-    return QuantileDistribution(ordered, table.levels)
+    return quantiles_at(distribution, table.values, table.levels)
 
 
 class ConformalModel(TraversabilityModel):

@@ -1,8 +1,9 @@
 """Quantile regression: the quantiles of λ at many levels at once, by the pinball loss.
 
-Q is a median and slopes ≥ 0 between the levels, so that quantiles cannot cross. The loss sees it before it is clipped
-to [0, 1], where what is beyond counts a tenth: quantiles of an atom at 0 or 1 reach it and still have a gradient.
-Levels 0 and 1 have the values 0 and 1, since no loss tells the ends of a distribution.
+Q is a median and slopes ≥ 0 between the levels, so that quantiles cannot cross, and is clipped to [0, 1]. An observed 0
+or 1 is learned as −0.1 or 1.1: quantiles of an atom then lie clearly beyond the range and are clipped to it, which is
+exact, since clipping is monotone. No loss tells the ends of a distribution: of what is beyond the outermost levels half
+is put on 0 and on 1, so that no observation is impossible.
 Sources: Koenker and Bassett (1978), "Regression quantiles"; Powell (1986), "Censored regression quantiles". Letters in
 shapes: B maps, H×W cells, Q inner levels.
 """
@@ -13,14 +14,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from benchnav.core.quantiles import LEVELS, QuantileDistribution
+from benchnav.core.distribution import TraversabilityDistribution
+from benchnav.core.quantiles import LEVELS, QuantileDistribution, quantiles_at
 from benchnav.models.config import JoinedConfig
 from benchnav.models.nets.joined import JoinedModel
 from benchnav.models.nets.trainable import Loss
 
 INNER = LEVELS[1:-1]
+_ALL = (0.0, INNER[0] / 2, *INNER, (1 + INNER[-1]) / 2, 1.0)
 _MEDIAN = INNER.index(0.5)
-_LEAK = 0.1
+_BEYOND = 0.1
 _FIRST_SLOPE = 0.5  # of Q, so that half of [0, 1] is spanned
 
 
@@ -30,7 +33,7 @@ class QuantileConfig(JoinedConfig):
 
 
 class QuantileModel(JoinedModel):
-    """Predicts quantiles at the levels of `benchnav.core.quantiles`.
+    """Predicts quantiles at the inner levels of `benchnav.core.quantiles`.
 
     Args:
         config: what it is.
@@ -56,16 +59,24 @@ class QuantileModel(JoinedModel):
         """The pinball loss in the mean over the inner levels."""
 
         def loss(outputs: Tensor, observed: Tensor) -> Tensor:
-            inside = outputs.clamp(0, 1)
-            return pinball(inside + _LEAK * (outputs - inside), INNER, observed)
+            beyond = torch.where(observed <= 0, -_BEYOND, torch.where(observed >= 1, 1 + _BEYOND, observed))
+            return pinball(outputs, INNER, beyond)
 
         return loss
 
     def to_distribution(self, outputs: Tensor) -> QuantileDistribution:
         """Piecewise linear between the quantiles, which are clipped to [0, 1]."""
         inside = outputs.clamp(0, 1)
-        ends = torch.zeros_like(inside[:, :1]), torch.ones_like(inside[:, :1])
-        return QuantileDistribution(torch.cat([ends[0], inside, ends[1]], 1))
+        none, whole = torch.zeros_like(inside[:, :2]), torch.ones_like(inside[:, :2])
+        return QuantileDistribution(torch.cat([none, inside, whole], 1), _ALL)
+
+    def sharpen(self, distribution: TraversabilityDistribution) -> TraversabilityDistribution:
+        """Applies the temperature T: quantiles at u are those that were at Φ(T·Φ⁻¹(u))."""
+        if self.temperature == 1:
+            return distribution
+        scores = torch.special.ndtri(torch.tensor(_ALL, dtype=torch.float64))
+        reads = torch.special.ndtr(self.temperature * scores)
+        return quantiles_at(distribution, reads.tolist(), _ALL)
 
 
 def pinball(quantiles: Tensor, levels: tuple[float, ...], observed: Tensor) -> Tensor:
@@ -74,7 +85,7 @@ def pinball(quantiles: Tensor, levels: tuple[float, ...], observed: Tensor) -> T
     Args:
         quantiles: shape [B, Q, H, W].
         levels: u of each, Q numbers in (0, 1).
-        observed: λ in [0, 1], and NaN where it was not observed, shape [B, H, W].
+        observed: λ, and NaN where it was not observed, shape [B, H, W].
 
     Returns:
         Mean over levels and observed cells, a number; 0 where none was.

@@ -110,7 +110,7 @@ def test_quantiles_never_cross_and_stay_in_range(seed: int, spread: float) -> No
     network = make("quantile")
     numbers = spread * torch.randn(1, len(INNER), 2, 2, generator=torch.Generator().manual_seed(seed))
     found = network.to_distribution(network.to_outputs(numbers))
-    assert found.levels == LEVELS
+    assert found.levels[2:-2] == INNER == LEVELS[1:-1]
     assert bool((found.values.diff(dim=1) >= 0).all())
     assert bool(((found.values >= 0) & (found.values <= 1)).all())
 
@@ -123,14 +123,43 @@ def test_the_median_and_the_slopes_by_hand() -> None:
         assert float(found.quantile(level)) == pytest.approx(0.25 + 0.5 * level, abs=1e-5)
 
 
-def test_what_lies_beyond_the_range_counts_a_tenth_and_has_a_gradient() -> None:
-    outputs = torch.full((1, len(INNER), 1, 1), 1.2, requires_grad=True)
-    loss = make("quantile").loss(outputs, torch.full((1, 1, 1), 0.5))
-    expected = np.mean([(1 - level) * (1.02 - 0.5) for level in INNER])
-    assert float(loss) == pytest.approx(expected, rel=1e-5)
-    loss.backward()
-    assert outputs.grad is not None
-    assert bool((outputs.grad > 0).all())
+def test_an_atom_is_learned_beyond_the_range_and_clipped_to_it() -> None:
+    """The pinball loss of λ with atoms at 0 and 1 is least where the clipped quantiles are those of λ."""
+    drawn = torch.from_numpy(np.random.default_rng(0).normal(0.8, 0.3, 2_001).clip(0, 1)).float()
+    network, observed = make("quantile"), drawn.view(1, 1, -1)
+    raw = network.first_numbers().view(1, -1, 1, 1).clone().requires_grad_()
+    optimizer = torch.optim.Adam([raw], lr=0.1)
+    for step in range(200):
+        optimizer.param_groups[0]["lr"] = 0.1 * (1 - step / 200)
+        optimizer.zero_grad()
+        network.loss(network.to_outputs(raw).expand(-1, -1, 1, 2_001), observed).backward()
+        optimizer.step()
+    found = network.to_distribution(network.to_outputs(raw.detach()))
+    for level in (0.02, 0.1, 0.3, 0.5, 0.7):
+        assert float(found.quantile(level)) == pytest.approx(float(drawn.quantile(level)), abs=0.03)
+    below, _ = found.cdf_limits(1.0)
+    assert float(below) == pytest.approx(float((drawn < 1).float().mean()), abs=0.03)
+    assert float(found.cdf(0.0)) == pytest.approx(float((drawn == 0).float().mean()), abs=0.01)
+
+
+def test_the_temperature_moves_quantiles_as_normal_scores() -> None:
+    network = make("quantile")
+    before = network.to_distribution(network.to_outputs(network.first_numbers().view(1, -1, 1, 1)))
+    assert network.sharpen(before) is before
+    network.temperature = 2.0
+    after = network.sharpen(before)
+    for level in (0.05, 0.2, 0.5, 0.9):
+        expected = before.quantile(float(stats.norm.cdf(2 * stats.norm.ppf(level))))
+        assert float(after.quantile(level)) == pytest.approx(float(expected), abs=2e-3)
+    assert float(after.quantile(0.1)) < float(before.quantile(0.1))
+
+
+def test_no_observation_is_impossible() -> None:
+    network = make("quantile")
+    found = network.to_distribution(torch.full((1, len(INNER), 1, 1), 0.5))
+    below, at = found.cdf_limits(1.0)
+    assert float(at - below) == pytest.approx(0.0025)
+    assert float(found.cdf(0.0)) == pytest.approx(0.0005)
 
 
 # --- evidence ------------------------------------------------------------------------------------
