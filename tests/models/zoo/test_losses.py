@@ -1,6 +1,7 @@
 """The losses and distributions of the zoo against scipy, closed forms and other libraries."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -17,12 +18,17 @@ from benchnav.models.config import JoinedConfig
 from benchnav.models.zoo.evidential import EvidentialConfig, evidential_loss
 from benchnav.models.zoo.mc_dropout import DropoutConfig
 from benchnav.models.zoo.mean_variance import MeanVarianceConfig, beta_nll
-from benchnav.models.zoo.quantile import INNER, pinball
+from benchnav.models.zoo.quantile import INNER, QuantileModel, pinball
 from benchnav.models.zoo.swag import SWAGConfig
 from tests.factories import normal
 from tests.models.zoo.support import make
 
 OBSERVED = torch.tensor([0.0, 0.05, 0.4, 0.8, 1.0])
+
+
+@cache
+def untrained() -> QuantileModel:
+    return make("quantile")
 
 
 def maps(values: Tensor) -> Tensor:
@@ -107,7 +113,7 @@ def test_the_pinball_loss_is_least_at_the_quantiles() -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.1, 30))
 def test_quantiles_never_cross_and_stay_in_range(seed: int, spread: float) -> None:
-    network = make("quantile")
+    network = untrained()
     numbers = spread * torch.randn(1, len(INNER), 2, 2, generator=torch.Generator().manual_seed(seed))
     found = network.to_distribution(network.to_outputs(numbers))
     assert found.levels[2:-2] == INNER == LEVELS[1:-1]
