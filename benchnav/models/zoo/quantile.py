@@ -1,9 +1,10 @@
 """Quantile regression: the quantiles of λ at many levels at once, by the pinball loss.
 
-Q is a median and slopes ≥ 0 between the levels, so that quantiles cannot cross, and is clipped to [0, 1]. An observed 0
-or 1 is learned as −0.1 or 1.1: quantiles of an atom then lie clearly beyond the range and are clipped to it, which is
-exact, since clipping is monotone. No loss tells the ends of a distribution: of what is beyond the outermost levels half
-is put on 0 and on 1, so that no observation is impossible.
+Q is a median and slopes ≥ 0 over normal scores between the levels, so that quantiles cannot cross, and is clipped to
+[0, 1]; equal slopes are a Gaussian, with which training begins. An observed 0 or 1 is learned as −0.1 or 1.1: quantiles
+of an atom then lie clearly beyond the range and are clipped to it, which is exact, since clipping is monotone. No loss
+tells the ends of a distribution: of what is beyond the outermost levels half is put on 0 and on 1, so that no
+observation is impossible.
 Sources: Koenker and Bassett (1978), "Regression quantiles"; Powell (1986), "Censored regression quantiles". Letters in
 shapes: B maps, H×W cells, Q inner levels.
 """
@@ -24,7 +25,8 @@ INNER = LEVELS[1:-1]
 _ALL = (0.0, INNER[0] / 2, *INNER, (1 + INNER[-1]) / 2, 1.0)
 _MEDIAN = INNER.index(0.5)
 _BEYOND = 0.1
-_FIRST_SLOPE = 0.5  # of Q, so that half of [0, 1] is spanned
+_STEPS = torch.special.ndtri(torch.tensor(INNER, dtype=torch.float64)).diff().float().view(-1, 1, 1)
+_FIRST_STD = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,14 +46,13 @@ class QuantileModel(JoinedModel):
         super().__init__(config)
 
     def first_numbers(self) -> Tensor:
-        """A median of 0.5, and the same slope everywhere."""
-        slope = math.log(math.expm1(_FIRST_SLOPE))  # softplus⁻¹
+        """A Gaussian of mean 0.5 and standard deviation 0.2."""
+        slope = math.log(math.expm1(_FIRST_STD))  # softplus⁻¹
         return torch.cat([torch.full((1,), 0.5), torch.full((len(INNER) - 1,), slope)])
 
     def to_outputs(self, numbers: Tensor) -> Tensor:
         """Quantiles before clipping, ascending, shape [B, Q, H, W]."""
-        steps = torch.tensor(INNER, device=numbers.device).diff().view(-1, 1, 1)
-        rise = (nn.functional.softplus(numbers[:, 1:]) * steps).cumsum(1)
+        rise = (nn.functional.softplus(numbers[:, 1:]) * _STEPS.to(numbers.device)).cumsum(1)
         rise = torch.cat([torch.zeros_like(rise[:, :1]), rise], 1)
         return numbers[:, :1] + rise - rise[:, _MEDIAN : _MEDIAN + 1]
 

@@ -125,8 +125,13 @@ def test_the_median_and_the_slopes_by_hand() -> None:
     network = make("quantile")
     numbers = network.first_numbers().view(1, -1, 1, 1)
     found = network.to_distribution(network.to_outputs(numbers))
-    for level in (0.01, 0.2, 0.5, 0.9):  # Q(u) = 0.5 + 0.5 (u − 0.5)
-        assert float(found.quantile(level)) == pytest.approx(0.25 + 0.5 * level, abs=1e-5)
+    for level in (0.01, 0.2, 0.5, 0.9):
+        assert float(found.quantile(level)) == pytest.approx(stats.norm.ppf(level, 0.5, 0.2), abs=1e-5)
+    other = numbers.clone()
+    other[:, 0], other[:, 1:] = 0.3, math.log(math.expm1(0.05))
+    found = network.to_distribution(network.to_outputs(other))
+    for level in (0.01, 0.2, 0.5, 0.9):
+        assert float(found.quantile(level)) == pytest.approx(stats.norm.ppf(level, 0.3, 0.05), abs=1e-5)
 
 
 def test_an_atom_is_learned_beyond_the_range_and_clipped_to_it() -> None:
