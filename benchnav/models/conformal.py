@@ -95,7 +95,7 @@ def fit_table(scores: Sequence[ndarray], levels: tuple[float, ...] = LEVELS) -> 
     order = np.argsort(pooled, kind="stable")
     # Of the scores up to each, the share; t may rise to the first with which the share is over u.
     share = weight + weights[order].cumsum()
-    first = np.searchsorted(share, np.array(levels) - _ROUNDING, side="right")
+    first = np.searchsorted(share, np.array(levels) - _ROUNDING)
     values = np.append(pooled[order], 1.0)[first]
     values = np.where(np.array(levels) < weight - _ROUNDING, 0.0, values)
     values[np.array(levels) >= 1] = 1.0
