@@ -13,8 +13,9 @@ VALUES = ("free_space", "objective", "problem", "risk", "robots", "sensing")
 PLANNING = tuple(f"planning.{name}" for name in VALUES)
 SYNTHESIS = ("datagen.synth", "datagen.recipe", "datagen.schema")
 # Whatever is known of models beside their training and their quality.
+WHOLE = ("fused", "conformal", "predictor")
 MODELS = tuple(
-    f"models.{name}" for name in ("base", "slope_gp", "nets", "checkpoint", "config", "fused", "predictor")
+    f"models.{name}" for name in ("base", "slope_gp", "nets", "zoo", "checkpoint", "config", *WHOLE)
 )
 VALUES_OF_EVAL = ("eval.experiment",)
 # What running writes and reports read.
@@ -34,6 +35,14 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "models": ("models", "datagen"),
     "models/slope_gp": ("models.slope_gp", "models.config", "datagen"),
     "models/nets": ("models.nets", "models.base", "models.checkpoint", "models.config", "datagen"),
+    "models/zoo": (
+        "models.zoo",
+        "models.nets",
+        "models.base",
+        "models.checkpoint",
+        "models.config",
+        "datagen",
+    ),
     "models/training": ("models.training", *MODELS, "datagen"),
     "models/quality": ("models.quality", *MODELS, "datagen"),
     "planning": PLANNING,
@@ -148,6 +157,9 @@ def test_no_modules_import_one_another_in_a_circle() -> None:
         ("datagen/synth/generate.py", "benchnav.datagen.files.reader", False),
         ("datagen/files/reader.py", "benchnav.datagen.dem.importer", False),
         ("models/nets/classifier.py", "benchnav.models.training.fit", False),
+        ("models/zoo/swag.py", "benchnav.models.nets.joined", True),
+        ("models/nets/mdn.py", "benchnav.models.zoo.mean_variance", False),
+        ("models/zoo/swag.py", "benchnav.models.training.fit", False),
         ("models/slope_gp/gp.py", "benchnav.models.training.fit", False),
         ("models/training/fit.py", "benchnav.models.quality.measure", False),
         ("models/quality/measure.py", "benchnav.models.nets.classifier", True),

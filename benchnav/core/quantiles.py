@@ -5,6 +5,7 @@ Mean, VaR and CVaR are then weighted sums of the x_i, and the expected time and 
 Letters in shapes: Q levels, H×W cells, *B any leading dimensions.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -150,3 +151,20 @@ class QuantileDistribution(TraversabilityDistribution):
         weights[:-1] += (high - low) - rising
         shares = torch.from_numpy(weights / tail).to(self.device)
         return torch.einsum("...qhw,q->...hw", self.values.double(), shares).to(self.dtype)
+
+
+def quantiles_at(
+    distribution: TraversabilityDistribution, reads: Sequence[float], levels: tuple[float, ...] = LEVELS
+) -> QuantileDistribution:
+    """Moves the quantiles of a distribution to other levels.
+
+    Args:
+        distribution: of shape [*B, H, W].
+        reads: at which of its own levels the quantiles are read, ascending from 0 to 1, one a level.
+        levels: which they are to have; see `QuantileDistribution`.
+
+    Returns:
+        Of shape [*B, H, W].
+    """
+    values = torch.stack([distribution.quantile(read) for read in reads], -3).clamp(0, 1)
+    return QuantileDistribution(values.cummax(-3).values, levels)  # rounding may have changed the order

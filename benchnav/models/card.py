@@ -10,7 +10,14 @@ from benchnav.core.tables import Table, to_markdown
 CARD = "README.md"
 
 
-def card_of(name: str, model: str, parts: Mapping[str, Any], classes: Sequence[str], code: str) -> str:
+def card_of(
+    name: str,
+    model: str,
+    parts: Mapping[str, Any],
+    classes: Sequence[str],
+    code: str,
+    conformal_maps: int = 0,
+) -> str:
     """Writes the card of a checkpoint.
 
     Args:
@@ -19,6 +26,7 @@ def card_of(name: str, model: str, parts: Mapping[str, Any], classes: Sequence[s
         parts: its parts by name, each a `models.checkpoint.Part`; one or more.
         classes: names of the terrain classes.
         code: digest of the code of a user's own class; empty where it is ours.
+        conformal_maps: by how many maps it has been recalibrated; 0 where it has not.
 
     Returns:
         Markdown, with the front matter that model hubs read.
@@ -33,6 +41,12 @@ def card_of(name: str, model: str, parts: Mapping[str, Any], classes: Sequence[s
         else ""
     )
     classes = f"Terrain classes of the maps: {', '.join(classes)}.\n\n" if classes else ""
+    promise = (
+        f"It is recalibrated by {conformal_maps} maps (conformal): on a new map of the same kind λ of a random cell "
+        "falls below the u-quantile with probability u at most. Nothing is promised on other ground.\n\n"
+        if conformal_maps
+        else ""
+    )
     return (
         f"---\n{yaml.safe_dump(head, sort_keys=False)}---\n\n# {name}\n\n"
         f"A model of traversability of the kind `{model}`, trained on {' and '.join(datasets)}. It predicts "
@@ -40,7 +54,7 @@ def card_of(name: str, model: str, parts: Mapping[str, Any], classes: Sequence[s
         f"```sh\nbenchnav-train evaluate {place} --data DATASET\n"
         f"benchnav-eval run --model {place} --data DATASET\n```\n\n"
         f"```python\nfrom benchnav.models import load_model\n\nmodel = load_model({place!r})\n```\n\n"
-        f"{own}{classes}## Parts\n\n{_parts_table(parts)}\n\n## Settings\n\n{_settings_table(parts)}\n\n"
+        f"{own}{classes}{promise}## Parts\n\n{_parts_table(parts)}\n\n## Settings\n\n{_settings_table(parts)}\n\n"
         "Measures are of the validation maps, which early stopping and calibration have seen. `config.json` holds the "
         "digests of data and tensors, and the versions of the packages. No licence is given here: add one before you "
         "share it.\n"

@@ -71,6 +71,7 @@ class Part:
         versions: of the packages that trained it.
         trainer: settings of the trainer on which the outcome depends; None of a part that none trained, or of an
             earlier version.
+        conformal: whether every second map of `valid` was kept from it, to be scored in the end.
     """
 
     config: dict[str, Any]
@@ -82,6 +83,7 @@ class Part:
     half_precision: bool = False
     versions: Mapping[str, str] = field(default_factory=_versions)
     trainer: Mapping[str, Any] | None = None
+    conformal: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +97,8 @@ class Checkpoint:
             module, its name alone.
         pool_temperature: of the average of several members (see `models.nets.calibration`); 1 changes nothing.
         code: digest of the code of the class; empty where that is ours.
+        conformal: a `models.conformal.ConformalTable` as plain data, by which the whole model is recalibrated; empty
+            where it is not.
     """
 
     class_names: tuple[str, ...]
@@ -102,6 +106,7 @@ class Checkpoint:
     model: str = FUSED
     pool_temperature: float = 1.0
     code: str = ""
+    conformal: Mapping[str, Any] = field(default_factory=dict)
 
     def part(self, name: str) -> Part:
         """Gives a part.
@@ -117,9 +122,9 @@ class Checkpoint:
         return self.parts[name]
 
     def with_part(self, name: str, part: Part) -> "Checkpoint":
-        """Gives a copy in which one part is added or replaced; another member makes another pool."""
+        """Gives a copy in which one part is added or replaced; another member makes another pool and another model."""
         pooled = self.pool_temperature if name == GP else 1.0
-        return replace(self, parts={**self.parts, name: part}, pool_temperature=pooled)
+        return replace(self, parts={**self.parts, name: part}, pool_temperature=pooled, conformal={})
 
 
 def _command(part: str) -> str:
@@ -215,7 +220,7 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
             raise ValueError(f"pool_temperature is {pooled}")
         return Checkpoint(
             class_names=tuple(names), parts=parts, model=config["model"], pool_temperature=pooled,
-            code=str(config.get("code", "")),
+            code=str(config.get("code", "")), conformal=dict(config.get("conformal", {})),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
@@ -300,6 +305,8 @@ def _write(folder: Path, checkpoint: Checkpoint, name: str) -> None:
         optional["pool_temperature"] = checkpoint.pool_temperature
     if checkpoint.code:
         optional["code"] = checkpoint.code
+    if checkpoint.conformal:
+        optional["conformal"] = dict(checkpoint.conformal)
     config = {
         "format": FORMAT,
         "format_version": ".".join(map(str, FORMAT_VERSION)),
@@ -312,7 +319,14 @@ def _write(folder: Path, checkpoint: Checkpoint, name: str) -> None:
     if parts:
         write_text(
             folder / CARD,
-            card_of(name, checkpoint.model, checkpoint.parts, checkpoint.class_names, checkpoint.code),
+            card_of(
+                name,
+                checkpoint.model,
+                checkpoint.parts,
+                checkpoint.class_names,
+                checkpoint.code,
+                checkpoint.conformal.get("maps", 0),
+            ),
         )
     write_text(folder / CONFIG, seal(config) + "\n")
 

@@ -27,6 +27,8 @@ class TrainOptions:
         crop: Train on squares of so many cells a side, drawn anew each epoch; 0 takes whole maps.
         resume: Go on with a training that was interrupted; finished parts and whole epochs are kept.
         overwrite: Replace the same parts, or a checkpoint of another model or other classes, that is there.
+        conformal: Recalibrate the whole model on every second map of valid, which stopping and temperature then do
+            not see, so that its lower quantiles keep their promise on new maps of the same kind.
     """
 
     seed: int = 0
@@ -39,6 +41,7 @@ class TrainOptions:
     crop: int = 0
     resume: bool = False
     overwrite: bool = False
+    conformal: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +107,8 @@ class ClassifierConfig(NetworkConfig):
             encoder's; where none are given, the architecture's own.
         full_resolution: give the last layers the image at full resolution too. Encoders begin by halving
             it, so that without this every class boundary is guessed from cells twice as large.
+        focal: γ of the focal loss (Lin et al., 2017), which weighs a cell by (1 − p)^γ, p the probability of its class;
+            0 leaves the loss a proper score.
         dice: weight of a soft Dice loss beside the cross-entropy; 0 leaves the loss a proper score.
         label_smoothing: probability spread over all classes in the targets of the cross-entropy.
     """
@@ -112,13 +117,15 @@ class ClassifierConfig(NetworkConfig):
     encoder_depth: int = 5
     decoder_channels: tuple[int, ...] = ()
     full_resolution: bool = True
+    focal: float = 0.0
     dice: float = 0.0
     label_smoothing: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuses numbers that cannot train."""
         super().__post_init__()
-        _check(self, self.dice >= 0, "dice", "≥ 0")
+        for name in ("focal", "dice"):
+            _check(self, 0 <= getattr(self, name) < math.inf, name, "≥ 0")
         _check(self, 0 <= self.label_smoothing < 1, "label_smoothing", "in [0, 1)")
         _check(self, 1 <= self.encoder_depth <= DEEPEST, "encoder_depth", f"in 1–{DEEPEST}")
         _check(self, min(self.decoder_channels, default=1) >= 1, "decoder_channels", "≥ 1 each")
@@ -184,25 +191,43 @@ class LatentGPConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MDNConfig(NetworkConfig):
-    """What the mixture-density network is and how it is trained.
+class JoinedConfig(NetworkConfig):
+    """What a network of the image that slope joins cell by cell is and how it is trained.
 
     Args:
-        components: K, Gaussians of a cell's mixture.
+        encoder_depth: stages of the encoder, each of which halves the image; fewer make a smaller network
+            that looks less far around a cell.
         hidden: channels of the layers in which slope joins what the image tells of a cell.
     """
 
-    components: int = 3
+    encoder_depth: int = 5
     hidden: int = 64
     max_epochs: int = 15
 
     def __post_init__(self) -> None:
         """Refuses numbers that cannot train."""
         super().__post_init__()
-        _check_least(self, 1, "components", "hidden")
+        _check(self, 1 <= self.encoder_depth <= DEEPEST, "encoder_depth", f"in 1–{DEEPEST}")
+        _check_least(self, 1, "hidden")
         _check(
             self, any(name != "slope_deg" for name in self.inputs), "inputs", "with a layer beside slope_deg"
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MDNConfig(JoinedConfig):
+    """What the mixture-density network is and how it is trained.
+
+    Args:
+        components: K, Gaussians of a cell's mixture.
+    """
+
+    components: int = 3
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that cannot train."""
+        super().__post_init__()
+        _check_least(self, 1, "components")
 
 
 def check_seed(seed: int, count: int = 1) -> None:

@@ -30,6 +30,7 @@ from benchnav.models.checkpoint import (
     read_config,
     refuse_unfinished,
 )
+from benchnav.models.conformal import ConformalModel, ConformalTable
 
 
 class Oracle(PrivilegedModel):
@@ -146,7 +147,9 @@ def open_checkpoint(checkpoint: Checkpoint) -> TraversabilityModel:
 def _rebuilt(family: type[ModelFamily], checkpoint: Checkpoint) -> TraversabilityModel:
     """Rebuilds a model; what its class raises ends in one line."""
     try:
-        return family.from_checkpoint(checkpoint)
+        model = family.from_checkpoint(checkpoint)
+        table = ConformalTable.read(checkpoint.conformal) if checkpoint.conformal else None
+        return ConformalModel(model, table) if table else model
     except CheckpointError:
         raise
     except (BenchnavError, KeyError, RuntimeError, TypeError, AttributeError) as error:

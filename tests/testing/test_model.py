@@ -22,6 +22,7 @@ from benchnav.models.nets.mdn import MixtureDensityModel
 from benchnav.models.predictor import load_model, open_checkpoint
 from benchnav.testing import check_model
 from tests.models.support import scale
+from tests.models.zoo.support import ZOO
 from tests.testing.refusal import refusal
 
 NAMES = ("soft", "firm")
@@ -275,7 +276,12 @@ def test_every_registered_model_keeps_the_contract(name: str) -> None:
 
 def test_the_families_whose_checkpoints_are_tried_here_are_all_that_the_package_has() -> None:
     own = {name for name in registry.names("model") if registry.find("model", name).shipped}
-    assert {name for name in own if family(name)} == {"fused", "mdn"}
+    assert {name for name in own if family(name)} == {"fused", "mdn", *ZOO}
+
+
+@pytest.mark.parametrize("name", ZOO)
+def test_models_of_the_zoo_are_found_by_name(name: str) -> None:
+    assert registry.find("model", name).target is ZOO[name][0]  # which tests/models/zoo/test_zoo.py tries
 
 
 @pytest.mark.parametrize("members", [1, 2])

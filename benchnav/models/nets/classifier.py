@@ -30,6 +30,7 @@ from benchnav.models.nets.trainable import Loss, TrainableNetwork
 
 _DETAIL_CHANNELS = 32
 _CONDITION_SIDE = 64
+_LEAST_DOUBT = 1e-6
 
 
 class MeanIoU(MulticlassJaccardIndex):
@@ -69,16 +70,22 @@ class TerrainClassifier(TrainableNetwork):
         """Cross-entropy, a proper score, unless more is asked for.
 
         A soft Dice loss may be added, which weighs rare classes as much as frequent ones. Source: Milletari et al.
-        (2016), "V-Net".
+        (2016), "V-Net". The focal loss weighs cells that are classified well less than others.
         """
-        smoothing, dice = self.config.label_smoothing, self.config.dice
+        smoothing, dice, focal = self.config.label_smoothing, self.config.dice, self.config.focal
         overlap = smp.losses.DiceLoss("multiclass", ignore_index=UNLABELLED)
 
         def loss(logits: Tensor, class_id: Tensor) -> Tensor:
             # The mean of PyTorch's own would be 0 / 0 for maps without labels.
             total = nn.functional.cross_entropy(
-                logits, class_id, ignore_index=UNLABELLED, label_smoothing=smoothing, reduction="sum"
+                logits,
+                class_id,
+                ignore_index=UNLABELLED,
+                label_smoothing=smoothing,
+                reduction="none" if focal else "sum",
             )
+            if focal:
+                total = (total * focal_weights(logits, class_id, focal)).sum()
             loss = total / (class_id != UNLABELLED).sum().clamp(min=1)
             return loss + dice * overlap(logits, class_id) if dice else loss
 
@@ -126,6 +133,25 @@ class TerrainClassifier(TrainableNetwork):
             for name, value in tensors.items()
         }
         return super().from_tensors(config, map_classes, renamed)
+
+
+def focal_weights(logits: Tensor, class_id: Tensor, focal: float) -> Tensor:
+    """Weights of cells in the focal loss: (1 − p)^γ, where p is the probability of a cell's class.
+
+    Source: Lin et al. (2017), "Focal loss for dense object detection".
+
+    Args:
+        logits: shape [B, C, H, W].
+        class_id: true classes, int64, 255 where they are not known, shape [B, H, W].
+        focal: γ > 0.
+
+    Returns:
+        Shape [B, H, W].
+    """
+    known = torch.where(class_id == UNLABELLED, 0, class_id)
+    log_probability = logits.log_softmax(1).gather(1, known.unsqueeze(1)).squeeze(1)
+    # At p = 1 a power under 1 would have no gradient.
+    return (-torch.expm1(log_probability)).clamp(min=_LEAST_DOUBT) ** focal
 
 
 def classifiers_of(checkpoint: Checkpoint) -> list[TerrainClassifier]:

@@ -1,8 +1,7 @@
 """A mixture-density network: from colour and slope straight to the distribution of traversability.
 
 It knows no terrain classes: it learns from observed λ alone, by the likelihood of a Gaussian mixture
-clipped to [0, 1]. Colour goes through a convolutional network, for what the ground is shows in its
-surroundings; slope joins cell by cell, for traversability hangs on the slope of the cell itself.
+clipped to [0, 1].
 Sources: Bishop (1994), "Mixture density networks"; Tobin (1958), "Estimation of relationships for
 limited dependent variables". Letters in shapes: B maps, H×W cells, K components.
 """
@@ -15,16 +14,24 @@ import torch
 from torch import Tensor, nn
 
 from benchnav.core.mixture import TraversabilityMixture, component_log_prob
-from benchnav.models.config import ClassifierConfig, MDNConfig
-from benchnav.models.nets.classifier import build_network
-from benchnav.models.nets.inputs import InputStack, LayerScale, Maps
-from benchnav.models.nets.trainable import Loss, TrainableModel
+from benchnav.models.config import MDNConfig
+from benchnav.models.nets.inputs import Maps
+from benchnav.models.nets.joined import JoinedModel
+from benchnav.models.nets.trainable import Loss
 
-SLOPE = "slope_deg"
 LEAST_STD = 0.01
 
-_FIRST_STD, _FIRST_SPREAD = 0.2, 0.1
-_FEATURES = 32
+_FIRST_STD = 0.2
+
+
+def to_std(widths: Tensor) -> Tensor:
+    """Standard deviations, at least 0.01, from numbers of any size."""
+    return nn.functional.softplus(widths) + LEAST_STD
+
+
+def first_width(count: int) -> Tensor:
+    """So many numbers of which `to_std` makes 0.2."""
+    return torch.full((count,), math.log(math.expm1(_FIRST_STD - LEAST_STD)))  # softplus⁻¹
 
 
 def censored_nll(log_weights: Tensor, means: Tensor, stds: Tensor, observed: Tensor) -> Tensor:
@@ -49,50 +56,21 @@ def censored_nll(log_weights: Tensor, means: Tensor, stds: Tensor, observed: Ten
     return -torch.where(seen, total, 0.0).sum() / seen.sum().clamp(min=1)
 
 
-class MixtureDensityModel(TrainableModel):
+class MixtureDensityModel(JoinedModel):
     """Predicts the mixture of every cell from colour and slope.
 
     Args:
         config: what it is.
     """
 
-    slope_scale_deg: Tensor
-
     def __init__(self, config: MDNConfig) -> None:
         """Keeps the settings."""
         super().__init__(config)
-        # The classifier's network, whose outputs tell of the ground by features rather than by classes.
-        self.image = ClassifierConfig(
-            architecture=config.architecture, encoder=config.encoder, pretrained=config.pretrained
-        )
 
-    @property
-    def stride(self) -> int:
-        """By which the encoder makes images smaller."""
-        return 2**self.image.encoder_depth
-
-    def make_modules(self, scale: Mapping[str, LayerScale] | None) -> None:
-        """Makes the network of the image, and what joins its features with the slope, where that is an input."""
-        self.has_slope = SLOPE in self.inputs
-        rms = scale[SLOPE].rms if scale and self.has_slope else torch.ones(())
-        self.register_buffer("slope_scale_deg", rms.clone())
-        self.stack = InputStack([name for name in self.inputs if name != SLOPE], scale)
-        self.network = build_network(self.image, self.stack.channels, _FEATURES)
-        count, hidden = self.config.components, self.config.hidden
-        torch.default_generator.manual_seed(self.seed)  # so that these weights do not hang on the encoder
-        self.joint = nn.Sequential(
-            nn.Conv2d(_FEATURES + self.has_slope, hidden, 1),
-            nn.SiLU(),
-            nn.Conv2d(hidden, hidden, 1),
-            nn.SiLU(),
-        )
-        self.head = nn.Conv2d(hidden, 3 * count, 1)
-        self.joint.to(memory_format=torch.channels_last)
-        # Components begin with means evenly over [0, 1], and with nearly the same weight and width.
-        means = (torch.arange(count) + 0.5) / count
-        width = math.log(math.expm1(_FIRST_STD - LEAST_STD))  # softplus⁻¹
-        first = torch.cat([torch.zeros(count), means, torch.full((count,), width)])
-        self.head.load_state_dict({"weight": _FIRST_SPREAD * self.head.weight, "bias": first})
+    def first_numbers(self) -> Tensor:
+        """Components begin with means evenly over [0, 1], and with nearly the same weight and width."""
+        count = self.config.components
+        return torch.cat([torch.zeros(count), (torch.arange(count) + 0.5) / count, first_width(count)])
 
     def configure_losses(self) -> Loss:
         """The negative log likelihood of λ as observed."""
@@ -103,23 +81,10 @@ class MixtureDensityModel(TrainableModel):
 
         return loss
 
-    def forward(self, maps: Maps) -> tuple[Tensor, Tensor, Tensor]:
-        """Computes the mixtures of maps of any size; their parameters are float32 under autocast too.
-
-        Args:
-            maps: B maps by field, `inputs` among them.
-
-        Returns:
-            Logarithms of the weights, means and standard deviations, each of shape [B, K, H, W].
-        """
-        features = super().forward(maps)
-        if self.has_slope:
-            slope = (maps[SLOPE].to(self.slope_scale_deg) / self.slope_scale_deg).unsqueeze(1)
-            features = torch.cat([features, slope.to(features.dtype)], dim=1)
-        hidden = self.joint(features)
-        with torch.autocast(hidden.device.type, enabled=False):
-            logits, means, widths = self.head(hidden.to(self.head.weight.dtype)).chunk(3, dim=1)
-            return logits.log_softmax(1), means, nn.functional.softplus(widths) + LEAST_STD
+    def to_outputs(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Logarithms of the weights, means and standard deviations, each of shape [B, K, H, W]."""
+        logits, means, widths = numbers.chunk(3, dim=1)
+        return logits.log_softmax(1), means, to_std(widths)
 
     def to_distribution(self, outputs: tuple[Tensor, Tensor, Tensor]) -> TraversabilityMixture:
         """The mixture, with parameters of shape [B, K, H, W]."""

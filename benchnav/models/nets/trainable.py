@@ -60,6 +60,9 @@ class TrainableNetwork(lightning.LightningModule):
     target: ClassVar[str] = "traversability"
     """Field of the maps that is learned."""
 
+    stops_early: ClassVar[bool] = True
+    """Whether training ends after `patience` epochs without a gain, and keeps the best; if not, it keeps the last."""
+
     def __init__(self, config: TrainingConfig) -> None:
         """Keeps the settings; `build` makes the network."""
         super().__init__()
@@ -208,7 +211,7 @@ class TrainableNetwork(lightning.LightningModule):
         raise NotImplementedError
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        """AdamW under a one-cycle schedule over all steps of a training (Smith and Topin, 2018)."""
+        """AdamW under the schedule of `configure_schedule`."""
         rate = self.config.learning_rate
         # Under mixed precision the fused kind unscales gradients by itself, and Lightning would not clip them.
         fused = not self.trainer.gradient_clip_val
@@ -216,10 +219,14 @@ class TrainableNetwork(lightning.LightningModule):
             self.parameters(), rate, weight_decay=self.config.weight_decay, fused=fused
         )
         steps = max(int(self.trainer.estimated_stepping_batches), 2)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, rate, total_steps=steps, pct_start=_WARM_UP_SHARE
-        )
+        schedule = self.configure_schedule(optimizer, steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def configure_schedule(self, optimizer: torch.optim.Optimizer, steps: int) -> Any:
+        """Gives the schedule of the learning rate over all steps of a training: one cycle (Smith and Topin, 2018)."""
+        return torch.optim.lr_scheduler.OneCycleLR(
+            optimizer, self.config.learning_rate, total_steps=steps, pct_start=_WARM_UP_SHARE
+        )
 
     def on_train_epoch_start(self) -> None:
         """Seeds what an epoch draws, such as dropout: by seed and epoch, so that a resumed training draws the same."""

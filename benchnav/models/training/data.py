@@ -95,7 +95,7 @@ class MapDataset(TerrainMaps):
     def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, Batch]]:
         """All maps neither turned nor jittered, in order, some at a time, with their indices; on a device."""
         origins = crop_origins(self.dataset.grid.shape, self.crop, self.seed, 0, len(self))
-        for indices, maps in self.dataset.chunks(self.split, self.fields):
+        for indices, maps in self._stored_chunks():
             batch = {name: torch.from_numpy(values) for name, values in maps.items()}
             if self.crop:
                 chosen = origins[indices.start : indices.stop].tolist()
@@ -104,6 +104,9 @@ class MapDataset(TerrainMaps):
                     for name, values in batch.items()
                 }
             yield indices, {name: values.to(device) for name, values in batch.items()}
+
+    def _stored_chunks(self) -> Iterator[tuple[range, dict[str, np.ndarray]]]:
+        return self.dataset.chunks(self.split, self.fields)
 
     def _cut(self, layer: Tensor, origin: Sequence[int]) -> Tensor:
         """The square of a layer, [*, H, W], from a cell on; the layer itself where none is asked for."""
@@ -248,6 +251,7 @@ class MapData(lightning.LightningDataModule):
         crop: cells of a side of the squares to train and to measure on; 0 takes whole maps.
         in_memory: hold all maps in memory.
         workers: processes that read ahead; 0 reads in this one.
+        valid: how `valid` is read.
 
     Raises:
         DatasetError: a split is missing.
@@ -264,13 +268,15 @@ class MapData(lightning.LightningDataModule):
         crop: int = 0,
         in_memory: bool = False,
         workers: int = 0,
+        valid: type[MapDataset] = MapDataset,
     ) -> None:
         """Opens the splits."""
         super().__init__()
         self.batch_size, self.seed, self.jitter, self.workers = batch_size, seed, jitter, workers
         self.symmetries = symmetries
         self.train, self.valid = (
-            MapDataset(dataset.path, split, fields, in_memory, crop, seed) for split in (TRAIN, VALID)
+            kind(dataset.path, split, fields, in_memory, crop, seed)
+            for split, kind in ((TRAIN, MapDataset), (VALID, valid))
         )
 
     def scale(self, inputs: Sequence[str]) -> dict[str, LayerScale]:

@@ -256,22 +256,27 @@ def quietly() -> Iterator[None]:
 
 
 class KeepBest(Callback):
-    """Keeps the weights of the epoch with the lowest validation loss and restores them at the end.
+    """Keeps the weights of the epoch with the lowest validation loss, or of the last, and restores them at the end.
 
     They are part of what a training goes on from. Lightning's `ModelCheckpoint` would put them into a second file,
     which a kill could leave of another epoch than the first, and knows the loss alone of all that was measured.
+
+    Args:
+        last: keep the last epoch's whose loss is finite.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, last: bool = False) -> None:
         """Starts with none."""
+        self.last = last
         self.best: dict[str, Any] = {"loss": float("inf"), "metrics": {}, "weights": {}}
         self.validated = False
 
     def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Copies the weights when they are the best so far."""
+        """Copies the weights when they are to be kept."""
         self.validated = True
         metrics = {name: value for name, value in measured(trainer).items() if name.startswith("valid_")}
-        if metrics["valid_loss"] < self.best["loss"]:
+        limit = float("inf") if self.last else self.best["loss"]
+        if metrics["valid_loss"] < limit:
             weights = {name: value.detach().clone() for name, value in module.state_dict().items()}
             metrics["epoch"] = trainer.current_epoch + 1
             self.best = {"loss": metrics["valid_loss"], "metrics": metrics, "weights": weights}

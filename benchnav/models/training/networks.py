@@ -9,6 +9,7 @@ from benchnav.core import registry
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.settings import config_class, of, read
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.base import ModelFamily
 from benchnav.models.checkpoint import (
     CLASSIFIER,
     FUSED,
@@ -24,7 +25,14 @@ from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.trainable import TrainableModel
 from benchnav.models.training.check import Trainable, check_network, class_names, fields_of
-from benchnav.models.training.data import VALID, MapData, MapDataset, open_dataset, training_digest
+from benchnav.models.training.conformal import StoppingMaps, check_valid, conformal_table
+from benchnav.models.training.data import (
+    VALID,
+    MapData,
+    MapDataset,
+    open_dataset,
+    training_digest,
+)
 from benchnav.models.training.fit import FitOptions, KeepBest, fit, in_words, is_first_process, say
 from benchnav.models.training.gaussian_processes import train_gps_on_maps
 from benchnav.models.training.target import Target, fresh_checkpoint, open_target
@@ -126,13 +134,22 @@ def train_networks(
     trainable = replace(trainable, config=config)
     options = FitOptions(**{**vars(how), "trainer": trainer, "folder": training_folder(out)})
     check_network(trainable, dataset, options)
+    if how.conformal:
+        check_valid(dataset)
     parts = [member_name(index, trainable.name) for index in range(members)]
     trained = [GP] * bool(gp) + parts
     fresh = fresh_checkpoint(dataset, trainable.family, trainable.code)
     target = open_target(out, fresh, trained, training_digest(dataset), options)
+    expect(
+        not how.conformal or bool(gp) or trainable.family != FUSED or GP in target.checkpoint.parts,
+        f"a whole model for `conformal`, got {trainable.name} alone. Train the GPs into {out} first, or take "
+        "`benchnav-train all`.",
+    )
     if gp and not target.holds(GP, gp, how.seed):
         target.add(GP, train_gps_on_maps(gp, dataset, options))
     train_parts(target, trainable, dataset, parts)
+    if how.conformal and is_first_process():
+        calibrate_whole(target, trainable, dataset)
     if not target.changed:
         print(f"{out} was finished already, with {' and '.join(sorted(target.checkpoint.parts))}")
 
@@ -157,15 +174,16 @@ def fit_network(
             calibrated and measured.
 
     Returns:
-        The network with its best weights, on the CPU, and what was measured on `valid` in the best epoch, before it
-        was calibrated.
+        The network with the weights that are kept, on the CPU, and what was measured of them on `valid`, before it was
+        calibrated.
     """
     config, network = trainable.config, trainable.kind(trainable.config)
     data = MapData(
         dataset, config.batch_size, seed, fields_of(network), config.jitter, config.symmetries, config.crop,
-        in_memory=options.in_memory, workers=options.workers,
+        in_memory=options.in_memory, workers=options.workers, valid=valid_maps(options),
     )  # fmt: skip
     network.build(data.scale(network.inputs), class_names(dataset), seed)
+    early = [EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)]
     metrics = fit(
         network,
         part or trainable.name,
@@ -176,14 +194,16 @@ def fit_network(
             "seed": seed,
             "half_precision": half_precision,
             **({"code": trainable.code} if trainable.code else {}),
+            **({"conformal": True} if options.conformal else {}),
         },
-        [KeepBest(), EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)],
+        [KeepBest(last=not network.stops_early), *(early if network.stops_early else [])],
         {"datamodule": data},
         max_epochs=config.max_epochs,
     )
     network.to(options.place).eval()
     if half_precision:
         network.load_state_dict(as_stored(network.state_dict(), half_precision))
+    if half_precision or not network.stops_early:
         metrics = {**metrics, **network.measure(data.valid)}
     network.calibrate(data.valid, options.place)
     return network.cpu(), metrics
@@ -208,6 +228,7 @@ def train_parts(target: Target, trainable: Trainable, dataset: TerrainDataset, p
             data_digest=target.digest,
             half_precision=options.half_precision,
             trainer=options.trainer_settings,
+            conformal=options.conformal,
         )
         target.add(part, trained)
     names = member_names(target.checkpoint, trainable.name)
@@ -216,7 +237,26 @@ def train_parts(target: Target, trainable: Trainable, dataset: TerrainDataset, p
     found = [target.checkpoint.part(name) for name in names]
     classes = target.checkpoint.class_names
     members = [trainable.kind.from_tensors(part.config, classes, part.tensors) for part in found]
-    maps = MapDataset(dataset.path, VALID, fields_of(members[0]), crop=config.crop, seed=options.seed)
+    maps = valid_maps(options)(
+        dataset.path, VALID, fields_of(members[0]), crop=config.crop, seed=options.seed
+    )
     temperature = trainable.kind.fit_pool(members, maps, options.seed, options.place)
     say(f"pool of {len(members)} networks: temperature {temperature:.3f}")
     target.set_pool_temperature(temperature)
+
+
+def valid_maps(options: FitOptions) -> type[MapDataset]:
+    """How the maps of `valid` are read by stopping and temperature."""
+    return StoppingMaps if options.conformal else MapDataset
+
+
+def calibrate_whole(target: Target, trainable: Trainable, dataset: TerrainDataset) -> None:
+    """Recalibrates a trained model on the maps of `valid` that its parts have not seen, unless it has been."""
+    if target.checkpoint.conformal:
+        return
+    family: type[ModelFamily] = FusedModel if trainable.family == FUSED else trainable.kind  # type: ignore[assignment]
+    model, options = family.from_checkpoint(target.checkpoint), target.options
+    table = conformal_table(model, dataset, options.seed, options.place)
+    fifth = table.values[table.levels.index(0.2)]
+    say(f"conformal: by {table.maps} maps of {VALID}, the lower fifth is read at level {fifth:.3f}")
+    target.set_conformal(table.plain())

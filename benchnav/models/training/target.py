@@ -4,6 +4,7 @@ Every refusal comes before any work is done. Where processes train together, the
 and writes.
 """
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,8 @@ class Target:
         there = {key: part.config.get(key, usual) for key, usual in defaults.items()}
         there |= {"seed": part.seed, "data": part.data_digest}
         if isinstance(config, TrainingConfig):
-            wanted["half_precision"], there["half_precision"] = options.half_precision, part.half_precision
+            for key in ("half_precision", "conformal"):
+                wanted[key], there[key] = getattr(options, key), getattr(part, key)
             if part.trainer is not None:
                 wanted |= {f"trainer.{key}": value for key, value in options.trainer_settings.items()}
                 there |= {f"trainer.{key}": value for key, value in part.trainer.items()}
@@ -89,8 +91,13 @@ class Target:
     def set_pool_temperature(self, temperature: float) -> None:
         """Saves the temperature of the pool of classifiers with the rest."""
         if temperature != self.checkpoint.pool_temperature:
-            self.checkpoint = replace(self.checkpoint, pool_temperature=temperature)
+            self.checkpoint = replace(self.checkpoint, pool_temperature=temperature, conformal={})
             self._save()
+
+    def set_conformal(self, table: Mapping[str, Any]) -> None:
+        """Saves the table of a conformal recalibration with the rest."""
+        self.checkpoint = replace(self.checkpoint, conformal=table)
+        self._save()
 
     def _save(self) -> None:
         if not is_first_process():

@@ -374,3 +374,35 @@ def test_what_a_hub_says_of_its_trials_does_not_bury_the_error(
     assert caplog.records == []
     hub.warning("seen again")
     assert len(caplog.records) == 1
+
+
+@pytest.mark.parametrize("focal", [0.5, 2.0])
+def test_the_focal_loss_by_its_definition(focal: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    logits = 3 * torch.randn(2, 4, 3, 5, generator=generator)
+    class_id = torch.randint(0, 4, (2, 3, 5), generator=generator)
+    class_id[0, 0] = UNLABELLED
+    known = class_id != UNLABELLED
+    share = logits.softmax(1).movedim(1, -1)[known].gather(1, class_id[known][:, None])[:, 0]
+    expected = -((1 - share) ** focal * share.log()).mean()
+    torch.testing.assert_close(build(focal=focal).loss(logits, class_id), expected)
+    torch.testing.assert_close(build(focal=0.0).loss(logits, class_id), -share.log().mean())
+    assert build(focal=focal).loss(logits, torch.full_like(class_id, UNLABELLED)) == 0
+    smooth = build(focal=focal, label_smoothing=0.2).loss(logits, class_id)
+    each = torch.nn.functional.cross_entropy(
+        logits.movedim(1, -1)[known], class_id[known], label_smoothing=0.2, reduction="none"
+    )
+    torch.testing.assert_close(smooth, ((1 - share) ** focal * each).mean())
+
+
+def test_the_focal_loss_has_a_finite_gradient_where_a_class_is_certain() -> None:
+    logits = torch.tensor([[200.0, 0.0], [0.0, 200.0]]).view(2, 2, 1, 1).requires_grad_()
+    build(focal=0.5).loss(logits, torch.zeros(2, 1, 1, dtype=torch.int64)).backward()
+    assert logits.grad is not None
+    assert bool(logits.grad.isfinite().all())
+
+
+@pytest.mark.parametrize("focal", [-1.0, float("inf")])
+def test_a_focus_that_is_none_is_refused(focal: float) -> None:
+    with pytest.raises(ConfigError, match="focal"):
+        ClassifierConfig(focal=focal)

@@ -248,6 +248,7 @@ def test_the_likelihood_is_in_single_precision_under_autocast() -> None:
     [
         ("components", 0),
         ("hidden", 0),
+        ("encoder_depth", 6),
         ("learning_rate", 0.0),
         ("weight_decay", 1.0),
         ("jitter", -0.1),

@@ -1,0 +1,102 @@
+"""Halves of `valid` for conformal recalibration: maps for stopping and temperature, and maps for scores."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy import ndarray
+
+from benchnav.core import rng
+from benchnav.core.errors import expect
+from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
+from benchnav.models.base import TraversabilityModel, predict
+from benchnav.models.conformal import ConformalTable, fit_table
+from benchnav.models.training.data import VALID, Batch, MapDataset
+
+_LEAST_MAPS = 4
+
+
+class StoppingMaps(MapDataset):
+    """Every second map of a split, the first among them: what stopping and temperature see where others are scored.
+
+    Its maps are counted anew. Arguments are those of `MapDataset`.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        split: str,
+        fields: Sequence[str] = ("rgb", "class_id"),
+        in_memory: bool = False,
+        crop: int = 0,
+        seed: int = 0,
+    ) -> None:
+        """Checks split and fields, and reads the maps where that is asked for."""
+        super().__init__(path, split, fields, crop=crop, seed=seed)
+        self._chosen = range(0, self._maps, 2)
+        if in_memory:
+            self._memory = super().read(range(self._maps))
+
+    def __len__(self) -> int:
+        """Number of maps that are seen."""
+        return len(self._chosen)
+
+    def read(self, indices: Sequence[int]) -> Batch:
+        """Reads maps by their indices among those that are seen."""
+        return super().read([self._chosen[index] for index in indices])
+
+    def _stored_chunks(self) -> Iterator[tuple[range, dict[str, np.ndarray]]]:
+        size = self.dataset.grid.maps_in(CHUNK_CELLS)
+        for first in range(0, len(self), size):
+            indices = range(first, min(first + size, len(self)))
+            chosen = [self._chosen[index] for index in indices]
+            yield indices, self.dataset.read(self.split, chosen, self.fields)
+
+
+def scored_maps(count: int) -> range:
+    """Indices of the maps of a split of so many that `StoppingMaps` leaves out."""
+    return range(1, count, 2)
+
+
+def check_valid(dataset: TerrainDataset) -> None:
+    """Refuses a dataset whose split `valid` cannot be halved.
+
+    Raises:
+        ConfigError: it has too few maps.
+    """
+    count = dataset.map_count(VALID)
+    expect(
+        count >= _LEAST_MAPS,
+        f"at least {_LEAST_MAPS} maps in split {VALID} of {dataset.path} for `conformal`, which takes every second "
+        f"one, got {count}. With n maps for it no level under 1 / (n + 1) can be promised.",
+    )
+
+
+def conformal_table(
+    model: TraversabilityModel, dataset: TerrainDataset, seed: int, device: torch.device
+) -> ConformalTable:
+    """Predicts every second map of `valid` and finds the levels that a model's quantiles are to be read at.
+
+    Args:
+        model: trained, and calibrated, on other maps.
+        dataset: where the maps are.
+        seed: root seed of the scores of atoms.
+        device: where to compute.
+    """
+    scores = [_scores(model, dataset, index, seed, device) for index in scored_maps(dataset.map_count(VALID))]
+    return fit_table(scores)
+
+
+def _scores(
+    model: TraversabilityModel, dataset: TerrainDataset, index: int, seed: int, device: torch.device
+) -> ndarray:
+    """PIT values of the observed cells of a map, float64."""
+    terrain = dataset.terrain(VALID, [index]).to(device)
+    observed = terrain.traversability
+    with torch.no_grad():
+        lower, upper = (share.double() for share in predict(model, terrain).cdf_limits(observed.nan_to_num()))
+    key = rng.stream_key(seed, "models", "conformal")
+    drawn = rng.uniform(key, np.array([index]), tuple(observed.shape[1:]))
+    inside = torch.lerp(lower, upper, torch.from_numpy(drawn).to(lower))
+    return inside[observed.isfinite()].cpu().numpy()
