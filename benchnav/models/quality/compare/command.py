@@ -185,7 +185,7 @@ def _notes(
             own_notes = notes_of_model(one.model, dataset, own, baselines, one.trained_on)
             lines += [f"{one.label}: {line}" for line in own_notes]
     height, width = dataset.grid.shape
-    where = gpu_name(device) or f"the CPU, {_threads()} threads"
+    where = gpu_name(device) or f"the CPU with {_threads()} thread{'s' * (_threads() > 1)}"
     lines.append(
         f"ms a map: median over repeated predictions of one map of {height}×{width} cells, on {where}"
     )

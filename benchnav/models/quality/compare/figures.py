@@ -115,7 +115,6 @@ def calibration_figure(tallies: Tallies, looks: Looks) -> Figure:
                 levels = np.linspace(0, 1, len(counts) + 1)
                 excess = np.concatenate([[0], np.cumsum(counts) / counts.sum()]) - levels
                 panel.plot(levels, excess, label=model, markevery=_MARKED_EVERY, **look)
-        panel.set(xlim=(0, 1), xticks=[0, 0.5, 1])
     figure.supxlabel("level of the quantile")
     figure.supylabel("share of λ under it less the level", fontsize=TITLE)
     _explain(figure)
@@ -137,7 +136,7 @@ def sparsification_figure(tallies: Tallies, looks: Looks) -> Figure:
                 left_out, by_width, by_error = tallies[split, model].curves()
                 panel.plot(left_out, by_width, label=model, markevery=2 * _MARKED_EVERY, **look)
                 panel.plot(left_out, by_error, color=look["color"], lw=0.8, ls=":")
-        panel.set(xlim=(0, 1), ylim=(0, None), xticks=[0, 0.5, 1])
+    panel.set_ylim(bottom=0)  # of all, which share it
     figure.supxlabel("share of cells left out")
     figure.supylabel("mean error of the rest", fontsize=TITLE)
     _explain(figure)
@@ -192,6 +191,8 @@ def _panels_of_splits(tallies: Tallies) -> tuple[Figure, dict[str, Axes]]:
     panels = [panel for (panel,) in stack_panels(figure, len(splits), across, sharex=True, sharey=True)]
     for panel, split in zip(panels, splits, strict=True):
         panel.set_title(split, parse_math=False)
+        panel.set_xlim(0, 1)
+        panel.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
         panel.grid(alpha=0.3)
     return figure, dict(zip(splits, panels, strict=True))
 

@@ -72,7 +72,7 @@ FIGURES = {
     "sparsification": (
         "Whether uncertainty finds the errors",
         "Mean error |λ − E[λ]| of the cells of a map that are left, over the share that was left out: the most "
-        "uncertain ones first (lines), or those with the largest error first (dotted). The area between the two is AUSE.",
+        "uncertain ones first (lines), or those with the largest error first (dotted). The area between is AUSE.",
     ),
     "severity": (
         "Quality over the severity of a shift",
