@@ -2,9 +2,13 @@
 
     python benchmarks/datasets.py
 
+    python benchmarks/datasets.py shards    # training batches from 2 000 shards alone
+
 Making is timed from the call to the closed file, with solvable test maps and their reference times,
 in an interpreter that has its imports done; the whole command is timed as well. Reading is random
-maps, one at a time, in one process. Each figure is the median of the repeats, with the range.
+maps, one at a time, in one process. From shards it is the batches of an epoch as training takes them, turned and
+mirrored, in one process of one thread, and seconds are those of its core; the files lie in the page cache. Each figure
+is the median of the repeats, with the range.
 """
 
 import resource
@@ -13,6 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
@@ -24,20 +29,28 @@ from rich.table import Table
 from benchnav.datagen import schema
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.maps import TerrainMaps
-from benchnav.datagen.recipe.recipe import Recipe, load_recipe
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.recipe import Recipe, Split, load_recipe
 from benchnav.datagen.synth.generate import generate
 
 REPEATS = 7
 READS = 3000
+SHARDS = 2000
+MAPS_A_SHARD = 10
 
 
-def per_second(count: int, work: Callable[[], object], repeats: int = REPEATS) -> tuple[float, str]:
+def per_second(
+    count: int,
+    work: Callable[[], object],
+    repeats: int = REPEATS,
+    clock: Callable[[], float] = time.perf_counter,
+) -> tuple[float, str]:
     """Times `count` maps of work; gives the median rate and the range as text."""
     rates = []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = clock()
         work()
-        rates.append(count / (time.perf_counter() - start))
+        rates.append(count / (clock() - start))
     return median(rates), f"{median(rates):,.0f} ({min(rates):,.0f}–{max(rates):,.0f})"
 
 
@@ -71,7 +84,61 @@ def read_plainly(path: Path, fields: tuple[str, ...], order: np.ndarray) -> None
                 file["train"][name][index]
 
 
+def make_shards(path: Path) -> None:
+    """20 000 maps of 32 × 32 cells in 2 000 files."""
+    paper = load_recipe("paper-v1")
+    splits = {"train": Split(scenario="std", maps=SHARDS * MAPS_A_SHARD)}
+    small = {"height": 32, "width": 32, "start_m": (4.0, 4.0), "goal_m": (12.0, 12.0)}
+    recipe = replace(
+        paper, id="shards", class_periods_m=(6.0, 3.0, 1.5), splits=splits,
+        scenarios={"std": paper.scenarios["std"]}, **small,
+    )  # fmt: skip
+    for _ in create(recipe, path, jobs=2, shard_cells=MAPS_A_SHARD * 32 * 32):
+        pass
+
+
+def read_shards() -> None:
+    """Times an epoch in windows of shards beside one in any order, and beside a file opened for every map."""
+    import torch
+
+    from benchnav.models.training.data import MapDataset, MapSampler
+
+    torch.set_num_threads(1)
+    fields, batch = ("rgb", "class_id"), 16
+    table = Table(
+        "work", "maps/s, median (range)", "ratio", title=f"{SHARDS} shards of {MAPS_A_SHARD} maps of 32 × 32"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        make_shards(Path(folder) / "shards")
+        pieces = TerrainDataset(Path(folder) / "shards").pieces["train"]
+        some = np.random.default_rng(0).integers(SHARDS * MAPS_A_SHARD, size=READS)
+
+        def plainly() -> None:
+            for index in some.tolist():
+                with h5py.File(pieces[index // MAPS_A_SHARD].path) as file:
+                    for name in fields:
+                        file["train"][name][index % MAPS_A_SHARD]
+
+        base, text = per_second(READS, plainly, 3, time.process_time)
+        table.add_row("h5py, any order, file opened each time", text, "1")
+        orders = {"any order": (), "windows of shards": tuple(piece.maps for piece in pieces)}
+        for order, shards in orders.items():
+            maps = MapDataset(Path(folder) / "shards", "train", fields)
+
+            def epoch(maps: MapDataset = maps, shards: tuple[int, ...] = shards) -> None:
+                symmetries = tuple(range(8))
+                for key in MapSampler(len(maps), batch, symmetries=symmetries, shuffle=True, shards=shards):
+                    maps[key]
+
+            rate, text = per_second(len(maps), epoch, 3, time.process_time)
+            table.add_row(f"batches of training, {order}", text, f"{rate / base:.1f}")
+    Console().print(table)
+
+
 def main() -> None:
+    if sys.argv[1:] == ["shards"]:
+        read_shards()
+        return
     recipe = load_recipe("paper-v1")
     total = sum(split.maps for split in recipe.splits.values())
     table = Table("work", "maps/s, median (range)", "ratio", title=f"paper-v1, {total} maps of 64 × 64")

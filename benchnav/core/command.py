@@ -2,8 +2,9 @@
 
 Words and YAML files make one plain mapping, which `benchnav.core.settings` reads by the types of the function's
 parameters; the help is jsonargparse's. `--contact-sheet` is `--contact_sheet true`, `--maps 3` is `--maps [3]`; a
-flag whose value is a name or a mapping may be given as both, `--world paper --world.noise stored`. Bad input ends in
-one line on standard error and exit status 2; an interruption in status 130.
+flag whose value is a name or a mapping may be given as both, `--world paper --world.noise stored`; one of a list may be
+given again, which adds to it. Bad input ends in one line on standard error and exit status 2; an interruption in status
+130.
 """
 
 import errno
@@ -16,7 +17,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.registry import KINDS
@@ -199,8 +200,9 @@ def _read_arguments(
     given: dict[str, Any] = {}
     for (name, *keys), value in sorted(flags, key=lambda flag: len(flag[0])):
         if name in options:
-            now = given.get(name, arguments.get(name, options[name].default))
-            given[name] = _merged(name, options[name].kind, now, keys, value)
+            kind, now = options[name].kind, given.get(name, arguments.get(name, options[name].default))
+            again = name in given and _takes_list(kind)
+            given[name] = _appended(now, value) if again else _merged(name, kind, now, keys, value)
     for name in command.positionals:
         if options[name].kind == list[str] and (places or name not in arguments):
             given[name], places = list(places), []
@@ -311,6 +313,19 @@ def _print_help_of(program: str, command: Command) -> int:
     parser.add_function_arguments(command.function, as_group=False, skip=skip)
     parser.print_help()
     return 0
+
+
+def _takes_list(kind: Any) -> bool:
+    """Whether it is a list of any length, and no text."""
+    members = members_of(kind)
+    ends = [get_args(member)[-1:] for member in members if get_origin(member) is tuple]
+    return str not in members and ((...,) in ends or any(get_origin(member) is list for member in members))
+
+
+def _appended(one: str, other: str) -> str:
+    """Two lists, each as text with or without brackets, as one."""
+    inner = (text.strip().removeprefix("[").removesuffix("]").strip() for text in (one, other))
+    return f"[{', '.join(text for text in inner if text)}]"
 
 
 def _takes_mapping(kind: Any) -> bool:

@@ -351,8 +351,9 @@ def _integral(
     # A lane halves one of its intervals a time, and hands one half to the next lane, so that all find work.
     filled = _FIRST // _AT_ONCE
     shape = (filled + rounds, _AT_ONCE, *first.shape)
-    intervals = [values.new_zeros(shape) for _ in range(6)]
+    intervals = [values.new_empty(shape) for _ in range(6)]
     begin, width, value, rise, bow, doubt = intervals
+    bow[:filled] = 0
     parts = (edges[:-1], edges.diff(dim=0), values[:-1], values.diff(dim=0))
     for layer, part in zip(intervals, parts, strict=False):
         layer[:filled] = part.view(filled, *shape[1:])

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 
+from benchnav.core.grid import is_azimuth
 from benchnav.core.store import replacing
 
 # Widths of a journal's column and of a page.
@@ -281,7 +282,7 @@ def layer_scale(name: str, values: np.ndarray) -> dict[str, Any]:
         name: of the layer; one that ends in `_azimuth_deg` holds directions.
         values: of any shape, NaN where nothing is known.
     """
-    if name.endswith("_azimuth_deg"):
+    if is_azimuth(name):
         return {"cmap": _colour_map(_DIRECTION_COLOURS), "vmin": 0.0, "vmax": 360.0}
     low, high = (float(end(values[np.isfinite(values)], initial=0.0)) for end in (np.min, np.max))
     return {"cmap": _colour_map(_LAYER_COLOURS), "vmin": low, "vmax": high if high > low else low + 1.0}

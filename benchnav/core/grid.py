@@ -101,3 +101,8 @@ class Grid:
         column = torch.where(column > 0, column, 0).clamp(max=self.width + 1).long()
         index = row * (self.width + 2) + column
         return torch.gather(padded, 1, index.reshape(len(padded), -1)).reshape(x_m.shape)
+
+
+def is_azimuth(layer: str) -> bool:
+    """Tells by its name a layer of directions: in degrees from +x towards +y, which turn with the map."""
+    return layer.endswith("_azimuth_deg")

@@ -37,6 +37,7 @@ from benchnav.core.figures import (
     show_map,
     styled,
 )
+from benchnav.core.grid import is_azimuth
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
@@ -49,6 +50,7 @@ STEEP_DEG = 30.0
 _PAGE, _DPI = 9.4, 300.0
 _SIDES, _ENDS = 0.7, 1.5  # what is not maps of a sheet's width and height
 _LINE, _LETTER, _COLUMN = 0.135, 0.054, 1.15
+_TITLE_LETTERS = 20  # of a layer's name in a line, which a column has room for
 _HATCH = "//////"
 _MOST_THUMBNAILS = 100
 _MARK_SIZE = 0.75
@@ -160,7 +162,8 @@ def layer_column(name: str, values: np.ndarray, unit: str) -> SheetColumn:
     """A layer as a column of a sheet, of shape [R, H, W]."""
     words = name.removesuffix(f"_{unit}").replace("_", " ")
     title = words[:1].upper() + words[1:] + {"1": "", "deg": " [°]"}.get(unit, f" [{unit}]")
-    shown = values % 360 if name.endswith("_azimuth_deg") else values
+    title = textwrap.fill(title, _TITLE_LETTERS, break_long_words=False)
+    shown = values % 360 if is_azimuth(name) else values
     return SheetColumn(name, title, np.ma.masked_invalid(shown), layer_scale(name, values), "")
 
 

@@ -11,5 +11,6 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.models.checkpoint": ("Checkpoint", "Part", "load_checkpoint", "save_checkpoint"),
         "benchnav.models.predictor": ("find_checkpoint", "list_checkpoints", "load_model"),
         "benchnav.models.quality.measure": ("evaluate as evaluate_model",),
+        "benchnav.models.tiles": ("Window", "measure_margin", "predict_tiles", "write_risk_maps"),
     },
 )

@@ -4,6 +4,7 @@ from benchnav.models.config import TrainingConfig
 from benchnav.models.nets.trainable import TrainableModel
 from benchnav.models.predictor import find_checkpoint, list_checkpoints, load_model
 from benchnav.models.quality.measure import evaluate as evaluate_model
+from benchnav.models.tiles import Window, measure_margin, predict_tiles, write_risk_maps
 
 __all__ = [
     "Checkpoint",
@@ -12,11 +13,15 @@ __all__ = [
     "TrainableModel",
     "TrainingConfig",
     "TraversabilityModel",
+    "Window",
     "evaluate_model",
     "find_checkpoint",
     "list_checkpoints",
     "load_checkpoint",
     "load_model",
+    "measure_margin",
     "predict",
+    "predict_tiles",
     "save_checkpoint",
+    "write_risk_maps",
 ]

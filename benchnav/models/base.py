@@ -118,9 +118,14 @@ def predict(model: TraversabilityModel, terrain: Terrain) -> TraversabilityDistr
     """
     if isinstance(model, PrivilegedModel):
         return model.predict_terrain(terrain)
+    return predict_observation(model, terrain.observe())
+
+
+def predict_observation(model: TraversabilityModel, observation: Observation) -> TraversabilityDistribution:
+    """As `predict`, where the truth is not at hand; refuses privileged models."""
     with exact_convolutions():
-        predicted: Any = model.predict(terrain.observe())
-    shape, got = [len(terrain), *terrain.grid.shape], type(predicted).__name__
+        predicted: Any = model.predict(observation)
+    shape, got = [len(observation.rgb), *observation.grid.shape], type(predicted).__name__
     if isinstance(predicted, TraversabilityDistribution):
         if list(predicted.shape) == shape:
             return predicted

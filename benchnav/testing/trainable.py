@@ -9,10 +9,11 @@ from torch import Tensor
 
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError
+from benchnav.core.grid import is_azimuth
 from benchnav.core.settings import config_class, of, one_line, read
 from benchnav.core.terrain import Terrain
 from benchnav.models.base import layers_of
-from benchnav.models.nets.inputs import LayerScale, is_azimuth
+from benchnav.models.nets.inputs import LayerScale
 from benchnav.models.nets.trainable import TrainableModel
 from benchnav.models.training.check import try_network
 from benchnav.testing.breaches import SEED, Breaches, same

@@ -374,3 +374,17 @@ def test_work_goes_on_where_no_one_reads_how_far_it_is(monkeypatch: pytest.Monke
     show_progress(steps(), "units")
     tell("a line more")
     assert reached == list(range(11))
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ("--some", "[1,2]", "--some", "3"),
+        ("--some", "1", "--some", "2", "--some=3"),
+        ("--some", "[]", "--some", "[1, 2, 3]"),
+        ("--some", "1,2", "--some", "[3]"),
+    ],
+)
+def test_a_flag_of_a_list_that_is_given_again_adds_to_it(argv: tuple[str, ...]) -> None:
+    assert call("work", "here", *argv) == 0
+    assert seen[-1] == ("here", [], False, 1, 1, 2, 3)

@@ -307,7 +307,7 @@ BAD_OVERRIDES = [
     ("classes.basalt.soft.weight=0.2", "Recipe stakes-v1: Expected `classes.basalt.soft.mean` as a number, got none."),
     ("scenarios.hs=3", "Recipe stakes-v1: Expected `scenarios.hs` as a mapping, got 3."),
     ("scenarios.hs.severity=x", "Expected `severity` of scenario 'hs' to be a finite number, got 'x'."),
-    ("scenarios.hs.ambeint=1", "Recipe stakes-v1: Expected keys of `scenarios.hs` among relief_m, roughness, crater_count, crater_radius_m, crater_depth_ratio, light_height, ambient, got 'ambeint'. Did you mean 'ambient'?"),
+    ("scenarios.hs.ambeint=1", "Recipe stakes-v1: Expected keys of `scenarios.hs` among relief_m, roughness, crater_count, crater_radius_m, crater_depth_ratio, light_height, ambient, tints, got 'ambeint'. Did you mean 'ambient'?"),
     ("places=3", "Recipe stakes-v1: Expected `places` as a mapping or null, got 3."),
 ]  # fmt: skip
 

@@ -15,6 +15,7 @@ from benchnav.core.figures import (
     TWO_COLUMNS_IN,
     condition_colours,
     hatching,
+    layer_scale,
     outline,
     planner_colours,
     planner_name,
@@ -119,3 +120,26 @@ def test_hatching_goes_through_all_of_a_region_without_breaks() -> None:
         assert (row == line).sum() == 3
     starts = {tuple(point) for point in lines[:, 0]}
     assert all(tuple(end) in starts for end in lines[:, 1] if end[0] < 12 and end[1] < 9)
+
+
+@pytest.mark.parametrize(
+    ("values", "low", "high"),
+    [
+        ([0.5, 2.0], 0.0, 2.0),
+        ([-3.0, 2.0], -3.0, 2.0),
+        ([-3.0, -2.0], -3.0, 0.0),
+        ([0.0, np.nan], 0.0, 1.0),
+        ([np.nan], 0, 1),
+    ],
+)
+def test_a_layer_is_coloured_from_zero_to_its_greatest_value(
+    values: list[float], low: float, high: float
+) -> None:
+    scale = layer_scale("moss", np.array(values))
+    assert (scale["vmin"], scale["vmax"]) == (low, high)
+
+
+def test_a_layer_of_directions_ends_in_the_colour_that_it_begins_with() -> None:
+    scale = layer_scale("rows_azimuth_deg", np.array([10.0, 20.0]))
+    assert (scale["vmin"], scale["vmax"]) == (0.0, 360.0)
+    np.testing.assert_allclose(scale["cmap"](0.0), scale["cmap"](1.0), atol=0.02)

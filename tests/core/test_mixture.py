@@ -196,7 +196,7 @@ def test_weights_that_sum_to_nearly_1_tell_of_what_those_do_that_sum_to_it(
     for found, wanted in (
         (mixture.mean(), exact.mean()),
         (mixture.cvar(0.9), exact.cvar(0.9)),
-        (mixture.expected_time(0.1), exact.expected_time(0.1)),
+        (1 / mixture.expected_time(0.1), 1 / exact.expected_time(0.1)),
         (mixture.chance(0.45), exact.chance(0.45)),
         (mixture.cdf(0.45), exact.cdf(0.45)),
         (mixture.log_prob(seen).exp(), exact.log_prob(seen).exp()),

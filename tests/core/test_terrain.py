@@ -1,11 +1,14 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchnav.core.batch import map_tensors
 from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
-from benchnav.core.terrain import Observation
+from benchnav.core.terrain import Observation, Terrain
 from tests import factories
 
 
@@ -50,3 +53,44 @@ def test_layers_that_do_not_fit_are_named() -> None:
         Observation(good.rgb.float(), good.elevation_m, good.slope_deg, good.grid)
     with pytest.raises(ConfigError, match="resolution_m"):
         Grid(4, 4, -1)
+
+
+def layered() -> Terrain:
+    ground = factories.terrain(torch.rand(3, 16, 16))
+    return replace(ground, layers={"moss": torch.rand(3, 16, 16), "dust": torch.rand(3, 16, 16)})
+
+
+def test_layers_go_with_their_maps() -> None:
+    terrain, members = layered(), torch.tensor([2, 0, 2])
+    for whole in (terrain, terrain.observe()):
+        kept, copy = whole.select(members), whole.clone()
+        assert list(kept.layers) == list(copy.layers) == ["moss", "dust"]
+        for name in whole.layers:
+            assert torch.equal(kept.layers[name], whole.layers[name][members])
+            assert torch.equal(copy.layers[name], whole.layers[name])
+            assert copy.layers[name].data_ptr() != whole.layers[name].data_ptr()
+        assert whole.to("meta").layers["moss"].device.type == "meta"
+
+
+def test_several_batches_are_changed_together_layer_by_layer() -> None:
+    one, other = layered().observe(), layered().observe()
+    joined = map_tensors(one, lambda first, second: torch.cat((first, second)), other)
+    assert torch.equal(joined.layers["dust"], torch.cat((one.layers["dust"], other.layers["dust"])))
+
+
+@pytest.mark.parametrize(
+    ("layers", "expected"),
+    [
+        ({"moss": torch.zeros(3, 16, 15)}, "`moss` of shape [3, 16, 16], got [3, 16, 15]"),
+        ({"moss": torch.zeros(2, 16, 16)}, "`moss` of shape [3, 16, 16], got [2, 16, 16]"),
+        ({"moss": torch.zeros(3, 16, 16).double()}, "layer `moss` as float32"),
+        ({"slope_deg": torch.zeros(3, 16, 16)}, "layer `slope_deg` as float32 under a name of its own"),
+        ({"rgb": torch.zeros(3, 16, 16)}, "layer `rgb` as float32 under a name of its own"),
+    ],
+)
+def test_layers_fit_the_grid(layers: dict[str, torch.Tensor], expected: str) -> None:
+    terrain = layered()
+    for whole in (terrain, terrain.observe()):
+        with pytest.raises(ConfigError) as caught:
+            replace(whole, layers=layers)
+        assert expected in str(caught.value)

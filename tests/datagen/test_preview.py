@@ -21,9 +21,11 @@ from benchnav.datagen.preview import (
     class_colours,
     contact_columns,
     contact_sheet_figure,
+    layer_column,
     preview_figure,
     soft_ground,
 )
+from benchnav.datagen.recipe.classes import Vegetation
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe
 from tests.datagen.small import small_stakes
 from tests.factories import tiny_dataset, tiny_recipe
@@ -399,3 +401,46 @@ def test_a_contact_sheet_of_soft_ground_shows_stored_traversability(stakes: Terr
         left, right, bottom, top = image.get_extent()
         assert (right - left) == pytest.approx(2 * (bottom - top))
     check_texts(figure)
+
+
+def test_layers_have_a_panel_a_bar_and_a_unit_each(tmp_path: Path) -> None:
+    recipe = small_stakes()
+    grass = Vegetation(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
+    grown = ("wet_clay", "gravel", "scree", "packed_soil", "crusted_soil")
+    classes = tuple(
+        replace(item, vegetation=grass if item.name in grown else None) for item in recipe.classes
+    )
+    recipe = replace(recipe, classes=classes, vegetation_period_m=4.0)
+    dataset = TerrainDataset(tiny_dataset(tmp_path / "grown.h5", recipe))
+    figure = preview_figure(dataset, "train", [0, 3])
+    check_texts(figure)
+    stored, shown = dataset.read("train", [0, 3])["vegetation_m"], panels(figure)
+    for row in (0, 1):
+        image = shown[f"vegetation_m {row}"].get_images()[0]
+        np.testing.assert_array_equal(image.get_array(), stored[row])
+        assert image.get_clim() == (0.0, stored.max())
+    assert shown["vegetation_m 0"].get_title() == "Vegetation [m]"
+    assert "vegetation_m bar" in shown
+    assert "not known" not in legend_names(figure)
+    assert "vegetation_m 0" not in panels(
+        preview_figure(TerrainDataset(tiny_dataset(tmp_path / "b.h5")), "train", [0])
+    )
+
+
+def test_a_layers_column_says_its_unit_and_where_nothing_is_known() -> None:
+    values = np.array([[[-20.0, 50.0], [np.nan, 350.0]]], np.float32)
+    titles = {
+        ("dust", "1"): "Dust",
+        ("dust_cover", "%"): "Dust cover [%]",
+        ("canopy_m", "m"): "Canopy [m]",
+        ("tilt_deg", "deg"): "Tilt [°]",
+        ("rows_azimuth_deg", "deg"): "Rows azimuth [°]",
+    }
+    for (name, unit), title in titles.items():
+        column = layer_column(name, values, unit)
+        assert (column.name, column.title, column.unit) == (name, title, "")
+        assert np.ma.getmaskarray(column.layers).ravel().tolist() == [False, False, True, False]
+        limits = (0.0, 360.0) if "azimuth" in name else (-20.0, 350.0)
+        assert (column.shades["vmin"], column.shades["vmax"]) == limits
+    turned = layer_column("rows_azimuth_deg", values, "deg").layers
+    assert turned.compressed().tolist() == [340.0, 50.0, 350.0]

@@ -13,12 +13,16 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 import benchnav  # noqa: F401 - registers the environment
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.classes import Vegetation
+from benchnav.datagen.recipe.recipe import Split
 from benchnav.planning.objective import GoalDistance, TravelTime
 from benchnav.planning.robots import DifferentialDrive, Unicycle
 from benchnav.planning.world.realisation import Realisation
 from benchnav.planning.world.world import World
 from tests import factories
+from tests.datagen.small import small_stakes
 
 ID = "benchnav/OffRoad-v0"
 AHEAD = np.array([1.0, 0.0], np.float32)
@@ -352,3 +356,45 @@ def test_maps_without_the_reference_times_that_stakes_need_are_one_line_with_the
     assert "\n" not in str(told.value)
     made = make(path, world={"preset": "stakes", "time_budget_s": 60})  # as the line says
     made.reset(seed=0)
+
+
+def test_layers_are_seen_by_their_names(tmp_path: Path) -> None:
+    grass = Vegetation(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
+    recipe = small_stakes(splits={"train": Split(scenario="std", maps=4)})
+    classes = tuple(replace(item, vegetation=grass if item.soft else None) for item in recipe.classes)
+    path = factories.tiny_dataset(
+        tmp_path / "d.h5", replace(recipe, classes=classes, vegetation_period_m=4.0)
+    )
+    stored = TerrainDataset(path).read("train")["vegetation_m"]
+    env = make(path, world={"time_budget_s": 1.0})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        check_env(env)
+        check_env_for_sb3(env)
+    seen, _ = env.reset(options={"map": 2})
+    assert set(env.observation_space) == {"state", "goal", "rgb", "elevation_m", "slope_deg", "vegetation_m"}
+    np.testing.assert_array_equal(seen["vegetation_m"], stored[2])
+    vector = make_vector(path, 3, world={"time_budget_s": 1.0})
+    batch, info = vector.reset(seed=1)
+    np.testing.assert_array_equal(batch["vegetation_m"], stored[info["map"]])
+
+
+def test_without_layers_nothing_more_is_seen(dataset_path: Path) -> None:
+    assert set(make(dataset_path).observation_space) == {"state", "goal", "rgb", "elevation_m", "slope_deg"}
+
+
+@pytest.mark.parametrize("name", ["state", "goal"])
+def test_a_layer_may_not_take_the_name_of_what_is_seen(
+    dataset_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    read = TerrainDataset.terrain
+
+    def terrain(dataset: TerrainDataset, *given: Any) -> Terrain:
+        found = read(dataset, *given)
+        return replace(found, layers={name: found.elevation_m})
+
+    monkeypatch.setattr(TerrainDataset, "terrain", terrain)
+    with pytest.raises(
+        ConfigError, match=f"layers that are not called 'state' or 'goal', got \\['{name}'\\]"
+    ):
+        make(dataset_path)

@@ -164,3 +164,19 @@ def test_what_was_predicted_at_the_end_is_that_of_the_cell_it_lies_in(
     states[-1, :2] = place
     found = replace(recording, states=states).predicted_at_end
     assert np.isnan(found) if cell is None else found == recording.predicted[cell]
+
+
+def test_layers_are_kept_in_the_file(tmp_path: Path) -> None:
+    layers = {
+        "vegetation_m": np.full((40, 60), 0.5, np.float32),
+        "rock share": np.full((40, 60), np.nan, np.float32),
+    }
+    made.recording(10, layers=layers).save(tmp_path / "a.npz")
+    found = Recording.load(tmp_path / "a.npz").layers
+    assert list(found) == list(layers)
+    for name in layers:
+        np.testing.assert_array_equal(found[name], layers[name])
+    made.recording(10).save(tmp_path / "b.npz")
+    with np.load(tmp_path / "b.npz") as stored:
+        assert not any("layers" in name for name in stored)  # as before there were any
+    assert Recording.load(tmp_path / "b.npz").layers == {}

@@ -133,7 +133,9 @@ def test_a_prediction_that_does_not_fit_the_maps_is_refused() -> None:
             ones = torch.ones(1, 1, 4, 4)
             return TraversabilityMixture(ones, ones, ones)
 
-    with pytest.raises(ConfigError, match=r"\[2, 16, 16\]"):
+    with pytest.raises(
+        ConfigError, match=r"shape \[2, 16, 16\], got TraversabilityMixture of shape \[1, 4, 4\]"
+    ):
         predict(Small(), make_terrain())
 
 

@@ -8,10 +8,13 @@ from torch import Tensor
 from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.quantiles import QuantileDistribution
 from benchnav.core.terrain import Observation
+from benchnav.planning.free_space import FreeSpace, Rules, cells_at_goal
 from benchnav.planning.problem import Problem, heading_to, pose_problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
 from tests import factories
+from tests.core.distributions import quantiles
 
 BATCH, HEIGHT, WIDTH = 3, 12, 20
 
@@ -148,3 +151,16 @@ def test_doubles_stay_doubles() -> None:
         problem.start, problem.start[:, :2], problem.ground_at(problem.start), problem.goal_m
     )
     assert cost.dtype == problem.action_bounds[0].dtype == problem.padded_ground.dtype == torch.float64
+
+
+def test_any_distribution_is_posed_and_taken_apart_with_the_batch() -> None:
+    made, law = varied(), quantiles(maps=BATCH)
+    law = QuantileDistribution(law.values[..., :1, :1].expand(-1, -1, HEIGHT, WIDTH).float().contiguous())
+    task = replace(made.task, rules=Rules(free_space=FreeSpace(by="mean", above=0.3)))
+    problem = pose_problem(task, made.observation, law, law.cvar(0.9), made.start[:, :2], made.goal_m, 42.0)
+    away = ~cells_at_goal(problem.grid, problem.goal_m, problem.goal_radius_m)
+    assert torch.equal(problem.free[away], (law.mean() > 0.3)[away])
+    kept = problem.clone().select(torch.tensor([2]))
+    assert torch.equal(kept.distribution.cdf(0.4), law.cdf(0.4)[2:])
+    with pytest.raises(ConfigError, match="`distribution` of shape"):
+        replace(problem, distribution=law.select(torch.tensor([0])))

@@ -8,6 +8,7 @@ from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning import risk
+from tests.core.distributions import quantiles
 from tests.core.test_mixture import random_mixture
 
 
@@ -98,3 +99,14 @@ def test_single_class_of_components_that_are_no_classes_is_refused_by_name() -> 
     mixture = replace(random_mixture(), group=None)
     with pytest.raises(ConfigError, match="single-class"):
         risk.apply(registry.make("risk", "single-class"), mixture)
+
+
+def test_measures_are_those_of_any_distribution_and_single_class_refuses_by_name() -> None:
+    law = quantiles()
+    for text, expected in (
+        ("mean", law.mean()), ("cvar:0.7", law.cvar(0.7)), ("var:0.7", law.var(0.7)), ("chance:0.2", law.chance(0.2)),
+        ("expected-time:0.1", 1 / law.expected_time(0.1)),
+    ):  # fmt: skip
+        assert torch.equal(risk.apply(registry.make("risk", text), law), expected), text
+    with pytest.raises(ConfigError, match="single-class option, got QuantileDistribution"):
+        risk.apply(registry.make("risk", "single-class"), law)

@@ -9,8 +9,11 @@ import torch
 from torch import Tensor
 
 from benchnav.core import registry
+from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.pooled import pool
+from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.core.terrain import Observation
 from benchnav.models.base import TraversabilityModel, is_family
 from benchnav.models.checkpoint import load_checkpoint, member_name
@@ -292,3 +295,70 @@ def test_fused_models_keep_the_contract(checkpoint_path: Path, members: int) -> 
 def test_a_mixture_density_model_keeps_the_contract() -> None:
     scales = scale(torch.full((3,), 90.0), torch.full((3,), 40.0), 9.0)
     check_model(MixtureDensityModel(MDNConfig(encoder="mobilenet_v2")).build(scales).eval())
+
+
+class Quantiles(TraversabilityModel):
+    """Quantiles from half of what the cell shows up to all of it, with an atom, and one thing changed."""
+
+    def __init__(
+        self, change: Callable[[QuantileDistribution], TraversabilityDistribution] = lambda found: found
+    ) -> None:
+        self.change = change
+
+    def predict(self, observation: Observation) -> TraversabilityDistribution:
+        share = observation.rgb.float().mean(1, keepdim=True) / 255
+        levels = torch.tensor(LEVELS, device=share.device).view(-1, 1, 1)
+        levels = torch.where((levels > 0.4) & (levels < 0.6), 0.4, levels)
+        return self.change(QuantileDistribution(0.5 * share * (1 + levels)))
+
+
+def test_a_model_of_quantiles_and_a_pool_of_models_keep_the_contract() -> None:
+    check_model(Quantiles())
+    check_model(Quantiles(lambda found: pool([found, replace(found, values=found.values.square())])))
+
+
+def overriding(
+    **methods: Callable[..., object],
+) -> Callable[[QuantileDistribution], TraversabilityDistribution]:
+    kind = type("Own", (QuantileDistribution,), methods)
+    return lambda found: kind(found.values)
+
+
+class Named(Quantiles):
+    class_names = NAMES
+
+
+BAD_DISTRIBUTIONS = {
+    "of descending quantiles": (lambda d: replace(d, values=d.values.flip(1)), "`quantile` to ascend"),
+    "beyond 1": (lambda d: replace(d, values=d.values + 1), "`cdf` to ascend from 0 under λ = 0 to 1 at λ = 1"),
+    "under 0": (lambda d: replace(d, values=d.values - 0.3), "`quantile` to ascend within [0, 1]"),
+    "with a hole": (
+        lambda d: replace(d, values=d.values.where(d.values < d.values.max(), torch.nan)),
+        "finite what `quantile` of the distribution gives",
+    ),
+    "elsewhere": (lambda d: d.to("meta"), "observation's device cpu, got meta"),
+    "a row short": (lambda d: replace(d, values=d.values[..., 1:, :]), "got QuantileDistribution of shape [3, 31, 32]"),
+    "of another inverse": (
+        overriding(quantile=lambda d, u: 0.9 * QuantileDistribution.quantile(d, u)), "inverse of `cdf`",
+    ),
+    "of another mean": (overriding(mean=lambda d: QuantileDistribution.mean(d) + 0.01), "`mean` to be what"),
+    "of another tail": (overriding(cvar=lambda d, level: d.var(level)), "`cvar` to be what"),
+    "of another time": (overriding(expected_time=lambda d, floor: 1 / d.mean()), "`expected_time` to be what"),
+    "of other limits": (overriding(cdf_limits=lambda d, x: (0 * d.cdf(x), d.cdf(x)), cdf=lambda d, x: (
+        QuantileDistribution.cdf_limits(d, x)[1])), "`cdf_limits` to be P(λ < value)"),
+    "of another dtype": (
+        overriding(quantile=lambda d, u: QuantileDistribution.quantile(d, u).double()), "torch.float32",
+    ),
+    "that raises": (overriding(cdf=lambda d, x: 1 / 0), "ZeroDivisionError"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "expected"), BAD_DISTRIBUTIONS.values(), ids=BAD_DISTRIBUTIONS.keys())
+def test_a_distribution_that_is_none_is_named(
+    change: Callable[[QuantileDistribution], TraversabilityDistribution], expected: str
+) -> None:
+    assert expected in refusal(check_model, Quantiles(change))
+
+
+def test_names_of_classes_without_their_probabilities_are_refused() -> None:
+    assert "got a QuantileDistribution without classes" in refusal(check_model, Named())

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav import TraversabilityMixture
+from benchnav import ConfigError, TraversabilityDistribution, TraversabilityMixture
 from benchnav.core import registry
 from benchnav.planning import risk
 from benchnav.testing import check_risk
@@ -52,6 +52,28 @@ BAD: dict[str, tuple[Any, str]] = {
 @pytest.mark.parametrize(("measure", "expected"), BAD.values(), ids=BAD.keys())
 def test_a_breach_is_caught_and_named(measure: Any, expected: str) -> None:
     assert expected in refusal(check_risk, measure)
+
+
+def test_what_needs_a_mixture_says_so_by_name_or_fails_on_quantiles() -> None:
+    needs = changed(lambda mean, given: mean * given.weights.sum(1))
+    assert (
+        "got AttributeError: 'QuantileDistribution' object has no attribute 'weights' [quantiles]"
+        in refusal(check_risk, needs)
+    )
+
+    def refusing(given: TraversabilityDistribution) -> Tensor:
+        if not isinstance(given, TraversabilityMixture):
+            raise ConfigError(f"Expected a TraversabilityMixture, got a {type(given).__name__}.")
+        return needs(given)
+
+    check_risk(refusing)
+
+    def nameless(given: TraversabilityDistribution) -> Tensor:
+        if isinstance(given, TraversabilityMixture):
+            return risk.mean(given)
+        raise ConfigError("Expected something else.")
+
+    assert "Expected something else. [quantiles]" in refusal(check_risk, nameless)
 
 
 @pytest.mark.parametrize("name", registry.names("risk"))

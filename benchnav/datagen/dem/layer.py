@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from benchnav.core.errors import expect
+from benchnav.core.grid import is_azimuth
 from benchnav.datagen import schema
 
-DIRECTIONAL = "_azimuth_deg"  # how the name of a layer of directions ends
 _UNITS = {"_m": "m", "_deg": "deg", "_s": "s", "_mps": "m/s", "_k": "K"}  # by the end of a layer's name
 
 
@@ -22,7 +22,7 @@ class LayerRaster(NamedTuple):
     @property
     def how(self) -> str:
         """How it is resampled: angles are no numbers to be averaged."""
-        return "nearest" if self.name.endswith(DIRECTIONAL) else "average"
+        return "nearest" if is_azimuth(self.name) else "average"
 
 
 def read_layer(text: str) -> LayerRaster:

@@ -25,13 +25,15 @@ _TOLERANCE = 0.01  # of a raster's cell that a place may be off by in another CR
 class Rasters:
     """What there is of the ground beside its elevation. Where a raster does not cover it, maps are left out.
 
+    A layer alone has to cover all maps; where it has no value, it is NaN.
+
     Args:
         classes: Raster of terrain classes; laid out at random when not given.
         class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
         random_classes: Allow a photo or measured traversability without classes: these are laid out at random.
         photo: Raster of red, green and blue; painted by the class when not given.
         traversability: Raster of measured traversability in [0, 1]; drawn by the class table when not given.
-        layer: Optional fields as [NAME=RASTER, NAME=RASTER:UNIT], such as [vegetation_m=canopy.tif].
+        layer: A layer as NAME=RASTER or NAME=RASTER:UNIT, such as vegetation_m=canopy.tif; several as a list.
     """
 
     classes: str = ""

@@ -11,7 +11,6 @@ from bisect import bisect_right
 from collections.abc import Collection, Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import groupby
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
 
 CHUNK_CELLS = 2**17
-_MOST_OPEN = 100  # files that a process keeps open; far fewer than systems allow
+_MOST_OPEN = 128  # files that a process keeps open; far fewer than systems allow
 FOLDER_MANIFEST = "manifest.json"
 
 Opened = tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]  # a file, and its arrays by split and name
@@ -187,19 +186,26 @@ class TerrainDataset:
         if not all(type(i) is int and 0 <= i < size for i in chosen):
             raise DatasetError(f"Expected map indices in 0–{size - 1} of split {split!r}, got {chosen}.")
 
-        pieces = self.pieces[split]
+        pieces, firsts = self.pieces[split], self._firsts[split]
+        # In the order of the files, each of which is asked once for maps that follow one another in it.
+        places = sorted(range(len(chosen)), key=chosen.__getitem__)
 
-        def run_of(item: tuple[int, int]) -> tuple[Piece, int]:
-            place, index = item
-            return pieces[bisect_right(pieces, index, key=attrgetter("first")) - 1], index - place
+        def run_of(item: tuple[int, int]) -> tuple[int, int]:
+            rank, place = item
+            return bisect_right(firsts, chosen[place]) - 1, chosen[place] - rank
 
-        parts = []  # of maps that follow one another in a file
-        for (piece, _), items in groupby(enumerate(chosen), run_of):
-            run = [index for _, index in items]
-            parts.append(self._read_run(split, piece, range(run[0], run[-1] + 1), names))
-        if not parts:
-            return self._read_run(split, pieces[0], range(0), names)
-        return schema.join_maps(parts)
+        read = {
+            name: np.empty((len(chosen), *self._stored[name][1]), self._stored[name][0]) for name in names
+        }
+        for (piece, _), items in groupby(enumerate(places), run_of):
+            own = [place for _, place in items]
+            run = range(chosen[own[0]], chosen[own[-1]] + 1)
+            part = self._read_run(split, pieces[piece], run, names)
+            if own == list(range(len(chosen))):
+                return part
+            for name, values in part.items():
+                read[name][own] = values
+        return read
 
     def entry_digests(self, split: str, indices: Sequence[int] | None = None) -> np.ndarray:
         """Reads the stored SHA-256 of every entry, as `schema.entry_digests` gives them.
@@ -256,6 +262,14 @@ class TerrainDataset:
         return pieces
 
     @cached_property
+    def _firsts(self) -> dict[str, list[int]]:
+        return {split: [piece.first for piece in pieces] for split, pieces in self.pieces.items()}
+
+    @cached_property
+    def _stored(self) -> dict[str, tuple[str, tuple[int, ...]]]:
+        return schema.stored_arrays(self.fields, *self.grid.shape)
+
+    @cached_property
     def files(self) -> set[Path]:
         """The files that hold maps."""
         return {piece.path for pieces in self.pieces.values() for piece in pieces}
@@ -288,14 +302,15 @@ class TerrainDataset:
         place = os.getpid(), path
         if place not in self._opened:
             if len(self._opened) == _MOST_OPEN:
-                self._opened.pop(next(iter(self._opened)))[0].close()
+                # Let go, which closes it: h5py's own `close` looks through all that is open, of any file.
+                del self._opened[next(iter(self._opened))]
             self._opened[place] = open_file(path), {}
         return self._opened[place]
 
     def stored_array(self, file: h5py.File, split: str, name: str, maps: int) -> h5py.Dataset:
         """An array of so many maps in a file; refuses, by a ValueError, one that is not what the manifest says."""
-        array = file[split][name]
-        kind, entry = schema.stored_arrays(self.fields, *self.grid.shape)[name]
+        array = file[f"{split}/{name}"]
+        kind, entry = self._stored[name]
         if (array.dtype.str, array.shape) != (kind, (maps, *entry)):
             raise ValueError(f"it is {array.dtype.str} {list(array.shape)}, not {kind} {[maps, *entry]}")
         return array

@@ -95,7 +95,7 @@ def look_alikes(
         )
         if overgrown is not None:
             own_map = np.arange(len(look))[:, None, None]
-            share = np.where(overgrown & ~shown[own_map, other], 0.0, share)
+            share = np.where(overgrown & labelled & ~shown[own_map, other], 0.0, share)
         weights, means, stds = truth(np.where(labelled, other, UNLABELLED), slope_deg, classes)
         pieces.append((weights, means, stds, share))
     weights, means, stds, share = (np.stack(parts, axis=1) for parts in zip(*pieces, strict=True))

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from benchnav.core.figures import TRAVERSABILITY_COLOURS, bytes_of, hatching, layer_scale, outline
+from benchnav.core.grid import is_azimuth
 
 # Dark red lies far from all colours of λ, for the colour-blind too.
 IMMOBILISING = "#a00000"
@@ -85,7 +86,7 @@ def shades(values: np.ndarray) -> np.ndarray:
 def layer_colours(name: str, layer: np.ndarray) -> np.ndarray:
     """Colours a layer, of shape [H, W], in grey where nothing is known; as `field_colours` does."""
     scale = layer_scale(name, layer)
-    shown = layer % 360 if name.endswith("_azimuth_deg") else layer
+    shown = layer % 360 if is_azimuth(name) else layer
     share = (np.ma.masked_invalid(shown) - scale["vmin"]) / (scale["vmax"] - scale["vmin"])
     return np.round(255 * scale["cmap"](share)[..., :3]).astype(np.uint8)
 

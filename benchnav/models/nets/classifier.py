@@ -121,7 +121,10 @@ class TerrainClassifier(TrainableNetwork):
     @classmethod
     def from_tensors(cls, config: Mapping[str, Any], map_classes: tuple[str, ...], tensors: Maps) -> Self:
         """As `TrainableNetwork.from_tensors`; in checkpoints before format 2.3 colours had a scale of their own."""
-        renamed = {name.replace("colour_", "stack."): value for name, value in tensors.items()}
+        renamed = {
+            name.replace("colour_", "stack."): value.flatten() if name.startswith("colour_") else value
+            for name, value in tensors.items()
+        }
         return super().from_tensors(config, map_classes, renamed)
 
 

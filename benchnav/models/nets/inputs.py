@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from benchnav.core.errors import ConfigError, expect
+from benchnav.core.grid import is_azimuth
 from benchnav.core.settings import hint
 
 Maps = Mapping[str, Tensor]  # by field, `rgb` of shape [B, 3, H, W], all others [B, H, W]
@@ -27,11 +28,6 @@ class LayerScale(NamedTuple):
     mean: Tensor
     std: Tensor
     rms: Tensor
-
-
-def is_azimuth(layer: str) -> bool:
-    """Tells a layer of directions in degrees, from +x towards +y, which turn with the map."""
-    return layer.endswith("_azimuth_deg")
 
 
 class InputStack(nn.Module):
@@ -58,8 +54,8 @@ class InputStack(nn.Module):
             mean, std = (
                 torch.cat([getattr(scale[name], value) for name in names]) for value in ("mean", "std")
             )
-        self.register_buffer("mean", mean.view(-1, 1, 1))
-        self.register_buffer("std", std.view(-1, 1, 1))
+        self.register_buffer("mean", mean.clone())
+        self.register_buffer("std", std.clone())
 
     def forward(self, maps: Maps) -> Tensor:
         """Stacks the layers of B maps; shape [B, N, H, W]."""
@@ -67,7 +63,7 @@ class InputStack(nn.Module):
         image = (
             layers[0] if len(layers) == 1 else torch.cat([layer.to(self.mean.dtype) for layer in layers], 1)
         )
-        image = (image.to(self.mean.dtype) - self.mean) / self.std
+        image = (image.to(self.mean.dtype) - self.mean.view(-1, 1, 1)) / self.std.view(-1, 1, 1)
         return image if self.names == ("rgb",) else torch.where(image.isfinite(), image, 0)
 
 

@@ -130,7 +130,9 @@ class MixtureDensityModel(TrainableModel):
     def from_tensors(cls, config: Mapping[str, Any], map_classes: tuple[str, ...], tensors: Maps) -> Self:
         """As `TrainableModel.from_tensors`; before format 2.3 the network of the image had another name."""
         renamed = {
-            name.replace("ground.colour_", "stack.").replace("ground.network.", "network."): value
+            name.replace("ground.colour_", "stack.").replace("ground.network.", "network."): (
+                value.flatten() if name.startswith("ground.colour_") else value
+            )
             for name, value in tensors.items()
         }
         return super().from_tensors(config, map_classes, renamed)

@@ -86,10 +86,14 @@ def check_network(trainable: Trainable, dataset: TerrainDataset, options: FitOpt
     indices = [index % dataset.map_count(TRAIN) for index in range(together)]
     maps = MapDataset(dataset.path, TRAIN, fields_of(network)).read(indices)
     crop = config.crop or None
-    try_network(
-        network.build(map_classes=class_names(dataset)),
-        {name: values[..., :crop, :crop] for name, values in maps.items()},
-    )
+    maps = {name: values[..., :crop, :crop] for name, values in maps.items()}
+    try:
+        network.build(map_classes=class_names(dataset))
+    except BenchnavError:
+        raise
+    except Exception as error:  # a user's code may raise anything
+        raise _unfit(network, maps, error) from error
+    try_network(network, maps)
 
 
 def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
@@ -102,7 +106,6 @@ def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
     Raises:
         ConfigError: it does not take the maps, or a hook gives what it should not.
     """
-    batch, height, width = maps[network.target].shape
     name, outputs = type(network).__name__, None
     try:
         with torch.random.fork_rng(devices=[]):
@@ -113,10 +116,7 @@ def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
     except BenchnavError:
         raise
     except Exception as error:  # a user's code may raise anything
-        raise ConfigError(
-            f"Expected a network that takes batches of {batch} maps of {height}×{width} cells, got "
-            f"{describe(network)}, which does not: {one_line(error)} Choose another."
-        ) from error
+        raise _unfit(network, maps, error) from error
     got = f"shape {list(loss.shape)}" if isinstance(loss, Tensor) else type(loss).__name__
     expect(got == "shape []", f"`configure_losses` of {name} to give a loss that is one number, got {got}.")
     device = maps[network.target].device
@@ -126,7 +126,7 @@ def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
         loss.requires_grad, f"a loss of {name} that has a gradient, got one without. Use the outputs in it."
     )
     if isinstance(network, TrainableModel):
-        check_distribution(outputs, (batch, height, width), device, name)
+        check_distribution(outputs, tuple(maps[network.target].shape), device, name)
 
 
 def check_distribution(given: Any, shape: tuple[int, ...], device: torch.device, name: str) -> None:
@@ -155,9 +155,13 @@ def check_distribution(given: Any, shape: tuple[int, ...], device: torch.device,
     )
 
 
-def describe(network: TrainableNetwork) -> str:
-    """What a network is, for messages: architecture and encoder where it has them, and its class."""
-    config = network.config
+def _unfit(network: TrainableNetwork, maps: Mapping[str, Tensor], error: Exception) -> ConfigError:
+    """Says of a network, by architecture and encoder where it has them, that it does not take some maps."""
+    config, (batch, height, width) = network.config, maps[network.target].shape
+    what = type(network).__name__
     if hasattr(config, "architecture") and hasattr(config, "encoder"):
-        return f"{config.architecture} of {config.encoder}"
-    return type(network).__name__
+        what = f"{config.architecture} of {config.encoder}"
+    return ConfigError(
+        f"Expected a network that takes batches of {batch} maps of {height}×{width} cells, got {what}, which does not: "
+        f"{one_line(error)} Choose another."
+    )

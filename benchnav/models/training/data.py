@@ -20,10 +20,12 @@ from torchvision.transforms.v2 import functional as photometry
 from benchnav.core import rng
 from benchnav.core.device import CPU
 from benchnav.core.errors import DatasetError, expect
+from benchnav.core.grid import is_azimuth
 from benchnav.datagen.files.maps import TerrainMaps
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.models.nets.inputs import LayerScale, is_azimuth
+from benchnav.models.nets.inputs import LayerScale
+from benchnav.models.training.map_order import map_order
 
 TRAIN, VALID = "train", "valid"
 
@@ -181,6 +183,7 @@ class MapSampler(Sampler[MapKey]):
         crop: cells of a side of the squares that are cut from maps; 0 takes whole maps.
         shape: (H, W) of the maps that squares are cut from.
         epoch: that the next iteration gives.
+        shards: how many maps each file of the dataset holds, in order; none where one holds them all.
     """
 
     maps: int
@@ -193,6 +196,7 @@ class MapSampler(Sampler[MapKey]):
     crop: int = 0
     shape: tuple[int, int] = (0, 0)
     epoch: int = 0
+    shards: tuple[int, ...] = ()
 
     def set_epoch(self, epoch: int) -> None:
         """Chooses the epoch that the next iteration gives; the trainer calls this."""
@@ -212,14 +216,16 @@ class MapSampler(Sampler[MapKey]):
         count, number = self.places, self.epoch if self.shuffle else 0
         order, epoch = np.arange(count), np.array([number])
         if self.shuffle:
-            order = rng.permutation(rng.stream_key(self.seed, "models", "map order"), epoch, count)[0]
+            squares = count // self.maps
+            shards = tuple(squares * maps for maps in self.shards or (self.maps,))
+            order = map_order(shards, self.seed, self.epoch) // squares
         drawn = rng.uniform(rng.stream_key(self.seed, "models", "map symmetry"), epoch, (count,))[0]
         symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
         drawn = rng.uniform(rng.stream_key(self.seed, "models", "map jitter"), epoch, (count, 3))[0]
         factors = 1 + self.jitter * (2 * drawn - 1)
         origins = crop_origins(self.shape, self.crop, self.seed, number, count)
         first, step = self.share
-        pieces = (np.array_split(v, len(self)) for v in (order % self.maps, symmetry, factors, origins))
+        pieces = (np.array_split(v, len(self)) for v in (order, symmetry, factors, origins))
         for batch in zip(*pieces, strict=True):
             start = min(first, len(batch[0]) - 1)  # no process is left without a map
             yield MapKey(*(torch.from_numpy(values[start::step]) for values in batch))
@@ -308,14 +314,9 @@ class MapData(lightning.LightningDataModule):
     def _load(self, maps: MapDataset, **order: Any) -> DataLoader[Batch]:
         share = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
         sampler = MapSampler(
-            len(maps),
-            self.batch_size,
-            self.seed,
-            share=share,
-            crop=maps.crop,
-            shape=maps.dataset.grid.shape,
-            **order,
-        )
+            len(maps), self.batch_size, self.seed, share=share, crop=maps.crop, shape=maps.dataset.grid.shape,
+            shards=tuple(piece.maps for piece in maps.dataset.pieces[maps.split]), **order,
+        )  # fmt: skip
         # A generator of its own keeps the loader from drawing on PyTorch's global one.
         return DataLoader(
             maps, batch_size=None, sampler=sampler, generator=torch.Generator(),

@@ -60,7 +60,9 @@ def run(dem: Path | str, out: Path, settings: dict[str, Any]) -> list[tuple[int,
     """Imports rasters by the settings of `Rasters` and of `import_dem`."""
     settings = {"recipe": RECIPE} | settings
     files = {name: str(settings.pop(name, "")) for name in ("classes", "photo", "traversability")}
-    plain = {name: settings.pop(name) for name in ("class_ids", "random_classes") if name in settings}
+    plain = {
+        name: settings.pop(name) for name in ("class_ids", "random_classes", "layer") if name in settings
+    }
     return list(import_dem(str(dem), out, rasters=Rasters(**files, **plain), **settings))
 
 

@@ -23,7 +23,9 @@ from benchnav.datagen.export.export import Publication, export, is_ours
 from benchnav.datagen.files import reader
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.classes import Vegetation
 from tests import factories
+from tests.datagen.small import small_stakes
 
 Call = Callable[..., int]
 OWN = ("--license", "CC-BY-4.0", "--creator", "The survey")
@@ -420,6 +422,7 @@ import os
 from pathlib import Path
 from benchnav.datagen.export.export import Publication, export, is_ours
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.classes import Vegetation
 for done, total in export(TerrainDataset({str(dataset_path)!r}), Path({str(tmp_path / "out")!r}), Publication()):
     if done:
         os.kill(os.getpid(), 9)
@@ -441,3 +444,33 @@ def test_a_disk_that_cannot_be_written_is_named(
     assert datagen("export", dataset_path, "--out", "out") == 2
     assert "No space left on device" in capsys.readouterr().err
     assert list(Path.cwd().iterdir()) == []
+
+
+def test_layers_are_columns_and_named(tmp_path: Path) -> None:
+    grass = Vegetation(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
+    recipe = small_stakes()
+    classes = tuple(
+        replace(item, vegetation=grass if item.name == "gravel" else None) for item in recipe.classes
+    )
+    path = factories.tiny_dataset(
+        tmp_path / "d.h5", replace(recipe, classes=classes, vegetation_period_m=4.0)
+    )
+    out = exported(path, tmp_path / "out")
+    stored = TerrainDataset(path).read("train")["vegetation_m"]
+    np.testing.assert_array_equal(read_back(out, "train", "vegetation_m").reshape(stored.shape), stored)
+    about = metadata(out)
+    assert "reference time; layers vegetation_m [m], NaN where nothing is known." in about["description"]
+    assert "layers vegetation_m [m]" in (out / "README.md").read_text()
+    table, train, *_ = about["recordSet"]
+    own = {field["name"]: field for field in train["field"]}
+    assert "height of the vegetation" in own["vegetation_m"]["description"]
+    rows = {row["classes/name"]: row for row in table["data"]}
+    keys = ("cover", "least_m", "most_m", "colour")
+    assert [rows["gravel"][f"classes/vegetation_{key}"] for key in keys] == [0.5, 0.1, 0.8, "#3c6e1e"]
+    assert [rows["basalt"][f"classes/vegetation_{key}"] for key in keys] == [0.0, 0.0, 0.0, ""]
+    assert {field["name"] for field in table["field"]} == {
+        key.removeprefix("classes/") for key in rows["basalt"]
+    }
+    plain = metadata(exported(factories.tiny_dataset(tmp_path / "e.h5", small_stakes()), tmp_path / "plain"))
+    assert "layers" not in plain["description"]
+    assert not any("vegetation" in key for key in plain["recordSet"][0]["data"][0])

@@ -1,8 +1,11 @@
 from pathlib import Path
 
 import h5py
+import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from torch.utils.data import DataLoader
 
 from benchnav.core.errors import DatasetError
@@ -98,3 +101,46 @@ def test_maps_of_a_folder_are_those_of_a_file(tmp_path: Path, monkeypatch: pytes
     assert len(parts.dataset._opened) == 2
     loaded = torch.cat([batch["rgb"] for batch in DataLoader(parts, batch_size=3, num_workers=2)])
     assert torch.equal(loaded, torch.stack([whole[index]["rgb"] for index in range(8)]))
+
+
+@pytest.fixture
+def shards(tmp_path: Path) -> TerrainMaps:
+    """Eight maps in shards of three."""
+    for _ in create(tiny_recipe(), tmp_path / "d", shard_cells=3 * 32 * 32):
+        pass
+    return TerrainMaps(tmp_path / "d", "train", ("rgb", "start_m"))
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.integers(0, 7), max_size=12))
+def test_maps_of_shards_are_read_in_any_order_and_more_than_once(
+    shards: TerrainMaps, indices: list[int]
+) -> None:
+    stored = shards.dataset.read("train", fields=("rgb", "start_m"))
+    for name, values in shards.read(indices).items():
+        np.testing.assert_array_equal(values, stored[name][indices])
+
+
+def test_maps_that_lie_side_by_side_are_read_together(
+    shards: TerrainMaps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plainly, runs = reader._values, []
+    monkeypatch.setattr(
+        reader,
+        "_values",
+        lambda array, which: runs.append((which.start, which.stop)) or plainly(array, which),
+    )
+    shards.read([4, 0, 3, 2, 7])
+    assert runs[::2] == [(0, 1), (2, 3), (0, 2), (1, 2)]
+
+
+def test_a_file_that_is_one_too_many_is_closed(shards: TerrainMaps, monkeypatch: pytest.MonkeyPatch) -> None:
+    def count() -> int:
+        return h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE | h5py.h5f.OBJ_DATASET)
+
+    monkeypatch.setattr(reader, "_MOST_OPEN", 2)
+    before = count()
+    for index in range(8):
+        shards[index]
+        assert count() - before <= 2 * 3  # files, each with two arrays
+    assert count() - before == 2 * 3

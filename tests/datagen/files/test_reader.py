@@ -88,7 +88,7 @@ def test_components_belong_to_the_class_whose_soft_spots_they_hold() -> None:
     terrain = terrain_of(generate(recipe, "train", np.arange(4)), recipe)
     assert terrain.truth.group == (0, 0)
     assert terrain.look_alikes is not None
-    seen = terrain.look_alikes(terrain.class_id, terrain.slope_deg)
+    seen = terrain.look_alikes(terrain)
     assert seen.group == (0, 0, 1, 1)
     look_alikes = torch.tensor([len(own) for own in classes.look_alike_classes(recipe.classes)])[
         terrain.class_id

@@ -4,9 +4,16 @@ import pytest
 import torch
 
 from benchnav.core.device import CPU
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.fused import sharpen
-from benchnav.models.nets.calibration import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.nets.calibration import (
+    fit_pool_temperature,
+    fit_temperature,
+    fit_width,
+    sample_logits,
+    sample_scores,
+)
 from benchnav.models.quality.scores import ReliabilityCurve, calibration_error
 from benchnav.models.training.data import MapData, MapDataset
 
@@ -134,3 +141,61 @@ def test_of_one_classifier_the_pool_temperature_is_what_its_own_leaves_over() ->
     own = fit_temperature(*sample_logits(Witness(0, 3.0), maps))
     assert fit_pool_temperature([Witness(0, 3.0)], maps) == pytest.approx(own, rel=1e-3)
     assert fit_pool_temperature([Witness(0, 3.0, own)], maps) == pytest.approx(1, rel=1e-3)
+
+
+# --- distributions of λ ----------------------------------------------------------------------------
+
+
+def scores(temperature: float, atoms: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+    """Normal scores of what was observed where a temperature would make predictions right."""
+    z = temperature * torch.randn(60_000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    if not atoms:
+        return z, z
+    # All below −0.5 is one atom, and all above 0.8 another: of these the interval alone is known.
+    low = torch.where(z < -0.5, -torch.inf, torch.where(z > 0.8, 0.8, z))
+    return low, torch.where(z < -0.5, -0.5, torch.where(z > 0.8, torch.inf, z))
+
+
+@pytest.mark.parametrize("atoms", [False, True])
+@pytest.mark.parametrize("temperature", [0.5, 0.9, 1.6])
+def test_the_temperature_of_distributions_is_found_with_and_without_atoms(
+    temperature: float, atoms: bool
+) -> None:
+    assert fit_width(*scores(temperature, atoms)) == pytest.approx(temperature, rel=0.02)
+
+
+def test_distributions_that_are_right_are_left_as_they_are() -> None:
+    assert fit_width(*scores(1.0)) == 1
+    assert fit_width(*scores(1.01)) == 1  # for a gain below 0.001 nats a cell
+
+
+def test_an_observation_outside_a_predictions_support_leaves_a_finite_temperature() -> None:
+    low, high = (values.clone() for values in scores(1.5))
+    low[0] = high[0] = torch.inf
+    low[1] = high[1] = -torch.inf
+    assert fit_width(low, high) == pytest.approx(1.5, rel=0.02)
+
+
+def test_sampled_scores_are_those_of_the_cells_that_were_observed() -> None:
+    generator = torch.Generator().manual_seed(3)
+    mean = torch.rand(4, 8, 8, generator=generator)
+    observed = (mean + 0.2 * torch.randn(4, 8, 8, generator=generator)).clamp(0, 1)
+    observed[:, ::2] = torch.nan
+    held = Held(mean, mean)
+    held._memory = {"slope_deg": mean, "traversability": observed}
+
+    def predict(layers: dict[str, torch.Tensor]) -> TraversabilityMixture:
+        assert set(layers) == {"slope_deg"}
+        own = layers["slope_deg"].unsqueeze(1)
+        return TraversabilityMixture(torch.ones_like(own), own, 0.2 * torch.ones_like(own))
+
+    low, high = sample_scores(predict, held, ("slope_deg",), seed=5)
+    known = observed.isfinite()
+    assert len(low) == int(known.sum())
+    inside = (observed > 0) & (observed < 1) & known
+    wanted = ((observed - mean) / 0.2)[inside]
+    torch.testing.assert_close(
+        high[low == high].sort().values.float(), wanted.sort().values, rtol=1e-3, atol=1e-3
+    )
+    assert int(low.isinf().sum()) == int((observed == 0).sum())
+    assert int(high.isinf().sum()) == int((observed == 1).sum())

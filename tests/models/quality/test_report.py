@@ -1,12 +1,17 @@
 import csv
 import io
 import json
+import math
 from dataclasses import replace
 
 import pytest
+import torch
 
+from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.core.tables import to_terminal
+from benchnav.core.terrain import Observation
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.base import TraversabilityModel
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.measure import Quality, evaluate
 from benchnav.models.quality.report import (
@@ -141,3 +146,25 @@ def test_every_figure_has_a_caption(dataset: TerrainDataset, qualities: Qualitie
     assert {"confusion", "reliability", "pit", "latent", "maps-test-std", "maps-test-hs"} == set(named)
     captions = [caption(name, dataset.splits) for name in (*named, "severity")]
     assert len({title for title, _ in captions}) == len(captions)
+
+
+class Quantiles(TraversabilityModel):
+    """A quantile distribution, which has no density."""
+
+    def predict(self, observation: Observation) -> QuantileDistribution:
+        share = observation.rgb.float().mean(1, keepdim=True) / 255
+        return QuantileDistribution(share * torch.tensor(LEVELS).view(-1, 1, 1))
+
+
+def test_the_likelihood_of_what_has_no_density_is_a_dash_and_null(dataset: TerrainDataset) -> None:
+    found = dict(evaluate(Quantiles(), dataset, ["valid"]))
+    assert math.isnan(found["valid"].traversability.nll)
+    assert 0 < found["valid"].traversability.crps < 1
+    table = quality_table("title", found)
+    assert table.rows[0][table.headings.index(COLUMNS["nll"][0])] == "–"
+    assert json.loads(quality_json({}, found))["splits"]["valid"]["nll"] is None
+    assert next(csv.DictReader(io.StringIO(quality_csv(found))))["nll"] == ""
+    drawn, _ = quality_figures("title", Quantiles(), dataset, found, 1)
+    assert {"pit", "maps-valid"} <= set(drawn)
+    for draw in drawn.values():
+        draw()

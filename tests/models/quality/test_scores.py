@@ -440,3 +440,17 @@ def test_sparsification_by_the_error_itself_has_no_area_and_by_nothing_is_flat()
     torch.testing.assert_close(own[0], own[1])
     flat, _ = sparsification(error, torch.full_like(error, 0.3))
     torch.testing.assert_close(flat, torch.full_like(flat, float(error.double().mean())))
+
+
+def test_pit_is_drawn_within_any_atom() -> None:
+    levels = torch.tensor(LEVELS, dtype=torch.float64)
+    quantiles = torch.where((levels >= 0.1) & (levels <= 0.6), 0.3, 0.3 + levels - 0.6)
+    quantiles = torch.where(levels < 0.1, 3 * levels, quantiles).clamp(0, 1)
+    law = QuantileDistribution(quantiles.view(-1, 1, 1).expand(-1, 200, 200).contiguous())
+    observed = law.from_normal(torch.randn(200, 200, generator=generator(3), dtype=torch.float64))
+    assert float((observed == quantiles[30]).double().mean()) == pytest.approx(0.5, abs=0.01)
+    transformed = pit(law, observed, generator(1))
+    assert coverage(transformed) == pytest.approx(0.9, abs=0.006)
+    assert tail_rate(transformed) == pytest.approx(0.1, abs=0.006)
+    counts = pit_counts(transformed)
+    assert 1800 < int(counts.min()) <= int(counts.max()) < 2200

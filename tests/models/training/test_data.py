@@ -148,3 +148,83 @@ def test_processes_share_every_batch(maps: int, batch_size: int, processes: int)
         assert set(torch.cat(shared).tolist()) == set(batch.tolist())
         if len(batch) >= processes:
             assert len(torch.cat(shared)) == len(batch)
+
+
+# --- squares and directions ------------------------------------------------------------------------
+
+
+def test_squares_are_cut_from_all_fields_alike_and_lie_within_their_maps(dataset: TerrainDataset) -> None:
+    data = MapData(dataset, 4, seed=0, crop=20, symmetries=False)
+    stored = dataset.read("train")
+    height, width = dataset.grid.shape
+    corners = set()
+    for key in data.train_dataloader().sampler:
+        batch = data.train[key]
+        for place, (index, (row, column)) in enumerate(
+            zip(key.maps.tolist(), key.origin.tolist(), strict=True)
+        ):
+            corners.add((row, column))
+            assert 0 <= row <= height - 20
+            assert 0 <= column <= width - 20
+            for name in ("rgb", "class_id"):
+                square = stored[name][index, ..., row : row + 20, column : column + 20]
+                np.testing.assert_array_equal(batch[name][place], square)
+    assert len(corners) > 5
+
+
+def test_squares_are_drawn_by_seed_and_epoch_and_stay_for_validation() -> None:
+    def draw(seed: int, epoch: int, shuffle: bool) -> list[list[int]]:
+        sampler = MapSampler(50, 50, seed, shuffle=shuffle, crop=32, shape=(32, 48))
+        sampler.set_epoch(epoch)
+        return [corner for key in sampler for corner in key.origin.tolist()]
+
+    assert draw(0, 3, True) == draw(0, 3, True)
+    assert draw(0, 3, True) not in (draw(0, 4, True), draw(1, 3, True))
+    assert draw(0, 3, False) == draw(0, 4, False)
+    rows, columns = np.transpose(draw(0, 0, True))
+    assert set(rows) == {0}
+    assert min(columns) == 0
+    assert max(columns) == 16
+
+
+def test_a_map_gives_as_many_squares_an_epoch_as_it_has_room_for() -> None:
+    sampler = MapSampler(5, 4, shuffle=True, crop=16, shape=(32, 50))
+    drawn = torch.cat([key.maps for key in sampler])
+    assert torch.bincount(drawn).tolist() == [6] * 5
+    assert len(sampler) == 8
+    assert len(MapSampler(5, 4, crop=16, shape=(32, 50))) == 2  # in validation one a map
+
+
+def test_validation_and_calibration_see_the_same_squares(dataset: TerrainDataset) -> None:
+    data = MapData(dataset, 3, seed=7, crop=16)
+    loaded = torch.cat([batch["rgb"] for batch in data.val_dataloader()])
+    measured = torch.cat([batch["rgb"] for _, batch in data.valid.chunks()])
+    assert torch.equal(loaded, measured)
+    assert loaded.shape[-2:] == (16, 16)
+
+
+def test_directions_turn_with_the_map() -> None:
+    """The direction in which a surface rises, found again on the turned surface, is the turned direction."""
+    rows, columns = torch.meshgrid(torch.arange(9.0), torch.arange(9.0), indexing="ij")
+    surface = 0.3 * columns + 0.1 * columns**2 - 0.2 * rows + 0.05 * rows * columns
+
+    def rises(of: torch.Tensor) -> torch.Tensor:
+        down, right = torch.gradient(of)
+        return torch.rad2deg(torch.atan2(down, right)) % 360
+
+    for which in range(8):
+        found = apply_symmetry(rises(surface), which, "wind_azimuth_deg")
+        wanted = rises(apply_symmetry(surface, which))
+        off = (found - wanted + 180) % 360 - 180
+        assert float(off[1:-1, 1:-1].abs().max()) < 1e-3, which
+    assert torch.equal(apply_symmetry(surface, 2, "elevation_m"), torch.rot90(surface, 1, (-2, -1)))
+
+
+def test_layers_are_scaled_by_their_known_cells(dataset: TerrainDataset) -> None:
+    scale = MapData(dataset, 4, seed=0).scale(("rgb", "slope_deg", "elevation_m", "traversability"))
+    for name in ("slope_deg", "elevation_m"):
+        values = dataset.read("train", fields=[name])[name].astype(float)
+        np.testing.assert_allclose(scale[name].mean, [values.mean()], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(scale[name].std, [values.std()], rtol=1e-5)
+    slope = dataset.read("train", fields=["slope_deg"])["slope_deg"].astype(float)
+    np.testing.assert_allclose(scale["slope_deg"].rms, np.sqrt((slope**2).mean()), rtol=1e-6)

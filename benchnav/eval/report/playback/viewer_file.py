@@ -14,6 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from benchnav.core.figures import bytes_of, condition_colours, layer_scale
+from benchnav.core.grid import is_azimuth
 from benchnav.core.store import replacing
 from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
@@ -136,7 +137,7 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
 
 def layer_title(name: str, layer: np.ndarray) -> str:
     """What the view of a layer is called: its name, and the values of its lightest and its darkest colour."""
-    if name.endswith("_azimuth_deg"):
+    if is_azimuth(name):
         return f"{name}, directions"
     scale = layer_scale(name, layer)
     return f"{name}, {scale['vmin']:.3g} to {scale['vmax']:.3g}"

@@ -7,7 +7,7 @@ import pytest
 
 from benchnav.core.figures import bytes_of, hatching, outline
 from benchnav.eval.recording import MOST_POINTS, DrawnPlan, Recording, thinned
-from benchnav.eval.report.plan_layers import IMMOBILISING, field_colours
+from benchnav.eval.report.plan_layers import IMMOBILISING, field_colours, layer_colours
 from benchnav.eval.report.playback.viewer_file import arrange, describe, drivers_of, map_views, write_rerun
 from tests.eval.report import made
 from tests.eval.report.playback.rrd import chunks, column, image, read_path, static, verify
@@ -305,3 +305,26 @@ def test_conditions_are_told_side_by_side() -> None:
 
 def test_an_episode_that_ended_at_once_met_nothing() -> None:
     assert "| observed λ | – |" in describe(drivers_of([made.recording(0)]))
+
+
+def test_each_layer_has_a_view_of_its_own_beside_the_colours(tmp_path: Path) -> None:
+    canopy = np.linspace(0, 1.25, 2400, dtype=np.float32).reshape(40, 60)
+    canopy[3, 4] = np.nan
+    layers = {"vegetation_m": canopy, "wind azimuth_azimuth_deg": 360 * canopy}
+    recording = made.recording(10, layers=layers)
+    path = written(tmp_path, recording)
+    verify(path)
+    views = map_views(drivers_of([recording]))
+    assert list(views)[:4] == [
+        "Colour", "vegetation_m, 0 to 1.25", "wind azimuth_azimuth_deg, directions", "Mean λ in truth",
+    ]  # fmt: skip
+    entity = views["vegetation_m, 0 to 1.25"][0]
+    assert entity == "/map/layers/vegetation_m"
+    shown = image(path, entity)
+    np.testing.assert_array_equal(shown, layer_colours("vegetation_m", canopy))
+    assert shown[3, 4].tolist() == [178, 178, 178]  # the grey of what is not known
+    darkness = -shown.astype(float).sum(axis=-1)
+    darkness[3, 4] = darkness[3, 3]
+    assert (np.diff(darkness.ravel()) >= -6).all()  # the higher the darker
+    assert views["wind azimuth_azimuth_deg, directions"][0] in chunks(path)
+    assert "/map/layers/vegetation_m" not in chunks(written(tmp_path, made.recording(10)))

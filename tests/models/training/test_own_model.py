@@ -1,0 +1,338 @@
+"""A user's own model goes the whole way: trained by the command, calibrated, killed and resumed, loaded, refused."""
+
+import json
+import re
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from benchnav.core.errors import CheckpointError, ConfigError
+from benchnav.core.sources import load_file
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
+from benchnav.models.cli import main
+from benchnav.models.nets.trainable import Ensemble
+from benchnav.models.predictor import load_model
+from benchnav.models.training import networks
+from benchnav.models.training.data import MapDataset
+from benchnav.models.training.fit import KeepBest
+from benchnav.testing import check_model
+
+EXAMPLE = Path(__file__).parents[3] / "examples" / "own_model.py"
+QUICK = ("--trainer.precision", "32-true", "--trainer.max_epochs", "3", "--settings.batch_size", "5")
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["benchnav-train", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder to work in, with the example in it."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(EXAMPLE, "own.py")
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def trained(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the example and an ensemble of two of its models."""
+    folder = tmp_path_factory.mktemp("own")
+    shutil.copy(EXAMPLE, folder / "own.py")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        settings = ("--settings.hidden", 8, "--settings.inputs", "[rgb, slope_deg, elevation_m]", "--seed", 4)
+        where = ("fit", "own.py:CellModel", "--data", dataset.path, "--out", "c")
+        assert call(patch, *where, *QUICK, *settings, "--members", 2) == 0
+    return folder
+
+
+def test_it_is_trained_calibrated_and_kept_as_data(trained: Path, dataset: TerrainDataset) -> None:
+    kept = load_checkpoint(trained / "c")
+    assert (kept.model, set(kept.parts)) == ("CellModel", {"CellModel", "CellModel-2"})
+    assert len(kept.code) == 64
+    assert [part.seed for part in kept.parts.values()] == [4, 5]
+    first = kept.part("CellModel")
+    assert (first.config["hidden"], first.config["max_epochs"], first.config["batch_size"]) == (8, 3, 5)
+    assert first.config["inputs"] == ["rgb", "slope_deg", "elevation_m"]
+    assert first.tensors["network.0.weight"].shape == (8, 5, 1, 1)
+    text = (trained / "c" / "config.json").read_text()
+    assert "own.py" not in text  # what is kept names no file to import
+    card = (trained / "c" / "README.md").read_text()
+    assert "path/to/file.py:CellModel@c" in card
+    assert "elevation_m" in card
+
+
+def test_layers_are_scaled_by_the_training_maps(trained: Path, dataset: TerrainDataset) -> None:
+    tensors = load_checkpoint(trained / "c").part("CellModel").tensors
+    for channel, name in ((3, "slope_deg"), (4, "elevation_m")):
+        values = torch.from_numpy(dataset.read("train", fields=[name])[name]).double()
+        torch.testing.assert_close(
+            float(tensors["stack.mean"][channel]), float(values.mean()), rtol=1e-4, atol=1e-5
+        )
+        torch.testing.assert_close(
+            float(tensors["stack.std"][channel]), float(values.std(correction=0)), rtol=1e-4, atol=1e-5
+        )
+
+
+def test_it_is_loaded_by_its_class_and_checkpoint(trained: Path, dataset: TerrainDataset) -> None:
+    source = f"{trained / 'own.py'}:CellModel@{trained / 'c'}"
+    model = load_model(source)
+    assert isinstance(model, Ensemble)
+    kept, seen = load_checkpoint(trained / "c"), dataset.terrain("test/std").observe()
+    assert model.temperature == kept.pool_temperature
+    for member, part in zip(model.members, kept.parts.values(), strict=True):
+        assert member.temperature == part.config["temperature"]
+    # The average of the members' distribution functions, before the pool's temperature.
+    model.temperature = 1.0
+    average = torch.stack([member.predict(seen).cdf(0.4) for member in model.members]).mean(0)
+    torch.testing.assert_close(model.predict(seen).cdf(0.4), average, rtol=0, atol=1e-5)
+    check_model(source)
+
+
+def test_the_temperatures_are_the_likeliest_on_the_validation_maps(
+    trained: Path, dataset: TerrainDataset
+) -> None:
+    source = f"{trained / 'own.py'}:CellModel@{trained / 'c'}"
+    valid = dataset.terrain("valid")
+
+    def nll(temperature: float) -> float:
+        model = load_model(source)
+        model.temperature = temperature  # type: ignore[attr-defined]
+        return -float(model.predict(valid.observe()).log_prob(valid.traversability).double().mean())
+
+    found = load_model(source).temperature  # type: ignore[attr-defined]
+    others = [nll(found * factor) for factor in (0.8, 0.9, 1.1, 1.25)]
+    assert nll(found) < min(others) + (0.001 if found == 1 else 0)
+
+
+def test_a_kill_in_any_epoch_changes_nothing(
+    trained: Path, own: Path, dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = ("--settings.hidden", 8, "--settings.inputs", "[rgb, slope_deg, elevation_m]", "--seed", 4)
+    command = ("fit", "own.py:CellModel", "--data", dataset.path, *QUICK, *settings)
+    for epoch in range(3):
+
+        class Killed(Exception):
+            pass
+
+        class Kill(KeepBest):
+            def on_train_batch_end(self, trainer, *_: object, epoch: int = epoch) -> None:  # type: ignore[no-untyped-def, override]
+                if trainer.current_epoch == epoch:
+                    raise Killed
+
+        out = f"c{epoch}"
+        with monkeypatch.context() as patch:
+            patch.setattr(networks, "KeepBest", Kill)
+            patch.setattr(sys, "argv", ["benchnav-train", *map(str, command), "--out", out])
+            with pytest.raises(Killed):
+                main()
+        assert call(monkeypatch, *command, "--out", out, "--resume") == 0
+        found, wanted = (load_checkpoint(folder).part("CellModel") for folder in (out, trained / "c"))
+        assert found.config == wanted.config
+        for name, value in wanted.tensors.items():
+            assert torch.equal(found.tensors[name], value), name
+
+
+def test_other_code_is_told_and_not_gone_on_with(
+    trained: Path,
+    own: Path,
+    dataset: TerrainDataset,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    shutil.copytree(trained / "c", "c")
+    load_model("own.py:CellModel@c")
+    assert capfd.readouterr().err == ""
+    Path("own.py").write_text(EXAMPLE.read_text() + "\n\nMORE = 1\n")
+    load_model("own.py:CellModel@c")
+    (line,) = capfd.readouterr().err.splitlines()
+    assert "the code of own.py:CellModel is not that which trained c" in line
+    command = ("fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK, "--resume")
+    assert call(monkeypatch, *command) == 2
+    assert "got one of other code" in capfd.readouterr().err
+
+
+def test_a_checkpoint_of_a_users_class_needs_the_class(trained: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"path/to/file\.py:CellModel@CHECKPOINT"):
+        load_model(trained / "c")
+    (trained / "other.py").write_text(EXAMPLE.read_text().replace("class CellModel", "class Other"))
+    with pytest.raises(CheckpointError, match=r"of the class Other, got .* which is one of 'CellModel'"):
+        load_model(f"{trained / 'other.py'}:Other@{trained / 'c'}")
+    with pytest.raises(ConfigError, match=r"to be a benchnav\.models\.TrainableModel or ModelFamily"):
+        load_model(f"{trained / 'own.py'}:CellConfig@{trained / 'c'}")
+
+
+@pytest.mark.parametrize("where", ["model", "code", "config", "parts"])
+def test_a_hostile_checkpoint_imports_nothing(trained: Path, tmp_path: Path, where: str) -> None:
+    """Whatever a checkpoint says of itself, no file or module that it names is imported or run."""
+    trap, sprung = tmp_path / "trap.py", tmp_path / "sprung"
+    trap.write_text(f"from pathlib import Path\nPath({str(sprung)!r}).touch()\nclass Trap: pass\n")
+    kept, name = load_checkpoint(trained / "c"), f"{trap}:Trap"
+    part = kept.part("CellModel")
+    hostile = {
+        "model": replace(kept, model=name),
+        "code": replace(kept, code=name),
+        "config": kept.with_part(
+            "CellModel", replace(part, config={**part.config, "model": name, "inputs": [name]})
+        ),
+        "parts": replace(
+            kept, parts={**kept.parts, "CellModel-2": replace(part, config={"class_path": name})}
+        ),
+    }[where]
+    save_checkpoint(tmp_path / "h", hostile)
+    sys.path.insert(0, str(tmp_path))
+    try:
+        for source in (tmp_path / "h", f"{trained / 'own.py'}:CellModel@{tmp_path / 'h'}"):
+            try:
+                load_model(source)
+            except (CheckpointError, ConfigError):
+                continue
+    finally:
+        sys.path.remove(str(tmp_path))
+    assert not sprung.exists()
+    assert "trap" not in sys.modules
+
+
+BROKEN = {
+    "shape": ("return (scores * seen).sum() / seen.sum().clamp(min=1)", "return scores",
+        "a loss that is one number, got shape"),
+    "nan": ("(scores * seen).sum()", "(scores * seen).sum() * float('nan')", "a finite loss, got nan"),
+    "no gradient": ("(scores * seen).sum() /", "(scores * seen).sum().detach() /", "that has a gradient"),
+    "no number": ("return crps", "return lambda outputs, observed: 3.0", "one number, got float"),
+    "distribution": ("return TraversabilityMixture(torch.ones_like(mean), mean, std)", "return mean",
+                     "to give a TraversabilityDistribution, got Tensor"),
+    "distribution's shape": ("TraversabilityMixture(torch.ones_like(mean), mean, std)",
+                             "TraversabilityMixture(*(v[..., 1:] for v in (torch.ones_like(mean), mean, std)))",
+                             r"to give one of shape \[2, 32, 32\], got \[2, 32, 31\]"),
+    "means": ("mean, std)\n\n", "mean, std * torch.nan)\n\n", r"means of λ in \[0, 1\]"),
+    "raises": ("hidden = self.config.hidden", "hidden = self.config.width",
+        "'CellConfig' object has no attribute 'width'"),
+    "device": ("return (scores * seen).sum() / seen.sum().clamp(min=1)", "return scores.sum().to('meta')",
+        "on cpu, got one on meta"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_a_hook_that_does_not_fit_is_refused_before_anything_is_trained(
+    own: Path,
+    dataset: TerrainDataset,
+    fault: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    old, new, expected = BROKEN[fault]
+    text = EXAMPLE.read_text()
+    assert old in text
+    Path("own.py").write_text(text.replace(old, new))
+    assert call(monkeypatch, "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 2
+    (line,) = capfd.readouterr().err.strip().splitlines()
+    assert re.search(expected, line)
+    assert not Path("c").exists()
+    assert not Path("c.training").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (
+            ["own.py:CellModel", "--settings.inputs", "[rgb, elevation]"],
+            r"got 'elevation'\. Did you mean 'elevation_m'\?",
+        ),
+        (["own.py:CellModel", "--settings.inputs", "[rgb, vegetation_m]"], "got 'vegetation_m'"),
+        (["own.py:CellModel", "--settings.inputs", "[]"], "`inputs` as layers, each once"),
+        (["own.py:CellModel", "--settings.width", "3"], "got 'width'"),
+        (["own.py:CellModel", "--crop", "33"], r"`crop` in 8–32 cells"),
+        (["own.py:CellModel", "--members", "0"], "`members` ≥ 1"),
+        (
+            ["own.py:CellConfig"],
+            "Expected a model that can be trained, fused, .*mdn.* got 'own.py:CellConfig'",
+        ),
+        (["own.py:CellMode"], "Did you mean 'CellModel'"),
+        (["oracle"], "got 'oracle'"),
+        (["mdm"], "Did you mean 'mdn'"),
+        (["mdn", "--settings.architecture", "unett"], "unett"),
+        (["mdn", "--settings.encoder", "resnet19"], "resnet19"),
+        (["fused", "--settings.clasifier.dice", "1"], "`settings` of 'fused' among classifier, gp"),
+        (["fused", "--settings.classifier.architecture", "unett"], "unett"),
+    ],
+)
+def test_bad_input_is_one_line_before_anything_is_trained(
+    own: Path,
+    dataset: TerrainDataset,
+    arguments: list[str],
+    expected: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    assert call(monkeypatch, "fit", *arguments, "--data", dataset.path, "--out", "c") == 2
+    (line,) = capfd.readouterr().err.strip().splitlines()
+    assert re.search(expected, line)
+    assert not Path("c").exists()
+
+
+def test_how_maps_are_cut_and_turned_reaches_the_training_and_the_checkpoint(
+    own: Path, dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[torch.Size, bool]] = []
+    give = MapDataset.__getitem__
+
+    def watch(self: MapDataset, key):  # type: ignore[no-untyped-def]
+        batch = give(self, key)
+        seen.append((batch["rgb"].shape, bool(key.symmetry.any())))
+        return batch
+
+    monkeypatch.setattr(MapDataset, "__getitem__", watch)
+    where = ("fit", "own.py:CellModel", "--data", dataset.path, *QUICK)
+    assert call(monkeypatch, *where, "--out", "a", "--crop", 24, "--symmetries", "false") == 0
+    assert {shape[-2:] for shape, _ in seen} == {(24, 24)}
+    assert not any(turned for _, turned in seen)
+    config = load_checkpoint("a").part("CellModel").config
+    assert (config["crop"], config["symmetries"]) == (24, False)
+    settings = json.loads(Path("a.training/CellModel/settings.json").read_text())
+    assert (settings["config"]["crop"], settings["config"]["symmetries"]) == (24, False)
+    seen.clear()
+    assert call(monkeypatch, *where, "--out", "b") == 0
+    assert {shape[-2:] for shape, _ in seen} == {torch.Size((32, 32))}
+    assert any(turned for _, turned in seen)
+
+
+@pytest.fixture(scope="module")
+def module() -> ModuleType:
+    return load_file(EXAMPLE, EXAMPLE.read_bytes())
+
+
+def test_a_class_that_keeps_the_contract_passes_and_one_that_does_not_is_told(module: ModuleType) -> None:
+    check_model(module.CellModel)
+    check_model(f"{EXAMPLE}:CellModel")
+
+    class Deaf(module.CellModel):  # type: ignore[name-defined, misc]
+        """Counts cells whose λ was not observed."""
+
+        def configure_losses(self):  # type: ignore[no-untyped-def]
+            return lambda outputs, observed: (outputs[:, 0] - observed).square().mean()
+
+    with pytest.raises(ConfigError, match="finite loss where λ is not observed in part"):
+        check_model(Deaf)
+
+    class Forgetful(module.CellModel):  # type: ignore[name-defined, misc]
+        """Keeps what it learned where no checkpoint looks."""
+
+        def build(self, *arguments, **named):  # type: ignore[no-untyped-def]
+            super().build(*arguments, **named)
+            self.shift = [float(torch.rand(()))]
+            return self
+
+        def to_distribution(self, outputs):  # type: ignore[no-untyped-def]
+            return super().to_distribution(outputs + self.shift[0])
+
+    with pytest.raises(ConfigError, match="same prediction from settings and tensors"):
+        check_model(Forgetful)
