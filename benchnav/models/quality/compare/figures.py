@@ -49,7 +49,7 @@ def model_looks(models: Sequence[str], privileged: Sequence[str]) -> dict[str, d
         looks[model] = {
             "color": _GREYS[place % len(_GREYS)],
             "marker": "+x|_"[place % 4],
-            "ls": ("--", ":")[place % 2],
+            "ls": ("--", "-.")[place % 2],
         }
     return {model: {"ms": 3, "lw": 1, **looks[model]} for model in models}
 
