@@ -3,10 +3,12 @@
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -54,6 +56,98 @@ def test_a_model_of_ones_own_is_trained_calibrated_measured_and_driven_with(
     rows = evaluate(dataset_path, tmp_path, "--model", model, "--planners", "[astar_dwa]")
     assert set(rows["model"]) == {"mine"}
     assert set(rows["outcome"]) <= {"success", "timeout", "stuck", "stalled"}
+
+
+@pytest.mark.slow
+def test_a_site_of_ones_own_goes_from_drives_to_a_suite(tmp_path: Path) -> None:
+    pytest.importorskip("rasterio")
+    said = run("own_site.py", tmp_path)
+    assert "rows of drives.csv.gz were used" in said
+    assert "against measured λ" in said
+    table = re.search(r"^site +astar_dwa +cvar:0.8 +\d+", said, re.MULTILINE)
+    assert table, said
+
+
+def test_what_robots_log_on_a_site_is_its_ground(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("rasterio")
+    site = runpy.run_path(str(EXAMPLES / "own_site.py"))
+    terrain = site["survey"](tmp_path)
+    log = site["drive"](terrain)
+    log.to_csv(tmp_path / "drives.csv", index=False)
+    rasters = "--dem dem.tif --photo photo.tif --recipe stakes-v1 --splits train:1"
+    site["command"](
+        f"benchnav-datagen import-drives drives.csv {rasters} --out site.h5", tmp_path, *site["MAPS"]
+    )
+    dataset = TerrainDataset(tmp_path / "site.h5")
+    assert dataset.truth_of("train") == "unknown"
+    source, maps = dataset.splits["train"]["parts"][0]["source"], dataset.read("train")
+    west, south = (np.array(source["origin_m"]) - [site["WEST"], site["SOUTH"]]) / site["CELL"]
+    ground = terrain.traversability[0].numpy()
+    errors = []
+    for place, number in enumerate(source["kept"]):
+        row, column = divmod(number, source["tiles"][1])
+        at_y, at_x = round(south) + 48 * row, round(west) + 48 * column
+        own = ground[at_y : at_y + 48, at_x : at_x + 48]
+        often = maps["drive_count"][place] >= 3
+        errors.append((maps["traversability"][place] - own)[often])
+    errors = np.concatenate(errors)
+    assert len(errors) > 1000
+    # Noise of 0.02 m/s beside 1 m/s, more near a goal, where the robot is slow.
+    assert np.abs(np.median(errors)) < 0.005
+    assert np.quantile(np.abs(errors), 0.95) < 0.05
+
+
+ODOMETRY = """
+from types import SimpleNamespace as Some
+class Stores: ROS2_HUMBLE = 0
+def get_typestore(store): pass
+class AnyReader:
+    connections = [Some(topic="/odom", msgtype="o"), Some(topic="/cmd_vel", msgtype="c"), Some(topic="/x", msgtype="x")]
+    def __init__(self, paths, default_typestore): pass
+    def __enter__(self): return self
+    def __exit__(self, *error): pass
+    def messages(self, connections):
+        odom, told, _ = self.connections
+        assert [one.topic for one in connections] == ["/odom", "/cmd_vel"]
+        for step in range(12):
+            if step in (1, 3):
+                yield told, 10**9 * (100 + step / 10), step
+            yield odom, 10**9 * (100 + step / 10), step
+    def deserialize(self, step, kind):
+        linear = Some(linear=Some(x=step / 2))
+        if kind == "c":
+            return linear if step == 1 else Some(twist=linear)
+        return Some(pose=Some(pose=Some(position=Some(x=1.0 * step, y=2.0))), twist=Some(twist=linear))
+"""
+
+
+def test_a_bag_becomes_a_log_of_drives(tmp_path: Path) -> None:
+    """With a stand-in for the package that reads bags, which is none of ours."""
+
+    def read_bag(*words: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, str(EXAMPLES / "read_bag.py"), "one.bag", *words]
+        here = os.environ | {"PYTHONPATH": str(tmp_path)}
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, env=here)
+
+    (tmp_path / "rosbags").mkdir()
+    (tmp_path / "rosbags" / "__init__.py").write_text("")
+    assert "pip install rosbags" in read_bag().stderr
+    for name in ("highlevel", "typesys"):
+        (tmp_path / "rosbags" / f"{name}.py").write_text(ODOMETRY)
+    assert "one.bag, which is not there" in read_bag().stderr
+    (tmp_path / "one.bag").touch()
+    assert "It has /cmd_vel (c), /odom (o), /x (x)" in read_bag("--command", "/no").stderr
+    done = read_bag("--origin", "500", "200", "90")
+    assert "12 rows, 4 without a command" in done.stdout, done.stderr
+    rows = pd.read_csv(tmp_path / "drives.csv")
+    assert list(rows) == ["time_s", "x_m", "y_m", "measured_m_s", "commanded_m_s", "drive"]
+    np.testing.assert_allclose(rows["time_s"], np.arange(12) / 10)
+    np.testing.assert_allclose(rows["x_m"], 498)
+    np.testing.assert_allclose(rows["y_m"], 200 + np.arange(12))
+    np.testing.assert_allclose(rows["measured_m_s"], np.arange(12) / 2)
+    # From the command on, for half a second.
+    wanted = [np.nan, 0.5, 0.5, *[1.5] * 6, *[np.nan] * 3]
+    np.testing.assert_allclose(rows["commanded_m_s"], wanted)
 
 
 def evaluate(dataset: Path, folder: Path, *flags: str) -> pd.DataFrame:

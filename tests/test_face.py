@@ -23,8 +23,8 @@ FACES = {
     "evaluate_model find_checkpoint list_checkpoints load_checkpoint load_model measure_margin predict predict_tiles "
     "save_checkpoint write_risk_maps",
     "benchnav.planning": "AStarDWA AStarMPPI Bicycle CLRRT DifferentialDrive FreeSpace GoalDistance LocalPlanner "
-    "MPPI MPPIConfig Objective Plan PlanStatus Planner Problem Robot Rules SPEED STEERING Step Straight TURN_RATE Task "
-    "TravelTime Unicycle distance pose_problem",
+    "MPPI MPPIConfig Objective Places Plan PlanStatus Planner Problem Robot Rules SPEED STEERING Simulation Step "
+    "Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem",
     "benchnav.testing": "check_model check_objective check_planner check_risk check_robot",
 }
 EACH = pytest.mark.parametrize("name", FACES)

@@ -15,6 +15,7 @@ from benchnav.core.errors import DatasetError, choose, expect
 from benchnav.core.store import output_path, read_shard, replacing
 from benchnav.core.tables import Table, print_table
 from benchnav.datagen.dem.raster import Rasters
+from benchnav.datagen.import_commands import import_dem, import_drives
 
 # A dataset of more becomes a folder of files.
 _MOST_CELLS_OF_A_FILE = 2**28
@@ -49,6 +50,7 @@ def create(
         overwrite: Replace what is there.
     """
     from benchnav.datagen.difficulty import table
+    from benchnav.datagen.files.describe import written
     from benchnav.datagen.files.reader import is_dataset
 
     expect(jobs >= 1, f"`jobs` ≥ 1, got {jobs}.")
@@ -80,7 +82,7 @@ def create(
             "same folder, nothing more: the last of them finishes it"
         )
         return
-    print_table(table(_written(path)))
+    print_table(table(written(path)))
 
 
 def list_datasets(folder: str = "") -> None:
@@ -179,79 +181,13 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
         id: Id of the new dataset; the name of the file when not given. Shards keep that of their recipe.
         overwrite: Replace what is there.
     """
+    from benchnav.datagen.files.describe import written
     from benchnav.datagen.files.merge import merge as merge_datasets
 
     path = output_path(out)
     sources = [Path(file) if Path(file).is_dir() else datagen.find_dataset(file) for file in files]
     show_progress(merge_datasets(sources, path, id, overwrite), "maps")
-    _written(path)
-
-
-def import_dem(
-    rasters: Rasters,
-    dem: str,
-    overrides: list[str],
-    out: str,
-    id: str = "",
-    recipe: str = "paper-v1",
-    splits: str = "test/real",
-    stride: float | None = None,
-    scenario: str = "std",
-    solvable: bool = False,
-    overwrite: bool = False,
-) -> None:
-    """Make a dataset from a real elevation model; needs the extra benchnav[geo].
-
-    Rasters may be anything that GDAL opens: files, https:// and s3:// addresses, zip:// archives, mosaics (.vrt).
-
-    Args:
-        rasters: What there is of the ground beside its elevation.
-        dem: Raster of elevations in metres, in any coordinate reference system.
-        overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
-        out: File .h5 to write, or else a folder of many files.
-        id: Id of the dataset; the name of the output when not given.
-        recipe: Id or path of a recipe that gives size, resolution, start, goal, class table and light.
-        splits: Splits and their shares of the maps, such as train:0.7,valid:0.1,test/site:0.2; no two of them touch.
-        stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
-        scenario: Which of the recipe's scenarios lights the maps.
-        solvable: Keep only maps whose goal can be reached, and store the grid reference time.
-        overwrite: Replace what is there.
-    """
-    from benchnav.datagen.dem.importer import import_dem as import_maps
-    from benchnav.datagen.dem.tiling import read_shares
-    from benchnav.datagen.files.hdf5 import name_of
-
-    path = output_path(out)
-    name = id or name_of(path)
-    chosen = datagen.load_recipe(recipe, [f"id={name}", *overrides] if overrides else [])
-    if id or not overrides:
-        chosen = replace(chosen, id=name)
-    steps = import_maps(
-        dem,
-        path,
-        chosen,
-        rasters,
-        shares=read_shares(splits),
-        scenario=scenario,
-        stride_m=stride,
-        solvable=solvable,
-        overwrite=overwrite,
-    )
-    show_progress(steps, "maps")
-    made = _written(path)
-    for split, entry in made.splits.items():
-        left_out = entry["parts"][0]["source"]["left_out"]
-        between = left_out.pop("between_splits")
-        reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in left_out.items())
-        print(f"  left out of {split}: {reasons}")
-        if "group" in made.fields:
-            groups = len(set(made.read(split, fields=["group"])["group"].tolist()))
-            print(
-                f"  {entry['maps']} maps of {split} overlap and are {groups} group(s), the unit of statistics: for "
-                "a test split leave --stride out, so that maps lie side by side"
-            )
-    if between:
-        print(f"  left out between splits: {between}")
+    written(path)
 
 
 def export(
@@ -346,18 +282,6 @@ def _opened(file: str) -> "datagen.TerrainDataset":
     return datagen.TerrainDataset(datagen.find_dataset(file))
 
 
-def _written(path: Path) -> "datagen.TerrainDataset":
-    """A new dataset, of which is printed where it is, its size, its splits and their digests."""
-    from rich.filesize import decimal
-
-    dataset = datagen.TerrainDataset(path)
-    size, files = decimal(sum(file.stat().st_size for file in dataset.files)), len(dataset.files)
-    print(f"wrote {path} ({size}{f' in {files} files' if files > 1 else ''})")
-    for name, split in dataset.splits.items():
-        print(f"  {name:12} {split['maps']:6} maps  {split['digest']}")
-    return dataset
-
-
 def main() -> None:
     """Entry point of `benchnav-datagen`."""
     commands = {
@@ -367,6 +291,7 @@ def main() -> None:
         "validate": Command(validate, ("file",)),
         "merge": Command(merge, ("files",)),
         "import-dem": Command(import_dem, ("dem", "overrides"), settings=Rasters),
+        "import-drives": Command(import_drives, ("drives", "overrides")),
         "export": Command(export, ("file",)),
         "preview": Command(preview, ("file",)),
     }

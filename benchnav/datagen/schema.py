@@ -75,6 +75,11 @@ OPTIONAL: dict[str, Field] = {
     "group": Field(
         "<i8", (), "1", 0, 2**53, "maps of one number overlap, directly or by others between them"
     ),
+    # Of the measured λ, so no model may see them.
+    "drive_count": Field("<i4", ("H", "W"), "1", 0, 2**31 - 1, "rows of a robot's log that λ is the mean of"),
+    "drive_std": Field(
+        "<f4", ("H", "W"), "1", 0, 1, "standard deviation of λ over these rows; NaN under two"
+    ),
 }
 
 # Layers, what a model may see of the ground beside colour and shape. NaN is where nothing is known.

@@ -75,11 +75,12 @@ def train_gp(
 
     Args:
         data: Path or id of a dataset with splits train and valid; or slip logs, a file .csv, .tsv, one of these
-            with .gz, or .parquet, with the columns class, slope_deg and traversability.
+            with .gz, or .parquet, with the columns class, slope_deg and traversability; and drive, to measure on
+            whole drives.
         out: Checkpoint folder; classifiers in it for the same classes are kept, and slip logs are read with
             their class table.
         gp: Settings of the GPs.
-        seed: Root seed of the rows of slip logs that are held out to measure on.
+        seed: Root seed of the rows or drives of slip logs that are held out to measure on.
         device: Where they are trained; auto takes CUDA where there is a GPU.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """

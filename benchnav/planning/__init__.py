@@ -24,5 +24,7 @@ __getattr__, __dir__, __all__ = face(
             "Unicycle",
         ),
         "benchnav.planning.sensing": ("Step",),
+        "benchnav.planning.world.simulation": ("Simulation",),
+        "benchnav.planning.world.world": ("Places", "World"),
     },
 )

@@ -9,6 +9,8 @@ from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Bicycle, DifferentialDrive, Robot, Unicycle
 from benchnav.planning.sensing import Step
+from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.world import Places, World
 
 __all__ = [
     "CLRRT",
@@ -25,17 +27,20 @@ __all__ = [
     "LocalPlanner",
     "MPPIConfig",
     "Objective",
+    "Places",
     "Plan",
     "PlanStatus",
     "Planner",
     "Problem",
     "Robot",
     "Rules",
+    "Simulation",
     "Step",
     "Straight",
     "Task",
     "TravelTime",
     "Unicycle",
+    "World",
     "distance",
     "pose_problem",
 ]

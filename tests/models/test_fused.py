@@ -1,3 +1,4 @@
+from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
@@ -18,14 +19,16 @@ class Linear(nn.Module):
         super().__init__()
         self.weight = torch.randn(3, 3, generator=torch.Generator().manual_seed(seed)) / 100
 
-    def forward(self, rgb: Tensor) -> Tensor:
+    def forward(self, maps: Mapping[str, Tensor]) -> Tensor:
+        rgb = maps["rgb"]
         return torch.einsum("dc,bchw->bdhw", self.weight, rgb.float())
 
 
 class Certain(nn.Module):
     """A classifier that is sure of the first class."""
 
-    def forward(self, rgb: Tensor) -> Tensor:
+    def forward(self, maps: Mapping[str, Tensor]) -> Tensor:
+        rgb = maps["rgb"]
         return torch.tensor([0.0, -1e4, -torch.inf]).view(1, 3, 1, 1).expand(len(rgb), -1, *rgb.shape[-2:])
 
 
@@ -124,7 +127,8 @@ def test_any_slope_has_a_prediction(slope: float) -> None:
 
 def test_a_classifier_of_other_classes_is_refused() -> None:
     class Two(nn.Module):
-        def forward(self, rgb: Tensor) -> Tensor:
+        def forward(self, maps: Mapping[str, Tensor]) -> Tensor:
+            rgb = maps["rgb"]
             return rgb[:, :2].float()
 
     with pytest.raises(ConfigError, match="of one shape"):

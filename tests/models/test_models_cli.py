@@ -207,6 +207,30 @@ def test_a_log_with_few_rows_of_a_class_is_told_in_one_line(
             assert "few.csv has fewer than 10 rows of 2 of 3 classes (mud 1, sand 1)" in told[0]
 
 
+def test_gps_are_measured_on_whole_drives_of_a_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rows = [f"rock,{row % 9},0.{5 + row % 3},{row // 10 % 10}\n" for row in range(200)]
+    for name, header, own in (
+        ("drives", "class,slope_deg,traversability,drive\n", rows),
+        ("one", "class,slope_deg,traversability,drive\n", [row[: row.rindex(",")] + ",a\n" for row in rows]),
+        ("none", "class,slope_deg,traversability\n", [row[: row.rindex(",")] + "\n" for row in rows]),
+    ):
+        Path(f"{name}.csv").write_text(header + "".join(own))
+        assert call(monkeypatch, "gp", "--data", f"{name}.csv", "--out", name, *QUICK_GP) == 0
+        (said,) = [line for line in capfd.readouterr().out.splitlines() if "held out" in line]
+        whose = "all of 1 of 10 drives" if name == "drives" else "which follow one another in each class"
+        assert f"gp: NLL of 20 rows held out, {whose}, " in said
+    measured = {name: load_checkpoint(name).part("gp").metrics["held_out_nll"] for name in ("one", "none")}
+    assert measured["one"] == measured["none"]
+    for seed in range(1, 4):
+        where = ("--data", "drives.csv", "--out", f"drives-{seed}", "--seed", seed)
+        assert call(monkeypatch, "gp", *where, *QUICK_GP) == 0
+        measured[f"{seed}"] = load_checkpoint(f"drives-{seed}").part("gp").metrics["held_out_nll"]
+    assert len({measured[f"{seed}"] for seed in range(1, 4)}) > 1
+
+
 def test_a_damaged_checkpoint_is_replaced_by_gps_of_a_log_where_that_is_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

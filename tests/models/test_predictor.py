@@ -209,7 +209,7 @@ def test_a_model_whose_training_was_interrupted_is_told_with_the_command_to_go_o
     for source, command in (
         ("killed", "all --data DATA --out checkpoints/killed --resume"),
         ("checkpoints/killed/", "all --data DATA --out checkpoints/killed --resume"),
-        ("first", "mdn --data DATA --out checkpoints/first --resume"),
+        ("first", "fit mdn --data DATA --out checkpoints/first --resume"),
     ):
         with pytest.raises(CheckpointError, match="training was interrupted") as caught:
             load_model(source)

@@ -286,7 +286,7 @@ def test_bad_settings_and_answers_are_named() -> None:
         predict_tiles(ColourModel(), observation, 63)
     with pytest.raises(ConfigError, match=r"`margin` of no cells or more, got -1"):
         predict_tiles(ColourModel(), observation, margin=-1)
-    with pytest.raises(ConfigError, match=r"\[1, K, 64, 64\]"):
+    with pytest.raises(ConfigError, match=r"\[1, 64, 64\]"):
         next(predict_tiles(Small(0, 0), observation, 64, 0))
     with pytest.raises(ConfigError, match="Terrain for the privileged model Oracle"):
         next(predict_tiles(load_model("oracle"), observation, 64, 0))

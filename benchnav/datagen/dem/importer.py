@@ -21,8 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from benchnav.core.errors import DatasetError
+from benchnav.core.errors import DatasetError, expect
 from benchnav.core.store import building, real_place
+from benchnav.datagen.dem.drive_log import Drives
 from benchnav.datagen.dem.raster import Rasters, load_rasterio
 from benchnav.datagen.dem.survey import Survey
 from benchnav.datagen.dem.tiling import Run
@@ -37,13 +38,19 @@ _CELLS_AT_ONCE = 2**20
 _CACHE_BYTES = 2**29  # of rasters that GDAL keeps; what it would choose grows with the machine
 
 # Why maps are left out, in the order of being found.
-_REASONS = {
+REASONS = {
+    "not_driven": "have no cell that a drive of their split crossed",
     "missing_elevation": "have cells without elevation",
     "missing_classes": "have no cell with a class or a measured λ, or cells without a class and no photo of them",
     "missing_colours": "have cells without colour",
     "not_solvable": "have a goal that cannot be reached",
 }
-_LACKING = {"missing_elevation": "dem", "missing_classes": "classes", "missing_colours": "photo"}
+_LACKING = {
+    "not_driven": "drive_count",
+    "missing_elevation": "dem",
+    "missing_classes": "classes",
+    "missing_colours": "photo",
+}
 
 
 def import_dem(
@@ -52,6 +59,7 @@ def import_dem(
     recipe: Recipe,
     rasters: Rasters = Rasters(),  # noqa: B008
     *,
+    drives: Drives | None = None,
     shares: Mapping[str, float] | None = None,
     scenario: str = "std",
     stride_m: float | None = None,
@@ -69,6 +77,7 @@ def import_dem(
         out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
         recipe: id of the dataset, size, resolution, start and goal of the maps, class table, light, seed.
         rasters: where classes, colours, λ and layers come from.
+        drives: log of drives that λ comes from, around which the ground is cut; maps that none crossed are left out.
         shares: of the maps, by split; None for all in `test/real`.
         scenario: which of the recipe's scenarios lights the maps.
         stride_m: from one map to the next; None for maps side by side.
@@ -79,6 +88,10 @@ def import_dem(
         ConfigError: rasterio is not installed, a setting does not fit the recipe, or `out` is taken.
         DatasetError: a raster does not fit, a split is left without maps, or `out` cannot be written.
     """
+    expect(
+        drives is None or not rasters.traversability,
+        "λ from `drives` or from `traversability`, got both. Leave one out.",
+    )
     out = real_place(out)
     shares = {"test/real": 1.0} if shares is None else shares
     splits = {name: Split(scenario=scenario, maps=1, solvable=solvable) for name in shares}
@@ -86,7 +99,7 @@ def import_dem(
     with ExitStack() as stack:
         stack.enter_context(held(out, overwrite))
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
-        ground = Survey(stack, dem, rasters, recipe, shares, stride_m)
+        ground = Survey(stack, dem, rasters, recipe, shares, stride_m, drives)
         folder = stack.enter_context(building(out))
         parts = {name: _Part(name, recipe, folder, ground) for name in shares}
         done = 0
@@ -111,8 +124,9 @@ def import_dem(
 
 
 def _fields_of(ground: Survey) -> Fields:
-    """What the maps have."""
-    return FIELDS | ({"group": OPTIONAL["group"]} if ground.tiling.overlaps else {}) | ground.fields
+    """What the maps have; groups are added when all maps are known."""
+    names = ["group"] * ground.tiling.overlaps + ["drive_count", "drive_std"] * (ground.driven is not None)
+    return FIELDS | {name: OPTIONAL[name] for name in OPTIONAL if name in names} | ground.fields
 
 
 @dataclass
@@ -140,6 +154,8 @@ class _Part:
             # A measured λ is worth learning from without a class.
             unknown = np.isnan(given["classes"]) & np.isnan(given.get("traversability", np.nan))
             lacking["classes"] = unknown.all(axis=(1, 2, 3))
+        if "drive_count" in given:
+            lacking["drive_count"] = (given["drive_count"] == 0).all(axis=(1, 2, 3))
         for reason, name in _LACKING.items():
             if name in lacking:
                 self.left_out[reason] += int((kept & lacking[name]).sum())
@@ -163,6 +179,9 @@ class _Part:
             maps["rgb"] = np.rint(given["photo"])
         if "traversability" in given:
             maps["traversability"] = quantise(given["traversability"][:, 0], 16)
+        if "drive_count" in given:
+            maps["drive_count"] = given["drive_count"][:, 0]
+            maps["drive_std"] = quantise(given["drive_std"][:, 0], 16)
         maps["reference_time_s"] = np.full(len(numbers), np.nan)
         if recipe.splits[self.name].solvable:
             maps["reference_time_s"] = reference_time_s(recipe, maps)
@@ -170,7 +189,7 @@ class _Part:
         self.left_out["not_solvable"] += int((~solved).sum())
         about = {"kept": numbers, "lowest_m": lowest_m, "unlabelled": (~labelled).sum(axis=(1, 2))}
         maps |= {name: given[f"layer {name}"][:, 0] for name in self.ground.fields}
-        fields = FIELDS | self.ground.fields
+        fields = {name: kind for name, kind in _fields_of(self.ground).items() if name != "group"}
         stored = {name: maps[name].astype(kind.dtype) for name, kind in fields.items()}
         stored |= {f"about {name}": values for name, values in about.items()}
         self.pending.append({name: values[solved] for name, values in stored.items()})
@@ -186,7 +205,7 @@ class _Part:
         if self.pending:
             self._flush()
         if not self.about["kept"]:
-            reasons = [f"{count} {_REASONS[reason]}" for reason, count in self.left_out.items() if count]
+            reasons = [f"{count} {REASONS[reason]}" for reason, count in self.left_out.items() if count]
             raise DatasetError(
                 f"Expected split {self.name!r} to get at least one map, got none from "
                 f"{self.ground.layers['dem'].raster.name}: of "

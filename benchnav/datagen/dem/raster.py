@@ -31,6 +31,7 @@ class Rasters:
         classes: Raster of terrain classes; laid out at random when not given.
         class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
         random_classes: Allow a photo or measured traversability without classes: these are laid out at random.
+        unlabelled: Allow a photo and measured traversability without classes: no cell has one.
         photo: Raster of red, green and blue; painted by the class when not given.
         traversability: Raster of measured traversability in [0, 1]; drawn by the class table when not given.
         layer: A layer as NAME=RASTER or NAME=RASTER:UNIT, such as vegetation_m=canopy.tif; several as a list.
@@ -39,6 +40,7 @@ class Rasters:
     classes: str = ""
     class_ids: dict[int, str | None] | None = None
     random_classes: bool = False
+    unlabelled: bool = False
     photo: str = ""
     traversability: str = ""
     layer: tuple[str, ...] = ()
@@ -50,11 +52,17 @@ class Rasters:
             "`classes` with `class_ids`, got none. Pass the raster they belong to.",
         )
         expect(not (self.classes and self.random_classes), "either `classes` or `random_classes`, got both.")
+        expect(
+            not self.unlabelled or (self.photo and not self.classes and not self.random_classes),
+            "`unlabelled` with `photo` and without classes, got otherwise: a cell without a class has the photo's "
+            "colour alone. Pass --photo RASTER, or --classes RASTER in place of it.",
+        )
         for name in ("photo", "traversability"):
             expect(
-                not getattr(self, name) or self.classes or self.random_classes,
+                not getattr(self, name) or self.classes or self.random_classes or self.unlabelled,
                 f"`classes` with `{name}`, got none: what is real would be joined to classes laid out at random. "
-                "Pass --classes RASTER, or --random-classes if that is what you want.",
+                "Pass --classes RASTER, --unlabelled for models that need none, or --random-classes if that is what "
+                "you want.",
             )
         names = [layer.name for layer in self.layers]
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -100,7 +108,7 @@ class Raster(NamedTuple):
             )
         for crs in (own, _utm_of(own, *middle), local):
             if crs is not None and crs.is_projected and crs.linear_units_factor[1] == 1:
-                places = _transformed(own, crs, x.ravel(), y.ravel()).T
+                places = transformed(own, crs, x.ravel(), y.ravel()).T
                 if max(stretch(crs, *place) for place in places) <= _MOST_STRETCH:
                     with self.warped(crs) as warped:
                         return crs, warped.bounds, (warped.res[1], warped.res[0])
@@ -210,7 +218,7 @@ def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Ra
 
 def _utm_of(crs: Any, x: float, y: float) -> Any:
     """The CRS of the UTM zone (or polar cap) that a place lies in; None off the Earth."""
-    longitude, latitude = _transformed(crs, "EPSG:4326", [x], [y])[:, 0]
+    longitude, latitude = transformed(crs, "EPSG:4326", [x], [y])[:, 0]
     if not np.isfinite(longitude + latitude):
         return None
     zone = 61 if not -80 <= latitude <= 84 else min(int((longitude + 180) // 6) + 1, 60)
@@ -230,7 +238,7 @@ def local_crs(crs: Any, x: float, y: float) -> Any:
         base = inner
     if base["type"] not in ("GeographicCRS", "GeodeticCRS"):
         return None
-    longitude, latitude = _transformed(crs, type(crs).from_user_input(json.dumps(base)), [x], [y])[:, 0]
+    longitude, latitude = transformed(crs, type(crs).from_user_input(json.dumps(base)), [x], [y])[:, 0]
     if not np.isfinite(longitude + latitude):
         return None
     parameters = [
@@ -267,14 +275,14 @@ def stretch(crs: Any, x: float, y: float) -> float:
     if local is None:
         return np.inf
     steps = _PROBE_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    moved = _transformed(crs, local, *(np.array([x, y]) + steps).T).T
+    moved = transformed(crs, local, *(np.array([x, y]) + steps).T).T
     if not np.isfinite(moved).all():
         return np.inf
     scales = np.linalg.svd(moved[::2] - moved[1::2], compute_uv=False) / (2 * _PROBE_M)
     return float(np.abs(scales - 1).max())
 
 
-def _transformed(crs: Any, to: Any, x: Any, y: Any) -> np.ndarray:
+def transformed(crs: Any, to: Any, x: Any, y: Any) -> np.ndarray:
     """Moves N places from one CRS to another, shape [2, N]; not finite where no way leads, as from another planet."""
     try:
         return np.array(load_rasterio().warp.transform(crs, to, list(x), list(y)))

@@ -17,8 +17,10 @@ from numpy import ndarray
 
 from benchnav.core.errors import DatasetError, expect
 from benchnav.core.sources import digest_of_path
+from benchnav.datagen.dem.drive_cells import BANDS, check_enough, describe_drives, drive_over, lay_out
+from benchnav.datagen.dem.drive_log import Drives, read_drives
 from benchnav.datagen.dem.raster import Layer, Raster, Rasters, load_rasterio, opened
-from benchnav.datagen.dem.tiling import Run, cut
+from benchnav.datagen.dem.tiling import Run, cut, cut_around
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Maps
 
@@ -41,6 +43,8 @@ class Survey:
     Attributes:
         tiling: how the ground is cut into maps.
         layers: by what the user calls the raster; under `NAME min` and `NAME max` what is averaged there.
+        unlabelled: whether no cell has a class.
+        driven: what drives say of the cells; None without a log.
         given: what the user calls each raster; layers are `layer NAME`.
         fields: those of layers, by name.
         valued: layers of which some value was read.
@@ -58,6 +62,7 @@ class Survey:
         recipe: Recipe,
         shares: Mapping[str, float],
         stride_m: float | None,
+        drives: Drives | None = None,
     ) -> None:
         """Opens rasters and lays them on the cells of all maps.
 
@@ -68,15 +73,17 @@ class Survey:
             recipe: size and resolution of the maps, class table.
             shares: of the maps, by split.
             stride_m: from one map to the next; None for maps side by side.
+            drives: log of drives, around which the ground is cut; None for all of the elevation model.
 
         Raises:
             ConfigError: a setting does not fit the recipe.
-            DatasetError: a raster does not fit, or the ground is too small.
+            DatasetError: a raster or the log does not fit, or the ground is too small.
         """
         names, step = [kind.name for kind in recipe.classes], recipe.resolution_m
         named = dict(enumerate(names)) if rasters.class_ids is None else rasters.class_ids
         unknown = sorted(map(str, {*named.values()} - {*names, None}))
         expect(not unknown, f"`class_ids` to name classes of the recipe, {names}, got {unknown}.")
+        log = read_drives(drives) if drives else None
         ground = stack.enter_context(opened("dem", dem))
         unit = ground.file.units[0] or "m"
         if unit.lower() not in _METRES:
@@ -90,14 +97,6 @@ class Survey:
             how, reach_m = "nearest", 0.0
         elif max(cell_m) <= step / 2 * (1 + 1e-9):
             how, reach_m = "average", 0.0
-        size_m = np.array([bounds.top - bounds.bottom, bounds.right - bounds.left])
-        cells = np.floor(size_m / step + _SLACK).astype(int).tolist()
-        if np.less(cells, recipe.grid.shape).any():
-            wide, high = recipe.grid.extent_m
-            raise DatasetError(
-                f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {dem} of "
-                f"{size_m[1]:g} m × {size_m[0]:g} m. Take a larger raster or a recipe of smaller maps."
-            )
         stride = recipe.grid.shape
         if stride_m is not None:
             apart = stride_m / step
@@ -106,9 +105,23 @@ class Survey:
                 f"`stride` as a multiple of the maps' resolution, {step:g} m, got {stride_m:g}.",
             )
             stride = round(apart), round(apart)
+        whole_m = np.array([bounds.top - bounds.bottom, bounds.right - bounds.left])
+        edge_m, size_m = np.zeros(2), whole_m
+        if log is not None:
+            log = lay_out(log, ground, crs, bounds)
+            check_enough(log, list(shares))
+            map_m, apart_m = np.multiply(recipe.grid.shape, step), np.multiply(stride, step)
+            edge_m, size_m = cut_around(log.places_m, whole_m, np.array(cell_m), map_m, apart_m)
+        cells = np.floor(size_m / step + _SLACK).astype(int).tolist()
+        if np.less(cells, recipe.grid.shape).any():
+            wide, high = recipe.grid.extent_m
+            raise DatasetError(
+                f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {dem} of "
+                f"{size_m[1]:g} m × {size_m[0]:g} m. Take a larger raster or a recipe of smaller maps."
+            )
         self.tiling = tiling = cut(cells, recipe.grid.shape, stride, shares)
         # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
-        offset_m = np.clip((size_m - np.multiply(step, tiling.cells)) / 2, 0, reach_m)
+        offset_m = edge_m + np.clip((size_m - np.multiply(step, tiling.cells)) / 2, 0, reach_m)
         south_m, west_m = (np.array([bounds.bottom, bounds.left]) + offset_m).tolist()
         height, width = tiling.cells
         north_m = south_m + (height + 1) * step
@@ -150,18 +163,24 @@ class Survey:
             self.source["layers"] = {name: origins[f"layer {name}"] for name in self.fields}
         self.valued: set[str] = set()
         self.known = []
-        for offset, count, size in zip(offset_m, tiling.cells, size_m, strict=True):
+        for offset, count, size in zip(offset_m, tiling.cells, whole_m, strict=True):
             edges = offset + step * np.arange(-1, count + 2)
             self.known.append((edges[:-1] > -_SLACK * step) & (edges[1:] < size + _SLACK * step))
         self.indices = {value: np.nan if name is None else names.index(name) for value, name in named.items()}
+        self.unlabelled, self.driven = rasters.unlabelled, None
+        if log is not None:
+            cells_of = np.floor((log.places_m - offset_m) / step).astype(np.int64)
+            log, self.driven = drive_over(log, tiling, *cells_of.T)
+            self.source["drives"] = about = describe_drives(log, list(shares))
+            self.source["traversability"] = {name: about[name] for name in ("file", "sha256")}
         self.cliff_m = _CLIFF * max(*cell_m, step) if ground.mask_kinds == {"all_valid"} else np.inf
 
     def read(self, run: Run) -> tuple[ndarray, Maps]:
         """Reads some maps.
 
         Returns:
-            Elevation with one cell of the ground beyond, shape [B, H + 2, W + 2], and by the names in `given` what
-            each raster says, shape [B, K, H, W]; NaN where there is nothing.
+            Elevation with one cell of the ground beyond, shape [B, H + 2, W + 2], and by the names in `given` and in
+            `BANDS` what others say, shape [B, K, H, W]; NaN where there is nothing.
 
         Raises:
             DatasetError: a raster cannot be read, or holds what it should not.
@@ -204,6 +223,12 @@ class Survey:
         given = {name: framed[name][:, :, 1:-1, 1:-1] for name in self.given}
         if "classes" in given:
             given["classes"] = self._classes(given["classes"])
+        elif self.unlabelled:
+            given["classes"] = np.full_like(given["dem"], np.nan)
+        if self.driven:
+            strip = self.driven.read(range(south, south + height), range(wests[0], wests[-1] + width))
+            maps = np.stack([strip[:, :, west - wests[0] :][:, :, :width] for west in wests])
+            given |= {name: maps[:, place : place + 1] for place, name in enumerate(BANDS)}
         return framed["dem"][:, 0], given
 
     def _out_of_range(

@@ -18,6 +18,8 @@ from benchnav.core.errors import DatasetError, expect
 
 Shape = tuple[int, int]  # along y and along x
 
+_SLACK = 1e-3  # of a cell, which arithmetic may be off by
+
 
 class Run(NamedTuple):
     """Neighbouring maps of one split: their row of maps, and which of the row."""
@@ -80,6 +82,26 @@ class Tiling(NamedTuple):
         _, firsts, inverse = np.unique(parts, return_index=True, return_inverse=True)
         return own[firsts][inverse]
 
+    def split_of(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Which split's maps show cells: index into `strips`, −1 where none do, int64, shape of `row`.
+
+        Args:
+            row: of the cells, counted northward.
+            column: counted eastward.
+        """
+        rows, columns = self.tiles
+        side = 0 if rows > columns else 1
+        along, split = (row, column)[side], np.full(np.shape(row), -1)
+        for place, strip in enumerate(self.strips.values()):
+            first, last = (
+                strip.start * self.stride[side],
+                (strip.stop - 1) * self.stride[side] + self.shape[side],
+            )
+            split[(along >= first) & (along < last)] = place
+        for cell, count, stride, size in zip((row, column), self.cells, self.stride, self.shape, strict=True):
+            split[(cell < 0) | (cell >= count) | (cell % stride >= size)] = -1
+        return split
+
     @property
     def between(self) -> int:
         """Number of maps that would lie between the splits, which belong to none."""
@@ -125,6 +147,29 @@ def cut(cells: Sequence[int], shape: Shape, stride: Shape, shares: Mapping[str, 
         for place, split in enumerate(shares)
     }
     return Tiling(shape, stride, (rows, columns), strips)
+
+
+def cut_around(
+    places_m: np.ndarray, whole_m: np.ndarray, cell_m: np.ndarray, shape_m: np.ndarray, stride_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cuts ground of whole maps around places, from an edge between cells of the raster on, where there is room.
+
+    Args:
+        places_m: northward and eastward from the raster's south-west corner, shape [N, 2].
+        whole_m: size of the raster; as what follows northward and eastward, shape [2].
+        cell_m: size of its cells.
+        shape_m: size of a map.
+        stride_m: from one map to the next.
+
+    Returns:
+        South-west corner and size of the ground, each of shape [2].
+    """
+    low_m = np.maximum(places_m.min(axis=0) - cell_m, 0)
+    high_m = np.minimum(places_m.max(axis=0) + cell_m, whole_m)
+    more = np.maximum(np.ceil((high_m - low_m - shape_m) / stride_m - _SLACK), 0)
+    size_m = np.minimum(shape_m + more * stride_m, whole_m)
+    edge_m = np.clip((low_m + high_m - size_m) / 2, 0, whole_m - size_m)
+    return np.floor(edge_m / cell_m + _SLACK) * cell_m, size_m
 
 
 def read_shares(text: str) -> dict[str, float]:

@@ -1,7 +1,8 @@
-"""What a dataset holds, as plain data and as tables."""
+"""What a dataset holds, as plain data, as tables and, of a new one, as lines."""
 
 from collections.abc import Iterator
 from dataclasses import asdict
+from pathlib import Path
 
 from benchnav.core.settings import plain
 from benchnav.core.tables import Table
@@ -138,3 +139,15 @@ def _origin(described: schema.Json, part: schema.Json) -> str:
         return f"{part['maps']} of {part['source']['file']}"
     recipe = described["recipes"][part["recipe"]]
     return f"{part['maps']} of {recipe['id']} {part['split']}, seed {recipe['seed']}"
+
+
+def written(path: Path) -> TerrainDataset:
+    """Gives a new dataset and prints where it is, its size, its splits and their digests."""
+    from rich.filesize import decimal
+
+    dataset = TerrainDataset(path)
+    size, files = decimal(sum(file.stat().st_size for file in dataset.files)), len(dataset.files)
+    print(f"wrote {path} ({size}{f' in {files} files' if files > 1 else ''})")
+    for name, split in dataset.splits.items():
+        print(f"  {name:12} {split['maps']:6} maps  {split['digest']}")
+    return dataset

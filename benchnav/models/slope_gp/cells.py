@@ -1,4 +1,4 @@
-"""Cells that a robot has driven over, from maps or from slip logs: what the class-wise GPs learn from.
+"""Cells that a robot has driven over, from maps or from slip logs (`slip_logs`): what the class-wise GPs learn from.
 
 Cells whose slope or traversability was not observed (NaN), or whose class is not known, are left out. Many
 observations at one slope enter the likelihood of the GPs by five sums. A bin of width w makes the noise seem larger by
@@ -6,32 +6,19 @@ observations at one slope enter the likelihood of the GPs by five sums. A bin of
 0.1 % of it. Sums of parts of the data add up, so that memory does not grow with them. A second mode of λ shows in no
 sum, so the cells are also counted by bins of λ. Letters in shapes: N cells, C classes, B bins of slope, V = 258 bins of
 λ: that at 0, 256 inside (0, 1), that at 1.
-
-A robot's own slip logs are tables with a row for each place driven over, CSV, TSV or Parquet. Columns: `class` (a
-class's name, or its integer id), `slope_deg` (0–90) and `traversability` (λ, 0–1; 1 minus the slip ratio where the
-robot holds its commanded speed). Others are ignored, and so are rows in which slope or traversability is missing.
 """
 
-import hashlib
-import re
-import warnings
-import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import reduce
-from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import torch
-from pandas.api.types import is_numeric_dtype
 from torch import Tensor
 
 from benchnav.core import rng
 from benchnav.core.batch import map_tensors
 from benchnav.core.errors import DatasetError
-from benchnav.core.settings import hint
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
@@ -40,14 +27,8 @@ from benchnav.models.slope_gp.table import SlopeTable
 CHUNK_CELLS = 2**18
 BIN_DEG = 0.25
 INSIDE_BINS = 256
-ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
 _BINS = round(90 / BIN_DEG) + 1
 _VALUES = INSIDE_BINS + 2
-_LIMITS = {"slope_deg": 90, "traversability": 1}
-COLUMNS = ("class", *_LIMITS)
-_MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
-_ENOUGH = 20  # rows of which some would be steeper than 1.6° if slopes were in degrees
-_MOST_CLASSES = 256  # class ids are stored in a byte
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,6 +106,30 @@ def hold_out(cells: Cells, share: float, seed: int = 0) -> tuple[Cells, Cells]:
         first = int(drawn[c] * (count - few + 1))
         held[(cells.class_id == c).nonzero().flatten()[first : first + few]] = True
     return cells.select(~held), cells.select(held)
+
+
+def hold_out_drives(drive: Tensor, share: float, seed: int = 0) -> Tensor:
+    """Chooses whole drives to hold out, in an order that is drawn, so that their rows come near a share of all.
+
+    Args:
+        drive: number of each row's drive, int64, shape [N], of two drives at least.
+        share: of the rows to hold out, in (0, 1).
+        seed: root seed of the draw.
+
+    Returns:
+        Which rows are held out, of one drive at least and never of all, bool, shape [N].
+    """
+    rows = drive.bincount().tolist()
+    order = rng.permutation(rng.stream_key(seed, "models", "held-out drives"), np.arange(1), len(rows))[0]
+    chosen: list[int] = []
+    wanted = share * len(drive)
+    for one in order.tolist():
+        held = sum(rows[other] for other in chosen)
+        if abs(held + rows[one] - wanted) < abs(held - wanted):
+            chosen.append(one)
+    # All are longer than twice the share: then the shortest.
+    chosen = chosen[: len(rows) - 1] or [min(order.tolist(), key=rows.__getitem__)]
+    return torch.isin(drive, torch.tensor(chosen))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,133 +287,3 @@ def measure_latent(table: SlopeTable, chunks: Iterable[Terrain], truth: bool = T
             noise_error = max(noise_error, float((ratio - 1).abs().max()))
     errors = {"latent_rmse": (squares / max(1, cells)) ** 0.5, "noise_error": noise_error} if truth else {}
     return {**errors, "nll": surprise / max(1, seen)}
-
-
-class SlipLogs(NamedTuple):
-    """What is learned from of a slip log.
-
-    Args:
-        class_names: the class table.
-        cells: the rows with a slope and a traversability, in order, under the ids of that table.
-        digest: SHA-256 of the file.
-    """
-
-    class_names: tuple[str, ...]
-    cells: Cells
-    digest: str
-
-
-def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipLogs:
-    """Reads a slip log.
-
-    Args:
-        path: a file that ends in one of `ENDINGS`.
-        class_names: the class table, into which integer ids of the log are indices. Where none is given it is that of
-            the log: its classes in alphabetical order; for integer ids "0", "1", … up to the largest.
-
-    Raises:
-        DatasetError: there is no such file, it cannot be read, lacks a column or rows, has a class that the table
-            lacks, or a value is no number or out of range.
-    """
-    path = Path(path)
-    rows = _read(path)
-    missing = [name for name in COLUMNS if name not in rows]
-    if missing:
-        raise DatasetError(
-            f"Expected columns {', '.join(COLUMNS)} in {path}, got no {' and no '.join(missing)}. "
-            f"It has {', '.join(str(name) for name in rows.columns) or 'none'}."
-        )
-    for name, most in _LIMITS.items():
-        rows[name] = _read_numbers(rows[name], name, most, path)
-    observed = rows.dropna(subset=list(_LIMITS))
-    if observed.empty:
-        raise DatasetError(
-            f"Expected rows with a slope and a traversability in {path}, got none among {len(rows)}. "
-            "Log places that the robot has driven over."
-        )
-    steepest = observed["slope_deg"].max()
-    if 0 < steepest <= np.pi / 2 and len(observed) >= _ENOUGH:
-        raise DatasetError(
-            f"Expected `slope_deg` in degrees in {path}, got at most {steepest:.4g} in {len(observed)} rows, as of "
-            "radians. Multiply radians by 57.2958. Ground that level in degrees looks the same: log steeper too."
-        )
-    class_names, class_id = _read_classes(observed["class"], path, class_names)
-    slope, value = (torch.from_numpy(observed[name].to_numpy(np.float32)) for name in _LIMITS)
-    cells = Cells(class_id=class_id, slope_deg=slope, traversability=value)
-    return SlipLogs(class_names, cells, hashlib.sha256(path.read_bytes()).hexdigest())
-
-
-def _read(path: Path) -> pd.DataFrame:
-    try:
-        if path.suffix == ".parquet":
-            return pd.read_parquet(path).reset_index(drop=True)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", pd.errors.ParserWarning)
-            # As text: a class may be called NA, and a bad number is to be found in its row.
-            rows = pd.read_csv(
-                path,
-                sep="\t" if ".tsv" in path.suffixes else ",",
-                dtype=str,
-                keep_default_na=False,
-                skipinitialspace=True,
-                index_col=False,
-            )
-        return rows.rename(columns=str.strip)
-    except (OSError, EOFError, ValueError, zlib.error, pd.errors.ParserWarning) as error:
-        why = [*str(error).strip().splitlines(), type(error).__name__]
-        raise DatasetError(
-            f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got one that cannot be read: {why[0]}"
-        ) from error
-
-
-def _read_numbers(column: pd.Series, name: str, most: float, path: Path) -> np.ndarray:
-    """Gives the numbers of a column, float64, NaN where missing."""
-    text = column if is_numeric_dtype(column) else column.astype("string").str.strip()
-    values = pd.to_numeric(text, errors="coerce").to_numpy(np.float64, na_value=np.nan)
-    given = (text.notna() & ~text.isin(_MISSING)).to_numpy(bool)
-    bad = np.flatnonzero(given & ~((values >= 0) & (values <= most)))
-    if len(bad):
-        raise DatasetError(
-            f"Expected `{name}` to be numbers within [0, {most}] in {path}, got {column.iloc[bad[0]]!s} in row "
-            f"{bad[0] + 1} below the header. Mend that row, or leave the value out."
-        )
-    return values
-
-
-def _read_classes(column: pd.Series, path: Path, names: tuple[str, ...]) -> tuple[tuple[str, ...], Tensor]:
-    """Gives the class table, that of the log where it has no names yet, and the id of each row."""
-    text = column.astype("string").str.strip().fillna("")
-    absent = text.index[text == ""]
-    if len(absent):
-        raise DatasetError(
-            f"Expected a `class` in every row of {path}, got none in row {absent[0] + 1} below the header."
-        )
-    found = text.to_numpy(str)
-    # pandas writes ids so where some are missing: 0.0
-    if all(re.fullmatch(r"\d+(\.\d*)?", name, re.ASCII) for name in found):
-        ids = found.astype(float)
-        if len(broken := found[ids % 1 > 0]):
-            raise DatasetError(
-                f"Expected class ids as whole numbers in {path}, got {broken[0]}. Number or name the classes."
-            )
-        count = int(ids.max()) + 1
-        own: Any = range(count)
-        if names and count > len(names):
-            raise DatasetError(
-                f"Expected class ids in 0–{len(names) - 1} in the slip log, got {count - 1}. "
-                "Number the classes as in the class table."
-            )
-    else:
-        own = np.unique(found)
-        count = len(own)
-        if names and (others := [name for name in own if name not in names]):
-            near = hint(others[0], names) or " Name classes as in the class table."
-            raise DatasetError(
-                f"Expected classes among {', '.join(names)} in the slip log, got {str(others[0])!r}.{near}"
-            )
-        ids = pd.Index(names or own).get_indexer(found)
-    if count > _MOST_CLASSES:
-        raise DatasetError(
-            f"Expected at most {_MOST_CLASSES} classes in {path}, got {count}. Number classes from 0."
-        )
-    return names or tuple(map(str, own)), torch.from_numpy(ids.astype(np.int64))

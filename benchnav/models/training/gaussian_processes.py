@@ -6,22 +6,25 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.utils.data import DataLoader
 
 from benchnav.core.command import Device, tell
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.files.robot_logs import ENDINGS
 from benchnav.models.checkpoint import GP, Checkpoint, Part
 from benchnav.models.config import LatentGPConfig, check_seed
 from benchnav.models.slope_gp.cells import (
-    ENDINGS,
+    Cells,
     SlopeSums,
     cell_nll,
     hold_out,
+    hold_out_drives,
     measure_latent,
-    read_slip_logs,
     sum_split,
 )
 from benchnav.models.slope_gp.gp import LatentGPs
+from benchnav.models.slope_gp.slip_logs import read_slip_logs
 from benchnav.models.slope_gp.soft_modes import find_soft_modes
 from benchnav.models.training.data import TRAIN, VALID, open_dataset, training_digest
 from benchnav.models.training.fit import FitOptions, fit, say
@@ -93,7 +96,7 @@ def train_gps_on_maps(config: LatentGPConfig, dataset: TerrainDataset, options: 
 def _train_on_logs(data: str, out: str, config: LatentGPConfig, options: FitOptions) -> None:
     """Trains the GPs on slip logs, into a checkpoint, whose class table the logs are read with if it is there."""
     there = existing(Path(out), options.overwrite)
-    names, cells, sha256 = read_slip_logs(data, there.class_names if there else ())
+    names, cells, sha256, drive = read_slip_logs(data, there.class_names if there else ())
     sums, digest = SlopeSums.of(cells, len(names)), f"file:{sha256}"
     target = open_target(out, Checkpoint(class_names=names), [GP], digest, options)
     counts = dict(zip(names, sums.count.tolist(), strict=True))
@@ -104,17 +107,30 @@ def _train_on_logs(data: str, out: str, config: LatentGPConfig, options: FitOpti
             f"({', '.join(few)}); their GPs are little more than the prior, which is vague{lost}"
         )
     metrics = {}
-    if max(counts.values()) >= 1 / _HELD_OUT:
-        kept, held = hold_out(cells, _HELD_OUT, options.seed)
+    if measured_on := _held_out(cells, drive, options.seed):
+        kept, held, whose = measured_on
         trial = fit_gps(config, SlopeSums.of(kept, len(names)), options.device)
         metrics["held_out_nll"] = cell_nll(held, trial.tabulate())
         say(
-            f"gp: NLL of {len(held)} rows held out, which follow one another in each class, "
-            f"{metrics['held_out_nll']:.4f}; now with all rows"
+            f"gp: NLL of {len(held)} rows held out, {whose}, {metrics['held_out_nll']:.4f}; now with all rows"
         )
     model = _fit_and_say(config, sums, names, options.device)
     say(f"gp: rows learned from: {', '.join(f'{name} {count}' for name, count in counts.items())}")
     target.add(GP, _part(model, options.seed, metrics, Path(data).name, digest))
+
+
+def _held_out(cells: Cells, drive: Tensor | None, seed: int) -> tuple[Cells, Cells, str] | None:
+    """Rows to learn from, rows to measure on, and which these are; None where there are too few."""
+    if drive is not None and (drives := len(drive.unique())) > 1:
+        held = hold_out_drives(drive, _HELD_OUT, seed)
+        return (
+            cells.select(~held),
+            cells.select(held),
+            f"all of {len(drive[held].unique())} of {drives} drives",
+        )
+    if int(cells.class_id.bincount().max()) < 1 / _HELD_OUT:
+        return None
+    return *hold_out(cells, _HELD_OUT, seed), "which follow one another in each class"
 
 
 def _fit_and_say(

@@ -2,9 +2,11 @@ from pathlib import Path
 
 import pytest
 
+from benchnav.core.sources import load_file
 from benchnav.eval.experiment.condition import Condition, conditions_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.provenance import describe_parts
+from benchnav.models.checkpoint import Checkpoint, Part, save_checkpoint
 
 PLANNERS = "benchnav.planning.planners."
 
@@ -44,3 +46,34 @@ def test_a_part_of_a_users_own_is_known_by_its_digest(tmp_path: Path) -> None:
     assert before["modules"] == after["modules"]
     assert before["parts"] != after["parts"]
     assert list(before["parts"]) == [f"risk {path}:worst"]
+
+
+def test_of_a_checkpoint_of_a_users_class_both_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    example = Path(__file__).parents[3] / "examples" / "own_model.py"
+    Path("own.py").write_text(example.read_text())
+    kind = load_file(Path("own.py").resolve(), Path("own.py").read_bytes()).CellModel
+    network = kind().build()
+    part = Part(
+        config=network.settings(),
+        tensors=dict(network.state_dict()),
+        seed=0,
+        metrics={},
+        data_id="x",
+        data_digest="y",
+    )
+    save_checkpoint("c", Checkpoint(class_names=(), parts={"CellModel": part}, model="CellModel", code="z"))
+    given = {"model": "own.py:CellModel@c"}
+
+    def parts() -> dict[str, str]:
+        return describe_parts(condition(planners="mppi", **given))["parts"]
+
+    first = parts()
+    assert set(first) == {"model own.py:CellModel@c", "class of model own.py:CellModel@c"}
+    Path("own.py").write_text(example.read_text() + "\nMORE = 1\n")
+    second = parts()
+    assert {name for name in first if first[name] != second[name]} == {"class of model own.py:CellModel@c"}
+    save_checkpoint(
+        "c", Checkpoint(class_names=("a",), parts={"CellModel": part}, model="CellModel", code="z")
+    )
+    assert {name for name in first if parts()[name] != second[name]} == {"model own.py:CellModel@c"}

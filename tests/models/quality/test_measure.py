@@ -1,5 +1,5 @@
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import astuple, replace
 from pathlib import Path
 
@@ -33,6 +33,13 @@ from tests.models.support import linear_table, make_terrain
 
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+class Colours(torch.nn.Module):
+    """A classifier whose logits are the colours."""
+
+    def forward(self, maps: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        return maps["rgb"]
 
 
 def test_the_oracle_is_calibrated_and_has_no_class_metrics() -> None:
@@ -188,7 +195,7 @@ def test_the_classes_are_measured_whole_where_they_have_two_modes() -> None:
     )
     names = ("a", "b", "c")
     plain, both = (
-        measure(FusedModel([torch.nn.Identity()], table, names), [terrain], generator(1))
+        measure(FusedModel([Colours()], table, names), [terrain], generator(1))
         for table in (linear_table(), replace(linear_table(), soft=soft))
     )
     assert both.classes[0].confusion == plain.classes[0].confusion
@@ -237,7 +244,7 @@ def test_cells_that_were_not_observed_are_left_out() -> None:
         truth=normal(terrain.truth.means[:, 0, :, 5:], terrain.truth.stds[:, 0, :, 5:]),
         grid=Grid(16, 11, 0.5),
     )  # fmt: skip
-    model = FusedModel([torch.nn.Identity()], linear_table(), ("a", "b", "c"))
+    model = FusedModel([Colours()], linear_table(), ("a", "b", "c"))
     found, wanted = (measure(model, [one], generator(1)).traversability for one in (holed, rest))
     for name in ("rmse_observed", "rmse_expected", "nll", "crps"):
         assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=1e-6), name
@@ -343,7 +350,8 @@ def test_an_ensemble_classifies_each_map_once(monkeypatch: pytest.MonkeyPatch) -
             super().__init__()
             self.shift = shift
 
-        def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        def forward(self, maps: Mapping[str, torch.Tensor]) -> torch.Tensor:
+            rgb = maps["rgb"]
             seen.append(len(rgb))
             return rgb.float() / 100 + self.shift * torch.arange(3).view(3, 1, 1)
 

@@ -1,15 +1,19 @@
 import gzip
 import hashlib
+import random
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from benchnav.core.errors import DatasetError
 from benchnav.models.config import LatentGPConfig
-from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out, read_slip_logs
+from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out, hold_out_drives
+from benchnav.models.slope_gp.slip_logs import read_slip_logs
 from benchnav.models.training.gaussian_processes import fit_gps
 from tests.models.support import make_cells
 
@@ -89,6 +93,8 @@ def test_the_number_that_means_no_class_in_maps_is_a_class_of_a_log(tmp_path: Pa
         (HEADER + "a,1,-0.1\n", r"within \[0, 1\].*got -0.1 in row 1"),
         (HEADER + "a,inf,0.1\n", "got inf in row 1"),
         (HEADER + "a,1,0.1\n,1,0.1\n", "`class` in every row.*row 2"),
+        ("class,slope_deg,traversability,drive\na,1,0.1,x\na,1,0.1, \n", "`drive` in every row.*row 2"),
+        ("klass,slope_deg,traversability\na,1,1\n", "got no class.*Did you mean 'klass'"),
         (HEADER + "256,1,0.1\n", "at most 256 classes.*got 257"),
         (HEADER + "99999999999999999999,1,0.1\n", "at most 256 classes.*got 100000000000000000001"),
         (HEADER + "a,1,0.1\na,1,0.1,0.2,0.3\n", "cannot be read: .*line 3"),
@@ -163,3 +169,49 @@ def test_slopes_in_radians_are_refused(tmp_path: Path) -> None:
                 read_slip_logs(path)
         else:
             assert len(read_slip_logs(path).cells) == count
+
+
+def test_drives_of_a_log_are_known_whatever_they_are_called(tmp_path: Path) -> None:
+    rows = pd.DataFrame(
+        {"class": "a", "slope_deg": [1.0, 2, None, 4], "traversability": 0.5, "drive": ["n", "m", "m", " n"]}
+    )
+    rows.to_csv(tmp_path / "log.csv", index=False)
+    drive = read_slip_logs(tmp_path / "log.csv").drive
+    assert drive is not None
+    assert drive.tolist() == [1, 0, 1]
+    rows["drive"] = [7, 3, 3, 7]
+    rows.to_parquet(tmp_path / "log.parquet")
+    drive = read_slip_logs(tmp_path / "log.parquet").drive
+    assert drive is not None
+    assert drive.tolist() == [1, 0, 1]
+    assert read_slip_logs(write(tmp_path, GOOD)).drive is None
+
+
+@given(
+    st.lists(st.integers(1, 50), min_size=2, max_size=20),
+    st.floats(0.05, 0.95),
+    st.integers(0, 5),
+    st.randoms(),
+)
+def test_whole_drives_are_held_out_near_the_share(
+    sizes: list[int], share: float, seed: int, shuffled: random.Random
+) -> None:
+    rows = [drive for drive, size in enumerate(sizes) for _ in range(size)]
+    shuffled.shuffle(rows)
+    drive = torch.tensor(rows)
+    held = hold_out_drives(drive, share, seed)
+    assert not set(drive[held].tolist()) & set(drive[~held].tolist())
+    assert 0 < held.sum() < len(rows)
+    assert torch.equal(held, hold_out_drives(drive, share, seed))
+    # As near to the share as half of the longest drive, where one of them is not too long for it.
+    if max(sizes) <= share * len(rows) and len(rows) * (1 - share) > max(sizes):
+        assert abs(int(held.sum()) - share * len(rows)) <= max(sizes) / 2
+
+
+def test_which_drives_are_held_out_is_drawn() -> None:
+    drive = torch.arange(20).repeat_interleave(10)
+    held = [tuple(drive[hold_out_drives(drive, 0.1, seed)].unique().tolist()) for seed in range(200)]
+    assert {len(one) for one in held} == {2}
+    counts = np.bincount([drive for one in held for drive in one], minlength=20)
+    assert 8 <= counts.min() <= counts.max() <= 36  # 20 each, four deviations
+    assert hold_out_drives(torch.tensor([0] * 60 + [1] * 30), 0.1).tolist() == [False] * 60 + [True] * 30

@@ -336,3 +336,45 @@ def test_a_class_that_keeps_the_contract_passes_and_one_that_does_not_is_told(mo
 
     with pytest.raises(ConfigError, match="same prediction from settings and tensors"):
         check_model(Forgetful)
+
+
+def test_fit_of_the_fused_model_is_all_and_its_classifier_takes_layers(
+    own: Path, dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    common = ("--data", dataset.path, "--trainer.precision", "32-true", "--trainer.max_epochs", 1)
+    stages = {
+        "classifier.encoder": "mobilenet_v2",
+        "classifier.batch_size": 5,
+        "classifier.inputs": "[elevation_m, rgb]",
+        "gp.inducing_points": 4,
+    }
+    settings = [(f"--settings.{name}", value) for name, value in stages.items()]
+    flags = [(f"--{name}", value) for name, value in stages.items()]
+    assert (
+        call(
+            monkeypatch, "fit", "fused", *common, "--out", "a", *(word for pair in settings for word in pair)
+        )
+        == 0
+    )
+    assert call(monkeypatch, "all", *common, "--out", "b", *(word for pair in flags for word in pair)) == 0
+    first, second = load_checkpoint("a"), load_checkpoint("b")
+    assert (first.model, set(first.parts)) == ("fused", {"gp", "classifier"})
+    for name, part in first.parts.items():
+        assert part.config == second.part(name).config
+        assert all(
+            torch.equal(value, second.part(name).tensors[tensor]) for tensor, value in part.tensors.items()
+        )
+    assert first.part("gp").config["inducing_points"] == 4
+    assert first.part("classifier").config["inputs"] == ["elevation_m", "rgb"]
+    model, seen = load_model("a"), dataset.terrain("test/std").observe()
+    before = model.predict(seen).mean()
+    higher = replace(seen, elevation_m=seen.elevation_m + torch.rand(seen.elevation_m.shape))
+    assert not torch.equal(model.predict(higher).mean(), before)
+
+
+def test_maps_without_a_layer_that_the_model_was_trained_on_are_refused(
+    module: ModuleType, dataset: TerrainDataset
+) -> None:
+    model = module.CellModel(module.CellConfig(inputs=("rgb", "vegetation_m"))).build()
+    with pytest.raises(ConfigError, match="vegetation_m among them, got rgb, elevation_m, slope_deg"):
+        model.predict(dataset.terrain("test/std").observe())

@@ -1,0 +1,170 @@
+"""What drives say of the cells of the ground, and which split each drive belongs to.
+
+Splits have strips of the ground, with ground between them that no map shows (`tiling`). A drive belongs to the split on
+whose strip most of its rows lie, and its rows on the strip of another are left out. So no cell and no drive tells two
+splits anything. Letters in shapes: N rows, D drives, S splits, M cells that were driven over.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy import ndarray
+from scipy.optimize import linear_sum_assignment
+
+from benchnav.core.errors import DatasetError
+from benchnav.datagen.dem.drive_log import RATIO_LIMITS, DriveLog, pace
+from benchnav.datagen.dem.raster import Raster, transformed
+from benchnav.datagen.dem.tiling import Tiling
+from benchnav.datagen.schema import Json
+
+BANDS = ("traversability", "drive_count", "drive_std")
+
+
+@dataclass(frozen=True)
+class DrivenCells:
+    """Cells that were driven over.
+
+    Args:
+        cells: number of each, row · width + column, ascending, int64, shape [M].
+        values: of each of `BANDS`: mean of λ, number of rows, standard deviation of λ (NaN of one row), shape [3, M].
+        width: cells of the ground eastward.
+    """
+
+    cells: ndarray
+    values: ndarray
+    width: int
+
+    def read(self, rows: range, columns: range) -> ndarray:
+        """Reads cells.
+
+        Args:
+            rows: counted northward.
+            columns: counted eastward.
+
+        Returns:
+            `BANDS`, float64, shape [3, len(rows), len(columns)]; NaN, 0 and NaN where no one drove.
+        """
+        read = np.full((3, len(rows), len(columns)), np.nan)
+        read[1] = 0
+        some = slice(*np.searchsorted(self.cells, [rows.start * self.width, rows.stop * self.width]))
+        row, column = np.divmod(self.cells[some], self.width)
+        own = (column >= columns.start) & (column < columns.stop)
+        read[:, row[own] - rows.start, column[own] - columns.start] = self.values[:, some][:, own]
+        return read
+
+
+def lay_out(log: DriveLog, ground: Raster, crs: Any, bounds: Any) -> DriveLog:
+    """Moves positions into the CRS of the maps, as metres from the south-west corner of the elevation model.
+
+    Args:
+        log: with positions as they were logged.
+        ground: the elevation model.
+        crs: of the maps.
+        bounds: of the elevation model in that.
+
+    Returns:
+        The log with the rows that lie on it.
+
+    Raises:
+        DatasetError: none does, or the log is in a CRS that is not in metres.
+    """
+    own, path = ground.file.crs, log.settings.file
+    if not log.is_geographic and not (own.is_projected and own.linear_units_factor[1] == 1):
+        raise DatasetError(
+            f"Expected positions as longitude_deg and latitude_deg in {path}, since the CRS of {ground.name}, "
+            f"{own.to_string()[:80]}, is not in metres, got x_m and y_m. Log them in WGS 84."
+        )
+    there = transformed("EPSG:4326" if log.is_geographic else own, crs, log.rows["x"], log.rows["y"])
+    x, y = there - np.array([[bounds.left], [bounds.bottom]])
+    off = ~((x >= 0) & (y >= 0) & (x < bounds.right - bounds.left) & (y < bounds.top - bounds.bottom))
+    if off.all():
+        left, bottom, right, top = ground.file.bounds
+        (west, east), (south, north) = (log.rows[name].agg(["min", "max"]) for name in ("x", "y"))
+        raise DatasetError(
+            f"Expected positions on {ground.name}, which covers x {left:.9g} to {right:.9g} and y {bottom:.9g} to "
+            f"{top:.9g} of {own.to_string()[:80]}, got x {west:.9g} to {east:.9g} and y {south:.9g} to {north:.9g} in "
+            f"{path}. Give x_m and y_m in that CRS, or longitude_deg and latitude_deg."
+        )
+    return replace(log, rows=log.rows.assign(x=x, y=y)).without("off_dem", off)
+
+
+def check_enough(log: DriveLog, splits: Sequence[str]) -> None:
+    """Refuses a log of fewer drives than splits.
+
+    Raises:
+        DatasetError: it is.
+    """
+    drives = log.rows["drive"].nunique()
+    if drives < len(splits):
+        raise DatasetError(
+            f"Expected a drive for each of the {len(splits)} splits {', '.join(splits)}, got {drives} in "
+            f"{log.settings.file}. Name drives in a column `drive`, or take fewer --splits."
+        )
+
+
+def drive_over(log: DriveLog, tiling: Tiling, row: ndarray, column: ndarray) -> tuple[DriveLog, DrivenCells]:
+    """Gives each drive to a split and takes the mean of λ over the rows on each cell.
+
+    Args:
+        log: the drives.
+        tiling: how the ground is cut into maps and splits.
+        row: of the cell that each row of the log lies on, counted northward, int64, shape [N].
+        column: counted eastward, int64, shape [N].
+
+    Returns:
+        The log with the rows that are used, and what they say of the cells.
+
+    Raises:
+        DatasetError: no drive is left for a split.
+    """
+    rows = log.rows.assign(row=row, column=column, split=tiling.split_of(row, column))
+    log = replace(log, rows=rows)
+    log = log.without("between_maps", (rows["split"] < 0).to_numpy())
+    splits = list(tiling.strips)
+    owner = _owners(log, splits)
+    log = log.without("other_split", log.rows["split"].to_numpy() != owner[log.rows["drive"]])
+    width = tiling.cells[1]
+    cell = log.rows["row"] * width + log.rows["column"]
+    driven = log.rows["traversability"].groupby(cell).agg(["mean", "count", "std"])
+    return log, DrivenCells(driven.index.to_numpy(), driven.to_numpy(np.float64).T, width)
+
+
+def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
+    """What the manifest says of the log that `drive_over` gives: what of it was used and left out."""
+    own = {split: log.rows[log.rows["split"] == place] for place, split in enumerate(splits)}
+    return {
+        "file": Path(log.settings.file).name,
+        "sha256": log.sha256,
+        "least_speed_m_s": log.settings.least_speed,
+        "ratio_limits": list(RATIO_LIMITS),
+        "rows": len(log.rows) + sum(log.left_out.values()),
+        "used": {split: len(rows) for split, rows in own.items()},
+        "left_out": dict(log.left_out),
+        "drives": {
+            split: [log.names[one] for one in np.unique(rows["drive"])] for split, rows in own.items()
+        },
+        "pace": pace(log.rows),
+    }
+
+
+def _owners(log: DriveLog, splits: Sequence[str]) -> ndarray:
+    """The split of each drive, index into the splits, shape [D]: as many rows as can be used, and none without a drive.
+
+    Every split gets a drive for which the fewest rows are lost by that; the others go where most of their rows lie.
+    """
+    counts = np.zeros((len(splits), len(log.names)))
+    np.add.at(counts, (log.rows["split"], log.rows["drive"]), 1)
+    owner = counts.argmax(axis=0)
+    lost = np.where(counts > 0, counts.max(axis=0) - counts, 2.0 * counts.sum() + 1)
+    chosen, drives = linear_sum_assignment(lost)
+    owner[drives] = chosen
+    empty = [splits[split] for split, drive in zip(chosen, drives, strict=True) if counts[split, drive] == 0]
+    if empty:
+        raise DatasetError(
+            f"Expected a drive of its own on the ground of each split, got none for {', '.join(empty)} in "
+            f"{log.settings.file}. Take fewer --splits, other shares, smaller maps, or drives over more ground."
+        )
+    return owner

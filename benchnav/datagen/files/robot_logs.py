@@ -1,0 +1,102 @@
+"""Tables that a robot logged, a row each time: CSV or TSV, packed or not, or Parquet.
+
+Text is read as text, so that a class may be called NA and a bad number is found in its row.
+"""
+
+import warnings
+import zlib
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from pandas.api.types import is_numeric_dtype
+
+from benchnav.core.errors import DatasetError
+from benchnav.core.settings import hint
+
+ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
+_MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
+
+
+def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path) -> None:
+    """Refuses a log that lacks a column.
+
+    Raises:
+        DatasetError: it does.
+    """
+    names = [str(name) for name in rows.columns]
+    if missing := [name for name in columns if name not in names]:
+        near = hint(missing[0], [name for name in names if name not in columns])
+        raise DatasetError(
+            f"Expected columns {', '.join(columns)} in {path}, got no {' and no '.join(missing)}. "
+            f"It has {', '.join(names) or 'none'}.{near}"
+        )
+
+
+def read_log(path: Path) -> pd.DataFrame:
+    """Reads a log, a file that ends in one of `ENDINGS`.
+
+    Raises:
+        DatasetError: there is no such file, or it cannot be read.
+    """
+    try:
+        if path.suffix == ".parquet":
+            return pd.read_parquet(path).reset_index(drop=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            rows = pd.read_csv(
+                path,
+                sep="\t" if ".tsv" in path.suffixes else ",",
+                dtype=str,
+                keep_default_na=False,
+                skipinitialspace=True,
+                index_col=False,
+            )
+        return rows.rename(columns=str.strip)
+    except (OSError, EOFError, ValueError, zlib.error, pd.errors.ParserWarning) as error:
+        why = [*str(error).strip().splitlines(), type(error).__name__]
+        raise DatasetError(
+            f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got one that cannot be read: {why[0]}"
+        ) from error
+
+
+def read_numbers(rows: pd.DataFrame, name: str, path: Path, limits: tuple[float, float]) -> np.ndarray:
+    """Gives the numbers of a column, float64, NaN where missing, shape [N].
+
+    Args:
+        rows: of a log.
+        name: of the column.
+        path: of the log.
+        limits: least and greatest value that may be.
+
+    Raises:
+        DatasetError: a value is no number, not finite, or beyond the limits.
+    """
+    column, (least, most) = rows[name], limits
+    text = column if is_numeric_dtype(column) else column.astype("string").str.strip()
+    values = pd.to_numeric(text, errors="coerce").to_numpy(np.float64, na_value=np.nan)
+    given = (text.notna() & ~text.isin(_MISSING)).to_numpy(bool)
+    bad = np.flatnonzero(given & ~((values >= least) & (values <= most) & np.isfinite(values)))
+    if len(bad):
+        within = f" within [{least:g}, {most:g}]" if np.isfinite(most) else ""
+        raise DatasetError(
+            f"Expected `{name}` to be numbers{within} in {path}, got {column.iloc[bad[0]]!s} in row "
+            f"{bad[0] + 1} below the header. Mend that row, or leave the value out."
+        )
+    return values
+
+
+def read_names(rows: pd.DataFrame, name: str, path: Path) -> np.ndarray:
+    """Gives the names of a column, such as those of classes or drives, as text, shape [N].
+
+    Raises:
+        DatasetError: a row has none.
+    """
+    text = rows[name].astype("string").str.strip().fillna("")
+    absent = text.index[text == ""]
+    if len(absent):
+        raise DatasetError(
+            f"Expected a `{name}` in every row of {path}, got none in row {absent[0] + 1} below the header."
+        )
+    return text.to_numpy(str)
