@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import beta, binomtest, bootstrap, norm
 
+from benchnav.core.resampling import sign_flips
 from benchnav.eval.stats.best import best_set_p
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.paired_difference import (
     sign_flip_p,
-    sign_flips,
     signed_rank_p,
     success_interval,
     total_time_interval,

@@ -11,6 +11,7 @@ from benchnav.models.config import (
     TrainOptions,
 )
 from benchnav.models.quality.command import evaluate
+from benchnav.models.quality.compare.command import compare
 
 _RESUMABLE = ("fit", "classifier", "all", "mdn")
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
@@ -135,6 +136,7 @@ def main() -> None:
         "all": Command(train_all, settings=TrainOptions),
         "mdn": Command(train_mdn, settings=TrainOptions),
         "evaluate": Command(evaluate, ("checkpoint",)),
+        "compare": Command(compare, ("models",)),
     }
     status = run("benchnav-train", "Train and measure models of traversability.", commands)
     if status == INTERRUPTED and sys.argv[1] in _RESUMABLE:

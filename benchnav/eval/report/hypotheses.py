@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchnav.core.resampling import LEAST_MAPS
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.words import count_range, p_in_words, p_value, signed
 from benchnav.eval.stats.comparison import ALPHA
-from benchnav.eval.stats.paired_difference import LEAST_MAPS
 
 _TESTS = {
     "difference": "differences by a sign-flip test by {unit}",

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from benchnav.core.figures import planner_name
+from benchnav.core.resampling import LEAST_MAPS
 from benchnav.core.tables import Bold, Table, to_latex
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.report.words import (
@@ -30,7 +31,6 @@ from benchnav.eval.report.words import (
 )
 from benchnav.eval.stats.best import PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
-from benchnav.eval.stats.paired_difference import LEAST_MAPS
 
 # What `follows` is where a planner follows the user's objective alone.
 _USERS_OWN = ("", "J")

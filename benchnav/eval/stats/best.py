@@ -15,11 +15,11 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
+from benchnav.core.resampling import sign_flips
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.unit import DRAW
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.paired_difference import (
-    sign_flips,
     smallest_difference,
     standard_deviation,
     success_interval,
@@ -76,7 +76,7 @@ def best_set_p(values: np.ndarray, flips: np.ndarray) -> tuple[np.ndarray, float
 
     Args:
         values: by map and condition, the higher the better, shape [M, K].
-        flips: from `paired_difference.sign_flips`, shape [ways, M].
+        flips: from `core.resampling.sign_flips`, shape [ways, M].
 
     Returns:
         p by condition, corrected for their number, shape [K], 1 for the best; and the least |t| that would be

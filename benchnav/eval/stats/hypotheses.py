@@ -15,9 +15,10 @@ import pandas as pd
 from scipy.optimize import brentq
 from statsmodels.stats.multitest import multipletests
 
+from benchnav.core.resampling import sign_flips
 from benchnav.eval.experiment.hypotheses import METRICS, Hypothesis
 from benchnav.eval.stats.comparison import ALPHA, gain_by_map, mean_differences, time_difference
-from benchnav.eval.stats.paired_difference import mean_interval, sign_flip_p, sign_flips, success_interval
+from benchnav.eval.stats.paired_difference import mean_interval, sign_flip_p, success_interval
 from benchnav.eval.stats.pairs import side_by_side
 from benchnav.eval.stats.summary import time_budgets
 
@@ -40,7 +41,7 @@ def test_hypotheses(
         `unit` of all that follows; `n_maps`, of which a group counts as one, and `n_episodes` of each condition;
         `mean_one`, `mean_other`, `difference`, and the ends of its 95 % and 90 % intervals, `low`, `high`, `low_90`,
         `high_90`; `p`, after Holm's correction `p_holm`; and `supported`, true where `p_holm` is under 0.05. Under
-        `paired_difference.LEAST_MAPS` maps a difference of anything but success has no interval.
+        `core.resampling.LEAST_MAPS` maps a difference of anything but success has no interval.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
     made = []

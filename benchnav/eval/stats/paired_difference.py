@@ -10,11 +10,11 @@ import math
 import numpy as np
 from scipy.stats import binom, norm, rankdata, t, wilcoxon
 
-POWER = 0.8
-LEAST_MAPS = 8  # for an interval of a time
+from benchnav.core.resampling import LEAST_MAPS
 
-# Up to so many maps signs are flipped in all ways, beyond in so many drawn ones.
-_ALL_FLIPPED, _FLIPS = 13, 9_999
+POWER = 0.8
+# Up to so many maps a test is exact.
+_EXACT = 13
 
 
 def by_map(values: np.ndarray, maps: np.ndarray) -> np.ndarray:
@@ -107,22 +107,6 @@ def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
     return min(float(chances[far].sum()), 1.0)
 
 
-def sign_flips(maps: int) -> np.ndarray:
-    """Ways to flip the sign of each map's differences: all of them on few maps, else as they are and 9 999 draws.
-
-    Args:
-        maps: M.
-
-    Returns:
-        ±1, shape [ways, M].
-    """
-    if maps <= _ALL_FLIPPED:
-        bits = np.arange(2**maps)[:, None] >> np.arange(maps) & 1
-        return 1.0 - 2.0 * bits
-    drawn = np.random.default_rng(0).integers(0, 2, (_FLIPS, maps), dtype=np.int8)
-    return np.concatenate([np.ones((1, maps)), 1.0 - 2.0 * drawn])
-
-
 def mean_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean over maps with Student's interval.
 
@@ -190,7 +174,7 @@ def signed_rank_p(late: np.ndarray) -> float:
     Args:
         late: difference of time by map, shape [M].
     """
-    if len(late) > _ALL_FLIPPED:
+    if len(late) > _EXACT:
         return float(wilcoxon(late).pvalue) if np.any(late) else 1.0
     differing = late[late != 0]
     # Whole numbers, those of ties too.

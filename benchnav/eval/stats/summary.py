@@ -131,7 +131,7 @@ def total_time_mean(episodes: pd.DataFrame, world: Mapping[str, Any]) -> tuple[f
         world: of the condition, as `run.json` holds it.
 
     Returns:
-        Mean and ends in seconds; the ends are NaN where there are fewer than `paired_difference.LEAST_MAPS` maps.
+        Mean and ends in seconds; the ends are NaN where there are fewer than `core.resampling.LEAST_MAPS` maps.
     """
     success, maps = episodes["success"].to_numpy(dtype=bool), episodes["group"].to_numpy()
     taken, budgets = episodes["total_time_s"].to_numpy(), time_budgets(episodes, world)

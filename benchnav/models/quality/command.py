@@ -1,13 +1,12 @@
 """The command `benchnav-train evaluate`: whether a model's probabilities can be trusted."""
 
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 from benchnav.core.command import Device
+from benchnav.models.quality.output import DPI, FIGURES, check_folder, check_writable
 
-REPORT, CSV, PAGE, FIGURES = "quality.json", "quality.csv", "quality.md", "figures"
-DPI = 300
+REPORT, CSV, PAGE = "quality.json", "quality.csv", "quality.md"
 
 
 def evaluate(
@@ -45,21 +44,30 @@ def evaluate(
     check_seed(seed)
     expect(maps >= 0, f"`maps` ≥ 0, got {maps}. 0 leaves the map sheets out.")
     target, folder = output_path(json), output_path(out)
-    _check_targets(target if json else None, folder if out else None, overwrite)
+    if json:
+        expect(
+            target.parent.is_dir() and not target.is_dir(),
+            f"`json` to be a file in a folder that exists, got {target}. Make {target.parent} first.",
+        )
+        check_writable(target)
+    if out:
+        check_folder(folder, overwrite, (REPORT, CSV, PAGE), "an evaluation")
     dataset = TerrainDataset(find_dataset(data))
     expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
 
     from benchnav.core.device import find_device
     from benchnav.core.figures import save_twice
     from benchnav.models.predictor import load_model, trained_on
-    from benchnav.models.quality.measure import choose_splits, nearest_colour_accuracy
+    from benchnav.models.quality.baselines import baselines_of
+    from benchnav.models.quality.measure import choose_splits
     from benchnav.models.quality.measure import evaluate as evaluate_model
     from benchnav.models.quality.report import (
+        notes_of_data,
+        notes_of_model,
         quality_csv,
         quality_figures,
         quality_json,
         quality_markdown,
-        quality_notes,
         quality_table,
     )
 
@@ -75,10 +83,10 @@ def evaluate(
     show_progress(steps(), "splits")
     title = f"{checkpoint} on {dataset.id}"
     print_table(quality_table(title, qualities))
-    by_colour: dict[str, float] = {}
-    if all(quality.classes for quality in qualities.values()):
-        by_colour = {split: nearest_colour_accuracy(dataset, split) for split in chosen}
-    notes = quality_notes(model, dataset, qualities, by_colour, trained_on(checkpoint))
+    with_classes = [split for split, quality in qualities.items() if quality.classes]
+    baselines = baselines_of(dataset, chosen, with_classes)
+    notes = notes_of_data(dataset, chosen, baselines)
+    notes += notes_of_model(model, dataset, qualities, baselines, trained_on(checkpoint))
     for note in notes:
         print(note)
     about = {
@@ -87,7 +95,8 @@ def evaluate(
         "seed": seed,
         "device": place.type,
         "package_version": __version__,
-        "nearest_colour_accuracy": by_colour,
+        "nearest_colour_accuracy": baselines.nearest_colour_accuracy,
+        "climatology_crps": baselines.climatology_crps,
         "truth": {split: dataset.truth_of(split) for split in chosen},
         "notes": notes,
     }
@@ -117,30 +126,3 @@ def evaluate(
         print(line)
     print(f"wrote {REPORT}, {CSV}, {PAGE} and {len(paths)} figures in {out}")
     print(f"what the columns and figures mean: {folder / PAGE}")
-
-
-def _check_targets(json: Path | None, out: Path | None, overwrite: bool) -> None:
-    """Refuses what cannot be written to before any work is done."""
-    from benchnav.core.errors import expect
-    from benchnav.core.store import refuse_taken
-
-    if json:
-        expect(
-            json.parent.is_dir() and not json.is_dir(),
-            f"`json` to be a file in a folder that exists, got {json}. Make {json.parent} first.",
-        )
-    if out:
-        refuse_taken(out, overwrite, _foreign)
-    for path in (path for path in (json, out and out / REPORT) if path):
-        nearest = next(parent for parent in path.absolute().parents if parent.exists())
-        try:
-            with tempfile.TemporaryFile(dir=nearest):
-                pass
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(path)) from error
-
-
-def _foreign(folder: Path) -> str:
-    """Says why what is at a place is no evaluation; empty where it is one. For `refuse_taken`."""
-    own = folder.is_dir() and {item.name for item in folder.iterdir()} <= {REPORT, CSV, PAGE, FIGURES}
-    return "" if own else "is something else than an evaluation"

@@ -8,7 +8,7 @@ cells of all maps.
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -26,6 +26,7 @@ from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, predict
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import class_mismatch
+from benchnav.models.quality.map_sums import CellScores, MapTally
 from benchnav.models.quality.scores import (
     PIT_BINS,
     ErrorRanking,
@@ -116,11 +117,13 @@ class Quality:
         maps: how many maps were predicted.
         traversability: of the distributions.
         classes: of the class probabilities; empty for a model that predicts no classes, and on maps without any.
+        by_map: what a comparison needs, where it was asked for.
     """
 
     maps: int
     traversability: TraversabilityQuality
     classes: tuple[ClassQuality, ...]
+    by_map: MapTally | None = field(default=None, compare=False, repr=False)
 
 
 def choose_splits(
@@ -137,6 +140,18 @@ def choose_splits(
         DatasetError: there is no such split, or no test split.
         CheckpointError: the model was trained on another class table.
     """
+    chosen = known_splits(dataset, splits)
+    if why := class_mismatch(model, dataset.recipe):
+        raise CheckpointError(f"{why}. Train it on a dataset with this class table.")
+    return chosen
+
+
+def known_splits(dataset: TerrainDataset, splits: Iterable[str] = ()) -> list[str]:
+    """Tells which splits are to be measured, as `choose_splits`, whatever the model.
+
+    Raises:
+        DatasetError: there is no such split, or no test split.
+    """
     chosen = list(dict.fromkeys(splits)) or [name for name in dataset.splits if name.startswith("test/")]
     if not chosen:
         raise DatasetError(
@@ -144,8 +159,6 @@ def choose_splits(
         )
     for split in chosen:
         dataset.map_count(split)  # refuses an unknown one
-    if why := class_mismatch(model, dataset.recipe):
-        raise CheckpointError(f"{why}. Train it on a dataset with this class table.")
     return chosen
 
 
@@ -172,12 +185,34 @@ def evaluate(
         DatasetError: there is no such split, or no test split.
         CheckpointError: the model was trained on another class table.
     """
-    alike = look_alike_classes(dataset.recipe.classes)
     for split in choose_splits(model, dataset, splits):
-        truth = dataset.truth_of(split) == "generated"
-        generator = rng.generator(rng.stream_key(seed, "models", "pit", split))
-        chunks = (terrain.to(device) for terrain in dataset.terrain_chunks(split))
-        yield split, measure(model, chunks, generator, alike, truth)
+        yield split, measure_split(model, dataset, split, seed, device)
+
+
+def measure_split(
+    model: TraversabilityModel,
+    dataset: TerrainDataset,
+    split: str,
+    seed: int = 0,
+    device: torch.device = CPU,
+    by_map: bool = False,
+) -> Quality:
+    """Measures a model on one split; by its λ alone where it knows other classes than the maps.
+
+    Args:
+        model: any model.
+        dataset: the maps.
+        split: which split.
+        seed: root seed of the draws within atoms, the same for every model.
+        device: where to compute.
+        by_map: keep what a comparison needs, which takes quantiles of every cell.
+    """
+    alike = look_alike_classes(dataset.recipe.classes)
+    truth = dataset.truth_of(split) == "generated"
+    generator = rng.generator(rng.stream_key(seed, "models", "pit", split))
+    chunks = (terrain.to(device) for terrain in dataset.terrain_chunks(split))
+    classes = not class_mismatch(model, dataset.recipe)
+    return measure(model, chunks, generator, alike, truth, by_map, classes)
 
 
 def measure(
@@ -186,6 +221,8 @@ def measure(
     generator: torch.Generator,
     alike: Sequence[tuple[int, ...]] = (),
     truth: bool = True,
+    by_map: bool = False,
+    classes: bool = True,
 ) -> Quality:
     """Measures a model on some maps.
 
@@ -195,35 +232,43 @@ def measure(
         generator: of the draws within atoms, on the CPU.
         alike: of each class those that look like it, itself among them; empty where none do.
         truth: whether the maps' true distribution of λ is known.
+        by_map: keep what a comparison needs, which takes quantiles of every cell.
+        classes: measure the model's classes, where it tells any.
     """
     maps, histogram = 0, torch.zeros(PIT_BINS, dtype=torch.int64)
     sums: dict[str, float] = defaultdict(float)
-    tally = _ClassTally(len(model.class_names), alike)
+    tally = _ClassTally(len(model.class_names) if classes else 0, alike)
+    kept = MapTally(tally.count, truth) if by_map else None
     for terrain in chunks:
         predicted, members = _predict(model, terrain)
-        scores, transformed = _score_cells(predicted, terrain, generator, isinstance(model, PrivilegedModel))
-        for name, score in scores.items():
-            sums[name] += score
-        histogram += pit_counts(transformed)
+        cells = _score_cells(predicted, terrain, generator, isinstance(model, PrivilegedModel))
+        if cells is not None:
+            for name, score in _summed(cells).items():
+                sums[name] += score
+            histogram += pit_counts(cells.transformed)
         maps += len(terrain)
         if tally.count:
-            tally.add(
-                predicted.class_probabilities(tally.count), members, terrain.class_id, terrain.slope_deg
-            )
-    cells = sums["cells"]
-    if not cells:
+            probabilities = predicted.class_probabilities(tally.count)
+            tally.add(probabilities, members, terrain.class_id, terrain.slope_deg)
+        if kept:
+            kept.add(cells, len(terrain))
+        if kept and tally.count:
+            kept.add_classes(probabilities, terrain.class_id)
+    total = sums["cells"]
+    if not total:
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
-    means: Any = {name: sums[name] / cells for name in ("nll", "crps", "coverage", "tail_rate")}
+    means: Any = {name: sums[name] / total for name in ("nll", "crps", "coverage", "tail_rate")}
     known = truth and sums["labelled"]
     return Quality(
         maps=maps,
         traversability=TraversabilityQuality(
-            rmse_observed=(sums["squares"] / cells) ** 0.5,
+            rmse_observed=(sums["squares"] / total) ** 0.5,
             rmse_expected=(sums["expected_squares"] / known) ** 0.5 if known else math.nan,
             **means,
             pit=tuple(histogram.tolist()),
         ),
         classes=(tally.quality(),) if tally.confusion.any() else (),
+        by_map=kept,
     )
 
 
@@ -309,56 +354,43 @@ def _in_a_row(layers: Tensor, which: Tensor) -> Tensor:
 
 def _score_cells(
     predicted: TraversabilityDistribution, terrain: Terrain, generator: torch.Generator, privileged: bool
-) -> tuple[dict[str, float], Tensor]:
-    """What is summed over cells, by name; and every PIT.
+) -> CellScores | None:
+    """What is said of each cell whose λ was observed, None where there are none.
 
-    `expected_squares` are the squared errors of E[λ], of the `labelled` cells. Cells whose λ was not observed are left
-    out; of a privileged model, which says nothing where no class is known, those without a class as well.
+    Of a privileged model, which says nothing where no class is known, cells without a class are left out as well.
     """
     labelled = terrain.class_id != UNLABELLED
     known = ~terrain.traversability.isnan()
     known = known & labelled if privileged else known
     if not bool(known.any()):
-        return {}, torch.zeros(0)
+        return None
     predicted, observed = predicted.at(known), terrain.traversability[known].unsqueeze(0)
     expected, transformed = predicted.mean(), pit(predicted, observed, generator)
-    cells = transformed.numel()
-    errors = (expected - terrain.truth.at(known).mean())[0, labelled[known]].double().square()
-    sums: dict[str, Any] = {
-        "cells": cells,
-        "squares": (expected - observed).double().square().sum(),
-        "nll": -predicted.log_prob(observed).double().sum(),
-        "crps": predicted.crps(observed).double().sum(),
-        "coverage": coverage(transformed) * cells,
-        "tail_rate": tail_rate(transformed) * cells,
-        "expected_squares": errors.sum(),
-        "labelled": errors.numel(),
+    labelled = labelled[known]
+    return CellScores(
+        predicted=predicted,
+        observed=observed,
+        expected=expected,
+        transformed=transformed,
+        maps=known.nonzero()[:, 0],
+        scores={
+            "squares": (expected - observed).double().square(),
+            "nll": -predicted.log_prob(observed).double(),
+            "crps": predicted.crps(observed).double(),
+        },
+        labelled=labelled,
+        expected_squares=(expected - terrain.truth.at(known).mean())[0, labelled].double().square(),
+    )
+
+
+def _summed(cells: CellScores) -> dict[str, float]:
+    """What is summed over cells, by name."""
+    count = cells.transformed.numel()
+    return {
+        "cells": float(count),
+        **{name: float(score.sum()) for name, score in cells.scores.items()},
+        "coverage": coverage(cells.transformed) * count,
+        "tail_rate": tail_rate(cells.transformed) * count,
+        "expected_squares": float(cells.expected_squares.sum()),
+        "labelled": float(cells.expected_squares.numel()),
     }
-    return {name: float(value) for name, value in sums.items()}, transformed
-
-
-def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
-    """Takes for each cell the class whose colour in full light is nearest, by Euclidean distance.
-
-    Args:
-        rgb: 0–255, shape [B, 3, H, W].
-        colours: of the classes, 0–255, shape [C, 3].
-
-    Returns:
-        Class indices, int64, shape [B, H, W]; of classes equally near the first.
-    """
-    pixels = rgb.movedim(1, -1).float().flatten(1, 2)
-    distance = torch.cdist(pixels, colours.float().expand(len(rgb), -1, -1))
-    return distance.argmin(-1).view_as(rgb[:, 0])
-
-
-def nearest_colour_accuracy(dataset: TerrainDataset, split: str) -> float:
-    """Share of a split's labelled cells whose class `nearest_colour` tells."""
-    colours = torch.tensor([item.colour for item in dataset.recipe.classes])
-    right, cells = 0, 0
-    for _, maps in dataset.chunks(split, ("rgb", "class_id")):
-        found = nearest_colour(torch.from_numpy(maps["rgb"]), colours)
-        class_id = torch.from_numpy(maps["class_id"])
-        right += int((found == class_id).sum())
-        cells += int((class_id != UNLABELLED).sum())
-    return right / max(1, cells)

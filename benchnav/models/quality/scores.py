@@ -11,7 +11,8 @@ The entropy of a prediction is its whole uncertainty. Of an ensemble, the part t
 not share (mutual information of class and member, "BALD") is the epistemic one: what more training
 data would settle. In nats. Sources: Houlsby et al. (2011), "Bayesian active learning for
 classification and preference learning"; Lakshminarayanan et al. (2017), "Simple and scalable
-predictive uncertainty estimation using deep ensembles".
+predictive uncertainty estimation using deep ensembles". Sparsification: Ilg et al. (2018), "Uncertainty
+estimates and multi-hypotheses networks for optical flow".
 
 Of classes that look alike, which are shown together, a perfect classifier says 1/2 each. So accuracy is
 also given with them merged into one class, and of the shares of the single classes within that one whether
@@ -34,6 +35,8 @@ from benchnav.core.distribution import TraversabilityDistribution
 LEVEL = 0.9
 CONFIDENCE_BINS = 15
 PIT_BINS = 20
+LOWER_FIFTH = tuple(percent / 100 for percent in range(1, 21))
+TAIL_LEVELS = (0.8, 0.9, 0.95)
 
 _DROPPED_BITS = 13  # of a float32's 23 fraction bits: scores that differ by over 0.1 % are distinct
 _PLACES = 2 ** (31 - _DROPPED_BITS)
@@ -64,15 +67,63 @@ def coverage(transformed: Tensor) -> float:
     return float(((transformed - 0.5).abs() <= LEVEL / 2).double().mean())
 
 
-def tail_rate(transformed: Tensor) -> float:
-    """Share of observations under the VaR at level 0.9; ideally 0.1.
+def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
+    """Share of observations under the VaR at a level α; ideally 1 − α.
 
     Where the VaR is 0 or 1 it lies on an atom, and the draw within the atom decides.
 
     Args:
         transformed: from `pit`, any shape.
+        level: α.
     """
-    return float((transformed < 1 - LEVEL).double().mean())
+    return float((transformed < 1 - level).double().mean())
+
+
+def lower_fifth_and_width(
+    distribution: TraversabilityDistribution, observed: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Pinball loss of the lower fifth, and width of the central 90 %.
+
+    The loss is the mean over the levels u = 0.01, 0.02, …, 0.20 of max(u·(λ − Q(u)), (u − 1)·(λ − Q(u))), a proper
+    score of these quantiles alone (Koenker and Bassett, 1978; Gneiting and Raftery, 2007, 6.1).
+
+    Args:
+        distribution: predicted, of shape [*B, H, W].
+        observed: λ in [0, 1], shape [*B, H, W].
+
+    Returns:
+        Loss, and Q(0.95) − Q(0.05), each float64, of shape [*B, H, W].
+    """
+    loss = torch.zeros_like(observed, dtype=torch.float64)
+    low = loss
+    for level in LOWER_FIFTH:
+        quantile = distribution.quantile(level).double()
+        gap = observed - quantile
+        loss = loss + torch.maximum(level * gap, (level - 1) * gap) / len(LOWER_FIFTH)
+        low = quantile if level == 0.05 else low
+    return loss, distribution.quantile(0.95).double() - low
+
+
+def sparsification(error: Tensor, uncertainty: Tensor) -> Tensor:
+    """Mean error of the cells that are left when the most uncertain ones are left out, one after another.
+
+    Cells whose uncertainty is within 0.1 % of each other count as equally uncertain, so that none of them goes first.
+    The mean of the first row less the second is the area under the sparsification error curve (AUSE): 0 where the
+    uncertainty ranks cells as their errors do.
+
+    Args:
+        error: of each cell, ≥ 0, shape [N].
+        uncertainty: of each cell, ≥ 0, shape [N].
+
+    Returns:
+        Of the 1, 2, …, N least uncertain cells, and of those with the least error, float64, shape [2, N].
+    """
+    error = error.double()
+    _, member = torch.unique(_in_order(uncertainty), return_inverse=True)
+    cells = torch.bincount(member)
+    tied = torch.bincount(member, error) / cells
+    ranked = torch.stack([tied.repeat_interleave(cells), error.sort().values])
+    return ranked.cumsum(1) / torch.arange(1, len(error) + 1, device=error.device)
 
 
 def pit_counts(transformed: Tensor) -> Tensor:
@@ -160,6 +211,12 @@ def _bin(values: Tensor, count: int) -> Tensor:
     return (values * count).floor().long().clamp(0, count - 1).flatten()
 
 
+def _in_order(score: Tensor) -> Tensor:
+    """The place of each score ≥ 0 in steps of 0.1 %, int64, of the same shape."""
+    # The bits of a float ≥ 0, read as an integer, are in the order of the floats.
+    return score.float().clamp(min=0).abs().view(torch.int32).long() >> _DROPPED_BITS
+
+
 def predictive_entropy(probabilities: Tensor) -> Tensor:
     """Entropy −Σ_c p_c ln p_c of the class in each cell.
 
@@ -201,9 +258,7 @@ class ErrorRanking:
 
     def update(self, score: Tensor, wrong: Tensor) -> None:
         """Adds cells: scores ≥ 0, and whether each is wrongly classified, of one shape."""
-        # The bits of a float ≥ 0, read as an integer, are in the order of the floats.
-        place = score.float().clamp(min=0).abs().view(torch.int32).long() >> _DROPPED_BITS
-        counted = torch.bincount((place + wrong * _PLACES).flatten(), minlength=2 * _PLACES)
+        counted = torch.bincount((_in_order(score) + wrong * _PLACES).flatten(), minlength=2 * _PLACES)
         self.counts += counted.view(2, _PLACES).cpu()
         self.total += float(score.double().sum())
 

@@ -3,8 +3,9 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
+from benchnav.core.resampling import sign_flips
 from benchnav.eval.stats.best import PRIVILEGED, against_best, best_set_p, competing, privileged_models
-from benchnav.eval.stats.paired_difference import sign_flip_p, sign_flips
+from benchnav.eval.stats.paired_difference import sign_flip_p
 from tests.eval.report import made
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}

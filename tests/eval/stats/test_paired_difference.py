@@ -6,12 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import PermutationMethod, binomtest, permutation_test, t, ttest_1samp, wilcoxon
 
+from benchnav.core.resampling import sign_flips
 from benchnav.eval.stats.paired_difference import (
     by_map,
     maps_needed,
     mean_interval,
     sign_flip_p,
-    sign_flips,
     signed_rank_p,
     smallest_difference,
     standard_deviation,

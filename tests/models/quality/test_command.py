@@ -11,8 +11,9 @@ from benchnav.core import registry
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.cli import main
 from benchnav.models.predictor import Oracle
-from benchnav.models.quality import map_sheet, measure
-from benchnav.models.quality.measure import evaluate, nearest_colour_accuracy
+from benchnav.models.quality import baselines, map_sheet
+from benchnav.models.quality.baselines import nearest_colour_accuracy
+from benchnav.models.quality.measure import evaluate
 from tests.models.stub import ColourModel
 
 
@@ -216,7 +217,7 @@ def test_a_model_that_is_right_less_often_than_the_nearest_colour_is_told_so(
 ) -> None:
     monkeypatch.setattr("benchnav.models.quality.command.DPI", 30)
     shares = {"test/std": 0.999, "test/hs": 0.0}
-    monkeypatch.setattr(measure, "nearest_colour_accuracy", lambda _, split: shares[split])
+    monkeypatch.setattr(baselines, "nearest_colour_accuracy", lambda _, split: shares[split])
     line = "warning: the model is right less often than the nearest colour on test/std"
     out = tmp_path / "quality"
     assert call(monkeypatch, "colours", "--data", dataset.path, "--out", out, "--maps", 0) == 0

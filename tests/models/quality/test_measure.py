@@ -17,12 +17,11 @@ from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.base import TraversabilityModel
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import Oracle
+from benchnav.models.quality.baselines import nearest_colour, nearest_colour_accuracy
 from benchnav.models.quality.measure import (
     choose_splits,
     evaluate,
     measure,
-    nearest_colour,
-    nearest_colour_accuracy,
 )
 from benchnav.models.quality.scores import mutual_information, predictive_entropy
 from benchnav.models.slope_gp.cells import measure_latent

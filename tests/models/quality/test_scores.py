@@ -3,12 +3,13 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 from scipy.stats import entropy, mannwhitneyu
 from torch import Tensor
 from torchmetrics.functional.classification import multiclass_calibration_error
@@ -30,10 +31,12 @@ from benchnav.models.quality.scores import (
     brier_score,
     calibration_error,
     coverage,
+    lower_fifth_and_width,
     mutual_information,
     pit,
     pit_counts,
     predictive_entropy,
+    sparsification,
     tail_rate,
 )
 from tests.factories import draw
@@ -382,6 +385,61 @@ def test_a_dataset_without_look_alikes_has_no_such_numbers(dataset: TerrainDatas
         json.loads(quality_json({}, qualities))["splits"]["test/std"]
     )
     assert "look-alike" not in quality_csv(qualities)
+
+
+def test_the_pinball_loss_is_that_of_the_closed_form_quantiles() -> None:
+    mixture = single(0.5, 0.05, (1, 201))
+    observed = torch.linspace(0.2, 0.8, 201, dtype=torch.float64)[None]
+    loss, width = lower_fifth_and_width(mixture, observed)
+    levels = np.arange(1, 21) / 100
+    gap = observed.numpy()[0][:, None] - (0.5 + 0.05 * ndtri(levels))
+    exact = np.where(gap >= 0, levels * gap, (levels - 1) * gap).mean(1)
+    np.testing.assert_allclose(loss[0].numpy(), exact, atol=1e-6)
+    np.testing.assert_allclose(width.numpy(), 2 * ndtri(0.95) * 0.05, atol=1e-6)
+
+
+def test_the_pinball_loss_is_least_where_the_lower_fifth_is_right_and_blind_to_the_rest() -> None:
+    drawn = torch.rand(1, 4000, generator=generator(), dtype=torch.float64)
+
+    def loss(values: Tensor) -> float:
+        knots = values.view(-1, 1, 1).expand(-1, 1, 4000).contiguous()
+        return float(lower_fifth_and_width(QuantileDistribution(knots, LEVELS), drawn)[0].mean())
+
+    levels = torch.tensor(LEVELS, dtype=torch.float64)
+    right = loss(torch.from_numpy(np.quantile(drawn.numpy(), LEVELS)))
+    assert right < loss(levels + 0.02 * (1 - levels))
+    assert right < loss(levels * 0.9)
+    upper = torch.where(levels > 0.21, 0.6 + 0.4 * levels, levels)
+    assert loss(upper) == pytest.approx(loss(levels), abs=1e-12)
+    # Of uniform λ the expected loss at a level u is u(1 − u)/2.
+    assert loss(levels) == pytest.approx(np.mean([u * (1 - u) / 2 for u in np.arange(1, 21) / 100]), rel=0.05)
+
+
+def test_tail_rates_are_counted_at_any_level() -> None:
+    transformed = torch.linspace(0, 1, 1001)
+    assert [tail_rate(transformed, level) for level in (0.8, 0.95)] == pytest.approx([0.2, 0.05], abs=2e-3)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 300), st.integers(0, 2**31))
+def test_sparsification_is_a_direct_sort(cells: int, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    error = random.random(cells)
+    uncertainty = np.geomspace(0.01, 1.0, cells)[random.permutation(cells)] if cells > 1 else np.ones(1)
+    if cells > 300 or np.diff(np.sort(np.log(uncertainty))).min(initial=1) < 2e-3:
+        uncertainty = uncertainty**3
+    curves = sparsification(torch.from_numpy(error), torch.from_numpy(uncertainty)).numpy()
+    for row, order in zip(curves, (np.argsort(uncertainty), np.argsort(error)), strict=True):
+        by_hand = [error[order[: left + 1]].mean() for left in range(cells)]
+        np.testing.assert_allclose(row, by_hand, atol=1e-12)
+
+
+def test_sparsification_by_the_error_itself_has_no_area_and_by_nothing_is_flat() -> None:
+    error = torch.linspace(0.1, 1, 50)[torch.randperm(50, generator=generator())]
+    own = sparsification(error, error)
+    torch.testing.assert_close(own[0], own[1])
+    flat, _ = sparsification(error, torch.full_like(error, 0.3))
+    torch.testing.assert_close(flat, torch.full_like(flat, float(error.double().mean())))
 
 
 def test_pit_is_drawn_within_any_atom() -> None:

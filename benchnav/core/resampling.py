@@ -1,0 +1,40 @@
+"""What a mean over maps might have been: ways to flip signs, for tests, and to draw maps anew, for intervals.
+
+All draws are those of one fixed seed, so that the same numbers give the same p and the same interval.
+"""
+
+import numpy as np
+
+LEAST_MAPS = 8  # for an interval of what may have any distribution
+
+# Up to so many maps signs are flipped in all ways, beyond in so many drawn ones.
+_ALL_FLIPPED, _FLIPS = 13, 9_999
+_RESAMPLES = 2_000
+
+
+def sign_flips(maps: int) -> np.ndarray:
+    """Ways to flip the sign of each map's differences: all of them on few maps, else as they are and 9 999 draws.
+
+    Args:
+        maps: M.
+
+    Returns:
+        ±1, shape [ways, M].
+    """
+    if maps <= _ALL_FLIPPED:
+        bits = np.arange(2**maps)[:, None] >> np.arange(maps) & 1
+        return 1.0 - 2.0 * bits
+    drawn = np.random.default_rng(0).integers(0, 2, (_FLIPS, maps), dtype=np.int8)
+    return np.concatenate([np.ones((1, maps)), 1.0 - 2.0 * drawn])
+
+
+def bootstrap_counts(maps: int) -> np.ndarray:
+    """How often each map is in one of 2 000 samples of as many maps, drawn with replacement (Efron, 1979).
+
+    Args:
+        maps: M.
+
+    Returns:
+        Whole numbers whose rows add up to M, float64, shape [2000, M].
+    """
+    return np.random.default_rng(0).multinomial(maps, np.full(maps, 1 / maps), _RESAMPLES).astype(float)

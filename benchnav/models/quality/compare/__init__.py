@@ -1,0 +1,1 @@
+"""Compares several models on the same maps."""

@@ -1,0 +1,279 @@
+"""A comparison in numbers and words: a table for each kind of file, and what columns and figures mean."""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from benchnav.core.resampling import LEAST_MAPS
+from benchnav.core.tables import NOTHING, Bold, Table, to_markdown
+from benchnav.datagen.recipe.scenario import find_series
+from benchnav.models.quality.compare.paired import ALPHA, MEASURES
+from benchnav.models.quality.map_sums import MapTally
+from benchnav.models.quality.report import COLUMNS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Of the numbers that are compared: the heading in two lines, and what it means. Those of `evaluate` mean the same here.
+HEADINGS = {
+    name: COLUMNS[name]
+    for name in ("accuracy", "miou", "rmse_expected", "rmse_observed", "nll", "crps", "coverage")
+} | {
+    "pinball": (
+        "pinball\nfifth",
+        "pinball loss of the lower fifth: the mean over the levels u = 0.01, 0.02, …, 0.20 of u·(λ − Q(u)) where λ is "
+        "at least the quantile Q(u), else of (1 − u)·(Q(u) − λ); it scores the bad end of the prediction alone, and "
+        "lower is better.",
+    ),
+    "width": (
+        "width\n90 %",
+        "sharpness: mean width Q(0.95) − Q(0.05) of the central 90 % interval; narrower says more, if “in 90 %” is "
+        "right.",
+    ),
+    "tail_error": (
+        "tail\nerror",
+        "tail calibration: how far the share of observed λ under the VaR at 0.8, 0.9 and 0.95 is from 0.2, 0.1 and "
+        "0.05, in the mean of the three; 0 is perfect.",
+    ),
+    "ause": (
+        "AUSE\n",
+        "area under the sparsification error curve: by how much the mean error |λ − E[λ]| of the cells that are left "
+        "is larger when the cells with the widest interval are left out one after another than when those with the "
+        "largest error are; on each map, in the mean over maps; 0 is perfect, and noise of the ground keeps any model "
+        "above it.",
+    ),
+    "prediction_ms": (
+        "ms a\nmap",
+        "median time of the prediction of one map alone in milliseconds.",
+    ),
+    "parameters": (
+        "param-\neters",
+        "number of weights of all networks of the model.",
+    ),
+}  # fmt: skip
+ORDER = (*MEASURES, "prediction_ms", "parameters")
+PRIVILEGED_MARK = " †"
+
+FIGURES = {
+    "measures": (
+        "Measures with their intervals",
+        "A row a model; marks are splits, and lines 95 % intervals over maps. Names in grey are of privileged models.",
+    ),
+    "calibration": (
+        "Whether the predicted distributions of λ can be trusted",
+        "How much more often than it should λ was under a quantile of its prediction, over the level of the quantile: "
+        "0 is calibrated. Above 0 at the left, bad ground comes more often than predicted.",
+    ),
+    "sparsification": (
+        "Whether uncertainty finds the errors",
+        "Mean error |λ − E[λ]| of the cells of a map that are left, over the share that was left out: the most "
+        "uncertain ones first (lines), or those with the largest error first (dotted). The area between is AUSE.",
+    ),
+    "severity": (
+        "Quality over the severity of a shift",
+        "CRPS and pinball loss of the lower fifth over the severity of each scenario, from 0, the maps of training, to "
+        "the scenario itself at 1; lines are 95 % intervals over maps.",
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What was measured of several models.
+
+    Args:
+        models: by label what is said of it, such as `source`, `privileged`, `parameters`, `prediction_ms`; those that
+            compete first.
+        summary: from `paired.summarise` of each split.
+        pairs: from `paired.compare_pairs` of each split.
+        best: from `paired.against_best`.
+        tallies: by split and model.
+    """
+
+    models: Mapping[str, Mapping[str, Any]]
+    summary: pd.DataFrame
+    pairs: pd.DataFrame
+    best: pd.DataFrame
+    tallies: Mapping[tuple[str, str], MapTally]
+
+    @property
+    def splits(self) -> list[str]:
+        """Those that were measured."""
+        return list(dict.fromkeys(self.summary["split"]))
+
+    @property
+    def numbers(self) -> pd.DataFrame:
+        """The summary with what each model costs."""
+        costs = pd.DataFrame(
+            [
+                {"model": label, **{name: about[name] for name in ("prediction_ms", "parameters")}}
+                for label, about in self.models.items()
+            ]
+        )
+        return self.summary.merge(costs, on="model", how="left")
+
+
+def comparison_table(title: str, comparison: Comparison, whole: bool = False) -> Table:
+    """Formats the numbers, a row a split and model; a number that there is not has a dash.
+
+    Args:
+        title: over the table.
+        comparison: what was measured.
+        whole: with both errors of E[λ]; else that to λ as observed stands where the other is unknown alone.
+    """
+    numbers = comparison.numbers
+    shown = [name for name in ORDER if name in numbers and numbers[name].notna().any()]
+    if not whole and numbers.get("rmse_expected", pd.Series([math.nan])).notna().all():
+        shown.remove("rmse_observed")
+    best = comparison.best
+    marked = {(row["split"], row["model"], row["measure"]) for row in best[best["marked"]].to_dict("records")}
+    rows = []
+    for row in numbers.to_dict("records"):
+        privileged = comparison.models[row["model"]]["privileged"]
+        cells = [row["split"], row["model"] + PRIVILEGED_MARK * privileged]
+        for name in shown:
+            text = _cell(name, row[name])
+            cells.append(Bold(text) if (row["split"], row["model"], name) in marked else text)
+        rows.append(tuple(cells))
+    explained = [(" ".join(heading.split()), text) for heading, text in (HEADINGS[name] for name in shown)]
+    return Table(
+        title=title,
+        headings=("split\n", "model\n", *(HEADINGS[name][0] for name in shown)),
+        labels=2,
+        numbers=True,
+        rows=tuple(rows),
+        bold_note=_BOLD if marked else "",
+        explained=(
+            ("split", "the maps that were measured."),
+            ("model", "† is privileged: it is given part of the truth; a reference, which does not compete."),
+            *explained,
+        ),
+    )  # fmt: skip
+
+
+_BOLD = (
+    "not significantly worse than the best of its split by this measure (models exchanged on each map, Holm over "
+    f"all pairs, p ≥ {ALPHA}); where nothing is significantly worse none is marked; privileged models (†) do not "
+    "compete."
+)  # fmt: skip
+
+
+def difference_table(comparison: Comparison) -> Table:
+    """Formats the differences to the best, a row a split, measure and other model that competes."""
+    rows = []
+    for row in comparison.best.to_dict("records"):
+        if row["model"] == row["best"] or math.isnan(row["difference"]):
+            continue
+        interval = NOTHING if math.isnan(row["low"]) else f"{row['low']:+.4f} to {row['high']:+.4f}"
+        p = "≤ 0.0001" if row["p_holm"] <= 1e-4 else f"{row['p_holm']:.2g}"
+        name = " ".join(HEADINGS[row["measure"]][0].split())
+        cells = (row["split"], name, row["best"], row["model"], f"{row['difference']:+.4f}", interval)
+        rows.append((*cells, p if row["alike"] else Bold(p)))
+    return Table(
+        title="Differences to the best",
+        headings=("split", "measure", "best", "model", "difference", "95 % interval", "p (Holm)"),
+        labels=4,
+        rows=tuple(rows),
+        bold_note=f"p under {ALPHA}." if any(isinstance(row[-1], Bold) for row in rows) else "",
+        explained=(
+            ("difference", "of the model less the best by this measure; of “in 90 %” of the distance to 0.9."),
+            ("95 % interval", f"by bootstrap over maps; none under {LEAST_MAPS} maps."),
+            ("p (Holm)", "chance of a difference as large if the two models were exchanged at random on each map; "
+             "Holm's correction is over all pairs of models that compete, within measure and split."),
+        ),
+    )  # fmt: skip
+
+
+def comparison_json(about: Mapping[str, Any], comparison: Comparison) -> str:
+    """Writes everything that was measured as JSON; a number that there is not is null."""
+    splits: dict[str, Any] = {}
+    for row in comparison.summary.to_dict("records"):
+        split, model = row.pop("split"), row.pop("model")
+        tally = comparison.tallies[split, model]
+        curves = tally.curves()
+        place = splits.setdefault(split, {"units": row["units"], "models": {}, "pairs": []})
+        place["models"][model] = {
+            **{name: value for name, value in row.items() if name != "units"},
+            "pit": list(tally.pit),
+            "sparsification": dict(zip(("left_out", "by_width", "by_error"), curves.tolist(), strict=True)),
+        }
+    for row in comparison.pairs.to_dict("records"):
+        splits[row.pop("split")]["pairs"].append(row)
+    all_series = {
+        scenario: [{"severity": severity, "split": split} for severity, split in pairs]
+        for scenario, pairs in find_series(splits).items()
+    }
+    whole = {**about, "models": comparison.models, "splits": splits, "series": all_series}
+    # JSON has no word for what is no number.
+    text = json.loads(json.dumps(whole, default=int), parse_constant=lambda _: None)
+    return json.dumps(text, indent=1) + "\n"
+
+
+def comparison_csv(comparison: Comparison) -> str:
+    """Writes the numbers as CSV, a row a split and model, with the ends of their intervals."""
+    numbers = comparison.numbers
+    measured = [name for name in ORDER if name in numbers]
+    singles = [name for name in numbers if name.startswith("tail_rate_")]
+    names = [own for name in measured for own in (name, f"{name}_low", f"{name}_high") if own in numbers]
+    privileged = numbers["model"].map(lambda model: comparison.models[model]["privileged"])
+    table = numbers.assign(privileged=privileged)
+    columns = ["split", "model", "privileged", "units", *names, *singles]
+    return table.to_csv(columns=columns, index=False, float_format="%.6g")
+
+
+def comparison_markdown(
+    title: str, comparison: Comparison, notes: Sequence[str], figures: Sequence[str]
+) -> str:
+    """Writes the tables as a page with its figures, and what columns and figures mean.
+
+    Args:
+        title: of the page.
+        comparison: what was measured.
+        notes: lines under the table.
+        figures: names of the figures, of `FIGURES`, whose images are in the folder `figures`.
+    """
+    lines = [f"# {title}", "", to_markdown(comparison_table(title, comparison, whole=True)).rstrip()]
+    lines += [text for note in notes for text in ("", note)]
+    differences = difference_table(comparison)
+    if differences.rows:
+        lines += ["", f"## {differences.title}", "", to_markdown(differences).rstrip()]
+    for name in figures:
+        heading, text = FIGURES[name]
+        lines += ["", f"![{heading}](figures/{name}.png)", "", f"**{heading}.** {text}"]
+    return "\n".join([*lines, ""])
+
+
+def comparison_figures(comparison: Comparison) -> "dict[str, Callable[[], Figure]]":
+    """Gives what draws the figures that apply, by name."""
+    from benchnav.models.quality.compare import figures
+
+    privileged = [label for label, about in comparison.models.items() if about["privileged"]]
+    looks = figures.model_looks(list(comparison.models), privileged)
+    headings = {name: " ".join(heading.split()) for name, (heading, _) in HEADINGS.items()}
+    drawn: dict[str, Callable[[], Figure]] = {
+        "measures": partial(figures.measures_figure, comparison.summary, headings, looks, privileged),
+        "calibration": partial(figures.calibration_figure, comparison.tallies, looks),
+        "sparsification": partial(figures.sparsification_figure, comparison.tallies, looks),
+    }
+    if all_series := find_series(comparison.splits):
+        drawn["severity"] = partial(figures.severity_figure, all_series, comparison.summary, headings, looks)
+    return drawn
+
+
+def _cell(name: str, value: float) -> str:
+    if value is None or math.isnan(value):
+        return NOTHING
+    if name == "parameters":
+        return (
+            f"{value / 1e6:.2f}M"
+            if value >= 1e6
+            else f"{value / 1e3:.1f}k"
+            if value >= 1e3
+            else f"{value:.0f}"
+        )
+    return f"{value:.3g}" if name == "prediction_ms" else f"{value:.4f}"

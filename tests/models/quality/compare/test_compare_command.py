@@ -1,0 +1,354 @@
+import csv
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchnav.core import registry
+from benchnav.core.quantiles import LEVELS, QuantileDistribution
+from benchnav.core.terrain import Observation
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.base import TraversabilityModel
+from benchnav.models.cli import main
+from benchnav.models.predictor import Oracle
+from benchnav.models.quality import baselines
+from benchnav.models.quality.compare import candidates, command
+from benchnav.models.quality.measure import evaluate, measure_split
+from tests.models.stub import ColourModel
+
+FILES = {"compare.json", "compare.csv", "differences.csv", "compare.md", "figures"}
+
+
+class Vague(ColourModel):
+    """Knows hardly more than that there are classes."""
+
+    def __init__(self) -> None:
+        super().__init__((3000.0,))
+
+
+class Quantiles(TraversabilityModel):
+    """λ spread evenly, without classes or density."""
+
+    def predict(self, observation: Observation) -> QuantileDistribution:
+        shape = (len(observation.rgb), 1, *observation.grid.shape)
+        return QuantileDistribution(torch.tensor(LEVELS).view(-1, 1, 1) * torch.ones(shape))
+
+
+class Foreign(ColourModel):
+    """Knows other classes than the maps have."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.class_names = ("a", "b")
+
+
+@pytest.fixture(autouse=True)
+def _models(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(command, "DPI", 30)
+    for name, model in (
+        ("colours", ColourModel), ("vague", Vague), ("quantiles", Quantiles), ("foreign", Foreign),
+    ):  # fmt: skip
+        registry.register("model", name, model)
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["benchnav-train", "compare", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_a_table_is_printed_and_nothing_written(
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, "colours", "vague", "--data", dataset.path) == 0
+    out, err = capfd.readouterr()
+    rows = [line.split() for line in out.splitlines() if line.startswith("test/")]
+    named = [("colours", "vague", "oracle", "ideal")] * 2
+    assert [row[1] for row in rows] == [name for names in named for name in names]
+    assert [row[0] for row in rows] == ["test/std"] * 4 + ["test/hs"] * 4
+    assert [row[2] for row in rows[2:4]] == ["†", "†"]
+    for model, row in ((ColourModel(), rows[4]), (Vague(), rows[5])):
+        quality = dict(evaluate(model, dataset))["test/hs"]
+        for value in (quality.classes[0].miou, quality.traversability.crps, quality.traversability.nll):
+            assert f"{value:.4f}" in [cell.rstrip("*") for cell in row]
+    assert err.splitlines()[-1] == "models and splits: 8/8"
+    assert "too few maps" in out
+    assert "units of the statistics: test/std 2 maps, test/hs 2 maps" in out
+    assert "with 1 thread" in out or "threads" in out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_holds_numbers_differences_page_and_figures(
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "new" / "comparison"
+    asked = ["vague", "colours", "quantiles", "--data", dataset.path, "--splits", "[train]", "--out", out]
+    assert call(monkeypatch, *asked, "--seed", 3) == 0
+    assert {path.name for path in out.iterdir()} == FILES
+    names = ("measures", "calibration", "sparsification")
+    assert {path.name for path in (out / "figures").iterdir()} == {
+        f"{name}.{kind}" for name in names for kind in ("png", "pdf")
+    }
+    found = json.loads((out / "compare.json").read_text())
+    assert (found["seed"], found["device"]) == (3, "cpu")
+    assert found["threads"] == torch.get_num_threads()
+    assert found["dataset"] == {"id": dataset.id, "digest": dataset.digest}
+    assert list(found["models"]) == ["vague", "colours", "quantiles", "oracle", "ideal"]
+    assert found["models"]["oracle"]["prediction_ms"] is None
+    assert found["models"]["colours"]["prediction_ms"] > 0
+    split = found["splits"]["train"]
+    assert split["units"] == 10
+    own = split["models"]["colours"]
+    quality = measure_split(ColourModel(), dataset, "train", 3)
+    assert own["pit"] == list(quality.traversability.pit)
+    assert own["crps"] == pytest.approx(quality.traversability.crps)
+    assert own["accuracy"] == pytest.approx(quality.classes[0].accuracy)
+    assert own["crps_low"] < own["crps"] < own["crps_high"]
+    assert split["models"]["quantiles"]["nll"] is None
+    assert "accuracy" not in split["models"]["quantiles"] or split["models"]["quantiles"]["accuracy"] is None
+    assert split["models"]["oracle"]["rmse_expected"] == 0
+    assert len(own["sparsification"]["by_width"]) == 50
+
+    rows = list(csv.DictReader((out / "compare.csv").open()))
+    assert [row["model"] for row in rows] == list(found["models"])
+    assert [row["privileged"] for row in rows] == ["False"] * 3 + ["True"] * 2
+    assert float(rows[1]["pinball"]) == pytest.approx(own["pinball"], rel=1e-5)
+    assert float(rows[1]["tail_rate_95"]) == pytest.approx(own["tail_rate_95"], rel=1e-5)
+    assert rows[2]["nll"] == rows[2]["accuracy"] == rows[3]["prediction_ms"] == ""
+    pairs = list(csv.DictReader((out / "differences.csv").open()))
+    both = [
+        row for row in pairs if (row["one"], row["other"], row["measure"]) == ("vague", "colours", "crps")
+    ]
+    assert float(both[0]["difference"]) > 0
+    assert float(both[0]["p_holm"]) < 0.05
+
+    page = (out / "compare.md").read_text()
+    assert all(f"(figures/{name}.png)" in page for name in names)
+    headings = [cell.strip() for cell in page.splitlines()[2].strip("|").split("|")]
+    explained = [line[4:].partition("**: ")[0] for line in page.splitlines() if line.startswith("- **")]
+    assert headings == explained[: len(headings)]
+    assert "## Differences to the best" in page
+    (row,) = [line for line in page.splitlines() if line.startswith("| train | colours")]
+    assert f"**{own['crps']:.4f}**" in row
+    (row,) = [line for line in page.splitlines() if line.startswith("| train | vague")]
+    assert "**" not in row.partition("0.9")[0] or f"**{split['models']['vague']['crps']:.4f}**" not in row
+
+    # Another comparison takes its place only when asked to.
+    assert call(monkeypatch, "colours", "--data", dataset.path, "--out", out) == 2
+    assert "--overwrite" in capfd.readouterr().err
+    assert call(monkeypatch, "colours", "--data", dataset.path, "--out", out, "--overwrite") == 0
+    assert list(json.loads((out / "compare.json").read_text())["splits"]) == ["test/std", "test/hs"]
+    assert "Differences" not in (out / "compare.md").read_text()
+
+
+def test_the_order_of_models_turns_the_signs_of_their_differences(
+    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = {}
+    for one, other in (("colours", "vague"), ("vague", "colours")):
+        out = tmp_path / one
+        assert call(monkeypatch, one, other, "--data", dataset.path, "--splits", "[valid]", "--out", out) == 0
+        rows = json.loads((out / "compare.json").read_text())["splits"]["valid"]["pairs"]
+        found[one] = {row["measure"]: row for row in rows if (row["one"], row["other"]) == (one, other)}
+    assert found["colours"].keys() == found["vague"].keys()
+    for name, row in found["colours"].items():
+        assert row["difference"] == pytest.approx(-found["vague"][name]["difference"]), name
+        assert row["p"] == found["vague"][name]["p"]
+
+
+def test_seed_and_device_reach_the_measurement(
+    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pits = {}
+    for seed in (0, 7):
+        out = tmp_path / str(seed)
+        asked = ("colours", "--data", dataset.path, "--splits", "[valid]", "--out", out, "--device", "cpu")
+        assert call(monkeypatch, *asked, "--seed", seed) == 0
+        models = json.loads((out / "compare.json").read_text())["splits"]["valid"]["models"]
+        pits[seed] = models["colours"]["pit"]
+        assert pits[seed] == list(measure_split(ColourModel(), dataset, "valid", seed).traversability.pit)
+    assert pits[0] != pits[7]
+    asked_for: list[torch.device] = []
+    measured, timed = measure_split, candidates.prediction_ms
+    monkeypatch.setattr("benchnav.core.device.find_device", lambda name: torch.device("cpu", 0))
+
+    def spy(
+        model: TraversabilityModel,
+        data: TerrainDataset,
+        split: str,
+        seed: int,
+        place: torch.device,
+        **how: bool,
+    ):  # type: ignore[no-untyped-def]
+        asked_for.append(place)
+        return measured(model, data, split, seed, torch.device("cpu"), **how)
+
+    monkeypatch.setattr("benchnav.models.quality.measure.measure_split", spy)
+    monkeypatch.setattr(candidates, "prediction_ms", lambda model, terrain: timed(model, terrain))
+    assert call(monkeypatch, "colours", "--data", dataset.path, "--splits", "[valid]") == 0
+    assert asked_for == [torch.device("cpu", 0)] * 3
+
+
+def test_groups_of_maps_are_the_units(
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    read, names = TerrainDataset.read, dataset.field_names
+
+    def with_groups(self: TerrainDataset, split: str, indices=None, fields=None):  # type: ignore[no-untyped-def]
+        if fields == ("group",):
+            return {"group": np.arange(self.map_count(split)) // 2}
+        return read(self, split, indices, fields)
+
+    monkeypatch.setattr(TerrainDataset, "read", with_groups)
+    monkeypatch.setattr(TerrainDataset, "field_names", property(lambda self: (*names, "group")))
+    out = tmp_path / "out"
+    assert call(monkeypatch, "colours", "--data", dataset.path, "--splits", "[train]", "--out", out) == 0
+    assert json.loads((out / "compare.json").read_text())["splits"]["train"]["units"] == 5
+    assert "train 10 maps in 5 groups" in capfd.readouterr().out
+
+
+def test_a_model_of_other_classes_is_compared_by_traversability_and_said_to_be(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert call(monkeypatch, "colours", "foreign", "--data", dataset.path, "--splits", "[valid]") == 0
+    out = capfd.readouterr().out
+    assert "foreign knows other classes than these maps have: it is compared by λ alone" in out
+    first, second = (
+        line.split() for line in out.splitlines() if line.startswith("valid ") and "†" not in line
+    )
+    assert second[2:4] == ["–", "–"]
+    assert first[4:10] == second[4:10]  # the same λ
+
+
+def test_where_the_truth_is_unknown_no_model_is_given_the_class_table_for_it(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    truth = TerrainDataset.truth_of
+    monkeypatch.setattr(
+        TerrainDataset, "truth_of", lambda self, split: "unknown" if split == "valid" else truth(self, split)
+    )
+    asked = ("colours", "--data", dataset.path, "--splits", "[valid,test/std]")
+    assert call(monkeypatch, *asked) == 0
+    out = capfd.readouterr().out
+    rows = [
+        line.split()[:2]
+        for line in out.splitlines()
+        if line.startswith(("valid ", "test/std ")) and "0." in line
+    ]
+    assert rows == [["valid", "colours"], *(["test/std", name] for name in ("colours", "oracle", "ideal"))]
+    assert "oracle and ideal are left out on valid, whose truth is unknown" in out
+    assert "RMSE λ" in " ".join(out.split()) or "RMSE E[λ] is – on valid" in out
+
+
+def test_a_model_that_is_worse_than_none_is_told_so(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(baselines, "nearest_colour_accuracy", lambda _, split: 0.999)
+    monkeypatch.setattr(baselines, "climatology_crps", lambda _, split: 0.15)
+    assert call(monkeypatch, "colours", "quantiles", "--data", dataset.path, "--splits", "[valid]") == 0
+    out = capfd.readouterr().out.splitlines()
+    assert "colours: warning: the model is right less often than the nearest colour on valid" in out
+    worse = "warning: the model's CRPS is higher than that of one distribution for all cells on valid"
+    crps = {
+        name: measure_split(model, dataset, "valid").traversability.crps
+        for name, model in (("colours", ColourModel()), ("quantiles", Quantiles()))
+    }
+    assert [f"{name}: {worse}" in out for name in crps] == [score > 0.15 for score in crps.values()]
+    assert crps["colours"] < 0.15 < crps["quantiles"]
+    assert not any(line.startswith("oracle: ") for line in out)
+
+
+def test_maps_that_a_model_was_trained_on_are_named(
+    dataset: TerrainDataset,
+    checkpoint_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    asked = (checkpoint_path, "colours", "--data", dataset.path, "--splits", "[valid]")
+    assert call(monkeypatch, *asked) == 0
+    lines = [line for line in capfd.readouterr().out.splitlines() if "was trained" in line]
+    assert [line.partition(":")[0] for line in lines] == ["tiny"]
+
+
+def test_a_series_is_drawn_where_there_is_one(
+    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = dict(dataset.manifest["splits"])
+    monkeypatch.setattr(
+        TerrainDataset, "splits", property(lambda self: {**held, "test/hs-100": held["test/hs"]})
+    )
+    read = TerrainDataset.read
+    monkeypatch.setattr(
+        TerrainDataset, "read", lambda self, split, *rest: read(self, split.removesuffix("-100"), *rest)
+    )
+    asked = ("colours", "--data", dataset.path, "--splits", "[test/std,test/hs-100]", "--out", tmp_path / "q")
+    assert call(monkeypatch, *asked) == 0
+    assert (tmp_path / "q" / "figures" / "severity.png").is_file()
+    assert "(figures/severity.png)" in (tmp_path / "q" / "compare.md").read_text()
+    found = json.loads((tmp_path / "q" / "compare.json").read_text())
+    assert list(found["series"]) == ["test/hs"]
+    assert math.isclose(found["series"]["test/hs"][1]["severity"], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "one model or more"),
+        (["colours", "colours"], "models that differ"),
+        (["colour"], "Did you mean 'colours'"),
+        (["colours", "--splits", "[test/hg]"], "test/hg"),
+        (["colours", "--splits", "[]"], "Expected `splits` among "),
+        (["colours", "--seed", "-1"], "`seed`"),
+        (["colours", "--out", "folder"], "is something else than a comparison"),
+        (["colours", "--out", "folder/file/out"], "folder/file"),
+        (["colours", "--out", "s3://bucket/out"], "place on this machine"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line_before_any_work(
+    arguments: list[str],
+    expected: str,
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    def never(*arguments: object) -> None:
+        raise AssertionError("measured what was to be refused")
+
+    monkeypatch.setattr(Oracle, "predict_terrain", never)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "file").write_text("mine")
+    assert call(monkeypatch, *arguments, "--data", dataset.path) == 2
+    out, err = capfd.readouterr()
+    assert len(err.strip().splitlines()) == 1, err
+    assert err.startswith("benchnav-train: error: ")
+    assert expected in err
+    assert out == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+def test_the_command_is_light_to_import() -> None:
+    code = (
+        "import sys, benchnav.models.quality.compare.command; "
+        "print(sorted({'torch', 'torchmetrics', 'matplotlib', 'pandas'} & set(sys.modules)))"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "[]"

@@ -1,0 +1,102 @@
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.predictor import Oracle
+from benchnav.models.quality.compare.figures import (
+    calibration_figure,
+    measures_figure,
+    model_looks,
+    severity_figure,
+    sparsification_figure,
+)
+from benchnav.models.quality.compare.paired import MEASURES, summarise
+from benchnav.models.quality.map_sums import MapTally
+from benchnav.models.quality.measure import measure_split
+from tests.models.stub import ColourModel
+
+MODELS = ("colours", "oracle")
+SPLITS = ("train", "test/std")
+HEADINGS = {name: name for name in MEASURES}
+Tallies = dict[tuple[str, str], MapTally]
+
+
+@pytest.fixture(scope="module")
+def tallies(dataset: TerrainDataset) -> Tallies:
+    found = {
+        (split, name): measure_split(model, dataset, split, by_map=True).by_map
+        for split in SPLITS
+        for name, model in (("colours", ColourModel()), ("oracle", Oracle()))
+    }
+    return {key: tally for key, tally in found.items() if tally}
+
+
+def panel(figure: Figure, title: str) -> Axes:
+    return next(axes for axes in figure.axes if axes.get_title() == title)
+
+
+def test_models_differ_in_look_and_privileged_ones_are_grey() -> None:
+    names = [f"m{number}" for number in range(16)]
+    looks = model_looks([*names, "oracle", "ideal"], ["oracle", "ideal"])
+    assert list(looks) == [*names, "oracle", "ideal"]
+    assert len({(look["color"], look["marker"], look["ls"]) for look in looks.values()}) == 18
+    assert looks["oracle"]["color"].startswith("0.")
+
+
+def test_marks_and_lines_are_the_measures_and_their_intervals(tallies: Tallies) -> None:
+    summary = pd.concat(
+        [summarise(split, {name: tallies[split, name].sums() for name in MODELS}) for split in SPLITS]
+    )
+    figure = measures_figure(summary, HEADINGS, model_looks(MODELS, ["oracle"]), ["oracle"])
+    axes = panel(figure, "crps")
+    marks = {line.get_label(): line.get_xdata() for line in axes.lines}
+    for split in SPLITS:
+        wanted = summary[summary["split"] == split].set_index("model")["crps"].reindex(MODELS)
+        np.testing.assert_allclose(np.asarray(marks[split], dtype=float), wanted)
+    train = summary[summary["split"] == "train"].set_index("model")
+    ends = [segment[:, 0] for segment in axes.collections[0].get_segments()]
+    np.testing.assert_allclose(ends[0], train.loc["colours", ["crps_low", "crps_high"]].astype(float))
+    labels = {label.get_text(): label.get_color() for label in figure.axes[0].get_yticklabels()}
+    assert labels == {"colours": "black", "oracle": "0.5"}
+    assert panel(figure, "coverage").lines[-1].get_xdata()[0] == 0.9  # type: ignore[index]
+
+
+def test_calibration_is_the_share_under_each_quantile(tallies: Tallies) -> None:
+    figure = calibration_figure(tallies, model_looks(MODELS, ["oracle"]))
+    for split in SPLITS:
+        lines = {line.get_label(): line for line in panel(figure, split).lines}
+        for model in MODELS:
+            counts = tallies[split, model].pit
+            level, excess = lines[model].get_data()
+            assert level[2] == pytest.approx(0.1)  # type: ignore[index]
+            assert excess[2] == pytest.approx(counts[:2].sum() / counts.sum() - 0.1)  # type: ignore[index]
+            assert excess[-1] == pytest.approx(0)  # type: ignore[index]
+
+
+def test_sparsification_shows_both_rankings_of_every_split(tallies: Tallies) -> None:
+    figure = sparsification_figure(tallies, model_looks(MODELS, ["oracle"]))
+    for split in SPLITS:
+        axes = panel(figure, split)
+        assert len(axes.lines) == 2 * len(MODELS)
+        left_out, by_width, by_error = tallies[split, "colours"].curves()
+        for line, values in zip(axes.lines[:2], (by_width, by_error), strict=True):
+            np.testing.assert_allclose(line.get_data(), [left_out, values])
+        low, high = axes.get_ylim()
+        assert low == 0
+        assert high > max(float(np.max(line.get_ydata())) for line in axes.lines)  # type: ignore[arg-type]
+
+
+def test_severity_has_a_line_a_model_and_leaves_out_what_was_not_measured(tallies: Tallies) -> None:
+    tables = [summarise("train", {"colours": tallies["train", "colours"].sums()})]
+    tables.append(summarise("test/std", {name: tallies["test/std", name].sums() for name in MODELS}))
+    summary = pd.concat(tables)
+    series = {"test/hg": [(0.0, "test/std"), (0.5, "train")]}
+    figure = severity_figure(series, summary, HEADINGS, model_looks(MODELS, ["oracle"]))
+    for axes, name in zip(figure.axes[:2], ("crps", "pinball"), strict=True):
+        lines = {line.get_label(): line.get_data() for line in axes.lines}
+        own = summary[summary["model"] == "colours"].set_index("split")[name]
+        np.testing.assert_allclose(lines["colours"], [[0, 0.5], [own["test/std"], own["train"]]])
+        assert len(lines["oracle"][0]) == 1
