@@ -25,8 +25,9 @@ from rich.console import Console
 from rich.table import Table
 
 from benchnav.core import registry
+from benchnav.core.resampling import sign_flips
 from benchnav.datagen import TerrainDataset
-from benchnav.eval.stats.paired_difference import mean_interval, sign_flips
+from benchnav.eval.stats.paired_difference import mean_interval
 from benchnav.models import load_model
 from benchnav.models.base import predict
 from benchnav.models.quality.scores import lower_fifth_and_width
@@ -88,7 +89,7 @@ def make_maps(out: Path, sizes: list[int]) -> None:
 
 
 def train(out: Path, sizes: list[int], seeds: list[int]) -> None:
-    """Trains what there is not; small sets for more epochs, so that every network takes 250 steps or more."""
+    """Trains what there is not; small sets for more epochs, so that every network takes 100 steps or more."""
     for seed in seeds:
         for size in sizes:
             place = out / checkpoint_name(size, seed)
@@ -96,7 +97,7 @@ def train(out: Path, sizes: list[int], seeds: list[int]) -> None:
                 (place / "config.json").read_text()
             ).get("parts", {}):
                 continue
-            epochs = max(20, -(-250 // -(-size // 16)))
+            epochs = max(20, -(-100 // -(-size // 16)))
             command(
                 "benchnav-train", "fit", "fused", "--data", out / f"train-{size}.h5", "--out", place, "--resume",
                 "--seed", seed, "--settings.classifier.encoder_depth", 3, "--settings.classifier.max_epochs", epochs,
