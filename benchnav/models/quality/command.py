@@ -61,9 +61,8 @@ def evaluate(
     from benchnav.models.quality.baselines import baselines_of
     from benchnav.models.quality.measure import choose_splits
     from benchnav.models.quality.measure import evaluate as evaluate_model
+    from benchnav.models.quality.notes import notes_of_data, notes_of_model
     from benchnav.models.quality.report import (
-        notes_of_data,
-        notes_of_model,
         quality_csv,
         quality_figures,
         quality_json,

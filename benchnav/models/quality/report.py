@@ -15,8 +15,6 @@ from benchnav.core.tables import NOTHING, Table, to_markdown
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.scenario import find_series
 from benchnav.models.base import TraversabilityModel
-from benchnav.models.predictor import Ideal, Oracle
-from benchnav.models.quality.baselines import Baselines
 from benchnav.models.quality.measure import Quality
 from benchnav.models.slope_gp.table import SlopeTable
 
@@ -246,84 +244,6 @@ def quality_markdown(
         heading, text = caption(PurePath(path).stem, qualities)
         lines += ["", f"![{heading}]({path})", "", f"**{heading}.** {text}"]
     return "\n".join([*lines, ""])
-
-
-def notes_of_data(dataset: TerrainDataset, splits: Sequence[str], baselines: Baselines) -> list[str]:
-    """Says in lines what a reader has to know of the maps.
-
-    Args:
-        dataset: on what models were measured.
-        splits: those of it.
-        baselines: what can be said without a model.
-    """
-    lines = []
-    if by_colour := baselines.nearest_colour_accuracy:
-        listed = ", ".join(f"{split} {share:.4f}" for split, share in by_colour.items())
-        lines.append(f"accuracy of the class of the nearest colour, without a model: {listed}")
-    listed = ", ".join(f"{split} {score:.4f}" for split, score in baselines.climatology_crps.items())
-    lines.append(f"CRPS of one distribution for all cells, that of the split's λ, without a model: {listed}")
-    if unknown := [split for split in splits if dataset.truth_of(split) == "unknown"]:
-        parts = [part for split in unknown for part in dataset.splits[split]["parts"]]
-        observed = "λ that was, at least in part, drawn by the class table, not measured"
-        if all(part.get("source", {}).get("traversability") for part in parts):
-            observed = "measured λ"
-        lines.append(
-            f"RMSE E[λ] is – on {', '.join(unknown)}, since the true distribution of λ is unknown on imported ground; "
-            f"RMSE λ, NLL, CRPS, “in 90 %” and “< VaR” there are against {observed}"
-        )
-    return lines
-
-
-def notes_of_model(
-    model: TraversabilityModel,
-    dataset: TerrainDataset,
-    qualities: Mapping[str, Quality],
-    baselines: Baselines,
-    trained_on: Mapping[str, str],
-) -> list[str]:
-    """Warns in lines of what makes a model's numbers bad or worth nothing.
-
-    Args:
-        model: what was measured.
-        dataset: on what.
-        qualities: by split.
-        baselines: what can be said without a model.
-        trained_on: names of the splits that the model was trained on, by digest.
-    """
-    lines = []
-    worse = [
-        split for split, share in baselines.nearest_colour_accuracy.items()
-        if split in qualities and any(item.accuracy < share for item in qualities[split].classes)
-    ]  # fmt: skip
-    if worse:
-        lines.append(f"warning: the model is right less often than the nearest colour on {', '.join(worse)}")
-    worse = [
-        split for split, quality in qualities.items()
-        if quality.traversability.crps > baselines.climatology_crps[split]
-    ]  # fmt: skip
-    if worse:
-        lines.append(
-            f"warning: the model's CRPS is higher than that of one distribution for all cells on {', '.join(worse)}"
-        )
-    seen = [
-        f"{split} (its {trained_on[digest]})"
-        for split in qualities
-        # Checkpoints of earlier versions hold the digest of the arrays alone.
-        for digest in (dataset.split_digest(split), dataset.splits[split]["digest"])
-        if digest in trained_on
-    ]
-    if seen:
-        lines.append(
-            f"warning: the model was trained, or chosen and calibrated, on the maps of {', '.join(seen)}: their "
-            "numbers say nothing of maps that it has not seen"
-        )
-    unknown = [split for split in qualities if dataset.truth_of(split) == "unknown"]
-    if unknown and isinstance(model, Oracle | Ideal):
-        lines.append(
-            f"warning: what this model says of {', '.join(unknown)} is the class table of the recipe, not the "
-            "truth of this ground"
-        )
-    return lines
 
 
 def quality_figures(

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import PermutationMethod, binomtest, permutation_test, t, ttest_1samp, wilcoxon
 
-from benchnav.core.resampling import sign_flips
 from benchnav.eval.stats.paired_difference import (
     by_map,
     maps_needed,
@@ -120,16 +119,6 @@ def test_one_sided_sign_flips_are_counted_to_their_own_side() -> None:
     sums = np.abs(gain) @ signs
     assert sign_flip_p(gain, "higher") == pytest.approx(np.mean(sums >= 6))
     assert sign_flip_p(gain, "lower") == pytest.approx(np.mean(sums <= 6))
-
-
-def test_signs_are_flipped_in_all_ways_or_in_as_many_as_are_drawn() -> None:
-    assert len(np.unique(sign_flips(5), axis=0)) == 2**5
-    many = sign_flips(40)
-    assert many.shape == (10_000, 40)
-    assert set(np.unique(many)) == {-1, 1}
-    assert (many[0] == 1).all()  # as they were seen is one of the ways
-    assert abs(many[1:].mean()) < 0.01
-    np.testing.assert_array_equal(many, sign_flips(40))
 
 
 def test_time_is_tested_by_ranks() -> None:

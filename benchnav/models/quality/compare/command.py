@@ -152,7 +152,7 @@ def _notes(
     from benchnav.core.device import gpu_name
     from benchnav.models.predictor import class_mismatch
     from benchnav.models.quality.baselines import baselines_of
-    from benchnav.models.quality.report import notes_of_data, notes_of_model
+    from benchnav.models.quality.notes import notes_of_data, notes_of_model
 
     any_classes = [
         split for split in splits if any(q.classes for (of, _), q in qualities.items() if of == split)
