@@ -2,9 +2,8 @@
 
 Words and YAML files make one plain mapping, which `benchnav.core.settings` reads by the types of the function's
 parameters; the help is jsonargparse's. `--contact-sheet` is `--contact_sheet true`, `--maps 3` is `--maps [3]`; a
-flag whose value is a name or a mapping may be given as both, `--world paper --world.noise stored`; one of a list may be
-given again, which adds to it. Bad input ends in one line on standard error and exit status 2; an interruption in status
-130.
+flag whose value is a name or a mapping may be given as both, `--world paper --world.noise stored`. Bad input ends in
+one line on standard error and exit status 2; an interruption in status 130.
 """
 
 import errno
@@ -17,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, get_origin
 
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.registry import KINDS
@@ -54,12 +53,14 @@ class Command:
         positionals: names of its parameters that are given by place rather than by flag; one that is a
             list takes what is left.
         settings: a dataclass whose fields become flags; one of it is the function's first argument.
+        repeated: names of lists whose flag may be given again, which adds to the list; of others the last one holds.
         configs: folder of shipped YAML files, which `--config NAME` finds where there is no such file.
     """
 
     function: Callable[..., int | None]
     positionals: tuple[str, ...] = ()
     settings: type | None = None
+    repeated: tuple[str, ...] = ()
     configs: Path | None = None
 
     @cached_property
@@ -201,7 +202,7 @@ def _read_arguments(
     for (name, *keys), value in sorted(flags, key=lambda flag: len(flag[0])):
         if name in options:
             kind, now = options[name].kind, given.get(name, arguments.get(name, options[name].default))
-            again = name in given and _takes_list(kind)
+            again = name in given and name in command.repeated
             given[name] = _appended(now, value) if again else _merged(name, kind, now, keys, value)
     for name in command.positionals:
         if options[name].kind == list[str] and (places or name not in arguments):
@@ -313,13 +314,6 @@ def _print_help_of(program: str, command: Command) -> int:
     parser.add_function_arguments(command.function, as_group=False, skip=skip)
     parser.print_help()
     return 0
-
-
-def _takes_list(kind: Any) -> bool:
-    """Whether it is a list of any length, and no text."""
-    members = members_of(kind)
-    ends = [get_args(member)[-1:] for member in members if get_origin(member) is tuple]
-    return str not in members and ((...,) in ends or any(get_origin(member) is list for member in members))
 
 
 def _appended(one: str, other: str) -> str:

@@ -290,8 +290,8 @@ def main() -> None:
         "show": Command(show, ("file",)),
         "validate": Command(validate, ("file",)),
         "merge": Command(merge, ("files",)),
-        "import-dem": Command(import_dem, ("dem", "overrides"), settings=Rasters),
-        "import-drives": Command(import_drives, ("drives", "overrides")),
+        "import-dem": Command(import_dem, ("dem", "overrides"), settings=Rasters, repeated=("layer",)),
+        "import-drives": Command(import_drives, ("drives", "overrides"), repeated=("layer",)),
         "export": Command(export, ("file",)),
         "preview": Command(preview, ("file",)),
     }

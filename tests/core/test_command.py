@@ -385,6 +385,14 @@ def test_work_goes_on_where_no_one_reads_how_far_it_is(monkeypatch: pytest.Monke
         ("--some", "1,2", "--some", "[3]"),
     ],
 )
-def test_a_flag_of_a_list_that_is_given_again_adds_to_it(argv: tuple[str, ...]) -> None:
-    assert call("work", "here", *argv) == 0
+def test_a_flag_of_a_list_that_is_given_again_adds_to_it_where_the_command_says_so(
+    argv: tuple[str, ...],
+) -> None:
+    command = Command(work, ("place", "rest"), repeated=("some",))
+    assert run("x", "Does.", {"work": command}, ("work", "here", *argv)) == 0
     assert seen[-1] == ("here", [], False, 1, 1, 2, 3)
+
+
+def test_of_any_other_flag_the_last_one_holds() -> None:
+    assert call("work", "here", "--some", "[1,2]", "--some", "3") == 0
+    assert seen[-1] == ("here", [], False, 1, 3)

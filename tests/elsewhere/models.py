@@ -217,8 +217,8 @@ def test_what_was_trained_is_measured_and_calibrated_where_it_was(
                 trainable(config), dataset, 0, FitOptions(device="cpu"), half_precision=True
             )
             assert {value.device for value in trained.parameters()} == {CPU}
-    # The classifier is measured and calibrated, the other network measured; before, colours are read on the CPU.
-    assert [place for place in read if place != CPU] == [device] * 3
+    # Both networks are measured and calibrated; before, layers are read on the CPU.
+    assert [place for place in read if place != CPU] == [device] * 4
 
 
 def test_a_pool_is_calibrated_on_the_device(
@@ -227,18 +227,20 @@ def test_a_pool_is_calibrated_on_the_device(
     given: list[torch.device] = []
 
     def fit_pool(members: Any, maps: Any, seed: int, device: torch.device) -> float:
+        assert len(members) == 2
         given.append(device)
         return 1.5
 
-    monkeypatch.setattr(networks, "fit_pool_temperature", fit_pool)
-    monkeypatch.setattr(networks, "classifiers_of", lambda checkpoint: [None, None])
+    monkeypatch.setattr(TerrainClassifier, "fit_pool", fit_pool)
+    one = load_checkpoint(checkpoint_path)
+    pair = one.with_part("classifier-2", one.part("classifier"))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for device in ("cpu", "cuda"):
         target = SimpleNamespace(
-            checkpoint=load_checkpoint(checkpoint_path),
+            checkpoint=pair,
             options=FitOptions(device=device),
             holds=lambda *words: True,
             set_pool_temperature=lambda value: None,
         )
-        networks.train_parts(target, ClassifierConfig(), dataset, ["classifier", "classifier-2"])  # type: ignore[arg-type]
+        networks.train_parts(target, trainable(ClassifierConfig()), dataset, ["classifier", "classifier-2"])  # type: ignore[arg-type]
     assert [place.type for place in given] == ["cpu", "cuda"]
