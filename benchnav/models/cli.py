@@ -10,6 +10,7 @@ from benchnav.models.config import (
     MDNConfig,
     TrainOptions,
 )
+from benchnav.models.onnx_command import export
 from benchnav.models.quality.command import evaluate
 
 _RESUMABLE = ("fit", "classifier", "all", "mdn")
@@ -134,6 +135,7 @@ def main() -> None:
         "all": Command(train_all, settings=TrainOptions),
         "mdn": Command(train_mdn, settings=TrainOptions),
         "evaluate": Command(evaluate, ("checkpoint",)),
+        "export": Command(export, ("checkpoint",)),
     }
     status = run("benchnav-train", "Train and measure models of traversability.", commands)
     if status == INTERRUPTED and sys.argv[1] in _RESUMABLE:
