@@ -131,7 +131,7 @@ def parameters_of(distribution: TraversabilityDistribution, prefix: str = "") ->
     if isinstance(distribution, ConditionedDistribution):
         return parameters_of(distribution.base, prefix)
     if isinstance(distribution, PooledDistribution):
-        found = {}
+        found: dict[str, Tensor] = {}
         for number, member in enumerate(distribution.members, 1):
             found |= parameters_of(member, f"{prefix}member_{number}_")
         return found

@@ -73,8 +73,8 @@ def load_model(source: Source) -> TraversabilityModel:
     Args:
         source: the folder of a checkpoint, by path or by its name in `checkpoints/` here or
             among those shipped, or `owner/name@revision` of a hub; or a part, such as `oracle`,
-            `package.module:Name` or `path/to/file.py:Name`, with options where it is a mapping; or the checkpoint of a class that a file or module holds,
-            `path/to/file.py:Name@CHECKPOINT`.
+            `package.module:Name` or `path/to/file.py:Name`, with options where it is a mapping; or the checkpoint of
+            a class that a file or module holds, `path/to/file.py:Name@CHECKPOINT`.
 
     Raises:
         ConfigError: there is no such model, or it refuses its options.

@@ -7,6 +7,7 @@ may: these are recorded, with a digest of the code of those that are not Lightni
 
 import importlib
 import inspect
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,8 @@ def described(given: Any) -> list[dict[str, Any]]:
     found = []
     for item in _listed(given):
         if isinstance(item, Callback):
-            kind, place, arguments = type(item), f"{type(item).__module__}.{type(item).__name__}", {}
+            kind, place = type(item), f"{type(item).__module__}.{type(item).__name__}"
+            arguments: dict[str, Any] = {}
         else:
             place, arguments = _split("callbacks", item)
             kind = _class("callbacks", place)
@@ -126,7 +128,8 @@ def _made(what: str, item: Any, folder: Path | None) -> Any:
     try:
         return kind(**arguments)
     except ModuleNotFoundError as error:
-        package = (error.name or str(error).split("`")[1 if "`" in str(error) else 0].split(">")[0]).strip()
+        wanted = re.search(r"[Rr]equirement '([\w-]+)|pip install (?:-U )?'?([\w-]+)", str(error))
+        package = error.name or (wanted[1] or wanted[2] if wanted else "PACKAGE")
         raise ConfigError(
             f"Expected the package that {place} needs, got none: {one_line(error)[:160]} "
             f"Install it, such as: pip install {package.partition('.')[0]}"

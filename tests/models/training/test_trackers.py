@@ -1,4 +1,4 @@
-"""A user's loggers and callbacks are made from text, write where they should, and are recorded where they may matter."""
+"""A user's loggers and callbacks are made from text, write where they should, and callbacks are recorded."""
 
 import json
 from pathlib import Path
