@@ -226,12 +226,11 @@ def _integral(distribution: TraversabilityDistribution, value: Tensor) -> Tensor
         rise = below((value.unsqueeze(1) - means) / stds) - below(-means / stds)
         return (weights * stds * rise).sum(1)
     edges = _edges(distribution, value)
-    total = torch.zeros_like(value)
     low, width = edges[:-1], edges[1:] - edges[:-1]
-    for node, weight in zip(_NODES.tolist(), _WEIGHTS.tolist(), strict=True):
-        heights = _tails(distribution, low + (0.5 + 0.5 * node) * width)[0]
-        total = total + 0.5 * weight * (width * heights).sum(0)
-    return total
+    # All nodes at once: a graph of few large operations, which is quicker to write and to run.
+    nodes, weights = (torch.from_numpy(values).view(-1, 1, 1, 1, 1) / 2 for values in (_NODES, _WEIGHTS))
+    heights = _tails(distribution, low + (0.5 + nodes) * width)[0]
+    return (weights * width * heights).flatten(0, 1).sum(0)
 
 
 def _edges(distribution: TraversabilityDistribution, value: Tensor) -> Tensor:

@@ -488,9 +488,14 @@ def test_mlcroissant_reads_the_metadata_and_the_maps(dataset_path: Path, tmp_pat
         maps = dataset.read(split)
         for row in rows:
             for field, values in maps.items():
-                got = np.stack(np.asarray(row[f"{name}/{field}"]).tolist())
+                got = np.array(nested(row[f"{name}/{field}"]))
                 np.testing.assert_array_equal(got.reshape(values.shape[1:]), values[int(row[f"{name}/map"])])
     classes = [row["classes/name"] for row in read.records("classes")]
     assert [name.decode() if isinstance(name, bytes) else name for name in classes] == [
         item.name for item in dataset.recipe.classes
     ]
+
+
+def nested(values: Any) -> Any:
+    """Arrays of arrays as lists of lists."""
+    return [nested(value) for value in values] if isinstance(values, list | np.ndarray) else values
