@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from benchnav.core.batch import map_tensors
 from benchnav.core.conditioned import ConditionedDistribution
 from benchnav.core.distribution import TraversabilityDistribution, tail_of
 from benchnav.core.errors import ConfigError, expect, quiet
@@ -111,7 +112,12 @@ class Graph(nn.Module):
 
     def forward(self, *layers: Tensor) -> tuple[Tensor, ...]:
         """Predicts B maps, given by layer in the order of `layers`; outputs in the order of `names`."""
-        predicted = self.predict(dict(zip(self.layers, layers, strict=True)))
+        batch, (height, width) = layers[0].shape[0], layers[0].shape[-2:]
+        # Of sizes that padding and cropping have made, expressions as they are, each operation would be slow to write.
+        predicted = map_tensors(
+            self.predict(dict(zip(self.layers, layers, strict=True))),
+            lambda values: values.reshape(batch, *values.shape[1:-2], height, width),
+        )
         found = parameters_of(predicted)
         found["mean"], found["cvar"] = mean_of(predicted), cvar_of(predicted, self.tail)
         self.names = tuple(found)
