@@ -256,7 +256,7 @@ def _average(values: Sequence[Tensor]) -> Tensor:
 
 
 def _normal_cdf(z: Tensor, deep: bool = False) -> Tensor:
-    """Φ in float64: by ONNX's own erf in float32; where `deep` to 10⁻¹³ of itself, also far below 0.
+    """Φ in float64: by ONNX's own erf in float32; where `deep` to 10⁻⁷ of itself, also far below 0.
 
     Source: Hart's approximation as of West (2005), "Better approximations to cumulative normal functions".
     """
