@@ -207,3 +207,15 @@ def test_the_command_in_an_examples_docstring_names_what_is_there(name: str) -> 
     assert named
     for file, part in named:
         assert re.search(rf"^(class|def) {part}\b", (EXAMPLES.parent / file).read_text(), re.MULTILINE)
+
+
+def test_a_sweep_finds_the_best_of_its_trials(tmp_path: Path) -> None:
+    pytest.importorskip("optuna", reason="Optuna, which the example alone needs, is not installed")
+    run(tmp_path, "benchnav-datagen", "create", "tiny-v1", "--out", "tiny.h5")
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / "sweep.py", "tiny.h5", "trials", "3"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"best: trial \d, validation loss -?\d\.\d+, \{'learning_rate'", done.stdout)
+    assert (tmp_path / "trials" / "trial-0" / "config.json").is_file()

@@ -10,6 +10,7 @@ from benchnav.models.config import (
     MDNConfig,
     TrainOptions,
 )
+from benchnav.models.onnx_command import export
 from benchnav.models.quality.command import evaluate
 from benchnav.models.quality.compare.command import compare
 
@@ -137,6 +138,7 @@ def main() -> None:
         "mdn": Command(train_mdn, settings=TrainOptions),
         "evaluate": Command(evaluate, ("checkpoint",)),
         "compare": Command(compare, ("models",)),
+        "export": Command(export, ("checkpoint",)),
     }
     status = run("benchnav-train", "Train and measure models of traversability.", commands)
     if status == INTERRUPTED and sys.argv[1] in _RESUMABLE:

@@ -43,6 +43,8 @@ class FusedModel(ModelFamily):
         """Sets the classifiers to evaluation."""
         self.classifiers = tuple(classifier.eval() for classifier in classifiers)
         self.table, self.class_names, self.pool_temperature = table, class_names, pool_temperature
+        # Told here, since an exported graph cannot hold a number of components that its tensors decide.
+        self.soft_owners = tuple(table.soft.weight.nonzero().flatten().tolist()) if table.soft else ()
 
     def predict(self, observation: Observation) -> TraversabilityMixture:
         """Predicts on the observation's device, to which the classifiers are moved.
@@ -58,16 +60,21 @@ class FusedModel(ModelFamily):
 
     def fuse(self, member_probabilities: Tensor, observation: Observation) -> TraversabilityMixture:
         """Makes the prediction of what the members said of the observation, [M, B, C, H, W]."""
+        return self.fuse_at(member_probabilities, observation.slope_deg)
+
+    def fuse_at(self, member_probabilities: Tensor, slope_deg: Tensor) -> TraversabilityMixture:
+        """As `fuse`, of maps of which the slope is known, [B, H, W]."""
         weights = sharpen(member_probabilities.sum(0) / len(self.classifiers), self.pool_temperature)
-        means, stds = self.table.lookup(observation.slope_deg.float())
+        means, stds = self.table.lookup(slope_deg.float())
         group = tuple(range(len(self.class_names)))
         if soft := self.table.soft:
-            owners = soft.weight.nonzero().flatten()
-            group += tuple(owners.tolist())
+            group += self.soft_owners
             share, mean, std = (values.to(weights).view(-1, 1, 1) for values in soft)
             second = (weights * share, mean.expand_as(weights), std.expand_as(weights))
             pairs = zip((weights * (1 - share), means, stds), second, strict=True)
-            weights, means, stds = (torch.cat([main, other[:, owners]], 1) for main, other in pairs)
+            weights, means, stds = (
+                torch.cat([main, other[:, list(self.soft_owners)]], 1) for main, other in pairs
+            )
         return TraversabilityMixture(weights, means, stds, group)
 
     def member_probabilities(self, observation: Observation) -> Tensor:

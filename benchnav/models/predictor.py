@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from benchnav.core import registry
+from benchnav.core import hub, registry
 from benchnav.core.command import tell
 from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
@@ -73,9 +73,9 @@ def load_model(source: Source) -> TraversabilityModel:
 
     Args:
         source: the folder of a checkpoint, by path or by its name in `checkpoints/` here or
-            among those shipped; or a part, such as `oracle`, `package.module:Name` or `path/to/file.py:Name`, with
-            options where it is a mapping; or the checkpoint of a class that a file or module holds,
-            `path/to/file.py:Name@CHECKPOINT`.
+            among those shipped, or `owner/name@revision` of a hub; or a part, such as `oracle`,
+            `package.module:Name` or `path/to/file.py:Name`, with options where it is a mapping; or the checkpoint of
+            a class that a file or module holds, `path/to/file.py:Name@CHECKPOINT`.
 
     Raises:
         ConfigError: there is no such model, or it refuses its options.
@@ -159,7 +159,7 @@ def _rebuilt(family: type[ModelFamily], checkpoint: Checkpoint) -> Traversabilit
 
 
 def find_checkpoint(source: str | Path) -> Path:
-    """Finds the folder of a checkpoint by path, or by name in `checkpoints/` here or among the shipped ones.
+    """Finds the folder of a checkpoint by path, by name in `checkpoints/` here or among the shipped ones, or on a hub.
 
     Of `path/to/file.py:Name@CHECKPOINT` it is the folder of CHECKPOINT.
 
@@ -177,6 +177,8 @@ def find_checkpoint(source: str | Path) -> Path:
         return Path(source)  # to be refused by the reader, which says what is missing there
     for path in places:
         refuse_unfinished(path)
+    if hub.is_address(source):
+        return hub.download(str(source), "model", CheckpointError)
     path, names = Path(source), [path.name for path in list_checkpoints()]
     known = sorted({*registry.names("model"), *names})
     siblings = [config.parent.name for config in path.parent.glob(f"*/{CONFIG}")]
@@ -186,8 +188,8 @@ def find_checkpoint(source: str | Path) -> Path:
         or registry.hint(path.name, names)
     )
     raise ConfigError(
-        f"Expected a model among {', '.join(known)}, the folder of a checkpoint, package.module:Name or "
-        f"path/to/file.py:Name, got {str(source)!r}.{near}"
+        f"Expected a model among {', '.join(known)}, the folder of a checkpoint, package.module:Name, "
+        f"path/to/file.py:Name or owner/name@revision of a hub, got {str(source)!r}.{near}"
     )
 
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import h5py
 import numpy as np
 
+from benchnav.core import hub
 from benchnav.core.errors import DatasetError
 from benchnav.core.grid import Grid
 from benchnav.core.shipped_files import shipped_folder
@@ -419,10 +420,10 @@ def is_dataset(path: Path) -> bool:
 
 
 def find_dataset(source: str | Path) -> Path:
-    """Finds a dataset by path, or by id in `dataset_folders`.
+    """Finds a dataset by path, by id in `dataset_folders`, or on a hub by `owner/name@revision`.
 
     Raises:
-        DatasetError: neither is there.
+        DatasetError: none of them is there.
     """
     if is_dataset(Path(source)) or any(Path(source).glob("*.h5")):
         return Path(source)  # of shards without a manifest the reader tells what to do
@@ -430,7 +431,22 @@ def find_dataset(source: str | Path) -> Path:
         for name in (f"{source}.h5", f"{source}", f"{source}-test.h5"):
             if is_dataset(folder / name):
                 return folder / name
+    if hub.is_address(source):
+        return _in_snapshot(hub.download(str(source), "dataset", DatasetError), str(source))
     raise DatasetError(
         f"Expected the path or id of a dataset, got {str(source)!r}, which is neither a file nor in "
         f"{' or '.join(map(str, dataset_folders()))}. Make one with `benchnav-datagen create`."
     )
+
+
+def _in_snapshot(folder: Path, source: str) -> Path:
+    """The dataset in what was downloaded: a folder of shards, or its one file."""
+    if (folder / FOLDER_MANIFEST).is_file():
+        return folder
+    files = sorted(folder.glob("*.h5"))
+    if len(files) != 1:
+        raise DatasetError(
+            f"Expected {source} to hold {FOLDER_MANIFEST} and its shards, or one file .h5, got {len(files)} files .h5. "
+            "Name another repository or revision."
+        )
+    return files[0]

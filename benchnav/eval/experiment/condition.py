@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from benchnav.core import registry
+from benchnav.core import hub, registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.registry import Part
@@ -240,7 +240,8 @@ def _parts(kind: str, given: Any) -> list[Part]:
                 f"Expected no options for the checkpoint {part.part!r}, got {dict(part.options)}."
             )
         is_named = part.label not in (part.part, part.part.rpartition(":")[2])
-        return [part if is_named else replace(part, label=folder.name)]
+        label = part.part.rpartition("/")[2] if hub.is_address(part.part) else folder.name
+        return [part if is_named else replace(part, label=label)]
     if kind == "model" and is_family(registry.find("model", part.part).target):
         load_model(part)  # says what to name in place of a family
     made = [registry.complete(kind, one) for one in each_part(kind, part)]

@@ -23,8 +23,8 @@ import lightning
 import pandas as pd
 import torch
 from lightning.fabric.plugins.io import TorchCheckpointIO
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar, RichProgressBar
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, ProgressBar, RichProgressBar
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
@@ -34,6 +34,7 @@ from benchnav.core.errors import CheckpointError, ConfigError, expect, quiet
 from benchnav.core.settings import check_known, one_line
 from benchnav.core.store import replacing, sole_writer, write_text
 from benchnav.models.config import TrainOptions
+from benchnav.models.training.trackers import described, make_callbacks, make_loggers
 
 STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
 
@@ -41,11 +42,12 @@ _PARTIAL = f".{STATE}.*.partial"  # what a kill in the middle of writing has lef
 
 # Settings of Lightning's trainer that are made here, and those that the outcome does not depend on.
 _OWN = {
-    "self", "logger", "callbacks", "plugins", "default_root_dir", "accelerator", "fast_dev_run",
+    "self", "plugins", "default_root_dir", "accelerator", "fast_dev_run",
     "enable_checkpointing", "enable_progress_bar", "enable_model_summary", "enable_autolog_hparams",
     "barebones", "num_sanity_val_steps", "use_distributed_sampler", "inference_mode", "model_registry", "profiler",
 }  # fmt: skip
 _DEFAULTS = inspect.signature(lightning.Trainer.__init__).parameters
+_TRACKERS = ("logger", "callbacks")  # which are made from text, see `models.training.trackers`
 _OF_NO_ACCOUNT = {"max_epochs", "log_every_n_steps", "detect_anomaly", "accelerator"}
 
 
@@ -72,6 +74,8 @@ class FitOptions(TrainOptions):
         )
         for name in asked:
             check_known("settings of `trainer`", name, sorted(_DEFAULTS.keys() - _OWN))
+        self.make_loggers(None)  # so that what cannot be made is refused before anything is trained
+        self.make_callbacks()
         devices, processors = asked.get("devices", 1), os.cpu_count() or 1
         expect(
             self.place.type != "cpu" or not isinstance(devices, int) or 1 <= devices <= processors,
@@ -91,13 +95,26 @@ class FitOptions(TrainOptions):
             for name, value in self.chosen().items()
             if name not in _OF_NO_ACCOUNT and value != _DEFAULTS[name].default
         }
+        if (asked := (self.trainer or {}).get("callbacks")) is not None:
+            chosen["callbacks"] = described(asked)
         return json.loads(json.dumps(chosen, default=str, sort_keys=True))
 
+    def make_loggers(self, folder: Path | None) -> list[Logger] | None:
+        """Makes the loggers that are asked for, to write in a folder; None where nothing is said of them."""
+        asked = (self.trainer or {}).get("logger")
+        return None if asked is None or asked is True else make_loggers(asked, folder)
+
+    def make_callbacks(self) -> list[Callback]:
+        """Makes the callbacks that are asked for."""
+        asked = (self.trainer or {}).get("callbacks")
+        return [] if asked is None else make_callbacks(asked)
+
     def chosen(self, **trainer: Any) -> dict[str, Any]:
-        """All settings of the trainer, of those given here and others, by name."""
+        """All settings of the trainer but loggers and callbacks, of those given here and others, by name."""
         kind = self.place.type
         first = {"precision": default_precision(kind), "devices": 1}
-        return {**first, **trainer, **(self.trainer or {}), "accelerator": kind}
+        asked = {name: value for name, value in (self.trainer or {}).items() if name not in _TRACKERS}
+        return {**first, **trainer, **asked, "accelerator": kind}
 
 
 def fit(
@@ -132,10 +149,15 @@ def fit(
     folder = options.folder / part if options.folder else None
     held = sole_writer(folder, str(folder)) if folder and is_first_process() else nullcontext()
     in_terminal, state = sys.stderr.isatty(), None
-    callbacks = [*callbacks, History(folder / HISTORY if folder else None, "" if in_terminal else part)]
+    callbacks = [
+        *callbacks,
+        *options.make_callbacks(),
+        History(folder / HISTORY if folder else None, "" if in_terminal else part),
+    ]
     if in_terminal:
         callbacks.append(RichProgressBar(console_kwargs={"stderr": True}))
-    kept: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
+    loggers = options.make_loggers(folder)
+    kept: dict[str, Any] = {"logger": False, "enable_checkpointing": _keeps_checkpoints(callbacks)}
     with quietly(), held:
         if folder:
             trainers = {f"trainer.{name}": value for name, value in options.trainer_settings.items()}
@@ -145,6 +167,10 @@ def fit(
             )
             callbacks.append(last)
             kept = {"logger": TensorBoardLogger(folder, name="", version=""), "plugins": [WholeFiles()]}
+        if loggers is not None:
+            kept["logger"] = loggers
+            for logger in loggers:
+                logger.log_hyperparams({"part": part, **settings})
         trainer = make_trainer(callbacks, **kept, **options.chosen(**usual))
         handler = signal.getsignal(signal.SIGINT)
         devices = [options.place] if options.place.type == "cuda" else []
@@ -163,6 +189,11 @@ def fit(
                 f"{state} is damaged: {type(error).__name__} {error}. Pass --overwrite to begin anew."
             ) from error
         return measured(trainer)
+
+
+def _keeps_checkpoints(callbacks: list[Callback]) -> bool:
+    """Tells whether a user's callback writes checkpoints, which Lightning asks for leave to do."""
+    return any(isinstance(callback, Checkpoint) for callback in callbacks)
 
 
 say = rank_zero_only(print)

@@ -474,3 +474,28 @@ def test_layers_are_columns_and_named(tmp_path: Path) -> None:
     plain = metadata(exported(factories.tiny_dataset(tmp_path / "e.h5", small_stakes()), tmp_path / "plain"))
     assert "layers" not in plain["description"]
     assert not any("vegetation" in key for key in plain["recordSet"][0]["data"][0])
+
+
+def test_mlcroissant_reads_the_metadata_and_the_maps(dataset_path: Path, tmp_path: Path) -> None:
+    mlcroissant = pytest.importorskip("mlcroissant")
+    dataset, out = TerrainDataset(dataset_path), exported(dataset_path, tmp_path / "out")
+    read = mlcroissant.Dataset(jsonld=out / "croissant.json")
+    assert not read.metadata.ctx.issues.errors
+    names = parquet.split_names(dataset.splits)
+    for split, name in names.items():
+        rows = list(read.records(name))
+        assert len(rows) == dataset.map_count(split)
+        maps = dataset.read(split)
+        for row in rows:
+            for field, values in maps.items():
+                got = np.array(nested(row[f"{name}/{field}"]), values.dtype)  # a number NaN comes as None
+                np.testing.assert_array_equal(got.reshape(values.shape[1:]), values[int(row[f"{name}/map"])])
+    classes = [row["classes/name"] for row in read.records("classes")]
+    assert [name.decode() if isinstance(name, bytes) else name for name in classes] == [
+        item.name for item in dataset.recipe.classes
+    ]
+
+
+def nested(values: Any) -> Any:
+    """Arrays of arrays as lists of lists."""
+    return [nested(value) for value in values] if isinstance(values, list | np.ndarray) else values

@@ -309,7 +309,7 @@ def test_nothing_to_resume_begins_anew(dataset: TerrainDataset, tmp_path: Path) 
     assert list(pd.read_csv(tmp_path / "classifier/metrics.csv")["epoch"]) == [1]
 
 
-@pytest.mark.parametrize("name", ["callbacks", "logger", "device"])
+@pytest.mark.parametrize("name", ["plugins", "profiler", "device"])
 def test_settings_that_the_trainer_does_not_take_are_refused(name: str) -> None:
     with pytest.raises(ConfigError, match=f"got '{name}'"):
         FitOptions(device="cpu", trainer={name: 1})

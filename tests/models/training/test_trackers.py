@@ -1,0 +1,104 @@
+"""A user's loggers and callbacks are made from text, write where they should, and callbacks are recorded."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from benchnav.core.errors import CheckpointError, ConfigError
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models.config import TrainOptions
+from benchnav.models.training.fit import FitOptions
+from benchnav.models.training.networks import fit_model
+
+OWN = Path(__file__).parents[3] / "examples" / "own_model.py"
+CALLBACK = """
+from pathlib import Path
+from lightning.pytorch.callbacks import Callback
+
+
+class Note(Callback):
+    def __init__(self, path: str, word: str = "epoch") -> None:
+        self.path, self.word = path, word
+
+    def on_train_epoch_end(self, trainer, module):
+        with open(self.path, "a") as file:
+            file.write(f"{self.word} {trainer.current_epoch}\\n")
+"""
+
+
+def train(dataset: TerrainDataset, out: Path, **trainer: Any) -> None:
+    options = TrainOptions(device="cpu", trainer={"max_epochs": 2, "precision": "32-true", **trainer})
+    fit_model(options, f"{OWN}:CellModel", str(dataset.path), str(out), {"batch_size": 5, "hidden": 4})
+
+
+def test_loggers_write_what_is_measured_and_change_nothing(dataset: TerrainDataset, tmp_path: Path) -> None:
+    train(dataset, tmp_path / "plain")
+    train(dataset, tmp_path / "logged", logger=["CSVLogger", {"class_path": "TensorBoardLogger"}])
+    logs = tmp_path / "logged.training" / "CellModel"
+    table = pd.read_csv(logs / "lightning_logs" / "version_0" / "metrics.csv")
+    own = pd.read_csv(logs / "metrics.csv")  # ours is there as ever
+    assert table["valid_loss"].dropna().tolist() == pytest.approx(own["valid_loss"].tolist())
+    told = (logs / "lightning_logs" / "version_0" / "hparams.yaml").read_text()
+    assert "hidden: 4" in told
+    assert "seed: 0" in told
+    assert list(logs.glob("lightning_logs/version_*/events.out.tfevents.*"))
+    assert not list(logs.glob("events.out.tfevents.*"))  # where loggers are named, these alone write
+    assert list((tmp_path / "plain.training" / "CellModel").glob("events.out.tfevents.*"))
+    first, second = (load_checkpoint(tmp_path / name).parts["CellModel"] for name in ("plain", "logged"))
+    assert all((first.tensors[name] == second.tensors[name]).all() for name in first.tensors)
+    assert first.trainer == second.trainer
+
+
+def test_a_callback_of_a_file_is_called_and_recorded(dataset: TerrainDataset, tmp_path: Path) -> None:
+    file, log = tmp_path / "note.py", tmp_path / "log.txt"
+    file.write_text(CALLBACK)
+    given = {"class_path": f"{file}:Note", "init_args": {"path": str(log), "word": "after"}}
+    train(dataset, tmp_path / "out", callbacks=[given, "DeviceStatsMonitor"], logger="CSVLogger")
+    assert log.read_text() == "after 0\nafter 1\n"
+    (note, stats) = load_checkpoint(tmp_path / "out").parts["CellModel"].trainer["callbacks"]
+    assert note["init_args"]["word"] == "after"
+    assert stats == {"class_path": "DeviceStatsMonitor"}
+    before = note["digest"]
+    file.write_text(CALLBACK.replace("current_epoch", "current_epoch + 1"))
+    options = FitOptions(device="cpu", trainer={"callbacks": given})
+    assert options.trainer_settings["callbacks"][0]["digest"] != before
+    json.dumps(options.trainer_settings)
+    with pytest.raises(CheckpointError, match=r"another .*trainer\.callbacks"):
+        fit_model(
+            TrainOptions(device="cpu", trainer={"max_epochs": 2, "precision": "32-true"}, resume=True),
+            f"{OWN}:CellModel", str(dataset.path), str(tmp_path / "out"), {"batch_size": 5, "hidden": 4},
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("trainer", "said"),
+    [
+        ({"logger": "CVSLogger"}, "CSVLogger"),
+        ({"logger": "EarlyStopping"}, "`trainer.logger` among"),
+        ({"logger": {"class": "CSVLogger"}}, "{class_path: CLASS, init_args: {…}}"),
+        (
+            {"logger": {"class_path": "CSVLogger", "init_args": {"colour": 1}}},
+            "arguments that CSVLogger takes",
+        ),
+        ({"callbacks": "nowhere.py:Note"}, "cannot be read"),
+        ({"callbacks": "no_such_module.Note"}, "no_such_module"),
+        ({"callbacks": "pathlib.Path"}, "lightning's Callback"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_before_training(trainer: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        FitOptions(device="cpu", trainer=trainer)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_missing_package_is_named_with_its_command() -> None:
+    mlflow = pytest.importorskip("lightning.pytorch.loggers.mlflow")
+    if mlflow._MLFLOW_AVAILABLE:
+        pytest.skip("mlflow is installed")
+    with pytest.raises(ConfigError, match="pip install mlflow"):
+        FitOptions(device="cpu", trainer={"logger": "lightning.pytorch.loggers.MLFlowLogger"})
