@@ -10,9 +10,7 @@ from pathlib import Path
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
-from benchnav.models import load_checkpoint
-from benchnav.models.config import TrainOptions
-from benchnav.models.training.networks import fit_model
+from benchnav.models import TrainOptions, fit_model, load_checkpoint
 
 try:
     import optuna

@@ -33,7 +33,14 @@ def test_a_model_of_ones_own_is_trained_calibrated_measured_and_driven_with(
 ) -> None:
     os.symlink(EXAMPLES / "own_model.py", tmp_path / "own_model.py")
     run(tmp_path, "benchnav-datagen", "create", "tiny-v1", "--out", "tiny.h5")
-    quick = ("--settings.batch_size", "2", "--settings.learning_rate", "0.02")
+    quick = (
+        "--settings.batch_size",
+        "2",
+        "--settings.learning_rate",
+        "0.02",
+        "--trainer.precision",
+        "32-true",
+    )
     said = run(
         tmp_path, "benchnav-train", "fit", "own_model.py:CellModel", "--data", "tiny.h5", "--out", "mine",
         "--members", "2", *quick,
@@ -51,7 +58,7 @@ def test_a_model_of_ones_own_is_trained_calibrated_measured_and_driven_with(
         true = dataset.terrain(split).truth.mean()
         constant = float((true - float(observed.mean())).square().mean().sqrt())
         oracle = measured["oracle"][split]
-        assert own["rmse_expected"] < 0.7 * constant
+        assert own["rmse_expected"] < 0.8 * constant
         assert oracle["crps"] < own["crps"]
     rows = evaluate(dataset_path, tmp_path, "--model", model, "--planners", "[astar_dwa]")
     assert set(rows["model"]) == {"mine"}

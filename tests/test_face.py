@@ -19,9 +19,9 @@ FACES = {
     "load_recipe recipe_from_dict shipped_recipes",
     "benchnav.env": "OffRoadEnv OffRoadVectorEnv",
     "benchnav.eval": "Condition Suite compare_runs open_run read_report read_steps run_suite write_report",
-    "benchnav.models": "Checkpoint ModelFamily Part TrainableModel TrainingConfig TraversabilityModel Window "
-    "evaluate_model find_checkpoint list_checkpoints load_checkpoint load_model measure_margin predict predict_tiles "
-    "save_checkpoint write_risk_maps",
+    "benchnav.models": "Checkpoint ModelFamily Part TrainOptions TrainableModel TrainingConfig TraversabilityModel "
+    "Window evaluate_model find_checkpoint fit_model list_checkpoints load_checkpoint load_model measure_margin "
+    "predict predict_tiles save_checkpoint write_risk_maps",
     "benchnav.planning": "AStarDWA AStarMPPI Bicycle CLRRT DifferentialDrive FreeSpace GoalDistance LocalPlanner "
     "MPPI MPPIConfig Objective Places Plan PlanStatus Planner Problem Robot Rules SPEED STEERING Simulation Step "
     "Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem",

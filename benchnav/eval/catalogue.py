@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.registry import Option
-from benchnav.core.settings import check_known, dataclass_in, list_options, plain
+from benchnav.core.settings import check_known, config_class, dataclass_in, list_options, plain
 from benchnav.core.tables import Bold, Table, print_table
 
 TITLES = {
@@ -98,7 +98,12 @@ def _describe(kind: str, name: str) -> Entry:
     try:
         target = registry.find(kind, name).target
         if kind == "model" and is_family(target):
-            return Entry(name, f"{_purpose(target)} A family: name a checkpoint of it.")
+            settings = tuple(_option_lines(list_options(target))) if config_class(target) else ()
+            return Entry(
+                name,
+                f"{_purpose(target)} Trained by `benchnav-train fit {name}`; name a checkpoint.",
+                settings,
+            )
         options = tuple(_option_lines(registry.options_of(kind, target)))
         return Entry(name, _purpose(target), options)
     except BenchnavError as error:

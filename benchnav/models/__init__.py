@@ -6,8 +6,9 @@ __getattr__, __dir__, __all__ = face(
     __name__,
     {
         "benchnav.models.base": ("ModelFamily", "TraversabilityModel", "predict"),
-        "benchnav.models.config": ("TrainingConfig",),
+        "benchnav.models.config": ("TrainOptions", "TrainingConfig"),
         "benchnav.models.nets.trainable": ("TrainableModel",),
+        "benchnav.models.training.networks": ("fit_model",),
         "benchnav.models.checkpoint": ("Checkpoint", "Part", "load_checkpoint", "save_checkpoint"),
         "benchnav.models.predictor": ("find_checkpoint", "list_checkpoints", "load_model"),
         "benchnav.models.quality.measure": ("evaluate as evaluate_model",),

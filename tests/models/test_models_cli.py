@@ -386,7 +386,7 @@ def test_how_maps_are_read_reaches_the_training(
 ) -> None:
     seen = []
 
-    def opened(*_: object, in_memory: bool, workers: int) -> None:
+    def opened(*_: object, in_memory: bool, workers: int, **others: object) -> None:
         seen.append((in_memory, workers))
         raise KeyboardInterrupt
 
