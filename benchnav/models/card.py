@@ -5,6 +5,7 @@ from typing import Any
 
 import yaml
 
+from benchnav.core import registry
 from benchnav.core.tables import Table, to_markdown
 
 CARD = "README.md"
@@ -33,11 +34,12 @@ def card_of(
     """
     datasets = sorted({part.data_id for part in parts.values()})
     head = {"library_name": "benchnav", "tags": ["traversability", "robotics"], "datasets": datasets}
-    place = f"path/to/file.py:{model}@{name}" if code else name
+    is_own = code and model not in registry.names("model")  # an installed class is found by its name
+    place = f"path/to/file.py:{model}@{name}" if is_own else name
     own = (
         f"The class `{model}` is a user's own and not in this folder: name the file that holds it. The "
         f"SHA-256 of its code was `{code}`.\n\n"
-        if code
+        if is_own
         else ""
     )
     classes = f"Terrain classes of the maps: {', '.join(classes)}.\n\n" if classes else ""

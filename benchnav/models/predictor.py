@@ -15,12 +15,12 @@ import torch
 
 from benchnav.core import hub, registry
 from benchnav.core.command import tell
-from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError, expect
+from benchnav.core.errors import CheckpointError, ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.shipped_files import shipped_folder
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.models.base import ModelFamily, PrivilegedModel, TraversabilityModel, is_family
+from benchnav.models.base import PrivilegedModel, TraversabilityModel, is_family
 from benchnav.models.checkpoint import (
     CLASSIFIER,
     CONFIG,
@@ -105,7 +105,7 @@ def split_own(source: str | Path) -> tuple[str, str] | None:
 
 
 def _load_own(place: str, folder: Path) -> TraversabilityModel:
-    """Rebuilds the model of a checkpoint by a class that the user names, and tells when its code is another now."""
+    """Rebuilds the model of a checkpoint by a class that the user names."""
     found = registry.find("model", place)
     if not is_family(found.target):
         raise ConfigError(
@@ -118,12 +118,7 @@ def _load_own(place: str, folder: Path) -> TraversabilityModel:
             f"Expected a checkpoint of the class {name}, got {folder}, which is one of {checkpoint.model!r}. "
             "Name the class that it was trained with."
         )
-    if checkpoint.code and checkpoint.code != found.digest:
-        tell(
-            f"benchnav: warning: the code of {place} is not that which trained {folder} "
-            f"(digest {found.digest[:12]}, then {checkpoint.code[:12]}): what it predicts may differ"
-        )
-    return _rebuilt(found.target, checkpoint)
+    return _rebuilt(found, checkpoint)
 
 
 def open_checkpoint(checkpoint: Checkpoint) -> TraversabilityModel:
@@ -135,24 +130,29 @@ def open_checkpoint(checkpoint: Checkpoint) -> TraversabilityModel:
         CheckpointError: the family is not known here by name, or cannot rebuild the model.
     """
     known = registry.names("model")
-    family = registry.find("model", checkpoint.model).target if checkpoint.model in known else None
-    if not is_family(family):
+    found = registry.find("model", checkpoint.model) if checkpoint.model in known else None
+    if found is None or not is_family(found.target):
         raise CheckpointError(
             f"Expected a checkpoint of a model among {', '.join(known)}, got one of {checkpoint.model!r}. Install the "
             f"package that registers it, or name the class: path/to/file.py:{checkpoint.model}@CHECKPOINT."
         )
-    return _rebuilt(family, checkpoint)
+    return _rebuilt(found, checkpoint)
 
 
-def _rebuilt(family: type[ModelFamily], checkpoint: Checkpoint) -> TraversabilityModel:
-    """Rebuilds a model; what its class raises ends in one line."""
+def _rebuilt(family: registry.Found, checkpoint: Checkpoint) -> TraversabilityModel:
+    """Rebuilds a model, and tells when its class is of other code now; what that raises ends in one line."""
+    if checkpoint.code and checkpoint.code != family.digest:
+        tell(
+            f"benchnav: warning: the code of {checkpoint.model} in {family.origin} is not that which trained the "
+            f"checkpoint (digest {family.digest[:12]}, then {checkpoint.code[:12]}): what it predicts may differ"
+        )
     try:
-        model = family.from_checkpoint(checkpoint)
+        model = family.target.from_checkpoint(checkpoint)
         table = ConformalTable.read(checkpoint.conformal) if checkpoint.conformal else None
         return ConformalModel(model, table) if table else model
     except CheckpointError:
         raise
-    except (BenchnavError, KeyError, RuntimeError, TypeError, AttributeError) as error:
+    except Exception as error:  # a user's class may raise anything
         raise CheckpointError(
             f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
         ) from error

@@ -335,9 +335,8 @@ def _layer_scale(name: str, sums: Tensor, cells: int) -> LayerScale:
     if is_azimuth(name):
         return LayerScale(torch.zeros(2), torch.ones(2), torch.ones(()))
     mean, square = (sums / max(1, cells)).unbind()
-    std = (
-        (square - mean**2).clamp(min=_LEAST_VARIANCE).sqrt()
-    )  # a layer that is the same everywhere has no scale
+    # A layer that is the same everywhere would have no scale.
+    std = (square - mean**2).clamp(min=_LEAST_VARIANCE).sqrt()
     return LayerScale(mean.float().view(1), std.float().view(1), square.clamp(min=1).sqrt().float())
 
 

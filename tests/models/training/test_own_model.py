@@ -11,6 +11,7 @@ from types import ModuleType
 import pytest
 import torch
 
+from benchnav.core import registry
 from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.sources import load_file
 from benchnav.datagen.files.reader import TerrainDataset
@@ -155,10 +156,38 @@ def test_other_code_is_told_and_not_gone_on_with(
     Path("own.py").write_text(EXAMPLE.read_text() + "\n\nMORE = 1\n")
     load_model("own.py:CellModel@c")
     (line,) = capfd.readouterr().err.splitlines()
-    assert "the code of own.py:CellModel is not that which trained c" in line
+    assert "the code of CellModel in file own.py is not that which trained the checkpoint" in line
     command = ("fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK, "--resume")
     assert call(monkeypatch, *command) == 2
     assert "got one of other code" in capfd.readouterr().err
+
+
+def test_an_installed_class_is_loaded_by_its_name_and_its_code_compared_too(
+    trained: Path,
+    own: Path,
+    dataset: TerrainDataset,
+    module: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(registry._REGISTERED, ("model", "cells"), module.CellModel)
+    assert call(monkeypatch, "fit", "cells", "--data", dataset.path, "--out", "c", *QUICK) == 0
+    kept = load_checkpoint("c")
+    assert (kept.model, list(kept.parts)) == ("cells", ["cells"])
+    assert "benchnav-train evaluate c --data" in Path("c/README.md").read_text()
+    capfd.readouterr()
+    load_model("c")
+    assert capfd.readouterr().err == ""
+    save_checkpoint("c", replace(kept, code="0" * 64))
+    load_model("c")
+    assert "the code of cells in this process is not that which trained" in capfd.readouterr().err
+
+
+def test_a_class_that_raises_while_it_is_rebuilt_ends_in_one_line(trained: Path, own: Path) -> None:
+    text = EXAMPLE.read_text().replace("hidden = self.config.hidden", "hidden = [][self.config.hidden]")
+    Path("own.py").write_text(text)
+    with pytest.raises(CheckpointError, match="list index out of range"):
+        load_model(f"own.py:CellModel@{trained / 'c'}")
 
 
 def test_a_checkpoint_of_a_users_class_needs_the_class(trained: Path) -> None:
