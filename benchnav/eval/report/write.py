@@ -276,7 +276,9 @@ def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> li
     # All conditions met the same; where a model failed nothing was drawn.
     again = episodes.groupby(MAP)["rejected_draws"].max()
     share = again.sum() / (again + 1).sum()
-    return [f"Of the draws of λ {100 * share:.1f} % had no feasible path from start to goal and were rejected."]
+    return [
+        f"Of the draws of λ {100 * share:.1f} % had no feasible path from start to goal and were rejected."
+    ]
 
 
 def _world(value: Mapping[str, Any]) -> str:
