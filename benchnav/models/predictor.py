@@ -65,6 +65,7 @@ class Clairvoyant(PrivilegedModel):
 
 
 Source = str | Path | Mapping[str, Any] | registry.Part
+IN_REPOSITORY_ALONE = "paper-v1"  # a checkpoint that `setup.py` leaves out of wheels
 
 
 @torch.inference_mode(False)  # so that it is the same model wherever it is loaded
@@ -179,6 +180,12 @@ def find_checkpoint(source: str | Path) -> Path:
         refuse_unfinished(path)
     if hub.is_address(source):
         return hub.download(str(source), "model", CheckpointError)
+    if str(source) == IN_REPOSITORY_ALONE:
+        raise ConfigError(
+            f"Expected the checkpoint {source}, which an installed wheel leaves out for its size, in checkpoints/, got "
+            f"none. Copy the folder checkpoints/{source} of the repository there, or name another model, such as "
+            "stakes-v1."
+        )
     path, names = Path(source), [path.name for path in list_checkpoints()]
     known = sorted({*registry.names("model"), *names})
     siblings = [config.parent.name for config in path.parent.glob(f"*/{CONFIG}")]
