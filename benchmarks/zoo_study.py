@@ -33,6 +33,7 @@ from scipy.stats import kendalltau, t
 
 from benchnav.core import registry
 from benchnav.core.resampling import sign_flips
+from benchnav.core.store import write_text
 from benchnav.datagen import TerrainDataset
 from benchnav.eval.stats.paired_difference import mean_interval
 from benchnav.models import load_model
@@ -179,7 +180,7 @@ def measure(out: Path, models: list[Dose], maps: int) -> pd.Series:
             loss, _ = lower_fifth_and_width(predict(model, terrain), terrain.traversability)
             losses.append(loss.mean((1, 2)))
         found[dose.label] = float(np.concatenate([loss.numpy() for loss in losses]).mean())
-        path.write_text(json.dumps(found, indent=1))
+        write_text(path, json.dumps(found, indent=1))
     return pd.Series(found)[[dose.label for dose in models]]
 
 
@@ -344,13 +345,11 @@ def run_zoo(out: Path, maps: int, draws: int, sizes: list[int], seeds: list[int]
 
 
 def run_quality(
-    out: Path, part: str, recipe: str, methods: dict[str, tuple[object, ...]], size: int, seeds: list[int]
+    out: Path, part: str, recipes: tuple[str, str], methods: Methods, maps: int, size: int, seeds: list[int]
 ) -> None:
-    """Methods on the maps of a recipe, compared alone; differences are to the first."""
-    train = make_maps(out / f"{part}-train.h5", recipe, "train,valid", size, max(4, size // 4))
-    test = make_maps(
-        out / f"{part}-test.h5", "full-v1" if recipe == "paper-v1" else recipe, "test/std,test/hs"
-    )
+    """Methods on the maps of two recipes, to train and to test on, compared alone; differences are to the first."""
+    train = training_maps(out / f"{part}-train.h5", recipes[0], size)
+    test = make_maps(out / f"{part}-test.h5", recipes[1], dict.fromkeys(TESTS, maps))
     places = {
         (method, seed): fit(out / f"{part}-{method}-s{seed}", train, words, seed)
         for seed in seeds
@@ -358,9 +357,9 @@ def run_quality(
     }
     table = compare_methods(out, part, places, test)
     table.to_csv(out / f"{part}.csv", index=False)
-    print_quality(f"{recipe}: mean over seeds", table)
+    print_quality(f"{recipes[0]}: mean over seeds", table)
     if len(seeds) > 1:
-        print_quality(f"{recipe}: difference to {next(iter(methods))}", table, next(iter(methods)))
+        print_quality(f"{recipes[0]}: difference to {next(iter(methods))}", table, next(iter(methods)))
 
 
 def main() -> None:
@@ -383,9 +382,11 @@ def main() -> None:
     if "zoo" in given.parts:
         run_zoo(out, given.maps, given.draws, given.sizes, given.seeds)
     if "paper" in given.parts:
-        run_quality(out, "paper", "full-v1", METHODS, given.maps, largest, given.seeds[:1])
+        run_quality(out, "paper", ("paper-v1", "full-v1"), METHODS, given.maps, largest, given.seeds[:1])
     if "inputs" in given.parts:
-        run_quality(out, "inputs", "vegetation-v1", INPUTS, given.maps, largest, given.seeds)
+        run_quality(
+            out, "inputs", ("vegetation-v1", "vegetation-v1"), INPUTS, given.maps, largest, given.seeds
+        )
     print(f"{time.perf_counter() - begun:.0f} s")
 
 
