@@ -51,7 +51,7 @@ def create(
     """
     from benchnav.datagen.difficulty import table
     from benchnav.datagen.files.describe import written
-    from benchnav.datagen.files.reader import is_dataset
+    from benchnav.datagen.files.manifest import is_dataset
 
     expect(jobs >= 1, f"`jobs` ≥ 1, got {jobs}.")
     expect(
@@ -91,7 +91,8 @@ def list_datasets(folder: str = "") -> None:
     Args:
         folder: Where to look for files; where ids are looked up when not given.
     """
-    from benchnav.datagen.files.reader import FOLDER_MANIFEST, dataset_folders
+    from benchnav.datagen.files.find import dataset_folders
+    from benchnav.datagen.files.manifest import FOLDER_MANIFEST
     from benchnav.datagen.recipe.recipe import shipped_sizes
 
     print("recipes:")

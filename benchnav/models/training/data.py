@@ -21,8 +21,9 @@ from benchnav.core import rng
 from benchnav.core.device import CPU
 from benchnav.core.errors import DatasetError, expect
 from benchnav.core.grid import is_azimuth
+from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.maps import TerrainMaps
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.nets.inputs import LayerScale
 from benchnav.models.training.map_order import map_order
