@@ -22,7 +22,7 @@ from benchnav.models.nets import calibration
 from benchnav.models.nets.trainable import Ensemble
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
-from benchnav.models.training.conformal import StoppingMaps, conformal_table, scored_maps
+from benchnav.models.training.conformal import conformal_table, scored_maps, stopping_every
 from benchnav.models.training.data import MapDataset, MapSampler
 from benchnav.models.training.networks import fit_model, train_networks
 from benchnav.testing import check_model
@@ -61,7 +61,7 @@ def test_one_half_is_every_second_map_and_the_other_is_the_rest(
     maps: TerrainDataset, in_memory: bool
 ) -> None:
     whole = MapDataset(maps.path, "valid", FIELDS)
-    half = StoppingMaps(maps.path, "valid", FIELDS, in_memory)
+    half = MapDataset(maps.path, "valid", FIELDS, in_memory, every=stopping_every(conformal=True))
     assert (len(whole), len(half), list(scored_maps(7))) == (7, 4, [1, 3, 5])
     every = whole.read(range(7))["rgb"]
     assert torch.equal(half.read([0, 3])["rgb"], every[[0, 6]])
