@@ -14,7 +14,6 @@ from benchnav.core.command import INTERRUPTED, Command, run, show_progress, tell
 from benchnav.core.errors import DatasetError, choose, expect
 from benchnav.core.store import output_path, read_shard, replacing
 from benchnav.core.tables import Table, print_table
-from benchnav.datagen.dem.raster import Rasters
 from benchnav.datagen.import_commands import import_dem, import_drives
 
 # A dataset of more becomes a folder of files.
@@ -291,7 +290,7 @@ def main() -> None:
         "show": Command(show, ("file",)),
         "validate": Command(validate, ("file",)),
         "merge": Command(merge, ("files",)),
-        "import-dem": Command(import_dem, ("dem", "overrides"), settings=Rasters, repeated=("layer",)),
+        "import-dem": Command(import_dem, ("dem", "overrides"), repeated=("layer",)),
         "import-drives": Command(import_drives, ("drives", "overrides"), repeated=("layer",)),
         "export": Command(export, ("file",)),
         "preview": Command(preview, ("file",)),

@@ -177,7 +177,7 @@ def draw_frozen(
         if len(pending) == 0:
             return field, attempts
     raise ConfigError(
-        f"Expected ground that joins start and goal, but {MOST_ATTEMPTS} draws of λ gave none for example "
+        f"Expected a feasible path from start to goal, but {MOST_ATTEMPTS} draws of λ gave none for example "
         f"{maps[int(pending[0])]}. Lower `immobile.below`, or take easier maps."
     )
 
