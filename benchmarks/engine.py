@@ -25,7 +25,8 @@ from rich.table import Table
 from torch import Tensor
 
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.files.find import find_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import predict
 from benchnav.models.predictor import load_model
 from benchnav.planning.objective import GoalDistance

@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchnav.core import cvar
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.files.find import find_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import predict
 from benchnav.models.predictor import load_model
 

@@ -101,8 +101,8 @@ def main(folder: Path) -> None:
     print(f"{DRIVES} drives of {len(log)} rows, {log['measured_m_s'].sum() * 0.1:.0f} m in all")
     rasters = "--dem dem.tif --photo photo.tif --classes classes.tif --solvable --recipe stakes-v1"
     command(f"benchnav-datagen import-drives drives.csv.gz {rasters} --out site.h5", folder, *MAPS)
-    network = "--mdn.max_epochs 12 --mdn.batch_size 4 --mdn.learning_rate 1e-3"
-    command(f"benchnav-train mdn --data site.h5 --out mine {network}", folder)
+    network = "--settings.max_epochs 12 --settings.batch_size 4 --settings.learning_rate 1e-3"
+    command(f"benchnav-train fit mdn --data site.h5 --out mine {network}", folder)
     command("benchnav-train evaluate mine --data site.h5 --out quality", folder)
     suite = "--world stakes --objectives [travel_time] --scenarios [site] --maps 0 --record none --jobs 2 --out run"
     parts = "--planners [straight,astar_dwa] --risks [mean,cvar:0.8]"

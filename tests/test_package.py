@@ -86,7 +86,8 @@ def test_out_of_the_wheel_the_shipped_maps_and_models_are_found(wheel: Path, tmp
     (site / "datasets").mkdir()
     look = """
 import benchnav
-from benchnav.datagen.files.reader import TerrainDataset, dataset_folders, find_dataset
+from benchnav.datagen.files.find import dataset_folders, find_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.predictor import find_checkpoint, list_checkpoints, load_model
 print(benchnav.__file__, *dataset_folders())
 print(*(TerrainDataset(find_dataset(name)).path for name in ("paper-v1", "stakes-v1")))

@@ -1,8 +1,6 @@
 """Real ground from rasters to a measured model, where some cells have no class."""
 
 import json
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium
@@ -13,12 +11,10 @@ from matplotlib.text import Text
 
 from benchnav.core import figures
 from benchnav.core.errors import ConfigError
-from benchnav.datagen.cli import main as datagen
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.eval.cli import main as evaluate
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.cli import main as train
+from tests.commands import call
 from tests.datagen.dem.rasters import rough, write
 
 rasterio = pytest.importorskip("rasterio")
@@ -28,13 +24,6 @@ QUICK = (
     "--gp.epochs", "1", "--gp.epoch_steps", "5", "--classifier.max_epochs", "1", "--classifier.batch_size", "2",
     "--trainer.precision", "32-true",
 )  # fmt: skip
-
-
-def call(monkeypatch: pytest.MonkeyPatch, main: Callable[[], None], *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["benchnav", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
 
 
 def test_a_model_is_trained_and_measured_on_ground_that_is_labelled_in_part(
@@ -50,18 +39,18 @@ def test_a_model_is_trained_and_measured_on_ground_that_is_labelled_in_part(
     write(tmp_path / "photo.tif", photo)
     rasters = ("dem.tif", "--classes", "classes.tif", "--photo", "photo.tif")
     splits = ("--splits", "train:0.4,valid:0.3,test/site:0.3", "--recipe", "tiny-v1")
-    assert call(monkeypatch, datagen, "import-dem", *rasters, *splits, "--out", "real.h5") == 0
+    assert call("datagen", "import-dem", *rasters, *splits, "--out", "real.h5") == 0
     dataset = TerrainDataset("real.h5")
     for split in dataset.splits:
         unlabelled = dataset.read(split)["class_id"] == UNLABELLED
         assert unlabelled[:, 24:].all()
         assert not unlabelled[:, :24].any()
-    assert call(monkeypatch, datagen, "validate", "real.h5") == 0
-    assert call(monkeypatch, datagen, "show", "real.h5") == 0
-    assert call(monkeypatch, datagen, "preview", "real.h5", "--out", "sheet.png") == 0
-    assert call(monkeypatch, train, "all", "--data", "real.h5", "--out", "mine", *QUICK) == 0
+    assert call("datagen", "validate", "real.h5") == 0
+    assert call("datagen", "show", "real.h5") == 0
+    assert call("datagen", "preview", "real.h5", "--out", "sheet.png") == 0
+    assert call("train", "all", "--data", "real.h5", "--out", "mine", *QUICK) == 0
     out = ("--out", "quality")
-    assert call(monkeypatch, train, "evaluate", "mine", "--data", "real.h5", *out) == 0
+    assert call("train", "evaluate", "mine", "--data", "real.h5", *out) == 0
     (quality,) = (tmp_path / "quality").glob("*.json")
     measured = json.loads(quality.read_text())["splits"]["test/site"]
     maps = dataset.map_count("test/site")
@@ -79,7 +68,7 @@ def test_a_model_is_trained_and_measured_on_ground_that_is_labelled_in_part(
         "--maps",
         "0",
     )
-    assert call(monkeypatch, evaluate, "run", "--data", "real.h5", *suite, "--out", "run") == 2
+    assert call("eval", "run", "--data", "real.h5", *suite, "--out", "run") == 2
     (line,) = capfd.readouterr().err.strip().splitlines()
     assert "Expected maps with a class in every cell to drive on" in line
     assert not (tmp_path / "run").exists()
@@ -107,9 +96,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     splits = ("--splits", "train:0.4,valid:0.2,test/site:0.4", "--recipe", "tiny-v1")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        assert call(patch, datagen, "import-dem", *rasters, *splits, "--out", "real.h5") == 0
+        assert call("datagen", "import-dem", *rasters, *splits, "--out", "real.h5") == 0
         gp = ("--gp.epochs", "2", "--gp.epoch_steps", "10", "--classifier.encoder_depth", "3")
-        assert call(patch, train, "all", "--data", "real.h5", "--out", "mine", *QUICK, *gp) == 0
+        assert call("train", "all", "--data", "real.h5", "--out", "mine", *QUICK, *gp) == 0
     return folder
 
 
@@ -131,7 +120,7 @@ def test_nothing_is_scored_against_a_truth_that_is_unknown(
     monkeypatch.setattr(figures, "save_twice", save)
     for model in ("mine", "oracle"):
         out = ("--out", tmp_path / model, "--maps", 1)
-        assert call(monkeypatch, train, "evaluate", model, "--data", "real.h5", *out) == 0
+        assert call("train", "evaluate", model, "--data", "real.h5", *out) == 0
         said, _ = capfd.readouterr()
         page = (tmp_path / model / "quality.md").read_text()
         for text in (said, page):
@@ -166,21 +155,18 @@ def test_lambda_that_the_class_table_drew_is_not_called_measured(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "dem.tif", rough(ROWS, 32 * 3))
-    assert call(monkeypatch, datagen, "import-dem", "dem.tif", "--recipe", "tiny-v1", "--out", "real.h5") == 0
+    assert call("datagen", "import-dem", "dem.tif", "--recipe", "tiny-v1", "--out", "real.h5") == 0
     capfd.readouterr()
-    assert call(monkeypatch, train, "evaluate", "oracle", "--data", "real.h5") == 0
+    assert call("train", "evaluate", "oracle", "--data", "real.h5") == 0
     said = capfd.readouterr().out
     assert "drawn by the class table, not measured" in said
     # Beside such ground the truth of what a recipe made is as well known as before.
     made = ("create", "tiny-v1", "--splits", "[test/std]", "--first", 1, "--out", "made.h5")
-    assert call(monkeypatch, datagen, *made) == 0
-    assert call(monkeypatch, datagen, "merge", "made.h5", "real.h5", "--out", "mixed.h5") == 0
+    assert call("datagen", *made) == 0
+    assert call("datagen", "merge", "made.h5", "real.h5", "--out", "mixed.h5") == 0
     capfd.readouterr()
     out = ("--out", tmp_path / "std", "--maps", 1)
-    assert (
-        call(monkeypatch, train, "evaluate", "oracle", "--data", "mixed.h5", "--splits", "[test/std]", *out)
-        == 0
-    )
+    assert call("train", "evaluate", "oracle", "--data", "mixed.h5", "--splits", "[test/std]", *out) == 0
     assert "unknown" not in capfd.readouterr().out
     found = json.loads((tmp_path / "std" / "quality.json").read_text())
     assert found["truth"] == {"test/std": "generated"}

@@ -48,28 +48,32 @@ class Command:
     """One subcommand.
 
     Args:
-        function: does the work; its type hints and docstring become flags and help. It returns the
-            exit status, or None for success.
+        function: does the work; its type hints and docstring become flags and help. Of a dataclass without a default
+            each field becomes a flag. It returns the exit status, or None for success.
         positionals: names of its parameters that are given by place rather than by flag; one that is a
             list takes what is left.
-        settings: a dataclass whose fields become flags; one of it is the function's first argument.
         repeated: names of lists whose flag may be given again, which adds to the list; of others the last one holds.
         configs: folder of shipped YAML files, which `--config NAME` finds where there is no such file.
     """
 
     function: Callable[..., int | None]
     positionals: tuple[str, ...] = ()
-    settings: type | None = None
     repeated: tuple[str, ...] = ()
     configs: Path | None = None
 
     @cached_property
+    def settings(self) -> dict[str, type]:
+        """Dataclasses whose fields are flags, by the function's parameter."""
+        known = list_options(self.function).items()
+        kinds = {name: dataclass_in(option.kind) for name, option in known if option.default is NO_DEFAULT}
+        return {name: kind for name, kind in kinds.items() if kind}
+
+    @cached_property
     def options(self) -> dict[str, Option]:
         """What can be given, by name."""
-        options = list_options(self.function)
-        if self.settings:
-            options.pop(next(iter(options)))
-            options = list_options(self.settings) | options
+        options: dict[str, Option] = {}
+        for name, option in list_options(self.function).items():
+            options |= list_options(self.settings[name]) if name in self.settings else {name: option}
         return options
 
     @cached_property
@@ -178,10 +182,10 @@ def _call(program: str, command: Command, words: Sequence[str]) -> int | None:
     if lacking := [name for name in command.options if name not in known | arguments]:
         named = [name.upper() if name in command.positionals else f"--{name}" for name in lacking]
         raise ConfigError(f"Expected {' and '.join(named)}, got none. See `{program} --help`.")
-    if command.settings is None:
-        return command.function(**arguments)
-    own = {name: arguments.pop(name) for name in list_options(command.settings) if name in arguments}
-    return command.function(command.settings(**own), **arguments)
+    for parameter, kind in command.settings.items():
+        own = {name: arguments.pop(name) for name in list_options(kind) if name in arguments}
+        arguments[parameter] = kind(**own)
+    return command.function(**arguments)
 
 
 def _read_arguments(
@@ -308,10 +312,9 @@ def _print_help_of(program: str, command: Command) -> int:
         many: dict[str, Any] = {"nargs": "*"} if command.options[name].kind == list[str] else {}
         parser.add_argument(name, type=str, help=documented.get(name), **many)
     skip: set[str | int] = set(command.positionals)
-    if command.settings:
-        parser.add_class_arguments(command.settings, as_group=False)
-        skip.add(next(iter(inspect.signature(command.function).parameters)))
-    parser.add_function_arguments(command.function, as_group=False, skip=skip)
+    for kind in command.settings.values():
+        parser.add_class_arguments(kind, as_group=False)
+    parser.add_function_arguments(command.function, as_group=False, skip=skip | set(command.settings))
     parser.print_help()
     return 0
 

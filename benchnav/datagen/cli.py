@@ -14,7 +14,6 @@ from benchnav.core.command import INTERRUPTED, Command, run, show_progress, tell
 from benchnav.core.errors import DatasetError, choose, expect
 from benchnav.core.store import output_path, read_shard, replacing
 from benchnav.core.tables import Table, print_table
-from benchnav.datagen.dem.raster import Rasters
 from benchnav.datagen.import_commands import import_dem, import_drives
 
 # A dataset of more becomes a folder of files.
@@ -51,7 +50,7 @@ def create(
     """
     from benchnav.datagen.difficulty import table
     from benchnav.datagen.files.describe import written
-    from benchnav.datagen.files.reader import is_dataset
+    from benchnav.datagen.files.manifest import is_dataset
 
     expect(jobs >= 1, f"`jobs` ≥ 1, got {jobs}.")
     expect(
@@ -91,7 +90,8 @@ def list_datasets(folder: str = "") -> None:
     Args:
         folder: Where to look for files; where ids are looked up when not given.
     """
-    from benchnav.datagen.files.reader import FOLDER_MANIFEST, dataset_folders
+    from benchnav.datagen.files.find import dataset_folders
+    from benchnav.datagen.files.manifest import FOLDER_MANIFEST
     from benchnav.datagen.recipe.recipe import shipped_sizes
 
     print("recipes:")
@@ -290,7 +290,7 @@ def main() -> None:
         "show": Command(show, ("file",)),
         "validate": Command(validate, ("file",)),
         "merge": Command(merge, ("files",)),
-        "import-dem": Command(import_dem, ("dem", "overrides"), settings=Rasters, repeated=("layer",)),
+        "import-dem": Command(import_dem, ("dem", "overrides"), repeated=("layer",)),
         "import-drives": Command(import_drives, ("drives", "overrides"), repeated=("layer",)),
         "export": Command(export, ("file",)),
         "preview": Command(preview, ("file",)),

@@ -4,7 +4,7 @@ What is heavy is imported where it is called, so that the command's help is quic
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from benchnav import datagen
@@ -16,18 +16,34 @@ from benchnav.datagen.dem.raster import Rasters
 _MOST_PACE = 2.5  # of what positions say beside speeds, or its inverse; km/h are 3.6 m/s
 
 
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions:
+    """What real ground is made into.
+
+    Args:
+        out: File .h5 to write, or else a folder of many files.
+        id: Id of the dataset; the name of the output when not given.
+        recipe: Id or path of a recipe that gives size, resolution, start, goal, class table and light.
+        stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
+        solvable: Keep only maps whose goal can be reached, and store the grid reference time.
+        overwrite: Replace what is there.
+    """
+
+    out: str
+    id: str = ""
+    recipe: str = "paper-v1"
+    stride: float | None = None
+    solvable: bool = False
+    overwrite: bool = False
+
+
 def import_dem(
     rasters: Rasters,
+    options: ImportOptions,
     dem: str,
     overrides: list[str],
-    out: str,
-    id: str = "",
-    recipe: str = "paper-v1",
     splits: str = "test/real",
-    stride: float | None = None,
     scenario: str = "std",
-    solvable: bool = False,
-    overwrite: bool = False,
 ) -> None:
     """Make a dataset from a real elevation model; needs the extra benchnav[geo].
 
@@ -35,30 +51,13 @@ def import_dem(
 
     Args:
         rasters: What there is of the ground beside its elevation.
+        options: What is made of it.
         dem: Raster of elevations in metres, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
-        out: File .h5 to write, or else a folder of many files.
-        id: Id of the dataset; the name of the output when not given.
-        recipe: Id or path of a recipe that gives size, resolution, start, goal, class table and light.
         splits: Splits and their shares of the maps, such as train:0.7,valid:0.1,test/site:0.2; no two of them touch.
-        stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
         scenario: Which of the recipe's scenarios lights the maps.
-        solvable: Keep only maps whose goal can be reached, and store the grid reference time.
-        overwrite: Replace what is there.
     """
-    made = _import(
-        out,
-        id,
-        recipe,
-        overrides,
-        splits,
-        dem=dem,
-        rasters=rasters,
-        scenario=scenario,
-        stride_m=stride,
-        solvable=solvable,
-        overwrite=overwrite,
-    )
+    made = _import(options, overrides, splits, dem=dem, rasters=rasters, scenario=scenario)
     for split, entry in made.splits.items():
         left_out = entry["parts"][0]["source"]["left_out"]
         between = left_out.pop("between_splits")
@@ -70,44 +69,34 @@ def import_dem(
 
 
 def import_drives(
+    options: ImportOptions,
     drives: str,
     dem: str,
     overrides: list[str],
-    out: str,
     photo: str = "",
     classes: str = "",
     class_ids: dict[int, str | None] | None = None,
     layer: tuple[str, ...] = (),
     least_speed: float = 0.1,
-    id: str = "",
-    recipe: str = "paper-v1",
     splits: str = "train:0.6,valid:0.2,test/site:0.2",
-    stride: float | None = None,
-    solvable: bool = False,
-    overwrite: bool = False,
 ) -> None:
     """Make a dataset of measured traversability from a robot's drives; needs the extra benchnav[geo].
 
     Traversability is measured over commanded speed, of each cell the mean. Rasters are as for import-dem.
 
     Args:
+        options: What is made of them.
         drives: Log, a file .csv, .tsv, one of these with .gz, or .parquet, with the columns time_s, x_m and y_m (in the
             coordinate reference system of the elevation model) or longitude_deg and latitude_deg, commanded_m_s,
             measured_m_s and, of several drives, drive.
         dem: Raster of elevations in metres, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
-        out: File .h5 to write, or else a folder of many files.
         photo: Raster of red, green and blue; painted by the class when not given.
         classes: Raster of terrain classes; no cell has one when not given.
         class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
         layer: Optional fields as [NAME=RASTER, NAME=RASTER:UNIT], such as [vegetation_m=canopy.tif].
         least_speed: Least commanded speed, forward or backward, of rows that are used, m/s.
-        id: Id of the dataset; the name of the output when not given.
-        recipe: Id or path of a recipe that gives size, resolution, start, goal, class table and light.
         splits: Splits and their shares of the maps; no two of them touch, and each drive belongs to one.
-        stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
-        solvable: Keep only maps whose goal can be reached, and store the grid reference time.
-        overwrite: Replace what is there.
     """
     from benchnav.datagen.dem.drive_log import Drives
     from benchnav.datagen.dem.importer import REASONS
@@ -116,21 +105,9 @@ def import_drives(
         photo or classes,
         "`photo` or `classes` with `drives`, got neither: nothing would show where λ is low. Pass --photo RASTER.",
     )
-    made = _import(
-        out,
-        id,
-        recipe,
-        overrides,
-        splits,
-        dem=dem,
-        rasters=Rasters(
-            photo=photo, classes=classes, class_ids=class_ids, layer=layer, unlabelled=not classes
-        ),
-        drives=Drives(file=drives, least_speed=least_speed),
-        stride_m=stride,
-        solvable=solvable,
-        overwrite=overwrite,
-    )
+    rasters = Rasters(photo=photo, classes=classes, class_ids=class_ids, layer=layer, unlabelled=not classes)
+    log = Drives(file=drives, least_speed=least_speed)
+    made = _import(options, overrides, splits, dem=dem, rasters=rasters, drives=log)
     sources = {split: entry["parts"][0]["source"] for split, entry in made.splits.items()}
     about = next(iter(sources.values()))["drives"]
     print(_sum_up(about))
@@ -165,7 +142,7 @@ def _few(names: Sequence[str]) -> str:
 
 
 def _import(
-    out: str, id: str, recipe: str, overrides: list[str], splits: str, **settings: Any
+    options: ImportOptions, overrides: list[str], splits: str, **settings: Any
 ) -> "datagen.TerrainDataset":
     """Imports under the id that is asked for, or that the output names."""
     from benchnav.datagen.dem.importer import import_dem as import_maps
@@ -173,12 +150,15 @@ def _import(
     from benchnav.datagen.files.describe import written
     from benchnav.datagen.files.hdf5 import name_of
 
-    path = output_path(out)
-    name = id or name_of(path)
-    chosen = datagen.load_recipe(recipe, [f"id={name}", *overrides] if overrides else [])
-    if id or not overrides:
+    path = output_path(options.out)
+    name = options.id or name_of(path)
+    chosen = datagen.load_recipe(options.recipe, [f"id={name}", *overrides] if overrides else [])
+    if options.id or not overrides:
         chosen = replace(chosen, id=name)
-    steps = import_maps(out=path, recipe=chosen, shares=read_shares(splits), **settings)
+    steps = import_maps(
+        out=path, recipe=chosen, shares=read_shares(splits), stride_m=options.stride,
+        solvable=options.solvable, overwrite=options.overwrite, **settings,
+    )  # fmt: skip
     show_progress(steps, "maps")
     return written(path)
 

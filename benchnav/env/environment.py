@@ -20,7 +20,8 @@ from torch import Tensor
 from benchnav.core import registry, rng
 from benchnav.core.batch import map_tensors
 from benchnav.core.errors import expect
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.files.find import find_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective, distance
 from benchnav.planning.problem import Task, heading_to

@@ -246,11 +246,11 @@ def _failed(folder: Path) -> int:
 def main() -> None:
     """Entry point of `benchnav-eval`."""
     commands = {
-        "run": Command(run_command, settings=Suite, configs=SUITES),
+        "run": Command(run_command, configs=SUITES),
         "list": Command(list_command, ("kinds",)),
         "report": Command(report, ("folder",)),
-        "compare": Command(compare, ("folders",), settings=Labels),
-        "replay": Command(replay, ("folder",), settings=Labels),
+        "compare": Command(compare, ("folders",)),
+        "replay": Command(replay, ("folder",)),
         "merge": Command(merge, ("out", "parts")),
         "rerun": Command(rerun, ("folder",)),
     }

@@ -131,11 +131,11 @@ def train_mdn(options: TrainOptions, data: str, out: str, mdn: MDNConfig = _DEFA
 def main() -> None:
     """Entry point of `benchnav-train`."""
     commands = {
-        "fit": Command(fit, ("model",), settings=TrainOptions),
-        "classifier": Command(train_classifier, settings=TrainOptions),
+        "fit": Command(fit, ("model",)),
+        "classifier": Command(train_classifier),
         "gp": Command(train_gp),
-        "all": Command(train_all, settings=TrainOptions),
-        "mdn": Command(train_mdn, settings=TrainOptions),
+        "all": Command(train_all),
+        "mdn": Command(train_mdn),
         "evaluate": Command(evaluate, ("checkpoint",)),
         "compare": Command(compare, ("models",)),
         "export": Command(export, ("checkpoint",)),

@@ -97,7 +97,7 @@ def _place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def call(*argv: str) -> int:
     commands = {
         "work": Command(work, ("place", "rest")),
-        "go": Command(go, settings=Suite, configs=Path("shipped")),
+        "go": Command(go, configs=Path("shipped")),
     }
     return run("x", "Does.", commands, argv)
 

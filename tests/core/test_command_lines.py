@@ -5,7 +5,7 @@
 import functools
 import shlex
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import MISSING, fields, is_dataclass, replace
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import benchnav.models.cli
 from benchnav.core import command
 from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe
+from tests.commands import call
 
 CLIS = {"datagen": benchnav.datagen.cli, "train": benchnav.models.cli, "eval": benchnav.eval.cli}
 
@@ -46,7 +47,8 @@ def changed(given: dict[str, Any], defaults: Callable[[str], Any]) -> dict[str, 
         if value == default and type(value) is type(default):
             continue
         if is_dataclass(value) and not isinstance(value, type):
-            base = default if is_dataclass(default) else type(value)()
+            required = [f.name for f in fields(value) if f.default is f.default_factory is MISSING]
+            base = default if is_dataclass(default) else type(value)(**dict.fromkeys(required))
             inner = {f.name: getattr(value, f.name) for f in fields(value)}
             value = changed(inner, functools.partial(getattr, base))
             if not value:
@@ -84,13 +86,9 @@ def received(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, 
     return calls
 
 
-def ended(line: str, monkeypatch: pytest.MonkeyPatch) -> int:
+def ended(line: str) -> int:
     """Gives a command line to its command, as a shell would; returns the exit status."""
-    program, *words = shlex.split(line)
-    monkeypatch.setattr("sys.argv", [f"benchnav-{program}", *words])
-    with pytest.raises(SystemExit) as caught:
-        CLIS[program].main()
-    return int(caught.value.code or 0)
+    return call(*shlex.split(line))
 
 
 GOOD: list[tuple[str, dict[str, Any]]] = [
@@ -133,7 +131,10 @@ GOOD: list[tuple[str, dict[str, Any]]] = [
      {"recipe": "tiny-v1", "overrides": ["id=a", "b=[1,2]"], "jobs": 2}),
     ("datagen import-dem d.tif --out o --classes c.tif --class-ids '{1: gravel, 9: null}'",
      {"rasters": {"classes": "c.tif", "class_ids": {1: "gravel", 9: None}},
-      "dem": "d.tif", "overrides": [], "out": "o"}),
+      "options": {"out": "o"}, "dem": "d.tif", "overrides": []}),
+    ("datagen import-drives log.csv --dem d.tif --out o --photo p.tif --stride 2 --splits train:1 a=1",
+     {"options": {"out": "o", "stride": 2.0}, "drives": "log.csv", "overrides": ["a=1"], "dem": "d.tif",
+      "photo": "p.tif", "splits": "train:1"}),
     ("eval merge out a b", {"out": "out", "parts": ["a", "b"]}),
     ("eval list", {"kinds": []}),
     # names, mappings, and keys within them
@@ -188,9 +189,9 @@ GOOD: list[tuple[str, dict[str, Any]]] = [
 
 @pytest.mark.parametrize(("line", "expected"), GOOD, ids=[line for line, _ in GOOD])
 def test_a_good_line_reaches_its_function(
-    line: str, expected: dict[str, Any], received: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+    line: str, expected: dict[str, Any], received: list[dict[str, Any]]
 ) -> None:
-    assert ended(line, monkeypatch) == 0
+    assert ended(line) == 0
     assert len(received) == 1
     assert received == [{name: value for name, value in expected.items() if value != {}}]
 
@@ -254,10 +255,10 @@ BAD: list[tuple[str, str]] = [
 
 @pytest.mark.parametrize(("line", "message"), BAD, ids=[line for line, _ in BAD])
 def test_a_bad_line_ends_in_one_line(
-    line: str, message: str, received: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch,
+    line: str, message: str, received: list[dict[str, Any]],
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    assert ended(line, monkeypatch) == 2
+    assert ended(line) == 2
     assert not received
     out, err = capsys.readouterr()
     assert (out, err) == ("", f"benchnav-{line.split()[0]}: error: {message}\n")
@@ -279,9 +280,8 @@ OVERRIDES: list[tuple[str, Callable[[Recipe], Any], Any]] = [
 @pytest.mark.parametrize(("text", "value", "expected"), OVERRIDES, ids=[row[0] for row in OVERRIDES])
 def test_an_override_reaches_the_recipe(
     text: str, value: Callable[[Recipe], Any], expected: Any, received: list[dict[str, Any]],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    assert ended(f"datagen create stakes-v1 id=mine '{text}'", monkeypatch) == 0
+    assert ended(f"datagen create stakes-v1 id=mine '{text}'") == 0
     assert value(load_recipe(received[0]["recipe"], received[0]["overrides"])) == expected
 
 
@@ -333,21 +333,21 @@ SHOWN = [
 
 
 def test_settings_may_be_printed_without_those_that_are_as_they_were(
-    received: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    received: list[dict[str, Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert ended("eval run --maps 3 --print_config=skip_default", monkeypatch) == 0
+    assert ended("eval run --maps 3 --print_config=skip_default") == 0
     assert capsys.readouterr().out == "maps: 3\n"
-    assert ended("eval run --config s.yaml --world.noise stored --print_config", monkeypatch) == 0
+    assert ended("eval run --config s.yaml --world.noise stored --print_config") == 0
     Path("printed.yaml").write_text(capsys.readouterr().out)
-    assert ended("eval run --config printed.yaml", monkeypatch) == 0
+    assert ended("eval run --config printed.yaml") == 0
     assert received == [{"suite": {"world": {"preset": "stakes", "noise": "stored"}, "maps": 3}}]
 
 
 @pytest.mark.parametrize(("line", "expected"), SHOWN, ids=[line for line, _ in SHOWN])
 def test_help_and_settings_are_printed_in_place_of_running(
-    line: str, expected: str, received: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch,
+    line: str, expected: str, received: list[dict[str, Any]],
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    assert ended(line, monkeypatch) == 0
+    assert ended(line) == 0
     assert not received
     assert expected in " ".join(capsys.readouterr().out.split())

@@ -2,6 +2,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -16,6 +17,7 @@ from benchnav.datagen.files.hdf5 import ShardFile
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import SoftSpots
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe, shipped_recipes
+from tests.commands import call
 from tests.factories import tiny_dataset
 
 Call = Callable[..., int]
@@ -29,13 +31,7 @@ def datagen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
     """Runs the command in an empty folder and gives its exit status."""
     monkeypatch.chdir(tmp_path)
 
-    def call(*arguments: str) -> int:
-        monkeypatch.setattr("sys.argv", ["benchnav-datagen", *arguments])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        return ended.value.code or 0  # type: ignore[return-value]
-
-    return call
+    return partial(call, "datagen")
 
 
 def test_a_dataset_from_making_to_mending(datagen: Call, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]

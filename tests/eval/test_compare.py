@@ -1,4 +1,3 @@
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,11 +8,11 @@ import pytest
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.tables import latex
-from benchnav.eval import cli
 from benchnav.eval.compare import compare_runs
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import Compared, find_pairs
+from tests.commands import call
 from tests.eval.forged import code_with, forge_run
 from tests.eval.report.made import condition, row, rows
 from tests.eval.stats.test_pairs import value_of
@@ -66,13 +65,6 @@ def run_folder(
     }
     given = {"code": code_with(parts={"planner mppi": "1"})} | about | changes
     return forge_run(folder, episodes, known, **given)
-
-
-def command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["benchnav-eval", "compare", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    return int(ended.value.code or 0)
 
 
 def test_the_numbers_are_those_of_the_pairs_of_the_run(tmp_path: Path) -> None:
@@ -141,14 +133,14 @@ OTHER_CODE = {
 
 @pytest.mark.parametrize("name", OTHER_CODE)
 def test_what_other_code_made_is_compared_only_when_asked_and_then_said_in_every_table(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, told = OTHER_CODE[name]
     episodes, out = settings()[lambda rows: rows["planner"] == "mppi"], tmp_path / "table"
     cautious = run_folder(tmp_path / "a", episodes[episodes["risk"] == "cvar"])
     plain = run_folder(tmp_path / "b", episodes[episodes["risk"] == "mean"], code=code)
     asked = (str(cautious), str(plain), "--by", "risk", "--out", str(out))
-    assert command(monkeypatch, *asked) == 2
+    assert call("eval", "compare", *asked) == 2
     refused = capsys.readouterr().err
     assert refused.count("\n") == 1
     assert (
@@ -156,7 +148,7 @@ def test_what_other_code_made_is_compared_only_when_asked_and_then_said_in_every
         in refused
     )
     assert not list(tmp_path.glob("table*"))
-    assert command(monkeypatch, *asked, "--allow-different", "code") == 0
+    assert call("eval", "compare", *asked, "--allow-different", "code") == 0
     line = f"b differs from a in {told}"
     assert f"Different code: {line}." in capsys.readouterr().out
     assert f"Different code: {line}." in out.with_suffix(".md").read_text()
@@ -309,10 +301,10 @@ def test_runs_with_conditions_of_their_own_are_compared_across(tmp_path: Path) -
         compare_runs([cautious, elsewhere], "", "mean", {}, 0.05)
 
 
-def test_command_prints_and_writes(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_command_prints_and_writes(tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
     folder = run_folder(tmp_path / "run", settings())
     out = tmp_path / "made" / "cautious"
-    assert command(monkeypatch, str(folder), "--against", "mean", "--points", "20", "--out", str(out)) == 0
+    assert call("eval", "compare", str(folder), "--against", "mean", "--points", "20", "--out", str(out)) == 0
     printed = capsys.readouterr().out
     assert "Family: 4 pairs" in printed
     assert "12 maps, 12 episodes of each condition" in printed
@@ -336,10 +328,10 @@ def test_command_prints_and_writes(tmp_path: Path, monkeypatch, capsys) -> None:
     ],
 )
 def test_bad_input_ends_with_one_line_and_status_2(
-    arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch, capsys
+    arguments: tuple[str, ...], message: str, tmp_path: Path, capsys
 ) -> None:  # type: ignore[no-untyped-def]
     folder = run_folder(tmp_path / "run", settings())
-    assert command(monkeypatch, *(str(folder) if word == "RUN" else word for word in arguments)) == 2
+    assert call("eval", "compare", *(str(folder) if word == "RUN" else word for word in arguments)) == 2
     written = capsys.readouterr().err
     assert message in written
     assert written.count("\n") == 1

@@ -13,6 +13,7 @@ from benchnav.eval import cli as eval_cli
 from benchnav.eval.cli import SUITES
 from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.run.runner import run_suite
+from tests.commands import call
 
 SMALL = (
     "--planners", "[straight,{part: mppi, options: {samples: 64}}]", "--risks", "[mean]",
@@ -20,38 +21,27 @@ SMALL = (
 )  # fmt: skip
 
 
-def call(main, name: str, arguments: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> int:  # type: ignore[no-untyped-def]
-    monkeypatch.setattr(sys, "argv", [name, *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
-
-
-def evaluate(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    return call(eval_cli.main, "benchnav-eval", arguments, monkeypatch)
-
-
 def test_run_report_and_replay(dataset_path: Path, tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
     out = tmp_path / "run"
-    assert evaluate(monkeypatch, "run", "--data", str(dataset_path), "--out", str(out), *SMALL) == 0
+    assert call("eval", "run", "--data", str(dataset_path), "--out", str(out), *SMALL) == 0
     printed = capsys.readouterr().out
     assert "mppi" in printed
     assert str(out / "report.html") in printed
     assert f"replay {out}" in printed
-    assert evaluate(monkeypatch, "report", str(out)) == 0
-    assert evaluate(monkeypatch, "replay", str(out), "--view", "false") == 0
+    assert call("eval", "report", str(out)) == 0
+    assert call("eval", "replay", str(out), "--view", "false") == 0
     assert ".rrd" in capsys.readouterr().out
     # The same command again finds all done; with another seed it extends the run.
     again = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL)
-    assert evaluate(monkeypatch, *again) == 0
+    assert call("eval", *again) == 0
     assert "2 of 2 units were there already" in capsys.readouterr().err
-    assert evaluate(monkeypatch, *again, "--seed", "1") == 0
+    assert call("eval", *again, "--seed", "1") == 0
     assert "2 of 4 units were there already" in capsys.readouterr().err
     # A suite that cannot be run drops nothing.
     monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)  # a report takes longer than a run
-    assert evaluate(monkeypatch, *again, "--overwrite", "true", "--maps", "99") == 2
+    assert call("eval", *again, "--overwrite", "true", "--maps", "99") == 2
     assert (out / "episodes.parquet").exists()
-    assert evaluate(monkeypatch, *again, "--overwrite") == 0
+    assert call("eval", *again, "--overwrite") == 0
     assert "already" not in capsys.readouterr().err
 
 
@@ -67,7 +57,7 @@ def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Pat
         "{by: mean, above: 0.1}",
     )
     monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)
-    assert evaluate(monkeypatch, *arguments) == 0
+    assert call("eval", *arguments) == 0
     for condition, _ in open_run(out).conditions.values():
         assert (condition.world.noise, condition.world.time_budget_s) == ("stored", 10.0)
         assert condition.rules.min_traversability == 0.05
@@ -83,9 +73,9 @@ def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Pat
     ],
 )
 def test_a_world_is_given_by_name_as_several_or_with_its_fields(
-    words: tuple[str, ...], expected: object, monkeypatch, capsys
+    words: tuple[str, ...], expected: object, capsys
 ) -> None:  # type: ignore[no-untyped-def]
-    assert evaluate(monkeypatch, "run", *words, "--print_config") == 0
+    assert call("eval", "run", *words, "--print_config") == 0
     assert yaml.safe_load(capsys.readouterr().out)["world"] == expected
 
 
@@ -110,7 +100,7 @@ def test_the_options_of_run_are_those_that_the_suite_is_run_with(
         raise ConfigError("enough")
 
     monkeypatch.setattr("benchnav.eval.run.runner.run_suite", begin)
-    assert evaluate(monkeypatch, "run", "--out", str(tmp_path / "run"), *SMALL, *words) == 2
+    assert call("eval", "run", "--out", str(tmp_path / "run"), *SMALL, *words) == 2
     (told,) = given
     expected = {
         "jobs": 1,
@@ -124,49 +114,47 @@ def test_the_options_of_run_are_those_that_the_suite_is_run_with(
     assert told["folder"] == tmp_path / "run"
 
 
-def test_a_planner_that_fails_ends_with_status_1(
-    dataset_path: Path, tmp_path: Path, monkeypatch, capsys
-) -> None:  # type: ignore[no-untyped-def]
+def test_a_planner_that_fails_ends_with_status_1(dataset_path: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
     out, faulty = tmp_path / "run", "{part: tests.eval.parts:Faulty, label: bad, options: {fault: raise}}"
     arguments = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL[2:-2])
-    assert evaluate(monkeypatch, *arguments, "--planners", f"[straight,{faulty}]") == 1
+    assert call("eval", *arguments, "--planners", f"[straight,{faulty}]") == 1
     captured = capsys.readouterr()
     assert "1 in planner_error, the first by " in captured.err
     assert "errors.txt" in captured.err
     assert "straight" in captured.out
 
 
-def test_list_names_every_part_with_its_options(monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
-    assert evaluate(monkeypatch, "list") == 0
+def test_list_names_every_part_with_its_options(capsys) -> None:  # type: ignore[no-untyped-def]
+    assert call("eval", "list") == 0
     printed = capsys.readouterr().out
     for kind in registry.KINDS:
         for name in registry.names(kind):
             assert name in printed
     assert "samples" in printed
     assert "5000" in printed
-    assert evaluate(monkeypatch, "list", "risk") == 0
+    assert call("eval", "list", "risk") == 0
     printed = capsys.readouterr().out
     assert "cvar" in printed
     assert "mppi" not in printed
-    assert evaluate(monkeypatch, "list", "rsk") == 2
+    assert call("eval", "list", "rsk") == 2
 
 
-def test_shipped_suites_are_found_by_name_and_have_the_blind_baseline(monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_shipped_suites_are_found_by_name_and_have_the_blind_baseline(capsys) -> None:  # type: ignore[no-untyped-def]
     names = [path.stem for path in SUITES.glob("*.yaml")]
     assert {"demo", "paper", "risk", "severity", "full"} == set(names)
     for name in names:
-        assert evaluate(monkeypatch, "run", "--config", name, "--print_config") == 0
+        assert call("eval", "run", "--config", name, "--print_config") == 0
         printed = yaml.safe_load(capsys.readouterr().out)
         listed = [printed, *(printed["conditions"] or [])]
         assert any("straight" in (product.get("planners") or []) for product in listed)
-    assert evaluate(monkeypatch, "run", "--config", "dmo") == 2
+    assert call("eval", "run", "--config", "dmo") == 2
     assert "Did you mean" in capsys.readouterr().err
 
 
-def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
     config = tmp_path / "suite.yaml"
     config.write_text(f"data: {dataset_path}\nmodel: oracle\nrisks: [mean]\n")
-    assert evaluate(monkeypatch, "run", "--config", str(config), "--seed", "3", "--print_config") == 0
+    assert call("eval", "run", "--config", str(config), "--seed", "3", "--print_config") == 0
     printed = capsys.readouterr().out
     assert "seed: 3" in printed
     assert "- mean" in printed
@@ -203,7 +191,7 @@ def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, monk
 def test_bad_input_is_one_line_and_status_2(arguments, dataset_path, tmp_path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
     monkeypatch.chdir(tmp_path)
     extra = ("--data", str(dataset_path)) if arguments[0] == "run" and "--data" not in arguments else ()
-    assert evaluate(monkeypatch, *arguments, *extra) == 2
+    assert call("eval", *arguments, *extra) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert len(captured.err.strip().splitlines()) == 1

@@ -22,15 +22,8 @@ from benchnav.eval.run import unit as units_of_run
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.rerun import compare, rerun
 from benchnav.eval.run.runner import run_suite
+from tests.commands import call
 from tests.eval.forged import forge_rows
-
-
-def call(*words: str) -> int:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["benchnav-eval", *words])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-    return int(ended.value.code or 0)
 
 
 def words_on(dataset: Path, *more: str) -> tuple[str, ...]:
@@ -43,7 +36,7 @@ def words_on(dataset: Path, *more: str) -> tuple[str, ...]:
 @pytest.fixture(scope="module")
 def made(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("places") / "run"
-    assert call(*words_on(dataset_path, "--out", str(folder))) == 0
+    assert call("eval", *words_on(dataset_path, "--out", str(folder))) == 0
     return folder
 
 
@@ -129,19 +122,19 @@ def test_a_run_is_reported_and_replayed_without_being_written(run: Path, tmp_pat
         path.unlink()
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     out = tmp_path / "elsewhere"
-    assert call("report", str(run), "--out", str(out)) == 0
+    assert call("eval", "report", str(run), "--out", str(out)) == 0
     assert str(out / "report.html") in capsys.readouterr().out
     assert {"report.html", "summary.csv", "summary.md", "summary.tex", "failures.csv", "figures"} == {
         path.name for path in out.iterdir()
     }
     assert (out / "figures" / "driven.png").exists()
-    assert call("replay", str(run), "--view", "false", "--out", str(out)) == 0
+    assert call("eval", "replay", str(run), "--view", "false", "--out", str(out)) == 0
     assert sorted(path.suffix for path in (out / "playback").iterdir()) == [".npz", ".rrd"]
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
     other = Path(shutil.copytree(run, tmp_path / "other"))
     capsys.readouterr()
     for command in ("report", "replay"):
-        assert call(command, str(run), "--out", str(other)) == 2
+        assert call("eval", command, str(run), "--out", str(other)) == 2
         assert "holds no other run" in capsys.readouterr().err
 
 
@@ -171,7 +164,7 @@ def test_bad_input_is_one_line_and_status_2(
     given = [str(made) if word == "RUN" else word for word in words]
     if words[0] == "run":
         given = [*words_on(dataset_path), *words[1:]]
-    assert call(*given) == 2
+    assert call("eval", *given) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert len(captured.err.strip().splitlines()) == 1

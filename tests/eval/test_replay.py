@@ -1,7 +1,6 @@
 """The command `replay`, and what `run` says of recordings."""
 
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +8,9 @@ import av
 import pytest
 from rerun.chunk import RrdReader
 
-from benchnav.eval import cli
 from benchnav.eval.report.playback import web
 from benchnav.eval.report.playback.video import frame_times
+from tests.commands import call
 
 SMALL = (
     "--planners", "[straight,'tests.eval.parts:Faulty']", "--risks", "[mean,cvar:0.5]", "--scenarios", "[std]",
@@ -19,18 +18,10 @@ SMALL = (
 )  # fmt: skip
 
 
-def call(*arguments: str) -> int:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["benchnav-eval", *arguments])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-    return int(ended.value.code or 0)
-
-
 @pytest.fixture(scope="module")
 def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("replay") / "run"
-    assert call("run", "--data", str(dataset_path), "--out", str(out), *SMALL) == 0
+    assert call("eval", "run", "--data", str(dataset_path), "--out", str(out), *SMALL) == 0
     return out
 
 
@@ -46,7 +37,7 @@ def shown(printed: str) -> Path:
 
 def test_one_episode_is_shown_alone(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ("--planner", "Faulty", "--risk", "cvar:0.5", "--map", "1")
-    assert call("replay", str(folder), *asked, "--view", "no") == 0
+    assert call("eval", "replay", str(folder), *asked, "--view", "no") == 0
     printed = capsys.readouterr().out
     path = shown(printed)
     assert path.name.startswith("Faulty-cvar-0-5-std")
@@ -57,7 +48,7 @@ def test_one_episode_is_shown_alone(folder: Path, capsys: pytest.CaptureFixture[
 
 @pytest.mark.parametrize("risks", ["mean,cvar:0.5", "[mean, 'cvar:0.5']"])
 def test_several_labels_show_their_conditions_together(risks: str, folder: Path, capsys: Any) -> None:
-    assert call("replay", str(folder), "--planner", "Faulty", "--risk", risks, "--view", "false") == 0
+    assert call("eval", "replay", str(folder), "--planner", "Faulty", "--risk", risks, "--view", "false") == 0
     path = shown(capsys.readouterr().out)
     assert path.name.startswith("together-std")
     assert {"/world/conditions/mean/robot", "/world/conditions/cvar\\:0.5/robot"} <= entities(path)
@@ -67,9 +58,7 @@ def test_other_episodes_together_are_another_file(folder: Path, capsys: Any) -> 
     paths = []
     for more in ((), ("--map", "1"), ("--planner", "straight,Faulty")):
         assert (
-            call(
-                "replay", str(folder), "--planner", "Faulty", "--risk", "mean,cvar:0.5", *more, "--view=false"
-            )
+            call("eval", "replay", folder, "--planner=Faulty", "--risk=mean,cvar:0.5", *more, "--view=false")
             == 0
         )
         paths.append(shown(capsys.readouterr().out))
@@ -82,7 +71,7 @@ def test_each_option_asks_for_what_it_names(seed: str, folder: Path, capsys: Any
     columns = ("planner", "risk", "scenario", "model", "robot", "objective", "world", "data")
     words = [word for name in columns for word in (f"--{name}", f"some {name}")]
     words += ["--seed", seed, "--realisation", "3", "--map", "4"]
-    assert call("replay", str(folder), *words) == 2
+    assert call("eval", "replay", str(folder), *words) == 2
     labels = ", ".join(f"{name} 'some {name}'" for name in columns)
     assert f"got {labels}, realisation 3, map 4, seed {seed}." in capsys.readouterr().err
 
@@ -91,7 +80,7 @@ def test_a_video_shows_conditions_side_by_side(folder: Path, tmp_path: Path, cap
     widths = []
     for name, risk in (("one", "mean"), ("two", "mean,cvar:0.5")):
         path = tmp_path / f"{name}.mp4"
-        assert call("replay", str(folder), "--planner", "Faulty", "--risk", risk, "--video", str(path)) == 0
+        assert call("eval", "replay", folder, "--planner", "Faulty", "--risk", risk, "--video", path) == 0
         assert str(path) in capsys.readouterr().out
         with av.open(str(path)) as container:
             widths.append(container.streams.video[0].width)
@@ -104,7 +93,7 @@ def test_the_viewer_is_served_with_the_recording(
 ) -> None:
     served: list[Path] = []
     monkeypatch.setattr(web, "serve", served.append)
-    assert call("replay", str(folder), "--web") == 0
+    assert call("eval", "replay", str(folder), "--web") == 0
     assert served == [shown(capsys.readouterr().out)]
 
 
@@ -112,16 +101,16 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
     dataset_path: Path, tmp_path: Path, capsys: Any
 ) -> None:
     out = tmp_path / "run"
-    assert call("run", "--data", str(dataset_path), "--out", str(out), *SMALL, "--record", "failures") == 0
+    assert call("eval", "run", "--data", dataset_path, "--out", out, *SMALL, "--record", "failures") == 0
     printed = capsys.readouterr().out.splitlines()
     count = len(list((out / "playback").glob("*.rrd")))
     assert any(line.startswith(f"recorded: {count} episodes in {out / 'playback'}, ") for line in printed)
     (line,) = [line for line in printed if line.startswith("replay:  ")]
     words = shlex.split(line.removeprefix("replay:  "))
     assert "straight" not in words
-    assert call(*words[1:], "--view", "false") == 0
+    assert call("eval", *words[1:], "--view", "false") == 0
     assert (
-        call("run", "--data", str(dataset_path), "--out", str(tmp_path / "none"), *SMALL, "--record", "steps")
+        call("eval", "run", "--data", dataset_path, "--out", tmp_path / "none", *SMALL, "--record", "steps")
         == 0
     )
     assert "recorded:" not in capsys.readouterr().out
@@ -151,7 +140,7 @@ def test_bad_input_is_one_line_and_status_2(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "old.yaml").write_text("recorded: 4\n")
-    assert call(*(str(folder) if word == "RUN" else word for word in arguments)) == 2
+    assert call("eval", *(str(folder) if word == "RUN" else word for word in arguments)) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     (line,) = captured.err.strip().splitlines()

@@ -12,7 +12,8 @@ from scipy.stats import norm
 from benchnav.core import rng
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.files.check import find_faults
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.files.find import find_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.run.runner import run_suite
 from benchnav.models.base import predict

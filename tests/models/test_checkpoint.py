@@ -2,7 +2,6 @@ import json
 import os
 import random
 import shutil
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,12 @@ from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models import checkpoint as module
 from benchnav.models.base import predict
 from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpoint, save_checkpoint
-from benchnav.models.cli import main
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.predictor import find_checkpoint, load_model, open_checkpoint
 from benchnav.models.slope_gp.table import SlopeTable, SoftModes
 from benchnav.testing.model import check_model
+from tests.commands import call
 from tests.models.stub import true_table
 from tests.models.support import make_terrain, names
 
@@ -356,7 +355,6 @@ def test_the_command_refuses_an_edited_checkpoint_in_one_line(
     small: tuple[Path, Terrain, TraversabilityMixture],
     dataset: TerrainDataset,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     copy = Path(shutil.copytree(small[0], tmp_path / "copy"))
@@ -371,10 +369,7 @@ def test_the_command_refuses_an_edited_checkpoint_in_one_line(
         {**config, "format_version": "2.1", "parts": {**parts, "gp": 5}},
     ]
     (copy / "config.json").write_text(json.dumps(edited[number]))
-    monkeypatch.setattr(sys, "argv", ["benchnav-train", "evaluate", str(copy), "--data", str(dataset.path)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
+    assert call("train", "evaluate", copy, "--data", dataset.path) == 2
     out, err = capfd.readouterr()
     assert (out, len(err.strip().splitlines())) == ("", 1)
     assert "is damaged" in err

@@ -1,7 +1,6 @@
 import json
 import re
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +10,13 @@ import pytest
 from benchnav.core.store import seal
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
-from benchnav.models.cli import main
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.calibration import fit_pool_temperature, fit_temperature, sample_logits
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
 from benchnav.models.training.data import MapDataset
+from tests.commands import call
 from tests.models.support import make_dataset, names
 
 QUICK_GP = ["--gp.epochs", "1", "--gp.epoch_steps", "5"]
@@ -34,17 +33,10 @@ QUICK_CLASSIFIER = [
 NETWORKS = {"all": "classifier", "classifier": "classifier", "mdn": "mdn"}
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["benchnav-train", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
-
-
-def refuses(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
+def refuses(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
     """Runs a command that must end with status 2 and one line; returns the line."""
     capfd.readouterr()
-    assert call(monkeypatch, *arguments) == 2
+    assert call("train", *arguments) == 2
     lines = capfd.readouterr().err.strip().splitlines()
     assert len(lines) == 1, lines
     assert lines[0].startswith("benchnav-train: error: ")
@@ -59,8 +51,8 @@ def test_halves_are_trained_into_one_checkpoint(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     where = ["--data", dataset.path, "--out", "new/mine"]
-    assert call(monkeypatch, "gp", *where, *QUICK_GP, "--seed", 7) == 0
-    assert call(monkeypatch, "classifier", *where, *QUICK_CLASSIFIER) == 0
+    assert call("train", "gp", *where, *QUICK_GP, "--seed", 7) == 0
+    assert call("train", "classifier", *where, *QUICK_CLASSIFIER) == 0
     out, err = capfd.readouterr()
     assert "validation RMSE of the latent mean" in out
     assert re.search(r"best epoch 1, validation loss [\d.]+, accuracy [\d.]+, miou [\d.]+, temperature", out)
@@ -75,11 +67,9 @@ def test_halves_are_trained_into_one_checkpoint(
     assert there.part("gp").data_id == "tiny-v1"
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["mine", "mine.training"]
 
-    again = refuses(monkeypatch, capfd, "gp", *where, *QUICK_GP)
+    again = refuses(capfd, "gp", *where, *QUICK_GP)
     assert "--overwrite" in again
-    assert (
-        call(monkeypatch, "gp", *where, *QUICK_GP, "--overwrite", "true", "--gp.likelihood", "gaussian") == 0
-    )
+    assert call("train", "gp", *where, *QUICK_GP, "--overwrite", "true", "--gp.likelihood", "gaussian") == 0
     after = load_checkpoint("new/mine")
     assert after.part("gp").config["likelihood"] == "gaussian"
     assert after.part("classifier").metrics == there.part("classifier").metrics
@@ -89,7 +79,6 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
     checkpoint_path: Path,
     dataset: TerrainDataset,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     copy = shutil.copytree(checkpoint_path, tmp_path / "copy")
@@ -98,7 +87,7 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
     del config["manifest_digest"]
     (copy / "config.json").write_text(seal(config))
     where = ["--data", dataset.path, "--out", copy]
-    message = refuses(monkeypatch, capfd, "classifier", *where, *QUICK_CLASSIFIER)
+    message = refuses(capfd, "classifier", *where, *QUICK_CLASSIFIER)
     assert "classes lava" in message
     assert f"classes {dataset.recipe.classes[0].name}" in message
 
@@ -153,7 +142,7 @@ def test_bad_input_is_refused_in_one_line(
     paths = {"DATA": dataset.path}
     if "TEST" in arguments:
         paths["TEST"] = make_dataset(tmp_path / "test.h5", test_std=1).path
-    message = refuses(monkeypatch, capfd, *(paths.get(item, item) for item in arguments))
+    message = refuses(capfd, *(paths.get(item, item) for item in arguments))
     assert expected in message
     assert {path.name for path in tmp_path.iterdir()} <= {"test.h5"}
 
@@ -169,7 +158,7 @@ def test_pretrained_weights_that_cannot_be_had_are_told_with_the_flag_before_any
     monkeypatch.chdir(tmp_path)
     for encoder in ("resnet18", "tu-resnet18"):
         asked = ("--classifier.pretrained", "--classifier.encoder", encoder)
-        message = refuses(monkeypatch, capfd, "all", "--data", dataset.path, "--out", "x/y", *asked)
+        message = refuses(capfd, "all", "--data", dataset.path, "--out", "x/y", *asked)
         assert f"ImageNet weights of {encoder} for `pretrained`" in message
         assert "leave --classifier.pretrained or --mdn.pretrained out" in message
     assert not (tmp_path / "x").exists()
@@ -178,18 +167,17 @@ def test_pretrained_weights_that_cannot_be_had_are_told_with_the_flag_before_any
 def test_an_interrupted_training_goes_on_from_its_gps(
     dataset: TerrainDataset,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     where = ["--data", dataset.path, "--out", tmp_path / "c"]
-    assert call(monkeypatch, "gp", *where, *QUICK_GP) == 0
+    assert call("train", "gp", *where, *QUICK_GP) == 0
     kept = (tmp_path / "c" / "gp.safetensors").read_bytes()
     capfd.readouterr()
-    assert call(monkeypatch, "all", *where, *QUICK_GP, *QUICK_CLASSIFIER, "--resume") == 0
+    assert call("train", "all", *where, *QUICK_GP, *QUICK_CLASSIFIER, "--resume") == 0
     assert "gp:" not in capfd.readouterr().err
     assert (tmp_path / "c" / "gp.safetensors").read_bytes() == kept
     assert set(load_checkpoint(tmp_path / "c").parts) == {"classifier", "gp"}
-    assert "--overwrite" in refuses(monkeypatch, capfd, "all", *where)
+    assert "--overwrite" in refuses(capfd, "all", *where)
 
 
 def test_a_log_with_few_rows_of_a_class_is_told_in_one_line(
@@ -200,7 +188,7 @@ def test_a_log_with_few_rows_of_a_class_is_told_in_one_line(
     header = "class,slope_deg,traversability\n"
     for name, rows in (("few", "mud,3,0.4\nsand,2,0.5\n"), ("enough", "")):
         Path(f"{name}.csv").write_text(header + many + rows)
-        assert call(monkeypatch, "gp", "--data", f"{name}.csv", "--out", name, *QUICK_GP) == 0
+        assert call("train", "gp", "--data", f"{name}.csv", "--out", name, *QUICK_GP) == 0
         told = [line for line in capfd.readouterr().err.splitlines() if "warning" in line]
         assert len(told) == (name == "few")
         if told:
@@ -218,7 +206,7 @@ def test_gps_are_measured_on_whole_drives_of_a_log(
         ("none", "class,slope_deg,traversability\n", [row[: row.rindex(",")] + "\n" for row in rows]),
     ):
         Path(f"{name}.csv").write_text(header + "".join(own))
-        assert call(monkeypatch, "gp", "--data", f"{name}.csv", "--out", name, *QUICK_GP) == 0
+        assert call("train", "gp", "--data", f"{name}.csv", "--out", name, *QUICK_GP) == 0
         (said,) = [line for line in capfd.readouterr().out.splitlines() if "held out" in line]
         whose = "all of 1 of 10 drives" if name == "drives" else "which follow one another in each class"
         assert f"gp: NLL of 20 rows held out, {whose}, " in said
@@ -226,7 +214,7 @@ def test_gps_are_measured_on_whole_drives_of_a_log(
     assert measured["one"] == measured["none"]
     for seed in range(1, 4):
         where = ("--data", "drives.csv", "--out", f"drives-{seed}", "--seed", seed)
-        assert call(monkeypatch, "gp", *where, *QUICK_GP) == 0
+        assert call("train", "gp", *where, *QUICK_GP) == 0
         measured[f"{seed}"] = load_checkpoint(f"drives-{seed}").part("gp").metrics["held_out_nll"]
     assert len({measured[f"{seed}"] for seed in range(1, 4)}) > 1
 
@@ -240,15 +228,14 @@ def test_a_damaged_checkpoint_is_replaced_by_gps_of_a_log_where_that_is_asked_fo
     Path("mine").mkdir()
     Path("mine/config.json").write_text("{")
     command = ["gp", "--data", "logs.csv", "--out", "mine", *QUICK_GP]
-    assert "damaged" in refuses(monkeypatch, capfd, *command)
-    assert call(monkeypatch, *command, "--overwrite") == 0
+    assert "damaged" in refuses(capfd, *command)
+    assert call("train", *command, "--overwrite") == 0
     assert load_checkpoint("mine").class_names == ("rock",)
 
 
 def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_dropped(
     checkpoint_path: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     folder = shutil.copytree(checkpoint_path, tmp_path / "mine")
@@ -256,7 +243,7 @@ def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_droppe
     rows = "".join(f"{name},{slope},0.8\n" for name in names[2:] for slope in range(12))
     Path(tmp_path, "logs.csv").write_text("class,slope_deg,traversability\n" + rows)
     command = ["gp", "--data", tmp_path / "logs.csv", "--out", folder, *QUICK_GP]
-    assert call(monkeypatch, *command, "--overwrite") == 0
+    assert call("train", *command, "--overwrite") == 0
     first, *rest = capfd.readouterr().err.splitlines()
     assert f"fewer than 10 rows of 2 of 10 classes ({names[0]} 0, {names[1]} 0); their GPs" in first
     assert f"what {folder} had learned of them is dropped" in first
@@ -264,7 +251,7 @@ def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_droppe
 
     there = load_checkpoint(folder)
     save_checkpoint(tmp_path / "alone", replace(there, parts={"classifier": there.part("classifier")}))
-    assert call(monkeypatch, *command[:4], tmp_path / "alone", *QUICK_GP) == 0
+    assert call("train", *command[:4], tmp_path / "alone", *QUICK_GP) == 0
     err = capfd.readouterr().err
     assert "rows of 2 of 10 classes" in err
     assert "dropped" not in err
@@ -294,7 +281,7 @@ def test_an_interruption_says_how_to_go_on(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("benchnav.models.training.data.find_dataset", interrupted)
-    assert call(monkeypatch, *command, "--data", dataset.path, "--out", tmp_path / "c") == 130
+    assert call("train", *command, "--data", dataset.path, "--out", tmp_path / "c") == 130
     assert capfd.readouterr().err.splitlines()[-1] == expected
 
 
@@ -315,7 +302,7 @@ def test_a_model_is_measured_by_its_file_and_a_folder_without_rights_is_named(
     )
     reports = []
     for source in ("./mine.py:Mine:0.1", "./mine.py:Mine:0.7"):
-        assert call(monkeypatch, "evaluate", source, "--data", dataset.path, "--json", "report.json") == 0
+        assert call("train", "evaluate", source, "--data", dataset.path, "--json", "report.json") == 0
         reports.append(json.loads(Path("report.json").read_text()))
     assert [report["model"] for report in reports] == ["./mine.py:Mine:0.1", "./mine.py:Mine:0.7"]
     assert reports[0]["splits"] != reports[1]["splits"]
@@ -324,7 +311,7 @@ def test_a_model_is_measured_by_its_file_and_a_folder_without_rights_is_named(
         raise PermissionError(13, "Permission denied", "/tmp/a-name-of-ours")
 
     monkeypatch.setattr("tempfile.TemporaryFile", locked)
-    message = refuses(monkeypatch, capfd, "evaluate", "oracle", "--data", dataset.path, "--out", "locked/new")
+    message = refuses(capfd, "evaluate", "oracle", "--data", dataset.path, "--out", "locked/new")
     assert f"could not use {tmp_path}/locked/new/quality.json: Permission denied" in message
     assert f"Choose another place with --out, or change the permissions of {tmp_path}." in message
 
@@ -338,7 +325,6 @@ def members_of(folder: Path) -> list[TerrainClassifier]:
 def test_an_ensemble_is_calibrated_as_a_whole_and_again_when_a_member_joins(
     dataset: TerrainDataset,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     folder, valid = tmp_path / "c", MapDataset(dataset.path, "valid")
@@ -346,7 +332,7 @@ def test_an_ensemble_is_calibrated_as_a_whole_and_again_when_a_member_joins(
     command = ["all", "--data", dataset.path, "--out", folder, *QUICK_GP, *QUICK_CLASSIFIER, *small]
     found = []
     for members in (1, 2, 3):
-        assert call(monkeypatch, *command, "--members", members, "--resume") == 0
+        assert call("train", *command, "--members", members, "--resume") == 0
         classifiers = members_of(folder)
         assert len(classifiers) == members
         found.append(load_checkpoint(folder).pool_temperature)
@@ -359,7 +345,7 @@ def test_an_ensemble_is_calibrated_as_a_whole_and_again_when_a_member_joins(
     first = members_of(folder)[0]
     assert first.config.decoder_channels == (16, 16, 8)
     assert first.temperature == load_checkpoint(folder).part("classifier").config["temperature"]
-    assert call(monkeypatch, *command, "--members", 1, "--overwrite") == 0
+    assert call("train", *command, "--members", 1, "--overwrite") == 0
     assert load_checkpoint(folder).pool_temperature == 1
     alone = members_of(folder)[0]
     assert alone.temperature == first.temperature
@@ -367,11 +353,11 @@ def test_an_ensemble_is_calibrated_as_a_whole_and_again_when_a_member_joins(
 
 @pytest.mark.parametrize("half_precision", [True, False])
 def test_what_is_stored_is_what_was_measured_and_calibrated(
-    half_precision: bool, dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    half_precision: bool, dataset: TerrainDataset, tmp_path: Path
 ) -> None:
     where = ["--data", dataset.path, "--out", tmp_path / "c"]
     small = ["--classifier.encoder_depth", "3", "--half_precision", str(half_precision).lower()]
-    assert call(monkeypatch, "classifier", *where, *QUICK_CLASSIFIER, *small) == 0
+    assert call("train", "classifier", *where, *QUICK_CLASSIFIER, *small) == 0
     part, valid = load_checkpoint(tmp_path / "c").part("classifier"), MapDataset(dataset.path, "valid")
     assert part.half_precision == half_precision
     plain = TerrainClassifier.from_tensors({**part.config, "temperature": 1.0}, names(10), part.tensors)
@@ -394,5 +380,5 @@ def test_how_maps_are_read_reaches_the_training(
     quick = QUICK_GP if kind == "all" else []
     for number, how in enumerate(([], ["--workers", 2], ["--in_memory", "true"])):
         where = ["--data", dataset.path, "--out", tmp_path / str(number)]
-        assert call(monkeypatch, kind, *where, *quick, *how) == 130
+        assert call("train", kind, *where, *quick, *how) == 130
     assert seen == [(False, 0), (False, 2), (True, 0)]

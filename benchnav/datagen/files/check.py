@@ -12,7 +12,8 @@ import numpy as np
 
 from benchnav.core.errors import DatasetError
 from benchnav.datagen import schema
-from benchnav.datagen.files.reader import CHUNK_CELLS, READ_ERRORS, TerrainDataset, open_file
+from benchnav.datagen.files.manifest import READ_ERRORS, open_file
+from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
 
 _MISSING = "is missing or cannot be opened"
 

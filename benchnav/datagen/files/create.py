@@ -29,7 +29,7 @@ from benchnav.datagen.files.hdf5 import (
     recipe_entry,
     whole,
 )
-from benchnav.datagen.files.reader import FOLDER_MANIFEST, read_manifest
+from benchnav.datagen.files.manifest import FOLDER_MANIFEST, read_manifest
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.synth.generate import generate
 

@@ -7,7 +7,8 @@ from pathlib import Path
 from benchnav.core.settings import plain
 from benchnav.core.tables import Table
 from benchnav.datagen import schema
-from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, damage, open_file
+from benchnav.datagen.files.manifest import READ_ERRORS, open_file
+from benchnav.datagen.files.reader import TerrainDataset, damage
 from benchnav.datagen.recipe.classes import plain_classes
 
 _DIGESTS = {

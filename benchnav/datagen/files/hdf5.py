@@ -20,7 +20,8 @@ import benchnav
 from benchnav.core.errors import DatasetError
 from benchnav.core.store import refuse_taken, replacing, restore, seal, sole_writer, take_place, write_text
 from benchnav.datagen import schema
-from benchnav.datagen.files.reader import FOLDER_MANIFEST, TerrainDataset, open_file, read_manifest
+from benchnav.datagen.files.manifest import FOLDER_MANIFEST, open_file, read_manifest
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe
 
 FOLDER_FORMAT_VERSION = "1.2"  # at least

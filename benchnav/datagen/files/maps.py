@@ -8,7 +8,8 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from benchnav.core.errors import DatasetError
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.files.find import find_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 
 
 class TerrainMaps(Dataset[dict[str, Tensor]]):

@@ -18,7 +18,8 @@ from benchnav.core.store import building, real_place
 from benchnav.datagen import schema
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.hdf5 import Contents, assemble, held, is_one_file, name_of, whole
-from benchnav.datagen.files.reader import TerrainDataset, is_dataset
+from benchnav.datagen.files.manifest import is_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe, check_name, recipe_from_dict
 
 # What a map's meaning rests on: alike in all files of a merge.

@@ -17,12 +17,10 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import h5py
 import numpy as np
 
-from benchnav.core import hub
 from benchnav.core.errors import DatasetError
 from benchnav.core.grid import Grid
-from benchnav.core.shipped_files import shipped_folder
-from benchnav.core.store import unseal
 from benchnav.datagen import schema
+from benchnav.datagen.files.manifest import READ_ERRORS, open_file, read_manifest
 from benchnav.datagen.recipe.classes import plain_classes
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.schema import Maps
@@ -30,12 +28,8 @@ from benchnav.datagen.schema import Maps
 if TYPE_CHECKING:
     from benchnav.core.terrain import Terrain
 
-# What HDF5 and h5py raise where a file is damaged, by where the damage lies.
-READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
-
 CHUNK_CELLS = 2**17
 _MOST_OPEN = 128  # files that a process keeps open; far fewer than systems allow
-FOLDER_MANIFEST = "manifest.json"
 
 Opened = tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]  # a file, and its arrays by split and name
 
@@ -335,54 +329,11 @@ class TerrainDataset:
         return self.splits[split]["maps"]
 
 
-def open_file(path: Path) -> h5py.File:
-    """Opens a file for reading.
-
-    Raises:
-        DatasetError: it is not there, is no HDF5 file, or its structure is damaged.
-    """
-    try:
-        return h5py.File(path, "r")
-    except FileNotFoundError as error:
-        raise DatasetError(
-            f"Expected a dataset file, got {path}, which is not there. "
-            "Make one with `benchnav-datagen create`."
-        ) from error
-    except OSError as error:
-        raise DatasetError(f"{path} is no readable HDF5 file: {error}. Make it again.") from error
-
-
 def damage(path: Path, split: str, field: str, error: Exception) -> DatasetError:
     """Says that a field cannot be read, and what to do."""
     return DatasetError(
         f"Field {field!r} of split {split!r} in {path} is damaged: {error}. Run `benchnav-datagen validate` "
         "on the dataset, which says how to make it anew."
-    )
-
-
-def read_manifest(path: Path) -> schema.Json:
-    """Reads the manifest of a file or a folder.
-
-    Raises:
-        DatasetError: there is none, or it is damaged, foreign, or of a newer format.
-    """
-    try:
-        text = _manifest_text(path)
-        manifest = json.loads(text)
-        kind, version = manifest["format"], manifest["format_version"]
-        if kind == schema.FORMAT and tuple(map(int, version.split("."))) <= schema.FORMAT_VERSION:
-            manifest = unseal(text)
-            schema.check(manifest)
-            return manifest
-    except (*READ_ERRORS, TypeError, AttributeError, IndexError) as error:
-        raise DatasetError(
-            f"The manifest of {path} is damaged: {str(error)[:200]}. Make the dataset again."
-        ) from error
-    if kind != schema.FORMAT:
-        raise DatasetError(f"Expected format {schema.FORMAT!r} in {path}, got {kind!r}.")
-    raise DatasetError(
-        f"Expected format version at most {'.'.join(map(str, schema.FORMAT_VERSION))} in {path}, "
-        f"got {version}. Read it with a newer benchnav: pip install --upgrade benchnav."
     )
 
 
@@ -392,61 +343,3 @@ def _values(array: h5py.Dataset, which: slice) -> np.ndarray:
         return array[which]
     except OSError:
         return np.concatenate([array[index : index + 1] for index in range(which.start, which.stop)])
-
-
-def _manifest_text(path: Path) -> str | bytes:
-    if path.is_dir():
-        if not is_dataset(path):
-            raise DatasetError(
-                f"Expected a folder with a finished dataset, got {path} without {FOLDER_MANIFEST}. "
-                "Finish it by the command that began it, or by `benchnav-datagen merge` of its shares."
-            )
-        return (path / FOLDER_MANIFEST).read_text()
-    with open_file(path) as file:
-        if schema.MANIFEST not in file:
-            raise DatasetError(f"Expected a {schema.FORMAT} file with a manifest, got {path} without one.")
-        return file[schema.MANIFEST][()]
-
-
-def dataset_folders() -> list[Path]:
-    """Where datasets are looked for by id: `datasets/` here, and the shipped ones."""
-    here, shipped = Path("datasets"), shipped_folder("datasets")
-    return [here] if here.resolve() == shipped.resolve() else [here, shipped]
-
-
-def is_dataset(path: Path) -> bool:
-    """Whether there is a file, or a folder with the manifest of a finished dataset."""
-    return path.is_file() or (path / FOLDER_MANIFEST).is_file()
-
-
-def find_dataset(source: str | Path) -> Path:
-    """Finds a dataset by path, by id in `dataset_folders`, or on a hub by `owner/name@revision`.
-
-    Raises:
-        DatasetError: none of them is there.
-    """
-    if is_dataset(Path(source)) or any(Path(source).glob("*.h5")):
-        return Path(source)  # of shards without a manifest the reader tells what to do
-    for folder in dataset_folders():
-        for name in (f"{source}.h5", f"{source}", f"{source}-test.h5"):
-            if is_dataset(folder / name):
-                return folder / name
-    if hub.is_address(source):
-        return _in_snapshot(hub.download(str(source), "dataset", DatasetError), str(source))
-    raise DatasetError(
-        f"Expected the path or id of a dataset, got {str(source)!r}, which is neither a file nor in "
-        f"{' or '.join(map(str, dataset_folders()))}. Make one with `benchnav-datagen create`."
-    )
-
-
-def _in_snapshot(folder: Path, source: str) -> Path:
-    """The dataset in what was downloaded: a folder of shards, or its one file."""
-    if (folder / FOLDER_MANIFEST).is_file():
-        return folder
-    files = sorted(folder.glob("*.h5"))
-    if len(files) != 1:
-        raise DatasetError(
-            f"Expected {source} to hold {FOLDER_MANIFEST} and its shards, or one file .h5, got {len(files)} files .h5. "
-            "Name another repository or revision."
-        )
-    return files[0]

@@ -28,7 +28,8 @@ from benchnav.core.device import gpu_name
 from benchnav.core.shipped_files import PACKAGE
 from benchnav.core.sources import digest_of, package_modules
 from benchnav.core.store import text_digest
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.files.find import find_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.condition import PART_KINDS, Condition, is_checkpoint
 from benchnav.eval.experiment.unit import Conditions, Unit
 from benchnav.models.checkpoint import digests_of, read_config

@@ -268,7 +268,7 @@ def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
 
 
 def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> list[str]:
-    """How often frozen λ was drawn again."""
+    """The share of draws of frozen λ that were rejected."""
     frozen = [name for name, about in conditions.items() if about["value"]["world"]["noise"] == "frozen"]
     episodes = episodes[episodes["condition"].isin(frozen)]
     if not episodes["rejected_draws"].any():

@@ -10,7 +10,8 @@ import torch
 
 from benchnav.core.device import device_of_run
 from benchnav.core.errors import BenchnavError, ConfigError
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.files.find import find_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.run_folder import EPISODES, Run, open_run, read_table
 from benchnav.eval.folder.steps import LAST_COLUMN, open_steps, read_steps

@@ -43,8 +43,7 @@ def episode_rows(
         problem: what was to be solved.
         episodes: what happened.
         reference_time_s: grid reference times at 1 m/s, shape [B]; NaN where there is none.
-        rejected_draws: how often the λ of each episode was drawn again, so that ground joins start and goal, B of
-            them.
+        rejected_draws: draws of λ of each episode in which no feasible path joins start and goal, B of them.
         compiled: the planner ran compiled.
 
     Returns:

@@ -23,7 +23,8 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.registry import Part
 from benchnav.core.terrain import Terrain
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.files.find import find_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.provenance import Origin, Origins, code_differences
 from benchnav.eval.folder.run_folder import clear_unit, write_unit

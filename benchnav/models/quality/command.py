@@ -38,7 +38,8 @@ def evaluate(
     from benchnav.core.errors import expect
     from benchnav.core.store import output_path, write_text
     from benchnav.core.tables import print_table
-    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+    from benchnav.datagen.files.find import find_dataset
+    from benchnav.datagen.files.reader import TerrainDataset
     from benchnav.models.config import check_seed
 
     check_seed(seed)

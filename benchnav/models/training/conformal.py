@@ -1,61 +1,26 @@
 """Halves of `valid` for conformal recalibration: maps for stopping and temperature, and maps for scores."""
 
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-
 import numpy as np
 import torch
 from numpy import ndarray
 
 from benchnav.core import rng
 from benchnav.core.errors import expect
-from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.conformal import ConformalTable, fit_table
-from benchnav.models.training.data import VALID, Batch, MapDataset
+from benchnav.models.training.data import VALID
 
 _LEAST_MAPS = 4
 
 
-class StoppingMaps(MapDataset):
-    """Every second map of a split, the first among them: what stopping and temperature see where others are scored.
-
-    Its maps are counted anew. Arguments are those of `MapDataset`.
-    """
-
-    def __init__(
-        self,
-        path: str | Path,
-        split: str,
-        fields: Sequence[str] = ("rgb", "class_id"),
-        in_memory: bool = False,
-        crop: int = 0,
-        seed: int = 0,
-    ) -> None:
-        """Checks split and fields, and reads the maps where that is asked for."""
-        super().__init__(path, split, fields, crop=crop, seed=seed)
-        self._chosen = range(0, self._maps, 2)
-        if in_memory:
-            self._memory = super().read(range(self._maps))
-
-    def __len__(self) -> int:
-        """Number of maps that are seen."""
-        return len(self._chosen)
-
-    def read(self, indices: Sequence[int]) -> Batch:
-        """Reads maps by their indices among those that are seen."""
-        return super().read([self._chosen[index] for index in indices])
-
-    def _stored_chunks(self) -> Iterator[tuple[range, dict[str, np.ndarray]]]:
-        size = self.dataset.grid.maps_in(CHUNK_CELLS)
-        for first in range(0, len(self), size):
-            indices = range(first, min(first + size, len(self)))
-            chosen = [self._chosen[index] for index in indices]
-            yield indices, self.dataset.read(self.split, chosen, self.fields)
+def stopping_every(conformal: bool) -> int:
+    """The n of which stopping and temperature see every n-th map of `valid`, from the first on."""
+    return 2 if conformal else 1
 
 
 def scored_maps(count: int) -> range:
-    """Indices of the maps of a split of so many that `StoppingMaps` leaves out."""
+    """Indices of the maps of a split of so many that `stopping_every` leaves out."""
     return range(1, count, 2)
 
 

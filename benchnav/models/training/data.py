@@ -21,8 +21,9 @@ from benchnav.core import rng
 from benchnav.core.device import CPU
 from benchnav.core.errors import DatasetError, expect
 from benchnav.core.grid import is_azimuth
+from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.maps import TerrainMaps
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.nets.inputs import LayerScale
 from benchnav.models.training.map_order import map_order
@@ -62,6 +63,7 @@ class MapDataset(TerrainMaps):
         in_memory: read all maps at once.
         crop: cells of a side of the squares that are cut from maps; 0 takes whole maps.
         seed: root seed of the squares that `chunks` cuts.
+        every: n where it is every n-th map that counts, the first among them; the others are never given.
     """
 
     def __init__(
@@ -72,10 +74,21 @@ class MapDataset(TerrainMaps):
         in_memory: bool = False,
         crop: int = 0,
         seed: int = 0,
+        every: int = 1,
     ) -> None:
         """Checks split and fields, and reads the maps where that is asked for."""
-        super().__init__(path, split, fields, in_memory)
-        self.crop, self.seed = crop, seed
+        super().__init__(path, split, fields)
+        self.crop, self.seed, self.every = crop, seed, every
+        if in_memory:
+            self._memory = super().read(range(self._maps))
+
+    def __len__(self) -> int:
+        """Number of maps that count."""
+        return len(range(0, self._maps, self.every))
+
+    def read(self, indices: Sequence[int]) -> Batch:
+        """Reads maps by their indices among those that count."""
+        return super().read([self.every * index for index in indices])
 
     def __getitem__(self, key: MapKey) -> Batch:  # type: ignore[override]
         """Gives every field of the maps in `key`, shape [b, *, H, W]."""
@@ -95,7 +108,10 @@ class MapDataset(TerrainMaps):
     def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, Batch]]:
         """All maps neither turned nor jittered, in order, some at a time, with their indices; on a device."""
         origins = crop_origins(self.dataset.grid.shape, self.crop, self.seed, 0, len(self))
-        for indices, maps in self._stored_chunks():
+        size = self.dataset.grid.maps_in(CHUNK_CELLS)
+        for first in range(0, len(self), size):
+            indices = range(len(self))[first : first + size]
+            maps = self.dataset.read(self.split, [self.every * index for index in indices], self.fields)
             batch = {name: torch.from_numpy(values) for name, values in maps.items()}
             if self.crop:
                 chosen = origins[indices.start : indices.stop].tolist()
@@ -104,9 +120,6 @@ class MapDataset(TerrainMaps):
                     for name, values in batch.items()
                 }
             yield indices, {name: values.to(device) for name, values in batch.items()}
-
-    def _stored_chunks(self) -> Iterator[tuple[range, dict[str, np.ndarray]]]:
-        return self.dataset.chunks(self.split, self.fields)
 
     def _cut(self, layer: Tensor, origin: Sequence[int]) -> Tensor:
         """The square of a layer, [*, H, W], from a cell on; the layer itself where none is asked for."""
@@ -251,7 +264,7 @@ class MapData(lightning.LightningDataModule):
         crop: cells of a side of the squares to train and to measure on; 0 takes whole maps.
         in_memory: hold all maps in memory.
         workers: processes that read ahead; 0 reads in this one.
-        valid: how `valid` is read.
+        valid_every: n where it is every n-th map of `valid` that counts.
 
     Raises:
         DatasetError: a split is missing.
@@ -268,15 +281,15 @@ class MapData(lightning.LightningDataModule):
         crop: int = 0,
         in_memory: bool = False,
         workers: int = 0,
-        valid: type[MapDataset] = MapDataset,
+        valid_every: int = 1,
     ) -> None:
         """Opens the splits."""
         super().__init__()
         self.batch_size, self.seed, self.jitter, self.workers = batch_size, seed, jitter, workers
         self.symmetries = symmetries
         self.train, self.valid = (
-            kind(dataset.path, split, fields, in_memory, crop, seed)
-            for split, kind in ((TRAIN, MapDataset), (VALID, valid))
+            MapDataset(dataset.path, split, fields, in_memory, crop, seed, every)
+            for split, every in ((TRAIN, 1), (VALID, valid_every))
         )
 
     def scale(self, inputs: Sequence[str]) -> dict[str, LayerScale]:
@@ -296,10 +309,8 @@ class MapData(lightning.LightningDataModule):
                 cells[name] += int(values.isfinite().sum())
         scale = {name: _layer_scale(name, sums[name], cells[name]) for name in inputs if name != "rgb"}
         if "rgb" in inputs:
-            share, level = (
-                counts.double() / counts.sum(1, keepdim=True),
-                torch.arange(256.0, dtype=torch.float64),
-            )
+            share = counts.double() / counts.sum(1, keepdim=True)
+            level = torch.arange(256.0, dtype=torch.float64)
             mean = (share * level).sum(1)
             variance = (share * level**2).sum(1) - mean**2
             # Ground of one colour would have no scale.

@@ -25,7 +25,7 @@ from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.trainable import TrainableModel
 from benchnav.models.training.check import Trainable, check_network, class_names, fields_of
-from benchnav.models.training.conformal import StoppingMaps, check_valid, conformal_table
+from benchnav.models.training.conformal import check_valid, conformal_table, stopping_every
 from benchnav.models.training.data import (
     VALID,
     MapData,
@@ -180,7 +180,7 @@ def fit_network(
     config, network = trainable.config, trainable.kind(trainable.config)
     data = MapData(
         dataset, config.batch_size, seed, fields_of(network), config.jitter, config.symmetries, config.crop,
-        in_memory=options.in_memory, workers=options.workers, valid=valid_maps(options),
+        in_memory=options.in_memory, workers=options.workers, valid_every=stopping_every(options.conformal),
     )  # fmt: skip
     network.build(data.scale(network.inputs), class_names(dataset), seed)
     early = [EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)]
@@ -237,17 +237,13 @@ def train_parts(target: Target, trainable: Trainable, dataset: TerrainDataset, p
     found = [target.checkpoint.part(name) for name in names]
     classes = target.checkpoint.class_names
     members = [trainable.kind.from_tensors(part.config, classes, part.tensors) for part in found]
-    maps = valid_maps(options)(
-        dataset.path, VALID, fields_of(members[0]), crop=config.crop, seed=options.seed
-    )
+    maps = MapDataset(
+        dataset.path, VALID, fields_of(members[0]), crop=config.crop, seed=options.seed,
+        every=stopping_every(options.conformal),
+    )  # fmt: skip
     temperature = trainable.kind.fit_pool(members, maps, options.seed, options.place)
     say(f"pool of {len(members)} networks: temperature {temperature:.3f}")
     target.set_pool_temperature(temperature)
-
-
-def valid_maps(options: FitOptions) -> type[MapDataset]:
-    """How the maps of `valid` are read by stopping and temperature."""
-    return StoppingMaps if options.conformal else MapDataset
 
 
 def calibrate_whole(target: Target, trainable: Trainable, dataset: TerrainDataset) -> None:

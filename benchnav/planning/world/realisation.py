@@ -5,8 +5,8 @@ planner and setting meets the same, whatever the batch or the order.
 
 Frozen λ is drawn once an episode as a correlated field, each cell with its own distribution: a field of correlated
 standard normals goes through each cell's quantile function (`benchnav.core.copula`). Where ground can immobilise a
-robot, a field that cuts the start off from the goal is drawn again: what is asked is which way to take, and there has
-to be one. Letters in shapes: B episodes, N steps, H×W cells, K components.
+robot, a draw in which no feasible path joins start and goal is rejected and drawn again: what is asked is which way to
+take, and there has to be one. Letters in shapes: B episodes, N steps, H×W cells, K components.
 """
 
 from collections.abc import Sequence
@@ -151,7 +151,7 @@ def draw_frozen(
         λ in [0, 1], shape [B, H, W]; and how many fields of each episode were drawn, int64, shape [B].
 
     Raises:
-        ConfigError: the correlation is too long for the maps, or no field of some episode joins its start and goal.
+        ConfigError: the correlation is too long for the maps, or all draws of some episode were rejected.
     """
     grid, cells = terrain.grid, world.correlation_m / terrain.grid.resolution_m
     longest = LONGEST_CORRELATION * min(grid.extent_m)
@@ -177,7 +177,7 @@ def draw_frozen(
         if len(pending) == 0:
             return field, attempts
     raise ConfigError(
-        f"Expected ground that joins start and goal, but {MOST_ATTEMPTS} draws of λ gave none for example "
+        f"Expected a feasible path from start to goal, but {MOST_ATTEMPTS} draws of λ gave none for example "
         f"{maps[int(pending[0])]}. Lower `immobile.below`, or take easier maps."
     )
 

@@ -3,7 +3,6 @@
 import gzip
 import json
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchnav.core.errors import BenchnavError, ConfigError, DatasetError
-from benchnav.datagen.cli import main
 from benchnav.datagen.dem.drive_cells import describe_drives, drive_over
 from benchnav.datagen.dem.drive_log import DriveLog, Drives, pace, read_drives
 from benchnav.datagen.dem.importer import import_dem
@@ -24,6 +22,7 @@ from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.merge import merge
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
+from tests.commands import call
 from tests.datagen.dem.rasters import COUNTER, RECIPE, SOUTH, WEST, rough, source_of, write
 
 rasterio = pytest.importorskip("rasterio")
@@ -520,13 +519,6 @@ def test_other_bad_settings_are_refused(dem: Path) -> None:
 # The command
 
 
-def datagen(line: str, monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(sys, "argv", ["benchnav-datagen", *shlex.split(line)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
-
-
 def test_the_command_says_what_was_used_and_what_was_not(
     dem: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -538,10 +530,10 @@ def test_the_command_says_what_was_used_and_what_was_not(
     (dem.parent / "log.csv.gz").write_bytes(gzip.compress((dem.parent / "log.csv").read_bytes()))
     grid = "height=16 width=24 start_m=[2.2,2.2] goal_m=[9.2,5.2]"
     common = f"import-drives log.csv.gz {grid} --dem dem.tif --recipe tiny-v1 --out site.h5"
-    assert datagen(common, monkeypatch) == 2
+    assert call("datagen", *shlex.split(common)) == 2
     assert "`photo` or `classes`" in capfd.readouterr().err
     flags = "--photo photo.tif --splits train:0.5,valid:0.25,test/site:0.25 --least-speed 0.2 --stride 4"
-    assert datagen(f"{common} {flags}", monkeypatch) == 0
+    assert call("datagen", *shlex.split(f"{common} {flags}")) == 0
     said = capfd.readouterr().out
     dataset = TerrainDataset("site.h5")
     assert dataset.id == "site"
@@ -567,9 +559,9 @@ def test_the_command_says_what_was_used_and_what_was_not(
     assert "group(s), the unit of statistics" in said
     assert "note: positions move" in said  # commands here have nothing to do with how far the robot went
     for line in ("validate site.h5", "show site.h5", "preview site.h5 --split train --out sheet.png"):
-        assert datagen(line, monkeypatch) == 0
+        assert call("datagen", *shlex.split(line)) == 0
     assert "drive_count, drive_std" in capfd.readouterr().out
-    assert datagen("show site.h5 --json", monkeypatch) == 0
+    assert call("datagen", *shlex.split("show site.h5 --json")) == 0
     assert json.loads(capfd.readouterr().out)["splits"]["train"]["parts"][0]["source"]["drives"] == about
 
 
@@ -582,21 +574,21 @@ def test_the_default_splits_are_for_training(
     write(dem, np.full((HEIGHT, WIDTH), 5, np.float32), CELL)
     grid = "height=16 width=24 start_m=[2.2,2.2] goal_m=[9.2,5.2] id=mine"
     common = f"import-drives log.csv {grid} --dem dem.tif --recipe tiny-v1 --out site --classes classes.tif"
-    assert datagen(common + " --class-ids '{7: gravel}' --solvable", monkeypatch) == 0
+    assert call("datagen", *shlex.split(common + " --class-ids '{7: gravel}' --solvable")) == 0
     dataset = TerrainDataset("site")
     assert dataset.id == "mine"
     assert list(dataset.splits) == ["train", "valid", "test/site"]
     gravel = [item.name for item in dataset.recipe.classes].index("gravel")
     assert (dataset.read("train")["class_id"] == gravel).all()
     assert np.isfinite(dataset.read("train")["reference_time_s"]).all()
-    assert datagen(common, monkeypatch) == 2
+    assert call("datagen", *shlex.split(common)) == 2
     assert "--overwrite" in capfd.readouterr().err
-    assert datagen(common + " --class-ids '{7: null, 3: gravel}' --overwrite", monkeypatch) == 2
+    assert call("datagen", *shlex.split(common + " --class-ids '{7: null, 3: gravel}' --overwrite")) == 2
     assert (
         "no cell with a class or a measured λ, or cells without a class and no photo"
         in capfd.readouterr().err
     )
-    assert datagen(common + " --class-ids '{7: scree}' --overwrite", monkeypatch) == 0
+    assert call("datagen", *shlex.split(common + " --class-ids '{7: scree}' --overwrite")) == 0
     assert not (TerrainDataset("site").read("train")["class_id"] == gravel).any()
 
 

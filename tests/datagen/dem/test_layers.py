@@ -1,7 +1,6 @@
 """Rasters that become layers: their values, their place, and what is refused."""
 
 import hashlib
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +8,10 @@ import numpy as np
 import pytest
 
 from benchnav.core.errors import ConfigError
-from benchnav.datagen import cli
 from benchnav.datagen.dem.layer import read_layer
 from benchnav.datagen.dem.raster import Rasters
 from benchnav.datagen.files.reader import TerrainDataset
+from tests.commands import call
 from tests.datagen.dem.rasters import (
     FLAT,
     RECIPE,
@@ -243,14 +242,9 @@ def test_the_command_takes_layers_as_a_list_or_one_by_one(
     for name, seed in (("dem", 0), ("a", 1), ("b", 2)):
         write(tmp_path / f"{name}.tif", values(32, 32, seed) if size else FLAT)
     words = ["import-dem", "dem.tif", "--recipe", "tiny-v1", "--out", "site.h5", *flags]
-    monkeypatch.setattr(sys, "argv", ["benchnav-datagen", *words])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 0, capsys.readouterr().err
+    assert call("datagen", *words) == 0, capsys.readouterr().err
     dataset = TerrainDataset("site.h5")
     assert dataset.layer_names == ("vegetation_m", "moss")
     assert dataset.fields["moss"].unit == "kg"
-    monkeypatch.setattr(sys, "argv", ["benchnav-datagen", "show", "site.h5"])
-    with pytest.raises(SystemExit):
-        cli.main()
+    assert call("datagen", "show", "site.h5") == 0
     assert "imported layer" in capsys.readouterr().out

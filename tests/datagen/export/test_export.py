@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import pytest
 import yaml
 
 from benchnav.core.errors import ConfigError, DatasetError
-from benchnav.datagen import cli, schema
+from benchnav.datagen import schema
 from benchnav.datagen.export import parquet
 from benchnav.datagen.export.export import Publication, export, is_ours
 from benchnav.datagen.files import reader
@@ -25,6 +26,7 @@ from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import Vegetation
 from tests import factories
+from tests.commands import call
 from tests.datagen.small import small_stakes
 
 Call = Callable[..., int]
@@ -36,13 +38,7 @@ def datagen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
     """Runs the command in an empty folder and gives its exit status."""
     monkeypatch.chdir(tmp_path)
 
-    def call(*arguments: object) -> int:
-        monkeypatch.setattr("sys.argv", ["benchnav-datagen", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        return ended.value.code or 0  # type: ignore[return-value]
-
-    return call
+    return partial(call, "datagen")
 
 
 def exported(path: Path, out: Path, publication: Publication | None = None, **settings: Any) -> Path:

@@ -3,7 +3,6 @@
 import json
 import random
 import shutil
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -15,10 +14,10 @@ import pytest
 
 from benchnav.core.errors import BenchnavError
 from benchnav.core.store import seal
-from benchnav.datagen.cli import main
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.maps import TerrainMaps
 from benchnav.datagen.files.reader import TerrainDataset
+from tests.commands import call
 from tests.factories import tiny_dataset, tiny_recipe
 
 EDITS = pytest.mark.parametrize(
@@ -104,7 +103,6 @@ def content(path: Path) -> dict[str, np.ndarray]:
 def test_an_edited_dataset_is_one_line_or_what_was_stored(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
     kind: str,
     edit: Callable[[Path, random.Random], None],
     seeds: range,
@@ -129,10 +127,8 @@ def test_an_edited_dataset_is_one_line_or_what_was_stored(
         if seed % 4 == 0:  # slower than the others
             commands["preview"] = ["--maps", "[0]", "--out", str(tmp_path / "p.png")]
         for command, options in commands.items():
-            monkeypatch.setattr(sys, "argv", ["benchnav-datagen", command, str(edited), *options])
-            with pytest.raises(SystemExit) as ended:
-                main()
+            status = call("datagen", command, edited, *options)
             said = capsys.readouterr().err
             allowed = (0, 1, 2) if command == "validate" else (0, 2)
-            assert ended.value.code in allowed, seed
-            assert said.count("\n") == (ended.value.code == 2), (seed, said)
+            assert status in allowed, seed
+            assert said.count("\n") == (status == 2), (seed, said)

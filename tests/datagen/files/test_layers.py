@@ -1,6 +1,5 @@
 """Layers of a dataset: which fields are layers, and that every reader carries them."""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 import torch
 
 from benchnav.core.errors import DatasetError
-from benchnav.datagen import cli, schema
+from benchnav.datagen import schema
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.hdf5 import ShardFile, pack, recipe_entry
@@ -20,6 +19,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import Vegetation
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.synth.generate import generate
+from tests.commands import call
 from tests.datagen.small import small_stakes
 from tests.factories import tiny_dataset, tiny_recipe
 
@@ -187,14 +187,9 @@ def test_what_models_record_covers_what_grows(path: Path, tmp_path: Path) -> Non
     assert dataset.about_digest("train") != other.about_digest("train")
 
 
-def test_the_commands_name_layers(
-    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_commands_name_layers(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def said(*words: str) -> str:
-        monkeypatch.setattr(sys, "argv", ["benchnav-datagen", *words])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        assert not ended.value.code
+        assert call("datagen", *words) == 0
         return capsys.readouterr().out
 
     assert "; layers vegetation_m" in said("list", "--folder", str(path.parent))

@@ -9,8 +9,9 @@ import torch
 
 from benchnav.core.errors import DatasetError
 from benchnav.datagen import schema
-from benchnav.datagen.files import reader
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.files import manifest, reader
+from benchnav.datagen.files.find import find_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.files.stored_terrain import terrain_of
 from benchnav.datagen.recipe import classes
 from benchnav.datagen.synth.generate import generate
@@ -121,7 +122,7 @@ def test_want_of_memory_is_not_taken_for_damage(which: slice) -> None:
     np.testing.assert_array_equal(reader._values(Tight(values), which), values[which])
     with pytest.raises(OSError, match="no room"):
         reader._values(Tight(values, damaged=4), which)
-    assert not issubclass(MemoryError, reader.READ_ERRORS)
+    assert not issubclass(MemoryError, manifest.READ_ERRORS)
 
 
 def test_recorded_digests_cover_what_maps_mean(tmp_path: Path) -> None:

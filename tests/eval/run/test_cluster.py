@@ -17,7 +17,6 @@ import torch
 
 from benchnav.core import workers as dask
 from benchnav.core.errors import BenchnavError, ConfigError
-from benchnav.eval import cli
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import units
 from benchnav.eval.folder import provenance
@@ -27,6 +26,7 @@ from benchnav.eval.run import cluster
 from benchnav.eval.run.cluster import check_worker, run_on_worker
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings
+from tests.commands import call
 
 distributed = pytest.importorskip("distributed")
 
@@ -225,10 +225,7 @@ def test_a_scheduler_that_cannot_be_reached_is_one_line_and_drops_nothing(
             "--scheduler",
             address,
         )
-        monkeypatch.setattr(sys, "argv", ["benchnav-eval", *words])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-    assert ended.value.code == 2
+        assert call("eval", *words) == 2
     captured = capsys.readouterr()
     (line,) = captured.err.splitlines()
     assert address in line

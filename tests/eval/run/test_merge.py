@@ -5,7 +5,6 @@ import multiprocessing
 import os
 import shutil
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,12 +17,12 @@ import pytest
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard
-from benchnav.eval import cli
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.run_folder import metadata, open_run, read_table, with_metadata, write_run
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.runner import run_suite
+from tests.commands import call
 
 OF = 3
 KEYS = ["condition", "seed", "realisation", "map"]
@@ -271,14 +270,11 @@ def test_a_folder_that_is_there_is_not_merged_into(parts: list[Path]) -> None:
 
 
 def test_the_commands(  # type: ignore[no-untyped-def]
-    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+    dataset_path: Path, tmp_path: Path, capsys
 ) -> None:
-    def call(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["benchnav-eval", *words])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        captured = capsys.readouterr()
-        return int(ended.value.code or 0), captured.out, captured.err
+    def told(*words: str) -> tuple[int, str, str]:
+        status, captured = call("eval", *words), capsys.readouterr()
+        return status, captured.out, captured.err
 
     run = (
         "run", "--data", str(dataset_path), "--model", "oracle", "--planners", "[tests.eval.parts:Faulty]",
@@ -287,24 +283,24 @@ def test_the_commands(  # type: ignore[no-untyped-def]
     )  # fmt: skip
     out = [str(tmp_path / name) for name in ("one", "two", "all")]
     for index, folder in enumerate(out[:2], start=1):
-        status, printed, _ = call(*run, "--shard", f"{index}/2", "--out", folder)
+        status, printed, _ = told(*run, "--shard", f"{index}/2", "--out", folder)
         assert status == 0
         assert f"shard {index}/2 is finished" in printed
-    status, _, error = call("report", out[0])
+    status, _, error = told("report", out[0])
     assert (status, len(error.splitlines())) == (2, 1)
     assert "shard 1/2" in error
-    status, printed, _ = call("merge", out[2], *out[:2])
+    status, printed, _ = told("merge", out[2], *out[:2])
     assert status == 0
     assert "Faulty" in printed
     assert (Path(out[2]) / "summary.md").exists()
     commands = open_run(Path(out[2])).about["history"]
     assert [entry["command"].split()[1] for entry in commands] == ["run", "run", "merge"]
-    assert call("report", out[2])[0] == 0
-    assert call(*run, "--shard", "3/2", "--out", out[0])[0] == 2
-    assert call("merge", out[2])[0] == 2
+    assert told("report", out[2])[0] == 0
+    assert told(*run, "--shard", "3/2", "--out", out[0])[0] == 2
+    assert told("merge", out[2])[0] == 2
     # A shard in which a part failed says so.
     bad = ["{part: tests.eval.parts:Faulty, options: {fault: raise}}"]
-    status, _, error = call(
+    status, _, error = told(
         *run, "--planners", f"[{bad[0]}]", "--shard", "1/1", "--out", str(tmp_path / "bad")
     )
     assert status == 1

@@ -15,13 +15,13 @@ import torch
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard
-from benchnav.eval import cli
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.run_folder import open_run, write_run
 from benchnav.eval.run.rerun import compare, rerun
 from benchnav.eval.run.runner import run_suite
 from tests import factories
+from tests.commands import call
 from tests.eval.forged import forge_rows
 
 MINE = "from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n"
@@ -265,37 +265,32 @@ def test_the_command_repeats_with_the_workers_that_are_asked_for(
         raise ConfigError("enough")
 
     monkeypatch.setattr("benchnav.eval.run.rerun.rerun", begin)
-    monkeypatch.setattr(sys, "argv", ["benchnav-eval", "rerun", str(tmp_path / "run"), *words])
-    with pytest.raises(SystemExit):
-        cli.main()
+    assert call("eval", "rerun", tmp_path / "run", *words) == 2
     (told,) = given
     assert {name: told[name] for name in expected} == expected
     assert (told["run_folder"], told["folder"]) == (tmp_path / "run", tmp_path / "run-rerun")
 
 
 def test_the_command_ends_with_0_1_or_2(  # type: ignore[no-untyped-def]
-    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+    suite: Suite, tmp_path: Path, capsys
 ) -> None:
-    def call(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["benchnav-eval", "rerun", *words])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        captured = capsys.readouterr()
-        return int(ended.value.code or 0), captured.out, captured.err
+    def told(*words: str) -> tuple[int, str, str]:
+        status, captured = call("eval", "rerun", *words), capsys.readouterr()
+        return status, captured.out, captured.err
 
     run = finish(suite, tmp_path / "run")
-    status, printed, _ = call(str(run))
+    status, printed, _ = told(str(run))
     assert status == 0
     assert "all 4 rows came out the same" in printed
     assert (tmp_path / "run-rerun" / "episodes.parquet").exists()
     change_rows(run, {"score": 0.25}, "map == 1")
-    status, printed, error = call(str(run))
+    status, printed, error = told(str(run))
     assert status == 1
     assert "2 of 2 units were there already" in error
     assert "2 of 4 rows came out differently" in printed
-    status, _, error = call(str(run), "--overwrite", "--out", str(tmp_path / "other"))
+    status, _, error = told(str(run), "--overwrite", "--out", str(tmp_path / "other"))
     assert status == 1
     assert "already" not in error
     (tmp_path / "mine.py").unlink()
-    status, printed, error = call(str(run), "--out", str(tmp_path / "third"))
+    status, printed, error = told(str(run), "--out", str(tmp_path / "third"))
     assert (status, printed, len(error.splitlines())) == (2, "", 1)

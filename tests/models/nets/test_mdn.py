@@ -1,6 +1,5 @@
 import json
 import re
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import predict
 from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpoint
-from benchnav.models.cli import main
 from benchnav.models.config import MDNConfig
 from benchnav.models.nets import mdn
 from benchnav.models.nets import trainable as trainable_module
@@ -31,6 +29,7 @@ from benchnav.models.training import networks
 from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions, KeepBest
 from benchnav.models.training.networks import fit_network
+from tests.commands import call
 from tests.factories import normal
 from tests.models.support import make_terrain, scale, trainable
 
@@ -63,13 +62,6 @@ def observe(batch: int, height: int, width: int) -> Observation:
 def parameters(weights: Tensor, means: Tensor, stds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """As the loss takes them: [1, K, 1, N] of [K] components in each of N cells."""
     return weights.log().view(1, -1, 1, 1), means.view(1, -1, 1, 1), stds.view(1, -1, 1, 1)
-
-
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["benchnav-train", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
 
 
 # --- the loss ------------------------------------------------------------------------------------
@@ -467,7 +459,7 @@ def test_the_command_trains_a_checkpoint_that_is_evaluated(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     where = ["mdn", "--data", dataset.path, "--out", "mine", *QUICK]
-    assert call(monkeypatch, *where, "--trainer.max_epochs", 2, "--seed", 7, "--mdn.components", 2) == 0
+    assert call("train", *where, "--trainer.max_epochs", 2, "--seed", 7, "--mdn.components", 2) == 0
     out, err = capfd.readouterr()
     assert re.search(r"validation loss -?[\d.]+, rmse [\d.]+", out)
     assert "wrote mine with mdn" in out
@@ -487,20 +479,20 @@ def test_the_command_trains_a_checkpoint_that_is_evaluated(
     valid = MapData(dataset, 2, 0, fields=("rgb", "slope_deg", "traversability")).valid
     assert kept.measure(valid).items() <= dict(part.metrics).items()
 
-    assert call(monkeypatch, "evaluate", "mine", "--data", dataset.path, "--splits", "[test/std]") == 0
+    assert call("train", "evaluate", "mine", "--data", dataset.path, "--splits", "[test/std]") == 0
     assert "test/std" in capfd.readouterr().out
 
     settings = ["--trainer.max_epochs", 2, "--seed", 7, "--mdn.components", 2]
-    assert call(monkeypatch, *where, *settings, "--resume") == 0  # nothing is left to do
+    assert call("train", *where, *settings, "--resume") == 0  # nothing is left to do
     assert capfd.readouterr().err == ""
     for wrong in ([], ["--resume"], ["--resume", "--seed", 8]):
-        assert call(monkeypatch, *where, *wrong) == 2
+        assert call("train", *where, *wrong) == 2
         lines = capfd.readouterr().err.strip().splitlines()
         assert len(lines) == 1
         assert "--overwrite" in lines[0]
     assert load_checkpoint("mine").part("mdn").seed == 7
     replaced = ["--overwrite", "--trainer.max_epochs", 1, "--half_precision", "false"]
-    assert call(monkeypatch, *where, *replaced) == 0
+    assert call("train", *where, *replaced) == 0
     after = load_checkpoint("mine").part("mdn")
     assert (after.seed, after.config["components"], after.half_precision) == (0, 3, False)
 
@@ -525,7 +517,7 @@ def test_bad_input_is_refused_in_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
-    assert call(monkeypatch, "mdn", "--data", dataset.path, *arguments) == 2
+    assert call("train", "mdn", "--data", dataset.path, *arguments) == 2
     lines = capfd.readouterr().err.strip().splitlines()
     assert len(lines) == 1, lines
     assert expected in lines[0]

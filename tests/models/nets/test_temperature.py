@@ -94,7 +94,7 @@ class Held(MapDataset):
     """Maps of no dataset."""
 
     def __init__(self, rgb: torch.Tensor, class_id: torch.Tensor) -> None:
-        self._memory, self._maps = {"rgb": rgb, "class_id": class_id}, len(rgb)
+        self._memory, self._maps, self.every = {"rgb": rgb, "class_id": class_id}, len(rgb), 1
 
     def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, dict[str, torch.Tensor]]]:
         every = range(len(self))

@@ -9,11 +9,11 @@ import pytest
 
 from benchnav.core import registry
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.cli import main
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality import baselines, map_sheet
 from benchnav.models.quality.baselines import nearest_colour_accuracy
 from benchnav.models.quality.measure import evaluate
+from tests.commands import call
 from tests.models.stub import ColourModel
 
 
@@ -23,13 +23,6 @@ def _colour_model(monkeypatch: pytest.MonkeyPatch) -> None:
     registry.register("model", "colours", ColourModel)
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["benchnav-train", "evaluate", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
-
-
 def test_a_table_is_printed_and_nothing_written(
     dataset: TerrainDataset,
     tmp_path: Path,
@@ -37,7 +30,7 @@ def test_a_table_is_printed_and_nothing_written(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert call(monkeypatch, "colours", "--data", dataset.path) == 0
+    assert call("train", "evaluate", "colours", "--data", dataset.path) == 0
     out, err = capfd.readouterr()
     quality = dict(evaluate(ColourModel(), dataset))["test/hs"]
     (row,) = [line for line in out.splitlines() if line.startswith("test/hs")]
@@ -55,7 +48,9 @@ def test_json_alone_is_written_for_other_programs(
 ) -> None:
     report = tmp_path / "report.json"
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert call(monkeypatch, "colours", "--data", dataset.path, "--json=~/report.json", "--seed", 5) == 0
+    assert (
+        call("train", "evaluate", "colours", "--data", dataset.path, "--json=~/report.json", "--seed", 5) == 0
+    )
     found = json.loads(report.read_text())
     assert list(found["splits"]) == ["test/std", "test/hs"]
     assert found["dataset"] == {"id": dataset.id, "digest": dataset.digest}
@@ -80,7 +75,7 @@ def test_a_folder_holds_report_page_and_figures(
     monkeypatch.setattr(
         map_sheet, "map_sheet_figure", lambda *given: titles.append(given[-1]) or draw(*given)
     )
-    assert call(monkeypatch, *asked) == 0
+    assert call("train", "evaluate", *asked) == 0
     assert titles == ["model colours on dataset tiny-v1"] * 2
     assert {path.name for path in out.iterdir()} == {"quality.json", "quality.csv", "quality.md", "figures"}
     figures = {path.name for path in (out / "figures").iterdir()}
@@ -95,10 +90,13 @@ def test_a_folder_holds_report_page_and_figures(
     assert len(list(csv.DictReader((out / "quality.csv").open()))) == 2
 
     # Another evaluation takes its place only when asked to, and leaves no figure of the first.
-    assert call(monkeypatch, "oracle", "--data", dataset.path, "--out", out) == 2
+    assert call("train", "evaluate", "oracle", "--data", dataset.path, "--out", out) == 2
     assert "--overwrite" in capfd.readouterr().err
     assert json.loads((out / "quality.json").read_text())["model"] == "colours"
-    assert call(monkeypatch, "oracle", "--data", dataset.path, "--out", out, "--maps", 0, "--overwrite") == 0
+    assert (
+        call("train", "evaluate", "oracle", "--data", dataset.path, "--out", out, "--maps", 0, "--overwrite")
+        == 0
+    )
     assert {path.name for path in (out / "figures").iterdir()} == {"pit.png", "pit.pdf"}
     said = capfd.readouterr().out
     assert "predicts no classes" in said
@@ -120,7 +118,7 @@ def test_a_series_is_drawn_where_there_is_one(
         TerrainDataset, "read", lambda self, split, *rest: read(self, split.removesuffix("-100"), *rest)
     )
     asked = ["oracle", "--data", dataset.path, "--splits", "[test/std,test/hs-100]", "--maps", 0]
-    assert call(monkeypatch, *asked, "--out", tmp_path / "q") == 0
+    assert call("train", "evaluate", *asked, "--out", tmp_path / "q") == 0
     assert (tmp_path / "q" / "figures" / "severity.png").is_file()
     assert list(json.loads((tmp_path / "q" / "quality.json").read_text())["series"]) == ["test/hs"]
 
@@ -167,7 +165,9 @@ def test_bad_input_is_refused_in_one_line_before_any_work(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "file").write_text("mine")
-    assert call(monkeypatch, *(str(dataset.path) if item == "DATA" else item for item in arguments)) == 2
+    assert (
+        call("train", "evaluate", *(str(dataset.path) if item == "DATA" else item for item in arguments)) == 2
+    )
     out, err = capfd.readouterr()
     assert len(err.strip().splitlines()) == 1, err
     assert err.startswith("benchnav-train: error: ")
@@ -190,7 +190,6 @@ def test_maps_that_the_model_was_trained_on_are_named(
     dataset: TerrainDataset,
     checkpoint_path: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     copy = Path(shutil.copy(dataset.path, tmp_path / "renamed.h5"))
@@ -201,11 +200,11 @@ def test_maps_that_the_model_was_trained_on_are_named(
     ):
         report = tmp_path / "report.json"
         asked = ("--data", copy, "--splits", splits, "--json", report)
-        assert call(monkeypatch, checkpoint_path, *asked) == 0
+        assert call("train", "evaluate", checkpoint_path, *asked) == 0
         warned = [line for line in capfd.readouterr().out.splitlines() if "was trained" in line]
         assert warned == [note for note in json.loads(report.read_text())["notes"] if "was trained" in note]
         assert [line.partition("maps of ")[2][: len(named)] for line in warned] == [named] * bool(named)
-    assert call(monkeypatch, "colours", "--data", copy, "--splits", "[train]") == 0
+    assert call("train", "evaluate", "colours", "--data", copy, "--splits", "[train]") == 0
     assert "was trained" not in capfd.readouterr().out
 
 
@@ -220,9 +219,9 @@ def test_a_model_that_is_right_less_often_than_the_nearest_colour_is_told_so(
     monkeypatch.setattr(baselines, "nearest_colour_accuracy", lambda _, split: shares[split])
     line = "warning: the model is right less often than the nearest colour on test/std"
     out = tmp_path / "quality"
-    assert call(monkeypatch, "colours", "--data", dataset.path, "--out", out, "--maps", 0) == 0
+    assert call("train", "evaluate", "colours", "--data", dataset.path, "--out", out, "--maps", 0) == 0
     assert line in capfd.readouterr().out.splitlines()
     assert line in (out / "quality.md").read_text().splitlines()
     shares["test/std"] = 0.0
-    assert call(monkeypatch, "colours", "--data", dataset.path) == 0
+    assert call("train", "evaluate", "colours", "--data", dataset.path) == 0
     assert "less often" not in capfd.readouterr().out

@@ -1,7 +1,6 @@
 """Conformal recalibration in training: halves of `valid` that do not overlap, any model, resume and checkpoints."""
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,17 +14,17 @@ from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.quantiles import QuantileDistribution
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.cli import main
 from benchnav.models.config import TrainOptions
 from benchnav.models.conformal import ConformalModel, fit_table
 from benchnav.models.nets import calibration
 from benchnav.models.nets.trainable import Ensemble
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
-from benchnav.models.training.conformal import StoppingMaps, conformal_table, scored_maps
+from benchnav.models.training.conformal import conformal_table, scored_maps, stopping_every
 from benchnav.models.training.data import MapDataset, MapSampler
 from benchnav.models.training.networks import fit_model, train_networks
 from benchnav.testing import check_model
+from tests.commands import call
 from tests.models.stub import ColourModel
 from tests.models.support import make_dataset
 from tests.models.zoo.support import Killed, to_train
@@ -61,7 +60,7 @@ def test_one_half_is_every_second_map_and_the_other_is_the_rest(
     maps: TerrainDataset, in_memory: bool
 ) -> None:
     whole = MapDataset(maps.path, "valid", FIELDS)
-    half = StoppingMaps(maps.path, "valid", FIELDS, in_memory)
+    half = MapDataset(maps.path, "valid", FIELDS, in_memory, every=stopping_every(conformal=True))
     assert (len(whole), len(half), list(scored_maps(7))) == (7, 4, [1, 3, 5])
     every = whole.read(range(7))["rgb"]
     assert torch.equal(half.read([0, 3])["rgb"], every[[0, 6]])
@@ -143,7 +142,7 @@ def test_a_users_own_model_is_recalibrated_and_kept(maps: TerrainDataset, tmp_pa
 
 
 def test_the_fused_model_is_recalibrated_as_a_whole(
-    maps: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    maps: TerrainDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = {"encoder": "mobilenet_v2", "encoder_depth": 2, "max_epochs": 1, "batch_size": 2}
     out = tmp_path / "fused"
@@ -160,17 +159,11 @@ def test_the_fused_model_is_recalibrated_as_a_whole(
     arguments = ["classifier", "--data", maps.path, "--conformal", "true", "--device", "cpu"]
     arguments += [f"--classifier.{name}={value}" for name, value in small.items()]
 
-    def call(*more: object) -> int:
-        monkeypatch.setattr(sys, "argv", ["benchnav-train", *map(str, [*arguments, *more])])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return int(ended.value.code or 0)
-
-    assert call("--out", tmp_path / "alone") == 2
+    assert call("train", *arguments, "--out", tmp_path / "alone") == 2
     assert "a whole model for `conformal`" in capsys.readouterr().err
     assert not (tmp_path / "alone").exists()
     before = load_checkpoint(out).conformal
-    assert call("--out", out, "--overwrite", "--seed", 4) == 0
+    assert call("train", *arguments, "--out", out, "--overwrite", "--seed", 4) == 0
     after = load_checkpoint(out)
     assert after.conformal
     assert after.conformal != before

@@ -23,16 +23,10 @@ from benchnav.models.training import networks
 from benchnav.models.training.data import MapDataset
 from benchnav.models.training.fit import KeepBest
 from benchnav.testing import check_model
+from tests.commands import call
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "own_model.py"
 QUICK = ("--trainer.precision", "32-true", "--trainer.max_epochs", "3", "--settings.batch_size", "5")
-
-
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["benchnav-train", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
 
 
 @pytest.fixture
@@ -52,7 +46,7 @@ def trained(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -
         patch.chdir(folder)
         settings = ("--settings.hidden", 8, "--settings.inputs", "[rgb, slope_deg, elevation_m]", "--seed", 4)
         where = ("fit", "own.py:CellModel", "--data", dataset.path, "--out", "c")
-        assert call(patch, *where, *QUICK, *settings, "--members", 2) == 0
+        assert call("train", *where, *QUICK, *settings, "--members", 2) == 0
     return folder
 
 
@@ -136,7 +130,7 @@ def test_a_kill_in_any_epoch_changes_nothing(
             patch.setattr(sys, "argv", ["benchnav-train", *map(str, command), "--out", out])
             with pytest.raises(Killed):
                 main()
-        assert call(monkeypatch, *command, "--out", out, "--resume") == 0
+        assert call("train", *command, "--out", out, "--resume") == 0
         found, wanted = (load_checkpoint(folder).part("CellModel") for folder in (out, trained / "c"))
         assert found.config == wanted.config
         for name, value in wanted.tensors.items():
@@ -147,7 +141,6 @@ def test_other_code_is_told_and_not_gone_on_with(
     trained: Path,
     own: Path,
     dataset: TerrainDataset,
-    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     shutil.copytree(trained / "c", "c")
@@ -158,7 +151,7 @@ def test_other_code_is_told_and_not_gone_on_with(
     (line,) = capfd.readouterr().err.splitlines()
     assert "the code of CellModel in file own.py is not that which trained the checkpoint" in line
     command = ("fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK, "--resume")
-    assert call(monkeypatch, *command) == 2
+    assert call("train", *command) == 2
     assert "got one of other code" in capfd.readouterr().err
 
 
@@ -171,7 +164,7 @@ def test_an_installed_class_is_loaded_by_its_name_and_its_code_compared_too(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setitem(registry._REGISTERED, ("model", "cells"), module.CellModel)
-    assert call(monkeypatch, "fit", "cells", "--data", dataset.path, "--out", "c", *QUICK) == 0
+    assert call("train", "fit", "cells", "--data", dataset.path, "--out", "c", *QUICK) == 0
     kept = load_checkpoint("c")
     assert (kept.model, list(kept.parts)) == ("cells", ["cells"])
     assert "benchnav-train evaluate c --data" in Path("c/README.md").read_text()
@@ -255,14 +248,13 @@ def test_a_hook_that_does_not_fit_is_refused_before_anything_is_trained(
     own: Path,
     dataset: TerrainDataset,
     fault: str,
-    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     old, new, expected = BROKEN[fault]
     text = EXAMPLE.read_text()
     assert old in text
     Path("own.py").write_text(text.replace(old, new))
-    assert call(monkeypatch, "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 2
+    assert call("train", "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 2
     (line,) = capfd.readouterr().err.strip().splitlines()
     assert re.search(expected, line)
     assert not Path("c").exists()
@@ -299,10 +291,9 @@ def test_bad_input_is_one_line_before_anything_is_trained(
     dataset: TerrainDataset,
     arguments: list[str],
     expected: str,
-    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    assert call(monkeypatch, "fit", *arguments, "--data", dataset.path, "--out", "c") == 2
+    assert call("train", "fit", *arguments, "--data", dataset.path, "--out", "c") == 2
     (line,) = capfd.readouterr().err.strip().splitlines()
     assert re.search(expected, line)
     assert not Path("c").exists()
@@ -321,7 +312,7 @@ def test_how_maps_are_cut_and_turned_reaches_the_training_and_the_checkpoint(
 
     monkeypatch.setattr(MapDataset, "__getitem__", watch)
     where = ("fit", "own.py:CellModel", "--data", dataset.path, *QUICK)
-    assert call(monkeypatch, *where, "--out", "a", "--crop", 24, "--symmetries", "false") == 0
+    assert call("train", *where, "--out", "a", "--crop", 24, "--symmetries", "false") == 0
     assert {shape[-2:] for shape, _ in seen} == {(24, 24)}
     assert not any(turned for _, turned in seen)
     config = load_checkpoint("a").part("CellModel").config
@@ -329,7 +320,7 @@ def test_how_maps_are_cut_and_turned_reaches_the_training_and_the_checkpoint(
     settings = json.loads(Path("a.training/CellModel/settings.json").read_text())
     assert (settings["config"]["crop"], settings["config"]["symmetries"]) == (24, False)
     seen.clear()
-    assert call(monkeypatch, *where, "--out", "b") == 0
+    assert call("train", *where, "--out", "b") == 0
     assert {shape[-2:] for shape, _ in seen} == {torch.Size((32, 32))}
     assert any(turned for _, turned in seen)
 
@@ -368,7 +359,7 @@ def test_a_class_that_keeps_the_contract_passes_and_one_that_does_not_is_told(mo
 
 
 def test_fit_of_the_fused_model_is_all_and_its_classifier_takes_layers(
-    own: Path, dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+    own: Path, dataset: TerrainDataset
 ) -> None:
     common = ("--data", dataset.path, "--trainer.precision", "32-true", "--trainer.max_epochs", 1)
     stages = {
@@ -380,12 +371,10 @@ def test_fit_of_the_fused_model_is_all_and_its_classifier_takes_layers(
     settings = [(f"--settings.{name}", value) for name, value in stages.items()]
     flags = [(f"--{name}", value) for name, value in stages.items()]
     assert (
-        call(
-            monkeypatch, "fit", "fused", *common, "--out", "a", *(word for pair in settings for word in pair)
-        )
+        call("train", "fit", "fused", *common, "--out", "a", *(word for pair in settings for word in pair))
         == 0
     )
-    assert call(monkeypatch, "all", *common, "--out", "b", *(word for pair in flags for word in pair)) == 0
+    assert call("train", "all", *common, "--out", "b", *(word for pair in flags for word in pair)) == 0
     first, second = load_checkpoint("a"), load_checkpoint("b")
     assert (first.model, set(first.parts)) == ("fused", {"gp", "classifier"})
     for name, part in first.parts.items():

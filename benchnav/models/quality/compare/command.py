@@ -43,7 +43,8 @@ def compare(
     from benchnav.core.errors import expect
     from benchnav.core.store import output_path
     from benchnav.core.tables import print_table
-    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+    from benchnav.datagen.files.find import find_dataset
+    from benchnav.datagen.files.reader import TerrainDataset
     from benchnav.models.config import check_seed
 
     check_seed(seed)

@@ -14,11 +14,11 @@ from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.core.terrain import Observation
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import TraversabilityModel
-from benchnav.models.cli import main
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality import baselines
 from benchnav.models.quality.compare import candidates, command
 from benchnav.models.quality.measure import evaluate, measure_split
+from tests.commands import call
 from tests.models.stub import ColourModel
 
 FILES = {"compare.json", "compare.csv", "differences.csv", "compare.md", "figures"}
@@ -57,13 +57,6 @@ def _models(monkeypatch: pytest.MonkeyPatch) -> None:
         registry.register("model", name, model)
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["benchnav-train", "compare", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
-
-
 def test_a_table_is_printed_and_nothing_written(
     dataset: TerrainDataset,
     tmp_path: Path,
@@ -71,7 +64,7 @@ def test_a_table_is_printed_and_nothing_written(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert call(monkeypatch, "colours", "vague", "--data", dataset.path) == 0
+    assert call("train", "compare", "colours", "vague", "--data", dataset.path) == 0
     out, err = capfd.readouterr()
     rows = [line.split() for line in out.splitlines() if line.startswith("test/")]
     named = [("colours", "vague", "oracle", "ideal")] * 2
@@ -92,12 +85,11 @@ def test_a_table_is_printed_and_nothing_written(
 def test_a_folder_holds_numbers_differences_page_and_figures(
     dataset: TerrainDataset,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "new" / "comparison"
     asked = ["vague", "colours", "quantiles", "--data", dataset.path, "--splits", "[train]", "--out", out]
-    assert call(monkeypatch, *asked, "--seed", 3) == 0
+    assert call("train", "compare", *asked, "--seed", 3) == 0
     assert {path.name for path in out.iterdir()} == FILES
     names = ("measures", "calibration", "sparsification")
     assert {path.name for path in (out / "figures").iterdir()} == {
@@ -148,20 +140,23 @@ def test_a_folder_holds_numbers_differences_page_and_figures(
     assert "**" not in row.partition("0.9")[0] or f"**{split['models']['vague']['crps']:.4f}**" not in row
 
     # Another comparison takes its place only when asked to.
-    assert call(monkeypatch, "colours", "--data", dataset.path, "--out", out) == 2
+    assert call("train", "compare", "colours", "--data", dataset.path, "--out", out) == 2
     assert "--overwrite" in capfd.readouterr().err
-    assert call(monkeypatch, "colours", "--data", dataset.path, "--out", out, "--overwrite") == 0
+    assert call("train", "compare", "colours", "--data", dataset.path, "--out", out, "--overwrite") == 0
     assert list(json.loads((out / "compare.json").read_text())["splits"]) == ["test/std", "test/hs"]
     assert "Differences" not in (out / "compare.md").read_text()
 
 
 def test_the_order_of_models_turns_the_signs_of_their_differences(
-    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dataset: TerrainDataset, tmp_path: Path
 ) -> None:
     found = {}
     for one, other in (("colours", "vague"), ("vague", "colours")):
         out = tmp_path / one
-        assert call(monkeypatch, one, other, "--data", dataset.path, "--splits", "[valid]", "--out", out) == 0
+        assert (
+            call("train", "compare", one, other, "--data", dataset.path, "--splits", "[valid]", "--out", out)
+            == 0
+        )
         rows = json.loads((out / "compare.json").read_text())["splits"]["valid"]["pairs"]
         found[one] = {row["measure"]: row for row in rows if (row["one"], row["other"]) == (one, other)}
     assert found["colours"].keys() == found["vague"].keys()
@@ -177,7 +172,7 @@ def test_seed_and_device_reach_the_measurement(
     for seed in (0, 7):
         out = tmp_path / str(seed)
         asked = ("colours", "--data", dataset.path, "--splits", "[valid]", "--out", out, "--device", "cpu")
-        assert call(monkeypatch, *asked, "--seed", seed) == 0
+        assert call("train", "compare", *asked, "--seed", seed) == 0
         models = json.loads((out / "compare.json").read_text())["splits"]["valid"]["models"]
         pits[seed] = models["colours"]["pit"]
         assert pits[seed] == list(measure_split(ColourModel(), dataset, "valid", seed).traversability.pit)
@@ -199,7 +194,7 @@ def test_seed_and_device_reach_the_measurement(
 
     monkeypatch.setattr("benchnav.models.quality.measure.measure_split", spy)
     monkeypatch.setattr(candidates, "prediction_ms", lambda model, terrain: timed(model, terrain))
-    assert call(monkeypatch, "colours", "--data", dataset.path, "--splits", "[valid]") == 0
+    assert call("train", "compare", "colours", "--data", dataset.path, "--splits", "[valid]") == 0
     assert asked_for == [torch.device("cpu", 0)] * 3
 
 
@@ -219,15 +214,17 @@ def test_groups_of_maps_are_the_units(
     monkeypatch.setattr(TerrainDataset, "read", with_groups)
     monkeypatch.setattr(TerrainDataset, "field_names", property(lambda self: (*names, "group")))
     out = tmp_path / "out"
-    assert call(monkeypatch, "colours", "--data", dataset.path, "--splits", "[train]", "--out", out) == 0
+    assert (
+        call("train", "compare", "colours", "--data", dataset.path, "--splits", "[train]", "--out", out) == 0
+    )
     assert json.loads((out / "compare.json").read_text())["splits"]["train"]["units"] == 5
     assert "train 10 maps in 5 groups" in capfd.readouterr().out
 
 
 def test_a_model_of_other_classes_is_compared_by_traversability_and_said_to_be(
-    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    dataset: TerrainDataset, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    assert call(monkeypatch, "colours", "foreign", "--data", dataset.path, "--splits", "[valid]") == 0
+    assert call("train", "compare", "colours", "foreign", "--data", dataset.path, "--splits", "[valid]") == 0
     out = capfd.readouterr().out
     assert "foreign knows other classes than these maps have: it is compared by λ alone" in out
     first, second = (
@@ -245,7 +242,7 @@ def test_where_the_truth_is_unknown_no_model_is_given_the_class_table_for_it(
         TerrainDataset, "truth_of", lambda self, split: "unknown" if split == "valid" else truth(self, split)
     )
     asked = ("colours", "--data", dataset.path, "--splits", "[valid,test/std]")
-    assert call(monkeypatch, *asked) == 0
+    assert call("train", "compare", *asked) == 0
     out = capfd.readouterr().out
     rows = [
         line.split()[:2]
@@ -262,7 +259,9 @@ def test_a_model_that_is_worse_than_none_is_told_so(
 ) -> None:
     monkeypatch.setattr(baselines, "nearest_colour_accuracy", lambda _, split: 0.999)
     monkeypatch.setattr(baselines, "climatology_crps", lambda _, split: 0.15)
-    assert call(monkeypatch, "colours", "quantiles", "--data", dataset.path, "--splits", "[valid]") == 0
+    assert (
+        call("train", "compare", "colours", "quantiles", "--data", dataset.path, "--splits", "[valid]") == 0
+    )
     out = capfd.readouterr().out.splitlines()
     assert "colours: warning: the model is right less often than the nearest colour on valid" in out
     worse = "warning: the model's CRPS is higher than that of one distribution for all cells on valid"
@@ -278,11 +277,10 @@ def test_a_model_that_is_worse_than_none_is_told_so(
 def test_maps_that_a_model_was_trained_on_are_named(
     dataset: TerrainDataset,
     checkpoint_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     asked = (checkpoint_path, "colours", "--data", dataset.path, "--splits", "[valid]")
-    assert call(monkeypatch, *asked) == 0
+    assert call("train", "compare", *asked) == 0
     lines = [line for line in capfd.readouterr().out.splitlines() if "was trained" in line]
     assert [line.partition(":")[0] for line in lines] == ["tiny"]
 
@@ -299,7 +297,7 @@ def test_a_series_is_drawn_where_there_is_one(
         TerrainDataset, "read", lambda self, split, *rest: read(self, split.removesuffix("-100"), *rest)
     )
     asked = ("colours", "--data", dataset.path, "--splits", "[test/std,test/hs-100]", "--out", tmp_path / "q")
-    assert call(monkeypatch, *asked) == 0
+    assert call("train", "compare", *asked) == 0
     assert (tmp_path / "q" / "figures" / "severity.png").is_file()
     assert "(figures/severity.png)" in (tmp_path / "q" / "compare.md").read_text()
     found = json.loads((tmp_path / "q" / "compare.json").read_text())
@@ -336,7 +334,7 @@ def test_bad_input_is_refused_in_one_line_before_any_work(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "file").write_text("mine")
-    assert call(monkeypatch, *arguments, "--data", dataset.path) == 2
+    assert call("train", "compare", *arguments, "--data", dataset.path) == 2
     out, err = capfd.readouterr()
     assert len(err.strip().splitlines()) == 1, err
     assert err.startswith("benchnav-train: error: ")

@@ -1,0 +1,77 @@
+"""Opens the files of datasets, and reads the manifest of one file or of a folder of shards."""
+
+import json
+from pathlib import Path
+
+import h5py
+
+from benchnav.core.errors import DatasetError
+from benchnav.core.store import unseal
+from benchnav.datagen import schema
+
+# What HDF5 and h5py raise where a file is damaged, by where the damage lies.
+READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
+
+FOLDER_MANIFEST = "manifest.json"  # beside the shards of a finished dataset
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether there is a file, or a folder with the manifest of a finished dataset."""
+    return path.is_file() or (path / FOLDER_MANIFEST).is_file()
+
+
+def open_file(path: Path) -> h5py.File:
+    """Opens a file for reading.
+
+    Raises:
+        DatasetError: it is not there, is no HDF5 file, or its structure is damaged.
+    """
+    try:
+        return h5py.File(path, "r")
+    except FileNotFoundError as error:
+        raise DatasetError(
+            f"Expected a dataset file, got {path}, which is not there. "
+            "Make one with `benchnav-datagen create`."
+        ) from error
+    except OSError as error:
+        raise DatasetError(f"{path} is no readable HDF5 file: {error}. Make it again.") from error
+
+
+def read_manifest(path: Path) -> schema.Json:
+    """Reads the manifest of a file or a folder.
+
+    Raises:
+        DatasetError: there is none, or it is damaged, foreign, or of a newer format.
+    """
+    try:
+        text = _manifest_text(path)
+        manifest = json.loads(text)
+        kind, version = manifest["format"], manifest["format_version"]
+        if kind == schema.FORMAT and tuple(map(int, version.split("."))) <= schema.FORMAT_VERSION:
+            manifest = unseal(text)
+            schema.check(manifest)
+            return manifest
+    except (*READ_ERRORS, TypeError, AttributeError, IndexError) as error:
+        raise DatasetError(
+            f"The manifest of {path} is damaged: {str(error)[:200]}. Make the dataset again."
+        ) from error
+    if kind != schema.FORMAT:
+        raise DatasetError(f"Expected format {schema.FORMAT!r} in {path}, got {kind!r}.")
+    raise DatasetError(
+        f"Expected format version at most {'.'.join(map(str, schema.FORMAT_VERSION))} in {path}, "
+        f"got {version}. Read it with a newer benchnav: pip install --upgrade benchnav."
+    )
+
+
+def _manifest_text(path: Path) -> str | bytes:
+    if path.is_dir():
+        if not is_dataset(path):
+            raise DatasetError(
+                f"Expected a folder with a finished dataset, got {path} without {FOLDER_MANIFEST}. "
+                "Finish it by the command that began it, or by `benchnav-datagen merge` of its shares."
+            )
+        return (path / FOLDER_MANIFEST).read_text()
+    with open_file(path) as file:
+        if schema.MANIFEST not in file:
+            raise DatasetError(f"Expected a {schema.FORMAT} file with a manifest, got {path} without one.")
+        return file[schema.MANIFEST][()]
