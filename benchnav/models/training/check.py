@@ -114,7 +114,7 @@ def _check_settings(network: TrainableNetwork) -> None:
     """Refuses a network of which a checkpoint could not keep the settings, and inputs that are no list of names."""
     name = type(network).__name__
     try:
-        inputs, settings = network.inputs, network.settings()
+        inputs, settings = tuple(network.inputs), network.settings()
         kept = json.loads(json.dumps(settings))
         kept.pop("temperature")
         again = read(type(network.config), kept, of(name))

@@ -188,13 +188,12 @@ def existing(folder: Path, overwrite: bool) -> Checkpoint | None:
 
 
 def _defaults(kind: type) -> dict[str, Any]:
-    """Usual values of the settings that have one, plain data."""
+    """Usual values of all settings, plain data; None of those that have none."""
     usual = {
-        item.name: item.default if item.default_factory is MISSING else item.default_factory()
+        item.name: item.default_factory() if item.default_factory is not MISSING else item.default
         for item in fields(kind)
-        if item.default is not MISSING or item.default_factory is not MISSING
     }
     return {
         name: asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
         for name, value in usual.items()
-    }
+    } | {name: None for name, value in usual.items() if value is MISSING}

@@ -1,0 +1,188 @@
+"""What a user's model may not do is told in one line, before anything is trained where it can be."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.checkpoint import load_checkpoint
+from tests.commands import call
+
+EXAMPLE = Path(__file__).parents[3] / "examples" / "own_model.py"
+QUICK = ("--trainer.precision", "32-true", "--trainer.max_epochs", "1", "--settings.batch_size", "5")
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder to work in, with the example in it."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(EXAMPLE, "own.py")
+    return tmp_path
+
+
+def with_hook(code: str) -> None:
+    """Writes the example with one hook more."""
+    text = EXAMPLE.read_text().replace("    def to_distribution", f"    {code}\n\n    def to_distribution")
+    text = text.replace("import math", "import math\nfrom torchmetrics import MeanAbsoluteError", 1)
+    Path("own.py").write_text(text)
+
+
+BROKEN = {
+    "shape": ("return (scores * seen).sum() / seen.sum().clamp(min=1)", "return scores",
+        "a loss that is one number, got shape"),
+    "nan": ("(scores * seen).sum()", "(scores * seen).sum() * float('nan')", "a finite loss, got nan"),
+    "no gradient": ("(scores * seen).sum() /", "(scores * seen).sum().detach() /", "that has a gradient"),
+    "no number": ("return crps", "return lambda outputs, observed: 3.0", "one number, got float"),
+    "distribution": ("return TraversabilityMixture(torch.ones_like(mean), mean, std)", "return mean",
+                     "to give a TraversabilityDistribution, got Tensor"),
+    "distribution's shape": ("TraversabilityMixture(torch.ones_like(mean), mean, std)",
+                             "TraversabilityMixture(*(v[..., 1:] for v in (torch.ones_like(mean), mean, std)))",
+                             r"to give one of shape \[2, 32, 32\], got \[2, 32, 31\]"),
+    "means": ("mean, std)\n\n", "mean, std * torch.nan)\n\n", r"means of λ in \[0, 1\]"),
+    "raises": ("hidden = self.config.hidden", "hidden = self.config.width",
+        "'CellConfig' object has no attribute 'width'"),
+    "no super": ("super().__init__(config)", "pass", r"call super\(\).__init__\(config\)"),
+    "device": ("return (scores * seen).sum() / seen.sum().clamp(min=1)", "return scores.sum().to('meta')",
+        "on cpu, got one on meta"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_a_hook_that_does_not_fit_is_refused_before_anything_is_trained(
+    own: Path,
+    dataset: TerrainDataset,
+    fault: str,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    old, new, expected = BROKEN[fault]
+    text = EXAMPLE.read_text()
+    assert old in text
+    Path("own.py").write_text(text.replace(old, new))
+    assert call("train", "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 2
+    (line,) = capfd.readouterr().err.strip().splitlines()
+    assert re.search(expected, line)
+    assert not Path("c").exists()
+    assert not Path("c.training").exists()
+
+
+HOOKS = {
+    "no metric": ("def configure_metrics(self): return {'mae': 3}", "Expected a network that takes batches"),
+    "metrics": (
+        "def update_metrics(self, outputs, target): self.metrics['rmse'].update(target, 3)",
+        "Expected a network that takes batches",
+    ),
+    "schedule": ("def configure_schedule(self, optimizer, steps): return 1 / 0", "ZeroDivisionError"),
+    "predict": (
+        "def predict(self, observation): return super().predict(observation).mean()",
+        "Expected the model to give a TraversabilityDistribution .* got Tensor",
+    ),
+    "predict raises": ("def predict(self, observation): return 1 / 0", "ZeroDivisionError"),
+    "stride": ("stride = 0", "`stride` of CellModel ≥ 1, got 0"),
+    "inputs": ("inputs = 3", "CellModel with `inputs` .* TypeError"),
+}
+
+
+@pytest.mark.parametrize("fault", HOOKS)
+def test_every_other_hook_is_tried_too(
+    own: Path, dataset: TerrainDataset, fault: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    code, expected = HOOKS[fault]
+    with_hook(code)
+    assert call("train", "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 2
+    (line,) = capfd.readouterr().err.strip().splitlines()
+    assert re.search(expected, line)
+    assert not Path("c.training").exists()
+
+
+def test_settings_that_no_checkpoint_could_keep_are_refused(
+    own: Path, dataset: TerrainDataset, capfd: pytest.CaptureFixture[str]
+) -> None:
+    text = EXAMPLE.read_text().replace("import math", "import math\nfrom pathlib import Path", 1)
+    Path("own.py").write_text(text.replace("hidden: int = 32", "hidden: int = 32\n    log: Path = Path('a')"))
+    assert call("train", "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 2
+    assert "settings that JSON can keep" in capfd.readouterr().err
+    assert not Path("c.training").exists()
+
+
+@pytest.mark.parametrize("name", ["swag", "classifier", "gp"])
+def test_a_class_of_a_name_that_is_ours_is_refused(
+    own: Path, dataset: TerrainDataset, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    Path("own.py").write_text(EXAMPLE.read_text().replace("class CellModel", f"class {name}"))
+    assert call("train", "fit", f"own.py:{name}", "--data", dataset.path, "--out", "c", *QUICK) == 2
+    assert (
+        f"a class with a name of its own, which its checkpoints bear, got {name!r}" in capfd.readouterr().err
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (
+            ["own.py:CellModel", "--settings.inputs", "[rgb, elevation]"],
+            r"got 'elevation'\. Did you mean 'elevation_m'\?",
+        ),
+        (["own.py:CellModel", "--settings.inputs", "[rgb, vegetation_m]"], "got 'vegetation_m'"),
+        (["own.py:CellModel", "--settings.inputs", "[]"], "`inputs` as layers, each once"),
+        (["own.py:CellModel", "--settings.width", "3"], "got 'width'"),
+        (["own.py:CellModel", "--crop", "33"], r"`crop` in 8–32 cells"),
+        (["own.py:CellModel", "--members", "0"], "`members` ≥ 1"),
+        (
+            ["own.py:CellConfig"],
+            "Expected a model that can be trained, fused, .*mdn.* got 'own.py:CellConfig'",
+        ),
+        (["own.py:CellMode"], "Did you mean 'CellModel'"),
+        (["oracle"], "got 'oracle'"),
+        (["mdm"], "Did you mean 'mdn'"),
+        (["mdn", "--settings.architecture", "unett"], "unett"),
+        (["mdn", "--settings.encoder", "resnet19"], "resnet19"),
+        (["fused", "--settings.clasifier.dice", "1"], "`settings` of 'fused' among classifier, gp"),
+        (["fused", "--settings.classifier.architecture", "unett"], "unett"),
+    ],
+)
+def test_bad_input_is_one_line_before_anything_is_trained(
+    own: Path,
+    dataset: TerrainDataset,
+    arguments: list[str],
+    expected: str,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    assert call("train", "fit", *arguments, "--data", dataset.path, "--out", "c") == 2
+    (line,) = capfd.readouterr().err.strip().splitlines()
+    assert re.search(expected, line)
+    assert not Path("c").exists()
+
+
+def test_metrics_of_ones_own_are_updated_by_the_mean(own: Path, dataset: TerrainDataset) -> None:
+    with_hook("def configure_metrics(self): return {'mae': MeanAbsoluteError()}")
+    assert call("train", "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 0
+    part = load_checkpoint("c").part("CellModel")
+    assert set(part.metrics) >= {"valid_loss", "valid_mae"}
+    assert 0 < part.metrics["valid_mae"] < 1
+
+
+def test_a_calibration_that_fails_ends_in_one_line(
+    own: Path, dataset: TerrainDataset, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with_hook("def calibrate(self, maps, device): return 1 / 0")
+    assert call("train", "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 2
+    assert "Expected `calibrate` of CellModel to succeed, got: ZeroDivisionError" in capfd.readouterr().err
+    assert not Path("c").exists()
+
+
+def test_a_setting_without_a_usual_value_is_compared_when_a_training_is_repeated(
+    own: Path, dataset: TerrainDataset, capfd: pytest.CaptureFixture[str]
+) -> None:
+    Path("own.py").write_text(
+        EXAMPLE.read_text()
+        .replace("hidden: int = 32", "hidden: int")
+        .replace("config: CellConfig = CellConfig()", "config: CellConfig")
+    )
+    where = ("fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK)
+    assert call("train", *where, "--settings.hidden", 4) == 0
+    assert call("train", *where, "--settings.hidden", 4, "--resume") == 0
+    assert "was finished already" in capfd.readouterr().out
+    assert call("train", *where, "--settings.hidden", 8, "--resume") == 2
+    assert "another `hidden`" in capfd.readouterr().err
