@@ -1,7 +1,7 @@
 """Puts the shipped maps and models into wheels and source archives; all else is said in pyproject.toml.
 
 They stay where they are in the repository, and the wheel holds them under `benchnav/_shipped`. Only the files
-named here go in, whatever else lies in those folders.
+named here go in, whatever else lies in those folders. The checkpoint paper-v1, 29 MB of weights, stays out.
 """
 
 from pathlib import Path
@@ -17,10 +17,6 @@ SHIPPED = (
     "datasets/stakes-v1-test.h5",
     "datasets/stakes-v1-test.md",
     "checkpoints/README.md",
-    "checkpoints/paper-v1/README.md",
-    "checkpoints/paper-v1/classifier.safetensors",
-    "checkpoints/paper-v1/config.json",
-    "checkpoints/paper-v1/gp.safetensors",
     "checkpoints/stakes-v1/README.md",
     "checkpoints/stakes-v1/classifier.safetensors",
     "checkpoints/stakes-v1/config.json",

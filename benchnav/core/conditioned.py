@@ -61,7 +61,12 @@ class ConditionedDistribution(TraversabilityDistribution):
         """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the base."""
         share = torch.as_tensor(probability, dtype=torch.float64, device=self.device)
         score = torch.special.ndtri(share).clamp(-MOST_SCORE, MOST_SCORE)
-        return self.from_normal(score.expand(self.shape))
+        value = self.from_normal(score.expand(self.shape))
+        if not isinstance(probability, Tensor) and 0 < probability < 1:
+            return value
+        # The ends of the range, which no finite score reaches.
+        ends = self.base.quantile((share >= 1).double().expand(self.shape)).to(self.dtype)
+        return torch.where(((share <= 0) | (share >= 1)) & (self.score_std > 0), ends, value)
 
     def from_normal(self, normal: Tensor) -> Tensor:
         """λ of the rank that a standard normal number has, shape [*B, H, W]; see the base."""

@@ -5,6 +5,7 @@ the name, so that a run says what it read: a commit is for good, a branch or tag
 `HF_HUB_OFFLINE`, `HF_ENDPOINT` and `HF_TOKEN` mean to huggingface_hub they mean here.
 """
 
+import json
 import re
 from functools import cache
 from pathlib import Path
@@ -21,7 +22,7 @@ FILES: dict[Kind, tuple[str, ...]] = {
 }
 """What is downloaded, by kind of repository."""
 
-_ADDRESS = re.compile(r"([\w.-]+/[\w.-]+)@([\w][\w./-]*)", re.ASCII)
+_ADDRESS = re.compile(r"(\w[\w.-]*/\w[\w.-]*)@([\w][\w./-]*)", re.ASCII)
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
@@ -62,9 +63,12 @@ def download(address: str, kind: Kind, error: type[BenchnavError]) -> Path:
     with quiet("huggingface_hub"):
         if _COMMIT.fullmatch(revision):  # which does not change, so that the hub need not be asked again
             try:
-                return snapshot(local=True)
+                folder = snapshot(local=True)
             except (errors.LocalEntryNotFoundError, OSError):
                 pass
+            else:
+                if _is_whole(folder, kind):
+                    return folder
         try:
             folder = snapshot(local=False)
         except Exception as cause:  # of many kinds, and not of one base
@@ -73,6 +77,23 @@ def download(address: str, kind: Kind, error: type[BenchnavError]) -> Path:
         commit = folder.name
         tell(f"benchnav: note: {address} is {commit} now and may move; @{commit} stays what it is")
     return folder
+
+
+def _is_whole(folder: Path, kind: Kind) -> bool:
+    """Tells whether all files are there that the first of them names: a download may have been cut short."""
+    try:
+        if kind == "model":
+            named = [
+                f"{part}.safetensors" for part in json.loads((folder / "config.json").read_text())["parts"]
+            ]
+        elif (folder / "manifest.json").exists():
+            shards = json.loads((folder / "manifest.json").read_text())["shards"]
+            named = [shard["file"] for own in shards.values() for shard in own]
+        else:
+            return len(list(folder.glob("*.h5"))) == 1
+        return all((folder / name).is_file() for name in named)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return False
 
 
 def _refused(cause: Exception, name: str, revision: str, kind: Kind) -> str:

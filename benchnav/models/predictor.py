@@ -65,6 +65,7 @@ class Clairvoyant(PrivilegedModel):
 
 
 Source = str | Path | Mapping[str, Any] | registry.Part
+IN_REPOSITORY_ALONE = "paper-v1"  # a checkpoint that `setup.py` leaves out of wheels
 
 
 @torch.inference_mode(False)  # so that it is the same model wherever it is loaded
@@ -124,19 +125,28 @@ def _load_own(place: str, folder: Path) -> TraversabilityModel:
 def open_checkpoint(checkpoint: Checkpoint) -> TraversabilityModel:
     """Rebuilds the model of a checkpoint through the family that it names.
 
-    Names alone are looked up, never a module or file: what a checkpoint says runs no code of its choice.
-
     Raises:
         CheckpointError: the family is not known here by name, or cannot rebuild the model.
     """
+    return _rebuilt(find_family(checkpoint.model), checkpoint)
+
+
+def find_family(name: str) -> registry.Found:
+    """Finds the family that a checkpoint names.
+
+    Names alone are looked up, never a module or file: what a checkpoint says runs no code of its choice.
+
+    Raises:
+        CheckpointError: it is not known here by name.
+    """
     known = registry.names("model")
-    found = registry.find("model", checkpoint.model) if checkpoint.model in known else None
+    found = registry.find("model", name) if name in known else None
     if found is None or not is_family(found.target):
         raise CheckpointError(
-            f"Expected a checkpoint of a model among {', '.join(known)}, got one of {checkpoint.model!r}. Install the "
-            f"package that registers it, or name the class: path/to/file.py:{checkpoint.model}@CHECKPOINT."
+            f"Expected a checkpoint of a model among {', '.join(known)}, got one of {name!r}. Install the package that "
+            f"registers it, or name the class: path/to/file.py:{name}@CHECKPOINT."
         )
-    return _rebuilt(found, checkpoint)
+    return found
 
 
 def _rebuilt(family: registry.Found, checkpoint: Checkpoint) -> TraversabilityModel:
@@ -179,6 +189,12 @@ def find_checkpoint(source: str | Path) -> Path:
         refuse_unfinished(path)
     if hub.is_address(source):
         return hub.download(str(source), "model", CheckpointError)
+    if str(source) == IN_REPOSITORY_ALONE:
+        raise ConfigError(
+            f"Expected the checkpoint {source}, which an installed wheel leaves out for its size, in checkpoints/, got "
+            f"none. Copy the folder checkpoints/{source} of the repository there, or name another model, such as "
+            "stakes-v1."
+        )
     path, names = Path(source), [path.name for path in list_checkpoints()]
     known = sorted({*registry.names("model"), *names})
     siblings = [config.parent.name for config in path.parent.glob(f"*/{CONFIG}")]

@@ -175,7 +175,7 @@ def _predict_window(
         )
         for part, size in zip(window, observation.grid.shape, strict=True)
     ]
-    distribution = predict_observation(model, _take(observation, *outer))
+    distribution = predict_observation(model, take(observation, *outer))
     inner = Window(
         *(
             slice(part.start - edge.start, part.stop - edge.start)
@@ -185,7 +185,7 @@ def _predict_window(
     return map_tensors(distribution, lambda values: values[..., *inner])
 
 
-def _take(observation: Observation, rows: Any, columns: Any) -> Observation:
+def take(observation: Observation, rows: Any, columns: Any) -> Observation:
     """Cells of an observation as a map of their own, by slices or by indices that broadcast to [h, w]."""
 
     def change(value: Any) -> Any:
@@ -203,9 +203,9 @@ def _probes(observation: Observation, side: int) -> Iterator[Observation]:
     """The middle of the first map, repeated where the map is smaller, and cells from anywhere in it."""
     sizes, one = observation.grid.shape, observation.select(torch.tensor([0]))
     rows, columns = ((size - side) // 2 + torch.arange(side) for size in sizes)
-    yield _take(one, rows[:, None] % sizes[0], columns % sizes[1])
+    yield take(one, rows[:, None] % sizes[0], columns % sizes[1])
     drawn = rng.uniform(rng.stream_key(0, "models", "margin"), np.arange(2), (side, side))
-    yield _take(
+    yield take(
         one, *(torch.from_numpy((n * share).astype(int)) for n, share in zip(sizes, drawn, strict=True))
     )
 
@@ -220,7 +220,7 @@ def _reach(model: TraversabilityModel, probe: Observation) -> int | None:
     distance = torch.minimum(row[:, None], row).flatten()
     worst = torch.zeros(len(row), dtype=torch.float64, device=row.device)
     for part, flip in ((slice(_STRIDE, side), []), (slice(0, side - _STRIDE), [-2, -1])):
-        alone = predict_observation(model, _take(probe, part, part))
+        alone = predict_observation(model, take(probe, part, part))
         there = map_tensors(whole, lambda values, part=part: values[..., part, part])
         difference = _difference(alone, there).flip(flip).flatten()
         worst = worst.scatter_reduce(0, distance, difference, "amax")

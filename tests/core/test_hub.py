@@ -184,7 +184,15 @@ def test_a_checkpoint_is_downloaded_and_what_is_here_goes_first(
         assert done.returncode == 0, done.stderr
         return done.stdout.strip()
 
-    assert call().endswith(COMMIT)
+    folder = Path(call())
+    assert folder.name == COMMIT
+    code = code.replace("@main", f"@{COMMIT}")
+    (folder / "gp.safetensors").unlink()  # as a download leaves it that was cut short
+    assert call() == str(folder)
+    assert (folder / "gp.safetensors").is_file()
+    handler.asked.clear()
+    assert (call(), handler.asked) == (str(folder), [])
+    code = code.replace(f"@{COMMIT}", "@main")
     (tmp_path / "me").mkdir()
     shutil.copytree(shipped, tmp_path / "me" / "stakes@main")
     assert call() == "me/stakes@main"

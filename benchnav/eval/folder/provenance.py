@@ -33,7 +33,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.condition import PART_KINDS, Condition, is_checkpoint
 from benchnav.eval.experiment.unit import Conditions, Unit
 from benchnav.models.checkpoint import digests_of, read_config
-from benchnav.models.predictor import find_checkpoint, split_own
+from benchnav.models.predictor import find_checkpoint, find_family, split_own
 from benchnav.planning.planners.compilation import can_compile
 
 PACKAGES = ("torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch")
@@ -114,7 +114,7 @@ def describe_parts(condition: Condition) -> Code:
             folder = find_checkpoint(part.part)
             parts[name] = text_digest(digests_of(folder))
             own = split_own(part.part)
-            family = registry.find(kind, own[0] if own else read_config(folder)["model"])
+            family = registry.find(kind, own[0]) if own else find_family(read_config(folder)["model"])
             if family.shipped:
                 modules.append(family.target.__module__)
             else:

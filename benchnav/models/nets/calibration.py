@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.optimize import minimize_scalar
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, ndtr
 from torch import Tensor, nn
 
 from benchnav.core import rng
@@ -70,7 +70,9 @@ def fit_width(lower: Tensor, upper: Tensor) -> float:
         upper: of P(λ ≤ observed), which is the same but at an atom, shape [N].
     """
     low, high = (scores.double().cpu().numpy() for scores in (lower, upper))
-    is_atom, score = high > low, high.clip(-_LARGEST_SCORE, _LARGEST_SCORE)
+    # Under 10⁻⁹ it is the rounding of a CDF that has none there.
+    is_atom, score = ndtr(high) - ndtr(low) > 1e-9, high.clip(-_LARGEST_SCORE, _LARGEST_SCORE)
+    low, high = np.where(is_atom, low, -1.0), np.where(is_atom, high, 1.0)  # of which the mass is defined
 
     def loss(temperature: float) -> float:
         density = 0.5 * (score / temperature) ** 2 + np.log(temperature)

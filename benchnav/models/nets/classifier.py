@@ -255,10 +255,9 @@ def _check_names(config: ClassifierConfig) -> None:
             f"Expected `architecture` among {', '.join(architectures)}, got {config.architecture!r}.{near}"
         )
     known, own = list(smp.encoders.get_encoder_names()), encoder.startswith("tu-")
-    # Of a name such as tu-resnet18.a1_in1k what follows the dot names weights; one with a colon is on a hub.
-    if encoder not in known and not (
-        own and (":" in encoder or timm.is_model(encoder[3:].partition(".")[0]))
-    ):
+    # Of a name such as tu-resnet18.a1_in1k what follows the dot names weights. One with a colon, of a hub or a folder,
+    # is none: who opens a checkpoint would ask there for it.
+    if encoder not in known and not (own and timm.is_model(encoder[3:].partition(".")[0])):
         known += [f"tu-{name}" for name in timm.list_models()] if own else []
         raise ConfigError(
             "Expected `encoder` to be one of segmentation-models-pytorch, such as resnet18, or of timm, such as "

@@ -25,6 +25,7 @@ import lightning
 import numpy as np
 import torch
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
+from lightning_utilities import apply_to_collection
 from torch import Tensor, nn
 from torchmetrics import MeanMetric, MeanSquaredError, Metric, MetricCollection
 
@@ -245,7 +246,7 @@ class TrainableNetwork(lightning.LightningModule):
 
     def validation_step(self, batch: Maps, batch_index: int) -> None:
         """Measures a batch."""
-        self._update(batch)
+        self.tally(batch)
         named = {"valid_loss": self.metrics["loss"], **dict(self.metrics.items())}  # tables begin with it
         self.log_dict(named, on_epoch=True, batch_size=len(batch[self.target]))
 
@@ -258,10 +259,11 @@ class TrainableNetwork(lightning.LightningModule):
         self.metrics.to(self.device).reset()
         with torch.inference_mode():
             for _, batch in maps.chunks(self.device):
-                self._update(batch)
+                self.tally(batch)
         return {name: float(value) for name, value in self.metrics.compute().items()}
 
-    def _update(self, batch: Maps) -> None:
+    def tally(self, batch: Maps) -> None:
+        """Updates `metrics` by a batch; the network is in evaluation."""
         loss, cells = self.assess(batch)
         self.metrics["loss"].update(loss, cells)
 
@@ -312,9 +314,12 @@ class TrainableModel(TrainableNetwork, ModelFamily):
         return {"rmse": MeanSquaredError(squared=False)}
 
     def update_metrics(self, outputs: Any, target: Tensor) -> None:
-        """Updates the error of E[λ]."""
+        """Updates every metric by E[λ] and λ of the cells where it was observed, each of shape [N]."""
         seen = target.isfinite()
-        self.metrics["rmse"].update(self.to_distribution(outputs).mean()[seen], target[seen])
+        mean = self.to_distribution(outputs).mean()[seen]
+        for name, metric in self.metrics.items(keep_base=True):
+            if name != "loss":
+                metric.update(mean, target[seen])
 
     def calibrate(self, maps: Any, device: torch.device) -> None:
         """Fits the temperature."""
@@ -385,7 +390,5 @@ def widened(distribution: TraversabilityDistribution, temperature: float) -> Tra
 
 
 def in_single_precision(outputs: Any) -> Any:
-    """Outputs of a network, a tensor or several, as float32."""
-    if isinstance(outputs, Tensor):
-        return outputs.float()
-    return tuple(value.float() for value in outputs)
+    """Outputs of a network, a tensor or a collection of them, as float32."""
+    return apply_to_collection(outputs, Tensor, Tensor.float)

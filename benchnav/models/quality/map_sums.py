@@ -198,7 +198,8 @@ def by_group(sums: Sums, groups: np.ndarray) -> dict[str, np.ndarray]:
     Returns:
         Sums of the units, in the order of their numbers.
     """
-    _, member = np.unique(groups, return_inverse=True)
-    units = (member == np.arange(member.max(initial=-1) + 1)[:, None]).astype(float)
-    together = added(sums, units)
+    numbers, member = np.unique(groups, return_inverse=True)
+    together = {name: np.zeros((len(numbers), *values.shape[1:])) for name, values in sums.items()}
+    for name, values in sums.items():
+        np.add.at(together[name], member, values)
     return {name: values[together["cells"] > 0] for name, values in together.items()}

@@ -1,5 +1,6 @@
 """What is refused before anything is trained: inputs, maps, settings of the trainer, and hooks that do not fit."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -9,11 +10,13 @@ from torch import Tensor
 
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import BenchnavError, ConfigError, expect
-from benchnav.core.settings import call, one_line
+from benchnav.core.settings import call, of, one_line, read
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.base import predict_observation
 from benchnav.models.config import TrainingConfig
 from benchnav.models.nets.inputs import check_inputs
 from benchnav.models.nets.trainable import TrainableModel, TrainableNetwork, in_single_precision
+from benchnav.models.tiles import take
 from benchnav.models.training.data import TRAIN, VALID, MapDataset, check_maps, squares_a_map
 from benchnav.models.training.fit import FitOptions, make_trainer, quietly
 
@@ -62,6 +65,7 @@ def check_network(trainable: Trainable, dataset: TerrainDataset, options: FitOpt
     """
     kind, config = trainable.kind, trainable.config
     network = call(f"a model of {kind.__name__}", kind, {"config": config})
+    _check_settings(network)
     check_inputs(network.inputs, ["rgb", "elevation_m", "slope_deg", *dataset.layer_names])
     check_maps(dataset, kind.target, config.crop)
     with quietly():
@@ -86,14 +90,48 @@ def check_network(trainable: Trainable, dataset: TerrainDataset, options: FitOpt
     indices = [index % dataset.map_count(TRAIN) for index in range(together)]
     maps = MapDataset(dataset.path, TRAIN, fields_of(network)).read(indices)
     crop = config.crop or None
-    maps = {name: values[..., :crop, :crop] for name, values in maps.items()}
+    maps = {name: values[..., :crop, :crop].to(options.place) for name, values in maps.items()}
     try:
-        network.build(map_classes=class_names(dataset))
+        network.build(map_classes=class_names(dataset)).to(options.place)
     except BenchnavError:
         raise
     except Exception as error:  # a user's code may raise anything
         raise _unfit(network, maps, error) from error
     try_network(network, maps)
+    if isinstance(network, TrainableModel) and type(network).predict is not TrainableModel.predict:
+        observation = dataset.terrain(TRAIN, [0]).to(options.place).observe()
+        side = config.crop or max(dataset.grid.shape)
+        rows, columns = (slice(min(side, size)) for size in dataset.grid.shape)
+        try:
+            predict_observation(network.eval(), take(observation, rows, columns))
+        except BenchnavError:
+            raise
+        except Exception as error:  # a user's code may raise anything
+            raise _unfit(network, maps, error) from error
+
+
+def _check_settings(network: TrainableNetwork) -> None:
+    """Refuses a network of which a checkpoint could not keep the settings, and inputs that are no list of names."""
+    name = type(network).__name__
+    try:
+        inputs, settings = network.inputs, network.settings()
+        kept = json.loads(json.dumps(settings))
+        kept.pop("temperature")
+        again = read(type(network.config), kept, of(name))
+    except BenchnavError:
+        raise
+    except Exception as error:  # a user's code may raise anything
+        raise ConfigError(
+            f"Expected {name} with `inputs` and settings that JSON can keep, numbers, text and lists of them, got: "
+            f"{one_line(error)}. Does its __init__ call super().__init__(config)?"
+        ) from error
+    expect(again == network.config, f"settings of {name} that JSON gives back as they were, got {kept!r}.")
+    expect(
+        all(isinstance(item, str) for item in inputs),
+        f"`inputs` of {name} as names of layers, got {inputs!r}.",
+    )
+    stride = network.stride
+    expect(isinstance(stride, int) and stride >= 1, f"`stride` of {name} ≥ 1, got {stride!r}.")
 
 
 def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
@@ -127,6 +165,17 @@ def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
     )
     if isinstance(network, TrainableModel):
         check_distribution(outputs, tuple(maps[network.target].shape), device, name)
+    try:
+        network.configure_schedule(torch.optim.AdamW(network.parameters()), 2)
+        network.metrics.to(device)
+        with torch.random.fork_rng(devices=[]), torch.no_grad():
+            network.eval().tally(maps)
+        network.metrics.compute()
+        network.metrics.reset()
+    except BenchnavError:
+        raise
+    except Exception as error:  # a user's code may raise anything
+        raise _unfit(network, maps, error) from error
 
 
 def check_distribution(given: Any, shape: tuple[int, ...], device: torch.device, name: str) -> None:

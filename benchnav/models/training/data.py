@@ -304,7 +304,7 @@ class MapData(lightning.LightningDataModule):
                     channels = values.unbind(1)
                     counts += torch.stack([channel.flatten().bincount(minlength=256) for channel in channels])
                     continue
-                known = values.double().nan_to_num()
+                known = torch.where(values.isfinite(), values, 0).double()
                 sums[name] += torch.stack([known.sum(), known.square().sum()])
                 cells[name] += int(values.isfinite().sum())
         scale = {name: _layer_scale(name, sums[name], cells[name]) for name in inputs if name != "rgb"}

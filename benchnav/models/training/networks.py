@@ -6,8 +6,8 @@ from typing import Any
 from lightning.pytorch.callbacks import EarlyStopping
 
 from benchnav.core import registry
-from benchnav.core.errors import ConfigError, expect
-from benchnav.core.settings import config_class, of, read
+from benchnav.core.errors import BenchnavError, ConfigError, expect
+from benchnav.core.settings import config_class, of, one_line, read
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import ModelFamily
 from benchnav.models.checkpoint import (
@@ -59,7 +59,14 @@ def find_trainable(source: str, settings: dict[str, Any]) -> Trainable:
             "Write def __init__(self, config: MyConfig = MyConfig()), where MyConfig is a subclass of it."
         )
     config = read(config_kind, settings, of(owner))
-    name = source if source in registry.names("model") else kind.__name__
+    name, known = kind.__name__, registry.names("model")
+    if source in known:
+        name = source
+    elif name in (CLASSIFIER, GP) or (name in known and registry.find("model", name).target is not kind):
+        raise ConfigError(
+            f"Expected a class with a name of its own, which its checkpoints bear, got {name!r}, which is one of this "
+            "package's. Rename it."
+        )
     code = "" if found.shipped else found.digest
     return Trainable(kind=kind, config=config, name=name, family=name, code=code)
 
@@ -150,7 +157,7 @@ def train_networks(
     train_parts(target, trainable, dataset, parts)
     if how.conformal and is_first_process():
         calibrate_whole(target, trainable, dataset)
-    if not target.changed:
+    if not target.changed and is_first_process():
         print(f"{out} was finished already, with {' and '.join(sorted(target.checkpoint.parts))}")
 
 
@@ -205,7 +212,15 @@ def fit_network(
         network.load_state_dict(as_stored(network.state_dict(), half_precision))
     if half_precision or not network.stops_early:
         metrics = {**metrics, **network.measure(data.valid)}
-    network.calibrate(data.valid, options.place)
+    try:
+        network.calibrate(data.valid, options.place)
+    except BenchnavError:
+        raise
+    except Exception as error:  # a user's code may raise anything
+        raise ConfigError(
+            f"Expected `calibrate` of {type(network).__name__} to succeed, got: {one_line(error)} "
+            "Mend it, and train again with --overwrite."
+        ) from error
     return network.cpu(), metrics
 
 
@@ -218,7 +233,8 @@ def train_parts(target: Target, trainable: Trainable, dataset: TerrainDataset, p
         network, metrics = fit_network(trainable, dataset, seed, options, part, options.half_precision)
         calibrated = {} if network.temperature == 1 else {"temperature": network.temperature}
         shown = filter(None, [in_words(metrics, "valid_"), in_words(calibrated)])
-        say(f"{part}: best epoch {metrics['epoch']:.0f}, validation {', '.join(shown)}")
+        kept = "best" if network.stops_early else "last"
+        say(f"{part}: {kept} epoch {metrics['epoch']:.0f}, validation {', '.join(shown)}")
         trained = Part(
             config=network.settings(),
             tensors=dict(network.state_dict()),

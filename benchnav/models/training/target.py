@@ -5,7 +5,7 @@ and writes.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,7 @@ class Target:
         if part is None:
             return False
         # A part of an earlier version does not name settings that came later, nor those of the trainer.
-        options, defaults = self.options, asdict(type(config)())
+        options, defaults = self.options, _defaults(type(config))
         wanted = {**asdict(config), "seed": seed, "data": self.digest}
         there = {key: part.config.get(key, usual) for key, usual in defaults.items()}
         there |= {"seed": part.seed, "data": part.data_digest}
@@ -185,3 +185,16 @@ def existing(folder: Path, overwrite: bool) -> Checkpoint | None:
         if overwrite:
             return None
         raise
+
+
+def _defaults(kind: type) -> dict[str, Any]:
+    """Usual values of the settings that have one, plain data."""
+    usual = {
+        item.name: item.default if item.default_factory is MISSING else item.default_factory()
+        for item in fields(kind)
+        if item.default is not MISSING or item.default_factory is not MISSING
+    }
+    return {
+        name: asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+        for name, value in usual.items()
+    }

@@ -112,7 +112,8 @@ def _pair(one: Sums, other: Sums, flips: np.ndarray, counts: np.ndarray) -> dict
         # Sums are exact to rounding, and ways that tie with what was seen count.
         least = abs(seen[name]) * (1 - 1e-9) - _ROUNDING
         low, high = _interval(drawn.get(name))
-        p = float(np.mean(np.abs(exchanged[name]) >= least))
+        # A sum that is 0 but for rounding has no root: such a way counts too.
+        p = float(np.mean(~(np.abs(exchanged[name]) < least)))
         rows[name] = {"difference": float(seen[name]), "low": low, "high": high, "p": p}
     return rows
 
