@@ -20,7 +20,6 @@ def export(checkpoint: str, onnx: str, level: float = 0.9, opset: int = 18, over
     from benchnav.models.onnx_graph import export_onnx
     from benchnav.models.predictor import load_model
 
-    expect(0 <= level < 1, f"`level` in [0, 1), got {level}.")
     expect(onnx.endswith(".onnx"), f"`onnx` as a file FILE.onnx, got {onnx!r}.")
     path = output_path(onnx)
     expect(

@@ -93,6 +93,12 @@ class Graph(nn.Module):
                 f"{type(model).__name__}. Export it by code of your own."
             )
         self.networks = nn.ModuleList(members)
+        for member in members:
+            lacks = member.no_graph
+            expect(
+                not lacks,
+                f"a model that ONNX can hold to export, got {type(member).__name__}, which {lacks}.",
+            )
         slope = ("slope_deg",) if isinstance(model, FusedModel) else ()
         layers = (name for member in members for name in member.inputs)
         self.layers = tuple(dict.fromkeys((*layers, *slope)))
@@ -170,13 +176,26 @@ def _quantile(distribution: TraversabilityDistribution, share: Tensor) -> Tensor
     """Least λ that is not exceeded with probabilities, shape [B, H, W]."""
     if isinstance(distribution, ConditionedDistribution):
         score = distribution.score_mean + distribution.score_std.double() * _normal_score(share)
-        return _quantile(distribution.base, _normal_cdf(score, deep=True))
-    low, high = torch.zeros_like(share), torch.ones_like(share)
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        reached = _cdf(distribution, middle) >= share
-        low, high = torch.where(reached, low, middle), torch.where(reached, middle, high)
-    return high
+        return _quantile(distribution.base, _normal_cdf(score))
+    # Each operation of a halving is written 40 times: what can be is computed before.
+    if isinstance(distribution, TraversabilityMixture):
+        weights, means, stds = _mixture(distribution)
+        scale, sought = math.sqrt(0.5) / stds, (2 * share - 1).unsqueeze(1)  # Φ = ½ (1 + erf)
+
+        def reached(value: Tensor) -> Tensor:
+            erf = torch.erf(((value - means) * scale).float()).double()  # which is ONNX's own
+            return (weights * erf).sum(1, keepdim=True) >= sought
+
+    else:
+
+        def reached(value: Tensor) -> Tensor:
+            return _tails(distribution, value[:, 0])[0].unsqueeze(1) >= share.unsqueeze(1)
+
+    low = torch.zeros_like(share).unsqueeze(1)
+    for halving in range(1, _HALVINGS + 1):
+        middle = low + 0.5**halving
+        low = torch.where(reached(middle), low, middle)
+    return low[:, 0] + 0.5**_HALVINGS
 
 
 def _first(distribution: TraversabilityDistribution) -> Tensor:
@@ -191,32 +210,23 @@ def _mixture(mixture: TraversabilityMixture) -> tuple[Tensor, Tensor, Tensor]:
     return weights / weights.sum(1, keepdim=True), mixture.means.double(), stds
 
 
-def _cdf(distribution: TraversabilityDistribution, value: Tensor) -> Tensor:
-    """P(λ ≤ value) at values in [0, 1), shape [B, H, W], to 10⁻⁷."""
-    if isinstance(distribution, TraversabilityMixture):
-        weights, means, stds = _mixture(distribution)
-        return (weights * _normal_cdf((value.unsqueeze(1) - means) / stds)).sum(1)
-    return _tails(distribution, value)[0]
-
-
-def _tails(distribution: TraversabilityDistribution, value: Tensor) -> tuple[Tensor, Tensor]:
-    """P(λ ≤ value) and P(λ > value), each to its own last digits, shape [*E, B, H, W]."""
+def _tails(distribution: TraversabilityDistribution, value: Tensor) -> Tensor:
+    """P(λ ≤ value) and P(λ > value), each to its own last digits, shape [2, *E, B, H, W]."""
     if isinstance(distribution, PooledDistribution):
-        tails = [_tails(member, value) for member in distribution.members]
-        return _average([below for below, _ in tails]), _average([above for _, above in tails])
+        return _average([_tails(member, value) for member in distribution.members])
     if isinstance(distribution, ConditionedDistribution):
-        below, above = _tails(distribution.base, value)
-        prior = torch.where(below < above, _normal_score(below), -_normal_score(above))
+        tails = _tails(distribution.base, value)
+        scores = _normal_score(tails)
+        prior = torch.where(tails[0] < tails[1], scores[0], -scores[1])
         score = (prior - distribution.score_mean) / distribution.score_std.double()
-        return _normal_cdf(score, deep=True), _normal_cdf(-score, deep=True)
+        return _normal_cdf(torch.stack([score, -score]))
     if isinstance(distribution, QuantileDistribution):
         below = distribution.cdf(value).double()
-        return below, 1 - below
+        return torch.stack([below, 1 - below])
     assert isinstance(distribution, TraversabilityMixture)
     weights, means, stds = _mixture(distribution)
     z = (value.unsqueeze(-3) - means) / stds
-    below, above = ((weights * _normal_cdf(sign * z, deep=True)).sum(-3) for sign in (1, -1))
-    return below, above
+    return (weights * _normal_cdf(torch.stack([z, -z]))).sum(-3)
 
 
 def _integral(distribution: TraversabilityDistribution, value: Tensor) -> Tensor:
@@ -225,12 +235,9 @@ def _integral(distribution: TraversabilityDistribution, value: Tensor) -> Tensor
         return _average([_integral(member, value) for member in distribution.members])
     if isinstance(distribution, TraversabilityMixture):
         weights, means, stds = _mixture(distribution)
-
-        def below(z: Tensor) -> Tensor:  # ∫ of Φ up to z
-            return z * _normal_cdf(z, deep=True) + torch.exp(-z * z / 2) / math.sqrt(2 * math.pi)
-
-        rise = below((value.unsqueeze(1) - means) / stds) - below(-means / stds)
-        return (weights * stds * rise).sum(1)
+        z = torch.stack([-means, value.unsqueeze(1) - means]) / stds
+        below = z * _normal_cdf(z) + torch.exp(-z * z / 2) / math.sqrt(2 * math.pi)  # ∫ of Φ up to z
+        return (weights * stds * (below[1] - below[0])).sum(1)
     edges = _edges(distribution, value)
     low, width = edges[:-1], edges[1:] - edges[:-1]
     # All nodes at once: a graph of few large operations, which is quicker to write and to run.
@@ -242,26 +249,24 @@ def _integral(distribution: TraversabilityDistribution, value: Tensor) -> Tensor
 def _edges(distribution: TraversabilityDistribution, value: Tensor) -> Tensor:
     """Ends of intervals over which F is smooth, about each component; shape [E, B, H, W]."""
     found = parameters_of(distribution)
-    edges = [torch.zeros_like(value), value]
+    edges = [torch.stack([torch.zeros_like(value), value])]
+    steps = torch.tensor(_EDGES, dtype=torch.float64).view(-1, 1, 1, 1, 1)
     for name in found:
         if name.endswith("means"):
             means, stds = found[name].double(), found[name.removesuffix("means") + "stds"].double()
-            edges += [(means + step * stds)[:, k] for k in range(means.shape[1]) for step in _EDGES]
-    stacked = torch.stack(edges)
-    return stacked.clamp(min=0).minimum(value).sort(0).values
+            edges.append((means + steps * stds).movedim(2, 1).flatten(0, 1))
+    return torch.cat(edges).clamp(min=0).minimum(value).sort(0).values
 
 
 def _average(values: Sequence[Tensor]) -> Tensor:
     return torch.stack(list(values)).mean(0)
 
 
-def _normal_cdf(z: Tensor, deep: bool = False) -> Tensor:
-    """Φ in float64: by ONNX's own erf in float32; where `deep` to 10⁻⁷ of itself, also far below 0.
+def _normal_cdf(z: Tensor) -> Tensor:
+    """Φ in float64 to 10⁻⁷ of itself, also far below 0.
 
     Source: Hart's approximation as of West (2005), "Better approximations to cumulative normal functions".
     """
-    if not deep:
-        return 0.5 * (1 + torch.erf((z * math.sqrt(0.5)).float()).double())
     x = z.abs().clamp(max=_FARTHEST)
     beyond = x + 0.65
     for count in (4, 3, 2, 1):

@@ -12,9 +12,15 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import pandas as pd
 import pytest
+from huggingface_hub import constants
 
 from benchnav.core import hub
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models.training.data import training_digest
+from tests.commands import call
 
 COMMIT = "a" * 40
 
@@ -190,6 +196,64 @@ def test_a_checkpoint_is_downloaded_and_what_is_here_goes_first(
     (tmp_path / "me").mkdir()
     shutil.copytree(shipped, tmp_path / "me" / "stakes@main")
     assert call() == "me/stakes@main"
+
+
+def test_addresses_go_through_training_measures_and_suites(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a cache that was filled before; what is found is what local files give."""
+    monkeypatch.chdir(tmp_path)
+    hub.download.cache_clear()
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "cache"))  # for other processes
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    ground, network = (
+        tmp_path / "cache" / name / "snapshots" / COMMIT
+        for name in ("datasets--me--ground", "models--me--net")
+    )
+    ground.mkdir(parents=True)
+    shutil.copy(dataset_path, ground / "maps.h5")
+    small = ("--settings.encoder_depth", 1, "--settings.hidden", 8, "--settings.max_epochs", 1)
+    trained = (
+        "fit",
+        "mean_variance",
+        "--out",
+        "net",
+        *small,
+        "--device",
+        "cpu",
+        "--trainer.precision",
+        "32-true",
+    )
+    assert call("train", *trained, "--data", f"me/ground@{COMMIT}") == 0
+    shutil.copytree("net", network)
+    kept = load_checkpoint("net").part("mean_variance")
+    assert kept.data_digest == training_digest(TerrainDataset(dataset_path))
+
+    shown = ("--splits", "[test/std]", "--json")
+    task = (
+        "--planners",
+        "[{part: mppi, options: {samples: 32}}]",
+        "--risks",
+        "[mean]",
+        "--scenarios",
+        "[std]",
+    )
+    task += ("--maps", 2, "--world.time_budget_s", 3, "--record", "none")
+    found = {}
+    for name, model, data in (
+        ("here", "net", dataset_path), ("hub", f"me/net@{COMMIT}", f"me/ground@{COMMIT}"),
+    ):  # fmt: skip
+        assert call("train", "evaluate", model, "--data", data, *shown, f"{name}.json") == 0
+        assert call("eval", "run", "--model", model, "--data", data, *task, "--out", name) == 0
+        report = json.loads(Path(f"{name}.json").read_text())
+        rows = pd.read_parquet(tmp_path / name / "episodes.parquet")
+        drawn = ["map", "outcome", "end_time_s", "traversability", "path_length_m"]
+        found[name] = report["splits"]["test/std"]["crps"], rows[drawn].to_dict("list"), set(rows["model"])
+    assert found["hub"][:2] == found["here"][:2]
+    assert (found["here"][2], found["hub"][2]) == ({"net"}, {f"net@{COMMIT}"})
+    about = (tmp_path / "hub" / "run.json").read_text()
+    assert f"me/net@{COMMIT}" in about
+    assert f"me/ground@{COMMIT}" in about
 
 
 def test_only_names_with_a_revision_are_of_a_hub() -> None:

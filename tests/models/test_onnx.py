@@ -14,16 +14,31 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.pooled import PooledDistribution
 from benchnav.core.terrain import Observation
+from benchnav.models.checkpoint import Checkpoint, Part, save_checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.mdn import MixtureDensityModel
-from benchnav.models.onnx_graph import _normal_cdf, _normal_score, cvar_of, export_onnx, mean_of
+from benchnav.models.nets.trainable import Ensemble
+from benchnav.models.onnx_graph import (
+    _normal_cdf,
+    _normal_score,
+    cvar_of,
+    export_onnx,
+    mean_of,
+    parameters_of,
+)
 from benchnav.models.predictor import Oracle
 from benchnav.models.slope_gp.table import SlopeTable, SoftModes
+from tests.commands import call
 from tests.models.support import NAMES, linear_table, make_terrain, scale
+from tests.models.zoo.support import ZOO
 
 SMALL: dict[str, Any] = {"decoder_channels": (16,), "encoder_depth": 1}
+KINDS: dict[str, tuple[Any, Any]] = {
+    "mdn": (MixtureDensityModel, MDNConfig),
+    **{name: (kind, type(config)) for name, (kind, config) in ZOO.items()},
+}
 COLOURS = scale(torch.full((3,), 127.0), torch.full((3,), 70.0), 20.0)
 
 
@@ -41,16 +56,10 @@ def fused(soft: bool = True) -> FusedModel:
     return FusedModel([member.eval() for member in members], table, NAMES, 1.4)
 
 
-class SmallMixture(MixtureDensityModel):
-    """With a smaller network than the usual one, which is slow to export."""
-
-    def __init__(self, config: MDNConfig) -> None:
-        super().__init__(config)
-        self.image = ClassifierConfig(**SMALL)
-
-
-def mdn(seed: int = 1, temperature: float = 1.0) -> SmallMixture:
-    model = SmallMixture(MDNConfig(hidden=8)).build(COLOURS, seed=seed)
+def small(name: str, temperature: float = 1.0, seed: int = 1, **settings: Any) -> Any:
+    """A model of the zoo with a small network, which is quick to export."""
+    kind, config = KINDS[name]
+    model = kind(config(hidden=8, encoder_depth=1, **settings)).build(COLOURS, seed=seed)
     model.temperature = temperature
     return model.eval()
 
@@ -66,8 +75,10 @@ def outputs(path: Path, observation: Observation) -> dict[str, np.ndarray]:
 
 MODELS = {
     "fused": lambda: fused(),
-    "mdn": lambda: mdn(),
-    "mdn calibrated": lambda: mdn(temperature=1.3),
+    "mdn calibrated": lambda: small("mdn", temperature=1.3),
+    "mean_variance": lambda: small("mean_variance"),
+    "quantile": lambda: small("quantile"),
+    "mc_dropout": lambda: small("mc_dropout", masks=3),
 }
 
 
@@ -81,13 +92,42 @@ def test_the_runtime_gives_what_the_model_gives(name: str, tmp_path: Path) -> No
         found, predicted = outputs(path, observation), model.predict(observation)
         np.testing.assert_allclose(found["mean"], predicted.mean().numpy(), atol=1e-5)
         np.testing.assert_allclose(found["cvar"], predicted.cvar(0.8).numpy(), atol=1e-5)
-        mixture = getattr(predicted, "base", predicted)
-        for parameter in ("weights", "means", "stds"):
-            np.testing.assert_allclose(found[parameter], getattr(mixture, parameter).numpy(), atol=1e-5)
+        own = parameters_of(predicted)
+        assert set(found) == {*own, "mean", "cvar"}
+        for parameter, values in own.items():
+            np.testing.assert_allclose(found[parameter], values.numpy(), atol=1e-5)
         assert np.abs(found["cvar"] - predicted.cvar(0.5).numpy()).max() > 1e-3  # the level counts
-    onnx = pytest.importorskip("onnx")
-    about = json.loads({entry.key: entry.value for entry in onnx.load(path).metadata_props}["benchnav"])
-    assert (about["model"], about["cvar_level"]) == (name, 0.8)
+
+
+def test_the_command_writes_what_its_flags_say(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
+    pytest.importorskip("onnxscript", reason="the extra onnx is not installed")
+    model, path = small("quantile"), tmp_path / "model.onnx"
+    part = Part(
+        config=model.settings(), tensors=dict(model.state_dict()), seed=0, metrics={}, data_id="", data_digest="",
+        half_precision=False,
+    )  # fmt: skip
+    save_checkpoint(tmp_path / "c", Checkpoint(class_names=(), model="quantile", parts={"quantile": part}))
+    path.write_text("mine")
+    given = ("export", tmp_path / "c", "--onnx", path, "--level", 0.6, "--opset", 20)
+    for words, said in (
+        (given, "which is there. Pass --overwrite"),
+        ((*given, "--overwrite", "--level", 1), "`level` in [0, 1), got 1"),
+        ((*given, "--onnx", tmp_path / "model.pt"), "`onnx` as a file FILE.onnx"),
+    ):
+        assert call("train", *words) == 2
+        assert said in capsys.readouterr().err
+        assert path.read_text() == "mine"
+    assert call("train", *given, "--overwrite") == 0
+    assert "to quantiles, mean, cvar at level 0.6" in capsys.readouterr().out
+    assert {entry.name for entry in tmp_path.iterdir()} == {"c", "model.onnx"}
+    observation = make_terrain(2, 24).observe()
+    predicted = model.predict(observation)
+    np.testing.assert_allclose(outputs(path, observation)["cvar"], predicted.cvar(0.6).numpy(), atol=1e-5)
+    written = onnx.load(path)
+    about = json.loads({entry.key: entry.value for entry in written.metadata_props}["benchnav"])
+    assert (about["model"], about["cvar_level"]) == (str(tmp_path / "c"), 0.6)
+    assert {entry.version for entry in written.opset_import if not entry.domain} == {20}
 
 
 @pytest.mark.parametrize("temperature", [0.4, 1.25, 3.0])
@@ -121,24 +161,31 @@ def test_integrals_are_those_of_the_distribution(temperature: float) -> None:
 def test_normal_numbers_are_exact_in_the_tails() -> None:
     z = torch.linspace(-35, 8, 4001, dtype=torch.float64)
     share = torch.from_numpy(scipy.special.ndtr(z.numpy()))
-    torch.testing.assert_close(_normal_cdf(z, deep=True), share, atol=0, rtol=1e-7)
+    torch.testing.assert_close(_normal_cdf(z), share, atol=0, rtol=1e-7)
     near = z > -7
-    torch.testing.assert_close(_normal_cdf(z, deep=True)[near], share[near], atol=0, rtol=1e-8)
+    torch.testing.assert_close(_normal_cdf(z)[near], share[near], atol=0, rtol=1e-8)
     torch.testing.assert_close(_normal_score(share[z < 5]), z[z < 5], atol=1e-7, rtol=1e-8)
 
 
 def test_what_has_no_graph_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("onnxscript", reason="the extra onnx is not installed")
 
-    class Odd(SmallMixture):
+    class Odd(MixtureDensityModel):
         def predict(self, observation: Observation) -> Any:
             mixture: Any = super().predict(observation)
             return TraversabilityMixture(mixture.weights, mixture.means - 0.1, mixture.stds)
 
-    odd = Odd(MDNConfig(hidden=8)).build(COLOURS).eval()
-    for model, said in ((Oracle(), "got Oracle"), (odd, "the graph is off by")):
+    odd = Odd(MDNConfig(hidden=8, encoder_depth=1)).build(COLOURS).eval()
+    refused = (
+        (Oracle(), "got Oracle"),
+        (odd, "the graph is off by"),
+        (small("swag"), "got SWAGModel, which draws its weights as it predicts"),
+        (small("evidential"), "got EvidentialModel, which needs the digamma function"),
+        (Ensemble([small("swag"), small("swag", seed=2)]), "got SWAGModel, which draws"),
+    )
+    for model, said in refused:
         with pytest.raises(ConfigError, match=said):
             export_onnx(model, tmp_path / "model.onnx", "odd")
     with pytest.raises(ConfigError, match="level"):
-        export_onnx(mdn(), tmp_path / "model.onnx", "mdn", level=1.0)
+        export_onnx(small("mdn"), tmp_path / "model.onnx", "mdn", level=1.0)
     assert not list(tmp_path.iterdir())

@@ -64,6 +64,9 @@ class TrainableNetwork(lightning.LightningModule):
     stops_early: ClassVar[bool] = True
     """Whether training ends after `patience` epochs without a gain, and keeps the best; if not, it keeps the last."""
 
+    no_graph: ClassVar[str] = ""
+    """Why no ONNX graph can be made of it; empty where one can."""
+
     def __init__(self, config: TrainingConfig) -> None:
         """Keeps the settings; `build` makes the network."""
         super().__init__()

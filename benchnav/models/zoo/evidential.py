@@ -10,6 +10,7 @@ deep evidential regression". Letters in shapes: B maps, H×W cells, K nodes.
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -50,6 +51,8 @@ class EvidentialModel(JoinedModel):
     Args:
         config: what it is.
     """
+
+    no_graph: ClassVar[str] = "needs the digamma function, which ONNX has not"
 
     def __init__(self, config: EvidentialConfig) -> None:
         """Keeps the settings."""

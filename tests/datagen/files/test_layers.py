@@ -39,11 +39,11 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_dataset(tmp_path_factory.mktemp("layers") / "small.h5", overgrown())
 
 
-def foreign(folder: Path, **fields: tuple[str, tuple[str, ...]]) -> TerrainDataset:
+def foreign(folder: Path, unit: str = "1", **fields: tuple[str, tuple[str, ...]]) -> TerrainDataset:
     """A dataset with fields of its own, by dtype and shape, all zero but a NaN in floats."""
     recipe = replace(tiny_recipe(), splits={"train": Split(scenario="std", maps=2)})
     own = {
-        name: schema.Field(kind, shape, "1", -np.inf, np.inf, "mine")
+        name: schema.Field(kind, shape, unit, -np.inf, np.inf, "mine")
         for name, (kind, shape) in fields.items()
     }
     maps = generate(recipe, "train", np.arange(2))
@@ -156,11 +156,14 @@ def test_datasets_with_one_set_of_layers_merge_and_others_are_refused_in_one_lin
 def test_layers_of_one_name_and_another_unit_or_order_are_not_merged(tmp_path: Path) -> None:
     plane = ("<f4", ("H", "W"))
     datasets = []
-    for name, fields in (("x", {"a": plane, "b": plane}), ("y", {"b": plane, "a": plane})):
+    for name, unit, fields in (("x", "1", "ab"), ("y", "1", "ba"), ("z", "m", "ab")):
         (tmp_path / name).mkdir()
-        datasets.append(foreign(tmp_path / name, **fields).path)
-    with pytest.raises(DatasetError, match="unlike order of fields"):
-        next(merge(datasets, tmp_path / "no.h5"))
+        datasets.append(foreign(tmp_path / name, unit, **dict.fromkeys(fields, plane)).path)
+    first, swapped, measured = datasets
+    with pytest.raises(DatasetError, match=r"unlike order of fields \(.*a, b / .*b, a\)"):
+        next(merge([first, swapped], tmp_path / "no.h5"))
+    with pytest.raises(DatasetError, match=r"fields of unlike dtype, unit or meaning \(a, b\)"):
+        next(merge([first, measured], tmp_path / "no.h5"))
 
 
 def test_damaged_and_impossible_values_are_found(path: Path, tmp_path: Path) -> None:
@@ -185,6 +188,16 @@ def test_what_models_record_covers_what_grows(path: Path, tmp_path: Path) -> Non
     ]
     other = TerrainDataset(tiny_dataset(tmp_path / "t.h5", replace(overgrown(), classes=tuple(taller))))
     assert dataset.about_digest("train") != other.about_digest("train")
+
+
+def test_the_command_refuses_unlike_layers_in_one_line(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bare = tiny_dataset(tmp_path / "bare.h5", small_stakes(seed=5))
+    assert call("datagen", "merge", path, bare, "--out", tmp_path / "no.h5") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{path} and {bare} have unlike fields (vegetation_m of one alone)" in line
+    assert not (tmp_path / "no.h5").exists()
 
 
 def test_the_commands_name_layers(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
