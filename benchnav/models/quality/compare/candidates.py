@@ -96,8 +96,8 @@ def _labels(sources: Sequence[str]) -> dict[str, str]:
 
 def count_parameters(model: TraversabilityModel) -> int | None:
     """Number of weights in the networks of a model and of its members; None where it has no network."""
-    networks = {id(network): network for network in _networks(model)}
-    weights = {id(weight): weight.numel() for network in networks.values() for weight in network.parameters()}
+    networks = list(_networks(model))
+    weights = {id(weight): weight.numel() for network in networks for weight in network.parameters()}
     return sum(weights.values()) if networks else None
 
 
