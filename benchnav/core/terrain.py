@@ -4,7 +4,8 @@ Traversability is in [0, 1] and higher is better. Letters in shapes: B maps, H×
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -94,6 +95,20 @@ class Terrain(Batch):
     def observe(self) -> Observation:
         """Gives the Observation of these maps: colour, elevation, slope, grid, layers, and nothing else."""
         return Observation(self.rgb, self.elevation_m, self.slope_deg, self.grid, self.layers)
+
+
+def take_cells(observation: Observation, rows: Any, columns: Any) -> Observation:
+    """Cells of an observation as a map of their own, by slices or by indices that broadcast to [h, w]."""
+
+    def change(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: change(layer) for name, layer in value.items()}
+        return value[..., rows, columns] if isinstance(value, Tensor) else value
+
+    taken = {each.name: change(getattr(observation, each.name)) for each in fields(observation)}
+    height, width = taken["rgb"].shape[-2:]
+    grid = Grid(height, width, observation.grid.resolution_m)
+    return replace(observation, **taken | {"grid": grid})
 
 
 def _check_shapes(grid: Grid, batch: int, maps: Mapping[str, Tensor], layers: Mapping[str, Tensor]) -> None:

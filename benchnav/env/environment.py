@@ -70,7 +70,7 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     | `elevation_m` | float32 | (H, W)    | elevation                                                     |
     | `slope_deg`   | float32 | (H, W)    | slope by Horn's method                                        |
 
-    and, where the dataset has layers, one key a layer by its name, such as `vegetation_m`: float32, (H, W), NaN where
+    and, where the dataset has layers, one key a layer by its name, such as `vegetation_m`: float32, (H, W), 0 where
     nothing is known.
 
     S is 3 for the unicycle and the bicycle, 5 for the differential drive, whose velocities v and ω follow.
@@ -324,7 +324,7 @@ class EnvBatch:
             "rgb": self._maps.rgb[self._map].numpy(),
             "elevation_m": self._maps.elevation_m[self._map].numpy(),
             "slope_deg": self._maps.slope_deg[self._map].numpy(),
-            **{name: layer[self._map].numpy() for name, layer in self._maps.layers.items()},
+            **{name: layer[self._map].nan_to_num().numpy() for name, layer in self._maps.layers.items()},
         }
         info = {
             "map": self._map.copy(),

@@ -8,7 +8,6 @@ of it. Letters in shapes: B maps, H×W cells of a map, h×w cells of a tile.
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import fields, replace
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,9 +20,8 @@ from benchnav.core import rng
 from benchnav.core.batch import map_tensors
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError, expect
-from benchnav.core.grid import Grid
 from benchnav.core.store import replacing
-from benchnav.core.terrain import Observation
+from benchnav.core.terrain import Observation, take_cells
 from benchnav.models.base import TraversabilityModel, predict_observation
 
 _STRIDE = 32
@@ -175,7 +173,7 @@ def _predict_window(
         )
         for part, size in zip(window, observation.grid.shape, strict=True)
     ]
-    distribution = predict_observation(model, take(observation, *outer))
+    distribution = predict_observation(model, take_cells(observation, *outer))
     inner = Window(
         *(
             slice(part.start - edge.start, part.stop - edge.start)
@@ -185,27 +183,13 @@ def _predict_window(
     return map_tensors(distribution, lambda values: values[..., *inner])
 
 
-def take(observation: Observation, rows: Any, columns: Any) -> Observation:
-    """Cells of an observation as a map of their own, by slices or by indices that broadcast to [h, w]."""
-
-    def change(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {name: change(layer) for name, layer in value.items()}
-        return value[..., rows, columns] if isinstance(value, Tensor) else value
-
-    taken = {each.name: change(getattr(observation, each.name)) for each in fields(observation)}
-    height, width = taken["rgb"].shape[-2:]
-    grid = Grid(height, width, observation.grid.resolution_m)
-    return replace(observation, **taken | {"grid": grid})
-
-
 def _probes(observation: Observation, side: int) -> Iterator[Observation]:
     """The middle of the first map, repeated where the map is smaller, and cells from anywhere in it."""
     sizes, one = observation.grid.shape, observation.select(torch.tensor([0]))
     rows, columns = ((size - side) // 2 + torch.arange(side) for size in sizes)
-    yield take(one, rows[:, None] % sizes[0], columns % sizes[1])
+    yield take_cells(one, rows[:, None] % sizes[0], columns % sizes[1])
     drawn = rng.uniform(rng.stream_key(0, "models", "margin"), np.arange(2), (side, side))
-    yield take(
+    yield take_cells(
         one, *(torch.from_numpy((n * share).astype(int)) for n, share in zip(sizes, drawn, strict=True))
     )
 
@@ -220,7 +204,7 @@ def _reach(model: TraversabilityModel, probe: Observation) -> int | None:
     distance = torch.minimum(row[:, None], row).flatten()
     worst = torch.zeros(len(row), dtype=torch.float64, device=row.device)
     for part, flip in ((slice(_STRIDE, side), []), (slice(0, side - _STRIDE), [-2, -1])):
-        alone = predict_observation(model, take(probe, part, part))
+        alone = predict_observation(model, take_cells(probe, part, part))
         there = map_tensors(whole, lambda values, part=part: values[..., part, part])
         difference = _difference(alone, there).flip(flip).flatten()
         worst = worst.scatter_reduce(0, distance, difference, "amax")

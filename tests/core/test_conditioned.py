@@ -132,3 +132,15 @@ def test_in_float32_a_narrow_posterior_is_as_in_float64() -> None:
     wanted = law._exact().cdf(at)
     assert bool(((wanted > 0.05) & (wanted < 0.95)).any())
     torch.testing.assert_close(law.cdf(at).double(), wanted, rtol=0, atol=1e-6)
+
+
+def test_however_narrow_the_ends_of_its_range_are_those_of_the_base() -> None:
+    base = mixture(2, 0.02, 0.3)
+    zeros = torch.zeros(SHAPE, dtype=torch.float64)
+    law = ConditionedDistribution(base, zeros, zeros + 0.05)
+    shares = torch.tensor([0.0, 1.0], dtype=torch.float64).view(2, 1, 1).expand(SHAPE)
+    assert torch.equal(law.quantile(0.0), base.quantile(0.0))
+    assert torch.equal(law.quantile(1), base.quantile(1.0))
+    assert torch.equal(law.quantile(shares), base.quantile(shares))
+    point = ConditionedDistribution(base, zeros, zeros)
+    assert torch.equal(point.quantile(0.0), point.quantile(0.5))

@@ -379,6 +379,22 @@ def test_layers_are_seen_by_their_names(tmp_path: Path) -> None:
     np.testing.assert_array_equal(batch["vegetation_m"], stored[info["map"]])
 
 
+def test_what_a_layer_does_not_know_is_0(dataset_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = TerrainDataset.terrain
+
+    def terrain(dataset: TerrainDataset, *given: Any) -> Terrain:
+        found = read(dataset, *given)
+        moss = torch.where(found.slope_deg > 5, torch.nan, found.slope_deg)
+        return replace(found, layers={"moss": moss})
+
+    monkeypatch.setattr(TerrainDataset, "terrain", terrain)
+    env = make(dataset_path)
+    seen, _ = env.reset(options={"map": 1})
+    assert env.observation_space.contains(seen)
+    slope = seen["slope_deg"]
+    np.testing.assert_array_equal(seen["moss"], np.where(slope > 5, 0, slope))
+
+
 def test_without_layers_nothing_more_is_seen(dataset_path: Path) -> None:
     assert set(make(dataset_path).observation_space) == {"state", "goal", "rgb", "elevation_m", "slope_deg"}
 

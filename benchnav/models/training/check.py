@@ -11,12 +11,12 @@ from torch import Tensor
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import BenchnavError, ConfigError, expect
 from benchnav.core.settings import call, of, one_line, read
+from benchnav.core.terrain import take_cells
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import predict_observation
 from benchnav.models.config import TrainingConfig
 from benchnav.models.nets.inputs import check_inputs
 from benchnav.models.nets.trainable import TrainableModel, TrainableNetwork, in_single_precision
-from benchnav.models.tiles import take
 from benchnav.models.training.data import TRAIN, VALID, MapDataset, check_maps, squares_a_map
 from benchnav.models.training.fit import FitOptions, make_trainer, quietly
 
@@ -103,7 +103,7 @@ def check_network(trainable: Trainable, dataset: TerrainDataset, options: FitOpt
         side = config.crop or max(dataset.grid.shape)
         rows, columns = (slice(min(side, size)) for size in dataset.grid.shape)
         try:
-            predict_observation(network.eval(), take(observation, rows, columns))
+            predict_observation(network.eval(), take_cells(observation, rows, columns))
         except BenchnavError:
             raise
         except Exception as error:  # a user's code may raise anything

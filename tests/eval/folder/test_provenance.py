@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 
+from benchnav.core.errors import CheckpointError
 from benchnav.core.sources import load_file
 from benchnav.eval.experiment.condition import Condition, conditions_of
 from benchnav.eval.experiment.suite import Suite
@@ -77,3 +78,16 @@ def test_of_a_checkpoint_of_a_users_class_both_count(tmp_path: Path, monkeypatch
         "c", Checkpoint(class_names=("a",), parts={"CellModel": part}, model="CellModel", code="z")
     )
     assert {name for name in first if parts()[name] != second[name]} == {"model own.py:CellModel@c"}
+
+
+@pytest.mark.parametrize("name", ["./payload.py:Family", "payload:Family"])
+def test_what_a_checkpoint_names_is_looked_up_and_never_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    Path("payload.py").write_text("open('sprung', 'w')\nclass Family: ...\n")
+    save_checkpoint("c", Checkpoint(class_names=(), parts={}, model=name))
+    with pytest.raises(CheckpointError, match="Expected a checkpoint of a model among"):
+        describe_parts(condition(planners="mppi", model="c"))
+    assert not Path("sprung").exists()

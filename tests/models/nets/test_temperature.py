@@ -164,6 +164,11 @@ def test_the_temperature_of_distributions_is_found_with_and_without_atoms(
     assert fit_width(*scores(temperature, atoms)) == pytest.approx(temperature, rel=0.02)
 
 
+def test_the_rounding_of_a_cdf_is_no_atom() -> None:
+    z, _ = scores(1.6)
+    assert fit_width(torch.nextafter(z, torch.full_like(z, -torch.inf)), z) == fit_width(z, z)
+
+
 def test_distributions_that_are_right_are_left_as_they_are() -> None:
     assert fit_width(*scores(1.0)) == 1
     assert fit_width(*scores(1.01)) == 1  # for a gain below 0.001 nats a cell

@@ -228,3 +228,15 @@ def test_layers_are_scaled_by_their_known_cells(dataset: TerrainDataset) -> None
         np.testing.assert_allclose(scale[name].std, [values.std()], rtol=1e-5)
     slope = dataset.read("train", fields=["slope_deg"])["slope_deg"].astype(float)
     np.testing.assert_allclose(scale["slope_deg"].rms, np.sqrt((slope**2).mean()), rtol=1e-6)
+
+
+def test_what_is_not_finite_has_no_part_in_the_scale(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = MapData(dataset, 4, seed=0)
+    values = np.array([[1.0, np.inf], [3.0, np.nan]], np.float32)
+    monkeypatch.setattr(
+        data.train.dataset, "chunks", lambda *_: iter([(range(1), {"moss": values[None]})]), raising=False
+    )
+    scale = data.scale(("moss",))["moss"]
+    assert (float(scale.mean), float(scale.std)) == (2, 1)

@@ -138,6 +138,7 @@ def test_a_class_of_a_name_that_is_ours_is_refused(
         (["mdm"], "Did you mean 'mdn'"),
         (["mdn", "--settings.architecture", "unett"], "unett"),
         (["mdn", "--settings.encoder", "resnet19"], "resnet19"),
+        (["mdn", "--settings.encoder", "tu-hf-hub:someone/net"], "got 'tu-hf-hub:someone/net'"),
         (["fused", "--settings.clasifier.dice", "1"], "`settings` of 'fused' among classifier, gp"),
         (["fused", "--settings.classifier.architecture", "unett"], "unett"),
     ],

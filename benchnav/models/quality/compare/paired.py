@@ -103,8 +103,8 @@ def _pair(one: Sums, other: Sums, flips: np.ndarray, counts: np.ndarray) -> dict
     gap = added({name: one[name] - other[name] for name in shared}, flips)
     total = added({name: one[name] + other[name] for name in shared}, whole)
     exchanged = _difference(
-        {name: (total[name] + gap[name]) / 2 for name in shared},
-        {name: (total[name] - gap[name]) / 2 for name in shared},
+        {name: _half(total[name], gap[name]) for name in shared},
+        {name: _half(total[name], -gap[name]) for name in shared},
     )
     drawn = _difference(added(one, counts), added(other, counts)) if units >= LEAST_MAPS else {}
     rows = {}
@@ -112,10 +112,15 @@ def _pair(one: Sums, other: Sums, flips: np.ndarray, counts: np.ndarray) -> dict
         # Sums are exact to rounding, and ways that tie with what was seen count.
         least = abs(seen[name]) * (1 - 1e-9) - _ROUNDING
         low, high = _interval(drawn.get(name))
-        # A sum that is 0 but for rounding has no root: such a way counts too.
-        p = float(np.mean(~(np.abs(exchanged[name]) < least)))
+        p = float(np.mean(np.abs(exchanged[name]) >= least))
         rows[name] = {"difference": float(seen[name]), "low": low, "high": high, "p": p}
     return rows
+
+
+def _half(total: np.ndarray, gap: np.ndarray) -> np.ndarray:
+    """Half of their sum; what rounding leaves of 0, of which a root would be far from 0, is 0."""
+    half = (total + gap) / 2
+    return np.where(np.abs(half) < _ROUNDING * np.abs(total), 0, half)
 
 
 def _difference(one: Sums, other: Sums) -> dict[str, np.ndarray]:

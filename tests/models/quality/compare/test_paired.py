@@ -190,3 +190,13 @@ def test_alone_a_model_is_the_best_and_not_marked() -> None:
     found = against_best(summarise("s", sums), compare_pairs("s", sums, ["a"]), ["a"])
     assert set(found["best"]) == {"a"}
     assert not found["marked"].any()
+
+
+@pytest.mark.parametrize("maps", [5, 13, 40])
+def test_against_a_model_without_any_error_every_way_has_a_chance(maps: int) -> None:
+    one, least = sums_of([0.1] * maps), 2 / 2**maps if maps <= 13 else 1 / 10_000
+    for seed in range(20):
+        other = {**one, "expected_squares": np.zeros(maps)}
+        own = {**one, "expected_squares": np.random.default_rng(seed).random(maps)}
+        p = row(compare_pairs("std", {"a": own, "b": other}, ["a"]), "rmse_expected")["p"]
+        assert p >= least * 0.99
