@@ -1,7 +1,8 @@
 """Puts the shipped maps and models into wheels and source archives; all else is said in pyproject.toml.
 
 They stay where they are in the repository, and the wheel holds them under `benchnav/_shipped`. Only the files
-named here go in, whatever else lies in those folders. The checkpoint paper-v1, 29 MB of weights, stays out.
+named here go in, whatever else lies in those folders. The checkpoint paper-v1, 29 MB of weights, stays out, of
+source archives too.
 """
 
 from pathlib import Path

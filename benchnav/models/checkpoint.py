@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 import benchnav
+from benchnav.core import registry
 from benchnav.core.errors import CheckpointError
 from benchnav.core.sources import digest_of_path
 from benchnav.core.store import (
@@ -130,7 +131,9 @@ class Checkpoint:
 def _command(part: str) -> str:
     """The command that trains a part."""
     stem = part.partition("-")[0]
-    return stem if stem in (CLASSIFIER, GP) else f"fit {stem}"
+    if stem in (CLASSIFIER, GP):
+        return stem
+    return f"fit {stem}" if stem in registry.names("model") else f"fit path/to/file.py:{stem}"
 
 
 def member_name(index: int, stem: str) -> str:

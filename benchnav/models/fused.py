@@ -30,7 +30,7 @@ class FusedModel(ModelFamily):
             these layers, and any other the colours alone.
         table: the GPs over slope.
         class_names: names of the C classes.
-        pool_temperature: of the averaged probabilities (see `models.nets.classifier`).
+        pool_temperature: of the averaged probabilities (see `models.nets.calibration`).
     """
 
     def __init__(

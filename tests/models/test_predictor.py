@@ -204,12 +204,18 @@ def test_a_model_whose_training_was_interrupted_is_told_with_the_command_to_go_o
     save_checkpoint("checkpoints/killed", half)
     with pytest.raises(CheckpointError, match="a part 'classifier'"):
         load_model("killed")
-    for folder in ("killed.training/classifier", "first.training/mdn", "whole.training/classifier"):
+    for folder in (
+        "killed.training/classifier",
+        "first.training/mdn",
+        "own.training/Mine-2",
+        "whole.training/classifier",
+    ):
         Path("checkpoints", folder).mkdir(parents=True)
     for source, command in (
         ("killed", "all --data DATA --out checkpoints/killed --resume"),
         ("checkpoints/killed/", "all --data DATA --out checkpoints/killed --resume"),
         ("first", "fit mdn --data DATA --out checkpoints/first --resume"),
+        ("own", "fit path/to/file.py:Mine --data DATA --out checkpoints/own --resume"),
     ):
         with pytest.raises(CheckpointError, match="training was interrupted") as caught:
             load_model(source)

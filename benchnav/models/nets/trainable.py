@@ -46,7 +46,7 @@ from benchnav.models.nets.inputs import InputStack, LayerScale, Maps
 
 CHUNK_CELLS = 2**17
 
-_WARM_UP_SHARE = 0.15
+WARM_UP_SHARE = 0.15
 
 Loss = Callable[[Any, Tensor], Tensor]
 
@@ -229,7 +229,7 @@ class TrainableNetwork(lightning.LightningModule):
     def configure_schedule(self, optimizer: torch.optim.Optimizer, steps: int) -> Any:
         """Gives the schedule of the learning rate over all steps of a training: one cycle (Smith and Topin, 2018)."""
         return torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, self.config.learning_rate, total_steps=steps, pct_start=_WARM_UP_SHARE
+            optimizer, self.config.learning_rate, total_steps=steps, pct_start=WARM_UP_SHARE
         )
 
     def on_train_epoch_start(self) -> None:

@@ -21,11 +21,11 @@ from torch.func import functional_call
 from benchnav.core import rng
 from benchnav.core.errors import expect
 from benchnav.models.nets.inputs import LayerScale, Maps
+from benchnav.models.nets.trainable import WARM_UP_SHARE
 from benchnav.models.zoo.batch_statistics import norms_of, size_of, statistics_of, to_buffers
 from benchnav.models.zoo.mean_variance import Gaussians, MeanVarianceConfig, MeanVarianceModel
 
 _BATCHES = 4  # of training maps, for the statistics of a draw
-_WARM_UP_SHARE = 0.15
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +115,7 @@ class SWAGModel(MeanVarianceModel):
         """The rate rises, falls to `collect_rate` along a cosine, and stays."""
         self.steps, floor = steps, self.config.collect_rate
         start = steps * (1 - self.config.collect)
-        warm = min(steps * _WARM_UP_SHARE, start)
+        warm = min(steps * WARM_UP_SHARE, start)
 
         def rate(step: int) -> float:
             if step < warm:
