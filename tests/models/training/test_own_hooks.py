@@ -5,9 +5,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models.nets.trainable import TrainableNetwork
 from tests.commands import call
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "own_model.py"
@@ -187,3 +189,21 @@ def test_a_setting_without_a_usual_value_is_compared_when_a_training_is_repeated
     assert "was finished already" in capfd.readouterr().out
     assert call("train", *where, "--settings.hidden", 8, "--resume") == 2
     assert "another `hidden`" in capfd.readouterr().err
+
+
+def test_what_an_epoch_draws_hangs_on_seed_and_epoch(
+    own: Path, dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds: list[int] = []
+    begin = TrainableNetwork.on_train_epoch_start
+
+    def watch(network: TrainableNetwork) -> None:
+        begin(network)
+        seeds.append(torch.initial_seed())
+
+    monkeypatch.setattr(TrainableNetwork, "on_train_epoch_start", watch)
+    where = ("fit", "own.py:CellModel", "--data", dataset.path, *QUICK, "--trainer.max_epochs", 3)
+    for out, seed in (("a", 4), ("b", 5), ("c", 4)):
+        assert call("train", *where, "--out", out, "--seed", seed) == 0
+    assert len({*seeds[:6]}) == 6
+    assert seeds[6:] == seeds[:3]
