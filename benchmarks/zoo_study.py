@@ -20,22 +20,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import yaml
-from rich.console import Console
-from rich.table import Table
-from scipy.stats import kendalltau, t
+from zoo_report import RISKS, SPLIT, Dose, print_quality, report_doses, report_zoo
 
 from benchnav.core import registry
-from benchnav.core.resampling import sign_flips
 from benchnav.core.store import write_text
 from benchnav.datagen import TerrainDataset
-from benchnav.eval.stats.paired_difference import mean_interval
 from benchnav.models import load_model
 from benchnav.models.base import predict
 from benchnav.models.quality.scores import lower_fifth_and_width
@@ -43,7 +38,7 @@ from benchnav.models.quality.scores import lower_fifth_and_width
 HERE = Path(__file__).parent
 HYPOTHESIS, VARIED = HERE / "zoo_study.yaml", HERE / "varied.py"
 TEMPERATURES, SOFT, BRIGHTNESS = (0.25, 0.5, 1.0, 2.0, 4.0), (0.0, 0.5, 2.0), (0.7, 0.85, 1.15)
-RISKS, SPLIT, CHUNK = ("expected-time", "cvar:0.8"), "test/std", 20
+CHUNK = 20
 TESTS = ("test/std", "test/hs")
 PARTS = ("doses", "zoo", "paper", "inputs")
 # What `benchnav-train fit` is told of each, beside data, folder and seed.
@@ -70,23 +65,6 @@ INPUTS: Methods = {
         ("all", "rgb,elevation_m,slope_deg,vegetation_m"),
     )
 }
-SCORES = ("rmse_expected", "nll", "crps", "pinball", "tail_error", "ause")  # of each the least is the best
-SHOWN = ("accuracy", "miou", *SCORES[:4], "coverage", "width", *SCORES[4:], "prediction_ms", "parameters")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Dose:
-    """A model of the study: maps that it was trained on, its training seed, and what is changed about it."""
-
-    size: int
-    seed: int
-    what: str = "temperature"
-    dose: float = 1.0
-
-    @property
-    def label(self) -> str:
-        """Its name in tables."""
-        return f"n{self.size}-s{self.seed}-{self.what}-{self.dose:g}"
 
 
 def doses(sizes: list[int], seeds: list[int]) -> Iterator[Dose]:
@@ -198,61 +176,12 @@ def drive(out: Path, name: str, models: list[dict[str, Any]], maps: int, draws: 
         "risks": list(RISKS),
         "models": models,
     }
-    (out / f"{name}.yaml").write_text(yaml.safe_dump(suite))
-    command("benchnav-eval", "run", "--config", out / f"{name}.yaml", "--out", out / name, "--jobs", 2)
+    done = out / f"{name}.done"
+    if not done.exists():
+        (out / f"{name}.yaml").write_text(yaml.safe_dump(suite))
+        command("benchnav-eval", "run", "--config", out / f"{name}.yaml", "--out", out / name, "--jobs", 2)
+        done.touch()
     return pd.read_parquet(out / name / "episodes.parquet")
-
-
-def slopes_by_map(loss: np.ndarray, success: np.ndarray) -> np.ndarray:
-    """Least-squares slopes of success on the loss over models, one a map.
-
-    Args:
-        loss: of each model, shape [K].
-        success: share of success of each model and map, shape [K, M].
-
-    Returns:
-        Success per unit of loss, shape [M].
-    """
-    centred = loss - loss.mean()
-    return centred @ (success - success.mean(0)) / (centred @ centred)
-
-
-def report(out: Path, rows: pd.DataFrame, loss: pd.Series, models: list[Dose]) -> None:
-    """Prints the test of the hypothesis, and success and time against dose; writes both to files."""
-    table = rows.pivot_table(index="model", columns="map", values="success", aggfunc="mean").loc[loss.index]
-    slopes = slopes_by_map(loss.to_numpy(), table.to_numpy())
-    flips = sign_flips(len(slopes))
-    p = float((flips @ slopes <= slopes.sum() + 1e-12).mean())
-    mean, low, high = mean_interval(slopes[None])
-    found = {
-        "models": len(loss), "maps": len(slopes), "episodes": len(rows),
-        "slope_points_per_0.001": 0.1 * float(mean[0]), "interval": [0.1 * float(low[0]), 0.1 * float(high[0])],
-        "p_one_sided": p, "hypothesis_sha256": digest(),
-    }  # fmt: skip
-    (out / "hypothesis.json").write_text(json.dumps(found, indent=1))
-    print(json.dumps(found, indent=1))
-    lines = []
-    for dose in models:
-        for risk in RISKS:
-            own = rows[(rows["model"] == dose.label) & (rows["risk"] == risk)]
-            centre = rows[
-                (rows["model"] == Dose(size=max(d.size for d in models), seed=dose.seed).label)
-                & (rows["risk"] == risk)
-            ]
-            gain = 100 * (own.groupby("map")["success"].mean() - centre.groupby("map")["success"].mean())
-            gained, least, most = mean_interval(gain.to_numpy()[None])
-            lines.append(
-                {"size": dose.size, "seed": dose.seed, "what": dose.what, "dose": dose.dose, "risk": risk,
-                 "pinball": loss[dose.label], "success": 100 * own["success"].mean(),
-                 "total_time_s": own["total_time_s"].mean(), "gain": gained[0], "least": least[0], "most": most[0]}
-            )  # fmt: skip
-    every = pd.DataFrame(lines)
-    every.to_csv(out / "doses.csv", index=False)
-    shown = every.groupby(["what", "size", "dose", "risk"]).mean(numeric_only=True).reset_index()
-    printed = Table(*(str(name) for name in shown.columns if name != "seed"))
-    for _, line in shown.drop(columns="seed").iterrows():
-        printed.add_row(*(f"{value:.4g}" if isinstance(value, float) else str(value) for value in line))
-    Console(width=160).print(printed)
 
 
 def compare_methods(out: Path, part: str, places: dict[tuple[str, int], Path], data: Path) -> pd.DataFrame:
@@ -271,44 +200,6 @@ def compare_methods(out: Path, part: str, places: dict[tuple[str, int], Path], d
     return pd.concat(tables, ignore_index=True)
 
 
-def print_quality(title: str, table: pd.DataFrame, against: str = "") -> None:
-    """Prints means over seeds with the half width of their t interval; with `against`, differences to that method."""
-    shown = [name for name in SHOWN if name in table and table[name].notna().any()]
-    wide = table.set_index(["split", "method", "seed"])[shown]
-    if against:
-        wide = wide - wide.xs(against, level="method").reindex(wide.index.droplevel("method")).set_axis(
-            wide.index
-        )
-    printed = Table("split", "method", *shown, title=title)
-    for (split, method), own in wide.groupby(level=["split", "method"], sort=False):
-        half = t.ppf(0.975, len(own) - 1) * own.std() / len(own) ** 0.5 if len(own) > 1 else own.std()
-        cells = (f"{own[name].mean():.4f} ±{half[name]:.4f}" for name in shown)
-        printed.add_row(str(split), str(method), *cells)
-    Console(width=240).print(printed)
-
-
-def report_zoo(out: Path, rows: pd.DataFrame, table: pd.DataFrame) -> None:
-    """Prints success of every method, against the fused model, and how it ranks with each score."""
-    rows = rows.assign(method=rows["model"].str.rsplit("-s", n=1).str[0])
-    success = 100 * rows.pivot_table(index="method", columns="map", values="success")
-    lines = Table(
-        "method", "success [%]", "− fused", "interval", title="success, both risk settings, all seeds"
-    )
-    for method, own in success.iterrows():
-        mean, low, high = mean_interval((own - success.loc["fused"]).to_numpy()[None])
-        lines.add_row(str(method), f"{own.mean():.2f}", f"{mean[0]:+.2f}", f"{low[0]:+.2f} to {high[0]:+.2f}")
-    Console(width=120).print(lines)
-    quality = table[(table["split"] == SPLIT) & ~table["privileged"]].groupby("method")[list(SCORES)].mean()
-    quality["success"] = success.mean(1)
-    quality.to_csv(out / "zoo-ranks.csv")
-    for name in SCORES:
-        both = quality[[name, "success"]].dropna()
-        tau, p = kendalltau(both[name], both["success"])
-        print(
-            f"exploratory: Kendall's τ of {name} and success over {len(both)} methods {tau:+.2f}, p = {p:.3f}"
-        )
-
-
 def digest() -> str:
     """SHA-256 of the hypothesis."""
     return hashlib.sha256(HYPOTHESIS.read_bytes()).hexdigest()
@@ -325,7 +216,8 @@ def run_doses(out: Path, maps: int, draws: int, sizes: list[int], seeds: list[in
     models = list(doses(sizes, seeds))
     train(out, sizes, seeds)
     loss = measure(out, models, maps)
-    report(out, drive(out, "run", [part_of(out, dose) for dose in models], maps, draws), loss, models)
+    rows = drive(out, "run", [part_of(out, dose) for dose in models], maps, draws)
+    report_doses(out, rows, loss, models, digest())
 
 
 def run_zoo(out: Path, maps: int, draws: int, sizes: list[int], seeds: list[int]) -> None:
