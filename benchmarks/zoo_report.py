@@ -128,7 +128,6 @@ def draw_doses(table: pd.DataFrame) -> Figure:
         panels = figure.subplots(1, len(RISKS), sharey=True)
         largest = table["training maps"].max()
         kinds = {
-            "training maps": table[(table["dose"] == 1) & (table["what"] == "temperature")],
             **{
                 f"temperature, {size} maps": table[
                     (table["what"] == "temperature") & (table["training maps"] == size)
@@ -141,10 +140,15 @@ def draw_doses(table: pd.DataFrame) -> Figure:
             },
         }
         for panel, risk in zip(panels, RISKS, strict=True):
-            for (name, own), marker in zip(kinds.items(), "so^vDPX", strict=False):
+            for (name, own), marker in zip(kinds.items(), "o^vDPX", strict=False):
                 panel.plot(
                     own["pinball"], own[f"success {risk}"], marker, label=name, markersize=5, alpha=0.8
                 )
+            trained = table[table["dose"] == 1]
+            panel.plot(
+                trained["pinball"], trained[f"success {risk}"], "o", markersize=10, markerfacecolor="none",
+                markeredgecolor="0.2", label="as trained",
+            )  # fmt: skip
             panel.set(title=risk, xlabel="pinball loss of the lower fifth")
         panels[0].set_ylabel("success [%]")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", frameon=False)
