@@ -68,6 +68,17 @@ def report_doses(out: Path, rows: pd.DataFrame, loss: pd.Series, models: list[Do
         mean, low, high = mean_interval(own[None])
         said = f"{0.1 * mean[0]:+.3f} ({0.1 * low[0]:+.3f} to {0.1 * high[0]:+.3f}) points per 0.001"
         print(f"exploratory: {label}, {len(chosen)} models: {said}, two-sided p = {flipped(own, 0):.4f}")
+    for one, other in contrasts(models):
+        labels = [
+            [dose.label for dose in models if (dose.size, dose.what, dose.dose) == key]
+            for key in (one, other)
+        ]
+        gain = 100 * (table.loc[labels[0]].mean(0) - table.loc[labels[1]].mean(0)).to_numpy()
+        mean, low, high = mean_interval(gain[None])
+        said = f"{mean[0]:+.1f} points ({low[0]:+.1f} to {high[0]:+.1f}), p = {flipped(gain, 0):.4f}"
+        print(
+            f"exploratory: {one} − {other}: {said}; loss {loss[labels[0]].mean() - loss[labels[1]].mean():+.4f}"
+        )
     every = doses_table(rows, table, loss, models)
     every.to_csv(out / "doses.csv", index=False)
     print_frame("success and time against dose, over seeds", every)
@@ -91,6 +102,14 @@ def exploratory(models: list[Dose]) -> Iterator[tuple[str, list[str]]]:
     yield "without brightness", [dose.label for dose in models if dose.what != "brightness"]
     for seed in sorted({dose.seed for dose in models}):
         yield f"seed {seed}", [dose.label for dose in models if dose.seed == seed]
+
+
+def contrasts(models: list[Dose]) -> Iterator[tuple[tuple[int, str, float], tuple[int, str, float]]]:
+    """Pairs of doses on both sides of what was trained: too cautious and too bold, too sure and too vague."""
+    sizes = sorted({dose.size for dose in models})
+    yield (sizes[-1], "soft", 2.0), (sizes[-1], "soft", 0.0)
+    for size in sizes:
+        yield (size, "temperature", 0.25), (size, "temperature", 4.0)
 
 
 def doses_table(rows: pd.DataFrame, table: pd.DataFrame, loss: pd.Series, models: list[Dose]) -> pd.DataFrame:
