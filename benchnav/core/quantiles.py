@@ -5,8 +5,10 @@ Mean, VaR and CVaR are then weighted sums of the x_i, and the expected time and 
 Letters in shapes: Q levels, H×W cells, *B any leading dimensions.
 """
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import numpy as np
 import torch
@@ -44,14 +46,14 @@ class QuantileDistribution(TraversabilityDistribution):
 
     def __post_init__(self) -> None:
         """Checks the levels and the shape; that values ascend takes a look at all of them, which `check_model` does."""
-        levels = np.array(self.levels, dtype=np.float64)
-        steps = np.diff(levels)
+        levels = self.levels  # plain numbers: PyTorch, as it writes a graph, would follow an array
+        steps = [upper - lower for lower, upper in pairwise(levels)]
         expect(
-            len(levels) >= _LEAST_LEVELS and levels[0] == 0 and levels[-1] == 1 and bool((steps > 0).all()),
+            len(levels) >= _LEAST_LEVELS and levels[0] == 0 and levels[-1] == 1 and min(steps) > 0,
             f"`levels` that ascend from 0 to 1, {_LEAST_LEVELS} or more, got {len(levels)}. "
             "`benchnav.core.quantiles.LEVELS` are such.",
         )
-        widest = float(steps[levels[:-1] < _TAIL - 1e-9].max())
+        widest = max(step for step, lower in zip(steps, levels, strict=False) if lower < _TAIL - 1e-9)
         expect(
             widest <= _TAIL_STEP + 1e-9,
             f"`levels` at most {_TAIL_STEP} apart up to {_TAIL}, where risk is, got {widest:.3g}. Take more there.",
@@ -88,12 +90,18 @@ class QuantileDistribution(TraversabilityDistribution):
 
     def quantile(self, probability: Tensor | float) -> Tensor:
         """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the base."""
-        share = torch.as_tensor(probability, dtype=torch.float64, device=self.device).clamp(0, 1)
+        if not isinstance(probability, Tensor):
+            plain = min(max(float(probability), 0.0), 1.0)
+            after = min(max(bisect_left(self.levels, plain), 1), len(self.levels) - 1)
+            before, behind = self.levels[after - 1 : after + 1]
+            low, high = (self.values.select(-3, place).double() for place in (after - 1, after))
+            return torch.lerp(low, high, (plain - before) / (behind - before)).to(self.dtype)
+        share = probability.to(torch.float64).clamp(0, 1)
         knots, levels = self._knots(), self._levels()
         at = share.expand(self.shape).unsqueeze(-1).contiguous()
         upper = torch.searchsorted(levels, at).clamp(1, len(levels) - 1)
-        low, high = levels[upper - 1], levels[upper]
-        found = torch.lerp(knots.gather(-1, upper - 1), knots.gather(-1, upper), (at - low) / (high - low))
+        part = (at - levels[upper - 1]) / (levels[upper] - levels[upper - 1])
+        found = torch.lerp(knots.gather(-1, upper - 1), knots.gather(-1, upper), part)
         return found.squeeze(-1).to(self.dtype)
 
     def mean(self) -> Tensor:
@@ -166,5 +174,6 @@ def quantiles_at(
     Returns:
         Of shape [*B, H, W].
     """
-    values = torch.stack([distribution.quantile(read) for read in reads], -3).clamp(0, 1)
-    return QuantileDistribution(values.cummax(-3).values, levels)  # rounding may have changed the order
+    values = (distribution.quantile(read).clamp(0, 1) for read in reads)
+    ascending = list(accumulate(values, torch.maximum))  # rounding may have changed the order
+    return QuantileDistribution(torch.stack(ascending, -3), levels)

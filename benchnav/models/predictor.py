@@ -91,11 +91,12 @@ def load_model(source: Source) -> TraversabilityModel:
         if checkpoint.model == FUSED and CLASSIFIER not in checkpoint.parts:
             refuse_unfinished(part, checkpoint.parts)
         return open_checkpoint(checkpoint)
-    expect(
-        not is_family(registry.find("model", part.part).target),
-        f"a model, got {part.part!r}, which is a family of models. "
-        "Name a checkpoint of it, by its path if it bears the same name.",
-    )
+    if is_family(registry.find("model", part.part).target):
+        there = next((path for path in list_checkpoints() if path.name == part.part), None)
+        how = f"path: {there}" if there else "name or path, a class of your own as FILE.py:Class@CHECKPOINT"
+        raise ConfigError(
+            f"Expected a model, got {part.part!r}, which is a family of models. Name a checkpoint of it, by its {how}."
+        )
     return registry.make("model", part)
 
 

@@ -78,6 +78,7 @@ MODELS = {
     "mdn calibrated": lambda: small("mdn", temperature=1.3),
     "mean_variance": lambda: small("mean_variance"),
     "quantile": lambda: small("quantile"),
+    "quantile calibrated": lambda: small("quantile", temperature=1.3),
     "mc_dropout": lambda: small("mc_dropout", masks=3),
 }
 

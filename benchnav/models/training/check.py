@@ -1,8 +1,10 @@
 """What is refused before anything is trained: inputs, maps, settings of the trainer, and hooks that do not fit."""
 
 import json
+import traceback
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,6 +13,7 @@ from torch import Tensor
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import BenchnavError, ConfigError, expect
 from benchnav.core.settings import call, of, one_line, read
+from benchnav.core.shipped_files import PACKAGE
 from benchnav.core.terrain import take_cells
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import predict_observation
@@ -159,7 +162,11 @@ def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
     expect(got == "shape []", f"`configure_losses` of {name} to give a loss that is one number, got {got}.")
     device = maps[network.target].device
     expect(loss.device == device, f"a loss of {name} on {device}, got one on {loss.device}.")
-    expect(bool(loss.isfinite()), f"`configure_losses` of {name} to give a finite loss, got {loss.item()}.")
+    seen = bool(maps[network.target].isfinite().any())
+    hint = "" if seen else " λ, NaN where it was not observed, is so in the whole batch."
+    expect(
+        bool(loss.isfinite()), f"`configure_losses` of {name} to give a finite loss, got {loss.item()}.{hint}"
+    )
     expect(
         loss.requires_grad, f"a loss of {name} that has a gradient, got one without. Use the outputs in it."
     )
@@ -195,6 +202,9 @@ def check_distribution(given: Any, shape: tuple[int, ...], device: torch.device,
         isinstance(given, TraversabilityDistribution),
         f"{where} a TraversabilityDistribution, got {type(given).__name__}.",
     )
+    expect(
+        is_dataclass(given), f"{where} a frozen dataclass of maps, got {type(given).__name__}, which is none."
+    )
     expect(tuple(given.shape) == shape, f"{where} one of shape {list(shape)}, got {list(given.shape)}.")
     expect(given.device == device, f"{where} one on {device}, got one on {given.device}.")
     mean = given.mean()
@@ -202,15 +212,29 @@ def check_distribution(given: Any, shape: tuple[int, ...], device: torch.device,
         bool(((mean >= 0) & (mean <= 1)).all()),
         f"{where} means of λ in [0, 1], got some outside or not a number.",
     )
+    ranks = torch.stack([given.quantile(share).double() for share in (0.01, 0.2, 0.5, 0.8, 0.99)])
+    expect(
+        bool((ranks.diff(dim=0) >= -1e-6).all() and (ranks[0] >= 0).all() and (ranks[-1] <= 1).all()),
+        f"{where} one whose `quantile` ascends within [0, 1], got another. `benchnav.testing.check_model` tells more.",
+    )
+    shares = torch.stack([given.cdf(value).double() for value in (0.0, 0.2, 0.5, 0.8, 1.0)])
+    expect(
+        bool((shares.diff(dim=0) >= -1e-6).all() and (shares[-1] == 1).all()),
+        f"{where} one whose `cdf` ascends to 1 at λ = 1, got another. `benchnav.testing.check_model` tells more.",
+    )
 
 
 def _unfit(network: TrainableNetwork, maps: Mapping[str, Tensor], error: Exception) -> ConfigError:
-    """Says of a network, by architecture and encoder where it has them, that it does not take some maps."""
+    """Says what a batch of maps raised: where in the file of the class, or of which architecture and encoder."""
     config, (batch, height, width) = network.config, maps[network.target].shape
-    what = type(network).__name__
+    what, remedy = type(network).__name__, "Choose another."
     if hasattr(config, "architecture") and hasattr(config, "encoder"):
         what = f"{config.architecture} of {config.encoder}"
+    frames = traceback.extract_tb(error.__traceback__)
+    if own := [at for at in frames if "site-packages" not in at.filename and str(PACKAGE) not in at.filename]:
+        at, what = own[-1], type(network).__name__
+        remedy = f"See {Path(at.filename).name}, line {at.lineno}, in `{at.name}`."
     return ConfigError(
         f"Expected a network that takes batches of {batch} maps of {height}×{width} cells, got {what}, which does not: "
-        f"{one_line(error)} Choose another."
+        f"{one_line(error).rstrip('.')}. {remedy}"
     )

@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+from scipy.special import ndtr, ndtri
 from torch import Tensor, nn
 
 from benchnav.core.distribution import TraversabilityDistribution
@@ -75,8 +76,7 @@ class QuantileModel(JoinedModel):
         """Applies the temperature T: quantiles at u are those that were at Φ(T·Φ⁻¹(u))."""
         if self.temperature == 1:
             return distribution
-        scores = torch.special.ndtri(torch.tensor(_ALL, dtype=torch.float64))
-        reads = torch.special.ndtr(self.temperature * scores)
+        reads = ndtr(self.temperature * ndtri(_ALL))
         return quantiles_at(distribution, reads.tolist(), _ALL)
 
 

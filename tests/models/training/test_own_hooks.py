@@ -31,6 +31,41 @@ def with_hook(code: str) -> None:
     Path("own.py").write_text(text)
 
 
+DISTRIBUTIONS = """
+
+from benchnav.core.distribution import TraversabilityDistribution
+
+
+@dataclass(frozen=True)
+class Own(TraversabilityDistribution):
+    mean_: Tensor
+    std_: Tensor
+    falls: bool = False
+
+    @property
+    def shape(self):
+        return self.mean_.shape
+
+    def cdf(self, value):
+        share = torch.as_tensor(value) + torch.zeros_like(self.mean_)
+        return 1 - share if self.falls else share
+
+    def quantile(self, probability):
+        share = torch.as_tensor(probability) + torch.zeros_like(self.mean_)
+        return share if self.falls else 1 - share
+
+    def mean(self):
+        return torch.full_like(self.mean_, 0.5)
+
+
+class Plain(TraversabilityDistribution):
+    def __init__(self, values):
+        self.values = values
+
+    shape = property(lambda self: self.values.shape)
+    cdf = quantile = lambda self, value: value + torch.zeros_like(self.values)
+"""
+
 BROKEN = {
     "shape": ("return (scores * seen).sum() / seen.sum().clamp(min=1)", "return scores",
         "a loss that is one number, got shape"),
@@ -43,8 +78,14 @@ BROKEN = {
                              "TraversabilityMixture(*(v[..., 1:] for v in (torch.ones_like(mean), mean, std)))",
                              r"to give one of shape \[2, 32, 32\], got \[2, 32, 31\]"),
     "means": ("mean, std)\n\n", "mean, std * torch.nan)\n\n", r"means of λ in \[0, 1\]"),
+    "quantiles": ("return TraversabilityMixture(torch.ones_like(mean), mean, std)", "return Own(mean[:, 0], std[:, 0])",
+                  "one whose `quantile` ascends"),
+    "falling cdf": ("return TraversabilityMixture(torch.ones_like(mean), mean, std)",
+                    "return Own(mean[:, 0], std[:, 0], falls=True)", "one whose `cdf` ascends to 1"),
+    "no dataclass": ("return TraversabilityMixture(torch.ones_like(mean), mean, std)", "return Plain(mean[:, 0])",
+                     "a frozen dataclass of maps, got Plain"),
     "raises": ("hidden = self.config.hidden", "hidden = self.config.width",
-        "'CellConfig' object has no attribute 'width'"),
+        r"no attribute 'width'. See own.py, line \d+, in `configure_network`."),
     "no super": ("super().__init__(config)", "pass", r"call super\(\).__init__\(config\)"),
     "device": ("return (scores * seen).sum() / seen.sum().clamp(min=1)", "return scores.sum().to('meta')",
         "on cpu, got one on meta"),
@@ -61,7 +102,7 @@ def test_a_hook_that_does_not_fit_is_refused_before_anything_is_trained(
     old, new, expected = BROKEN[fault]
     text = EXAMPLE.read_text()
     assert old in text
-    Path("own.py").write_text(text.replace(old, new))
+    Path("own.py").write_text(text.replace(old, new) + DISTRIBUTIONS)
     assert call("train", "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 2
     (line,) = capfd.readouterr().err.strip().splitlines()
     assert re.search(expected, line)
