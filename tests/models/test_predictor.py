@@ -220,6 +220,9 @@ def test_a_model_whose_training_was_interrupted_is_told_with_the_command_to_go_o
         with pytest.raises(CheckpointError, match="training was interrupted") as caught:
             load_model(source)
         assert f"`benchnav-train {command}`" in str(caught.value)
+    save_checkpoint("checkpoints/mdn", replace(whole, model="mdn"))
+    with pytest.raises(ConfigError, match="Name a checkpoint of it, by its path: checkpoints/mdn"):
+        load_model("mdn")
     # A finished training has left its logs; a member that joins an ensemble may still be trained.
     Path("checkpoints/whole.training/classifier-2").mkdir()
     save_checkpoint("checkpoints/whole", whole)

@@ -1,27 +1,22 @@
 """What a user's model may not do is told in one line, before anything is trained where it can be."""
 
 import re
-import shutil
 from pathlib import Path
 
 import pytest
 import torch
 
+from benchnav.core.errors import ConfigError
+from benchnav.core.sources import load_file
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.nets.trainable import TrainableNetwork
+from benchnav.models.training.check import fields_of, try_network
+from benchnav.models.training.data import MapDataset
 from tests.commands import call
+from tests.models.training.conftest import EXAMPLE
 
-EXAMPLE = Path(__file__).parents[3] / "examples" / "own_model.py"
 QUICK = ("--trainer.precision", "32-true", "--trainer.max_epochs", "1", "--settings.batch_size", "5")
-
-
-@pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder to work in, with the example in it."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copy(EXAMPLE, "own.py")
-    return tmp_path
 
 
 def with_hook(code: str) -> None:
@@ -248,3 +243,15 @@ def test_what_an_epoch_draws_hangs_on_seed_and_epoch(
         assert call("train", *where, "--out", out, "--seed", seed) == 0
     assert len({*seeds[:6]}) == 6
     assert seeds[6:] == seeds[:3]
+
+
+def test_a_loss_that_divides_by_no_cell_is_told_why(own: Path, dataset: TerrainDataset) -> None:
+    text = EXAMPLE.read_text().replace("seen.sum().clamp(min=1)", "seen.sum()")
+    network = load_file(own / "own.py", text.encode()).CellModel().build()
+    maps = MapDataset(dataset.path, "train", fields_of(network)).read([0, 1])
+    try_network(network, maps)
+    unseen = {**maps, "traversability": torch.full_like(maps["traversability"], torch.nan)}
+    with pytest.raises(
+        ConfigError, match=r"got nan\. λ, NaN where it was not observed, is so in the whole batch"
+    ):
+        try_network(network, unseen)

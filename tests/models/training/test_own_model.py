@@ -23,17 +23,9 @@ from benchnav.models.training.data import MapDataset
 from benchnav.models.training.fit import KeepBest
 from benchnav.testing import check_model
 from tests.commands import call
+from tests.models.training.conftest import EXAMPLE
 
-EXAMPLE = Path(__file__).parents[3] / "examples" / "own_model.py"
 QUICK = ("--trainer.precision", "32-true", "--trainer.max_epochs", "3", "--settings.batch_size", "5")
-
-
-@pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder to work in, with the example in it."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copy(EXAMPLE, "own.py")
-    return tmp_path
 
 
 @pytest.fixture(scope="module")
