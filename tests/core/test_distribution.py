@@ -22,6 +22,9 @@ LAWS = {
     "wide and narrow": mixture(3, 0.0005, 0.5, seed=1),
     "points": mixture(3, 1e-9, 1e-8),
     "many": mixture(6, 0.01, 0.3),
+    "20 needles": mixture(20, 1e-3, 2e-3),
+    "20 points": mixture(20, 1e-9, 1e-8),
+    "50 points": mixture(50, 1e-9, 1e-8),
     "quantiles": quantiles(),
     "other quantiles": quantiles(1),
 }
