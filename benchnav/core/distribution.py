@@ -45,8 +45,8 @@ class TraversabilityDistribution(Batch, ABC):
     """The distribution of λ in each cell of a map: the base class of what models predict and beliefs hold.
 
     A subclass is a frozen dataclass whose tensors are maps, of shape [*B, H, W] or [*B, K, H, W] for any K, and gives
-    `shape`, `cdf` and `quantile`. What the base makes of these is within 10⁻⁴, of `expected_time` relative to it (tested up to
-    50 atoms a cell), and has no gradient.
+    `shape`, `cdf` and `quantile`. What the base makes of these is within 10⁻⁴, of `expected_time` relative to it
+    (tested up to 50 atoms a cell), and has no gradient.
     """
 
     @property
@@ -368,7 +368,7 @@ def _integral(
 def _trapezia(
     function: Callable[[Tensor], Tensor], edges: Tensor, first: Tensor, last: Tensor, rounds: int
 ) -> tuple[Tensor, Tensor]:
-    """The integral, and its doubt: the whole of intervals with a jump, little of smooth ones; both of shape [b, h, w]."""
+    """The integral, and its doubt, most of it of intervals with a jump in them; both of shape [b, h, w]."""
     values = torch.cat((first[None], function(edges[1:-1]), last[None]))
     # A lane halves one of its intervals a time, and hands one half to the next lane, so that all find work.
     filled = _FIRST // _AT_ONCE
