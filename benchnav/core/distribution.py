@@ -360,8 +360,8 @@ def _integral(
     unsure = doubt > _MOST_DOUBT
     if unsure.any():
         rest = partial(curve, _stacked(own.at(unsure)._in_members()))
-        parts = (part[..., unsure][..., None, None, :] for part in (edges, first, last))
-        total[unsure] = _trapezia(rest, *parts, rounds * _MORE)[0].flatten()
+        begins, low, high = (part[..., unsure][..., None, None, :] for part in (edges, first, last))
+        total[unsure] = _trapezia(rest, begins, low, high, rounds * _MORE)[0].flatten()
     return total
 
 
