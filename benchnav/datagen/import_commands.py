@@ -152,7 +152,9 @@ def _import(
 
     path = output_path(options.out)
     name = options.id or name_of(path)
-    chosen = datagen.load_recipe(options.recipe, [f"id={name}", *overrides] if overrides else [])
+    scenario = settings.get("scenario", "std")
+    used = f"splits={{imported: {{scenario: {scenario}, maps: 1}}}}"  # so that others need not fit the maps
+    chosen = datagen.load_recipe(options.recipe, [f"id={name}", used, *overrides] if overrides else [])
     if options.id or not overrides:
         chosen = replace(chosen, id=name)
     steps = import_maps(

@@ -18,6 +18,7 @@ def card_of(
     classes: Sequence[str],
     code: str,
     conformal_maps: int = 0,
+    pool_temperature: float = 1.0,
 ) -> str:
     """Writes the card of a checkpoint.
 
@@ -28,6 +29,7 @@ def card_of(
         classes: names of the terrain classes.
         code: digest of the code of a user's own class; empty where it is ours.
         conformal_maps: by how many maps it has been recalibrated; 0 where it has not.
+        pool_temperature: of the average of its members.
 
     Returns:
         Markdown, with the front matter that model hubs read.
@@ -38,7 +40,7 @@ def card_of(
     place = f"path/to/file.py:{model}@{name}" if is_own else name
     own = (
         f"The class `{model}` is a user's own and not in this folder: name the file that holds it. The "
-        f"SHA-256 of its code was `{code}`.\n\n"
+        f"SHA-256 of its code was `{code}`. Loading runs that file.\n\n"
         if is_own
         else ""
     )
@@ -52,7 +54,8 @@ def card_of(
     return (
         f"---\n{yaml.safe_dump(head, sort_keys=False)}---\n\n# {name}\n\n"
         f"A model of traversability of the kind `{model}`, trained on {' and '.join(datasets)}. It predicts "
-        "the distribution of traversability in every cell of a map. Reading it runs no code.\n\n"
+        f"the distribution of traversability in every cell of a map.{_members(parts, pool_temperature)} This folder "
+        "holds tensors and settings, and no code.\n\n"
         f"```sh\nbenchnav-train evaluate {place} --data DATASET\n"
         f"benchnav-eval run --model {place} --data DATASET\n```\n\n"
         f"```python\nfrom benchnav.models import load_model\n\nmodel = load_model({place!r})\n```\n\n"
@@ -61,6 +64,15 @@ def card_of(
         "digests of data and tensors, and the versions of the packages. No licence is given here: add one before you "
         "share it.\n"
     )
+
+
+def _members(parts: Mapping[str, Any], temperature: float) -> str:
+    """Of an ensemble, of how many networks it is made."""
+    count = sum(name.partition("-")[2] != "" for name in parts) + 1
+    if count == 1:
+        return ""
+    widened = "" if temperature == 1 else f", and widened by the temperature {temperature:.3g}"
+    return f" It is an ensemble: what its {count} networks predict is averaged{widened}."
 
 
 def _parts_table(parts: Mapping[str, Any]) -> str:
@@ -78,8 +90,10 @@ def _parts_table(parts: Mapping[str, Any]) -> str:
 
 def _settings_table(parts: Mapping[str, Any]) -> str:
     first = {name.partition("-")[0]: part for name, part in reversed([*parts.items()])}
-    rows = [
-        (stem, setting, str(value)) for stem, part in sorted(first.items()) for setting, value in part.config.items()
-        if setting not in ("steepest_deg",)
-    ]  # fmt: skip
+    rows = []
+    for stem, part in sorted(first.items()):
+        for setting, value in part.config.items():
+            shown = list(value) if isinstance(value, tuple) else value
+            if setting != "steepest_deg":
+                rows.append((stem, setting, str(shown)))
     return to_markdown(Table(title="", headings=("part", "setting", "value"), rows=tuple(rows)))

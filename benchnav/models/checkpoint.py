@@ -329,6 +329,7 @@ def _write(folder: Path, checkpoint: Checkpoint, name: str) -> None:
                 checkpoint.class_names,
                 checkpoint.code,
                 checkpoint.conformal.get("maps", 0),
+                checkpoint.pool_temperature,
             ),
         )
     write_text(folder / CONFIG, seal(config) + "\n")

@@ -30,8 +30,8 @@ def fit(
 
     Args:
         options: How.
-        model: NAME of a model that can be trained, such as fused or mdn, path/to/file.py:Class or
-            package.module:Class with a TrainableModel.
+        model: NAME of a model that can be trained (fused, mdn, mean_variance, quantile, evidential, mc_dropout, swag),
+            or path/to/file.py:Class or package.module:Class with a TrainableModel.
         data: Path or id of a dataset with splits train and valid.
         out: Checkpoint folder. Logs go to OUT.training.
         settings: Settings of the model, such as --settings.learning_rate 1e-3 --settings.inputs [rgb,elevation_m];

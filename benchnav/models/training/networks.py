@@ -1,6 +1,7 @@
 """Training networks, whatever they learn: one door for classifiers, trainable models of ours and a user's own."""
 
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 from lightning.pytorch.callbacks import EarlyStopping
@@ -37,6 +38,8 @@ from benchnav.models.training.fit import FitOptions, KeepBest, fit, in_words, is
 from benchnav.models.training.gaussian_processes import train_gps_on_maps
 from benchnav.models.training.target import Target, fresh_checkpoint, open_target
 
+_FEW_MAPS = 19  # with which 1 / (n + 1) is 0.05
+
 
 def find_trainable(source: str, settings: dict[str, Any]) -> Trainable:
     """Finds a trainable model by name, file or module.
@@ -44,12 +47,11 @@ def find_trainable(source: str, settings: dict[str, Any]) -> Trainable:
     Raises:
         ConfigError: there is none of that name, it cannot be trained, or has no such settings.
     """
-    found = registry.find("model", source)
+    found = find_kind(source)
     kind = found.target
     if not (isinstance(kind, type) and issubclass(kind, TrainableModel)):
-        known = [name for name in registry.names("model") if is_trainable(name)]
         raise ConfigError(
-            f"Expected a model that can be trained, {', '.join([FUSED, *known])} or FILE.py:Class with a "
+            f"Expected a model that can be trained, {', '.join(_trainable_names())} or FILE.py:Class with a "
             f"benchnav.models.TrainableModel, got {source!r}, which is none."
         )
     owner, config_kind = f"model {source!r}", config_class(kind)
@@ -69,6 +71,26 @@ def find_trainable(source: str, settings: dict[str, Any]) -> Trainable:
         )
     code = "" if found.shipped else found.digest
     return Trainable(kind=kind, config=config, name=name, family=name, code=code)
+
+
+def find_kind(source: str) -> registry.Found:
+    """Finds the class of a model, by a name only among those that can be trained.
+
+    Raises:
+        ConfigError: there is none, or it cannot be imported.
+    """
+    is_name = not (":" in source or source.endswith(".py") or Path(f"{source}.py").is_file())
+    if is_name and source not in registry.names("model"):
+        names = _trainable_names()
+        raise ConfigError(
+            f"Expected a model that can be trained, {', '.join(names)} or FILE.py:Class, got {source!r}."
+            + registry.hint(source, names)
+        )
+    return registry.find("model", source)
+
+
+def _trainable_names() -> list[str]:
+    return [FUSED, *(name for name in registry.names("model") if is_trainable(name))]
 
 
 def is_trainable(name: str) -> bool:
@@ -93,7 +115,7 @@ def fit_model(
         settings: of the model, plain data by name; of the fused one those of its stages, `classifier` and `gp`.
         members: how many networks there are to be.
     """
-    if registry.find("model", model).target is FusedModel:
+    if find_kind(model).target is FusedModel:
         kinds = {CLASSIFIER: ClassifierConfig, GP: LatentGPConfig}
         unknown = [name for name in settings if name not in kinds]
         expect(not unknown, f"`settings` of {model!r} among {', '.join(kinds)}, got {', '.join(unknown)}.")
@@ -271,4 +293,9 @@ def calibrate_whole(target: Target, trainable: Trainable, dataset: TerrainDatase
     table = conformal_table(model, dataset, options.seed, options.place)
     fifth = table.values[table.levels.index(0.2)]
     say(f"conformal: by {table.maps} maps of {VALID}, the lower fifth is read at level {fifth:.3f}")
+    if table.maps < _FEW_MAPS:
+        least = 1 / (table.maps + 1)
+        say(
+            f"note: levels under 1 / {table.maps + 1} = {least:.2f} give the lowest λ; give {VALID} more maps"
+        )
     target.set_conformal(table.plain())

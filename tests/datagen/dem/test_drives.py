@@ -572,8 +572,9 @@ def test_the_default_splits_are_for_training(
     log_of(drives_over(), dem.parent / "log.csv")
     write(dem.parent / "classes.tif", np.full((HEIGHT, WIDTH), 7, np.uint8), CELL)
     write(dem, np.full((HEIGHT, WIDTH), 5, np.float32), CELL)
-    grid = "height=16 width=24 start_m=[2.2,2.2] goal_m=[9.2,5.2] id=mine"
-    common = f"import-drives log.csv {grid} --dem dem.tif --recipe tiny-v1 --out site --classes classes.tif"
+    # Maps on which the craters of another scenario would have no room.
+    grid = "height=16 width=24 resolution_m=0.5 start_m=[2.2,2.2] goal_m=[9.2,5.2] id=mine"
+    common = f"import-drives log.csv {grid} --dem dem.tif --out site --classes classes.tif"
     assert call("datagen", *shlex.split(common + " --class-ids '{7: gravel}' --solvable")) == 0
     dataset = TerrainDataset("site")
     assert dataset.id == "mine"

@@ -124,9 +124,12 @@ def test_scores_are_the_pit_values_of_the_other_half_drawn_in_atoms(
         assert conformal_table(model, maps, 5, cpu) != table
 
 
-def test_a_users_own_model_is_recalibrated_and_kept(maps: TerrainDataset, tmp_path: Path) -> None:
+def test_a_users_own_model_is_recalibrated_and_kept(
+    maps: TerrainDataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "mine"
     fit_model(HOW, OWN, str(maps.path), str(out), {"max_epochs": 1, "batch_size": 2})
+    assert "note: levels under 1 / 4 = 0.25 give the lowest λ" in capsys.readouterr().out
     model = load_model(f"{OWN}@{out}")
     assert isinstance(model, ConformalModel)
     assert not isinstance(model.model, Ensemble)
@@ -137,7 +140,9 @@ def test_a_users_own_model_is_recalibrated_and_kept(maps: TerrainDataset, tmp_pa
     at = model.table.values[model.table.levels.index(0.5)]
     torch.testing.assert_close(found.quantile(0.5), model.model.predict(seen).quantile(at))
     check_model(f"{OWN}@{out}", shapes=((20, 37),))
-    assert "recalibrated by 3 maps" in (out / "README.md").read_text()
+    card = (out / "README.md").read_text()
+    assert "recalibrated by 3 maps" in card
+    assert "ensemble" not in card
     assert json.loads((out / "config.json").read_text())["conformal"]["maps"] == 3
 
 

@@ -173,7 +173,7 @@ def test_a_class_of_a_name_that_is_ours_is_refused(
         ),
         (["own.py:CellMode"], "Did you mean 'CellModel'"),
         (["oracle"], "got 'oracle'"),
-        (["mdm"], "Did you mean 'mdn'"),
+        (["mdm"], "can be trained, fused, evidential, .* or FILE.py:Class, got 'mdm'. Did you mean 'mdn'"),
         (["mdn", "--settings.architecture", "unett"], "unett"),
         (["mdn", "--settings.encoder", "resnet19"], "resnet19"),
         (["mdn", "--settings.encoder", "tu-hf-hub:someone/net"], "got 'tu-hf-hub:someone/net'"),

@@ -54,7 +54,11 @@ def test_it_is_trained_calibrated_and_kept_as_data(trained: Path, dataset: Terra
     assert "own.py" not in text  # what is kept names no file to import
     card = (trained / "c" / "README.md").read_text()
     assert "path/to/file.py:CellModel@c" in card
-    assert "elevation_m" in card
+    assert "| inputs | ['rgb', 'slope_deg', 'elevation_m'] |" in card
+    assert "SHA-256 of its code was" in card
+    assert "Loading runs that file." in card
+    assert "It is an ensemble: what its 2 networks predict is averaged" in card
+    assert ("widened by the temperature" in card) == (kept.pool_temperature != 1)
 
 
 def test_layers_are_scaled_by_the_training_maps(trained: Path, dataset: TerrainDataset) -> None:

@@ -21,7 +21,7 @@ from benchnav.core.figures import (
     stack_panels,
     styled,
 )
-from benchnav.models.quality.compare.paired import COVERAGE, MEASURES
+from benchnav.models.quality.compare.paired import COVERAGE, HIGHER, LOWER, MEASURES
 from benchnav.models.quality.map_sums import MapTally
 
 _GREYS = ("0.35", "0.6")
@@ -30,6 +30,7 @@ _LEAST_WIDTH_IN = 4.4
 _LINE_IN, _ROW_IN = 0.075, 0.16  # of a mark, and at least of a model
 _AT_SEVERITY = ("crps", "pinball")
 _MARKED_EVERY = 4
+_BETTER = dict.fromkeys(HIGHER, " ↑") | dict.fromkeys(LOWER, " ↓")
 
 Looks = Mapping[str, Mapping[str, Any]]
 Tallies = Mapping[tuple[str, str], MapTally]
@@ -74,7 +75,7 @@ def measures_figure(
     figure = Figure(figsize=(TWO_COLUMNS_IN, down * high + 0.35), layout="constrained")
     panels = [panel for (panel,) in stack_panels(figure, len(shown), across, sharey=True)]
     for panel, name in zip(panels, shown, strict=True):
-        panel.set_title(headings[name], parse_math=False)
+        panel.set_title(headings[name] + _BETTER.get(name, ""), parse_math=False)
         for place, split in enumerate(splits):
             rows = summary[summary["split"] == split].set_index("model").reindex(models)
             y = np.arange(len(models)) + 0.7 * ((place + 0.5) / len(splits) - 0.5)

@@ -52,7 +52,7 @@ HEADINGS = {
         "median time of the prediction of one map alone in milliseconds.",
     ),
     "parameters": (
-        "param-\neters",
+        "parameters\n",
         "number of weights of all networks of the model.",
     ),
 }  # fmt: skip
@@ -62,7 +62,8 @@ PRIVILEGED_MARK = " †"
 FIGURES = {
     "measures": (
         "Measures with their intervals",
-        "A row a model; marks are splits, and lines 95 % intervals over maps. Names in grey are of privileged models.",
+        "A row a model; marks are splits, and lines 95 % intervals over maps. ↑: higher is better, ↓: lower is. Names "
+        "in grey are of privileged models, which see what no model does.",
     ),
     "calibration": (
         "Whether the predicted distributions of λ can be trusted",

@@ -51,7 +51,9 @@ def test_marks_and_lines_are_the_measures_and_their_intervals(tallies: Tallies) 
         [summarise(split, {name: tallies[split, name].sums() for name in MODELS}) for split in SPLITS]
     )
     figure = measures_figure(summary, HEADINGS, model_looks(MODELS, ["oracle"]), ["oracle"])
-    axes = panel(figure, "crps")
+    axes = panel(figure, "crps ↓")
+    titles = [axes.get_title() for axes in figure.axes]
+    assert {"accuracy ↑", "ause ↓", "width"} < set(titles)
     marks = {line.get_label(): line.get_xdata() for line in axes.lines}
     for split in SPLITS:
         wanted = summary[summary["split"] == split].set_index("model")["crps"].reindex(MODELS)
