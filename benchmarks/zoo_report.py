@@ -193,7 +193,12 @@ def print_quality(title: str, table: pd.DataFrame, against: str = "") -> None:
     printed = Table("split", "method", *shown, title=title)
     for (split, method), own in wide.groupby(level=["split", "method"], sort=False):
         half = t.ppf(0.975, len(own) - 1) * own.std() / len(own) ** 0.5 if len(own) > 1 else own.std()
-        cells = (f"{own[name].mean():.4f} ±{half[name]:.4f}" for name in shown)
+        cells = (
+            f"{own[name].mean():.4f}" + (f" ±{half[name]:.4f}" if len(own) > 1 else "")
+            if own[name].notna().any()
+            else "–"
+            for name in shown
+        )
         printed.add_row(str(split), str(method), *cells)
     Console(width=240).print(printed)
 

@@ -174,7 +174,8 @@ def test_a_training_of_other_settings_is_not_gone_on_with(
 ) -> None:
     config = replace(SMALL, **other) if isinstance(other, dict) else SMALL
     options = FitOptions(device="cpu", folder=cut, resume=True, trainer=EXACT)
-    with pytest.raises(CheckpointError, match="to resume it"):
+    name = next(iter(other)) if isinstance(other, dict) else other
+    with pytest.raises(CheckpointError, match=f"to resume it, got another `{name}"):
         fit_network(
             trainable(config), dataset, 2 if other == "seed" else 1, options, half_precision=other == "half"
         )
