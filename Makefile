@@ -7,13 +7,14 @@ LOWEST := .venv-lowest
 # A worker takes up to 2 GB.
 JOBS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
-.PHONY: help demo test test-slow test-lowest bench lint wheel clean
+.PHONY: help demo docs docs-test test test-slow test-lowest bench lint wheel clean
 
 help:
 	@echo "make demo   set up, run a small suite of the shipped model on the shipped maps, write report and playback"
 	@echo "make test   set up, run the tests"
 	@echo "make test-slow  those that take minutes: whole suites with the shipped model"
 	@echo "make test-lowest  the tests with the lowest versions that pyproject.toml allows, set up in $(LOWEST)"
+	@echo "make docs   the documentation as a site in build/site; \`make docs-test\` runs all that its pages show"
 	@echo "make bench  speed, side by side with peers"
 	@echo "make lint   ruff and mypy"
 	@echo "make wheel  the package with the shipped maps and models, in dist/"
@@ -35,6 +36,17 @@ demo: $(STAMP)
 # is compiled is tried in tests of its own.
 test: $(STAMP)
 	OMP_NUM_THREADS=1 TORCH_COMPILE_DISABLE=1 $(BIN)/python -m pytest -n $$(($(JOBS) + 1)) --dist loadfile --no-loadscope-reorder
+
+# A page that is not well-formed, or a link that leads nowhere, fails the build.
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt '.[docs]'
+	$(BIN)/python tools/reference.py docs/reference/commands
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
+
+# Every block of every page, on so many maps where the page has many.
+MAPS ?= 2
+docs-test: $(STAMP)
+	BENCHNAV_DOCS_MAPS=$(MAPS) OMP_NUM_THREADS=1 TORCH_COMPILE_DISABLE=1 $(BIN)/python -m pytest -n $(JOBS) -m docs tests/docs
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -n $(JOBS) -m slow

@@ -1,9 +1,9 @@
-"""Measures the series of shifts `shift-v1` for docs/scenarios.md: its tables and its figures.
+"""Measures the series of shifts `shift-v1` for docs/studies/scenarios.md: its tables and its figures.
 
     .venv/bin/python benchmarks/scenarios.py
 
 takes some minutes on one thread, prints the tables and writes them between the markers of
-docs/scenarios.md, and draws docs/figures/scenarios-*.png. Every statistic is a function of means
+docs/studies/scenarios.md, and draws docs/figures/scenarios-*.png. Every statistic is a function of means
 over maps, so that one bootstrap over maps gives the standard error of each. Letters in shapes: B
 maps, H×W cells, C classes, K numbers a map.
 """

@@ -1,6 +1,6 @@
-"""Writes the tables of docs/results.md and docs/risk.md from the runs that they are of.
+"""Writes the tables of docs/studies/results.md and docs/studies/risk.md from the runs that they are of.
 
-    python benchmarks/tables.py docs/risk.md            # reads runs/NAME; --runs FOLDER for others
+    python benchmarks/tables.py docs/studies/risk.md            # reads runs/NAME; --runs FOLDER for others
 
 A table stands between `<!-- KIND RUN -->` and `<!-- end -->`; one whose run is not there stays as it is. Kinds:
 

@@ -1,4 +1,4 @@
-"""Draws one map under the tints that docs/scenarios.md shows.
+"""Draws one map under the tints that docs/studies/scenarios.md shows.
 
     .venv/bin/python benchmarks/tints.py
 

@@ -132,7 +132,7 @@ def test_no_public_name_is_that_of_a_commands_function(name: str) -> None:
 
 
 EXAMPLES = [*ROOT.glob("examples/*.py"), ROOT / "docs" / "risk" / "off_by.py"]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md")]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]
 
 
 def imported_from(code: str) -> set[str]:

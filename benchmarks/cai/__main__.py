@@ -4,7 +4,7 @@
     python -m benchmarks.cai --density 0.4 1.0 --out trials.csv    # some of it
     python -m benchmarks.cai --setup.risk_map histogram            # with a choice of theirs
 
-What is theirs, what is ours and what differs is said in `docs/validation.md`.
+What is theirs, what is ours and what differs is said in `docs/studies/validation.md`.
 """
 
 import sys

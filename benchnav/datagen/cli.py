@@ -282,21 +282,23 @@ def _opened(file: str) -> "datagen.TerrainDataset":
     return datagen.TerrainDataset(datagen.find_dataset(file))
 
 
+COMMANDS = {
+    "create": Command(create, ("recipe", "overrides")),
+    "list": Command(list_datasets),
+    "show": Command(show, ("file",)),
+    "validate": Command(validate, ("file",)),
+    "merge": Command(merge, ("files",)),
+    "import-dem": Command(import_dem, ("dem", "overrides"), repeated=("layer",)),
+    "import-drives": Command(import_drives, ("drives", "overrides"), repeated=("layer",)),
+    "export": Command(export, ("file",)),
+    "preview": Command(preview, ("file",)),
+}
+
+
 def main() -> None:
     """Entry point of `benchnav-datagen`."""
-    commands = {
-        "create": Command(create, ("recipe", "overrides")),
-        "list": Command(list_datasets),
-        "show": Command(show, ("file",)),
-        "validate": Command(validate, ("file",)),
-        "merge": Command(merge, ("files",)),
-        "import-dem": Command(import_dem, ("dem", "overrides"), repeated=("layer",)),
-        "import-drives": Command(import_drives, ("drives", "overrides"), repeated=("layer",)),
-        "export": Command(export, ("file",)),
-        "preview": Command(preview, ("file",)),
-    }
     description = "Make, list, show, check, combine, import, export and draw terrain datasets."
-    status = run("benchnav-datagen", description, commands)
+    status = run("benchnav-datagen", description, COMMANDS)
     if status == INTERRUPTED and sys.argv[1] == "create":
         tell("benchnav-datagen: to go on, give the same command again")
     sys.exit(status)

@@ -1,4 +1,4 @@
-"""Dataset formats 1.0 to 1.3: fields, manifest and content digests; `docs/format.md` describes it for readers.
+"""Dataset formats 1.0 to 1.3: fields, manifest and content digests; `docs/reference/format.md` is for readers.
 
 One HDF5 file is one dataset. Groups are splits; each holds the fields that the manifest lists, those of `FIELDS` and
 perhaps others, and the SHA-256 of every entry. The manifest is a JSON text in the dataset `manifest`. A folder of such

@@ -243,19 +243,21 @@ def _failed(folder: Path) -> int:
     return 1
 
 
+COMMANDS = {
+    "run": Command(run_command, configs=SUITES),
+    "list": Command(list_command, ("kinds",)),
+    "report": Command(report, ("folder",)),
+    "compare": Command(compare, ("folders",)),
+    "replay": Command(replay, ("folder",)),
+    "merge": Command(merge, ("out", "parts")),
+    "rerun": Command(rerun, ("folder",)),
+}
+
+
 def main() -> None:
     """Entry point of `benchnav-eval`."""
-    commands = {
-        "run": Command(run_command, configs=SUITES),
-        "list": Command(list_command, ("kinds",)),
-        "report": Command(report, ("folder",)),
-        "compare": Command(compare, ("folders",)),
-        "replay": Command(replay, ("folder",)),
-        "merge": Command(merge, ("out", "parts")),
-        "rerun": Command(rerun, ("folder",)),
-    }
     description = "Evaluate planners under risk settings; report, replay, merge, repeat."
-    status = run("benchnav-eval", description, commands)
+    status = run("benchnav-eval", description, COMMANDS)
     if status == INTERRUPTED and sys.argv[1] in ("run", "rerun"):
         _say("to go on, give the same command again")
     sys.exit(status)

@@ -128,19 +128,21 @@ def train_mdn(options: TrainOptions, data: str, out: str, mdn: MDNConfig = _DEFA
     train_networks(options, data, out, find_trainable("mdn", vars(mdn)))
 
 
+COMMANDS = {
+    "fit": Command(fit, ("model",)),
+    "classifier": Command(train_classifier),
+    "gp": Command(train_gp),
+    "all": Command(train_all),
+    "mdn": Command(train_mdn),
+    "evaluate": Command(evaluate, ("checkpoint",)),
+    "compare": Command(compare, ("models",)),
+    "export": Command(export, ("checkpoint",)),
+}
+
+
 def main() -> None:
     """Entry point of `benchnav-train`."""
-    commands = {
-        "fit": Command(fit, ("model",)),
-        "classifier": Command(train_classifier),
-        "gp": Command(train_gp),
-        "all": Command(train_all),
-        "mdn": Command(train_mdn),
-        "evaluate": Command(evaluate, ("checkpoint",)),
-        "compare": Command(compare, ("models",)),
-        "export": Command(export, ("checkpoint",)),
-    }
-    status = run("benchnav-train", "Train and measure models of traversability.", commands)
+    status = run("benchnav-train", "Train and measure models of traversability.", COMMANDS)
     if status == INTERRUPTED and sys.argv[1] in _RESUMABLE:
         anew = any(word.startswith("--overwrite") for word in sys.argv)
         instead = " in place of --overwrite" if anew else ""

@@ -32,7 +32,7 @@ _NEGLIGIBLE = 1e-6  # a tenth of what tiles may be off
 class Window(NamedTuple):
     """A rectangle of cells; `values[..., *window]` are those of an array of shape [*B, H, W].
 
-    Args:
+    Attributes:
         rows: from the first to behind the last.
         columns: likewise.
     """

@@ -1,4 +1,4 @@
-"""Makes stakes-v1's std maps with soft spots of another weight or depth, for docs/risk.md.
+"""Makes stakes-v1's std maps with soft spots of another weight or depth, for docs/studies/risk.md.
 
 python docs/risk/maps.py --weight 0.2      # datasets/stakes-weight-0.2.h5
 python docs/risk/maps.py --depth 0.15      # datasets/stakes-depth-0.15.h5: their λ is N(0.15, 0.05)

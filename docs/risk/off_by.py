@@ -1,4 +1,4 @@
-"""The shipped model with another weight of soft spots, for docs/risk.md."""
+"""The shipped model with another weight of soft spots, for docs/studies/risk.md."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The suites that are shipped and those of docs/risk.md can be run as they are written; its tables say what is so."""
+"""The suites that are shipped and those of docs/studies/risk.md can be run as written; its tables say what is so."""
 
 import importlib.util
 from collections.abc import Sequence

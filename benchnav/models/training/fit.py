@@ -218,10 +218,10 @@ def forget(options: FitOptions, part: str) -> None:
 
 def differing(wanted: Mapping[str, Any], there: Mapping[str, Any]) -> str:
     """Names the settings in which two trainings differ, such as "another `seed`"; empty where there are none."""
-    wanted, there = (json.loads(json.dumps(settings, default=str)) for settings in (wanted, there))
-    for settings in (wanted, there):
+    one, other = (json.loads(json.dumps(settings, default=str)) for settings in (wanted, there))
+    for settings in (one, other):
         settings |= settings.pop("config", {})  # a network's own, each by its name
-    others = sorted(name for name in {**wanted, **there} if wanted.get(name) != there.get(name))
+    others = sorted(name for name in {**one, **other} if one.get(name) != other.get(name))
     return f"another {' and '.join(f'`{name}`' for name in others)}" if others else ""
 
 

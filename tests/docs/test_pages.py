@@ -1,0 +1,41 @@
+"""Pages are short, their code can be read by what is to run it, and the site shows all of them."""
+
+import ast
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.docs.pages import DOCS, ROOT, blocks, name, pages
+
+MOST_WORDS = 1500
+LONG = ("docs/studies/", "docs/reference/", "docs/guide.md", "docs/models.md")
+EACH = pytest.mark.parametrize("page", pages(), ids=name)
+
+
+@EACH
+def test_a_page_is_short(page: Path) -> None:
+    words = len(page.read_text().split())
+    assert words <= MOST_WORDS or name(page).startswith(LONG)
+
+
+@EACH
+def test_blocks_can_be_read(page: Path) -> None:
+    for block in blocks(page):
+        where = f"{name(page)}:{block.line}"
+        if block.kind == "python":
+            ast.parse(block.body, where)
+        elif block.kind == "sh":
+            read = subprocess.run(["bash", "-n"], input=block.body, capture_output=True, text=True)
+            assert read.returncode == 0, f"{where}: {read.stderr}"
+        elif block.kind == "yaml":
+            list(yaml.safe_load_all(block.body))
+
+
+def test_the_site_shows_every_page() -> None:
+    shown = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    assert {page.relative_to(DOCS).as_posix() for page in pages()[1:]} == {
+        page for page in shown if not page.startswith("reference/commands/")
+    }

@@ -1,0 +1,84 @@
+"""Writes the pages of the three commands for the documentation, from their parsers.
+
+    python tools/reference.py docs/reference/commands
+
+A page a command, a section a subcommand, a row an option, as `--help` has them.
+"""
+
+import inspect
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import yaml
+from docstring_parser import parse
+
+from benchnav.core.command import Command
+from benchnav.core.settings import NO_DEFAULT, Option, dataclass_in, in_words, list_options, plain
+from benchnav.core.store import write_text
+
+PROGRAMS = {"datagen": "benchnav.datagen.cli", "train": "benchnav.models.cli", "eval": "benchnav.eval.cli"}
+
+
+def documented(target: Any) -> dict[str, str]:
+    """What docstrings say of each parameter of a function, or of each field of a dataclass and of its bases."""
+    found: dict[str, str] = {}
+    for owner in reversed(getattr(target, "__mro__", (target,))):
+        told = parse(inspect.getdoc(owner) or "").params if owner is not object else []
+        found |= {own.arg_name: " ".join((own.description or "").split()) for own in told}
+    return found
+
+
+def line(*cells: str) -> str:
+    """A row of a table."""
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def row(name: str, option: Option, about: str) -> str:
+    """The row of an option."""
+    shown = ""
+    if option.default is NO_DEFAULT:
+        shown = "needed"
+    elif not dataclass_in(option.kind):
+        value = yaml.safe_dump(plain(option.default), default_flow_style=True).removesuffix("...\n").strip()
+        shown = f"`{value}`"
+    return line(f"`{name}`", in_words(option.kind).replace("'", "`"), shown, about)
+
+
+def section(program: str, name: str, command: Command) -> str:
+    """The section of a subcommand."""
+    about = documented(command.function)
+    for kind in command.settings.values():
+        about |= documented(kind)
+    rows = []
+    for option in (*command.positionals, *(own for own in command.options if own not in command.positionals)):
+        own = command.options[option]
+        flag = option.upper() if option in command.positionals else f"--{option}"
+        rows.append(row(flag, own, about.get(option, "")))
+        if group := dataclass_in(own.kind):
+            told = documented(group)
+            rows += [
+                row(f"{flag}.{key}", item, told.get(key, "")) for key, item in list_options(group).items()
+            ]
+    shipped = f", or one of {', '.join(command.shipped)}" if command.shipped else ""
+    rows.append(line("`--config`", "text", "", f"A YAML file with these settings{shipped}."))
+    rows.append(line("`--print_config`", "true or false", "", "Print the settings as YAML and end."))
+    text = (inspect.getdoc(command.function) or "").partition("\nArgs:")[0].strip()
+    head = [line("option", "type", "default", "meaning"), "|---|---|---|---|"]
+    return "\n".join([f"## {name}", "", f"`{program} {name}`: {text}", "", *head, *rows, ""])
+
+
+def main() -> None:
+    """Writes the pages."""
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, module in PROGRAMS.items():
+        program = f"benchnav-{name}"
+        commands: dict[str, Command] = import_module(module).COMMANDS
+        sections = [section(program, own, command) for own, command in commands.items()]
+        write_text(folder / f"{name}.md", f"# {program}\n\n" + "\n".join(sections))
+
+
+if __name__ == "__main__":
+    main()
