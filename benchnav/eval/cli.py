@@ -194,9 +194,9 @@ def _say(line: str) -> None:
 
 def _report(folder: Path, place: Path) -> None:
     from benchnav.eval.report.write import PAGE, print_report, write_report
-    from benchnav.eval.run.recordings import record_failures
+    from benchnav.eval.run.recordings import record_driven
 
-    print_report(write_report(folder, partial(record_failures, folder), place))
+    print_report(write_report(folder, partial(record_driven, folder), place))
     print(f"report:  {place / PAGE}")
 
 
@@ -212,16 +212,21 @@ def _print_replay(folder: Path) -> None:
     import yaml
 
     from benchnav.eval.experiment.condition import NOT_USED
+    from benchnav.eval.find_episodes import propose
     from benchnav.eval.folder.run_folder import open_run
 
     every = [condition.labels for condition, _ in open_run(folder).conditions.values()]
-    # What looks at a prediction has more to show.
-    shown = next((labels for labels in every if labels["risk"] != NOT_USED), every[0])
+    shown, place = propose(folder)
     words = ["replay", str(folder)]
-    for name, label in shown.items():
-        if label != NOT_USED and (name in ("planner", "scenario") or len({one[name] for one in every}) > 1):
-            is_plain = yaml.safe_load(f"[{label}]") == [label]
-            words += [f"--{name}", label if is_plain else json.dumps([label])]
+    for name, labels in shown.items():
+        several = name in ("planner", "scenario") or len({one[name] for one in every}) > 1
+        if labels != [NOT_USED] and several:
+            text = ",".join(labels)
+            is_plain = yaml.safe_load(f"[{text}]") == labels
+            words += [f"--{name}", text if is_plain else json.dumps(labels)]
+    for name, value in place.items():
+        if name == "map" or value:
+            words += [f"--{name}", str(value)]
     print(f"replay:  {program('benchnav-eval')} {shlex.join(words)}")
 
 

@@ -4,11 +4,14 @@ import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import pandas as pd
+
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import hint
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.experiment.unit import Unit, units
-from benchnav.eval.folder.run_folder import Run, open_run
+from benchnav.eval.folder.run_folder import EPISODES, Run, open_run, read_table
+from benchnav.eval.recording import GROUND, Ground
 
 
 def find_episodes(
@@ -59,6 +62,38 @@ def find_episodes(
     if len(maps) > 1:
         raise ConfigError(f"Expected conditions on one map to show together, got {', '.join(maps)}.")
     return episodes
+
+
+def propose(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
+    """Proposes what to play back: conditions with unlike outcomes on the map on which outcomes differ most.
+
+    Args:
+        folder: a finished run.
+
+    Returns:
+        Labels by column, of one condition or of two that differ in their risk setting alone; and `map`, `seed` and
+        `realisation`.
+    """
+    run = open_run(folder)
+    every = [condition.labels for condition, _ in run.conditions.values()]
+    # What looks at a prediction has more to show.
+    first = next((labels for labels in every if labels["risk"] != NOT_USED), every[0])
+    if not (folder / GROUND).exists():
+        return {name: [label] for name, label in first.items()}, {"map": 0}
+    about = Ground.load(folder / GROUND).about
+    rows = read_table(folder, EPISODES)
+    rows = rows[(rows[list(about)] == pd.Series(about)).all(axis=1)]
+    labels = [
+        (run.conditions[row["condition"]][0].labels, bool(row["success"]))
+        for row in rows.to_dict("records")
+        if row["risk"] != NOT_USED
+    ]
+    place = {name: int(about[name]) for name in ("map", "seed", "realisation")}
+    for (one, arrived), (other, also) in itertools.combinations(labels, 2):
+        if arrived != also and all(one[name] == other[name] for name in LABELS if name != "risk"):
+            return {name: list(dict.fromkeys((one[name], other[name]))) for name in LABELS}, place
+    shown = labels[0][0] if labels else run.conditions[rows["condition"].iloc[0]][0].labels
+    return {name: [label] for name, label in shown.items()}, place
 
 
 def _find(run: Run, asked: Mapping[str, str], episode: tuple[int | None, int, int]) -> Unit | None:

@@ -2,12 +2,16 @@
 
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
+import pandas as pd
 import pytest
 from rerun.chunk import RrdReader
 
+from benchnav.eval.find_episodes import propose
+from benchnav.eval.recording import GROUND, Ground
 from benchnav.eval.report.playback import web
 from benchnav.eval.report.playback.video import frame_times
 from tests.commands import call
@@ -76,6 +80,24 @@ def test_each_option_asks_for_what_it_names(seed: str, folder: Path, capsys: Any
     assert f"got {labels}, realisation 3, map 4, seed {seed}." in capsys.readouterr().err
 
 
+def test_what_is_proposed_are_unlike_outcomes_on_the_map_where_they_differ_most(folder: Path) -> None:
+    rows = pd.read_parquet(folder / "episodes.parquet")
+    faulty = rows["planner"] == "Faulty"
+    for arrived in (True, False):
+        rows["success"] = faulty & (rows["map"] == 1) & ((rows["risk"] == "mean") == arrived)
+        with pytest.MonkeyPatch.context() as patch:
+            about = {**Ground.load(folder / GROUND).about, "map": 1}
+            patch.setattr("benchnav.eval.find_episodes.read_table", lambda *_, own=rows: own)
+            patch.setattr(Ground, "load", lambda _, own=about: SimpleNamespace(about=own))
+            labels, place = propose(folder)
+        assert (labels["planner"], labels["risk"]) == (["Faulty"], ["mean", "cvar:0.5"])
+        assert place == {"map": 1, "seed": 0, "realisation": 0}
+    rows["success"] = True
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("benchnav.eval.find_episodes.read_table", lambda *_: rows)
+        assert propose(folder)[0]["risk"] == ["mean"]
+
+
 def test_a_video_shows_conditions_side_by_side(folder: Path, tmp_path: Path, capsys: Any) -> None:
     widths = []
     for name, risk in (("one", "mean"), ("two", "mean,cvar:0.5")):
@@ -108,6 +130,7 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
     (line,) = [line for line in printed if line.startswith("replay:  ")]
     words = shlex.split(line.removeprefix("replay:  "))
     assert "straight" not in words
+    assert "--map" in words
     assert call("eval", *words[1:], "--view", "false") == 0
     assert (
         call("eval", "run", "--data", dataset_path, "--out", tmp_path / "none", *SMALL, "--record", "steps")

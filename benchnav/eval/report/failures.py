@@ -21,7 +21,7 @@ from benchnav.eval.report.words import blocks, with_names
 from benchnav.eval.stats.best import competing
 
 # Gives a recording of each of some failures of one condition, rows of `failures_table`.
-RecordFailures = Callable[[pd.DataFrame], Sequence[Recording]]
+RecordDriven = Callable[[pd.DataFrame], Sequence[Recording]]
 
 ACROSS = 4  # failures of a condition that are shown
 _MOST_BLOCKS = 6
@@ -107,18 +107,18 @@ class Sheets:
 
 
 def collect_sheets(
-    summary: pd.DataFrame, failures: pd.DataFrame, record_failures: RecordFailures | None
+    summary: pd.DataFrame, failures: pd.DataFrame, record_driven: RecordDriven | None
 ) -> Sheets:
     """Collects the sheets of a run.
 
     Args:
         summary: from `summary.summarise`, joined with `best.against_best`.
         failures: from `failures_table`.
-        record_failures: it may raise a `BenchnavError`. None where no sheet is asked for.
+        record_driven: it may raise a `BenchnavError`. None where no sheet is asked for.
     """
     placed = failures[failures["x_m"].notna()]
-    if record_failures is None or placed.empty:
-        asked = record_failures is not None and not failures.empty
+    if record_driven is None or placed.empty:
+        asked = record_driven is not None and not failures.empty
         why = "No sheet of failures: the run kept no steps of them." if asked else ""
         return Sheets(shown=(), predicted={}, left_out=why)
     shown, predicted, left_out = [], {}, []
@@ -132,7 +132,7 @@ def collect_sheets(
                 own = placed[placed["condition"] == condition].head(_MOST_FAILURES).reset_index(drop=True)
                 if own.empty:
                     continue
-                recordings, chosen = record_failures(own), choose_failures(own)
+                recordings, chosen = record_driven(own), choose_failures(own)
                 predicted[condition] = np.array([recording.predicted_at_end for recording in recordings])
                 lines.append(
                     FailedLine(

@@ -8,17 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from matplotlib.figure import Figure
 
 import benchnav
+from benchnav.core.errors import BenchnavError
 from benchnav.core.figures import save_twice
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
 from benchnav.eval.folder.provenance import command_lines
 from benchnav.eval.folder.run_folder import ERRORS, caveats, open_run, read_table
-from benchnav.eval.recording import MAP, read_recordings
+from benchnav.eval.recording import MAP, Ground, Recording, read_recordings
 from benchnav.eval.report.charts.conditions import (
     distribution_figure,
     forest_figure,
@@ -26,6 +28,7 @@ from benchnav.eval.report.charts.conditions import (
     success_figure,
 )
 from benchnav.eval.report.charts.maps import (
+    MOST_PANELS,
     choose_recordings,
     driven_figure,
     failure_figure,
@@ -33,7 +36,7 @@ from benchnav.eval.report.charts.maps import (
     trajectory_figure,
 )
 from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_name
-from benchnav.eval.report.failures import RecordFailures, Sheets, collect_sheets, failures_table
+from benchnav.eval.report.failures import RecordDriven, Sheets, collect_sheets, failures_table
 from benchnav.eval.report.findings import findings
 from benchnav.eval.report.hypotheses import hypothesis_findings, hypothesis_table
 from benchnav.eval.report.result_tables import LATENCIES, paper_table, result_table
@@ -45,6 +48,7 @@ from benchnav.eval.stats.summary import summarise
 PAGE = "report.html"
 
 _MOST_PATHS = 16
+_EPISODE = ("condition", "seed", "realisation", "map")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,13 +87,13 @@ class Report:
         return hypothesis_table(self.tests, unit_of_statistics(self.summary))
 
 
-def read_report(folder: Path, record_failures: RecordFailures | None = None) -> Report:
+def read_report(folder: Path, record_driven: RecordDriven | None = None) -> Report:
     """Makes the report of a finished run, and writes nothing.
 
     Args:
         folder: a finished run.
-        record_failures: records failures again, as `run.recordings.record_failures` does of the folder; without it none
-            is shown on a map.
+        record_driven: records driven episodes again, as `run.recordings.record_driven` does of the folder; without it
+            no failure is shown on a map.
 
     Raises:
         ConfigError: the folder is no run folder, or its run is not finished.
@@ -107,7 +111,7 @@ def read_report(folder: Path, record_failures: RecordFailures | None = None) -> 
     known = [about["conditions"][condition].get("latency", {}) for condition in summary["condition"]]
     summary = summary.join(pd.DataFrame(known, columns=LATENCIES, dtype=float).add_prefix("latency_"))
     failures = failures_table(folder, episodes)
-    sheets = collect_sheets(summary, failures, record_failures)
+    sheets = collect_sheets(summary, failures, record_driven)
     said = findings(summary, failures, sheets.predicted)
     if not tests.empty:
         # Beside hypotheses that were fixed before the run all else is exploratory.
@@ -134,21 +138,19 @@ def read_report(folder: Path, record_failures: RecordFailures | None = None) -> 
     )
 
 
-def write_report(
-    folder: Path, record_failures: RecordFailures | None = None, out: Path | None = None
-) -> Report:
+def write_report(folder: Path, record_driven: RecordDriven | None = None, out: Path | None = None) -> Report:
     """Writes `report.html`, `summary.{csv,md,tex}`, `failures.csv` and `figures/` of a run.
 
     Args:
         folder: a finished run.
-        record_failures: records failures again, as `run.recordings.record_failures` does of the folder; without it none
-            is shown on a map.
+        record_driven: records driven episodes again, as `run.recordings.record_driven` does of the folder; without it
+            no failure is shown on a map.
         out: where to; the run folder when not given.
 
     Returns:
         What was written of.
     """
-    report, out = read_report(folder, record_failures), out or folder
+    report, out = read_report(folder, record_driven), out or folder
     write_text(out / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))
     write_text(out / "failures.csv", report.failures.to_csv(index=False, float_format="%.4g"))
     comments = "".join(f"% {line}\n" for line in (*report.header, *report.table.notes, *report.warnings))
@@ -160,7 +162,7 @@ def write_report(
             out / "hypotheses.tex", to_latex([report.hypotheses], caption, f"{report.name}-hypotheses")
         )
     figures = {}
-    for name, caption, figure in _figures(folder, report):
+    for name, caption, figure in _figures(folder, report, record_driven):
         path = out / "figures" / f"{name}.png"
         # These are as wide as their maps: white borders are cut away.
         save_twice(figure, path, trim=name in ("trajectories", "driven"))
@@ -181,8 +183,8 @@ def print_report(report: Report) -> None:
 Drawn = Iterator[tuple[str, str, Figure]]  # name, caption and figure
 
 
-def _figures(folder: Path, report: Report) -> Drawn:
-    """All that is drawn of a run."""
+def _figures(folder: Path, report: Report, record_driven: RecordDriven | None) -> Drawn:
+    """All that is drawn of a run; first what it was to show, how often, and on which map it is seen best."""
     summary, sheets = report.summary, report.sheets.shown
     if not report.tests.empty:
         yield (
@@ -197,6 +199,9 @@ def _figures(folder: Path, report: Report) -> Drawn:
         "another is; grey: planners that are blind.",
         success_figure(summary),
     )
+    driven = read_driven(folder, report.episodes)
+    if driven is not None:
+        yield _driven(*driven)
     sweeps = find_sweeps(report.about["conditions"])
     names = Counter(map(sweep_name, sweeps))
     for number, lines in sweeps.items():
@@ -219,21 +224,46 @@ def _figures(folder: Path, report: Report) -> Drawn:
             failure_figure(sheet),
         )
     recorded = read_recordings(folder)
-    if chosen := choose_recordings(recorded, list(summary["condition"])):
+    chosen = _on_one_map(driven[1], recorded, record_driven) if driven else []
+    if chosen := chosen or choose_recordings(recorded, list(summary["condition"])):
         caption = "What was planned and driven, on the terrain and on the λ̂ that the planner was given."
         if any(recording.field is not None for recording in chosen):
             caption += " Below, the whole driven path on λ as it was."
-        count = f"{len(chosen)} of {len(recorded)} recorded episodes."
-        yield "trajectories", f"{caption} {count}", trajectory_figure(chosen)
-    yield from _driven(folder, report.episodes)
+        yield "trajectories", caption, trajectory_figure(chosen)
 
 
-def _driven(folder: Path, episodes: pd.DataFrame) -> Drawn:
-    """The figure of whole driven paths; none where no steps were kept."""
-    driven = read_driven(folder, episodes)
-    if driven is None:
-        return
-    ground, rows, tracks = driven
+def _on_one_map(
+    rows: pd.DataFrame, recorded: Sequence[Recording], record_driven: RecordDriven | None
+) -> list[Recording]:
+    """Recordings of a few conditions on the map on which outcomes differ most, as many that arrived as not.
+
+    Args:
+        rows: an episode a condition on that map.
+        recorded: all there are, which tell what was planned too; the others are made of the steps that were kept.
+        record_driven: makes those.
+
+    Returns:
+        At most `MOST_PANELS`, in the order of the rows; none where one cannot be made.
+    """
+    turn = rows.groupby("success", sort=False).cumcount()
+    chosen = rows.assign(turn=turn).sort_values("turn", kind="stable").head(MOST_PANELS).sort_index()
+    known = {tuple(str(own.about[name]) for name in _EPISODE): own for own in recorded}
+    found = []
+    for place, row in chosen.iterrows():
+        own = known.get(tuple(str(row[name]) for name in _EPISODE))
+        if own is None and record_driven is not None:
+            try:
+                (own,) = record_driven(chosen.loc[[place]])
+            except (BenchnavError, OSError):
+                return []
+        if own is None:
+            return []
+        found.append(own)
+    return found
+
+
+def _driven(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarray]) -> tuple[str, str, Figure]:
+    """The figure of whole driven paths, as from `read_driven`."""
     about, shown = ground.about, rows.iloc[:_MOST_PATHS]
     why = (
         "of all maps the one on which outcomes differ most."
@@ -246,7 +276,7 @@ def _driven(folder: Path, episodes: pd.DataFrame) -> Drawn:
     )
     if len(shown) < len(rows):
         caption += f" {len(shown)} of {len(rows)} conditions."
-    yield "driven", caption, driven_figure(ground, shown, tracks[:_MOST_PATHS])
+    return "driven", caption, driven_figure(ground, shown, tracks[:_MOST_PATHS])
 
 
 def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:

@@ -95,12 +95,12 @@ def _repeats(row: Mapping[str, Any], recording: Recording) -> bool:
     return bool(row["path_length_m"] == length_m and row["traversability"] == met)
 
 
-def record_failures(folder: Path, failures: pd.DataFrame) -> list[Recording]:
-    """Records failures again from the steps that were kept: their ground is read and predicted, nothing is planned.
+def record_driven(folder: Path, rows: pd.DataFrame) -> list[Recording]:
+    """Records episodes again from the steps that were kept: their ground is read and predicted, nothing is planned.
 
     Args:
         folder: a finished run that kept steps.
-        failures: episodes of one condition, rows of the run's table.
+        rows: episodes of one condition, rows of the run's table.
 
     Returns:
         A recording a row.
@@ -109,13 +109,13 @@ def record_failures(folder: Path, failures: pd.DataFrame) -> list[Recording]:
         BenchnavError: the maps or the parts are not those of the run, or cannot be had.
     """
     run, recordings = open_run(folder), dict[int, Recording]()
-    for _, rows in failures.groupby(["seed", "realisation"], sort=False):
-        recordings |= dict(zip(rows.index, _record_block(run, rows), strict=True))
-    return [recordings[index] for index in failures.index]
+    for _, own in rows.groupby(["seed", "realisation"], sort=False):
+        recordings |= dict(zip(own.index, _record_block(run, own), strict=True))
+    return [recordings[index] for index in rows.index]
 
 
 def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
-    """Records failures under one seed and realisation."""
+    """Records episodes under one seed and realisation."""
     first = rows.iloc[0]
     condition, _ = run.conditions[first["condition"]]
     maps = tuple(rows["map"].tolist())

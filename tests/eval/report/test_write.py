@@ -144,7 +144,6 @@ def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
     assert (folder / "figures" / "trajectories.png").stat().st_size > 10_000
     text = (folder / "summary.md").read_text()
     assert "![trajectories](figures/trajectories.png)" in text
-    assert "3 of 3 recorded episodes" in text
     assert "λ as it was" not in text
 
 
@@ -157,7 +156,7 @@ def test_a_figure_with_λ_as_it_was_says_so(tmp_path: Path) -> None:
     made.held_recording(about=about).save(folder / "playback" / "a.npz")
     write_report(folder)
     text = (folder / "summary.md").read_text()
-    assert "Below, the whole driven path on λ as it was. 1 of 1 recorded episodes." in text
+    assert "Below, the whole driven path on λ as it was." in text
 
 
 @pytest.mark.parametrize("outcome", ["planner_error", "model_error"])

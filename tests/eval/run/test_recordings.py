@@ -19,7 +19,7 @@ from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.recording import GROUND, Ground, Recording
 from benchnav.eval.report.failures import failures_table
 from benchnav.eval.report.write import write_report
-from benchnav.eval.run.recordings import keep_ground, record_failures, telling_map
+from benchnav.eval.run.recordings import keep_ground, record_driven, telling_map
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings, build
 from tests.eval.forged import forge_rows
@@ -142,7 +142,7 @@ def test_the_ground_is_that_of_each_episode_under_its_own_noise(failed: Path) ->
     rows = read_table(failed, "episodes.parquet")  # whether they failed does not matter here
     assert len(rows) == 8
     mixed = rows.sort_values("map")
-    taken = record_failures(failed, mixed)
+    taken = record_driven(failed, mixed)
     (condition, _) = next(iter(open_run(failed).conditions.values()))
     for recording, row in zip(taken, mixed.to_dict("records"), strict=True):
         noise = {name: row[name] for name in ("seed", "realisation")}
@@ -162,7 +162,7 @@ def test_the_ground_is_that_of_each_episode_under_its_own_noise(failed: Path) ->
 
 
 def test_the_report_shows_failures_and_says_what_the_planner_was_told(failed: Path) -> None:
-    report = write_report(failed, partial(record_failures, failed))
+    report = write_report(failed, partial(record_driven, failed))
     assert (failed / "figures" / "failures.png").stat().st_size > 5000
     assert "![failures](figures/failures.png)" in (failed / "summary.md").read_text()
     assert any("the predicted λ̂ was " in said for said in next(iter(report.findings.values())))
@@ -183,8 +183,8 @@ def test_other_maps_and_models_than_those_of_the_run_are_not_shown(part: str, fa
     try:
         rows = failures_table(failed, read_table(failed, "episodes.parquet"))
         with pytest.raises(BenchnavError, match="Expected"):
-            record_failures(failed, rows)
-        report = write_report(failed, partial(record_failures, failed))
+            record_driven(failed, rows)
+        report = write_report(failed, partial(record_driven, failed))
         assert report.warnings[-1].startswith("No sheet of failures: Expected")
     finally:
         (failed / "run.json").write_text(before)

@@ -41,12 +41,13 @@ from benchnav.eval.report.plan_layers import (
 )
 from benchnav.eval.report.words import NAMING, condition_name, contender_names, differ, outcome_in_words
 
-MOST_PANELS = 8
+MOST_PANELS = 4
 _PANELS_A_LINE = 4
 _CLOSED = "0.25"
 _LETTER_IN = 0.048
 _SAME_MAP = ["data", "scenario", "map", "seed", "realisation"]
 _PATH_STYLES = ("solid", "dashed")
+_LIGHT = 0.5  # opacity of a map under marks and dark red
 _DARKEST = 0.35  # grey of λ = 0
 _LAMBDA: dict[str, Any] = {"cmap": TRAVERSABILITY_COLOURS, "vmin": 0, "vmax": 1}
 _HOLDS = {"label": "immobilises a robot", "color": IMMOBILISING}
@@ -290,7 +291,7 @@ def failure_figure(lines: Sequence[FailedLine]) -> Figure:
 
 def _draw_failure(panel: Axes, recording: Recording) -> None:
     panel.set_visible(True)
-    show_map(panel, recording.predicted, recording.grid.extent_m, **_LAMBDA)
+    show_map(panel, recording.predicted, recording.grid.extent_m, alpha=_LIGHT, **_LAMBDA)
     if recording.immobilising.any():
         colours = np.zeros((*recording.grid.shape, 4))
         colours[recording.immobilising] = to_rgba(IMMOBILISING, 0.75)

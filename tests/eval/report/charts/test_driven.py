@@ -128,10 +128,12 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(tmp_path: Path) -> None:
     with_steps(folder, rows)
     assert read_driven(folder, rows) is None
     ground().save(folder / GROUND)
-    ((name, caption, figure),) = write._driven(folder, rows)
+    driven = read_driven(folder, rows)
+    assert driven
+    name, caption, figure = write._driven(*driven)
     assert name == "driven"
     assert "std 1, seed 0, realisation 0: of all maps" in caption
-    _, own, tracks = read_driven(folder, rows) or ((), (), ())
+    _, own, tracks = driven
     assert own["map"].tolist() == [1, 1, 1]
     for place, positions in enumerate(tracks):
         np.testing.assert_allclose(positions, track(place) + 1)
@@ -148,9 +150,11 @@ def test_the_paths_are_those_of_the_maps_own_noise(seed: int, realisation: int, 
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground(about={**ground().about, "seed": seed, "realisation": realisation}).save(folder / GROUND)
-    ((_, caption, _),) = write._driven(folder, rows)
+    driven = read_driven(folder, rows)
+    assert driven
+    _, caption, _ = write._driven(*driven)
     assert f"std 1, seed {seed}, realisation {realisation}:" in caption
-    _, own, tracks = read_driven(folder, rows) or ((), (), ())
+    _, own, tracks = driven
     assert own["risk"].tolist() == list(RISKS)
     assert set(zip(own["seed"], own["realisation"], own["map"], strict=True)) == {(seed, realisation, 1)}
     for place, positions in enumerate(tracks):
@@ -167,9 +171,39 @@ def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(tmp_
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground().save(folder / GROUND)
-    ((_, caption, figure),) = write._driven(folder, rows)
+    driven = read_driven(folder, rows)
+    assert driven
+    _, caption, figure = write._driven(*driven)
     assert f"on no map did outcomes differ. {most} of {most + 2} conditions." in caption
     assert len(figure.axes[0].lines) >= most
+
+
+def test_trajectories_are_of_that_map_as_many_that_arrived_as_not() -> None:
+    risks = [f"cvar:0.{i}" for i in range(6)]
+    rows = made.rows(
+        made.row(made.condition(risk=risk), 1, None if place in (4, 5) else 30.0)
+        for place, risk in enumerate(risks)
+    )
+    kept = made.recording(
+        20, about={"condition": rows["condition"][0], "map": "1", "seed": "0", "realisation": "0"}
+    )
+    other = made.recording(
+        20, about={"condition": rows["condition"][1], "map": "0", "seed": "0", "realisation": "0"}
+    )
+    asked: list[str] = []
+
+    def again(wanted: pd.DataFrame) -> list[Any]:
+        asked.extend(wanted["risk"])
+        return [wanted["risk"].iloc[0]]
+
+    assert write._on_one_map(rows, [kept, other], again) == [kept, "cvar:0.1", "cvar:0.4", "cvar:0.5"]
+    assert asked == ["cvar:0.1", "cvar:0.4", "cvar:0.5"]
+    assert write._on_one_map(rows, [kept], None) == []
+
+    def gone(wanted: pd.DataFrame) -> list[Any]:
+        raise ConfigError("Expected the maps, got none.")
+
+    assert write._on_one_map(rows, [kept], gone) == []
 
 
 def test_the_map_comes_back_as_it_was(tmp_path: Path) -> None:
