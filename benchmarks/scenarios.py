@@ -8,10 +8,12 @@ over maps, so that one bootstrap over maps gives the standard error of each. Let
 maps, H×W cells, C classes, K numbers a map.
 """
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import matplotlib
@@ -205,8 +207,8 @@ def calibration_columns(recipe: Recipe) -> Columns:
     """How often realised λ lies in the central 90 % interval, and under VaR 0.9, by source of classes."""
     count, clay = len(recipe.classes), [c.name for c in recipe.classes].index("wet_clay")
     return {
-        "held, predicted": lambda m: show([m["held predicted"]], first, 100, 2),
-        "held, true": lambda m: show([m["held true"]], first, 100, 2),
+        "coverage, predicted": lambda m: show([m["held predicted"]], first, 100, 2),
+        "coverage, true": lambda m: show([m["held true"]], first, 100, 2),
         "tail, predicted": lambda m: show([m["tail predicted"]], first, 100, 2),
         "tail, true": lambda m: show([m["tail true"]], first, 100, 2),
         "bias [10⁻³]": lambda m: show([m["error predicted"]], first, 1000),
@@ -372,11 +374,18 @@ def _severity(name: str) -> float:
 
 
 def rewrite(path: Path, tables: Mapping[str, str]) -> None:
-    """Puts each table between its markers `<!-- NAME -->` and `<!-- end -->` in a document."""
+    """Puts each table between its markers `<!-- NAME -->` and `<!-- end -->` in a document.
+
+    A table in a fold is indented, and there needs empty lines around it.
+    """
     text = path.read_text()
     for name, lines in tables.items():
-        start = text.index(f"<!-- {name} -->") + len(f"<!-- {name} -->")
-        text = f"{text[:start]}\n{lines}\n{text[text.index('<!-- end -->', start) :]}"
+        found = re.search(rf"^( *)<!-- {name} -->\n.*?<!-- end -->", text, re.DOTALL | re.MULTILINE)
+        if found is None:
+            raise ValueError(f"Expected `<!-- {name} -->` and `<!-- end -->` in {path}. Add them.")
+        body = f"\n{lines}\n" if found[1] else lines
+        block = indent(f"<!-- {name} -->\n{body}\n<!-- end -->", found[1])
+        text = text[: found.start()] + block + text[found.end() :]
     path.write_text(text)
 
 
@@ -437,7 +446,7 @@ def main() -> None:
                 metadata={"Software": None},
                 pil_kwargs={"optimize": True},
             )
-    rewrite(DOCS / "scenarios.md", tables)
+    rewrite(DOCS / "studies" / "scenarios.md", tables)
 
 
 if __name__ == "__main__":

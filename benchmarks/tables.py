@@ -2,7 +2,8 @@
 
     python benchmarks/tables.py docs/studies/risk.md            # reads runs/NAME; --runs FOLDER for others
 
-A table stands between `<!-- KIND RUN -->` and `<!-- end -->`; one whose run is not there stays as it is. Kinds:
+A table stands between `<!-- KIND RUN -->` and `<!-- end -->`, which may be indented, as in a fold. A table whose run is
+missing stays as it is. Kinds:
 
 - `results`: the table of the run's report;
 - `hypotheses`: what the suite was to show, and the tests of it;
@@ -19,6 +20,7 @@ import argparse
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import pandas as pd
@@ -39,7 +41,7 @@ from benchnav.eval.stats.summary import wilson_interval
 PAPER_EPISODES = 20
 PAPER = {"std": (0.90, 52.7, 22.5), "hg": (0.80, 60.2, 26.1), "hs": (0.85, 58.6, 25.7)}
 
-_BLOCK = re.compile(r"<!-- (\w+) ([\w-]+) -->\n.*?<!-- end -->", re.DOTALL)
+_BLOCK = re.compile(r"^( *)<!-- (\w+) ([\w-]+) -->\n.*?<!-- end -->", re.DOTALL | re.MULTILINE)
 _BESIDE_RISK = ("data", "scenario", "world", "robot", "model", "planner")
 
 
@@ -148,6 +150,12 @@ KINDS: dict[str, Callable[[Path], str]] = {
 }
 
 
+def between(margin: str, name: str, lines: str) -> str:
+    """A table between its markers; where it is indented, with the empty lines without which it is not a table."""
+    body = f"\n{lines.rstrip()}\n" if margin else lines
+    return indent(f"<!-- {name} -->\n{body}\n<!-- end -->", margin)
+
+
 def main() -> None:
     """Rewrites the tables of a document."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -156,11 +164,11 @@ def main() -> None:
     given = parser.parse_args()
 
     def written(block: re.Match[str]) -> str:
-        kind, name = block.groups()
+        margin, kind, name = block.groups()
         if not (given.runs / name / EPISODES).exists():
             print(f"left as it is: {kind} {name}")
             return block.group()
-        return f"<!-- {kind} {name} -->\n{KINDS[kind](given.runs / name)}\n<!-- end -->"
+        return between(margin, f"{kind} {name}", KINDS[kind](given.runs / name))
 
     given.document.write_text(_BLOCK.sub(written, given.document.read_text()))
 

@@ -119,6 +119,20 @@ def test_only_the_tables_of_runs_that_are_there_are_written(
     assert "old" not in before
 
 
+def test_a_table_in_a_fold_stays_indented(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_folder(tmp_path / "runs" / "one", made(mean=[True] * 12, cvar=[True, False] * 6))
+    note = tmp_path / "note.md"
+    note.write_text('??? note "A"\n\n    <!-- sweep one -->\n\n    old\n\n    <!-- end -->\n\nB\n')
+    monkeypatch.setattr("sys.argv", ["tables.py", str(note), "--runs", str(tmp_path / "runs")])
+    tables().main()
+    once = note.read_text()
+    _, _, marker, empty, *table, gap, end, _, after = once.splitlines()
+    assert (marker, empty, gap, end, after) == ("    <!-- sweep one -->", "", "", "    <!-- end -->", "B")
+    assert [line[:8] for line in table] == ["    | me", "    |---", "    | 10"]
+    tables().main()
+    assert note.read_text() == once
+
+
 def test_settings_stand_beside_one_another_with_their_success_and_time(tmp_path: Path) -> None:
     shared = {"data": "d", "scenario": "std", "world": "w", "robot": "r", "model": "m", "planner": "mppi"}
     numbers = ("success_rate", "success_low", "success_high", "total_time_mean_s")
