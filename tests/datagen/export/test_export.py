@@ -377,8 +377,8 @@ def test_maps_of_others_are_never_ours(
 
 def test_the_documented_lines_make_arrays_of_parquet(dataset_path: Path, tmp_path: Path) -> None:
     out = exported(dataset_path, tmp_path / "out")
-    guide = (Path(__file__).parents[3] / "docs/guide.md").read_text()
-    (lines,) = (part.split("```")[0] for part in guide.split("```python\n")[1:] if "read_table" in part)
+    page = (Path(__file__).parents[3] / "docs/how-to/export-and-read.md").read_text()
+    (lines,) = (part.split("```")[0] for part in page.split("```python\n")[1:] if "read_table" in part)
     (place,) = out.glob("data/valid*")
     own: dict[str, Any] = {}
     exec(lines.replace("exports/stakes-v1/data/test_std-00000-of-00001.parquet", str(place)), own)
