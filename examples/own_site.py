@@ -6,8 +6,8 @@ two speeds. All else is done by commands, as for real ground:
 
     python examples/own_site.py [FOLDER]
 
-Real ground seldom has a map of classes. Without `--classes` all works up to `evaluate`; a suite simulates λ by the
-class table, and so needs them.
+Real ground seldom has a map of classes. Without `--classes` and `--solvable` all works up to `evaluate`; a suite
+simulates λ by the class table, and so needs them.
 """
 
 import os

@@ -21,7 +21,7 @@ def smaller(program: str, words: list[str], maps: int) -> list[str]:
         given = {word.partition("=")[0] for word in rest}
         fewer = [f"splits.{split}.maps={maps}" for split in shipped_sizes(rest[0])]
         named = [] if "id" in given else [f"id={rest[0]}-small"]
-        out = [] if "--out" in given else ["--out", f"datasets/{rest[0]}.h5"]
+        out = [] if {"--out", "--seed", "id"} & given else ["--out", f"datasets/{rest[0]}.h5"]
         return [asked, *rest, *fewer, *named, *out]
     if program == "train" and asked in ("fit", "classifier", "all", "mdn"):
         return [*words, "--trainer.max_epochs", "1"]

@@ -92,6 +92,10 @@ def import_dem(
         drives is None or not rasters.traversability,
         "λ from `drives` or from `traversability`, got both. Leave one out.",
     )
+    expect(
+        not (solvable and rasters.unlabelled),
+        "`classes` with `solvable`, which goes by the class table, got none. Leave `solvable` out, or pass --classes.",
+    )
     out = real_place(out)
     shares = {"test/real": 1.0} if shares is None else shares
     splits = {name: Split(scenario=scenario, maps=1, solvable=solvable) for name in shares}

@@ -504,6 +504,8 @@ def test_other_bad_settings_are_refused(dem: Path) -> None:
     rasters = Rasters(photo="p.tif", traversability="t.tif", unlabelled=True)
     with pytest.raises(ConfigError, match="`drives` or from `traversability`, got both"):
         imported(dem, Path("log.csv"), rasters=rasters)
+    with pytest.raises(ConfigError, match="`classes` with `solvable`"):
+        imported(dem, Path("log.csv"), solvable=True)
     with pytest.raises(DatasetError, match="No such file"):
         imported(dem, dem.parent / "none.csv")
     degrees = write(
