@@ -11,7 +11,7 @@ import yaml
 from tests.docs.pages import DOCS, ROOT, blocks, name, pages
 
 MOST_WORDS = 1500
-LONG = ("docs/studies/", "docs/reference/", "docs/guide.md", "docs/models.md")
+LONG = ("docs/studies/", "docs/reference/")
 EACH = pytest.mark.parametrize("page", pages(), ids=name)
 
 
