@@ -19,7 +19,10 @@ def smaller(program: str, words: list[str], maps: int) -> list[str]:
         return words
     if (program, asked) == ("datagen", "create") and rest[0] in shipped_recipes():
         given = {word.partition("=")[0] for word in rest}
-        fewer = [f"splits.{split}.maps={maps}" for split in shipped_sizes(rest[0])]
+        sizes = {split: max(maps, 4) if split == "valid" else maps for split in shipped_sizes(rest[0])}
+        fewer = [
+            f"splits.{split}.maps={count}" for split, count in sizes.items()
+        ]  # a half of `valid` needs two
         named = [] if "id" in given else [f"id={rest[0]}-small"]
         out = [] if {"--out", "--seed", "id"} & given else ["--out", f"datasets/{rest[0]}.h5"]
         return [asked, *rest, *fewer, *named, *out]
