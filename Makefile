@@ -39,7 +39,7 @@ test: $(STAMP)
 
 # A page that is not well-formed, or a link that leads nowhere, fails the build.
 docs: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt '.[docs]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
 	$(BIN)/python tools/reference.py docs/reference/commands
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 

@@ -6,13 +6,16 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.sources import load_file
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models.checkpoint import FUSED, load_checkpoint
+from benchnav.models.cli import fit
 from benchnav.models.nets.trainable import TrainableNetwork
 from benchnav.models.training.check import fields_of, try_network
 from benchnav.models.training.data import MapDataset
+from benchnav.models.training.networks import is_trainable
 from tests.commands import call
 from tests.models.training.conftest import EXAMPLE
 
@@ -255,3 +258,9 @@ def test_a_loss_that_divides_by_no_cell_is_told_why(own: Path, dataset: TerrainD
         ConfigError, match=r"got nan\. λ, NaN where it was not observed, is so in the whole batch"
     ):
         try_network(network, unseen)
+
+
+def test_the_help_of_fit_names_all_that_can_be_trained() -> None:
+    names = [FUSED, *(name for name in registry.names("model") if is_trainable(name))]
+    (told,) = re.findall(r"a model that can be trained \(([^)]+)\)", " ".join((fit.__doc__ or "").split()))
+    assert sorted(told.split(", ")) == sorted(names)
