@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 LOWEST := .venv-lowest
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
 # A worker takes up to 2 GB.
 JOBS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
@@ -14,10 +15,10 @@ help:
 	@echo "make test   set up, run the tests"
 	@echo "make test-slow  those that take minutes: whole suites with the shipped model"
 	@echo "make test-lowest  the tests with the lowest versions that pyproject.toml allows, set up in $(LOWEST)"
-	@echo "make docs   the documentation as a site in build/site; \`make docs-test\` runs all that its pages show"
+	@echo "make docs   the documentation as a site in build/site; \`make docs-test\` runs all that its pages and the notebooks show"
 	@echo "make bench  speed, side by side with peers"
 	@echo "make lint   ruff and mypy"
-	@echo "make wheel  the package with the shipped maps and models, in dist/"
+	@echo "make wheel  source archive and wheel with the shipped maps and models, in dist/, checked"
 
 # The stamp depends on what is installed, so a second run installs nothing.
 $(STAMP): pyproject.toml constraints.txt
@@ -25,7 +26,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  echo "benchnav: expected Python 3.11, 3.12 or 3.13, got \"$$($(PYTHON) --version 2>&1)\" from $(PYTHON); run make PYTHON=/path/to/python3.12" >&2; exit 2; }
 	@echo "benchnav: setting up $(VENV) (several minutes and about 7 GB, once)"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(INSTALL) '.[dev]'
 	@touch $(STAMP)
 
 demo: $(STAMP)
@@ -39,13 +40,14 @@ test: $(STAMP)
 
 # A page that is not well-formed, or a link that leads nowhere, fails the build.
 docs: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
+	$(INSTALL) '.[docs]'
 	$(BIN)/python tools/reference.py docs/reference/commands
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 
-# Every block of every page, on so many maps where the page has many.
+# Every block of every page and every cell of every notebook, on so many maps where these have many.
 MAPS ?= 2
 docs-test: $(STAMP)
+	$(INSTALL) '.[notebook]'
 	BENCHNAV_DOCS_MAPS=$(MAPS) OMP_NUM_THREADS=1 TORCH_COMPILE_DISABLE=1 $(BIN)/python -m pytest -n $(JOBS) -m docs tests/docs
 
 test-slow: $(STAMP)
@@ -74,10 +76,12 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# What an earlier build has left in build/ would go into the wheel.
+# The wheel is built from the source archive. What *.egg-info lists of an earlier build would go into the archive.
 wheel: $(STAMP)
-	rm -rf build dist
-	$(BIN)/python -m pip wheel . --quiet --disable-pip-version-check --no-deps --no-build-isolation --wheel-dir dist
+	$(INSTALL) '.[release]'
+	rm -rf dist *.egg-info
+	$(BIN)/python -m build --no-isolation
+	$(BIN)/python -m twine check --strict dist/*
 	@ls -lh dist
 
 clean:

@@ -20,7 +20,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from benchnav.core.figures import styled
+from benchnav.core.figures import MARKS, mark, robot_marker, styled
 from benchnav.eval.recording import Recording
 
 FIGURES = Path(__file__).parents[1] / "docs/figures"
@@ -82,9 +82,9 @@ def draw_ground(panel: Axes3D, pair: tuple[Recording, Recording]) -> None:
         )
     held = pair[0].track[-1]
     top = heights(ground, np.array([ground.track[0], ground.goal_m, held])) + 0.4
-    panel.scatter(*ground.track[0], top[0], color="black", s=28, zorder=4)
-    panel.scatter(*ground.goal_m, top[1], color="black", marker="*", s=110, zorder=4)
-    panel.scatter(*held, top[2], color=COLOURS[0], marker="X", s=80, edgecolor="black", zorder=4)
+    places = {"start": ground.track[0], "goal": ground.goal_m, "immobilised": held}
+    for (name, (x_m, y_m)), height in zip(places.items(), top, strict=True):
+        panel.plot([x_m], [y_m], [height], **MARKS[name] | {"ms": 1.3 * MARKS[name]["ms"], "zorder": 4})
     panel.set_box_aspect((1, rows / columns, 0.22), zoom=1.18)
     panel.view_init(elev=42, azim=-62)
     panel.set_axis_off()
@@ -97,12 +97,12 @@ def draw_map(panel: Axes, own: Recording, place: int) -> AxesImage:
         own.predicted, origin="lower", extent=(0, width, 0, height), cmap="viridis", vmin=0, vmax=1
     )
     panel.plot(*own.track.T, color=COLOURS[place], lw=2, path_effects=EDGE)
-    panel.plot(*own.track[0], "o", color="black", ms=5)
-    panel.plot(*own.goal_m, "*", color="black", ms=11)
+    mark(panel, "start", own.track[0], 1.2)
+    mark(panel, "goal", own.goal_m, 1.2)
     arrived = own.about["outcome"] == "success"
     end = "arrived" if arrived else "immobilised"
     if not arrived:
-        panel.plot(*own.track[-1], "X", color=COLOURS[place], mec="black", ms=9)
+        mark(panel, "immobilised", own.track[-1], 1.2)
     panel.set_title(f"λ̂ = {NAMES[place]}: {end} after {len(own.actions) * own.dt_s:.0f} s", fontsize=9)
     panel.set(xticks=[], yticks=[])
     return image
@@ -124,7 +124,7 @@ def draw_hero(pair: tuple[Recording, Recording]) -> Figure:
 
 @styled()
 def frames(pair: tuple[Recording, Recording]) -> Iterator[Image.Image]:
-    """Both robots on λ as it was, over time."""
+    """Both robots on the λ̂ that their planner was given, over time."""
     ground = pair[0]
     assert ground.field is not None
     width, height = ground.grid.extent_m
@@ -143,12 +143,14 @@ def frames(pair: tuple[Recording, Recording]) -> Iterator[Image.Image]:
             )
             driven = own.track[: now + 1]
             panel.plot(*driven.T, color=COLOURS[place], lw=3, path_effects=EDGE)
-            panel.plot(*own.goal_m, "*", color="black", ms=11)
+            mark(panel, "start", own.track[0], 1.2)
+            mark(panel, "goal", own.goal_m, 1.2)
             ended, arrived = now >= len(own.track) - 1, own.about["outcome"] == "success"
-            shape = "o" if not ended or arrived else "X"
-            panel.plot(*driven[-1], shape, color=COLOURS[place], mec="black", ms=8)
             state = ("arrived" if arrived else "immobilised") if ended else "driving"
-            panel.set_title(f"A* + DWA, {NAMES[place]}: {state}", fontsize=8)
+            heading = robot_marker(own.states[min(now, len(own.track) - 1), 2])
+            looks = {} if ended else {"marker": heading}
+            mark(panel, state if ended else "robot", driven[-1], 1.4, **looks)
+            panel.set_title(f"A*+DWA, {NAMES[place]}: {state}", fontsize=8)
             panel.set(xticks=[], yticks=[])
         figure.supxlabel(f"{now * ground.dt_s:4.1f} s", fontsize=9)
         yield rendered(figure)
@@ -173,7 +175,10 @@ def main() -> None:
     pair = find_pair(given.run)
     print(f"map {pair[0].about['map']}")
     draw_hero(pair).savefig(given.out / "hero.png", dpi=170)
-    first, *rest = (image.quantize(256, dither=Image.Dither.NONE) for image in frames(pair))
+    # One palette for all, by coverage, which keeps the colours of few pixels: those of the marks.
+    images = list(frames(pair))
+    palette = images[FRAMES // 2].quantize(256, method=Image.Quantize.MAXCOVERAGE)
+    first, *rest = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     first.save(
         given.out / "hero.gif", save_all=True, append_images=rest, duration=[TICK_MS] * len(rest) + [2500],
         loop=0, optimize=True,

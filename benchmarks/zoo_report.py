@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pandas as pd
@@ -19,6 +20,7 @@ from benchnav.models.quality.compare.paired import holm
 
 RISKS, SPLIT = ("expected-time", "cvar:0.8"), "test/std"
 SCORES = ("rmse_expected", "nll", "crps", "pinball", "tail_error", "ause")  # of each the least is the best
+Key = TypeVar("Key")
 SHOWN = ("accuracy", "miou", *SCORES[:4], "coverage", "width", *SCORES[4:], "prediction_ms", "parameters")
 
 
@@ -79,7 +81,7 @@ def report_doses(out: Path, rows: pd.DataFrame, loss: pd.Series, models: list[Do
         print(
             f"exploratory: {one} − {other}: {said}; loss {loss[labels[0]].mean() - loss[labels[1]].mean():+.4f}"
         )
-    every = doses_table(rows, table, loss, models)
+    every = doses_table(rows, loss, models)
     every.to_csv(out / "doses.csv", index=False)
     print_frame("success and time against dose, over seeds", every)
     save(draw_doses(every), out / "zoo-doses.png", "png", dpi=200)
@@ -112,31 +114,42 @@ def contrasts(models: list[Dose]) -> Iterator[tuple[tuple[int, str, float], tupl
         yield (size, "temperature", 0.25), (size, "temperature", 4.0)
 
 
-def doses_table(rows: pd.DataFrame, table: pd.DataFrame, loss: pd.Series, models: list[Dose]) -> pd.DataFrame:
-    """A row a dose, over its seeds: loss, success and time under each risk setting, and what it gains over the centre.
+def success_table(rows: pd.DataFrame, groups: dict[Key, list[str]], first: Key) -> pd.DataFrame:
+    """A row a group of models: success and time under each risk setting, and what it gains over the first group.
 
     The gain is in points of success over both risk settings, with its interval and p by maps, corrected by Holm.
     """
-    by_dose: dict[tuple[int, str, float], list[str]] = {}
-    for dose in models:
-        by_dose.setdefault((dose.size, dose.what, dose.dose), []).append(dose.label)
-    centre = table.loc[by_dose[max(dose.size for dose in models), "temperature", 1.0]].mean(0)
-    lines = []
-    for (size, what, level), labels in by_dose.items():
+    by_map = rows.pivot_table(index="model", columns="map", values="success", aggfunc="mean")
+    centre, lines = by_map.loc[groups[first]].mean(0), {}
+    for key, labels in groups.items():
         own = rows[rows["model"].isin(labels)]
-        gain = 100 * (table.loc[labels].mean(0) - centre).to_numpy()
+        gain = 100 * (by_map.loc[labels].mean(0) - centre).to_numpy()
         gained, least, most = (float(value[0]) for value in mean_interval(gain[None]))
-        cells = {"training maps": size, "what": what, "dose": level, "pinball": loss[labels].mean()}
+        cells = {}
         for risk in RISKS:
             under = own[own["risk"] == risk]
             cells |= {
                 f"success {risk}": 100 * under["success"].mean(),
                 f"T_total {risk}": under["total_time_s"].mean(),
             }
-        lines.append({**cells, "gain": gained, "low": least, "high": most, "p": flipped(gain, 0)})
-    found = pd.DataFrame(lines)
-    others = (found[["low", "high"]] != 0).any(axis=1)
+        lines[key] = {**cells, "gain": gained, "low": least, "high": most, "p": flipped(gain, 0)}
+    found = pd.DataFrame(lines).T
+    others = [key != first for key in groups]
     found.loc[others, "p"] = holm(found.loc[others, "p"].to_numpy())
+    return found
+
+
+def doses_table(rows: pd.DataFrame, loss: pd.Series, models: list[Dose]) -> pd.DataFrame:
+    """A row a dose, over its seeds, with its loss; see `success_table`."""
+    groups: dict[tuple[int, str, float], list[str]] = {}
+    for dose in models:
+        groups.setdefault((dose.size, dose.what, dose.dose), []).append(dose.label)
+    found = success_table(rows, groups, (max(dose.size for dose in models), "temperature", 1.0))
+    for place, (name, values) in enumerate(
+        zip(("training maps", "what", "dose"), zip(*groups, strict=True), strict=True)
+    ):
+        found.insert(place, name, list(values))
+    found.insert(3, "pinball", [loss[labels].mean() for labels in groups.values()])
     return found.sort_values("pinball")
 
 
@@ -205,21 +218,20 @@ def print_quality(title: str, table: pd.DataFrame, against: str = "") -> None:
 
 def report_zoo(out: Path, rows: pd.DataFrame, table: pd.DataFrame) -> None:
     """Prints success of every method, against the fused model, and how it ranks with each score."""
-    rows = rows.assign(method=rows["model"].str.rsplit("-s", n=1).str[0])
-    success = 100 * rows.pivot_table(index="method", columns="map", values="success")
-    lines = Table(
-        "method", "success [%]", "− fused", "interval", title="success, both risk settings, all seeds"
-    )
-    for method, own in success.iterrows():
-        mean, low, high = mean_interval((own - success.loc["fused"]).to_numpy()[None])
-        lines.add_row(str(method), f"{own.mean():.2f}", f"{mean[0]:+.2f}", f"{low[0]:+.2f} to {high[0]:+.2f}")
-    Console(width=120).print(lines)
+    groups: dict[str, list[str]] = {}
+    for label in sorted(rows["model"].unique()):
+        groups.setdefault(label.rsplit("-s", maxsplit=1)[0], []).append(label)
     quality = table[(table["split"] == SPLIT) & ~table["privileged"]].groupby("method")[list(SCORES)].mean()
-    quality["success"] = success.mean(1)
-    quality.to_csv(out / "zoo-ranks.csv")
+    every = quality.join(success_table(rows, groups, "fused")).sort_values("pinball")
+    every.to_csv(out / "zoo-success.csv")
+    print_frame(
+        "the methods: scores, success and time, over seeds",
+        every.reset_index().drop(columns=list(SCORES[:3])),
+    )
+    success = every[[f"success {risk}" for risk in RISKS]].mean(axis=1)
     for name in SCORES:
-        both = quality[[name, "success"]].dropna()
-        tau, p = kendalltau(both[name], both["success"])
+        has = every[name].notna()
+        tau, p = kendalltau(every.loc[has, name], success[has])
         print(
-            f"exploratory: Kendall's τ of {name} and success over {len(both)} methods {tau:+.2f}, p = {p:.3f}"
+            f"exploratory: Kendall's τ of {name} and success over {has.sum()} methods {tau:+.2f}, p = {p:.3f}"
         )

@@ -22,7 +22,7 @@ __getattr__, __dir__, __all__ = face(
     },
 )
 
-__version__ = "0.9.0"
+__version__ = "0.10.0"
 
 # Gymnasium takes 0.05 s beside NumPy and loads no PyTorch.
 gymnasium.register(

@@ -1,5 +1,6 @@
-"""The cards of what is shipped, and the citation, say what files say: no number of theirs is their own."""
+"""The cards of what is shipped, the citation and the versions say what files say: no number of theirs is their own."""
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+import benchnav
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import digests_of
 from benchnav.models.predictor import find_checkpoint, load_model
@@ -84,3 +86,26 @@ def test_the_citation_is_of_this_version_and_of_the_paper() -> None:
     (paper,) = citation["references"]
     assert [author["family-names"] for author in paper["authors"]] == ["Endo", "Honda", "Ishigami"]
     assert (paper["year"], paper["identifiers"][0]["value"]) == (2024, "arXiv:2405.13318")
+
+
+def test_no_shipped_weights_began_at_those_of_others() -> None:
+    page = (ROOT / "docs" / "reference" / "licences.md").read_text()
+    for folder in MODELS:
+        parts = json.loads((folder / "config.json").read_text())["parts"]
+        assert parts["classifier"]["config"]["pretrained"] is False
+        assert f"`{folder.name}`" in page
+    assert '`config.json` of each checkpoint says `"pretrained": false`' in page
+    assert PROJECT["license"] in page
+
+
+def test_one_version_and_one_date_are_everywhere() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    newest = re.search(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    (entry,) = re.findall(r"@software\{.*?^\}", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
+    date = citation["date-released"]
+    assert benchnav.__version__ == citation["version"] == PROJECT["version"]
+    assert newest
+    assert newest[1] == f"{PROJECT['version']} ({date})"
+    assert f"version = {{{PROJECT['version']}}}" in entry
+    assert f"year = {{{date.year}}}" in entry
+    assert f"title = {{{citation['title']}}}" in entry

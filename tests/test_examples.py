@@ -71,7 +71,7 @@ def test_a_site_of_ones_own_goes_from_drives_to_a_suite(tmp_path: Path) -> None:
     said = run("own_site.py", tmp_path)
     assert "rows of drives.csv.gz were used" in said
     assert "against measured λ" in said
-    table = re.search(r"^site +astar_dwa +cvar:0.8 +\d+", said, re.MULTILINE)
+    table = re.search(r"^site +A\* \+ DWA +CVaR₀.₈ +\d+", said, re.MULTILINE)
     assert table, said
 
 

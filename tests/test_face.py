@@ -131,7 +131,7 @@ def test_no_public_name_is_that_of_a_commands_function(name: str) -> None:
     assert not functions & set(face(name).__all__)
 
 
-EXAMPLES = [*ROOT.glob("examples/*.py"), ROOT / "docs" / "risk" / "off_by.py"]
+EXAMPLES = [*ROOT.glob("examples/**/*.py"), ROOT / "docs" / "risk" / "off_by.py"]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]
 
 

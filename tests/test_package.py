@@ -1,10 +1,11 @@
-"""A wheel holds the package with the shipped maps and models, and runs where there is no repository."""
+"""Source archive and wheel hold the package with the shipped maps and models, and run where there is no repository."""
 
 import importlib.util
 import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -28,25 +29,56 @@ def shipped_files() -> tuple[str, ...]:
     return module.SHIPPED
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A wheel built of a copy of the repository, in which a user has made maps and a model."""
+def built(what: str, source: Path, out: Path) -> Path:
+    """A `wheel` or an `sdist` of a source tree, as `make wheel` builds it."""
     pytest.importorskip("setuptools", minversion="77")
-    work = tmp_path_factory.mktemp("wheel")
-    copy, out = work / "copy", work / "out"
-    hidden = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(ROOT / "benchnav", copy / "benchnav", ignore=hidden)
-    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", *shipped_files()):
-        (copy / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(ROOT / name, copy / name)
-    for own in ("datasets/mine-test.h5", "checkpoints/mine/config.json", "checkpoints/paper-v1/notes.json"):
-        (copy / own).parent.mkdir(exist_ok=True)
-        (copy / own).write_text("{}")
     out.mkdir()
-    build = f"from setuptools import build_meta; print(build_meta.build_wheel({str(out)!r}))"
-    subprocess.run([sys.executable, "-c", build], cwd=copy, check=True, capture_output=True)
-    (built,) = out.glob("*.whl")
-    return built
+    build = f"from setuptools import build_meta; print(build_meta.build_{what}({str(out)!r}))"
+    subprocess.run([sys.executable, "-c", build], cwd=source, check=True, capture_output=True)
+    (path,) = out.iterdir()
+    return path
+
+
+def files_of_git(*folders: str) -> list[str]:
+    if not (ROOT / ".git").exists():
+        pytest.skip("no git checkout")
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", *folders], cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    return [name for name in listed.stdout.split("\0") if name and (ROOT / name).exists()]
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A source archive built of a copy of the repository, in which a user has made maps and a model."""
+    work = tmp_path_factory.mktemp("archive")
+    copy = work / "copy"
+    own = ("datasets/mine-test.h5", "checkpoints/mine/config.json", "checkpoints/paper-v1/notes.json")
+    for name in (*files_of_git(), *own):
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
+        if name in own:
+            (copy / name).write_text("{}")
+        else:
+            shutil.copyfile(ROOT / name, copy / name)
+    return built("sdist", copy, work / "out")
+
+
+@pytest.fixture(scope="module")
+def wheel(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wheel built of the source archive."""
+    work = tmp_path_factory.mktemp("wheel")
+    with tarfile.open(archive) as packed:
+        packed.extractall(work, filter="data")
+    (source,) = work.iterdir()
+    return built("wheel", source, work / "out")
+
+
+def test_the_source_archive_holds_what_git_has(archive: Path) -> None:
+    with tarfile.open(archive) as packed:
+        names = {name.partition("/")[2] for name in packed.getnames() if packed.getmember(name).isfile()}
+    made = {name for name in names if name.startswith("benchnav.egg-info/")} | {"PKG-INFO", "setup.cfg"}
+    kept = {name for name in files_of_git() if not name.startswith(IN_REPOSITORY_ALONE)}
+    assert names - made == kept - {".gitignore"}
 
 
 def test_the_wheel_holds_the_package_and_what_is_shipped_and_nothing_else(wheel: Path) -> None:
@@ -68,12 +100,8 @@ def test_the_wheel_holds_the_package_and_what_is_shipped_and_nothing_else(wheel:
 
 
 def test_what_is_shipped_is_what_git_has() -> None:
-    if not (ROOT / ".git").exists():
-        pytest.skip("no git checkout")
-    listed = subprocess.run(
-        ["git", "ls-files", "datasets", "checkpoints"], cwd=ROOT, check=True, capture_output=True, text=True
-    )
-    named = [name for name in listed.stdout.split() if not name.startswith(IN_REPOSITORY_ALONE)]
+    listed = files_of_git("datasets", "checkpoints")
+    named = [name for name in listed if not name.startswith(IN_REPOSITORY_ALONE)]
     assert sorted(shipped_files()) == sorted(named)
 
 

@@ -125,8 +125,9 @@ def run(
         return 0
     except OSError as error:
         return _refuse(program, _unusable(error, command))
-    except KeyboardInterrupt:
-        print(f"{program}: interrupted; what was finished is kept", file=sys.stderr)
+    except KeyboardInterrupt as stopped:
+        # A command that knows what it has kept says so by the interruption's text.
+        print("; ".join([f"{program}: interrupted", *map(str, stopped.args)]), file=sys.stderr)
         return INTERRUPTED
 
 

@@ -18,6 +18,9 @@ from matplotlib.colors import Colormap, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
+from matplotlib.markers import MarkerStyle
+from matplotlib.path import Path as MarkerPath
+from matplotlib.transforms import Affine2D
 
 from benchnav.core.grid import is_azimuth
 from benchnav.core.store import replacing
@@ -35,7 +38,8 @@ _STYLE: dict[Any, Any] = {
     **dict.fromkeys(("xtick.major.size", "ytick.major.size"), 2.0),
     **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
     **dict.fromkeys(("figure.constrained_layout.h_pad", "figure.constrained_layout.w_pad"), 0.03),
-    "legend.handlelength": 1.6,
+    "hatch.linewidth": 0.7,
+    "legend.handlelength": 2.2,
     "legend.columnspacing": 1.4,
 }
 # Type 42 embeds whole fonts, as publishers ask; composed images would be sampled anew in a PDF.
@@ -54,22 +58,57 @@ _HATCH_CELLS = 4
 LACKING = "0.7"
 
 MARKERS = "osD^vP*X<"
+# Of paths and curves that lie over each other, which grey tells apart by these.
+LINE_STYLES: tuple[Any, ...] = (
+    "-",
+    (0, (3.2, 1.2)),
+    (0, (1, 1.1)),
+    (0, (5, 1.2, 1, 1.2)),
+    (0, (5, 1.2, 1, 1.2, 1, 1.2)),
+)
+# A tick, an hourglass and an arrowhead along x; a shape says in grey too how an episode ended.
+_TICK, _HOURGLASS, _ARROWHEAD = (
+    MarkerPath([*corners, corners[0]], closed=True)
+    for corners in (
+        [(-1, 0.05), (-0.62, 0.43), (-0.25, 0.05), (0.66, 0.95), (1, 0.6), (-0.25, -0.75)],
+        [(-0.8, 1), (0.8, 1), (-0.8, -1), (0.8, -1)],
+        [(1, 0), (-0.8, 0.7), (-0.4, 0), (-0.8, -0.7)],
+    )
+)
+ROBOT = "#ff7800"  # as no λ is coloured
+
 # What stands at a place on a map, for `Axes.plot`.
 _WHITE_EDGED: dict[str, Any] = {"ls": "none", "mec": "white", "mew": 0.8, "zorder": 3}
+_END: dict[str, Any] = {**_WHITE_EDGED, "color": "black", "ms": 7, "zorder": 4}
 MARKS: dict[str, dict[str, Any]] = {
     "start": {**_WHITE_EDGED, "marker": "o", "color": "#e61e1e", "ms": 5},
     "goal": {**_WHITE_EDGED, "marker": "*", "color": "#ff00ff", "ms": 9},
-    "robot": {**_WHITE_EDGED, "marker": "o", "color": "black", "ms": 5},
-    "end": {**_WHITE_EDGED, "marker": "X", "color": "black", "ms": 7, "zorder": 4},
+    "robot": {**_WHITE_EDGED, "marker": _ARROWHEAD, "color": ROBOT, "mec": "black", "ms": 8, "zorder": 3.5},
+    "arrived": {**_END, "marker": _TICK, "ms": 8},
+    "immobilised": {**_END, "marker": "X"},
+    "out of time": {**_END, "marker": _HOURGLASS},
+    "failed": {**_END, "marker": "s", "ms": 6},
 }
 
 _PLANNERS = {
-    "astar_dwa": ("A* + DWA", BLUE),
-    "astar_mppi": ("A* + MPPI", PINK),
+    "astar_dwa": ("A*+DWA", BLUE),
+    "astar_mppi": ("A*+MPPI", PINK),
     "cl_rrt": ("CL-RRT", ORANGE),
     "mppi": ("MPPI", GREEN),
     "straight": ("straight", BLIND),
 }
+
+# Of each shipped risk measure its name without a number, and with one.
+_RISKS = {
+    "mean": ("mean", "mean:{}"),
+    "cvar": ("CVaR", "CVaR{lowered}"),
+    "var": ("VaR", "VaR{lowered}"),
+    "expected-time": ("expected time", "expected time (floor {})"),
+    "chance": ("P(λ ≥ bound)", "P(λ ≥ {})"),
+    "single-class": ("single class", "single-class CVaR{lowered}"),
+}
+_NUMBER = re.compile(r"\d+(\.\d+)?")
+_LOWERED = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
 def styled() -> Any:
@@ -81,6 +120,19 @@ def planner_name(planner: str) -> str:
     """What figures call a planner, from its label: the name, and its options as they are."""
     name = re.split("[ :]", planner)[0]
     return _PLANNERS[name][0] + planner[len(name) :] if name in _PLANNERS else planner
+
+
+def risk_name(risk: str) -> str:
+    """What tables, figures and videos call a risk setting, from its label: `cvar:0.95` is CVaR₀.₉₅.
+
+    Args:
+        risk: a label. One that is not of a shipped measure with at most a number stays as it is.
+    """
+    measure, colon, number = risk.partition(":")
+    if colon and not _NUMBER.fullmatch(number):
+        return risk
+    named, with_number = _RISKS.get(measure, (measure, f"{measure}:{{}}"))
+    return with_number.format(number, lowered=number.translate(_LOWERED)) if colon else named
 
 
 def planner_colours(planners: Sequence[str]) -> dict[str, str]:
@@ -113,8 +165,8 @@ def bytes_of(colour: Any) -> tuple[int, ...]:
     return tuple(round(255 * value) for value in to_rgba(colour))
 
 
-def mark(panel: Axes, name: str, place: Any, scale: float = 1.0, **style: Any) -> None:
-    """Marks a place on a map.
+def mark(panel: Axes, name: str, place: Any, scale: float = 1.0, **style: Any) -> Line2D:
+    """Marks a place on a map; gives the mark.
 
     Args:
         panel: in metres.
@@ -124,12 +176,23 @@ def mark(panel: Axes, name: str, place: Any, scale: float = 1.0, **style: Any) -
         **style: what differs, as in `Axes.plot`; a legend calls the mark by its name, unless a `label` is there.
     """
     looks = MARKS[name] | {"label": name, "ms": scale * MARKS[name]["ms"]}
-    panel.plot(*place, **looks | style)
+    (drawn,) = panel.plot(*place, **looks | style)
+    return drawn
 
 
 def mark_handle(name: str, scale: float = 1.0) -> Line2D:
     """The entry of a legend for a mark."""
     return Line2D([], [], **MARKS[name] | {"label": name, "ms": scale * MARKS[name]["ms"]})
+
+
+def line_style(place: int) -> Any:
+    """The style of the line that is drawn in this place among others."""
+    return LINE_STYLES[place % len(LINE_STYLES)]
+
+
+def robot_marker(heading_rad: float) -> MarkerStyle:
+    """The mark of a robot that heads somewhere, as the `marker` of a line."""
+    return MarkerStyle(_ARROWHEAD, transform=Affine2D().rotate(float(heading_rad)))
 
 
 def draw_edged(panel: Axes, track: Any, width: float, colour: Any = "black", **style: Any) -> None:

@@ -300,10 +300,12 @@ def _spec(name: str, near: Path) -> ModuleSpec | None:
 
 @cache
 def _installed_folders() -> frozenset[str]:
+    """Folders of the standard library and of installed distributions, wherever on the path they were put."""
     known = sysconfig.get_paths()
     return frozenset(
         [known[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
         + [*site.getsitepackages(), site.getusersitepackages()]
+        + [folder for folder in sys.path if folder and any(Path(folder).glob("*.dist-info"))]
     )
 
 

@@ -111,7 +111,7 @@ def _take(lock: Path, what: str, kind: int) -> int:
         except BlockingIOError as error:
             os.close(descriptor)
             raise BenchnavError(
-                f"Another run is writing {what}. Wait for it, or choose another `out`."
+                f"Another run is writing {what}. Wait for it to end, or choose another `out`."
             ) from error
         except BaseException:
             os.close(descriptor)
@@ -142,10 +142,13 @@ def refuse_taken(out: Path, overwrite: bool, foreign: Callable[[Path], str]) -> 
         return
     if why := foreign(out):
         raise ConfigError(
-            f"Expected `out` to be new or what is made here, but {out} {why}. Choose another `out`."
+            f"Expected `out` to be new or an earlier result of this command, got {out}, which {why}. "
+            "Choose another `out`."
         )
     if not overwrite and not (out.is_dir() and not any(out.iterdir())):
-        raise ConfigError(f"Expected `out` to be new, but {out} exists. Pass --overwrite to replace it.")
+        raise ConfigError(
+            f"Expected `out` to be new, got {out}, which exists. Pass --overwrite to replace it."
+        )
 
 
 def new_folder(place: Path) -> Path:

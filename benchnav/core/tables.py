@@ -28,7 +28,10 @@ _LATEX = {
     "¶": r"\P{}",
 }  # fmt: skip
 _LATEX |= {raised: rf"\textsuperscript{{{digit}}}" for digit, raised in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")}
-_WRITTEN = re.compile("|".join(map(re.escape, _LATEX)))
+# Digits below the line, with the dots between them.
+_LOWERED = re.compile("[₀-₉]+(?:\\.[₀-₉]+)?")
+_RAISED = str.maketrans("₀₁₂₃₄₅₆₇₈₉", "0123456789")
+_WRITTEN = re.compile("|".join([_LOWERED.pattern, *map(re.escape, _LATEX)]))
 _MINUS = re.compile(r"(?<![\w-])-(?=\d)")
 _COLOUR = re.compile(r"#[0-9a-f]{6}")
 
@@ -152,7 +155,12 @@ def _one_line(heading: str) -> str:
 
 def latex(text: str) -> str:
     """Escapes text for LaTeX; a hyphen before a number of its own is a minus."""
-    return _WRITTEN.sub(lambda found: _LATEX[found[0]], _MINUS.sub("−", text))
+    return _WRITTEN.sub(_latex_of, _MINUS.sub("−", text))
+
+
+def _latex_of(found: re.Match[str]) -> str:
+    lowered = found[0].translate(_RAISED)
+    return _LATEX.get(found[0]) or rf"$_{{{lowered}}}$"
 
 
 def markdown(text: str) -> str:

@@ -90,7 +90,7 @@ def _run_in_processes(calls: Sequence[Callable[[], Result]], jobs: int) -> Itera
             yield future.result()
     except BrokenProcessPool as error:
         raise BenchnavError(
-            "A worker was killed, perhaps for want of memory. What was finished is kept: give the same command again, "
+            "A worker was killed, perhaps for lack of memory. Finished work is kept: give the same command again, "
             "if need be with fewer `jobs`."
         ) from error
     finally:
@@ -131,12 +131,12 @@ def _run_on_cluster(calls: Sequence[Callable[[], Result]], scheduler: str) -> It
                 yield future.result()
         except CancelledError as error:
             raise BenchnavError(
-                f"The scheduler at {scheduler} was lost. What was finished is kept: give the same command again."
+                f"The scheduler at {scheduler} was lost. Finished work is kept: give the same command again."
             ) from error
         except KilledWorker as error:
             raise BenchnavError(
                 f"Some work was given up, since several workers died over it, the last at {error.last_worker.address}: "
-                "see their logs, perhaps for want of memory. What was finished is kept."
+                "see their logs, perhaps for lack of memory. Finished work is kept."
             ) from error
 
 

@@ -38,11 +38,11 @@ def create(
     Args:
         recipe: Id of a shipped recipe, such as paper-v1, or path of a YAML file.
         overrides: Changes to it, such as id=mine splits.train.maps=50 scenarios.hs.severity=0.5.
-        out: File .h5 to write, or else a folder of many files; datasets/ID.h5 if not given, datasets/ID for many maps.
+        out: File .h5, or a folder for many files; datasets/ID.h5 if not given, datasets/ID for many maps.
         jobs: Worker processes of this machine; a cluster has its own. The result is the same for any number.
-        seed: Root seed in place of the recipe's: a sibling, of id ID-seedN, with other maps of the same classes.
+        seed: Root seed in place of the recipe's; makes other maps of the same classes, under the id ID-seedN.
         splits: Only these splits, for example [test/std,test/hg]; the same maps as in the whole.
-        first: Only the first so many maps of each split; the same maps as in the whole. 0 makes all.
+        first: Number of maps of each split to make, the first of the whole dataset; 0 makes all.
         shard: Make only this shard of the maps, such as 2/5; the others may be made on other machines.
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
@@ -77,8 +77,8 @@ def create(
     if not is_dataset(path):
         print(
             f"{path}: shard {own} is made\n"
-            f"when the others are: benchnav-datagen merge {path} OTHER … --out OUT, or, where they are made in the\n"
-            "same folder, nothing more: the last of them finishes it"
+            f"The last shard made in this folder finishes the dataset. Join shards of several folders with\n"
+            f"benchnav-datagen merge {path} OTHER … --out OUT"
         )
         return
     print_table(table(written(path)))
@@ -90,28 +90,31 @@ def list_datasets(folder: str = "") -> None:
     Args:
         folder: Where to look for files; where ids are looked up when not given.
     """
+    from benchnav.datagen.files.describe import widest
     from benchnav.datagen.files.find import dataset_folders
     from benchnav.datagen.files.manifest import FOLDER_MANIFEST
     from benchnav.datagen.recipe.recipe import shipped_sizes
 
     print("recipes:")
+    wide = widest(datagen.shipped_recipes())
     for name in datagen.shipped_recipes():
         sizes = ", ".join(f"{split} {maps}" for split, maps in shipped_sizes(name).items())
-        print(f"  {name:14} {sizes}")
-    expect(not folder or Path(folder).is_dir(), f"`folder` to be one, got {folder!r}.")
+        print(f"  {name:{wide}} {sizes}")
+    expect(not folder or Path(folder).is_dir(), f"`folder` as a folder that exists, got {folder!r}.")
     for place in [Path(folder)] if folder else dataset_folders():
         folders = [manifest.parent for manifest in place.glob(f"*/{FOLDER_MANIFEST}")]
         files = sorted([*place.glob("*.h5"), *folders])
         print(f"files in {place}:" if files else f"no files in {place}")
+        wide = widest(path.name for path in files)
         for path in files:
             try:
                 dataset = datagen.TerrainDataset(path)
             except DatasetError as error:
-                print(f"  {path.name:20} not readable: {error}")
+                print(f"  {path.name:{wide}} not readable: {error}")
                 continue
             sizes = ", ".join(f"{split} {entry['maps']}" for split, entry in dataset.splits.items())
             layers = f"; layers {', '.join(dataset.layer_names)}" if dataset.layer_names else ""
-            print(f"  {path.name:20} {dataset.id:14} {sizes}{layers}")
+            print(f"  {path.name:{wide}} {dataset.id:14} {sizes}{layers}")
 
 
 def show(file: str, json: bool = False) -> None:
@@ -159,15 +162,12 @@ def validate(file: str) -> int:
     print(f"{path}: {len(faults)} fault(s)")
     files = sorted({fault.file for fault in faults if fault.file})
     if not all("recipe" in part for entry in entries for part in entry["parts"]):
-        print("These maps were imported: import them again.")
+        print("To mend it, import its maps again.")
     elif files:
-        print(
-            f"To make them anew, remove {' '.join(files)} in {path} and give the command again that made it."
-        )
+        print(f"To mend it, remove {' '.join(files)} in {path} and give the command that made it again.")
     else:
         print(
-            "To make them anew, make the file again with --overwrite: the same recipe and version give the same "
-            "digests."
+            "To mend it, make the file again with --overwrite. The same recipe and version give the same digests."
         )
     return 1
 
@@ -177,7 +177,7 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
 
     Args:
         files: Paths or ids of two or more datasets, or folders with the shards of one.
-        out: File .h5 to write, or else a folder of many files.
+        out: File .h5 to write, or a folder for many files.
         id: Id of the new dataset; the name of the file when not given. Shards keep that of their recipe.
         overwrite: Replace what is there.
     """
@@ -265,7 +265,7 @@ def preview(
         path.suffix in (".png", ".pdf", ".svg", ".jpg"),
         f"`out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.",
     )
-    expect(maps is None or not contact_sheet, "either `maps` or `contact-sheet`, got both.")
+    expect(maps is None or not contact_sheet, "`maps` or `contact-sheet`, got both.")
     expect(maps is None or maps, "`maps` with at least one index, got none.")
     if contact_sheet:
         figure = contact_sheet_figure(dataset, split)
@@ -300,5 +300,5 @@ def main() -> None:
     description = "Make, list, show, check, combine, import, export and draw terrain datasets."
     status = run("benchnav-datagen", description, COMMANDS)
     if status == INTERRUPTED and sys.argv[1] == "create":
-        tell("benchnav-datagen: to go on, give the same command again")
+        tell("benchnav-datagen: finished maps are kept; to go on, give the same command again")
     sys.exit(status)

@@ -19,13 +19,8 @@ _HEADINGS = (
 )  # fmt: skip
 # What columns hold.
 _NOTES = (
-    "  stuck %: share of the cells that count as stuck: their true mean λ is at most λ_stuck, {stuck:g}.",
-    "  soft ground %: share of the cells whose class has soft spots, which no colour shows; 0 where no class has.",
-    "  soft spots %: share of all ground that is itself a soft spot, on average over draws of λ.",
-    "  time s: of the fastest path over cells that are not stuck, at 1 m/s times their mean λ: median, least and most "
-    "of the maps. A dash where the recipe does not ask for it with `solvable: true`.",
-    "  straight free: maps on which the straight line from start to goal meets no stuck cell. Where these are nearly "
-    "all, there is little to plan.",
+    "stuck: true mean λ ≤ λ_stuck. soft ground: classes with soft spots, which no colour shows. soft spots: of all.",
+    "time s: fastest path around stuck cells (solvable splits). straight free: maps with no stuck cell on the line.",
 )
 
 
@@ -112,9 +107,9 @@ def table(dataset: TerrainDataset) -> Table:
         straight = measured["straight"]
         rows.append((split, *percent, typical, spread, f"{straight.sum()}/{len(straight)}"))
     return Table(
-        title=f"how hard the maps are: what stands in a robot's way (λ_stuck {stuck:g})",
+        title=f"how hard the maps are (λ_stuck {stuck:g})",
         headings=_HEADINGS,
         numbers=True,
         rows=tuple(rows),
-        notes=tuple(note.format(stuck=stuck) for note in _NOTES),
+        notes=_NOTES,
     )

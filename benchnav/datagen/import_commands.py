@@ -21,7 +21,7 @@ class ImportOptions:
     """What real ground is made into.
 
     Args:
-        out: File .h5 to write, or else a folder of many files.
+        out: File .h5 to write, or a folder for many files.
         id: Id of the dataset; the name of the output when not given.
         recipe: Id or path of a recipe that gives size, resolution, start, goal, class table and light.
         stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
@@ -103,7 +103,7 @@ def import_drives(
 
     expect(
         photo or classes,
-        "`photo` or `classes` with `drives`, got neither: nothing would show where λ is low. Pass --photo RASTER.",
+        "`photo` or `classes` with `drives`, got neither, so that no input shows where λ is low. Pass --photo RASTER.",
     )
     rasters = Rasters(photo=photo, classes=classes, class_ids=class_ids, layer=layer, unlabelled=not classes)
     log = Drives(file=drives, least_speed=least_speed)
@@ -114,9 +114,9 @@ def import_drives(
     for split, source in sources.items():
         print(f"  {split}: {about['used'][split]} rows of {_few(about['drives'][split])}")
         counts = source["left_out"]
-        reasons = [f"{counts[reason]} {why}" for reason, why in REASONS.items() if counts.get(reason)]
+        reasons = [f"{counts[reason]} maps {why}" for reason, why in REASONS.items() if counts.get(reason)]
         if reasons:
-            print(f"  maps left out of {split}: {', '.join(reasons)}")
+            print(f"  left out of {split}: {', '.join(reasons)}")
         _tell_groups(made, split)
 
 
@@ -126,12 +126,14 @@ def _sum_up(about: Mapping[str, Any]) -> str:
 
     lines = [f"{sum(about['used'].values())} of {about['rows']} rows of {about['file']} were used"]
     lines += [
-        f"left out: {count} that {REASONS[reason]}" for reason, count in about["left_out"].items() if count
+        f"{count} rows are left out: they {REASONS[reason]}"
+        for reason, count in about["left_out"].items()
+        if count
     ]
     if about["pace"] is not None and not 1 / _MOST_PACE < about["pace"] < _MOST_PACE:
         lines.append(
-            f"note: positions move {about['pace']:g} times as far as measured_m_s says (median over spans of 2 s). Are "
-            "speeds in m/s, times in s and positions in m?"
+            f"warning: positions move {about['pace']:g} times as far as measured_m_s says (median over spans of 2 s). "
+            "Check that speeds are in m/s, times in s and positions in m"
         )
     return "\n  ".join(lines)
 
@@ -170,6 +172,6 @@ def _tell_groups(made: "datagen.TerrainDataset", split: str) -> None:
     if "group" in made.fields:
         groups = len(set(made.read(split, fields=["group"])["group"].tolist()))
         print(
-            f"  {made.map_count(split)} maps of {split} overlap and are {groups} group(s), the unit of statistics: for "
-            "a test split leave --stride out, so that maps lie side by side"
+            f"  {made.map_count(split)} maps of {split} overlap and form {groups} group(s), the statistical unit. "
+            "Leave --stride out of test splits, so that their maps do not overlap"
         )

@@ -20,11 +20,11 @@ TITLES = {
     "risk": "risk measures",
     "robot": "robots",
     "objective": "objectives",
-    "world": "worlds, with the rules of a task that go with each",
+    "world": "worlds, each with its rules of the task",
 }
 HELP = (
-    "More by package.module:Name and path/to/file.py:Name. NAME:VALUE sets the first option, "
-    "{part: NAME, label: LABEL, options: {...}} any."
+    "Parts of your own are named package.module:Name or path/to/file.py:Name. NAME:VALUE sets the first option, "
+    "{part: NAME, label: LABEL, options: {...}} sets any."
 )
 
 
@@ -131,7 +131,7 @@ def _option_lines(options: dict[str, Option], prefix: str = "", holder: Any = No
 
 def _default(value: Any) -> str:
     if value is registry.NO_DEFAULT:
-        return " (has to be given)"
+        return " (required)"
     try:
         return f" = {json.dumps(plain(value), ensure_ascii=False)}"
     except ConfigError:

@@ -29,20 +29,20 @@ def run_command(
     device: Device = "auto",
     reuse_code: bool = False,
 ) -> int:
-    """Run a suite into a folder, going on with or extending the run that is there.
+    """Run a suite into a folder; resume or extend the run that is there.
 
     Args:
         suite: What is evaluated.
         out: Run folder.
         jobs: Worker processes. The result is the same for any number.
-        overwrite: Drop a run that is there.
+        overwrite: Delete the run that is there first.
         planner_limit_s: Seconds that a planner may take for one answer; planners then run in processes of
             their own. 0 sets no limit.
-        shard: I/N runs the I-th of N shards of the run alone; `merge` makes one run of them.
+        shard: I/N runs only the I-th of N shards of the run; `merge` joins them.
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
         device: Where maps are predicted and episodes run; auto takes CUDA where there is a GPU.
-        reuse_code: Take finished units that other code has made, and mark their rows; they are not used otherwise.
+        reuse_code: Use finished units of other code too, and mark their rows.
     """
     from benchnav.eval.run.runner import run_suite
 
@@ -58,15 +58,15 @@ def run_command(
     if own is None:
         return _finish(folder)
     print(f"shard {own} is finished in {folder}")
-    print(f"merge:   {program('benchnav-eval')} merge OUT PART …, when all {own.of} are")
+    print(f"merge:   {program('benchnav-eval')} merge OUT PART …, once all {own.of} shards are finished")
     return _failed(folder)
 
 
 def merge(out: str, parts: list[str]) -> int:
-    """Make one run of its shards, and report on it.
+    """Merge the shards of a run, and report on it.
 
     Args:
-        out: Run folder to be made.
+        out: New run folder.
         parts: Folders of all the run's shards, in any order.
     """
     from benchnav.eval.run.merge import merge_shards
@@ -90,7 +90,7 @@ def rerun(
         folder: Run folder of a finished run.
         out: Run folder of the repeated run; RUN-rerun when not given.
         jobs: Worker processes.
-        overwrite: Drop a run that is there.
+        overwrite: Delete the run that is there first.
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
     """
@@ -117,11 +117,11 @@ def list_command(kinds: list[str]) -> None:
 
 
 def report(folder: str, out: str = "") -> None:
-    """Write tables, figures and the page of a finished run again, and print what it says.
+    """Write the report of a finished run again (tables, figures, page), and print it.
 
     Args:
         folder: Run folder.
-        out: Folder that they are written to, such as for a run that cannot be written; the run's own when not given.
+        out: Folder for them, for a run that cannot be written; the run folder when not given.
     """
     _report(Path(folder), other_folder(folder, out))
 
@@ -138,14 +138,14 @@ def compare(
     """Compare conditions that met the same maps with the same draws of λ, with intervals and corrected tests.
 
     Args:
-        labels: Of the conditions that are looked at.
+        labels: Of the conditions to compare.
         folders: Folders of finished runs, one or more.
-        against: What all others are compared with, such as mean or straight; all pairs when not given.
-        by: In what conditions differ, and in nothing else: risk, planner, model, objective, robot, world or run. When
-            not given, that in which `against` is found; run where runs share conditions; else risk.
-        points: Difference of success in percentage points, for which the maps that it needs are told.
-        allow_different: code compares conditions that other code made too, and names in every table what differs.
-        out: Path without a suffix; .csv, .md and .tex are written there.
+        against: Label that all others are compared with, such as mean or straight; all pairs when not given.
+        by: The one thing in which the conditions of a pair differ: risk, planner, model, objective, robot, world or
+            run. When not given: the kind of `against`; run where runs share conditions; else risk.
+        points: Difference of success in percentage points; a note tells how many maps it needs.
+        allow_different: code also compares conditions made by different code, and says so under the table.
+        out: Path without a suffix, to which .csv, .md and .tex are added.
     """
     from benchnav.core.tables import print_table
     from benchnav.eval.compare import compare_runs, write_comparison
@@ -157,6 +157,8 @@ def compare(
     print_table(shown)
     if out:
         print("written:", ", ".join(map(str, write_comparison(Path(out), table, shown))))
+    else:
+        print("columns: --out NAME writes NAME.md, which explains them")
 
 
 def _own_folder(path: str) -> Path:
@@ -170,10 +172,10 @@ def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
     if jobs < 1:
         raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
     if (backend == "dask") != bool(scheduler):
-        raise ConfigError("Expected `backend` dask and `scheduler` together, got one without the other.")
+        raise ConfigError("Expected `backend` dask and `scheduler` together, got one of the two. Pass both.")
     if scheduler and jobs > 1:
         raise ConfigError(
-            f"Expected no `jobs` with `backend` dask, whose cluster has its own workers, got {jobs}."
+            f"Expected no `jobs` with `backend` dask, got {jobs}. The cluster has its own workers: leave `jobs` out."
         )
 
 
@@ -236,14 +238,14 @@ def _failed(folder: Path) -> int:
 
     if not (folder / ERRORS).exists():
         return 0
-    said = "some episodes ended by a fault of the code they ran"
+    said = "warning: a planner or model failed in some episodes"
     if (folder / EPISODES).exists():  # which a shard does not have
         rows = read_table(folder, EPISODES)
         faults = rows[rows["outcome"].isin(["planner_error", "model_error"])]
         counts = faults["outcome"].value_counts()
-        counted = " and ".join(f"{count} in {kind}" for kind, count in counts.items())
+        counted = " and ".join(f"{count} {kind}" for kind, count in counts.items())
         first = faults["error"].iloc[0]
-        said = f"episodes that ended by a fault of the code they ran: {counted}, the first by {first}"
+        said = f"warning: a planner or model failed in some episodes ({counted}); the first fault: {first}"
     _say(f"{said}; see {folder / ERRORS}")
     return 1
 
@@ -264,7 +266,8 @@ def main() -> None:
     description = "Evaluate planners under risk settings; report, replay, merge, repeat."
     status = run("benchnav-eval", description, COMMANDS)
     if status == INTERRUPTED and sys.argv[1] in ("run", "rerun"):
-        _say("to go on, give the same command again")
+        anew = any(word.startswith("--overwrite") for word in sys.argv)
+        _say(f"finished units are kept; to go on, give the same command{' without --overwrite' * anew} again")
     sys.exit(status)
 
 

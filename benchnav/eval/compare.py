@@ -19,6 +19,7 @@ from benchnav.eval.experiment.unit import DRAW
 from benchnav.eval.folder.provenance import code_differences
 from benchnav.eval.folder.run_folder import EPISODES, Run, caveats, differences, open_run, read_table
 from benchnav.eval.report.result_tables import comparison_table
+from benchnav.eval.report.words import reading_name
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import (
     Compared,
@@ -78,12 +79,12 @@ def compare_runs(
     lines = _unlike_code(members, parts_alone=not any(unlike))
     if lines and by != "run" and not allow_different_code:
         raise ConfigError(
-            f"Expected conditions that differ in their {by} alone, but the code that made them differs too: "
-            f"{'; '.join(lines)}. Run them with one code, or pass --allow-different code to have it said in the table."
+            f"Expected conditions that differ in their {by} alone, got conditions made by different code: "
+            f"{'; '.join(lines)}. Run them with one code, or pass --allow-different code, which names it in the table."
         )
     table = compare(pairs, difference).assign(different_code=["; ".join(found) for found in unlike])
     shown = comparison_table(table, difference, by)
-    notes = (*_about(pairs, table), *_left_out(pairs), *_no_partner(conditions, pairs), *shown.notes)
+    notes = (*_about(pairs, table), *_left_out(pairs, by), *_no_partner(conditions, pairs, by), *shown.notes)
     notes += tuple(f"Different code: {line}." for line in lines)
     notes += tuple(dict.fromkeys(line for run in runs for line in caveats(run.about)))
     return table, replace(shown, notes=notes)
@@ -202,8 +203,8 @@ def _joined(one: Compared, other: Compared) -> Compared:
         both = len(first.merge(second, on=DRAW))
         why = "; ".join(_unlike_code((one, other)))
         raise ConfigError(
-            f"Expected one set of rows of a condition that several runs hold, but {len(unlike)} of {both} episodes of "
-            f"{words} came out differently in {runs}{f' ({why})' if why else ''}. Leave one of them out, or "
+            f"Expected the same rows of a condition in all runs that hold it, got {len(unlike)} of {both} episodes of "
+            f"{words} that differ between {runs}{f' ({why})' if why else ''}. Leave one of the runs out, or "
             "compare the runs with each other by --by run."
         )
     rows = pd.concat([one.episodes, other.episodes]).drop_duplicates(DRAW, ignore_index=True)
@@ -214,28 +215,25 @@ def _joined(one: Compared, other: Compared) -> Compared:
 
 def _about(pairs: Sequence[Pair], table: pd.DataFrame) -> list[str]:
     same = [
-        f"{name} {table[name].iloc[0]}"
+        f"{name} {reading_name(name, table[name].iloc[0])}"
         for name in LABELS
         if name in table and table[name].nunique() == 1 and table[name].iloc[0] != NOT_USED
     ]
-    lines = [f"Of {', '.join(same)}."]
     if all(table[name].nunique() == 1 for name in ("n_maps", "n_groups", "n_episodes")):
         maps, groups, episodes = table[["n_maps", "n_groups", "n_episodes"]].iloc[0]
-        lines.append(
-            f"Each pair: {maps} maps, {episodes} episodes of each condition, both with the same draws of λ."
-        )
+        same.append(f"{maps} maps")
         if groups != maps:
-            lines.append(
-                f"The maps are in {groups} groups that overlap or share a site; the group is the unit."
-            )
-    return lines
+            same.append(f"{groups} groups of maps (the statistical unit)")
+        same.append(f"{episodes} episodes a condition")
+    return [f"All pairs: {', '.join([*same, 'the same draws of λ'])}."]
 
 
-def _left_out(pairs: Sequence[Pair]) -> list[str]:
+def _left_out(pairs: Sequence[Pair], by: str) -> list[str]:
     """Says which episodes of a condition its partner was not run on."""
     lines: dict[str, None] = {}
     for pair in pairs:
-        sides = (pair.one, pair.other), (pair.other, pair.one)
+        one, other = (reading_name(by, label) for label in (pair.one, pair.other))
+        sides = (one, other), (other, one)
         for condition, (own, partner) in zip(pair.members, sides, strict=True):
             both = condition.episodes[DRAW].merge(pair.episodes[DRAW], how="left", indicator=True)
             rows = both[both["_merge"] == "left_only"]
@@ -248,8 +246,8 @@ def _left_out(pairs: Sequence[Pair]) -> list[str]:
             if places:
                 more = f" and {len(places) - _NAMED} more draws" if len(places) > _NAMED else ""
                 line = (
-                    f"Left out: {len(rows)} of {len(condition.episodes)} episodes of {own}, on which {partner} was not "
-                    f"run ({'; '.join(places[:_NAMED])}{more})."
+                    f"{len(rows)} of {len(condition.episodes)} episodes of {own} are left out: {partner} was not run "
+                    f"on them ({'; '.join(places[:_NAMED])}{more})."
                 )
                 lines[line] = None
     return _first_of(list(lines), "pairs with episodes left out")
@@ -265,15 +263,24 @@ def _maps(maps: Sequence[int]) -> str:
     return f"{len(maps)} maps ({', '.join(map(str, maps[:_NAMED]))}{more})"
 
 
-def _no_partner(conditions: Sequence[Compared], pairs: Sequence[Pair]) -> list[str]:
+def _no_partner(conditions: Sequence[Compared], pairs: Sequence[Pair], by: str) -> list[str]:
     """Names the conditions that are in no pair."""
     paired = {member for pair in pairs for member in pair.members}
     alone = [condition for condition in conditions if condition not in paired]
     varying = [
         name for name in (*LABELS, "run") if len({condition.labels[name] for condition in conditions}) > 1
     ]
-    names = [" ".join(label_words(condition.labels, varying)) for condition in alone]
-    return [f"Without a partner, so in no row: {'; '.join(_first_of(names, 'conditions'))}."] if names else []
+    names = [" ".join(label_words(_as_read(condition.labels), varying)) for condition in alone]
+    if not names:
+        return []
+    return [
+        f"Not in the table, since no condition differs from them in {by} alone: "
+        f"{'; '.join(_first_of(names, 'conditions'))}."
+    ]
+
+
+def _as_read(labels: Mapping[str, str]) -> dict[str, str]:
+    return {name: reading_name(name, label) for name, label in labels.items()}
 
 
 def _first_of(lines: list[str], what: str) -> list[str]:

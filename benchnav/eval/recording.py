@@ -52,7 +52,7 @@ class Ground:
         about: what it is known by: labels of a condition, `seed`, `realisation` and `map` among them.
         resolution_m: edge length of a cell.
         rgb: uint8, shape [3, H, W].
-        field: λ as it was through the episode, shape [H, W]; None where it was resampled.
+        field: λ of every cell in the episode, shape [H, W]; None where it was resampled.
         immobilising: cells of the field that immobilise a robot, bool, shape [H, W].
         goal_m: (x, y).
     """

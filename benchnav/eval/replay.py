@@ -31,7 +31,7 @@ def replay(
     video: str = "",
     out: str = "",
 ) -> int:
-    """Play an episode back, or several on one map, recording first what was not recorded.
+    """Play back an episode, or several on one map; missing recordings are made first.
 
     Several labels of a column, such as --risk mean,cvar:0.9, show their conditions together. Of a column that is not
     named the run's first label that fits is taken.
@@ -42,11 +42,10 @@ def replay(
         seed: Root seed; the run's first when not given.
         realisation: Draw of λ.
         map: Number of the map in the scenario.
-        view: Open the viewer; false only makes the recording.
+        view: Open the viewer; false makes the recording only.
         web: Serve the viewer to a browser on this machine until Ctrl-C.
         video: Write a video to this file, .mp4, in place of opening the viewer; conditions stand side by side.
-        out: Folder that recordings are written to, such as for a run that cannot be written; the run's own when not
-            given.
+        out: Folder for recordings, for a run that cannot be written; the run folder when not given.
     """
     from benchnav.eval.find_episodes import find_episodes
 
@@ -66,8 +65,8 @@ def replay(
     worlds = dict.fromkeys(unit.condition.labels["world"] for unit, _ in found)
     if len({repr(unit.condition.world) for unit, _ in found}) > 1:
         raise ConfigError(
-            f"Expected conditions in one world to show on one map, got {', '.join(worlds)}. A video shows them side by "
-            "side: --video FILE.mp4."
+            f"Expected conditions of one world to show on one map, got {', '.join(worlds)}. Pass --video FILE.mp4, "
+            "which shows them side by side."
         )
     path = _viewer_file(run, found, place)
     print(f"recording: {path}")
@@ -81,7 +80,7 @@ def replay(
         return (
             1 if subprocess.run([sys.executable, "-m", "rerun_cli", str(path)], check=False).returncode else 0
         )
-    lacking = "there is no display here; " if view else ""
+    lacking = "no display was found; " if view else ""
     print(
         f"{lacking}view it with: {program('rerun')} {path}, in a browser with --web, or as --video FILE{VIDEO}"
     )

@@ -249,8 +249,8 @@ def refuse_unfinished(folder: str | Path, trained: Collection[str] = ()) -> None
     if begun:
         command = "all" if GP in trained else _command(begun[0])
         raise CheckpointError(
-            f"Expected a trained model in {folder}, got one whose training was interrupted: {logs / begun[0]} has not "
-            "come to its end. Go on with the command that began it and --resume, such as "
+            f"Expected a trained model in {folder}, got one whose training was interrupted: {logs / begun[0]} is not "
+            "finished. Give its command again with --resume, such as "
             f"`benchnav-train {command} --data DATA --out {folder} --resume`."
         )
 

@@ -3,7 +3,7 @@
 import sys
 from typing import Any
 
-from benchnav.core.command import INTERRUPTED, Command, Device, run
+from benchnav.core.command import Command, Device, run
 from benchnav.models.config import (
     ClassifierConfig,
     LatentGPConfig,
@@ -14,7 +14,6 @@ from benchnav.models.onnx_command import export
 from benchnav.models.quality.command import evaluate
 from benchnav.models.quality.compare.command import compare
 
-_RESUMABLE = ("fit", "classifier", "all", "mdn")
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
 
 
@@ -142,9 +141,4 @@ COMMANDS = {
 
 def main() -> None:
     """Entry point of `benchnav-train`."""
-    status = run("benchnav-train", "Train and measure models of traversability.", COMMANDS)
-    if status == INTERRUPTED and sys.argv[1] in _RESUMABLE:
-        anew = any(word.startswith("--overwrite") for word in sys.argv)
-        instead = " in place of --overwrite" if anew else ""
-        print(f"benchnav-train: to go on, give the same command with --resume{instead}", file=sys.stderr)
-    sys.exit(status)
+    sys.exit(run("benchnav-train", "Train and measure models of traversability.", COMMANDS))

@@ -21,14 +21,14 @@ class TrainOptions:
         device: Where it is trained and calibrated; auto takes CUDA where there is a GPU.
         trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
         workers: Processes that read maps ahead. The result is the same for any number.
-        in_memory: Hold all maps in memory, in place of reading them as they are asked for.
+        in_memory: Hold all maps in memory instead of reading them when they are needed.
         half_precision: Store the weights of networks as float16.
         symmetries: Turn and mirror training maps at random; false for photos, whose light comes from one direction.
         crop: Train on squares of so many cells a side, drawn anew each epoch; 0 takes whole maps.
-        resume: Go on with a training that was interrupted; finished parts and whole epochs are kept.
-        overwrite: Replace the same parts, or a checkpoint of another model or other classes, that is there.
-        conformal: Recalibrate the whole model on every second map of valid, which stopping and temperature then do
-            not see, so that its lower quantiles keep their promise on new maps of the same kind.
+        resume: Go on with an interrupted training from its finished parts and epochs.
+        overwrite: Replace these parts, or a checkpoint of another model or other classes, where `out` holds one.
+        conformal: Recalibrate the model on every second map of valid, which early stopping and temperature then leave
+            out. Its lower quantiles then hold on new maps of the same kind.
     """
 
     seed: int = 0
@@ -145,15 +145,15 @@ class LatentGPConfig:
         epochs: equal parts of training, after each of which progress is shown.
         epoch_steps: steps an epoch, each over all cells.
         prior_level: λ on flat ground before any data.
-        prior_fall: by which it falls with each degree of slope.
+        prior_fall: fall of λ per degree of slope before any data.
         prior_fall_std: standard deviation of that fall.
-        prior_std: standard deviation of the function about this line, to begin with.
-        prior_std_range: within which the data may change it.
-        length_deg: length scale of the function, to begin with.
-        length_range_deg: within which the data may change it.
+        prior_std: initial standard deviation of the function about this line.
+        prior_std_range: range in which training may change it.
+        length_deg: initial length scale of the function.
+        length_range_deg: range in which training may change it.
         noise_std: standard deviation of λ about the function before any data.
         noise_spread: standard deviation of its logarithm.
-        noise_std_range: within which the data may change it.
+        noise_std_range: range in which training may change it.
     """
 
     likelihood: Literal["censored", "gaussian"] = "censored"

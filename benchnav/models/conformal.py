@@ -88,7 +88,7 @@ def fit_table(scores: Sequence[ndarray], levels: tuple[float, ...] = LEVELS) -> 
         ConfigError: no map has a score.
     """
     maps = [own for own in scores if len(own)]
-    expect(len(maps) > 0, "maps with an observed λ to take scores from, got none.")
+    expect(len(maps) > 0, "maps with an observed λ to calibrate on, got none.")
     weight = 1 / (len(maps) + 1)
     weights = np.concatenate([np.full(len(own), weight / len(own)) for own in maps])
     pooled = np.concatenate(maps)

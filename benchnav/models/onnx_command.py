@@ -23,7 +23,8 @@ def export(checkpoint: str, onnx: str, level: float = 0.9, opset: int = 18, over
     expect(onnx.endswith(".onnx"), f"`onnx` as a file FILE.onnx, got {onnx!r}.")
     path = output_path(onnx)
     expect(
-        overwrite or not path.exists(), f"`onnx` as a new file, got {onnx}, which is there. Pass --overwrite."
+        overwrite or not path.exists(),
+        f"`onnx` as a new file, got {onnx}, which exists. Pass --overwrite to replace it.",
     )
     graph = export_onnx(load_model(checkpoint), path, checkpoint, level, opset)
     print(

@@ -154,8 +154,8 @@ def _rebuilt(family: registry.Found, checkpoint: Checkpoint) -> TraversabilityMo
     """Rebuilds a model, and tells when its class is of other code now; what that raises ends in one line."""
     if checkpoint.code and checkpoint.code != family.digest:
         tell(
-            f"benchnav: warning: the code of {checkpoint.model} in {family.origin} is not that which trained the "
-            f"checkpoint (digest {family.digest[:12]}, then {checkpoint.code[:12]}): what it predicts may differ"
+            f"benchnav: warning: {checkpoint.model} in {family.origin} has changed since it trained the checkpoint "
+            f"(digest {family.digest[:12]}, then {checkpoint.code[:12]}), so that its predictions may differ"
         )
     try:
         model = family.target.from_checkpoint(checkpoint)
@@ -192,9 +192,8 @@ def find_checkpoint(source: str | Path) -> Path:
         return hub.download(str(source), "model", CheckpointError)
     if str(source) == IN_REPOSITORY_ALONE:
         raise ConfigError(
-            f"Expected the checkpoint {source}, which an installed wheel leaves out for its size, in checkpoints/, got "
-            f"none. Copy the folder checkpoints/{source} of the repository there, or name another model, such as "
-            "stakes-v1."
+            f"Expected the checkpoint {source} in checkpoints/, got none: the wheel leaves it out for its size. Copy "
+            f"the folder checkpoints/{source} of the repository there, or name another model, such as stakes-v1."
         )
     path, names = Path(source), [path.name for path in list_checkpoints()]
     known = sorted({*registry.names("model"), *names})
@@ -255,8 +254,8 @@ def class_mismatch(model: TraversabilityModel | Checkpoint, recipe: Recipe, name
     if model.class_names in ((), names):
         return ""
     return (
-        f"{name} was trained on another class table than that of {recipe.id}: on "
-        f"{', '.join(model.class_names)}; the maps have {', '.join(names)}"
+        f"{name} was trained on other classes than those of {recipe.id}: {', '.join(model.class_names)}; the maps have "
+        f"{', '.join(names)}"
     )
 
 

@@ -10,7 +10,7 @@ shapes: *B any leading dimensions, S state and A action dimensions.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -110,11 +110,13 @@ class TravelTime(Objective):
 def toward_waypoints(objective: Objective) -> Objective:
     """J of a local planner: a way-point is reached at the point itself, not within the goal's radius of it.
 
-    Else a way-point that is nearer than that radius, as in narrow places, would draw no robot.
+    Else a way-point that is nearer than that radius, as in narrow places, would draw no robot. A dataclass with
+    a field `goal_radius_m` is remade with the smaller radius; another objective is used as it is.
     """
-    if not isinstance(objective, TravelTime):
+    if not is_dataclass(objective) or "goal_radius_m" not in {entry.name for entry in fields(objective)}:
         return objective
-    return replace(objective, goal_radius_m=min(objective.goal_radius_m, _WAYPOINT_M))
+    radius: float = objective.goal_radius_m
+    return replace(objective, goal_radius_m=min(radius, _WAYPOINT_M))
 
 
 def has_path_cost(objective: Objective) -> bool:

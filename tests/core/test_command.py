@@ -343,13 +343,16 @@ def test_what_the_system_refuses_is_named_with_a_remedy(
     assert expected.format(here=Path.cwd()) in err
 
 
-def test_an_interruption_ends_with_130(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(("said", "expected"), [((), ""), (("2 maps are kept",), "; 2 maps are kept")])
+def test_an_interruption_ends_with_130_and_says_what_the_command_kept(
+    said: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     def stop() -> None:
         """Stop."""
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(*said)
 
     assert run("x", "Does.", {"stop": Command(stop)}, ["stop"]) == 130
-    assert "what was finished is kept" in capsys.readouterr().err
+    assert capsys.readouterr().err == f"x: interrupted{expected}\n"
 
 
 class Unread:

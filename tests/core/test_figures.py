@@ -9,19 +9,25 @@ from hypothesis.extra.numpy import arrays
 from matplotlib.figure import Figure
 
 from benchnav.core.figures import (
+    _RISKS,
     BLIND,
     LINE_COLOURS,
+    LINE_STYLES,
     MARKS,
     TWO_COLUMNS_IN,
     condition_colours,
     hatching,
     layer_scale,
+    line_style,
     outline,
     planner_colours,
     planner_name,
+    risk_name,
+    robot_marker,
     save_twice,
     styled,
 )
+from benchnav.core.registry import find, names
 
 
 def test_a_planner_has_one_colour_in_whatever_company() -> None:
@@ -36,7 +42,7 @@ def test_a_planner_has_one_colour_in_whatever_company() -> None:
 @pytest.mark.parametrize(
     ("planner", "name"),
     [
-        ("astar_dwa", "A* + DWA"),
+        ("astar_dwa", "A*+DWA"),
         ("cl_rrt expansions=64", "CL-RRT expansions=64"),
         ("mppi:9", "MPPI:9"),
         ("mine", "mine"),
@@ -59,9 +65,21 @@ def test_eight_conditions_have_eight_colours() -> None:
     assert condition_colours(["mppi"] * 9)[8] == condition_colours(["mppi"] * 2)[0]
 
 
-def test_marks_differ_in_shape_or_colour() -> None:
-    assert len({(looks["marker"], looks["color"]) for looks in MARKS.values()}) == len(MARKS)
-    assert {looks["mec"] for looks in MARKS.values()} == {"white"}
+def test_marks_differ_in_shape_and_have_an_edge_that_parts_them_from_the_ground() -> None:
+    assert len({str(looks["marker"]) for looks in MARKS.values()}) == len(MARKS)
+    assert {name for name, looks in MARKS.items() if looks["mec"] != "white"} == {"robot"}
+    assert MARKS["robot"]["mec"] == "black"
+
+
+def test_lines_that_are_drawn_together_differ_in_style() -> None:
+    assert len({repr(line_style(place)) for place in range(len(LINE_STYLES))}) == len(LINE_STYLES)
+    assert line_style(0) == line_style(len(LINE_STYLES)) == "-"
+
+
+def test_the_robots_mark_turns_and_keeps_its_size() -> None:
+    east, north = (robot_marker(heading) for heading in (0.0, np.pi / 2))
+    tips = [turned.get_transform().transform(turned.get_path().vertices[0]) for turned in (east, north)]
+    np.testing.assert_allclose(tips[0][::-1], tips[1], atol=1e-9)
 
 
 @pytest.mark.usefixtures("whole_fonts")
@@ -143,3 +161,20 @@ def test_a_layer_of_directions_ends_in_the_colour_that_it_begins_with() -> None:
     scale = layer_scale("rows_azimuth_deg", np.array([10.0, 20.0]))
     assert (scale["vmin"], scale["vmax"]) == (0.0, 360.0)
     np.testing.assert_allclose(scale["cmap"](0.0), scale["cmap"](1.0), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("label", "name"),
+    [
+        ("mean", "mean"), ("cvar", "CVaR"), ("cvar:0.95", "CVaR₀.₉₅"), ("var:0.9", "VaR₀.₉"),
+        ("expected-time", "expected time"), ("expected-time:0.05", "expected time (floor 0.05)"),
+        ("chance:0.1", "P(λ ≥ 0.1)"), ("single-class", "single class"), ("single-class:0", "single-class CVaR₀"),
+        ("entropic:5", "entropic:5"), ("cautious", "cautious"), ("cvar:x", "cvar:x"), ("–", "–"),
+    ],
+)  # fmt: skip
+def test_risk_settings_are_named_as_papers_do_and_own_ones_stay(label: str, name: str) -> None:
+    assert risk_name(label) == name
+
+
+def test_every_shipped_risk_measure_has_a_name_for_readers() -> None:
+    assert set(_RISKS) == {name for name in names("risk") if find("risk", name).shipped}

@@ -114,6 +114,20 @@ def test_the_standard_library_and_what_is_installed_have_versions_instead(part: 
     assert "numpy" in sys.modules  # it could have been followed
 
 
+def test_what_was_installed_into_a_folder_of_its_own_is_left_out_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "target"
+    (target / "other-1.0.dist-info").mkdir(parents=True)
+    (target / "other_aid.py").write_text("x = 1\n")
+    monkeypatch.syspath_prepend(target)
+    sources._installed_folders.cache_clear()
+    try:
+        assert imported_sources(tmp_path, "", b"import other_aid") == {}
+    finally:
+        sources._installed_folders.cache_clear()
+
+
 def test_the_same_files_elsewhere_have_the_same_digest(part: Path, tmp_path: Path) -> None:
     """A fresh process says so, which has imported neither."""
     other = tmp_path / "copy"

@@ -95,3 +95,7 @@ def test_bold_cells_and_what_bold_means() -> None:
     assert "\x1b[1m–\x1b[0m" in styled
     assert "Bold: the best | all" in styled
     assert "\x1b" not in plain
+
+
+def test_lowered_digits_are_one_index_in_latex() -> None:
+    assert latex("CVaR₀.₉₅, VaR₀") == r"CVaR$_{0.95}$, VaR$_{0}$"

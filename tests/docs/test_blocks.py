@@ -5,8 +5,6 @@ examples: `sh` by bash, `python` in one namespace. A block with `title="FILE"` i
 run, nor is one after the comment `<!-- not run: WHY -->`.
 """
 
-import os
-import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -15,39 +13,12 @@ import pytest
 
 from tests.docs.pages import ROOT, Block, blocks, name, pages
 
-TAKEN = ("examples", "datasets", "checkpoints", "docs")
 LIMIT_S = 900
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A folder to work in, with what a checkout has."""
-    for taken in TAKEN:
-        (tmp_path / taken).mkdir()
-        for own in (ROOT / taken).iterdir():
-            (tmp_path / taken / own.name).symlink_to(own)
-    commands = tmp_path / ".commands"
-    commands.mkdir()
-    for program in ("datagen", "train", "eval"):
-        path = commands / f"benchnav-{program}"
-        path.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m tests.docs.smaller {program} "$@"\n')
-        path.chmod(path.stat().st_mode | stat.S_IEXEC)
-    return tmp_path
 
 
 @pytest.mark.docs
 @pytest.mark.parametrize("page", pages(), ids=name)
-def test_what_a_page_shows_runs(page: Path, folder: Path) -> None:
-    os_path = (
-        f"{folder / '.commands'}{os.pathsep}{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    )
-    environment = {
-        "BENCHNAV_DOCS_MAPS": "2",
-        **os.environ,
-        "PATH": os_path,
-        "PYTHONPATH": f"{ROOT}{os.pathsep}{folder}",
-        "MPLBACKEND": "agg",
-    }
+def test_what_a_page_shows_runs(page: Path, folder: Path, environment: dict[str, str]) -> None:
     python = subprocess.Popen(
         [sys.executable, str(ROOT / "tests/docs/run_python.py")],
         cwd=folder, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,

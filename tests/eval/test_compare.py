@@ -97,7 +97,7 @@ def test_what_is_looked_at_can_be_narrowed(tmp_path: Path) -> None:
         ("mppi", "var", "mean"),
         ("cl_rrt", "var", "mean"),
     ]
-    assert any("Family: 2 pairs" in note for note in shown.notes)
+    assert any("corrected over 2 pairs (Holm)" in note for note in shown.notes)
     assert some["success_p_holm"].iloc[0] < every["success_p_holm"].iloc[1]
     planners, _ = compare_runs([folder], "planner", "", {"risk": ("cvar",)}, 0.05)
     assert [(r["one"], r["other"]) for r in planners.to_dict("records")] == [("cl_rrt", "mppi")]
@@ -144,8 +144,7 @@ def test_what_other_code_made_is_compared_only_when_asked_and_then_said_in_every
     refused = capsys.readouterr().err
     assert refused.count("\n") == 1
     assert (
-        f"in their risk alone, but the code that made them differs too: b differs from a in {told}. "
-        in refused
+        f"in their risk alone, got conditions made by different code: b differs from a in {told}. " in refused
     )
     assert not list(tmp_path.glob("table*"))
     assert call("eval", "compare", *asked, "--allow-different", "code") == 0
@@ -190,7 +189,7 @@ def test_a_condition_that_two_runs_hold_counts_once(tmp_path: Path) -> None:
     second = run_folder(tmp_path / "b", again)
     table, shown = compare_runs([first, second], "risk", "", {}, 0.05)
     pd.testing.assert_frame_equal(table.drop(columns="run"), whole.drop(columns="run"))
-    assert not any("Left out" in note for note in shown.notes)
+    assert not any("left out" in note for note in shown.notes)
     # The other way round the longer one comes last.
     turned, _ = compare_runs([second, first], "risk", "mean", {}, 0.05)
     assert set(turned["n_episodes"]) == {MAPS}
@@ -205,7 +204,8 @@ def test_rows_of_one_condition_that_disagree_are_refused(tmp_path: Path) -> None
     second = run_folder(tmp_path / "b", late[mean | (late["risk"] == "var")], code=edited)
     for allowed in (False, True):
         with pytest.raises(
-            ConfigError, match=r"2 of 12 episodes of .* in a and b \(b differs from a in planner mppi\)"
+            ConfigError,
+            match=r"2 of 12 episodes of .* that differ between a and b \(b differs from a in planner mppi\)",
         ):
             compare_runs([first, second], "risk", "", {}, 0.05, allowed)
 
@@ -224,14 +224,14 @@ def test_two_settings_under_one_label_are_refused(tmp_path: Path) -> None:
 def test_what_found_no_partner_is_named(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run", settings())
     _, shown = compare_runs([folder], "planner", "", {"risk": ("mean", "–")}, 0.05)
-    assert not any("Without a partner" in note for note in shown.notes)
+    assert not any("Not in the table" in note for note in shown.notes)
     lonely = {"part": "mppi", "options": {"theta": 5.0}}
     episodes = settings()[lambda rows: (rows["planner"] != "cl_rrt") | (rows["risk"] != "var")]
     other = run_folder(tmp_path / "other", episodes, values={"var": {"risk": lonely}})
     _, shown = compare_runs([other], "planner", "", {"planner": ("mppi", "cl_rrt")}, 0.05)
-    assert "Without a partner, so in no row: mppi var." in shown.notes
+    assert "Not in the table, since no condition differs from them in planner alone: MPPI VaR." in shown.notes
     _, shown = compare_runs([folder], "", "mean", {}, 0.05)
-    assert "Without a partner, so in no row: straight." in shown.notes
+    assert "Not in the table, since no condition differs from them in risk alone: straight." in shown.notes
 
 
 def test_maps_of_unequally_many_draws_all_count_and_what_is_left_out_is_named(tmp_path: Path) -> None:
@@ -243,16 +243,16 @@ def test_maps_of_unequally_many_draws_all_count_and_what_is_left_out_is_named(tm
     )
     table, shown = compare_runs([uneven], "risk", "", {}, 0.05)
     assert (table["n_maps"][0], table["n_episodes"][0]) == (12, 17)
-    assert "Each pair: 12 maps, 17 episodes of each condition, both with the same draws of λ." in shown.notes
-    assert not any("Left out" in note for note in shown.notes)
+    assert shown.notes[0].endswith(", 12 maps, 17 episodes a condition, the same draws of λ.")
+    assert not any("left out" in note for note in shown.notes)
     short = run_folder(
         tmp_path / "b", pd.concat([drawn("mean", (0, 12), (1, 9)), drawn("cvar", (0, 10), (2, 1))])
     )
     table, shown = compare_runs([short], "risk", "", {}, 0.05)
     assert (table["n_maps"][0], table["n_episodes"][0]) == (10, 10)
-    assert [note for note in shown.notes if "Left out" in note] == [
-        "Left out: 1 of 11 episodes of cvar, on which mean was not run (seed 2 on map 0).",
-        "Left out: 11 of 21 episodes of mean, on which cvar was not run "
+    assert [note for note in shown.notes if "left out" in note] == [
+        "1 of 11 episodes of CVaR are left out: mean was not run on them (seed 2 on map 0).",
+        "11 of 21 episodes of mean are left out: CVaR was not run on them "
         "(seed 0 on maps 10 to 11; seed 1 on maps 0 to 8).",
     ]
 
@@ -262,7 +262,7 @@ def test_groups_of_maps_are_the_unit(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run", episodes.assign(group=episodes["map"] // 3))
     table, shown = compare_runs([folder], "risk", "", {}, 0.05)
     assert set(zip(table["n_maps"], table["n_groups"], strict=True)) == {(12, 4)}
-    assert "The maps are in 4 groups that overlap or share a site; the group is the unit." in shown.notes
+    assert "4 groups of maps (the statistical unit)" in shown.notes[0]
 
 
 def test_robots_under_unlike_budgets_are_compared_in_shares(tmp_path: Path) -> None:
@@ -306,9 +306,9 @@ def test_command_prints_and_writes(tmp_path: Path, capsys) -> None:  # type: ign
     out = tmp_path / "made" / "cautious"
     assert call("eval", "compare", str(folder), "--against", "mean", "--points", "20", "--out", str(out)) == 0
     printed = capsys.readouterr().out
-    assert "Family: 4 pairs" in printed
-    assert "12 maps, 12 episodes of each condition" in printed
-    assert "A difference of 20 points needs" in printed
+    assert "corrected over 4 pairs (Holm)" in printed
+    assert "12 maps, 12 episodes a condition" in printed
+    assert "20 points need" in printed
     numbers = pd.read_csv(out.with_suffix(".csv"))
     assert list(numbers["one"]) == ["cvar", "var"] * 2
     assert out.with_suffix(".md").read_text().count("\n| ") == 4

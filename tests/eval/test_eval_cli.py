@@ -119,7 +119,7 @@ def test_a_planner_that_fails_ends_with_status_1(dataset_path: Path, tmp_path: P
     arguments = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL[2:-2])
     assert call("eval", *arguments, "--planners", f"[straight,{faulty}]") == 1
     captured = capsys.readouterr()
-    assert "1 in planner_error, the first by " in captured.err
+    assert "failed in some episodes (1 planner_error); the first fault: " in captured.err
     assert "errors.txt" in captured.err
     assert "straight" in captured.out
 

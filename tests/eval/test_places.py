@@ -113,7 +113,7 @@ def test_a_column_that_one_table_has_is_a_difference(run: Path, tmp_path: Path) 
     forge_rows(run, pd.read_parquet(run / "episodes.parquet").assign(more=1.0))
     same, lines = compare(run, tmp_path / "again")
     assert not same
-    assert "only one of the two tables has the column more" in lines
+    assert "column more is in only one of the two tables" in lines
     assert not any("came out the same" in line for line in lines)
 
 
@@ -213,7 +213,7 @@ def test_one_condition_has_one_label_for_good(dataset_path: Path, tmp_path: Path
     out = tmp_path / "run"
     list(run_suite(suite("careful", 0.9), out))
     before = json.loads((out / "run.json").read_text())
-    with pytest.raises(ConfigError, match=r"got 'cvar:0\.9' for what is called 'careful'"):
+    with pytest.raises(ConfigError, match=r"got 'cvar:0\.9' and 'careful' for the same setting"):
         list(run_suite(suite(None, 0.5, 0.9), out))
     assert json.loads((out / "run.json").read_text()) == before
     list(run_suite(suite("cautious", 0.5), out))

@@ -3,6 +3,8 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import huggingface_hub
 import pytest
@@ -16,6 +18,7 @@ from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
 from benchnav.models.training.data import MapDataset
+from benchnav.models.training.fit import STATE, FitOptions
 from tests.commands import call
 from tests.models.support import make_dataset, names
 
@@ -207,9 +210,9 @@ def test_gps_are_measured_on_whole_drives_of_a_log(
     ):
         Path(f"{name}.csv").write_text(header + "".join(own))
         assert call("train", "gp", "--data", f"{name}.csv", "--out", name, *QUICK_GP) == 0
-        (said,) = [line for line in capfd.readouterr().out.splitlines() if "held out" in line]
+        (said,) = [line for line in capfd.readouterr().out.splitlines() if "held-out" in line]
         whose = "all of 1 of 10 drives" if name == "drives" else "which follow one another in each class"
-        assert f"gp: NLL of 20 rows held out, {whose}, " in said
+        assert re.search(rf"gp: NLL \S+ on 20 held-out rows, {whose}; ", said)
     measured = {name: load_checkpoint(name).part("gp").metrics["held_out_nll"] for name in ("one", "none")}
     assert measured["one"] == measured["none"]
     for seed in range(1, 4):
@@ -246,7 +249,7 @@ def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_droppe
     assert call("train", *command, "--overwrite") == 0
     first, *rest = capfd.readouterr().err.splitlines()
     assert f"fewer than 10 rows of 2 of 10 classes ({names[0]} 0, {names[1]} 0); their GPs" in first
-    assert f"what {folder} had learned of them is dropped" in first
+    assert f"the GPs that {folder} held for them are dropped" in first
     assert not any("warning" in line for line in rest)
 
     there = load_checkpoint(folder)
@@ -260,16 +263,16 @@ def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_droppe
 @pytest.mark.parametrize(
     ("command", "expected"),
     [
-        (["all"], "benchnav-train: to go on, give the same command with --resume"),
+        (["all", *QUICK_GP], "gp kept; to go on, give the same command with --resume"),
         (
-            ["classifier", "--overwrite"],
-            "benchnav-train: to go on, give the same command with --resume in place of --overwrite",
+            ["all", "--overwrite", *QUICK_GP],
+            "gp kept; to go on, give the same command with --resume in place of --overwrite",
         ),
-        (["mdn"], "benchnav-train: to go on, give the same command with --resume"),
-        (["gp"], "benchnav-train: interrupted; what was finished is kept"),
+        (["mdn"], "nothing was finished; give the same command again"),
+        (["classifier", "--overwrite"], "nothing was finished; give the same command again"),
     ],
 )
-def test_an_interruption_says_how_to_go_on(
+def test_an_interruption_says_what_is_kept_and_how_to_go_on(
     command: list[str],
     expected: str,
     dataset: TerrainDataset,
@@ -277,12 +280,24 @@ def test_an_interruption_says_how_to_go_on(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    def interrupted(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("benchnav.models.training.data.find_dataset", interrupted)
-    assert call("train", *command, "--data", dataset.path, "--out", tmp_path / "c") == 130
-    assert capfd.readouterr().err.splitlines()[-1] == expected
+    monkeypatch.setattr(networks, "MapData", interrupt)
+    out = tmp_path / "c"
+    assert call("train", *command, "--data", dataset.path, "--out", out) == 130
+    assert capfd.readouterr().err.splitlines()[-1] == f"benchnav-train: interrupted; {expected}"
+    assert Path(out, "gp.safetensors").exists() == expected.startswith("gp")
+
+
+def test_epochs_that_were_finished_are_said_to_be_kept(tmp_path: Path) -> None:
+    (tmp_path / "classifier").mkdir()
+    (tmp_path / "classifier" / STATE).touch()
+    target: Any = SimpleNamespace(checkpoint=SimpleNamespace(parts={"gp": None}))
+    said = networks._kept(target, ["gp", "classifier", "classifier-2"], FitOptions(folder=tmp_path))
+    assert said == (
+        "gp and the finished epochs of classifier kept; to go on, give the same command with --resume"
+    )
 
 
 def test_a_model_is_measured_by_its_file_and_a_folder_without_rights_is_named(

@@ -112,7 +112,7 @@ def test_the_command_writes_what_its_flags_say(tmp_path: Path, capsys: pytest.Ca
     path.write_text("mine")
     given = ("export", tmp_path / "c", "--onnx", path, "--level", 0.6, "--opset", 20)
     for words, said in (
-        (given, "which is there. Pass --overwrite"),
+        (given, "which exists. Pass --overwrite"),
         ((*given, "--overwrite", "--level", 1), "`level` in [0, 1), got 1"),
         ((*given, "--overwrite", "--opset", 9), "`opset` of at least 18"),
         ((*given, "--onnx", tmp_path / "model.pt"), "`onnx` as a file FILE.onnx"),

@@ -1,3 +1,5 @@
+from dataclasses import dataclass
+
 import pytest
 import torch
 
@@ -72,6 +74,16 @@ def test_a_way_point_nearer_than_the_goals_radius_is_still_to_be_reached() -> No
     assert toward_waypoints(TravelTime(Unicycle(), 0.1)) == TravelTime(Unicycle(), 0.1)
     paper = GoalDistance()
     assert toward_waypoints(paper) is paper
+
+
+def test_an_objective_of_ones_own_with_a_radius_is_remade_for_way_points() -> None:
+    @dataclass(frozen=True)
+    class Own(GoalDistance):
+        weight: float
+        goal_radius_m: float
+
+    assert toward_waypoints(Own(2.0, 1.0)) == Own(2.0, 0.2)
+    assert toward_waypoints(Own(2.0, 0.1)) == Own(2.0, 0.1)
 
 
 def test_a_metre_of_path_costs_its_time_or_its_length() -> None:

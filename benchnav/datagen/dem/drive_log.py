@@ -29,11 +29,11 @@ _WINDOW_S = 2.0  # over which the noise of positions is small beside the way
 # Why rows are left out, in the order of being found.
 REASONS = {
     "missing": "lack a value",
-    "slow": "were commanded less than the least speed, as when standing or turning on the spot",
+    "slow": "were commanded less than the least speed (standing, turning on the spot)",
     "implausible": f"have a measured speed below {RATIO_LIMITS[0]:g} or above {RATIO_LIMITS[1]:g} of the commanded one",
     "off_dem": "lie off the elevation model",
-    "between_maps": "lie on ground that no map shows",
-    "other_split": "lie on the ground of another split than their drive's",
+    "between_maps": "lie between the maps",
+    "other_split": "lie on the ground of a split that their drive does not belong to",
 }
 
 

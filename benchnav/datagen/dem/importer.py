@@ -41,7 +41,7 @@ _CACHE_BYTES = 2**29  # of rasters that GDAL keeps; what it would choose grows w
 REASONS = {
     "not_driven": "have no cell that a drive of their split crossed",
     "missing_elevation": "have cells without elevation",
-    "missing_classes": "have no cell with a class or a measured λ, or cells without a class and no photo of them",
+    "missing_classes": "have no cell with a class or measured λ, or have cells with neither class nor photo",
     "missing_colours": "have cells without colour",
     "not_solvable": "have a goal that cannot be reached",
 }

@@ -86,7 +86,7 @@ def create(
         check_place(path, overwrite or not is_one_file(path), [file.name for file in shards])
         folder = path
         if is_one_file(path) or (overwrite and (path / FOLDER_MANIFEST).exists()):
-            expect(shard is None, f"no finished dataset to replace by a shard, got {path}. Remove it first.")
+            expect(shard is None, f"no finished dataset in place of a shard, got {path}. Remove it first.")
             folder = path.with_name(f".{path.name}.partial")
         folder.mkdir(parents=True, exist_ok=True)
         missing = _missing(folder, recipe, shards, own, may_replace=overwrite or folder != path)
@@ -173,8 +173,8 @@ def _missing(
     for file in foreign:
         expect(
             may_replace,
-            f"`out` to be new or to hold shards of one recipe and version, but {file} is of another. "
-            "Choose another `out`, or pass --overwrite with the recipe, settings and version of the others.",
+            f"`out` to be new or to hold shards of one recipe and version, got {file} of another. Choose another "
+            "`out`, or pass --overwrite with the recipe, settings and version of the other shards.",
         )
     # Those of other shards are for these to replace; what is half-written of these is of a killed run.
     mine = {shard.name for shard in own}

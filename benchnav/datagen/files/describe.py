@@ -1,6 +1,6 @@
 """What a dataset holds, as plain data, as tables and, of a new one, as lines."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from benchnav.datagen.recipe.classes import plain_classes
 
 _DIGESTS = {
     "digest": "content digests",
-    "recorded_digest": "digests that models record: of content, class table, λ_stuck, resolution and kind of truth",
+    "recorded_digest": "digests that models record (content, class table, λ_stuck, resolution, kind of truth)",
 }
 
 
@@ -73,11 +73,11 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
     making, places = f"synthesis {described['synthesis']}", described["places"]
     if places:
         making += (
-            f", start and goal drawn a map, at least {places['least_distance_m']:g} m apart and "
+            f", start and goal drawn for each map, at least {places['least_distance_m']:g} m apart and "
             f"{places['margin_m']:g} m from the edges"
         )
     if "vegetation_period_m" in described:
-        making += f", vegetation in patches of a period of {described['vegetation_period_m']:g} m"
+        making += f", vegetation in patches with a period of {described['vegetation_period_m']:g} m"
     if described["correlation_m"]:
         making += f", λ correlated over {described['correlation_m']:g} m"
     yield making
@@ -106,10 +106,11 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
         )
     extra = [name for name in fields if name not in (*schema.FIELDS, *layers)]
     if extra:
-        yield f"fields beside those of every dataset: {', '.join(extra)}"
+        yield f"optional fields: {', '.join(extra)}"
     for key, title in _DIGESTS.items():
         yield title
-        yield from (f"  {name:12} {entry[key]}" for name, entry in described["splits"].items())
+        wide = widest(described["splits"])
+        yield from (f"  {name:{wide}} {entry[key]}" for name, entry in described["splits"].items())
     headings = ["id", "class", "colour", "a", "b", "o", "σ", "soft spots", "vegetation"]
     rows = []
     for number, item in enumerate(described["classes"]):
@@ -142,6 +143,11 @@ def _origin(described: schema.Json, part: schema.Json) -> str:
     return f"{part['maps']} of {recipe['id']} {part['split']}, seed {recipe['seed']}"
 
 
+def widest(names: Iterable[str]) -> int:
+    """Characters of the longest of some names, at least 12, so that what follows them stands in one column."""
+    return max([12, *map(len, names)])
+
+
 def written(path: Path) -> TerrainDataset:
     """Gives a new dataset and prints where it is, its size, its splits and their digests."""
     from rich.filesize import decimal
@@ -149,6 +155,7 @@ def written(path: Path) -> TerrainDataset:
     dataset = TerrainDataset(path)
     size, files = decimal(sum(file.stat().st_size for file in dataset.files)), len(dataset.files)
     print(f"wrote {path} ({size}{f' in {files} files' if files > 1 else ''})")
+    wide = widest(dataset.splits)
     for name, split in dataset.splits.items():
-        print(f"  {name:12} {split['maps']:6} maps  {split['digest']}")
+        print(f"  {name:{wide}} {split['maps']:6} maps  {split['digest']}")
     return dataset

@@ -47,7 +47,7 @@ def merge(
     out = real_place(out)
     finished = [path for path in paths if is_dataset(path) or not path.is_dir()]
     if finished and len(finished) < len(paths):
-        raise DatasetError("Expected either datasets or shards of one dataset, got both.")
+        raise DatasetError("Expected datasets, or shards of one dataset, got both. Merge them apart.")
     name = dataset_id or name_of(out)
     contents = _of_datasets(finished, name) if finished else _of_shards(paths)
     total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
@@ -112,7 +112,7 @@ def _of_shards(folders: Sequence[Path]) -> Contents:
     shards = [TerrainDataset(path) for folder in folders for path in sorted(folder.glob("*.h5"))]
     if not shards:
         raise DatasetError(
-            f"Expected datasets or shards of one, got {', '.join(map(str, folders))} without any."
+            f"Expected datasets, or folders with shards of one, got {', '.join(map(str, folders))} without any."
         )
     for shard, name in product(shards, ("recipes", "generator")):
         if shard.manifest[name] != shards[0].manifest[name]:
@@ -132,7 +132,9 @@ def _of_shards(folders: Sequence[Path]) -> Contents:
                 files[name].append(own[begin].path)
                 place = begin + own[begin].splits[name]["maps"]
     if lacking:
-        raise DatasetError(f"Expected all shards of {recipe.id}, got none with {'; '.join(lacking)}.")
+        raise DatasetError(
+            f"Expected all shards of {recipe.id}, got none with {'; '.join(lacking)}. Make the missing shards first."
+        )
     return whole(recipe, files)
 
 

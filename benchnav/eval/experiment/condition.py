@@ -145,7 +145,7 @@ def conditions_of(suite: Suite, scenarios_of: Any) -> list[Condition]:
         for condition in _product(_listed(suite, product), scenarios_of):
             if condition.id in here and condition.risk.label != NOT_USED:
                 words = " ".join(label_words(condition.labels))
-                raise ConfigError(f"Expected settings that differ, got twice what {words} is.")
+                raise ConfigError(f"Expected settings that differ, got {words} twice.")
             here.add(condition.id)
             every.append(condition)
     check_labels(every)
@@ -178,7 +178,7 @@ def check_labels(conditions: Iterable[Condition]) -> None:
             first = labels.setdefault((name, digest), label)
             if first != label:
                 raise ConfigError(
-                    f"Expected one label for one {name}, got {label!r} for what is called {first!r}. Write "
+                    f"Expected one label for one {name}, got {label!r} and {first!r} for the same setting. Write "
                     f"label: {first}."
                 )
 
@@ -265,8 +265,8 @@ def _as_run_once(condition: Condition) -> Condition:
         return condition
     if condition.world.noise == "resampled":
         raise ConfigError(
-            f"Expected a world whose λ can be known for the model 'clairvoyant', got {condition.world_label!r}, where "
-            "it is resampled at each step. Take the world stakes, or `world.noise` frozen or stored."
+            f"Expected a world with λ that stays for the model 'clairvoyant', got {condition.world_label!r}, which "
+            "resamples λ at each step. Take the world stakes, or `world.noise` frozen or stored."
         )
     return replace(condition, risk=any_risk)
 

@@ -138,8 +138,8 @@ def _read(given: Mapping[str, Any], where: str, conditions: Sequence[Condition])
         first.robot != second.robot and first.world.time_budget_ratio is not None for first, second in pairs
     ):
         raise ConfigError(
-            f"Expected {where} to compare T_total of conditions with one time budget, got robots whose T differs, "
-            "which is what their failures count as. Compare their success, or give the world `time_budget_s`."
+            f"Expected {where} to compare T_total of conditions with one time budget, got robots of different T, as "
+            "which failures count. Compare their success, or give the world `time_budget_s`."
         )
     # Text calls conditions by the labels that name them, and by what else differs between the pairs.
     labels = [condition.labels for pair in pairs for condition in pair]
@@ -203,7 +203,7 @@ def _pairs(
     if not pairs:
         raise ConfigError(
             f"Expected {where} to name two conditions that are the same in {', '.join(unnamed) or 'all else'}, got "
-            "none. Name in each what the other names."
+            "none. Name the same labels in `one` and `other`."
         )
     for name in ("data", "scenario", "world"):
         if any(getattr(one, name) != getattr(other, name) for one, other in pairs):

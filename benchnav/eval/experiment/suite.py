@@ -26,8 +26,8 @@ class Suite:
 
     Args:
         data: Path or id of a dataset with splits test/SCENARIO.
-        scenarios: Test splits by scenario; every one of the data when none is named.
-        model: Model, or checkpoint by folder or by name in `checkpoints/`; `oracle` knows the truth.
+        scenarios: Test splits by scenario; all of the dataset when none is named.
+        model: Model, or checkpoint by folder or by name in `checkpoints/`; `oracle` is given the true distribution.
         models: Several models in place of `model`.
         planners: Planners.
         risks: Risk settings, such as `mean` or `cvar:0.9`.
@@ -38,14 +38,14 @@ class Suite:
             time_budget_ratio: T over the map's reference time}; or a list of several.
         task: Changes to the preset's rules: {free_space: {by: risk | mean, above: 0.3}, min_traversability: 0.3,
             goal_radius_m: 1.0}.
-        maps: Maps a scenario, the first ones of the split; 0 takes all.
+        maps: Maps of each scenario, the first of its split; 0 takes all.
         seed: Root seed of all draws.
         seeds: Several root seeds in place of `seed`.
         realisations: How often λ is drawn for each map and seed.
-        record: What is kept of episodes beside their rows, each with all before it: none; the steps of all episodes;
-            recordings for playback of the first map of each condition; of failures; of all.
-        conditions: Several products: mappings of the keys above, each taking what it leaves out from there.
-        hypotheses: What the run is to show, fixed before its first unit: mappings of `one` and `other`, conditions by
+        record: Kept beside the rows, each with all before it: none; steps of all episodes; recordings for playback of
+            each condition's first map; of failures; of all episodes.
+        conditions: Several products: mappings of the keys above. A key that a mapping lacks has its value above.
+        hypotheses: Hypotheses, fixed before the first unit is run: mappings of `one` and `other`, conditions by
             their labels, such as {planner: mppi, risk: mean}; `metric`: success, T_total, score, traversability or
             path_length; `kind`: difference, non-inferiority or equivalence; `direction`: higher or lower; `margin`.
     """
@@ -98,7 +98,7 @@ class Labels:
     """Which conditions of a run are meant, by what its table calls them: of each column one label or several.
 
     Args:
-        planner: Planners, several with a comma between; those of all conditions when not given, as all of these.
+        planner: Planners, with commas between; all when not given. The other labels work alike.
         risk: Risk settings.
         scenario: Scenarios.
         model: Models.

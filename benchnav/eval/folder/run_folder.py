@@ -29,6 +29,7 @@ from benchnav.eval.experiment.unit import DRAW, Extent, Unit
 from benchnav.eval.folder.provenance import Origin, code_digest
 
 FORMAT, FORMAT_VERSION = "benchnav-run", 5
+_LAST_OF_0_7 = 3
 RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
 KEYS = ["condition", *DRAW]  # of a row
 
@@ -77,10 +78,13 @@ def open_run(folder: Path) -> Run:
             }
             shard = Shard(**about["shard"]) if "shard" in about else None
             return Run(folder=folder, about=about, conditions=conditions, shard=shard)
-    reader = "a newer benchnav" if version > FORMAT_VERSION else "benchnav 0.7, which reads versions 1 to 3"
+    remedy = "Run its suite again with this version"
+    if version > FORMAT_VERSION:
+        remedy = "Read it with a newer benchnav: pip install --upgrade benchnav"
+    elif version <= _LAST_OF_0_7:
+        remedy += f", or read it with benchnav 0.7, which reads versions 1 to {_LAST_OF_0_7}"
     raise ConfigError(
-        f"Expected a run folder of format version {FORMAT_VERSION}, got {folder} of version {version}. Read it "
-        f"with {reader}, or run its suite again."
+        f"Expected a run folder of format version {FORMAT_VERSION}, got {folder} of version {version}. {remedy}."
     )
 
 
@@ -110,8 +114,7 @@ def caveats(about: Mapping[str, Any]) -> list[str]:
         about: of its `run.json` at least `warnings` and `dropped`.
     """
     left_out = [
-        f"left out: planner {pair['planner']} with robot {pair['robot']}, which it cannot steer"
-        for pair in about["dropped"]
+        f"left out: planner {pair['planner']} cannot steer robot {pair['robot']}" for pair in about["dropped"]
     ]
     warnings = [*about["warnings"], *([about["reused"]] if about.get("reused") else [])]
     return [*(f"warning: {line}" for line in warnings), *left_out]
@@ -127,8 +130,8 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
     if not path.exists():
         if run.shard is not None:
             raise ConfigError(
-                f"Expected a whole run, got {folder}, which is shard {run.shard} of one and has no tables. Put all "
-                "shards together with `benchnav-eval merge OUT PART …`."
+                f"Expected a whole run, got {folder}, which is shard {run.shard} of a run and has no tables. Merge all "
+                "shards with `benchnav-eval merge OUT PART …`."
             )
         raise ConfigError(
             f"Expected a finished run, got {folder} without {name}. Give its `benchnav-eval run` command again to "

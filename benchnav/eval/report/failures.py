@@ -119,11 +119,11 @@ def collect_sheets(
     placed = failures[failures["x_m"].notna()]
     if record_driven is None or placed.empty:
         asked = record_driven is not None and not failures.empty
-        why = "No sheet of failures: the run kept no steps of them." if asked else ""
+        why = "there is no figure of failures, since the run kept no steps" if asked else ""
         return Sheets(shown=(), predicted={}, left_out=why)
     shown, predicted, left_out = [], {}, []
     if len(every := blocks(with_names(summary))) > _MOST_BLOCKS:
-        left_out.append(f"Sheets of failures are of the first {_MOST_BLOCKS} of {len(every)} blocks.")
+        left_out.append(f"figures of failures show the first {_MOST_BLOCKS} of {len(every)} blocks")
     for title, rows in every[:_MOST_BLOCKS]:
         lines = []
         try:
@@ -143,11 +143,11 @@ def collect_sheets(
                     )
                 )
         except (BenchnavError, OSError) as error:
-            left_out.append(f"No sheet of failures: {error}")
+            left_out.append(f"a figure of failures is missing: {error}")
             continue
         if lines:
             shown.append((title, tuple(lines)))
-    return Sheets(shown=tuple(shown), predicted=predicted, left_out=" ".join(dict.fromkeys(left_out)))
+    return Sheets(shown=tuple(shown), predicted=predicted, left_out="; ".join(dict.fromkeys(left_out)))
 
 
 def _looked_at(rows: pd.DataFrame) -> list[dict[Any, Any]]:

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.report.words import FAILURE_COUNTS, blocks, p_in_words, rate_in_words, with_names
-from benchnav.eval.stats.best import PRIVILEGED, competing
+from benchnav.eval.stats.best import BLOCK, PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
 
 _MOST_NAMED = 6
@@ -27,41 +28,65 @@ def findings(
         By the title of a block its sentences.
     """
     every = blocks(with_names(summary))
-    return {title: list(_sentences(block, failures, predicted)) for title, block in every}
+    apart = [_apart(block, summary) for _, block in every]
+    return {
+        title: list(_sentences(block, failures, predicted, unlike))
+        for (title, block), unlike in zip(every, apart, strict=True)
+    }
+
+
+def _apart(rows: pd.DataFrame, summary: pd.DataFrame) -> dict[str, bool]:
+    """By which labels settings on the same maps are in other blocks, and whether `compare` pairs them by that label."""
+    own, kept = rows.iloc[0], [name for name in LABELS if name not in BLOCK]
+    same_maps = summary[(summary["data"] == own["data"]) & (summary["scenario"] == own["scenario"])]
+    settings, found = set(rows[kept].itertuples(index=False, name=None)), {}
+    for name in ("robot", "objective", "world"):
+        rest = [label for label in BLOCK if label != name]
+        others = same_maps[(same_maps[rest] == own[rest]).all(axis=1) & (same_maps[name] != own[name])]
+        if not others.empty:
+            # Worlds may draw unlike λ, and are then not paired.
+            paired = name != "world" and bool(settings & set(others[kept].itertuples(index=False, name=None)))
+            found[name] = paired
+    return found
 
 
 def _sentences(
-    rows: pd.DataFrame, failures: pd.DataFrame, predicted: Mapping[str, np.ndarray]
+    rows: pd.DataFrame, failures: pd.DataFrame, predicted: Mapping[str, np.ndarray], apart: Mapping[str, bool]
 ) -> Iterable[str]:
     rivals = rows[competing(rows)]
     best = rivals[rivals["condition"] == rivals["best"].iloc[0]].to_dict("records")[0]
     others = rivals[rivals["condition"] != best["condition"]].sort_values("best_difference", kind="stable")
     shared = int((others["success_rate"] == best["success_rate"]).sum())
-    also = f" and {shared} more" if shared else ""
+    named = f"{best['name']} and {shared} more have" if shared else f"{best['name']} has"
     yield (
-        f"The highest success rate is that of {best['name']}{also}: {rate_in_words(best)} % of its episodes "
-        f"reached the goal (95 % interval {100 * best['success_low']:.0f} to {100 * best['success_high']:.0f} %)."
+        f"{named} the highest success rate: {rate_in_words(best)} % of the episodes reached the goal (95 % interval "
+        f"{100 * best['success_low']:.0f} to {100 * best['success_high']:.0f} %)."
     )
     common = int(best["best_episodes"])
     if not others.empty and (rivals["n_episodes"] > common).any():
-        yield f"The settings are compared on the {common} episodes that all of them have."
-    yield from _rank(best, others)
+        yield f"The comparison uses the {common} episodes that all settings have."
+    yield from _rank(best, others, apart)
     yield from _why(best, failures, predicted)
     count = int(rivals["n_episodes"].sum())
     failed = rivals[list(FAILURE_COUNTS)].to_numpy().sum()
     if failed and len(rivals) > 1:
-        yield (
-            f"All {len(rivals)} compared settings together failed in {failed} of {count} episodes: {_shares(rivals)}."
-        )
+        every = "Both" if len(rivals) == 2 else f"All {len(rivals)}"
+        yield f"{every} compared settings together failed in {failed} of {count} episodes: {_shares(rivals)}."
     references = rows[~competing(rows)].sort_values("success_rate", kind="stable")
     for part in reversed(PRIVILEGED):
         for most in references[references["privileged"] == part].tail(1).to_dict("records"):
-            yield f"With the privileged model {most['model']} {most['name']} reached {rate_in_words(most)} %."
+            yield (
+                f"For reference, {most['name']} reached {rate_in_words(most)} % with the privileged model "
+                f"{most['model']}."
+            )
 
 
-def _rank(best: Mapping[Any, Any], others: pd.DataFrame) -> Iterable[str]:
+def _rank(best: Mapping[Any, Any], others: pd.DataFrame, apart: Mapping[str, bool]) -> Iterable[str]:
     if others.empty:
-        yield "There is no other setting to compare it with."
+        with_this = f" with this {' and '.join(apart)}" if apart else ""
+        yield f"There is no other setting{with_this} to compare it with."
+        for name in (name for name, paired in apart.items() if paired):
+            yield f"benchnav-eval compare --by {name} compares the {name}s of the run."
         return
     alike, worse = others[others["best_alike"]], others[~others["best_alike"]]
     unit = "group" if best["n_groups"] < best["n_maps"] else "map"
@@ -71,26 +96,26 @@ def _rank(best: Mapping[Any, Any], others: pd.DataFrame) -> Iterable[str]:
         maps = f"{int(best['best_maps'])} {unit}s"
         power = f"; {maps} detect differences of {100 * shown:.0f} points or more with 80 % power"
         yield (
-            f"No setting is significantly worse ({test}, p {'=' if p >= 1 else '≥'} "
-            f"{max(np.floor(100 * p) / 100, ALPHA):g}"
-            f"{power if shown <= 1 else ''}): the run does not say which is best."
+            f"There is no significant difference between the settings ({test}, p {'=' if p >= 1 else '≥'} "
+            f"{max(np.floor(100 * p) / 100, ALPHA):g}{power if shown <= 1 else ''})."
         )
         return
     if alike.empty:
         other = "The other setting is" if len(worse) == 1 else f"All {len(worse)} other settings are"
-        yield f"{other} significantly worse: it is the best here."
+        yield f"{other} significantly worse."
     else:
         listed = list(alike["name"])
         more = f" and {len(listed) - _MOST_NAMED} more" if len(listed) > _MOST_NAMED else ""
         verb = "1 other setting is" if len(listed) == 1 else f"{len(listed)} other settings are"
         yield f"{verb} not significantly worse (p ≥ {ALPHA}): {'; '.join(listed[:_MOST_NAMED])}{more}."
     following = worse.iloc[0]
-    place = "The next" if alike.empty else "The next that is significantly worse"
     low, high = 100 * following["best_low"], 100 * following["best_high"]
+    verb = (
+        "is significantly worse" if len(worse) == 1 else "is the best of those that are significantly worse"
+    )
     yield (
-        f"{place} is {following['name']} with {rate_in_words(following)} %: the difference is "
-        f"{100 * following['best_difference']:.1f} points (95 % interval of the pair alone {low:.1f} to "
-        f"{high:.1f}), {p_in_words(following['best_p'])} ({test})."
+        f"{following['name']} {verb}: {rate_in_words(following)} %, {100 * following['best_difference']:.1f} points "
+        f"less (95 % interval of this pair alone {low:.1f} to {high:.1f}), {p_in_words(following['best_p'])} ({test})."
     )
 
 
@@ -108,11 +133,11 @@ def _why(
     given = pd.Series(predicted.get(best["condition"]), dtype=float).median()
     if not np.isnan(observed) and not np.isnan(given):
         yield (
-            f"At the place where they ended, the predicted λ̂ was {given:.2f}, and in the last 2 s "
-            f"the robot observed λ = {observed:.2f} (medians)."
+            f"Where they ended, the predicted λ̂ was {given:.2f}; the robot observed λ = {observed:.2f} in the last 2 s "
+            "(medians)."
         )
     elif not np.isnan(observed):
-        yield f"In their last 2 s the robot observed λ = {observed:.2f} (median)."
+        yield f"The robot observed λ = {observed:.2f} in their last 2 s (median)."
 
 
 def _shares(rows: pd.DataFrame) -> str:

@@ -1,6 +1,7 @@
 """What a run says of the hypotheses that were fixed before it: sentences, and their table."""
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -9,13 +10,14 @@ import pandas as pd
 from benchnav.core.resampling import LEAST_MAPS
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.report.words import count_range, p_in_words, p_value, signed
+from benchnav.eval.experiment.hypotheses import Hypothesis
+from benchnav.eval.report.words import count_range, p_in_words, p_value, reading_names, signed
 from benchnav.eval.stats.comparison import ALPHA
 
 _TESTS = {
-    "difference": "differences by a sign-flip test by {unit}",
-    "non-inferiority": "non-inferiority by one one-sided test at the margin",
-    "equivalence": "equivalence by two one-sided tests at the margin (TOST)",
+    "difference": "sign-flip test by {unit} (difference)",
+    "non-inferiority": "one-sided test at the margin (non-inferiority)",
+    "equivalence": "two one-sided tests (TOST) at the margin (equivalence)",
 }
 _OF_MARGINS = {"equivalence": "equivalent", "non-inferiority": "not inferior"}
 
@@ -32,7 +34,7 @@ def hypothesis_findings(tests: pd.DataFrame, about: Mapping[str, Any], unit: str
         Sentences by the title over them.
     """
     said = [
-        f"{number}. {_capital(row['claim'])}: {_verdict(row)} ({_numbers(row, unit)})."
+        f"{number}. {_capital(_claim(row))}: {_verdict(row)} ({_numbers(row, unit)})."
         for number, row in enumerate(tests.to_dict("records"), start=1)
     ]
     title = f"Hypotheses, fixed before the first unit was run (digest {about['hypotheses']['digest']})"
@@ -50,7 +52,7 @@ def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
     rows = tuple(
         (
             str(number),
-            row["claim"],
+            _claim(row),
             str(row["n_maps"]),
             f"{_value(row['mean_one'])} : {_value(row['mean_other'])}",
             _with_unit(row),
@@ -63,23 +65,37 @@ def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
     used = "; ".join(words for kind, words in _TESTS.items() if (tests["kind"] == kind).any())
     family = "1 hypothesis" if len(tests) == 1 else f"{len(tests)} hypotheses"
     notes = [
-        f"Tests: {used.format(unit=unit)}. p is after Holm's correction over {family}; supported where it is under "
-        f"{ALPHA}.",
-        "Intervals are of one difference alone: 95 % of a difference, and 90 % where a margin is tested, whose end "
-        "beyond the margin decides the test before the correction. "
-        f"Under {LEAST_MAPS} {unit}s success alone has one.",
+        f"Tests: {used.format(unit=unit)}; p is corrected over {family} (Holm). Supported: p < {ALPHA}.",
+        "Intervals are of one difference and not corrected, so that an interval and p can disagree.",
+    ]
+    explained = [
+        ("values", "of the first condition and of the second."),
+        (
+            "interval",
+            "95 % for a difference; 90 % for a margin, where the end beyond the margin decides the test before the "
+            f"correction. Under {LEAST_MAPS} {unit}s success alone has an interval.",
+        ),
     ]
     if ((tests["metric"] == "T_total") & (tests["kind"] == "difference")).any():
-        notes.append(
-            "T_total: intervals allow for failures that so few maps did not show; p of a difference is of what was "
-            "seen, so that it can be small where the interval holds 0."
+        explained.append(
+            (
+                "T_total",
+                "the interval allows for rare failures that no episode showed, and p does not. So p can be small where "
+                "the interval holds 0.",
+            )
         )
     if (tests["metric"] == "path_length").any():
-        notes.append("Path length: of the episodes in which both arrived.")
+        explained.append(("path length", "over the episodes in which both arrived."))
     return Table(
-        headings=headings, labels=2, rows=rows, notes=tuple(notes),
+        headings=headings, labels=2, rows=rows, notes=tuple(notes), explained=tuple(explained),
         bold_note="supported." if tests["supported"].any() else "",
     )  # fmt: skip
+
+
+def _claim(row: Mapping[Any, Any]) -> str:
+    """The hypothesis with the names that tables and figures have for the two conditions."""
+    test = Hypothesis(**{name.name: row[name.name] for name in fields(Hypothesis)})
+    return test.claim(*map(reading_names, row["names"]))
 
 
 def _verdict(row: Mapping[Any, Any]) -> str:
@@ -108,8 +124,8 @@ def _extended(about: Mapping[str, Any]) -> list[str]:
     if now == planned:
         return []
     return [
-        f"They were fixed for {count_range(planned.values())} episodes of a condition; the run was extended to "
-        f"{count_range(now.values())} later, so that their p-values hold only if that was planned."
+        f"The run was extended after the hypotheses were fixed (episodes a condition: {count_range(planned.values())} "
+        f"then, {count_range(now.values())} now). The p-values hold only if that was planned."
     ]
 
 

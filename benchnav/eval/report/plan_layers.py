@@ -1,22 +1,35 @@
-"""What is drawn over a map, once for figures and playback: plans, and ground that is soft or immobilises a robot.
+"""What is drawn over a map, once for figures and playback: plans, ends, and ground that is soft or immobilises a robot.
 
 Letters in shapes: H×W cells, N positions.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex
+from matplotlib.patheffects import Normal, withStroke
+from matplotlib.transforms import ScaledTranslation
 
-from benchnav.core.figures import TRAVERSABILITY_COLOURS, bytes_of, hatching, layer_scale, outline
+from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, bytes_of, hatching, layer_scale, outline
 from benchnav.core.grid import is_azimuth
 
 # Dark red lies far from all colours of λ, for the colour-blind too.
 IMMOBILISING = "#a00000"
 SOFT = "white"
+CLOSED = "0.25"  # ground that is not free
+# Which of `MARKS` stands where an episode ended, by its outcome; `failed` for all others.
+_END_MARKS = {
+    "success": "arrived",
+    "immobilised": "immobilised",
+    **dict.fromkeys(("timeout", "stuck", "stalled"), "out of time"),
+}
+_CAME_CELLS = 2.0  # over which a path shows where it came from
 
 _LINE_WIDTH = 0.4  # of the thinnest line of a plan
 
@@ -30,31 +43,37 @@ class LayerStyle:
         colour: red, green, blue and opacity, in hexadecimal digits.
         width: over the thinnest line's.
         dashed: where lines can be.
+        edged: on white, which parts it from dark ground, where lines can be.
     """
 
     label: str
     colour: str
     width: float
     dashed: bool = False
+    edged: bool = False
 
 
 # From the undermost layer to the topmost.
 STYLES: Mapping[str, LayerStyle] = {
     "tree": LayerStyle(label="tree", colour="#3c3c3c8c", width=1),
     "samples": LayerStyle(label="samples", colour="#78b4ff6e", width=1),
-    "reference": LayerStyle(label="reference path", colour="#285affff", width=3, dashed=True),
-    "path": LayerStyle(label="planned", colour="#00008cff", width=3),
+    "reference": LayerStyle(label="reference path", colour="#285affff", width=3, dashed=True, edged=True),
+    "path": LayerStyle(label="planned", colour="#00008cff", width=3, edged=True),
 }
 
 
-def plan_layer(style: LayerStyle, lines: Sequence[np.ndarray] = ()) -> LineCollection:
-    """A layer of a plan as lines that can be put on a map."""
+def plan_layer(style: LayerStyle, lines: Sequence[np.ndarray] = (), scale: float = 1.0) -> LineCollection:
+    """A layer of a plan as lines that can be put on a map, so many times as wide as printed."""
+    width = scale * _LINE_WIDTH * style.width
     return LineCollection(
         list(lines),
         colors=[style.colour],
-        linewidths=_LINE_WIDTH * style.width,
+        linewidths=width,
         linestyles="dashed" if style.dashed else "solid",
         label=style.label,
+        path_effects=[withStroke(linewidth=width + scale, foreground="white"), Normal()]
+        if style.edged
+        else None,
     )
 
 
@@ -69,6 +88,67 @@ def draw_driven(path: LineCollection, track: np.ndarray, traversability: np.ndar
     """Draws a path, positions of shape [N + 1, 2], in the colours of observed λ, of shape [N] or longer."""
     path.set_segments(list(np.stack((track[:-1], track[1:]), axis=1)))
     path.set_array(traversability[: len(track) - 1])
+
+
+def end_mark(outcome: str) -> str:
+    """Which of `MARKS` stands where an episode ended, by its outcome as tables of episodes have it."""
+    return _END_MARKS.get(outcome, "failed")
+
+
+def mark_end(
+    panel: Axes,
+    outcome: str,
+    track: np.ndarray,
+    goal_m: np.ndarray,
+    resolution_m: float,
+    scale: float = 1.0,
+    ground: np.ndarray | None = None,
+    **style: Any,
+) -> list[Artist]:
+    """Marks how an episode ended, beside the cell in which it ended, and outlines that cell.
+
+    The mark stands at the side of the path that is farther from the goal.
+
+    Args:
+        panel: in metres.
+        outcome: as tables of episodes have it.
+        track: driven positions, shape [N + 1, 2].
+        goal_m: (x, y).
+        resolution_m: edge length of a cell.
+        scale: of the mark's size.
+        ground: colours of the map, uint8 of shape [H, W, 3], that the cell is shown in over the path.
+        **style: what differs of the mark, as in `Axes.plot`.
+
+    Returns:
+        The cell and the mark.
+    """
+    name, end = end_mark(outcome), np.asarray(track[-1], np.float64)
+    looks = MARKS[name] | {"label": name, "ms": scale * MARKS[name]["ms"]} | style
+    column, row = np.floor(end / resolution_m).astype(int)
+    corners = resolution_m * np.add([(0, 0), (1, 0), (1, 1), (0, 1)], (column, row))
+    face = "none"
+    if ground is not None and 0 <= row < ground.shape[0] and 0 <= column < ground.shape[1]:
+        face = to_hex(ground[row, column] / 255)
+    edge = [withStroke(linewidth=2 * scale, foreground="white"), Normal()]
+    (cell,) = panel.fill(*corners.T, fc=face, ec="black", lw=0.7 * scale, zorder=3.9, path_effects=edge)
+    away = _beside(track, goal_m, resolution_m)
+    right, up = away * (looks["ms"] / 2 + 1.5) / 72
+    transform = panel.transData + ScaledTranslation(right, up, panel.figure.dpi_scale_trans)
+    # From the middle of a cell to its corners it is 0.7 of its edge.
+    middle = corners.mean(axis=0)
+    (drawn,) = panel.plot(*(middle + 0.7 * resolution_m * away), **looks, transform=transform, clip_on=False)
+    return [cell, drawn]
+
+
+def _beside(track: np.ndarray, goal_m: np.ndarray, resolution_m: float) -> np.ndarray:
+    """The direction square to the end of a path that leads away from the goal, of length 1."""
+    places = np.asarray(track, np.float64)
+    end = places[-1]
+    far = places[np.linalg.norm(places - end, axis=1) >= _CAME_CELLS * resolution_m]
+    came = end - (far[-1] if len(far) else places[0])
+    along = came / np.linalg.norm(came) if came.any() else np.array([1.0, 0.0])
+    side = np.array([-along[1], along[0]])
+    return side if side @ (goal_m - end) <= 0 else -side
 
 
 def draw_soft(panel: Axes, soft: np.ndarray, resolution_m: float) -> None:
@@ -94,7 +174,7 @@ def layer_colours(name: str, layer: np.ndarray) -> np.ndarray:
 def predicted_colours(predicted: np.ndarray, free: np.ndarray) -> np.ndarray:
     """Colours λ̂, of shape [H, W], and in dark grey what is not free, bool of its shape; as `field_colours` does."""
     colours = shades(predicted)
-    colours[~free] = 64
+    colours[~free] = bytes_of(CLOSED)[:3]
     return colours
 
 

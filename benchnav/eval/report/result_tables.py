@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.core.figures import planner_name
 from benchnav.core.resampling import LEAST_MAPS
 from benchnav.core.tables import Bold, Table, to_latex
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
@@ -22,6 +21,7 @@ from benchnav.eval.report.words import (
     mean_and_std,
     p_value,
     rate_in_words,
+    reading_name,
     several_models,
     short,
     signed,
@@ -39,29 +39,27 @@ ALONE, IN_BATCH = "one robot [ms]", "per episode of a batch [ms]"
 LATENCIES = ("median_ms", "p95_ms", "max_ms")
 # What columns hold, by heading; only those that are shown are explained.
 _COLUMNS = {
-    "data": "the dataset.",
-    "scenario": "the kind of ground; a scenario is a test split of the dataset.",
-    "world": "what λ does during an episode, and the rules of the task.",
-    "robot": "how the robot moves.",
-    "objective": "what planners are asked to minimise.",
-    "model": "what predicts λ; ideal, oracle and clairvoyant are privileged: they are given part of the truth.",
-    "planner": "what chooses the actions.",
-    "risk": "how the predicted distribution of λ becomes the one number λ̂ that the planner is given.",
-    "groups": "number of groups of maps that the condition was run on; the statistics take a group as one.",
-    "maps": "number of maps that the condition was run on.",
-    "episodes": "number of episodes of the condition.",
+    "data": "dataset.",
+    "scenario": "kind of ground: a test split of the dataset.",
+    "world": "behaviour of λ during an episode, and rules of the task.",
+    "robot": "motion model of the robot.",
+    "objective": "cost J that planners minimise.",
+    "model": "predictor of λ; the privileged models ideal, oracle and clairvoyant are given part of the truth.",
+    "planner": "motion planner.",
+    "risk": "risk setting, which turns the predicted distribution of λ into λ̂, the one number a planner is given.",
+    "groups": "number of groups of maps; the group is the statistical unit.",
+    "maps": "number of maps.",
+    "episodes": "number of episodes.",
     "Succ. [%]": "share of episodes that reached the goal.",
-    "95 % interval": "of the success rate: Wilson's, with maps as the unit, so that episodes on one map count as fewer "
-    "the more alike they end.",
-    "T_total [s]": "mean time to the goal, a failure counted as T; in brackets its 95 % interval over maps, from "
-    f"those of the success rate and of the time of arrival; none under {LEAST_MAPS} maps.",
-    "T if success [s]": "mean ± standard deviation of the time over the episodes that reached the goal.",
-    "λ̄ [%]": "mean observed λ during an episode, mean ± standard deviation over episodes.",
-    ALONE: "wall time of planning one step of one robot alone on one thread, replanning included: the median, and in "
-    "brackets the 95th percentile and the maximum, over at most 100 steps of one episode after its first.",
-    IN_BATCH: "wall time of planning one step of a batch of at most 50 episodes on one thread over their number, which "
-    "is no latency: the median over an episode's steps and in brackets their 95th percentile, each as its median over "
-    "episodes; ¶ marks planners that were compiled.",
+    "95 % interval": "Wilson's interval of the success rate, with maps as the unit.",
+    "T_total [s]": "mean time to the goal, a failure counted as the time budget T, with its 95 % interval in brackets; "
+    f"no interval under {LEAST_MAPS} maps.",
+    "T if success [s]": "time of the episodes that reached the goal, mean ± standard deviation.",
+    "λ̄ [%]": "mean observed λ of an episode, mean ± standard deviation over episodes.",
+    ALONE: "planning time of a step of one robot alone, on one thread: median (95th percentile, maximum) over at most "
+    "100 steps.",
+    IN_BATCH: "planning time of a step of a batch, divided by its episodes, on one thread: median (95th percentile) "
+    "over steps; no latency.",
     "failures": "how the other episodes ended.",
 }
 # Of the columns that not every run has, that of the summary which says so.
@@ -93,13 +91,16 @@ def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, An
     marks, notes = _notes(summary, conditions)
     rows = []
     for row, mark in zip(summary.to_dict("records"), marks, strict=True):
-        cells = {name: str(row[name]) for name in labels} | {name: str(row[f"n_{name}"]) for name in counts}
-        cells |= {"planner": row["planner"] + mark, **_results(row)}
+        cells = {name: reading_name(name, str(row[name])) for name in labels}
+        cells |= {name: str(row[f"n_{name}"]) for name in counts}
+        cells |= {"planner": cells["planner"] + mark, **_results(row)}
         if row["best_marked"]:
             cells["Succ. [%]"] = Bold(cells["Succ. [%]"])
         rows.append(tuple(cells[heading] for heading in headings))
     if any("¶" in cell for row in rows for cell in row):
-        notes.append("¶ compiled planner: its time is that of compiled code.")
+        notes.append("¶ The planner ran as compiled code.")
+    if (summary["best_rivals"] > 0).any() and not summary["best_marked"].any():
+        notes.append("No rate is bold: no setting is significantly worse than the best.")
     return Table(
         headings=headings,
         labels=len(labels),
@@ -123,8 +124,9 @@ def paper_table(summary: pd.DataFrame, label: str) -> str:
     count = maps_in_words(*(count_range(summary[name]) for name in ("n_maps", "n_groups")))
     note = f" Bold: {bold_note(summary)}" if bold_note(summary) else ""
     caption = (
-        f"Planning results on {count} a scenario: success with its 95 % interval, T_total with a failure counted as "
-        f"T and mean traversability observed λ̄, mean ± standard deviation over episodes.{note}"
+        f"Planning results on {count} per scenario: success rate with its 95 % interval; total time T_total, a "
+        f"failure counted as the time budget T; and mean observed traversability λ̄. ± is the standard deviation over "
+        f"episodes.{note}"
     )
     several = several_models(summary)
     tables = [_across(known[i : i + _MOST_ACROSS], several) for i in range(0, len(known), _MOST_ACROSS)]
@@ -143,7 +145,8 @@ def _across(known: Sequence[tuple[str, pd.DataFrame]], several: Sequence[str]) -
     names = names.iloc[names["planner"].factorize()[0].argsort(kind="stable")]
     cells = table.loc[pd.MultiIndex.from_frame(names)]
     as_above = names.eq(names.shift()).cummin(axis=1)
-    names["planner"] = names["planner"].map(planner_name)
+    for name in labels:
+        names[name] = [reading_name(name, label) for label in names[name]]
     return Table(
         headings=(*(name.capitalize() for name in labels), *_PAPER * len(known)),
         labels=len(labels),
@@ -170,16 +173,16 @@ def bold_note(summary: pd.DataFrame) -> str:
     """
     if not summary["best_marked"].any():
         return ""
+    several = "" if len(blocks(summary)) == 1 else " of a block"
     words = (
-        "not significantly worse than the highest success rate of its block (max-T sign-flip test by "
-        f"{unit_of_statistics(summary)} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is "
-        "significantly worse none is marked"
+        f"highest success rate{several} and all without a significant difference from it (max-T sign-flip test by "
+        f"{unit_of_statistics(summary)}, p ≥ {ALPHA})"
     )
     left_out = pd.concat([rows[~competing(rows)] for _, rows in blocks(summary)])
     models = dict.fromkeys(
         model for part in PRIVILEGED for model in left_out.loc[left_out["privileged"] == part, "model"]
     )
-    return f"{words}; privileged models ({', '.join(models)}) do not compete." if models else f"{words}."
+    return f"{words}. Privileged models ({', '.join(models)}) do not compete." if models else f"{words}."
 
 
 def _results(row: Mapping[Any, Any]) -> dict[str, str]:
@@ -218,7 +221,7 @@ def _notes(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -
     for condition in summary["condition"]:
         about = conditions[condition]
         follows = about["follows"]
-        texts = [] if follows in _USERS_OWN else [f"minimises, in place of the task's J: {follows}"]
+        texts = [] if follows in _USERS_OWN else [f"Cost minimised in place of J: {follows}."]
         own = [
             numbers.setdefault(text, str(len(numbers) + 1).translate(_SUPERSCRIPTS))
             for text in (*texts, *about["remarks"])
@@ -247,10 +250,15 @@ def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
     )
     rows = []
     for row in table.to_dict("records"):
-        labels = [row[name] for name in (*shown, "one", "other")]
+        labels = [reading_name(name, row[name]) for name in shown]
+        labels += [reading_name(by, row[name]) for name in ("one", "other")]
         rows.append((*labels, *(str(row[name]) for name in counts), *_differences(row)))
     return Table(
-        headings=headings, labels=len(shown) + 2, rows=tuple(rows), notes=_comparison_notes(table, difference)
+        headings=headings,
+        labels=len(shown) + 2,
+        rows=tuple(rows),
+        notes=_comparison_notes(table, difference),
+        explained=_comparison_columns(unit),
     )
 
 
@@ -275,21 +283,39 @@ def _differences(row: Mapping[Any, Any]) -> tuple[str, ...]:
 
 def _comparison_notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
     pairs = "1 pair" if len(table) == 1 else f"{len(table)} pairs"
-    share = (
-        " T differs between conditions, so that T_total and its difference are in shares of each condition's own T."
-        if "time_difference_share" in table
-        else ""
-    )
+    unit = "group" if (table["n_groups"] < table["n_maps"]).any() else "map"
     return (
-        f"Family: {pairs}. Holm's correction is over all of them, for success and for T_total apart.",
-        "Success: sign-flip test of the difference by map (McNemar's exact test where there is one episode a map), "
-        "interval of Bonett and Price. T_total: a failure counts as T; Δ and 95 % are of the mean, "
-        "from the intervals of success and of the time without failures." + share,
-        "p (ranks): Wilcoxon's signed-rank test of T_total. It compares the ranks of the maps' differences and not "
-        "their mean, so that it may disagree with the interval, which is of the mean.",
-        "95 %: of each pair alone, not corrected, so that it may leave 0 out where p is above 0.05; of times a dash "
-        f"where there are fewer than {LEAST_MAPS} maps.",
-        "detectable: minimum detectable difference of success [points], at a power of 80 %; "
-        "a dash where they are too few to show any. "
-        f"A difference of {100 * difference:g} points needs {count_range(table['maps_needed'])} maps.",
+        f"Tests by {unit}: signs of the difference (success) and ranks (T_total), p corrected over {pairs} (Holm).",
+        f"Intervals are of means and not corrected: they can exclude 0 where p > {ALPHA}. "
+        f"{100 * difference:g} points need {count_range(table['maps_needed'])} maps.",
+    )
+
+
+def _comparison_columns(unit: str) -> tuple[tuple[str, str], ...]:
+    share = "; in shares of each condition's own T, since T differs" if unit != "s" else ""
+    return (
+        ("Succ. [%]", "success rates of the two conditions."),
+        ("Δ [points], 95 %", "difference of success, with the interval of Bonett and Price."),
+        ("p", "sign-flip test by map (McNemar's exact test with one episode a map), Holm's correction."),
+        ("significant", f"p < {ALPHA}."),
+        (
+            "detectable",
+            "minimum detectable difference of success [points] with 80 % power, for which the maps needed are counted "
+            "too; a dash where the maps are too few.",
+        ),
+        (
+            f"Δ T_total [{unit}], 95 %",
+            f"difference of the mean time, a failure counted as the time budget T{share}; a dash for an interval of "
+            f"fewer than {LEAST_MAPS} maps.",
+        ),
+        (
+            "p (ranks)",
+            "Wilcoxon's signed-rank test of T_total, Holm's correction. It compares ranks and the interval is of the "
+            "mean, so that the two can disagree.",
+        ),
+        (
+            "Δ T if both arrive [s], 95 %, on maps",
+            "difference of time over the episodes in which both arrived. It is not tested: both conditions decide "
+            "which episodes these are.",
+        ),
     )

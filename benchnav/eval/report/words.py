@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.core.figures import planner_name
+from benchnav.core.figures import planner_name, risk_name
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.stats.best import BLOCK
 from benchnav.planning.world.outcome import FAILURES
@@ -15,6 +15,7 @@ from benchnav.planning.world.outcome import FAILURES
 FAILURE_COUNTS = {
     f"{outcome.name.lower()}_count": outcome.name.lower().replace("_", " ") for outcome in FAILURES
 }
+_READ = {"planner": planner_name, "risk": risk_name}
 # Labels that tell conditions of one map apart.
 NAMING = ("planner", "risk", "model", "robot", "objective", "world")
 
@@ -22,6 +23,22 @@ NAMING = ("planner", "risk", "model", "robot", "objective", "world")
 def differ(labels: Iterable[str]) -> bool:
     """Tells whether labels differ; of a condition that uses none of it, it does not count."""
     return len(set(labels) - {NOT_USED}) > 1
+
+
+def reading_name(column: str, label: str) -> str:
+    """What a reader of a table or figure calls a label: planners and risk settings as papers write them.
+
+    Args:
+        column: of the label, such as `risk`.
+        label: as it is typed, and stands in CSV and Parquet.
+    """
+    named = _READ.get(column)
+    return named(label) if named else label
+
+
+def reading_names(labels: str) -> str:
+    """Labels with commas between, as `run.json` names the conditions of a hypothesis, as readers call them."""
+    return ", ".join(planner_name(risk_name(label)) for label in labels.split(", "))
 
 
 def several_models(summary: pd.DataFrame) -> list[str]:
@@ -46,7 +63,7 @@ def condition_name(labels: Mapping[str, Any], several: Collection[str] = ()) -> 
     # A planner that is given λ itself has a model and no risk setting; a blind one has neither.
     if labels["risk"] == NOT_USED and "model" not in several:
         beside.insert(0, labels["model"])
-    return joined([planner_name(labels["planner"]), *beside, labels["risk"]])
+    return joined([planner_name(labels["planner"]), *beside, risk_name(labels["risk"])])
 
 
 def with_names(summary: pd.DataFrame) -> pd.DataFrame:
@@ -64,7 +81,7 @@ def contender_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
     differing = [name for name in NAMING if differ(own.get(name, NOT_USED) for own in labels)]
     names = []
     for own in labels:
-        shown = {**own, "planner": planner_name(own["planner"])}
+        shown = {name: reading_name(name, label) for name, label in own.items()}
         names.append(joined(shown.get(name, NOT_USED) for name in differing) or shown["planner"])
     return names
 

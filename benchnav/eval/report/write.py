@@ -120,9 +120,9 @@ def read_report(folder: Path, record_driven: RecordDriven | None = None) -> Repo
     warnings = caveats(about)
     if count := summary[["planner_error_count", "model_error_count"]].to_numpy().sum():
         episodes_in_words = "1 episode" if count == 1 else f"{count} episodes"
-        warnings.append(f"In {episodes_in_words} a planner or model failed; tracebacks: {folder / ERRORS}")
+        warnings.append(f"warning: a planner or model failed in {episodes_in_words}; see {folder / ERRORS}")
     if sheets.left_out:
-        warnings.append(sheets.left_out)
+        warnings.append(f"note: {sheets.left_out}")
     return Report(
         name=folder.resolve().name,
         header=(*_header(summary, about), *_rejected_draws(episodes, about["conditions"])),
@@ -157,7 +157,7 @@ def write_report(folder: Path, record_driven: RecordDriven | None = None, out: P
     write_text(out / "summary.tex", comments + paper_table(report.summary, report.name))
     if not report.tests.empty:
         write_text(out / "hypotheses.csv", report.tests.to_csv(index=False, float_format="%.6g"))
-        caption = "Hypotheses that were fixed before the run, and their tests."
+        caption = "Tests of the hypotheses that were fixed before the run."
         write_text(
             out / "hypotheses.tex", to_latex([report.hypotheses], caption, f"{report.name}-hypotheses")
         )
@@ -189,14 +189,14 @@ def _figures(folder: Path, report: Report, record_driven: RecordDriven | None) -
     if not report.tests.empty:
         yield (
             "forest",
-            "Paired differences of all hypotheses, which were fixed before the run; p after Holm's correction over "
-            "them. Filled: supported; thick and thin: 90 % and 95 % intervals of one difference alone.",
+            "Paired differences of the hypotheses that were fixed before the run. Filled points are supported "
+            "(p < 0.05 after Holm's correction). Lines are 90 % (thick) and 95 % (thin) intervals of one difference.",
             forest_figure(report.tests),
         )
     yield (
         "success",
-        "Success rates with their 95 % intervals; filled: not significantly worse than the best of its panel, where "
-        "another is; grey: planners that are blind.",
+        "Success rates with 95 % intervals. Filled points are not significantly worse than the best of their panel; "
+        "all are open where nothing is significantly worse. Grey planners are blind.",
         success_figure(summary),
     )
     driven = read_driven(folder, report.episodes)
@@ -207,28 +207,27 @@ def _figures(folder: Path, report: Report, record_driven: RecordDriven | None) -
     for number, lines in sweeps.items():
         short = sweep_name(number)
         name = short if names[short] == 1 else number.replace(".", "-")
-        caption = f"Success and T_total over {name}, with their 95 % intervals."
+        caption = f"Success and T_total over {name}, with 95 % intervals."
         yield f"over-{name}", caption, curve_figure(number, lines, summary)
-    yield "outcomes", "How episodes ended.", outcome_figure(summary)
+    yield "outcomes", "Outcomes of the episodes.", outcome_figure(summary)
     yield (
         "distributions",
-        "A dot an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean observed λ.",
+        "Each dot is an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean observed λ.",
         distribution_figure(summary, report.episodes),
     )
     for place, (title, sheet) in enumerate(sheets, start=1):
         yield (
             "failures" if len(sheets) == 1 else f"failures-{place}",
-            f"Failures of the highest success rate and of the lowest, {title}: what was predicted (colour), the path "
-            "driven, and where it ended. Of each outcome one is shown before any other twice; observed λ: mean of "
-            "the last 2 s.",
+            f"Failures of the settings with the highest and the lowest success rate, {title}: predicted λ̂ (colour), "
+            "driven path and its end. Observed λ is the mean of the last 2 s.",
             failure_figure(sheet),
         )
     recorded = read_recordings(folder)
     chosen = _on_one_map(driven[1], recorded, record_driven) if driven else []
     if chosen := chosen or choose_recordings(recorded, list(summary["condition"])):
-        caption = "What was planned and driven, on the terrain and on the λ̂ that the planner was given."
+        caption = "Plans and driven paths, on the terrain and on the λ̂ that the planner was given."
         if any(recording.field is not None for recording in chosen):
-            caption += " Below, the whole driven path on λ as it was."
+            caption += " Below: the whole driven path on the λ field."
         yield "trajectories", caption, trajectory_figure(chosen)
 
 
@@ -266,16 +265,14 @@ def _driven(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarray]) ->
     """The figure of whole driven paths, as from `read_driven`."""
     about, shown = ground.about, rows.iloc[:_MOST_PATHS]
     why = (
-        "of all maps the one on which outcomes differ most."
-        if rows["success"].nunique() > 1
-        else "on no map did outcomes differ."
+        "On this map outcomes differ most." if rows["success"].nunique() > 1 else "Outcomes differ on no map."
     )
     caption = (
-        f"Whole driven paths on {about['scenario']} {about['map']}, seed {about['seed']}, realisation "
-        f"{about['realisation']}: {why}"
+        f"Driven paths on {about['scenario']} {about['map']}, seed {about['seed']}, realisation "
+        f"{about['realisation']}. {why}"
     )
     if len(shown) < len(rows):
-        caption += f" {len(shown)} of {len(rows)} conditions."
+        caption += f" The figure shows {len(shown)} of {len(rows)} conditions."
     return "driven", caption, driven_figure(ground, shown, tracks[:_MOST_PATHS])
 
 
@@ -307,7 +304,7 @@ def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> li
     again = episodes.groupby(MAP)["rejected_draws"].max()
     share = again.sum() / (again + 1).sum()
     return [
-        f"Of the draws of λ {100 * share:.1f} % had no feasible path from start to goal and were rejected."
+        f"{100 * share:.1f} % of the draws of λ had no feasible path from start to goal and were rejected."
     ]
 
 
@@ -318,12 +315,13 @@ def _world(value: Mapping[str, Any]) -> str:
         words[0] += f", correlated over {world['correlation_m']:g} m"
     if "immobile" in world:
         held = world["immobile"]
-        words.append(f"an episode ends after {held['for_s']:g} s of λ under {held['below']:g}")
+        words.append(f"λ below {held['below']:g} for {held['for_s']:g} s immobilises the robot")
     if "time_budget_ratio" in world:
-        words.append(f"T = {world['time_budget_ratio']:g} × the reference time at the robot's top speed")
+        words.append(f"time budget T = {world['time_budget_ratio']:g} × the reference time at the top speed")
     else:
-        words.append(f"T = {world['time_budget_s']:g} s")
-    return ", ".join([*words, f"free where the {free['by']} map is above {free['above']:g}"])
+        words.append(f"time budget T = {world['time_budget_s']:g} s")
+    by = "mean λ" if free["by"] == "mean" else "λ̂"
+    return "; ".join([*words, f"free ground has {by} above {free['above']:g}"])
 
 
 def render(file: str, report: Report, figures: Mapping[Path, str]) -> str:
@@ -338,7 +336,7 @@ def render(file: str, report: Report, figures: Mapping[Path, str]) -> str:
         loader=PackageLoader("benchnav.eval.report", "templates"), autoescape=select_autoescape(),
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters |= {"markdown": markdown, "table": to_markdown, "inline": _inline}
+    environment.filters |= {"markdown": markdown, "table": to_markdown, "inline": _inline, "pixels": _pixels}
     return environment.get_template(file).render(
         report=report,
         figures=figures,
@@ -370,3 +368,8 @@ def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _inline(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+def _pixels(path: Path) -> int:
+    """The width of a PNG, which its header holds."""
+    return int.from_bytes(path.read_bytes()[16:20])

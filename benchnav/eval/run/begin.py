@@ -59,7 +59,8 @@ def begin(work: Work, folder: Path, say: Say) -> Conditions:
     if not (folder / RUN).exists():
         if is_taken(folder):
             raise ConfigError(
-                f"Expected `out` to be a new folder or a run folder, but {folder} holds something else."
+                f"Expected `out` to be a new folder or a run folder, got {folder}, which holds something else. Choose "
+                "another `out`."
             )
         write_run(folder, _about({}, work, work.conditions))
         return work.conditions
@@ -95,22 +96,21 @@ def _check_extends(work: Work, earlier: Run) -> None:
     folder = earlier.folder
     if earlier.shard != work.shard:
         raise ConfigError(
-            f"Expected `out` to be new or to hold {_in_words(work.shard)}, but {folder} holds "
+            f"Expected `out` to be new or to hold {_in_words(work.shard)}, got {folder}, which holds "
             f"{_in_words(earlier.shard)}. Choose another `out`."
         )
     # Others would be written after what they are tested by.
     fixed = earlier.about.get("hypotheses", {}).get("digest", "none")
     if work.hypotheses and work.hypotheses["digest"] != fixed:
         raise ConfigError(
-            f"Expected the `hypotheses` that {folder} was begun with (digest {fixed}), got others (digest "
-            f"{work.hypotheses['digest']}), which would be written after its first results. Leave `hypotheses` out to "
-            "go on, or choose another `out`."
+            f"Expected the `hypotheses` that were fixed when {folder} was begun (digest {fixed}), got others (digest "
+            f"{work.hypotheses['digest']}). Leave `hypotheses` out to go on, or choose another `out`."
         )
     check_labels(condition for known in (earlier, work) for condition, _ in known.conditions.values())
 
 
 def _in_words(shard: Shard | None) -> str:
-    return "a whole run" if shard is None else f"shard {shard} of one"
+    return "a whole run" if shard is None else f"shard {shard} of a run"
 
 
 def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> dict[str, Any]:

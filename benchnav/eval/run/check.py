@@ -228,7 +228,7 @@ def _late(condition: Condition, task: Task, dataset: TerrainDataset, maps: int) 
         return []
     return [
         f"in {late.sum()} of {len(late)} maps of {condition.split} a robot of {top_speed:g} m/s cannot reach the goal "
-        "within T"
+        "within the time budget T"
     ]
 
 
@@ -239,8 +239,8 @@ def _check_model(condition: Condition, dataset: TerrainDataset) -> list[str]:
     knows_classes = bool(model.class_names) or isinstance(model, PrivilegedModel)
     if condition.risk.part == "single-class" and not knows_classes:
         raise ConfigError(
-            f"Expected a model that tells classes for the risk setting 'single-class', got {condition.model.label!r}, "
-            "which has no `class_names`."
+            f"Expected a model that predicts classes for the risk setting 'single-class', got "
+            f"{condition.model.label!r}, which has no `class_names`."
         )
     if is_checkpoint("model", part):
         model = load_checkpoint(find_checkpoint(part))  # which has a class table in any case
@@ -259,8 +259,8 @@ def check_everywhere(conditions: Iterable[Condition]) -> None:
             source = getattr(condition, kind).part
             if not is_checkpoint(kind, source) and not registry.find(kind, source).everywhere:
                 raise ConfigError(
-                    f"Expected {kind} {source!r} to be found by other processes, which `jobs` > 1, "
-                    "`scheduler` and `planner_limit_s` need, but it is registered in this one alone. Name it as "
+                    f"Expected a {kind} that other processes can load (for `jobs` > 1, `scheduler` or "
+                    f"`planner_limit_s`), got {source!r}, which is registered in this process alone. Name it as "
                     "path/to/file.py:Name."
                 )
 
@@ -270,13 +270,13 @@ def _doubts(condition: Condition, dataset: TerrainDataset) -> list[str]:
     threshold = dataset.recipe.stuck_threshold
     if condition.rules.free_space.above != threshold:
         lines.append(
-            f"each map of {dataset.id} has a way over ground above {threshold:g}, and ground is free above "
-            f"{condition.rules.free_space.above:g} here"
+            f"maps of {dataset.id} have a feasible path over ground above {threshold:g}, but free ground is above "
+            f"{condition.rules.free_space.above:g} in this run"
         )
     split = dataset.recipe.splits.get(condition.split)
     if split is not None and not split.solvable:
         lines.append(
-            f"the maps of {dataset.id} {condition.split} were not asked to have a free way to the goal; "
-            "a failure may be the map's"
+            f"maps of {dataset.id} {condition.split} may have no feasible path to the goal (no `solvable: true`), "
+            "so that a planner may fail on them for that alone"
         )
     return lines

@@ -47,8 +47,8 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
     with sole_writer(folder, str(folder)):
         if is_taken(folder):
             raise ConfigError(
-                f"Expected `out` to be a new folder, got {folder}, which is there. Write `benchnav-eval merge OUT PART "
-                "…`, with the new folder first."
+                f"Expected `out` to be a new folder, got {folder}, which exists. Write `benchnav-eval merge OUT PART "
+                "…` with the new folder first."
             )
         runs = [_open_shard(part) for part in parts]
         _check_alike(runs)
@@ -59,8 +59,8 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         for (_, earlier), (_, now) in pairwise(found):
             if changed := provenance.code_differences(earlier.about["code"], now.about["code"]):
                 raise ConfigError(
-                    f"Expected shards that one code has made, but {earlier.path} and {now.path} differ in "
-                    f"{'; '.join(changed)}. Give the commands of the shards again, by one code."
+                    f"Expected shards made by one code, got {earlier.path} and {now.path}, which differ in "
+                    f"{'; '.join(changed)}. Give the commands of the shards again with one code."
                 )
         target = folder.resolve()
         partial = new_folder(target)
@@ -106,8 +106,8 @@ def _check_alike(runs: Sequence[Run]) -> None:
     reasons = [f"{run.folder}: {'; '.join(unlike)}" for run in runs[1:] if (unlike := _unlike(runs[0], run))]
     if reasons:
         raise ConfigError(
-            f"Expected shards of one run, but these differ from {runs[0].folder} in what is named: "
-            f"{'. '.join(reasons)}. Give one command, of one code and data, for each of the shards."
+            f"Expected shards of one run, got differences to {runs[0].folder}: {'. '.join(reasons)}. Give the same "
+            "command, with the same code and data, for each shard."
         )
 
 
@@ -142,8 +142,8 @@ def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
     for other in found[1:]:
         if len(differences(unit_rows(found[0]), unit_rows(other))[0]):
             raise ConfigError(
-                f"Expected the same rows wherever a unit is, but {unit.name} ({unit.condition.description}) differs "
-                f"between {found[0].path} and {other.path}. Leave one of them out."
+                f"Expected the same rows of a unit in all shards, got {unit.name} ({unit.condition.description}), "
+                f"which differs between {found[0].path} and {other.path}. Leave one of them out."
             )
     return found[0] if found else None
 
@@ -160,8 +160,8 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run]) -> None:
         begun = f" in {folders[index]}" if index in folders else ""
         named.append(f"{count} {'unit' if count == 1 else 'units'} of shard {index}/{of}{begun}")
     raise ConfigError(
-        f"Expected all units of the run, but these are missing: {', '.join(named)}. Give the run's command to its "
-        "end with each of these as `--shard`, then this command again with all parts."
+        f"Expected all units of the run, got none for: {', '.join(named)}. Finish the run's command with each of these "
+        "as `--shard`, then give this command again with all parts."
     )
 
 
@@ -174,6 +174,11 @@ def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
     for name in ("warnings", "dropped", "history"):
         about[name] = provenance.join(*(run.about[name] for run in runs))
     about["history"] = provenance.extend_history(about["history"], about["suite"])
+    machines = provenance.join([run.about["machine"] for run in runs])
+    if len(machines) > 1:
+        names = ", ".join(dict.fromkeys(f"{one['processor']} with {one['cores']} cores" for one in machines))
+        line = f"the shards ran on {len(machines)} machines ({names}), so that planning times do not compare planners"
+        about["warnings"] = provenance.join(about["warnings"], [line])
     return about
 
 

@@ -52,8 +52,8 @@ def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = Non
     recording = recorder.recording(episodes, member)
     if not _repeats(row, recording):
         raise BenchnavError(
-            f"The episode did not repeat: {folder} was made with other versions or on another machine type. "
-            "Run the suite again here to replay it."
+            f"The repeated episode differs from the stored one: {folder} was made with other versions or on "
+            "another machine type. Run the suite again here to replay it."
         )
     recording.save(out / unit.recording_path(member))
     return recording
@@ -78,7 +78,7 @@ def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
     own = (rows[list(known)] == pd.Series(known)).all(axis=1)
     if not own.any():
         raise ConfigError(
-            f"Expected a finished run, got {folder} without that episode. Run the same command again to finish it."
+            f"Expected a finished run, got {folder} without that episode. Give its command again to finish it."
         )
     return rows[own].to_dict("records")[0]
 
@@ -124,10 +124,10 @@ def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
     origin, made = Settings().origins().of(unit), run.about["codes"][first["code"]]
     digests = run.about["datasets"][condition.data]["maps"][condition.split]
     if origin.maps[1:] != tuple(digests[i] for i in maps):
-        raise BenchnavError(f"Expected {condition.data} with the maps that {run.folder} was on, got others.")
+        raise BenchnavError(f"Expected {condition.data} with the maps of {run.folder}, got other maps.")
     for part, digest in origin.code["parts"].items():
         if made["parts"].get(part) != digest:
-            raise BenchnavError(f"Expected {part} as it was when {run.folder} was run, got another.")
+            raise BenchnavError(f"Expected {part} as it was when {run.folder} was run, got a changed one.")
     with one_thread():
         recorder = _recorder(unit, Settings(), ())
     kept = read_steps(run.folder, condition=condition.id, seed=seed, realisation=realisation, map=maps)
@@ -160,7 +160,7 @@ def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
 
 
 def keep_ground(folder: Path) -> None:
-    """Writes the map on which the outcomes of a run differ most, with λ as it was there; not where no steps were kept.
+    """Writes the map on which the outcomes of a run differ most, with the λ field; not where no steps were kept.
 
     Args:
         folder: a run whose rows are all there.

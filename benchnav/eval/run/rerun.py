@@ -100,7 +100,7 @@ def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:
     if len(cells) or len(lacking):
         conditions = {i: one for i, (one, _) in (*again.conditions.items(), *run.conditions.items())}
         lines += _verdict(conditions, len(first), cells, lacking)
-    lines += [f"only one of the two tables has the column {name}" for name in columns]
+    lines += [f"column {name} is in only one of the two tables" for name in columns]
     return same, [*lines, _environment(run.about, again.about)]
 
 
@@ -114,15 +114,15 @@ def _check_repeats(run: Run, folder: Path) -> None:
     """Refuses a run that is no rerun: one of other conditions, or with units that were copied from the run itself."""
     if set(open_run(folder).conditions) != set(run.conditions):
         raise ConfigError(
-            f"Expected `out` to be new or an earlier rerun of {run.folder}, but {folder} has other conditions. Choose "
+            f"Expected `out` to be new or an earlier rerun of {run.folder}, got {folder} with other conditions. Choose "
             "another `out`."
         )
     every = units(run.conditions)
     copied = len(_makings(run.folder, every) & _makings(folder, every))
     if copied:
         raise ConfigError(
-            f"Expected `out` to be new or an earlier rerun of {run.folder}, but {copied} of the {len(every)} units in "
-            f"{folder} are copies of its own, which repeat nothing. Choose another `out`, or pass --overwrite."
+            f"Expected `out` to be new or an earlier rerun of {run.folder}, got {folder}, where {copied} of "
+            f"{len(every)} units are copies of that run's units. Choose another `out`, or pass --overwrite."
         )
 
 
@@ -141,9 +141,7 @@ def _check_there(run: Run) -> None:
             except BenchnavError as error:
                 lacking[str(error)] = None
     if lacking:
-        raise ConfigError(
-            f"{run.folder} cannot be repeated here, since something is no longer there. {' '.join(lacking)}"
-        )
+        raise ConfigError(f"Expected all that {run.folder} was made with, got a lack: {' '.join(lacking)}")
     build_each((condition for condition, _ in run.conditions.values()), seed=0, maps=1)
 
 
@@ -153,13 +151,13 @@ def _verdict(
     """Which rows came out differently, the first of them with all that differs, and the greatest differences."""
     changes = [f"{name} {_text(a)} → {_text(b)}" for (*_, name), a, b in cells.itertuples()]
     told = pd.Series(changes, index=cells.index, dtype=str).groupby(level=KEYS, sort=False).agg(", ".join)
-    differing = pd.concat([told, pd.Series("in one of the tables alone", index=lacking)])
+    differing = pd.concat([told, pd.Series("in only one of the two tables", index=lacking)])
     counts = differing.groupby(level="condition", sort=False).size()
     lines = [
         f"{len(differing)} of {rows} rows came out differently, in {len(counts)} of {len(conditions)} conditions:"
     ]
     lines += [f"  {conditions[condition].description}: {count} rows" for condition, count in counts.items()]
-    lines.append("first of them:")
+    lines.append("the first of them:")
     for (condition, *place), line in differing.head(_SHOWN).items():
         where = ", ".join(f"{name} {value}" for name, value in zip(KEYS[1:], place, strict=True))
         lines.append(f"  {conditions[condition].description}, {where}: {line}")
@@ -185,5 +183,5 @@ def _environment(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     if machines[0] != machines[1]:
         changed.append(f"machine ({machines[0]} to {machines[1]})")
     if not changed:
-        return "nothing that is known of the environment differs"
-    return f"what differs in the environment: {'; '.join(dict.fromkeys(changed))}"
+        return "no difference between the recorded environments"
+    return f"the environments differ in: {'; '.join(dict.fromkeys(changed))}"

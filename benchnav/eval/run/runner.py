@@ -85,7 +85,7 @@ def run_work(
         with connected(scheduler):  # else nothing is dropped or written
             pass
     if work.settings.device == "cuda":
-        say(f"computing on {gpu_name(work.settings.device)}")
+        say(f"running on {gpu_name(work.settings.device)}")
     if overwrite:
         drop(folder)
     conditions = begin(work, folder, say)
@@ -97,7 +97,7 @@ def run_work(
     if own:
         yield done, len(own)
     else:
-        say(f"none of the {len(every)} units is in shard {work.shard}")
+        say(f"shard {work.shard} holds none of the {len(every)} units")
     # Workers may be older than this call, so that they are told where names of files begin.
     run = partial(run_on_worker, Path.cwd()) if scheduler else partial(_run_in, Path.cwd(), folder.resolve())
     calls: list[Any] = [partial(run, unit, origin, work.settings) for unit, origin in missing]
@@ -143,11 +143,11 @@ def _missing(
     if done := len(own) - len(missing):
         say(f"{done} of {len(own)} units were there already")
     if again:
-        say(f"run again for recordings or steps that were not asked for: {again} of {len(own)} units")
+        say(f"{again} of {len(own)} units are run again for recordings or steps that they lack")
     if unused:
         say(
-            f"finished by other code or maps ({'; '.join(other)}), so not used: {unused} of {len(own)} units; "
-            "--reuse-code takes those of other code"
+            f"{unused} of {len(own)} units were finished by other code or maps ({'; '.join(other)}) and are run again; "
+            "--reuse-code takes units of other code"
         )
     return missing
 
@@ -184,14 +184,12 @@ def _finished(
         counts = _counting(find_units(folder, unit), unit, origin, reuse_code)
         if counts is None:
             raise ConfigError(
-                f"Expected unit {unit.name} of condition {unit.condition.id} in {folder}, which is not there any more. "
+                f"Expected unit {unit.name} of condition {unit.condition.id} in {folder}, got none: it was removed. "
                 "Give its `benchnav-eval run` command again."
             )
         found.append((unit, counts))
         if counts.about["key"] != origin.key(unit):
             reused += 1
             other |= dict.fromkeys(_differences(counts, origin))
-    line = (
-        f"{reused} of {len(own)} units are of other code ({'; '.join(other)}); column `code` tells which rows"
-    )
+    line = f"{reused} of {len(own)} units were made by other code ({'; '.join(other)}); column `code` tells which rows"
     return found, line if reused else ""

@@ -111,8 +111,8 @@ def _check_origin(unit: Unit, origin: Origin, settings: Settings) -> None:
         changed.append(f"maps of {unit.condition.data} {unit.condition.split}")
     if changed or now != origin:
         raise ConfigError(
-            f"Expected the code and the maps that the run was begun with, but these are others: {'; '.join(changed)}. "
-            "Give the run's command again; what was finished is kept."
+            f"Expected the code and the maps that the run was begun with, got changes: {'; '.join(changed)}. "
+            "Give the run's command again; finished units are kept."
         )
 
 

@@ -34,12 +34,12 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
         A row a pair: labels of the two, `one`, `other`; `n_maps`, `n_groups`, the statistical units, which are as many
         unless maps are grouped, and `n_episodes` of each condition; `success_one`, `success_other`;
         `success_difference` with its 95 % interval `_low`, `_high`, `success_p`
-        and, corrected, `success_p_holm`; `success_detectable`, the smallest difference that so many maps show with a
-        chance of 80 %, and `maps_needed` for `difference`, both at the level of the first step of Holm. The same of
+        and, corrected, `success_p_holm`; `success_detectable`, the minimum detectable difference with 80 %
+        power, and `maps_needed` for `difference`, both at the level of the first step of Holm. The same of
         `time`, T_total in seconds, where a failure counts as T: `time_difference_s`, `time_low_s`, `time_high_s`. Where
         the two conditions of some pair have unlike T, whose difference would else be that of the penalty, all are in
         shares of T and end in `_share`. And of `arrival_time`, over episodes in which both arrived: no test, since
-        which these are hangs on both conditions.
+        both conditions decide which episodes these are.
     """
     alpha = ALPHA / len(pairs)
     table = pd.DataFrame([_compare_success(pair, alpha, difference) for pair in pairs])

@@ -120,7 +120,10 @@ def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> 
     check_known("`against`", against, sorted({label for _, label in labels} - {NOT_USED}))
     found = list(dict.fromkeys(name for name, label in labels if label == against))
     if len(found) > 1:
-        raise ConfigError(f"Expected `by` {' or '.join(found)}: both have {against!r}.")
+        raise ConfigError(
+            f"Expected `against` to be a label of one kind, got {against!r}, a label of {' and of '.join(found)}. Pass "
+            f"--by {' or --by '.join(found)}."
+        )
     return found[0]
 
 

@@ -105,7 +105,7 @@ def evaluate(
         write_text(target, report)
         print(f"wrote {json}")
     if not out:
-        print(f"what the columns mean: with --out FOLDER, {PAGE} there says so")
+        print(f"columns: --out FOLDER writes {PAGE}, which explains them")
         return
     write_text(folder / REPORT, report)
     write_text(folder / CSV, quality_csv(qualities))
@@ -125,4 +125,4 @@ def evaluate(
     for line in absent:
         print(line)
     print(f"wrote {REPORT}, {CSV}, {PAGE} and {len(paths)} figures in {out}")
-    print(f"what the columns and figures mean: {folder / PAGE}")
+    print(f"columns and figures are explained in {folder / PAGE}")

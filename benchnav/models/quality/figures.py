@@ -121,7 +121,7 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
         lower.set(ylim=(0, 1), yticks=[0, 1])
         lower.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
     for (upper, lower), _ in pairs[::3]:
-        upper.set_ylabel("how often right")
+        upper.set_ylabel("accuracy")
         lower.set_ylabel("cells")
     figure.align_ylabels()
     figure.supxlabel("probability of the most likely class")
@@ -168,7 +168,7 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
         room = highest - lowest
         panel.set(xlim=(0, 1), ylim=(lowest - 0.1 * room, highest + 0.5 * room), xticks=[0, 0.5, 1])
         panel.locator_params(axis="y", nbins=5, steps=[1, 2, 5, 10])
-    figure.supxlabel("PIT of the realised λ")
+    figure.supxlabel("PIT of observed λ")
     figure.supylabel("density")
     _explain(figure, most=5)
     return figure

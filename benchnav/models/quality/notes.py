@@ -20,17 +20,17 @@ def notes_of_data(dataset: TerrainDataset, splits: Sequence[str], baselines: Bas
     lines = []
     if by_colour := baselines.nearest_colour_accuracy:
         listed = ", ".join(f"{split} {share:.4f}" for split, share in by_colour.items())
-        lines.append(f"accuracy of the class of the nearest colour, without a model: {listed}")
+        lines.append(f"baseline without a model, class of the nearest colour: accuracy {listed}")
     listed = ", ".join(f"{split} {score:.4f}" for split, score in baselines.climatology_crps.items())
-    lines.append(f"CRPS of one distribution for all cells, that of the split's λ, without a model: {listed}")
+    lines.append(f"baseline without a model, one distribution of λ for all cells: CRPS {listed}")
     if unknown := [split for split in splits if dataset.truth_of(split) == "unknown"]:
         parts = [part for split in unknown for part in dataset.splits[split]["parts"]]
-        observed = "λ that was, at least in part, drawn by the class table, not measured"
+        observed = "λ that the class table drew at least in part, not measured λ"
         if all(part.get("source", {}).get("traversability") for part in parts):
             observed = "measured λ"
         lines.append(
-            f"RMSE E[λ] is – on {', '.join(unknown)}, since the true distribution of λ is unknown on imported ground; "
-            f"RMSE λ, NLL, CRPS, “in 90 %” and “< VaR” there are against {observed}"
+            f"the true distribution of λ is unknown on {', '.join(unknown)}: RMSE E[λ] is a dash, and RMSE λ, NLL, "
+            f"CRPS, “in 90 %” and “< VaR” are against {observed}"
         )
     return lines
 
@@ -57,14 +57,16 @@ def notes_of_model(
         if split in qualities and any(item.accuracy < share for item in qualities[split].classes)
     ]  # fmt: skip
     if worse:
-        lines.append(f"warning: the model is right less often than the nearest colour on {', '.join(worse)}")
+        lines.append(
+            f"warning: the model's accuracy is below that of the nearest colour on {', '.join(worse)}"
+        )
     worse = [
         split for split, quality in qualities.items()
         if quality.traversability.crps > baselines.climatology_crps[split]
     ]  # fmt: skip
     if worse:
         lines.append(
-            f"warning: the model's CRPS is higher than that of one distribution for all cells on {', '.join(worse)}"
+            f"warning: the model's CRPS is worse than that of one distribution for all cells on {', '.join(worse)}"
         )
     seen = [
         f"{split} (its {trained_on[digest]})"
@@ -75,13 +77,13 @@ def notes_of_model(
     ]
     if seen:
         lines.append(
-            f"warning: the model was trained, or chosen and calibrated, on the maps of {', '.join(seen)}: their "
-            "numbers say nothing of maps that it has not seen"
+            f"warning: the model was trained, or selected and calibrated, on the maps of {', '.join(seen)}: these "
+            "numbers do not hold for unseen maps"
         )
     unknown = [split for split in qualities if dataset.truth_of(split) == "unknown"]
     if unknown and isinstance(model, Oracle | Ideal):
         lines.append(
-            f"warning: what this model says of {', '.join(unknown)} is the class table of the recipe, not the "
-            "truth of this ground"
+            f"warning: on {', '.join(unknown)} this model gives the class table of the recipe, not the truth of the "
+            "ground"
         )
     return lines

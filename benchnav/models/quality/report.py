@@ -30,13 +30,13 @@ COLUMNS = {
     ),
     "miou": (
         "mIoU\n",
-        "mean intersection over union: the cells where a class is both predicted and true, over those where it "
-        "is either, in the mean over the classes that occur in truth; 1 is perfect.",
+        "mean intersection over union of the predicted and the true cells of a class, averaged over the classes that "
+        "occur in truth; 1 is perfect.",
     ),
     "miou_predicted": (
         "mIoU\n∪ pred.",
-        "the same in the mean over the classes that are true or predicted somewhere; one that never occurs "
-        "counts as 0 as soon as a cell is taken for it.",
+        "mIoU averaged over all classes that are true or predicted somewhere; a class that is predicted and never "
+        "occurs counts as 0.",
     ),
     "look_alike_accuracy": (
         "accuracy\nlook-alikes=1",
@@ -48,26 +48,25 @@ COLUMNS = {
     ),
     "look_alike_share_error": (
         "look-alikes\noff ½",
-        "of two classes that share a colour, how far the share of the true one is from ½, which is all that can "
-        "be said; 0 is perfect.",
+        "distance from ½ of the share that the true one of two look-alike classes is given; 0 is perfect, since no "
+        "image tells them apart.",
     ),
     "look_alike_share_ece": (
         "ECE\nlook-alikes",
-        "of two classes that share a colour, the calibration error of the larger share; 0 is perfect.",
+        "calibration error of the larger share of two look-alike classes; 0 is perfect.",
     ),
     "ece": (
         "ECE\n",
-        "expected calibration error: how far the probability of the most likely class is from how often it is "
-        "right, in the mean over cells; 0 is perfect.",
+        "expected calibration error: mean gap between the probability of the most likely class and its accuracy; 0 is "
+        "perfect.",
     ),
     "brier": (
         "Brier\n",
-        "squared distance of the class probabilities to the truth, which is 1 for the true class and 0 for the "
-        "rest; 0 is perfect, 2 is sure and wrong.",
+        "mean squared distance of the class probabilities to the true class; 0 is perfect, 2 is sure and wrong.",
     ),
     "entropy": (
         "entropy\n[nats]",
-        "mean uncertainty of the class in nats; 0 is sure.",
+        "mean entropy of the class probabilities in nats; 0 is sure.",
     ),
     "mutual_information": (
         "mutual\ninf.",
@@ -75,42 +74,41 @@ COLUMNS = {
     ),
     "entropy_auroc": (
         "AUROC\nentropy",
-        "how often a wrongly classified cell has a higher entropy than a right one: 1 where uncertainty finds "
-        "every error, 0.5 where it tells nothing.",
+        "probability that a wrong cell has a higher entropy than a right one; 1 is perfect, 0.5 is chance.",
     ),
     "mutual_information_auroc": (
         "AUROC\nm. inf.",
-        "the same of mutual information.",
+        "AUROC of mutual information, as for entropy.",
     ),
     "rmse_observed": (
         "RMSE\nλ",
-        "typical distance of the predicted mean to λ as observed; the noise of the ground stays in it, even for "
-        "a perfect model.",
+        "root mean squared error of the predicted mean against observed λ; noise of the ground keeps it above 0 even "
+        "for a perfect model.",
     ),
     "rmse_expected": (
         "RMSE\nE[λ]",
-        "typical distance of the predicted mean to the true mean of λ; 0 is perfect, and – stands where the true "
-        "mean is unknown.",
+        "root mean squared error of the predicted mean against the true mean of λ; 0 is perfect. A dash: the true mean "
+        "is unknown.",
     ),
     "nll": (
         "NLL\nλ",
-        "minus the logarithm of the predicted density at λ as observed, in the mean; lower is better, it may be "
-        "negative, and – stands where the predicted distribution has no density.",
+        "mean negative log-likelihood of observed λ; lower is better, also below 0. A dash: the predicted distribution "
+        "has no density.",
     ),
     "crps": (
         "CRPS\nλ",
-        "continuous ranked probability score: distance of the predicted distribution to λ as observed, in units "
-        "of λ; lower is better.",
+        "continuous ranked probability score of the predicted distribution against observed λ, in units of λ; lower is "
+        "better.",
     ),
     "coverage": (
         "in 90 %\n(0.9)",
-        "share of observed λ within the central 90 % of their prediction; 0.9 is perfect, and less means that "
-        "the model is too sure.",
+        "coverage: share of observed λ within the central 90 % interval of its prediction; 0.9 is perfect, less means "
+        "overconfident.",
     ),
     "tail_rate": (
         "< VaR\n(0.1)",
-        "share of observed λ under the value at risk (VaR) at level 0.9, under which a tenth should fall; 0.1 is "
-        "perfect, and more means that bad ground comes more often than predicted.",
+        "share of observed λ below the value at risk VaR₀.₉; 0.1 is perfect, more means that bad ground is more "
+        "frequent than predicted.",
     ),
 }
 # Where classes look alike.
@@ -127,38 +125,35 @@ _FILES_ONLY = (
 # Title and explanation by the name of a figure; those of map sheets go on with the split.
 _FIGURES = {
     "confusion": (
-        "Which class is taken for which",
-        "A row is a true class, a column the most likely one; a number is a share of the row in percent. A perfect "
-        "model has 100 along the diagonal, but no model can tell classes of one colour apart. A grey row is of a class "
-        "that no map of the split shows.",
+        "Confusion of classes",
+        "Rows are true classes, columns the most likely ones, numbers shares of the row in per cent. A perfect model "
+        "has 100 along the diagonal; no model can tell look-alike classes apart. Grey rows are classes that no map of "
+        "the split shows.",
     ),
     "reliability": (
-        "Whether the class probabilities can be trusted",
-        "Above, how often the most likely class is right, over its probability: on the dashed line they are the same, "
-        "under it the model is too sure. ECE is the mean gap. Below, how many cells have such a probability.",
+        "Calibration of the class probabilities",
+        "Above: accuracy of the most likely class over its probability. Calibrated is on the dashed line; below it the "
+        "model is overconfident. ECE is the mean gap. Below: number of cells with that probability.",
     ),
     "pit": (
-        "Whether the predicted distribution of λ can be trusted",
-        "The probability integral transform (PIT) says where an observed λ lies in its prediction, from 0 at the low "
-        "end to 1 at the high end. Calibrated is flat at 1. High at both ends means too sure, high in the middle not "
-        "sure enough; high at the left, in orange, that bad ground comes more often than predicted. Each panel has a "
-        "scale of its own.",
+        "Calibration of the predicted distribution of λ",
+        "The probability integral transform (PIT) is the place of observed λ in its prediction, from 0 (low end) to 1 "
+        "(high end). Calibrated is flat at 1. High at both ends is overconfident, high in the middle underconfident. "
+        "High at the left (orange): bad ground is more frequent than predicted. Panels have scales of their own.",
     ),
     "severity": (
         "Quality over the severity of a shift",
-        "The numbers of the table over the severity of each scenario, from 0, the maps of training, to the scenario "
-        "itself at 1.",
+        "Measures of the table over the severity of each scenario: 0 is the training maps, 1 the scenario itself.",
     ),
     "latent": (
         "What the Gaussian processes have learned",
-        "Traversability over slope, class by class, beside the truth in black where it is known. Where it is grey, few "
-        "of the measured cells are as steep, or none.",
+        "Predicted traversability over slope for each class, with the truth in black where it is known. Few or no "
+        "measured cells are as steep as the grey part.",
     ),
     "maps": (
         "Maps of",
-        "A row a map, from what the robot sees to the truth, the prediction, its error and its uncertainty; where the "
-        "true distribution of λ is unknown, λ as observed stands for it. A quantity has the same scale in all sheets "
-        "of an evaluation.",
+        "Each row is a map: observation, truth, prediction, error and uncertainty. Observed λ stands for the truth "
+        "where the true distribution is unknown. A quantity has one scale in all sheets of an evaluation.",
     ),
 }
 
@@ -188,7 +183,7 @@ def quality_table(title: str, qualities: Mapping[str, Quality], whole: bool = Fa
             )
             for split, row in zip(qualities, table[names].to_numpy(), strict=True)
         ),
-        explained=(("split", "the maps that were measured; their number is under maps."), *explained),
+        explained=(("split", "split of the dataset; maps: the number of its maps."), *explained),
     )
 
 

@@ -210,7 +210,7 @@ def check_distribution(given: Any, shape: tuple[int, ...], device: torch.device,
     mean = given.mean()
     expect(
         bool(((mean >= 0) & (mean <= 1)).all()),
-        f"{where} means of λ in [0, 1], got some outside or not a number.",
+        f"{where} means of λ in [0, 1], got values outside or not a number.",
     )
     ranks = torch.stack([given.quantile(share).double() for share in (0.01, 0.2, 0.5, 0.8, 0.99)])
     expect(

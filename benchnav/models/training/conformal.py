@@ -34,7 +34,7 @@ def check_valid(dataset: TerrainDataset) -> None:
     expect(
         count >= _LEAST_MAPS,
         f"at least {_LEAST_MAPS} maps in split {VALID} of {dataset.path} for `conformal`, which takes every second "
-        f"one, got {count}. With n maps for it no level under 1 / (n + 1) can be promised.",
+        f"one, got {count}. Its least level is 1 / (n + 1) for n maps: give {VALID} more maps.",
     )
 
 

@@ -13,7 +13,7 @@ import pickle
 import signal
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -205,7 +205,7 @@ def is_first_process() -> bool:
     return not getattr(rank_zero_only, "rank", 0)
 
 
-def interrupted(options: FitOptions, parts: list[str]) -> list[str]:
+def interrupted(options: FitOptions, parts: Sequence[str]) -> list[str]:
     """Names the parts whose training was interrupted in the folder of some options."""
     return [part for part in parts if options.folder and (options.folder / part / STATE).exists()]
 
@@ -320,8 +320,8 @@ class KeepBest(Callback):
             raise ConfigError(
                 "Expected a finite validation loss, got none. Train with a lower `learning_rate`."
                 if self.validated
-                else "Expected settings of `trainer` under which the split valid is measured, got an end of training "
-                "before it ever was. Train for longer, or validate more often."
+                else "Expected `trainer` to measure the split valid, got none: training ended before the first "
+                "validation. Train for longer, or validate more often."
             )
         module.load_state_dict(self.best["weights"])
         # The trainer's own metrics are what comes back from processes that it has started.

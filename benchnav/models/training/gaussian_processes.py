@@ -86,7 +86,7 @@ def train_gps_on_maps(config: LatentGPConfig, dataset: TerrainDataset, options: 
     errors = (
         f"RMSE of the latent mean {found['latent_rmse']:.4f}, largest error of the noise {found['noise_error']:.1%}, "
         if known
-        else "(of their errors nothing is known: the true distribution of λ of this ground is unknown) "
+        else "(errors unknown, since the true distribution of λ of this ground is unknown) "
     )
     say(f"gp: validation {errors}NLL {found['nll']:.4f}")
     metrics = {f"valid_{name}": value for name, value in found.items()}
@@ -101,10 +101,10 @@ def _train_on_logs(data: str, out: str, config: LatentGPConfig, options: FitOpti
     target = open_target(out, Checkpoint(class_names=names), [GP], digest, options)
     counts = dict(zip(names, sums.count.tolist(), strict=True))
     if few := [f"{name} {count}" for name, count in counts.items() if count < _FEW_ROWS]:
-        lost = f", and what {out} had learned of them is dropped" if there and GP in there.parts else ""
+        lost = f"; the GPs that {out} held for them are dropped" if there and GP in there.parts else ""
         tell(
             f"benchnav-train: warning: {data} has fewer than {_FEW_ROWS} rows of {len(few)} of {len(counts)} classes "
-            f"({', '.join(few)}); their GPs are little more than the prior, which is vague{lost}"
+            f"({', '.join(few)}); their GPs stay close to the prior, which is vague{lost}"
         )
     metrics = {}
     if measured_on := _held_out(cells, drive, options.seed):
@@ -112,10 +112,10 @@ def _train_on_logs(data: str, out: str, config: LatentGPConfig, options: FitOpti
         trial = fit_gps(config, SlopeSums.of(kept, len(names)), options.device)
         metrics["held_out_nll"] = cell_nll(held, trial.tabulate())
         say(
-            f"gp: NLL of {len(held)} rows held out, {whose}, {metrics['held_out_nll']:.4f}; now with all rows"
+            f"gp: NLL {metrics['held_out_nll']:.4f} on {len(held)} held-out rows, {whose}; training on all rows next"
         )
     model = _fit_and_say(config, sums, names, options.device)
-    say(f"gp: rows learned from: {', '.join(f'{name} {count}' for name, count in counts.items())}")
+    say(f"gp: training rows: {', '.join(f'{name} {count}' for name, count in counts.items())}")
     target.add(GP, _part(model, options.seed, metrics, Path(data).name, digest))
 
 

@@ -1,5 +1,6 @@
 """Training networks, whatever they learn: one door for classifiers, trainable models of ours and a user's own."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,15 @@ from benchnav.models.training.data import (
     open_dataset,
     training_digest,
 )
-from benchnav.models.training.fit import FitOptions, KeepBest, fit, in_words, is_first_process, say
+from benchnav.models.training.fit import (
+    FitOptions,
+    KeepBest,
+    fit,
+    in_words,
+    interrupted,
+    is_first_process,
+    say,
+)
 from benchnav.models.training.gaussian_processes import train_gps_on_maps
 from benchnav.models.training.target import Target, fresh_checkpoint, open_target
 
@@ -174,13 +183,26 @@ def train_networks(
         f"a whole model for `conformal`, got {trainable.name} alone. Train the GPs into {out} first, or take "
         "`benchnav-train all`.",
     )
-    if gp and not target.holds(GP, gp, how.seed):
-        target.add(GP, train_gps_on_maps(gp, dataset, options))
-    train_parts(target, trainable, dataset, parts)
-    if how.conformal and is_first_process():
-        calibrate_whole(target, trainable, dataset)
+    try:
+        if gp and not target.holds(GP, gp, how.seed):
+            target.add(GP, train_gps_on_maps(gp, dataset, options))
+        train_parts(target, trainable, dataset, parts)
+        if how.conformal and is_first_process():
+            calibrate_whole(target, trainable, dataset)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(_kept(target, trained, options)) from None
     if not target.changed and is_first_process():
-        print(f"{out} was finished already, with {' and '.join(sorted(target.checkpoint.parts))}")
+        print(f"{out} was finished already and holds {' and '.join(sorted(target.checkpoint.parts))}")
+
+
+def _kept(target: Target, trained: Sequence[str], options: FitOptions) -> str:
+    """Says what an interrupted training has kept, and how to go on with it."""
+    kept = [name for name in trained if name in target.checkpoint.parts]
+    kept += [f"the finished epochs of {name}" for name in interrupted(options, trained) if name not in kept]
+    if not kept:
+        return "nothing was finished; give the same command again"
+    instead = " in place of --overwrite" if options.overwrite else ""
+    return f"{' and '.join(kept)} kept; to go on, give the same command with --resume{instead}"
 
 
 def fit_network(

@@ -76,7 +76,7 @@ class Target:
             return True
         remedy = "pass --overwrite instead of --resume"
         if interrupted(options, [name]):
-            remedy = "pass --overwrite with --resume to go on with the training that was to replace it"
+            remedy = "pass --overwrite with --resume to go on with the training that replaces it"
         raise CheckpointError(
             f"Expected the {name} in {self.folder} to be of these settings, seed and maps, got others: of seed "
             f"{part.seed} and {part.data_id}, {others}. Repeat its settings, or {remedy}."
@@ -136,14 +136,14 @@ def open_target(
     if left and not (options.resume or may_replace):
         raise CheckpointError(
             f"Expected no interrupted training in {options.folder}, got one of {' and '.join(left)}. "
-            "Pass --resume to go on with it, or --overwrite to begin anew."
+            "Pass --resume to go on with it, or --overwrite to start again."
         )
     # Whether a checkpoint can be written there shows now rather than after the training.
     with open_place(out) as (folder, _):
         checkpoint = existing(folder, may_replace) or fresh
     if checkpoint.code != fresh.code and checkpoint.model == fresh.model and not may_replace:
         raise CheckpointError(
-            f"Expected checkpoint {folder} to be of the code of {fresh.model} as it is now, got one of other code. "
+            f"Expected checkpoint {folder} to be of the present code of {fresh.model}, got one of other code. "
             "Pass --overwrite to replace it."
         )
     if (checkpoint.model, checkpoint.class_names) != (fresh.model, fresh.class_names):
@@ -168,7 +168,7 @@ def open_target(
         checkpoint = replace(checkpoint, parts=kept)
     elif not options.resume and not checkpoint.parts.keys().isdisjoint(parts):
         # The processes alone are trained in a moment, and so not gone on with.
-        resume = ", or --resume to go on with what an interrupted training has left" if options.folder else ""
+        resume = ", or --resume to go on with an interrupted training" if options.folder else ""
         raise CheckpointError(
             f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
             f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace it"

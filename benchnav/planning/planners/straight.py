@@ -63,7 +63,7 @@ class Straight(Planner[Problem]):
 
     def follows(self, task: Task) -> str:
         """That it minimises nothing; see `Planner`."""
-        return "nothing, drives straight at the goal"
+        return "none (it drives straight at the goal)"
 
     def init(self, problem: Problem, generator: torch.Generator) -> Problem:
         """Keeps the problem, for its goals; draws nothing. See `Planner`."""

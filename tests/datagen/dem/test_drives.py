@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -545,21 +546,21 @@ def test_the_command_says_what_was_used_and_what_was_not(
     used = sum(about["used"].values())
     assert f"{used} of {len(rows)} rows of log.csv.gz were used" in said
     for reason, why in (
-        ("slow", "that were commanded less than the least speed"),
-        ("between_maps", "that lie on ground that no map shows"),
-        ("other_split", "that lie on the ground of another split than their drive's"),
+        ("slow", "were commanded less than the least speed"),
+        ("between_maps", "lie between the maps"),
+        ("other_split", "lie on the ground of a split that their drive does not belong to"),
     ):
-        assert f"left out: {about['left_out'][reason]} {why}" in said
+        assert f"{about['left_out'][reason]} rows are left out: they {why}" in said
     assert "missing" not in said
     names = about["drives"]["valid"]
     assert (
         f"valid: {about['used']['valid']} rows of {len(names)} drive{'s' * (len(names) > 1)} ({names[0]}"
         in said
     )
-    assert "maps left out of train: " in said
+    assert re.search(r"left out of train: \d+ maps have ", said)
     assert "have no cell that a drive of their split crossed" in said
-    assert "group(s), the unit of statistics" in said
-    assert "note: positions move" in said  # commands here have nothing to do with how far the robot went
+    assert "group(s), the statistical unit" in said
+    assert "warning: positions move" in said  # commands here have nothing to do with how far the robot went
     for line in ("validate site.h5", "show site.h5", "preview site.h5 --split train --out sheet.png"):
         assert call("datagen", *shlex.split(line)) == 0
     assert "drive_count, drive_std" in capfd.readouterr().out
@@ -588,7 +589,7 @@ def test_the_default_splits_are_for_training(
     assert "--overwrite" in capfd.readouterr().err
     assert call("datagen", *shlex.split(common + " --class-ids '{7: null, 3: gravel}' --overwrite")) == 2
     assert (
-        "no cell with a class or a measured λ, or cells without a class and no photo"
+        "no cell with a class or measured λ, or have cells with neither class nor photo"
         in capfd.readouterr().err
     )
     assert call("datagen", *shlex.split(common + " --class-ids '{7: scree}' --overwrite")) == 0

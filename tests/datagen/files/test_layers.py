@@ -209,6 +209,6 @@ def test_the_commands_name_layers(path: Path, capsys: pytest.CaptureFixture[str]
     shown = said("show", str(path))
     assert "height of the vegetation; 0 on bare ground" in shown
     assert "50% #3c6e1e 0.1–0.8 m" in shown
-    assert "vegetation in patches of a period of 4 m" in shown
+    assert "vegetation in patches with a period of 4 m" in shown
     assert '"vegetation_period_m": 4.0' in said("show", str(path), "--json")
     assert "sound" in said("validate", str(path))

@@ -135,7 +135,7 @@ def test_the_best_and_the_worst_that_sees_are_shown(tmp_path: Path) -> None:
     sheets, conditions = collected(tmp_path, recorded)
     ((title, (best, worst)),) = sheets.shown
     assert title == "std"
-    assert (best.name, best.among, list(best.failures["map"])) == ("MPPI, cvar", 2, [8, 9])
+    assert (best.name, best.among, list(best.failures["map"])) == ("MPPI, CVaR", 2, [8, 9])
     assert (worst.name, worst.among, list(worst.failures["map"])) == ("MPPI, mean", 8, [2, 3, 4, 5])
     assert sheets.left_out == ""
     for line in (best, worst):
@@ -159,11 +159,11 @@ def test_it_is_left_out_with_a_reason(tmp_path: Path) -> None:
 
     sheets, _ = collected(tmp_path, gone)
     assert (sheets.shown, sheets.predicted) == ((), {})
-    assert sheets.left_out == "No sheet of failures: Expected a dataset, got none."
+    assert sheets.left_out == "a figure of failures is missing: Expected a dataset, got none."
     assert collected(tmp_path, None)[0].left_out == ""
 
 
 def test_without_steps_there_is_no_sheet(tmp_path: Path) -> None:
     sheets, _ = collected(tmp_path, recorded, steps=False)
     assert sheets.shown == ()
-    assert sheets.left_out == "No sheet of failures: the run kept no steps of them."
+    assert sheets.left_out == "there is no figure of failures, since the run kept no steps"

@@ -40,9 +40,9 @@ def test_each_hypothesis_is_said_with_its_numbers() -> None:
     ).items()
     assert title == "Hypotheses, fixed before the first unit was run (digest d1)"
     assert sentences == [
-        "1. T_total of cvar and of mean differs by less than 0.5 s: equivalent (difference +0.10 s, interval -0.20 to "
+        "1. T_total of CVaR and of mean differs by less than 0.5 s: equivalent (difference +0.10 s, interval -0.20 to "
         "+0.40 (90 %), p = 0.02, 40 maps).",
-        "2. Success of cvar differs from that of mean: no significant difference (difference -4.0 points, interval "
+        "2. Success of CVaR differs from that of mean: no significant difference (difference -4.0 points, interval "
         "-14.0 to +6.0 (95 %), p = 0.6, 40 maps).",
     ]
 
@@ -53,7 +53,7 @@ def test_an_extension_after_the_hypotheses_is_told() -> None:
         pd.DataFrame([a_test()]), ABOUT | {"conditions": conditions}, "group"
     ).values()
     assert said[-1].startswith(
-        "They were fixed for 80 episodes of a condition; the run was extended to 80 to 200 later"
+        "The run was extended after the hypotheses were fixed (episodes a condition: 80 then, 80 to 200 now)"
     )
     assert "40 groups" in said[0]
 
@@ -77,8 +77,8 @@ def test_a_verdict_is_that_of_its_kind(changes: dict[str, Any], words: str) -> N
 
 def test_a_difference_of_time_says_that_its_interval_and_its_p_are_of_two_kinds() -> None:
     for test, said in ((a_test(kind="difference"), True), (a_test(), False), (a_test(**OTHER), False)):
-        notes = hypothesis_table(pd.DataFrame([test]), "map").notes
-        assert any("where the interval holds 0" in note for note in notes) == said
+        explained = hypothesis_table(pd.DataFrame([test]), "map").explained
+        assert any("where the interval holds 0" in text for _, text in explained) == said
 
 
 def test_a_forest_has_a_panel_a_metric_with_points_intervals_and_margins() -> None:

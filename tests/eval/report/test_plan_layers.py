@@ -4,9 +4,11 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 
-from benchnav.core.figures import bytes_of
-from benchnav.eval.report.plan_layers import IMMOBILISING, field_colours
+from benchnav.core.figures import MARKS, bytes_of
+from benchnav.eval.report.plan_layers import IMMOBILISING, end_mark, field_colours, mark_end
+from benchnav.planning.world.outcome import Outcome
 
 # Machado, Oliveira and Fernandes (2009), full severity, on linear RGB.
 SEEN = {
@@ -48,3 +50,38 @@ def test_cells_have_the_colour_of_their_own_traversability_or_that_of_what_holds
     usual = np.round(255 * matplotlib.colormaps["viridis"](field)[..., :3])
     np.testing.assert_array_equal(colours[~immobilising], usual[~immobilising])
     assert (colours[immobilising] == bytes_of(IMMOBILISING)[:3]).all()
+
+
+def test_each_outcome_has_a_mark() -> None:
+    marks = {outcome.name.lower(): end_mark(outcome.name.lower()) for outcome in Outcome}
+    assert set(marks.values()) <= MARKS.keys()
+    assert [name for name, mark in marks.items() if mark == "arrived"] == ["success"]
+    assert [name for name, mark in marks.items() if mark == "immobilised"] == ["immobilised"]
+    # What stood still until its time was up is out of time too.
+    assert [name for name, mark in marks.items() if mark == "out of time"] == ["timeout", "stuck", "stalled"]
+
+
+@pytest.mark.parametrize("goal_m", [(6.0, 4.5), (6.0, 1.5)])
+def test_an_end_is_marked_beside_its_cell_on_the_side_away_from_the_goal(goal_m: tuple[float, float]) -> None:
+    panel = Figure(figsize=(4, 3), dpi=100).add_axes((0, 0, 1, 1))
+    panel.set(xlim=(0, 8), ylim=(0, 6))
+    # It came along x, and ended in the cell from (3.5, 3) to (4, 3.5).
+    track = np.stack((np.linspace(0.2, 3.8, 37), np.full(37, 3.2)), axis=1)
+    cell, mark = mark_end(panel, "immobilised", track, np.array(goal_m), 0.5, color="red", label="held")
+    assert cell.get_path().get_extents().bounds == (3.5, 3.0, 0.5, 0.5)
+    assert (mark.get_marker(), mark.get_color(), mark.get_label()) == ("X", "red", "held")
+    x, y = mark.get_transform().transform(np.ravel(mark.get_data()))
+    middle_x, middle_y = panel.transData.transform((3.75, 3.25))
+    assert x == pytest.approx(middle_x)
+    assert (y > middle_y) == (goal_m[1] < 3)
+    # 25 pixels are half a metre; a point is 100 / 72 of a pixel.
+    assert abs(y - middle_y) - mark.get_markersize() / 2 * 100 / 72 > 12.5
+
+
+def test_an_end_off_the_map_or_at_the_start_is_marked_too() -> None:
+    panel = Figure().add_axes((0, 0, 1, 1))
+    for track in (np.array([[1.0, 1.0]]), np.array([[1.0, 1.0], [-0.2, 9.0]])):
+        ground = np.zeros((4, 4, 3), np.uint8)
+        cell, mark = mark_end(panel, "timeout", track, np.array([2.0, 2.0]), 0.5, ground=ground)
+        assert np.isfinite(mark.get_xydata()).all()
+        assert cell.get_fill() == (len(track) == 1) or cell.get_facecolor()[3] == 0

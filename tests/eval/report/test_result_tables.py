@@ -48,13 +48,14 @@ def test_golden_table() -> None:
         "| scenario | planner | risk | Succ. [%] | 95 % interval | T_total [s] | T if success [s] | λ̄ [%] "
         "| per episode of a batch [ms] | failures |\n"
         "|---|---|---|---|---|---|---|---|---|---|\n"
-        "| std | mppi | cvar | 100 | 34–100 | 25.0 | 25.0 ± 7.1 | 70.0 ± 0.0 | 1 (2)¶ | – |\n"
-        "| std | cl_rrt¹,² | mean | 50 | 9–91 | 70.0 | 40.0 | 70.0 ± 28.3 | 1 (3) | 1 stuck |\n"
+        "| std | MPPI | CVaR | 100 | 34–100 | 25.0 | 25.0 ± 7.1 | 70.0 ± 0.0 | 1 (2)¶ | – |\n"
+        "| std | CL-RRT¹,² | mean | 50 | 9–91 | 70.0 | 40.0 | 70.0 ± 28.3 | 1 (3) | 1 stuck |\n"
         "| std | straight | – | 0 | 0–66 | 100.0 | – | 80.0 (n = 1) | – | 1 out of bounds, "
         "1 planner failure |\n"
-        "\n¹ minimises, in place of the task's J: its own time\n"
+        "\n¹ Cost minimised in place of J: its own time.\n"
         "\n² limits 0.5 m/s²\n"
-        "\n¶ compiled planner: its time is that of compiled code."
+        "\n¶ The planner ran as compiled code.\n"
+        "\nNo rate is bold: no setting is significantly worse than the best."
     )
 
 
@@ -78,7 +79,7 @@ def test_the_mark_of_compiled_planners_is_explained_wherever_it_stands() -> None
         table_of(made.rows(made.row(made.condition(), compiled=value))) for value in (True, False)
     )
     for written in (to_terminal(compiled), to_markdown(compiled), to_latex([compiled], "", "")):
-        assert "compiled planner: its time is that of compiled code" in written
+        assert "The planner ran as compiled code" in written
     assert not eager.notes
 
 
@@ -108,14 +109,17 @@ def test_bold_is_what_is_not_worse_than_the_best_where_another_is() -> None:
     rate = table.headings.index("Succ. [%]")
     assert made.bold_cells(table) == {(1, rate), (2, rate)}
     assert table.bold_note == (
-        "not significantly worse than the highest success rate of its block (max-T sign-flip test by map over the "
-        "block, step by step, p ≥ 0.05); in blocks where nothing is significantly worse none is marked; privileged "
-        "models (oracle) do not compete."
+        "highest success rate and all without a significant difference from it (max-T sign-flip test by map, p ≥ "
+        "0.05). Privileged models (oracle) do not compete."
     )
     alike = table_of(rows[rows["risk"].isin(["var", "cvar"]) & (rows["model"] != "oracle")])
     assert (made.bold_cells(alike), alike.bold_note) == (set(), "")
+    no_difference = "No rate is bold: no setting is significantly worse than the best."
+    assert no_difference in alike.notes
+    assert no_difference not in table.notes
     alone = table_of(made.rows(made.row(made.condition())))
     assert (made.bold_cells(alone), alone.bold_note) == (set(), "")
+    assert no_difference not in alone.notes
 
 
 def test_labels_that_differ_are_shown_and_others_are_not() -> None:
@@ -172,14 +176,14 @@ def test_notes_are_numbered_once_and_marked_at_every_condition_they_hold_for() -
     )
     shared = {"follows": "path length", "remarks": []}
     table = table_of(episodes, a=shared, b=shared | {"remarks": ["slow"]})
-    assert [row[1] for row in table.rows] == ["mppi", "mppi", "a¹", "a¹", "b¹,²", "b¹,²"]
-    assert table.notes == ("¹ minimises, in place of the task's J: path length", "² slow")
+    assert [row[1] for row in table.rows] == ["MPPI", "MPPI", "a¹", "a¹", "b¹,²", "b¹,²"]
+    assert table.notes[:2] == ("¹ Cost minimised in place of J: path length.", "² slow")
 
 
 @pytest.mark.parametrize("follows", ["", "J"])
 def test_a_planner_that_follows_the_users_objective_alone_needs_no_note(follows: str) -> None:
     table = table_of(made.rows(made.row(made.condition(), compiled=False)), mppi={"follows": follows})
-    assert table.rows[0][1] == "mppi"
+    assert table.rows[0][1] == "MPPI"
     assert table.notes == ()
 
 
@@ -199,9 +203,9 @@ def test_groups_are_counted_and_named_where_there_are_such() -> None:
     assert [row[3:5] for row in table.rows] == [("20", "40"), ("18", "36")]
     worse = [made.row(made.condition(risk="c"), i, None, group=i // 2) for i in range(40)]
     text = table_of(made.rows(grouped(made.condition(risk="a"), 40), worse)).bold_note
-    assert "by group over the block" in text
+    assert "sign-flip test by group" in text
     paper = paper_table(made.summary(made.rows(grouped(made.condition(), 40))), "run")
-    assert "on 40 maps in 20 groups a scenario" in paper
+    assert "on 40 maps in 20 groups per scenario" in paper
 
 
 def paper_of(*conditions: tuple[dict[str, str], int]) -> str:
@@ -230,7 +234,7 @@ def test_settings_stand_down_and_scenarios_across() -> None:
         *([r"Succ. {[}\%]", r"$T_\mathrm{total}$ {[}s]", r"$\bar{\lambda}$ {[}\%]"] * 2),
     ]
     assert r"\cmidrule(lr){3-5} \cmidrule(lr){6-8}" in text
-    assert [row[:2] for row in rows] == [["A* + DWA", "mean"], ["", "cvar:0.9"], ["MPPI", "mean"]]
+    assert [row[:2] for row in rows] == [["A*+DWA", "mean"], ["", r"CVaR$_{0.9}$"], ["MPPI", "mean"]]
     # Not 38 but 10 of 40 are significantly worse than 40; hg has one setting alone, so none is bold.
     assert [row[2].split(" ")[0] for row in rows] == [r"\textbf{100}", "25", r"\textbf{95}"]
     assert rows[1][3] == r"80.0 $\pm$ 35.1"
@@ -239,7 +243,7 @@ def test_settings_stand_down_and_scenarios_across() -> None:
     # A line parts the planners, as it parts the heading from the first.
     lines = [line.strip() for line in text.splitlines()]
     under = [lines[place + 1].split(" &")[0] for place, line in enumerate(lines) if line == r"\midrule"]
-    assert under == ["A* + DWA", "MPPI"]
+    assert under == ["A*+DWA", "MPPI"]
 
 
 def test_it_is_a_whole_table_for_booktabs_alone() -> None:
@@ -267,7 +271,7 @@ def test_it_is_a_whole_table_for_booktabs_alone() -> None:
 def test_a_model_is_named_where_there_are_several() -> None:
     text = paper_of((made.condition(model="a"), 30), (made.condition(model="b"), 30))
     assert body(text)[1][:3] == ["Planner", "Model", "Risk"]
-    assert [row[:3] for row in body(text)[2:]] == [["MPPI", "a", "cvar"], ["", "b", "cvar"]]
+    assert [row[:3] for row in body(text)[2:]] == [["MPPI", "a", "CVaR"], ["", "b", "CVaR"]]
     assert r"\begin{table}[t]" in text
 
 
@@ -289,7 +293,7 @@ def test_success_is_in_points_and_p_is_the_corrected_one() -> None:
     table["success_p_holm"], table["success_p"] = [0.032, 0.00001], 0.9
     first, second = cells(table)
     assert (first["risk"], first["against"], first["Succ. [%]"], first["Δ [points]"]) == (
-        "cvar",
+        "CVaR",
         "mean",
         "75 : 50",
         "+25.0",
@@ -326,9 +330,9 @@ def test_labels_that_differ_have_a_column_and_notes_name_the_family() -> None:
     assert shown.headings[:3] == ("planner", "risk", "against")
     assert shown.labels == 3
     notes = " ".join(shown.notes)
-    assert "Family: 2 pairs" in notes
+    assert "corrected over 2 pairs (Holm)" in notes
     needed = np.unique(table["maps_needed"])
-    assert f"A difference of 20 points needs {needed[0]} maps" in notes
+    assert f"20 points need {needed[0]} maps" in notes
 
 
 def test_maps_too_few_to_show_any_difference_say_so() -> None:
@@ -344,9 +348,12 @@ def test_what_test_p_is_of_stands_in_heading_and_note() -> None:
     shown = comparison_table(compare([pair(A, B)]), 0.05, "risk")
     assert shown.headings[shown.headings.index("Δ T_total [s]") + 2] == "p (ranks)"
     notes = " ".join(shown.notes)
-    assert "p (ranks): Wilcoxon's signed-rank test of T_total" in notes
-    assert "Δ and 95 % are of the mean" in notes
-    assert "shares" not in notes
+    assert "Tests by map: signs of the difference (success) and ranks (T_total)" in notes
+    assert "Intervals are of means and not corrected" in notes
+    assert all(len(note) <= 110 for note in shown.notes)
+    columns = dict(shown.explained)
+    assert columns["p (ranks)"].startswith("Wilcoxon's signed-rank test of T_total")
+    assert "shares" not in " ".join(columns.values())
 
 
 def test_times_in_shares_of_unlike_budgets_say_so() -> None:
@@ -355,4 +362,4 @@ def test_times_in_shares_of_unlike_budgets_say_so() -> None:
     (row,) = cells(table)
     assert row["Δ T_total [% of T]"] == "+15.0"  # shares 0.1, 1, 0.2 less 0.1, 0.5, 0.25
     assert not [heading for heading in shown.headings if "T_total [s]" in heading]
-    assert "in shares of each condition's own T" in " ".join(shown.notes)
+    assert "in shares of each condition's own T" in dict(shown.explained)["Δ T_total [% of T], 95 %"]

@@ -7,7 +7,7 @@ from tests.eval.report import made
 @pytest.mark.parametrize(
     ("conditions", "names"),
     [
-        ([made.condition(risk="mean"), made.condition(risk="cvar:0.9")], ["mean", "cvar:0.9"]),
+        ([made.condition(risk="mean"), made.condition(risk="cvar:0.9")], ["mean", "CVaR₀.₉"]),
         (
             [made.condition("mppi", "mean"), made.condition("straight", "–", model="–")],
             ["MPPI", "straight"],

@@ -18,8 +18,10 @@ from benchnav.eval.run.rerun import rerun
 from benchnav.eval.run.runner import run_suite
 
 FREE, STEERING = "tests.eval.parts:Faulty", "tests.eval.parts:Steering"
-LINE = "left out: planner Steering with robot bicycle, which it cannot steer"
-WARNING = "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within T"
+LINE = "left out: planner Steering cannot steer robot bicycle"
+WARNING = (
+    "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within the time budget T"
+)
 
 
 def suite_on(dataset: Path, **changes: Any) -> Suite:

@@ -148,7 +148,7 @@ def test_a_worker_of_other_code_or_without_the_data_is_named(
     for change, expected in (
         (
             lambda: mine.write_text(mine.read_text() + "# edited\n"),
-            r"\d+: .*these are others: planner .*mine\.py",
+            r"\d+: .*got changes: planner .*mine\.py",
         ),
         (data.unlink, r"\d+: .*tiny\.h5"),
     ):
@@ -183,7 +183,7 @@ def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(dataset_path: Pat
         while next(steps)[0] < 4:
             pass
         lost.scheduler.kill()
-        with pytest.raises(BenchnavError, match=r"was lost\. What was finished is kept"):
+        with pytest.raises(BenchnavError, match=r"was lost\. Finished work is kept"):
             list(steps)
     finally:
         lost.stop()

@@ -18,8 +18,9 @@ import pytest
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.run_folder import metadata, open_run, read_table, with_metadata, write_run
+from benchnav.eval.folder.run_folder import caveats, metadata, open_run, read_table, with_metadata, write_run
 from benchnav.eval.folder.steps import read_steps
+from benchnav.eval.run import merge
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.runner import run_suite
 from tests.commands import call
@@ -103,6 +104,17 @@ def test_merged_shards_are_the_run_of_one_process(whole: Path, parts: list[Path]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["all", *(part.name for part in parts)]
 
 
+def test_planning_times_of_several_machines_are_warned_of(parts: list[Path], tmp_path: Path) -> None:
+    runs = [open_run(part) for part in parts]
+    assert merge._about(runs)["warnings"] == runs[0].about["warnings"]
+    other = {**runs[0].about["machine"], "processor": "Abacus", "host": "elsewhere"}
+    write_run(parts[1], {**runs[1].about, "machine": other})
+    list(merge_shards(parts, tmp_path / "all"))
+    (line,) = [line for line in caveats(open_run(tmp_path / "all").about) if "planning times" in line]
+    assert line.startswith("warning: the shards ran on 2 machines (")
+    assert "Abacus with " in line
+
+
 def test_a_merged_run_is_gone_on_with_and_extended(suite: Suite, parts: list[Path], tmp_path: Path) -> None:
     list(merge_shards(parts, tmp_path / "all"))
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "all").glob("units/*/*")}
@@ -133,7 +145,7 @@ def test_a_shard_has_rows_and_no_tables(parts: list[Path]) -> None:
     part = parts[0]
     assert open_run(part).shard == Shard(index=1, of=OF)
     assert {path.name for path in part.iterdir()} <= {"run.json", "units", "steps", "playback", "errors.txt"}
-    with pytest.raises(ConfigError, match=r"shard 1/3 of one and has no tables.*benchnav-eval merge"):
+    with pytest.raises(ConfigError, match=r"shard 1/3 of a run and has no tables.*benchnav-eval merge"):
         read_table(part, "episodes.parquet")
 
 
@@ -160,7 +172,7 @@ def test_a_shard_without_units_is_not_needed(suite: Suite, tmp_path: Path) -> No
     full = [folder for folder in folders if (folder / "units").exists()]
     assert len(full) == 1
     (line,) = said
-    assert line.startswith("none of the 1 units is in shard ")
+    assert line.endswith(" holds none of the 1 units")
     list(merge_shards(full, tmp_path / "all"))
     assert len(pd.read_parquet(tmp_path / "all" / "episodes.parquet")) == 2
 
@@ -228,7 +240,7 @@ def test_shards_that_other_code_made_are_refused_by_what_differs(
     about["code"][group][name] = value
     pq.write_table(with_metadata(pq.read_table(path, partitioning=None), about), path)
     with pytest.raises(
-        ConfigError, match=rf"Expected shards that one code has made, .* differ in ({expected})"
+        ConfigError, match=rf"Expected shards made by one code, got .*, which differ in ({expected})"
     ):
         list(merge_shards(parts, tmp_path / "all"))
     assert not (tmp_path / "all").exists()

@@ -175,7 +175,7 @@ def test_an_episode_that_does_not_repeat_is_refused(name: str, dataset: Path, tm
     rows = pd.read_parquet(folder / "episodes.parquet")
     rows[name] = "planner_failure" if name == "outcome" else rows[name] + 0.1
     forge_rows(folder, rows)
-    with pytest.raises(BenchnavError, match="did not repeat"):
+    with pytest.raises(BenchnavError, match="repeated episode differs from the stored one"):
         again(folder, 0, 1)
 
 

@@ -185,6 +185,6 @@ def test_other_maps_and_models_than_those_of_the_run_are_not_shown(part: str, fa
         with pytest.raises(BenchnavError, match="Expected"):
             record_driven(failed, rows)
         report = write_report(failed, partial(record_driven, failed))
-        assert report.warnings[-1].startswith("No sheet of failures: Expected")
+        assert report.warnings[-1].startswith("note: a figure of failures is missing: Expected")
     finally:
         (failed / "run.json").write_text(before)

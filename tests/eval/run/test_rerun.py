@@ -66,7 +66,7 @@ def test_a_run_that_was_extended_by_commands_is_repeated_whole(suite: Suite, tmp
         True,
         [
             f"all {2 * 2 + 2 * 1 + 2 * 2 * 2} rows came out the same",
-            "nothing that is known of the environment differs",
+            "no difference between the recorded environments",
         ],
     )
     first, second = open_run(run), open_run(tmp_path / "again")
@@ -99,7 +99,7 @@ def test_the_device_is_repeated_and_refused_where_it_is_not(
     next(steps := rerun(run, tmp_path / "again", say=told.append))
     steps.close()
     assert open_run(tmp_path / "again").about["device"] == "cuda"
-    assert "computing on a GPU" in told
+    assert "running on a GPU" in told
 
 
 def test_rows_that_differ_are_counted_and_the_first_named(suite: Suite, tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_code_that_changed_is_named_beside_the_rows(suite: Suite, tmp_path: Path
     _, lines = repeat(run, tmp_path / "again")
     assert lines[0].startswith("2 of 4 rows came out differently")
     assert len([line for line in lines if "outcome success → planner_failure" in line]) == 2
-    assert lines[-1].startswith("what differs in the environment: ")
+    assert lines[-1].startswith("the environments differ in: ")
     assert "mine.py" in lines[-1]
 
 
@@ -154,7 +154,7 @@ def test_files_that_a_part_imports_or_is_named_are_seen_by_extension_resumption_
     own = {"part": f"{tmp_path / 'mine.py'}:Mine", "options": {"weights": "weights.txt"}}
     suite = replace(suite, planners=(own,))
     run = finish(suite, tmp_path / "run")
-    assert repeat(run, tmp_path / "same")[1][-1] == "nothing that is known of the environment differs"
+    assert repeat(run, tmp_path / "same")[1][-1] == "no difference between the recorded environments"
     name = f"planner {tmp_path / 'mine.py'}:Mine"
     for changed, content, told in (
         (helper, "from tests.eval.parts import Faulty\nx = 1\n", f"({name})"),
@@ -165,20 +165,18 @@ def test_files_that_a_part_imports_or_is_named_are_seen_by_extension_resumption_
         for asked in (suite, replace(suite, realisations=2)):
             copy, said = Path(shutil.copytree(run, tmp_path / "copy")), list[str]()
             finish(asked, copy, say=said.append)
-            (line,) = [line for line in said if "not used" in line]
-            assert f"by other code or maps {told}, so not used: 1 of " in line
+            (line,) = [line for line in said if "are run again" in line]
+            assert f"finished by other code or maps {told} and are run again" in line
             shutil.rmtree(copy)
         if changed is weights:
             _, lines = repeat(run, tmp_path / "again")
             assert lines[0].startswith("2 of 2 rows came out differently")
-            assert lines[-1] == f"what differs in the environment: weights.txt of {name}"
+            assert lines[-1] == f"the environments differ in: weights.txt of {name}"
         changed.write_text(before)
     steps = run_suite(suite, tmp_path / "other")
     next(steps)
     weights.write_text("3.0")
-    with pytest.raises(
-        ConfigError, match=r"that the run was begun with, but these are others: weights\.txt of"
-    ):
+    with pytest.raises(ConfigError, match=r"that the run was begun with, got changes: weights\.txt of"):
         list(steps)
     del sys.modules["helper_of_mine"]
 
@@ -211,7 +209,9 @@ def test_all_that_is_no_longer_there_is_told_before_anything_is_run(suite: Suite
     run = finish(replace(suite, risks=("mean", "tests.eval.parts:least")), tmp_path / "run")
     (tmp_path / "mine.py").unlink()
     (tmp_path / "tiny.h5").unlink()
-    with pytest.raises(ConfigError, match=r"cannot be repeated.*dataset.*tiny\.h5.*mine\.py"):
+    with pytest.raises(
+        ConfigError, match=r"that .*run was made with, got a lack: .*dataset.*tiny\.h5.*mine\.py"
+    ):
         repeat(run, tmp_path / "again")
     assert not (tmp_path / "again").exists()
 
@@ -228,7 +228,7 @@ def test_a_folder_of_other_conditions_is_left_as_it_is(suite: Suite, tmp_path: P
     run = finish(suite, tmp_path / "run")
     other = finish(replace(suite, risks=("cvar",)), tmp_path / "other")
     before = {path: path.read_bytes() for path in other.rglob("*") if path.is_file()}
-    with pytest.raises(ConfigError, match="has other conditions"):
+    with pytest.raises(ConfigError, match="with other conditions"):
         repeat(run, other)
     assert {path: path.read_bytes() for path in other.rglob("*") if path.is_file()} == before
 

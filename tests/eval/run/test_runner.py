@@ -86,9 +86,11 @@ def unused(suite: Suite, folder: Path, **options: object) -> str:
     rows = finish(suite, folder, say=said.append, **options)
     count = rows["condition"].nunique()
     assert not any("were there already" in line for line in said)
-    (line,) = [line for line in said if "not used" in line]
-    differing, _, rest = line.removeprefix("finished by other code or maps (").rpartition("), so not used: ")
-    assert rest.startswith(f"{count} of {count} units; --reuse-code")
+    (line,) = [line for line in said if "are run again" in line]
+    begun = f"{count} of {count} units were finished by other code or maps ("
+    assert line.startswith(begun)
+    differing, _, rest = line.removeprefix(begun).rpartition(") and are run again")
+    assert rest.startswith("; --reuse-code")
     return differing
 
 
@@ -285,7 +287,7 @@ def test_code_that_changes_while_a_run_goes_on_makes_no_table(dataset_path: Path
     steps = run_suite(suite, tmp_path / "run")
     next(steps)
     mine.write_text(mine.read_text() + "# edited\n")
-    with pytest.raises(ConfigError, match=r"that the run was begun with, but these are others: .*mine\.py"):
+    with pytest.raises(ConfigError, match=r"that the run was begun with, got changes: .*mine\.py"):
         list(steps)
     assert not (tmp_path / "run" / "episodes.parquet").exists()
 
@@ -414,13 +416,13 @@ def test_units_of_other_code_are_taken_when_asked_for_and_marked(
     assert codes[0] == first["code"].iloc[0] != codes[5]
     about = open_run(folder).about
     assert set(about["codes"]) == set(codes.values())
-    line = f"1 of 2 units are of other code (planner {mine}:Mine); column `code` tells which rows"
+    line = f"1 of 2 units were made by other code (planner {mine}:Mine); column `code` tells which rows"
     assert about["reused"] == line
     report = write_report(folder)
     assert f"warning: {line}" in report.warnings
     # Rows of other code are compared with none of this code, unless that is asked for.
     finish(replace(suite, seeds=(0, 5), risks=("cvar",)), folder, reuse_code=True)
-    with pytest.raises(ConfigError, match="the code that made them differs too"):
+    with pytest.raises(ConfigError, match="got conditions made by different code"):
         compare_runs([folder], "risk", "", {}, 0.05)
     # Without it the unit is run anew, and nothing is marked.
     finish(replace(suite, seeds=(0, 5)), folder)
@@ -633,7 +635,9 @@ def test_goals_out_of_reach_are_told_before_the_run(dataset_path: Path, tmp_path
         return [line for line in lines if "within T" in line]
 
     # 8 m by 8 m to the goal, of which the last metre is not driven: 10.3 s at 1 m/s.
-    line = "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within T"
+    line = (
+        "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within the time budget T"
+    )
     assert told(10.2) == [line]
     assert told(10.4) == []
     assert told(10.2, {"part": "unicycle", "options": {"speed_mps": [0.0, 2.0]}}) == []
@@ -710,7 +714,7 @@ def test_hypotheses_are_fixed_before_the_first_unit_and_stay(dataset_path: Path,
     report = write_report(folder)
     assert report.tests["n_episodes"].tolist() == [4]
     assert (
-        "fixed for 2 episodes of a condition; the run was extended to 4"
+        "extended after the hypotheses were fixed (episodes a condition: 2 then, 4 now)"
         in next(iter(report.findings.values()))[-1]
     )
     other = (given | {"metric": "score"},)

@@ -119,7 +119,7 @@ def test_other_maps_worlds_budgets_and_doubles_are_refused() -> None:
         fixed(named("world", "paper", "stakes"), world=("paper", "stakes"))
     robots = {"robots": ("unicycle", "differential_drive"), "world": "stakes"}
     fixed(named("robot", "unicycle", "differential_drive"), **robots)
-    with pytest.raises(ConfigError, match="robots whose T differs"):
+    with pytest.raises(ConfigError, match="robots of different T"):
         fixed(named("robot", "unicycle", "differential_drive", "T_total"), **robots)
     same = {"one": CVAR, "other": MEAN, "metric": "success"}
     with pytest.raises(ConfigError, match="got twice"):

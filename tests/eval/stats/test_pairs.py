@@ -177,7 +177,11 @@ def test_runs_that_share_conditions_are_compared_with_each_other() -> None:
         ({}, {"by": "planer"}, "Did you mean 'planner'"),
         ({}, {"against": "meen"}, "Did you mean 'mean'"),
         ({}, {"by": "risk", "against": "mppi"}, "Expected `against` among mean, cvar"),
-        ({"model": "mean"}, {"against": "mean"}, "Expected `by` risk or model"),
+        (
+            {"model": "mean"},
+            {"against": "mean"},
+            "a label of risk and of model. Pass --by risk or --by model",
+        ),
     ],
 )
 def test_what_cannot_be_paired_is_refused_with_the_reason(

@@ -37,7 +37,7 @@ def test_a_table_is_printed_and_nothing_written(
     for value in (quality.classes[0].ece, quality.traversability.nll, quality.traversability.coverage):
         assert f"{value:.4f}" in row
     assert f"test/hs {nearest_colour_accuracy(dataset, 'test/hs'):.4f}" in out
-    assert out.splitlines()[-1] == "what the columns mean: with --out FOLDER, quality.md there says so"
+    assert out.splitlines()[-1] == "columns: --out FOLDER writes quality.md, which explains them"
     assert max(map(len, out.splitlines())) <= 124
     assert err.splitlines() == ["splits: 1/2", "splits: 2/2"]
     assert list(tmp_path.iterdir()) == []
@@ -83,7 +83,7 @@ def test_a_folder_holds_report_page_and_figures(
     assert figures == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
     printed = capfd.readouterr().out
     assert "no series" in printed
-    assert printed.splitlines()[-1] == f"what the columns and figures mean: {out}/quality.md"
+    assert printed.splitlines()[-1] == f"columns and figures are explained in {out}/quality.md"
     page = (out / "quality.md").read_text()
     assert all(f"(figures/{name}.png)" in page for name in names)
     assert "nearest colour" in page
@@ -217,7 +217,7 @@ def test_a_model_that_is_right_less_often_than_the_nearest_colour_is_told_so(
     monkeypatch.setattr("benchnav.models.quality.command.DPI", 30)
     shares = {"test/std": 0.999, "test/hs": 0.0}
     monkeypatch.setattr(baselines, "nearest_colour_accuracy", lambda _, split: shares[split])
-    line = "warning: the model is right less often than the nearest colour on test/std"
+    line = "warning: the model's accuracy is below that of the nearest colour on test/std"
     out = tmp_path / "quality"
     assert call("train", "evaluate", "colours", "--data", dataset.path, "--out", out, "--maps", 0) == 0
     assert line in capfd.readouterr().out.splitlines()

@@ -120,7 +120,7 @@ def test_the_page_shows_table_notes_and_figures(qualities: Qualities) -> None:
     header, rule, *rows = [line for line in lines if line.startswith("|")]
     assert len({line.count("|") for line in (header, rule, *rows)}) == 1
     assert len(rows) == len(qualities)
-    images = ["![Whether the predicted distribution of λ can be trusted](figures/pit.png)"]
+    images = ["![Calibration of the predicted distribution of λ](figures/pit.png)"]
     images.append("![Maps of test/hs-050](figures/maps-test-hs-050.png)")
     assert {"a note", *images} <= set(lines)
     for image in images:

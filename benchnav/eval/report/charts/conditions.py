@@ -27,13 +27,12 @@ from benchnav.core.figures import (
     TWO_COLUMNS_IN,
     legend_outside,
     planner_colours,
-    planner_name,
     stack_panels,
     styled,
 )
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.hypotheses import METRICS
-from benchnav.eval.report.words import blocks, outcome_in_words, p_in_words, with_names
+from benchnav.eval.report.words import blocks, outcome_in_words, p_in_words, reading_names, with_names
 
 # From what the ground did to what the code did; success is light, each failure has a colour of its own.
 OUTCOME_COLOURS = {
@@ -47,10 +46,22 @@ OUTCOME_COLOURS = {
     "model_error": "#7F7F7F",
 }
 SUCCESS_COLOUR = "#E4E4E4"
+# In white, so that outcomes of one lightness differ in grey.
+OUTCOME_HATCHES = {
+    "immobilised": "",
+    "stuck": "/////",
+    "timeout": "....",
+    "stalled": "|||||",
+    "out_of_bounds": "xxxx",
+    "planner_failure": "-----",
+    "planner_error": "",
+    "model_error": "\\\\\\\\\\",
+}
 
 _ROW_IN, _GAP_ROWS = 0.145, 0.6
 _PANELS_A_LINE = 4
 _QUANTITIES = {"total_time_s": "T_total [s], a failure counts as T", "traversability": "λ̄, mean observed λ"}
+_ENDS = {"success": (BLUE, "o"), "failure": (ORANGE, "x")}  # colour and marker of a dot
 _SPREAD = 0.32  # of a row's height, to either side
 _TEST_IN, _METRIC_IN = 0.3, 0.55
 _MARGIN = "0.88"
@@ -141,7 +152,8 @@ def outcome_figure(summary: pd.DataFrame) -> Figure:
         for name in ended:
             share = 100 * rows[f"{name}_count"] / rows["n_episodes"]
             colour, label = OUTCOME_COLOURS[name], outcome_in_words(name)
-            panel.barh(rows["height"], share, 0.78, left, color=colour, lw=0, label=label)
+            hatched: dict[str, Any] = {"hatch": OUTCOME_HATCHES[name], "ec": "white"}
+            panel.barh(rows["height"], share, 0.78, left, fc=colour, lw=0, label=label, **hatched)
             left = left + share
         panel.barh(rows["height"], 100 - left, 0.78, left, color=SUCCESS_COLOUR, lw=0, label="success")
     panel.set_xlim(0, 100)
@@ -163,8 +175,8 @@ def distribution_figure(summary: pd.DataFrame, episodes: pd.DataFrame) -> Figure
     panels[0][0].set_xlim(left=0)
     panels[1][0].set_xlim(0, 1)
     handles = [
-        Line2D([], [], marker="o", ls="none", ms=3, color=colour, label=label)
-        for label, colour in (("success", BLUE), ("failure", ORANGE))
+        Line2D([], [], ls="none", ms=3, color=colour, marker=marker, label=label)
+        for label, (colour, marker) in _ENDS.items()
     ]
     words = "median and quartiles of all"
     handles.append(Line2D([], [], color="black", marker="|", ms=6, lw=1.2, label=words))
@@ -180,8 +192,13 @@ def _draw_dots(panel: Axes, rows: pd.DataFrame, episodes: pd.DataFrame, name: st
     dots = dots[dots[name].notna()]
     if dots.empty:
         return
-    colours = np.where(dots["success"], BLUE, ORANGE)
-    panel.scatter(dots[name], dots["up"], s=2.5, c=colours, alpha=0.35, lw=0, rasterized=True)
+    for (colour, marker), own in zip(
+        _ENDS.values(), (dots[dots["success"]], dots[~dots["success"]]), strict=True
+    ):
+        looks: dict[str, Any] = {"color": colour, "marker": marker, "alpha": 0.45, "rasterized": True}
+        panel.scatter(
+            own[name], own["up"], s=5 if marker == "x" else 3, lw=0.5 if marker == "x" else 0, **looks
+        )
     middles = dots.groupby("height")[name].quantile([0.25, 0.5, 0.75]).unstack()
     heights = middles.index.to_numpy()
     panel.plot(
@@ -239,7 +256,7 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame) -> None:
         panel.plot(row["difference"], height, "o", color=BLUE, ms=4.5, mfc=face, zorder=3)
         beside = panel.get_yaxis_transform()
         panel.text(1.01, height, p_in_words(row["p_holm"]), transform=beside, va="center")
-        one, other = (", ".join(map(planner_name, name.split(", "))) for name in row["names"])
+        one, other = map(reading_names, row["names"])
         names.append(f"{row['number']}. {one}\nless {other}")
     panel.set_yticks(range(len(rows)), names)
     panel.tick_params(axis="y", length=0)

@@ -20,7 +20,10 @@ from benchnav.core.figures import (
     draw_edged,
     frame_map,
     legend_outside,
+    line_style,
     mark,
+    mark_handle,
+    robot_marker,
     show_map,
     stack_panels,
     styled,
@@ -30,23 +33,24 @@ from benchnav.eval.folder.steps import STEPS, read_steps
 from benchnav.eval.recording import GROUND, Ground, Recording
 from benchnav.eval.report.failures import FailedLine
 from benchnav.eval.report.plan_layers import (
+    CLOSED,
     IMMOBILISING,
     SOFT,
     STYLES,
     draw_driven,
     draw_soft,
     driven_path,
+    end_mark,
     field_colours,
+    mark_end,
     plan_layer,
 )
 from benchnav.eval.report.words import NAMING, condition_name, contender_names, differ, outcome_in_words
 
 MOST_PANELS = 4
 _PANELS_A_LINE = 4
-_CLOSED = "0.25"
 _LETTER_IN = 0.048
 _SAME_MAP = ["data", "scenario", "map", "seed", "realisation"]
-_PATH_STYLES = ("solid", "dashed")
 _LIGHT = 0.5  # opacity of a map under marks and dark red
 _DARKEST = 0.35  # grey of λ = 0
 _LAMBDA: dict[str, Any] = {"cmap": TRAVERSABILITY_COLOURS, "vmin": 0, "vmax": 1}
@@ -111,7 +115,9 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
             for name, style in STYLES.items():
                 if len(plan.lines.get(name, ())):
                     panel.add_collection(plan_layer(style, plan.lines[name]))
-            _mark_places(panel, recording, recording.track[now])
+            _mark_places(panel, recording)
+            turned = robot_marker(recording.states[now, 2])
+            mark(panel, "robot", recording.track[now], marker=turned)
         if recording.field is not None:
             _draw_field(last[0], recording, recording.field)
         elif last:
@@ -119,7 +125,7 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
         drawn = [above, below, *last]
         drawn[-1].set_xlabel("x [m]")
         for panel in drawn:
-            panel.tick_params(labelleft=place % across == 0)
+            panel.tick_params(labelleft=place % across == 0, labelbottom=panel is drawn[-1])
             panel.set_ylabel("y [m]" if place % across == 0 else "")
             # Broken where it is wider than the panel.
             title = (textwrap.fill(line, letters) for line in panel.get_title().splitlines())
@@ -158,29 +164,36 @@ def _draw_predicted(panel: Axes, recording: Recording) -> None:
     show_map(panel, recording.predicted, recording.grid.extent_m, **_LAMBDA)
     if not recording.free.all():
         closed = np.where(recording.free, np.nan, 1.0)
-        show_map(panel, closed, recording.grid.extent_m, cmap=ListedColormap([_CLOSED]))
-        _name_ground(panel, "not free", color=_CLOSED)
+        show_map(panel, closed, recording.grid.extent_m, cmap=ListedColormap([CLOSED]))
+        _name_ground(panel, "not free", color=CLOSED)
     blind = recording.about["model"] == NOT_USED
-    panel.set_title("E[λ] in truth; the planner is given nothing" if blind else "λ̂ given to the planner")
+    panel.set_title("true E[λ]; the planner uses no map" if blind else "λ̂ given to the planner")
     words = "driven; above in the colour of the observed λ"
     draw_edged(panel, recording.track[: recording.now + 1], 1.4, label=words)
 
 
 def _draw_field(panel: Axes, recording: Recording, field: np.ndarray) -> None:
-    """Draws λ as it was, and the whole driven path over it."""
-    show_map(panel, field_colours(field, recording.immobilising), recording.grid.extent_m)
+    """Draws the λ field, and the whole driven path over it."""
+    colours = field_colours(field, recording.immobilising)
+    show_map(panel, colours, recording.grid.extent_m)
     draw_edged(panel, recording.track, 1.4)
-    _mark_places(panel, recording, recording.track[-1])
-    if recording.immobilised_at is not None:
-        mark(panel, "end", recording.immobilised_at, label="immobilised")
+    _mark_places(panel, recording)
+    mark_end(
+        panel,
+        recording.about["outcome"],
+        recording.track,
+        recording.goal_m,
+        recording.resolution_m,
+        ground=colours,
+    )
     if recording.immobilising.any():
         _name_ground(panel, **_HOLDS)
-    panel.set_title(f"driven to the end ({recording.end_s:g} s), on λ as it was")
+    panel.set_title(f"path driven in {recording.end_s:g} s, over the λ field")
 
 
-def _mark_places(panel: Axes, recording: Recording, robot: np.ndarray) -> None:
-    """Marks start, goal and robot."""
-    for name, place in (("start", recording.track[0]), ("goal", recording.goal_m), ("robot", robot)):
+def _mark_places(panel: Axes, recording: Recording) -> None:
+    """Marks start and goal."""
+    for name, place in (("start", recording.track[0]), ("goal", recording.goal_m)):
         mark(panel, name, place)
     frame_map(panel)
 
@@ -214,7 +227,7 @@ def read_driven(folder: Path, episodes: pd.DataFrame) -> tuple[Ground, pd.DataFr
 
 @styled()
 def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarray]) -> Figure:
-    """Draws whole driven paths over λ as it was, or over faded terrain where it was resampled.
+    """Draws whole driven paths over the λ field, or over faded terrain where it was resampled.
 
     Args:
         ground: the map.
@@ -227,24 +240,27 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
     panel = figure.subplots()
     show_map(panel, _backdrop(ground), ground.grid.extent_m)
     names = contender_names(rows[list(NAMING)].to_dict("records"))
-    colours = condition_colours(list(rows["planner"]))
+    colours, failed = condition_colours(list(rows["planner"])), dict[str, None]()
     for place, (row, track) in enumerate(zip(rows.to_dict("records"), tracks, strict=True)):
         # Later ones are smaller, so that paths and ends that coincide are all seen.
         smaller = 1 - place / max(len(rows), 2)
-        style = _PATH_STYLES[place // len(set(colours)) % len(_PATH_STYLES)]
         label = f"{names[place]}: {outcome_in_words(row['outcome'])}, {row['end_time_s']:.0f} s"
-        draw_edged(panel, track, 0.9 + 2.2 * smaller, colours[place], ls=style, label=label)
+        draw_edged(panel, track, 0.9 + 2.2 * smaller, colours[place], ls=line_style(place), label=label)
         if not row["success"]:
-            words = "end of a failure, in the colour of its path"
-            mark(panel, "end", track[-1], 0.6 + smaller, color=colours[place], label=words)
+            looks = {"color": colours[place], "label": ""}
+            mark(panel, end_mark(row["outcome"]), track[-1], 0.6 + smaller, **looks)
+            failed[end_mark(row["outcome"])] = None
     mark(panel, "start", tracks[0][0])
     mark(panel, "goal", ground.goal_m)
     if ground.immobilising.any():
         _name_ground(panel, **_HOLDS)
-    title = "terrain, faded" if ground.field is None else "λ as it was: the lighter the faster"
+    title = "terrain, faded" if ground.field is None else "λ field of the episode; lighter is higher"
     panel.set(xlabel="x [m]", ylabel="y [m]", title=title)
     frame_map(panel)
-    legend_outside(figure, columns=1, side="right upper")
+    ends = [mark_handle(name) for name in failed]
+    for handle in ends:
+        handle.set_label(f"{handle.get_label()}, in the colour of its path")
+    legend_outside(figure, ends, columns=1, side="right upper")
     return figure
 
 
@@ -275,7 +291,7 @@ def failure_figure(lines: Sequence[FailedLine]) -> Figure:
     for row_of_panels, line in zip(panels, lines, strict=True):
         shown = zip(row_of_panels, line.recordings, line.failures.to_dict("records"), strict=False)
         for panel, recording, row in shown:
-            _draw_failure(panel, recording)
+            _draw_failure(panel, recording, row["outcome"])
             predicted = recording.predicted_at_end
             words = ["outside the map" if np.isnan(predicted) else f"λ̂ = {predicted:.2f}"]
             if not np.isnan(row["last_traversability"]):
@@ -289,7 +305,7 @@ def failure_figure(lines: Sequence[FailedLine]) -> Figure:
     return figure
 
 
-def _draw_failure(panel: Axes, recording: Recording) -> None:
+def _draw_failure(panel: Axes, recording: Recording, outcome: str) -> None:
     panel.set_visible(True)
     show_map(panel, recording.predicted, recording.grid.extent_m, alpha=_LIGHT, **_LAMBDA)
     if recording.immobilising.any():
@@ -299,7 +315,8 @@ def _draw_failure(panel: Axes, recording: Recording) -> None:
         _name_ground(panel, **_HOLDS)
     track = recording.track
     draw_edged(panel, track, 1.1, label="driven")
-    for name, position in (("start", track[0]), ("goal", recording.goal_m), ("end", track[-1])):
+    for name, position in (("start", track[0]), ("goal", recording.goal_m)):
         mark(panel, name, position, 0.9)
+    mark_end(panel, outcome, track, recording.goal_m, recording.resolution_m, 0.9)
     panel.spines[:].set_visible(False)
     panel.set(xticks=[], yticks=[])

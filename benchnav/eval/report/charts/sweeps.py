@@ -18,6 +18,7 @@ from benchnav.core.figures import (
     condition_colours,
     legend_outside,
     planner_name,
+    risk_name,
     stack_panels,
     styled,
 )
@@ -146,7 +147,7 @@ def curve_figure(number: str, lines: Sequence[Line], summary: pd.DataFrame) -> F
                     colour = BLIND if blind else colours[name]
                     panel.axhline(scale * row[names[0]], color=colour, ls=look["ls"], lw=1, zorder=1)
                 rate, low, high = (scale * own[column] for column in names)
-                marker = MARKERS[list(colours).index(name) // len(LINE_COLOURS) % len(MARKERS)]
+                marker = MARKERS[list(colours).index(name) % len(MARKERS)]
                 places = _places(number, line.values)
                 panel.fill_between(places, low, high, color=colours[name], alpha=0.15, lw=0)
                 panel.plot(places, rate, color=colours[name], marker=marker, ms=3.5, lw=1.2, label=name)
@@ -178,6 +179,7 @@ def _label_lines(number: str, lines: Sequence[Line], rows: pd.DataFrame) -> pd.D
         parts = np.array([line.rest.get(f"{part}.part") for line in lines])
         labelled[column] = labelled[column].where(labelled[column] == NOT_USED, parts)
     labelled["who"] = labelled["who"].map(planner_name)
+    labelled["risk"] = labelled["risk"].map(risk_name)
     names = {}
     for _, alike in labelled.groupby(list(_LABELS), sort=False):
         rests = [lines[place].rest for place in alike.index]
@@ -215,7 +217,7 @@ def _references(first: Labels, others: Iterable[Labels]) -> Iterator[tuple[str, 
         blind = row["model"] == NOT_USED
         shared = _SAME if blind else (*_SAME, "model", "planner")
         if all(row[name] == first[name] for name in shared):
-            yield planner_name(row["planner"]) if blind else row["risk"], row
+            yield planner_name(row["planner"]) if blind else risk_name(row["risk"]), row
 
 
 def _places(number: str, values: Sequence[float]) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""Videos of episodes, side by side, on one map, at one time base.
+"""Videos of episodes on one map, at one time base, 16:9.
 
-Each episode is a column: above, the terrain with what is planned and the path driven so far, coloured by the λ
-met; below, λ as it was where it stayed so, else the λ̂ that the planner was given.
+Of each episode the λ̂ that its planner was given is shown, with what was planned; beside these, the λ field, once for
+all episodes that drove on the same.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,34 +15,52 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.text import Text
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, mark, show_map
+from benchnav.core.figures import (
+    MARKS,
+    TRAVERSABILITY_COLOURS,
+    condition_colours,
+    line_style,
+    mark,
+    mark_handle,
+    robot_marker,
+    show_map,
+)
 from benchnav.core.store import replacing
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.plan_layers import (
+    CLOSED,
+    IMMOBILISING,
     STYLES,
-    draw_driven,
-    draw_soft,
-    driven_path,
+    end_mark,
     field_colours,
+    mark_end,
     plan_layer,
     predicted_colours,
+    shades,
 )
-from benchnav.eval.report.words import condition_name, contender_names
+from benchnav.eval.report.words import NAMING, condition_name, differ, joined
 
+SIZE = (1280, 720)  # of a frame: width and height in pixels
 FRAMES_A_SECOND = 20
 # Seconds of an episode in a second of video.
 SPEED = 4.0
 HOLD_S = 2.0  # of the last frame, which says how it ended
 MOST_CONDITIONS = 6
-ROBOT = "#ff7800"  # as no λ is coloured
 
 _DPI = 100
-_PANEL, _GAP, _HEAD, _FOOT = 440, 20, 92, 76  # pixels
+_MARGIN, _GAP, _TOP, _FOOT, _HEADING = 24, 24, 56, 100, 54  # pixels; the last stands over a panel
+_BAR = 210  # pixels, of the colour bar and its last number
 _TALLEST = 2.0  # of a map, over its width
-_ROBOT_M = np.array([(0.9, 0.0), (-0.6, 0.5), (-0.6, -0.5)])
-_MARKS = 1.6  # over those of a printed figure
+_TEXT, _HEAD, _LARGE = 12.0, 14.0, 16.0  # points
+_MARKS, _PATH, _EDGE = 1.9, 2.6, 5.0  # over those of a printed figure, and widths in points
+_LENGTHS_M = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500)  # of scale bars
+_SCALE_SHARE = 0.35  # of a map's width, which a scale bar keeps under
+_ARRIVED, _FAILED = "#00684a", "#a00000"
 
 
 def frame_times(end_s: float) -> np.ndarray:
@@ -75,7 +93,7 @@ def write_video(recordings: Sequence[Recording], path: Path) -> Iterator[tuple[i
     faststart = {"movflags": "+faststart"}
     with replacing(path) as partial, av.open(str(partial), "w", format="mp4", options=faststart) as container:
         stream = container.add_stream("libx264", rate=FRAMES_A_SECOND, options={"crf": "20"})
-        stream.width, stream.height = frames.size
+        stream.width, stream.height = SIZE
         stream.pix_fmt = "yuv420p"
         for done, time_s in enumerate(times, start=1):
             frame = av.VideoFrame.from_ndarray(frames.draw(float(time_s)), format="rgb24")
@@ -88,42 +106,59 @@ class Frames:
     """Draws episodes at any time.
 
     Args:
-        recordings: at least one.
+        recordings: at least one, of one map.
 
     Attributes:
-        size: width and height in pixels, both even, as video formats ask for.
+        given: of each recording the panel of the λ̂ that its planner was given.
+        truths: the panels of the λ field.
+        drivers: robots on panels, first each on its own of `given`.
     """
 
     def __init__(self, recordings: Sequence[Recording]) -> None:
         """Draws what never changes."""
-        rows, columns = recordings[0].grid.shape
-        panel_high = round(_PANEL * min(rows / columns, _TALLEST))
-        width = len(recordings) * (_PANEL + _GAP) + _GAP
-        height = _HEAD + 2 * panel_high + _GAP + _FOOT
-        across, up = self.size = (width + width % 2, height + height % 2)
-        self._figure = Figure(figsize=(across / _DPI, up / _DPI), dpi=_DPI)
+        self._figure = Figure(figsize=(SIZE[0] / _DPI, SIZE[1] / _DPI), dpi=_DPI)
         self._canvas = FigureCanvasAgg(self._figure)
-        panels = self._figure.subplots(
-            2, len(recordings), squeeze=False,
-            gridspec_kw={
-                "left": _GAP / across, "right": (width - _GAP) / across, "wspace": _GAP / _PANEL,
-                "bottom": _FOOT / up, "top": (_FOOT + 2 * panel_high + _GAP) / up, "hspace": _GAP / panel_high,
-            },
-        )  # fmt: skip
-        if len(recordings) == 1:
-            names = [condition_name(recordings[0].about)]
-        else:
-            names = contender_names([recording.about for recording in recordings])
-        self._columns = [_Column(*column) for column in zip(panels.T, recordings, names, strict=True)]
-        bar = self._figure.add_axes((_GAP / across, 44 / up, _PANEL / across, 12 / up))
-        shades = ScalarMappable(Normalize(0, 1), TRAVERSABILITY_COLOURS)
-        self._figure.colorbar(shades, cax=bar, orientation="horizontal")
-        bar.tick_params(labelsize=8, length=2)
-        words = ["traversability λ"]
-        words += ["hatched: soft ground"] if any(r.soft.any() for r in recordings) else []
-        words += ["dark red: immobilises a robot"] if any(r.immobilising.any() for r in recordings) else []
-        words += ["grey: not free"] if any(r.field is None for r in recordings) else []
-        self._figure.text(_GAP / across, 10 / up, "; ".join(words), fontsize=8)
+        first, names, shared = recordings[0], _names(recordings), _alike(recordings)
+        colours = condition_colours([own.about["planner"] for own in recordings])
+        colours = ["black"] if len(recordings) == 1 else colours
+        panels = self._panels(len(recordings) + len(shared), first.grid.height / first.grid.width)
+        self.given, self.truths = panels[: len(recordings)], panels[len(recordings) :]
+        self.drivers = []
+        for place, (own, panel) in enumerate(zip(recordings, self.given, strict=True)):
+            shown, blind = predicted_colours(own.predicted, own.free), own.about["model"] == NOT_USED
+            _head(
+                panel,
+                names[place],
+                "true mean of λ; the planner uses no map" if blind else "λ̂ given to the planner",
+                colours[place],
+            )
+            show_map(panel, shown, first.grid.extent_m)
+            state = _over(panel, "", (1, 1), 5, ha="right", weight="bold")
+            self.drivers.append(_Driver(panel, shown, own, colours[place], line_style(place), state))
+        for panel, places in zip(self.truths, shared, strict=True):
+            own = recordings[places[0]]
+            words = ", ".join(names[place] for place in places) if len(shared) > 1 else ""
+            if own.field is None:
+                shown, heading = shades(own.true_mean), "mean of λ, drawn anew at each step"
+            else:
+                shown, heading = field_colours(own.field, own.immobilising), "λ field of the episode"
+            _head(panel, heading, words)
+            show_map(panel, shown, first.grid.extent_m)
+            for place in places:
+                self.drivers.append(
+                    _Driver(panel, shown, recordings[place], colours[place], line_style(place))
+                )
+        for panel in panels:
+            panel.set(aspect="auto", xticks=[], yticks=[])
+        about = "{data}, {scenario}, map {map}".format(**first.about)
+        self._text(_MARGIN, SIZE[1] - 40, f"{about}; {SPEED:g} × as fast as driven", size=_LARGE)
+        self._time = self._text(
+            SIZE[0] - _MARGIN, SIZE[1] - 40, "", size=_LARGE, ha="right", family="monospace"
+        )
+        self._explain(recordings)
+        self._moving = [self._time, *(artist for driver in self.drivers for artist in driver.moving)]
+        for artist in self._moving:
+            artist.set_animated(True)
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(self._figure.bbox)
 
@@ -134,79 +169,169 @@ class Frames:
             time_s: since the episodes began; those that have ended stay as they ended.
         """
         self._canvas.restore_region(self._background)
-        for column in self._columns:
-            column.move(time_s)
-            for artist in column.moving:
-                self._figure.draw_artist(artist)
+        self._time.set_text(f"t = {time_s:5.1f} s")
+        for driver in self.drivers:
+            driver.move(time_s)
+        for artist in self._moving:
+            self._figure.draw_artist(artist)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
+    def _panels(self, count: int, ratio: float) -> list[Axes]:
+        """Panels for maps of a height over width, as large as fits, row by row, in the middle of the frame."""
+        wide, high, ratio = SIZE[0] - 2 * _MARGIN, SIZE[1] - _TOP - _FOOT, min(ratio, _TALLEST)
+        widths = {}
+        for columns in range(1, count + 1):
+            rows = -(-count // columns)
+            tall = (high + _GAP) / rows - _GAP - _HEADING
+            widths[columns] = min((wide + _GAP) / columns - _GAP, tall / ratio)
+        columns, width = max(widths.items(), key=lambda item: item[1])
+        across, down = width + _GAP, width * ratio + _HEADING + _GAP
+        left = (SIZE[0] - columns * across + _GAP) / 2
+        top = _FOOT + (high + -(-count // columns) * down + _GAP) / 2
+        places = [divmod(place, columns) for place in range(count)]
+        return [self._axes(left + x * across, top - (y + 1) * down, width, width * ratio) for y, x in places]
 
-class _Column:
-    """One episode: its two panels, and what of them moves."""
-
-    def __init__(self, panels: Sequence[Axes], recording: Recording, name: str) -> None:
-        self.panels, self.recording = panels, recording
-        above, below = panels
-        # In points over the panel.
-        over: Any = {"xy": (0, 1), "xycoords": "axes fraction", "textcoords": "offset points"}
-        above.annotate(name, xytext=(0, 47.5), fontsize=12, weight="bold", **over)
-        self._time = above.annotate("", xytext=(0, 28.8), fontsize=11, family="monospace", **over)
-        self._outcome = above.annotate("", xytext=(0, 10.1), fontsize=12, weight="bold", **over)
-        self._layers = {name: plan_layer(style) for name, style in STYLES.items()}
-        for layer in self._layers.values():
-            above.add_collection(layer)
-        self._driven = driven_path(3.5)
-        self._edges = [
-            panel.plot([], [], color=colour, lw=width, solid_capstyle="round")[0]
-            for panel, colour, width in ((above, "white", 5.5), (below, "white", 4.5), (below, "black", 2))
+    def _explain(self, recordings: Sequence[Recording]) -> None:
+        """Draws below all panels a scale bar, what is what, and the colours of λ."""
+        width_m, _ = recordings[0].grid.extent_m
+        length_m = max(each for each in _LENGTHS_M if each < max(_SCALE_SHARE * width_m, 1))
+        length = length_m / width_m * self.given[0].get_window_extent().width
+        bar = self._axes(_MARGIN, 30, length, 8)
+        bar.set(label="scale", xticks=[], yticks=[], facecolor="black")
+        self._text(_MARGIN + length / 2, 48, f"{length_m:g} m", ha="center")
+        layers = {
+            name
+            for own in recordings
+            for plan in own.own_plans
+            for name, lines in plan.lines.items()
+            if lines
+        }
+        ends = dict.fromkeys(end_mark(own.about["outcome"]) for own in recordings)
+        handles: list[Artist] = [
+            mark_handle(name, 0.8 * _MARKS) for name in ("start", "goal", "robot", *ends)
         ]
-        above.add_collection(self._driven)
-        self._robots = [panel.fill(*_ROBOT_M.T, fc=ROBOT, ec="black", lw=0.8)[0] for panel in panels]
-        self._crosses = [panel.plot([], [], **MARKS["end"] | {"ms": 13})[0] for panel in panels]
-        extent_m = recording.grid.extent_m
-        show_map(above, np.moveaxis(recording.rgb, 0, -1), extent_m)
-        draw_soft(above, recording.soft, recording.resolution_m)
-        if recording.field is not None:
-            shown, title = field_colours(recording.field, recording.immobilising), "λ as it was"
-        else:
-            shown, title = predicted_colours(recording.predicted, recording.free), "λ̂ given to the planner"
-        show_map(below, shown, extent_m)
-        for panel, words in zip(panels, ("terrain and plan", title), strict=True):
-            mark(panel, "start", recording.states[0, :2], _MARKS)
-            mark(panel, "goal", recording.goal_m, _MARKS)
-            panel.set(aspect="auto", xticks=[], yticks=[])
-            panel.text(
-                0.02, 0.975, words, transform=panel.transAxes, fontsize=9, va="top",
-                bbox={"fc": "white", "ec": "none", "alpha": 0.75, "pad": 2},
-            )  # fmt: skip
-        self.moving: list[Artist] = [
-            *self._layers.values(), *self._edges, self._driven, *self._robots, *self._crosses, self._time,
-            self._outcome,
-        ]  # fmt: skip
-        for artist in self.moving:
-            artist.set_animated(True)
+        handles += [plan_layer(style, scale=_MARKS) for name, style in STYLES.items() if name in layers]
+        if any(not own.free.all() for own in recordings):
+            handles.append(Patch(color=CLOSED, label="not free"))
+        if any(own.immobilising.any() for own in recordings):
+            handles.append(Patch(color=IMMOBILISING, label="immobilises a robot"))
+        columns, between = -(-len(handles) // 2), 0.5 + (length - _BAR) / 2 / SIZE[0]
+        self._figure.legend(
+            handles=handles, loc="center", bbox_to_anchor=(between, 42 / SIZE[1]), ncols=columns, fontsize=_TEXT,
+            frameon=False, columnspacing=1.2, handlelength=1.4,
+        )  # fmt: skip
+        shown = ScalarMappable(Normalize(0, 1), TRAVERSABILITY_COLOURS)
+        bar = self._axes(SIZE[0] - _MARGIN - _BAR, 34, _BAR - 10, 14)
+        self._figure.colorbar(shown, cax=bar, orientation="horizontal", ticks=[0, 0.5, 1])
+        bar.tick_params(labelsize=_TEXT, length=3)
+        bar.set_title("traversability λ, λ̂", fontsize=_TEXT, pad=4)
+
+    def _axes(self, x: float, y: float, width: float, height: float) -> Axes:
+        return self._figure.add_axes((x / SIZE[0], y / SIZE[1], width / SIZE[0], height / SIZE[1]))
+
+    def _text(self, x: float, y: float, words: str, size: float = _TEXT, **style: Any) -> Text:
+        return self._figure.text(x / SIZE[0], y / SIZE[1], words, fontsize=size, parse_math=False, **style)
+
+
+def _names(recordings: Sequence[Recording]) -> list[str]:
+    """Names of planner and risk setting, and of what else differs."""
+    every = [own.about for own in recordings]
+    several = [name for name in NAMING if differ(about.get(name, NOT_USED) for about in every)]
+    more = [name for name in ("robot", "objective") if name in several]
+    return [joined([condition_name(about, several), *(about[name] for name in more)]) for about in every]
+
+
+def _alike(recordings: Sequence[Recording]) -> list[list[int]]:
+    """Places of recordings by the λ that was there, those of one λ together."""
+    groups: dict[bytes, list[int]] = {}
+    for place, own in enumerate(recordings):
+        truth = (own.true_mean,) if own.field is None else (own.field, own.immobilising)
+        groups.setdefault(b"".join(part.tobytes() for part in truth), []).append(place)
+    return list(groups.values())
+
+
+def _over(panel: Axes, words: str, corner: tuple[int, int], points: float, **style: Any) -> Text:
+    """Text at an upper corner of a panel, so many points above it; smaller over a small panel."""
+    size = min(1.0, panel.get_window_extent().width / 380) * style.pop("fontsize", _TEXT)
+    looks: dict[str, Any] = {"fontsize": size, "parse_math": False, **style}
+    return panel.annotate(
+        words, corner, (0, points), xycoords="axes fraction", textcoords="offset points", **looks
+    )
+
+
+def _head(panel: Axes, heading: str, words: str = "", colour: str = "black") -> None:
+    """Writes over a panel what it shows, and under that a line that is not as loud."""
+    _over(panel, heading, (0, 1), 22 if words else 5, fontsize=_HEAD, weight="bold", color=colour)
+    _over(panel, words, (0, 1), 5, color="0.25")
+
+
+class _Driver:
+    """A robot on a map: its path, itself, how it ended, and what it planned, where a line says how it fares.
+
+    Args:
+        panel: which the map is drawn on.
+        shown: colours of the map, uint8 of shape [H, W, 3].
+        recording: its episode.
+        colour: of its path.
+        style: of its path.
+        state: what says the observed λ, and at the end the outcome; without it no plan is drawn.
+
+    Attributes:
+        moving: what is drawn anew in each frame, from the undermost to the topmost.
+    """
+
+    def __init__(
+        self,
+        panel: Axes,
+        shown: np.ndarray,
+        recording: Recording,
+        colour: str,
+        style: Any,
+        state: Text | None = None,
+    ) -> None:
+        self.recording, self.state = recording, state
+        planned = STYLES if state is not None else {}
+        self.layers = {name: plan_layer(look, scale=_MARKS) for name, look in planned.items()}
+        for layer in self.layers.values():
+            panel.add_collection(layer)
+        self.path = [
+            panel.plot([], [], color="white", lw=_EDGE, solid_capstyle="round")[0],
+            panel.plot([], [], color=colour, lw=_PATH, ls=style, solid_capstyle="round")[0],
+        ]
+        places = [
+            mark(panel, "start", recording.track[0], _MARKS),
+            mark(panel, "goal", recording.goal_m, _MARKS),
+        ]
+        looks = MARKS["robot"]
+        (self.robot,) = panel.plot([], [], **looks | {"ms": _MARKS * looks["ms"]})
+        self.end = mark_end(
+            panel, recording.about["outcome"], recording.track, recording.goal_m, recording.resolution_m, _MARKS, shown
+        )  # fmt: skip
+        said = [] if state is None else [state]
+        self.moving = [*self.layers.values(), *self.path, *places, self.robot, *self.end, *said]
 
     def move(self, time_s: float) -> None:
         """Puts everything where it is at a time."""
-        recording = self.recording
-        steps = len(recording.traversability)
-        now = min(int(time_s / recording.dt_s + 1e-6), steps)
-        x, y, heading = recording.states[now, :3]
-        track = recording.track[: now + 1]
-        draw_driven(self._driven, track, recording.traversability)
-        for line in self._edges:
-            line.set_data(*track.T)
-        turn = np.array(((np.cos(heading), np.sin(heading)), (-np.sin(heading), np.cos(heading))))
-        for body in self._robots:
-            body.set_xy(_ROBOT_M @ turn + (x, y))
+        own = self.recording
+        steps = len(own.traversability)
+        now = min(int(time_s / own.dt_s + 1e-6), steps)
         has_ended = now == steps
-        plan = recording.plan_at(time_s)
-        for name, layer in self._layers.items():
+        for line in self.path:
+            line.set_data(*own.track[: now + 1].T)
+        x, y, heading_rad = own.states[now, :3]
+        self.robot.set_data([x], [y])
+        self.robot.set_marker(robot_marker(heading_rad))
+        # It would cover the cell that held it.
+        self.robot.set_visible(not has_ended)
+        for artist in self.end:
+            artist.set_visible(has_ended)
+        plan = own.plan_at(time_s)
+        for name, layer in self.layers.items():
             layer.set_segments([] if has_ended else list(plan.lines.get(name, ())))
-        met = f"{recording.traversability[min(now, steps - 1)]:.2f}" if steps else "–"
-        self._time.set_text(f"t = {now * recording.dt_s:5.1f} s   observed λ = {met}")
-        self._outcome.set_text(recording.outcome if has_ended else "")
-        self._outcome.set_color("#00684a" if recording.about["outcome"] == "success" else "#a00000")
-        held = recording.immobilised_at if has_ended else None
-        for cross in self._crosses:
-            cross.set_data(*(([], []) if held is None else ([held[0]], [held[1]])))
+        if self.state is None:
+            return
+        if has_ended:
+            arrived = own.about["outcome"] == "success"
+            self.state.set(text=f"{own.outcome}, {own.end_s:.1f} s", color=_ARRIVED if arrived else _FAILED)
+        else:
+            self.state.set(text=f"observed λ = {own.traversability[now]:.2f}", color="0.25")

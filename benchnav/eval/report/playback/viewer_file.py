@@ -1,8 +1,8 @@
 """Files for the Rerun viewer: one episode, or several on one map.
 
-A file holds the terrain as a mesh, its colours and layers, λ in truth and as it was, the λ̂ that each planner was given,
-each robot with its heading at every step, the path driven so far, what the planner was thinking, how it
-ended, and time series; and a blueprint that arranges them.
+A file holds the terrain as a mesh, its colours and layers, the true mean of λ, the λ field, the λ̂ that each
+planner was given, each robot with its heading at every step, the path driven so far, what the planner was thinking,
+how it ended, and time series; and a blueprint that arranges them.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.playback.scene import TIMELINE, Driver, layer_entity, log_driver, log_ground
-from benchnav.eval.report.words import NAMING, contender_names
+from benchnav.eval.report.words import NAMING, contender_names, reading_name
 
 APPLICATION = "benchnav"
 
@@ -125,10 +125,10 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
             layer_title(name, layer): [f"/{layer_entity(name)}", _ALL, _PLACES]
             for name, layer in recording.layers.items()
         },
-        "Mean λ in truth": ["/map/true_mean", *own, _ALL, _PLACES],
+        "True mean of λ": ["/map/true_mean", *own, _ALL, _PLACES],
     }
     if recording.field is not None:
-        views["λ as it was, dark red: immobilises a robot"] = ["/map/field", *own, _ALL, _PLACES]
+        views["λ field of the episode; dark red immobilises a robot"] = ["/map/field", *own, _ALL, _PLACES]
     for driver in drivers:
         name = f"λ̂ given to {driver.name or 'the planner'}, free: {free_rule(driver.recording)}"
         views[name] = [driver.entity("/map/risk"), driver.entity("/map/overlay", "**"), _PLACES]
@@ -146,8 +146,8 @@ def layer_title(name: str, layer: np.ndarray) -> str:
 def describe(drivers: Sequence[Driver]) -> str:
     """Says in Markdown what is shown, how each episode ended, and which ground was free."""
     about, driven = drivers[0].recording.about, [driver.recording for driver in drivers]
-    labels = {name: [own.about.get(name, NOT_USED) for own in driven] for name in NAMING}
-    rows = {
+    labels = {name: [reading_name(name, own.about.get(name, NOT_USED)) for own in driven] for name in NAMING}
+    rows: dict[str, Sequence[str]] = {
         **{name: cells for name, cells in labels.items() if set(cells) != {NOT_USED}},
         "outcome": [Bold(own.outcome) for own in driven],
         "time": [f"{own.end_s:.1f} s of {own.time_budget_s:g} s" for own in driven],

@@ -85,7 +85,7 @@ def compare(
     for note in notes:
         print(note)
     if not out:
-        print(f"what the columns mean, and all differences: with --out FOLDER, {PAGE} there says so")
+        print(f"columns: --out FOLDER writes {PAGE}, which explains them and lists all differences")
         return
     about = {
         "dataset": {"id": dataset.id, "digest": dataset.digest},
@@ -162,7 +162,7 @@ def _notes(
     counts = {split: dataset.map_count(split) for split in splits}
     units = dict(zip(comparison.summary["split"], comparison.summary["units"], strict=True))
     lines = [
-        "units of the statistics: "
+        "statistical units: "
         + ", ".join(
             f"{split} {count} maps" + (f" in {units[split]} groups" if units[split] != count else "")
             for split, count in counts.items()
@@ -173,23 +173,23 @@ def _notes(
         corrected = rivals * (rivals + 1) // 2
         few = [split for split, own in units.items() if corrected * 2.0 ** (1 - own) >= 0.05]
         if few:
-            lines.append(f"too few maps for any difference to be significant: {', '.join(few)}")
+            lines.append(f"no difference can be significant with so few maps: {', '.join(few)}")
     if left := [one.label for one in candidates if one.needs_truth]:
         unknown = [split for split in splits if dataset.truth_of(split) == "unknown"]
         if unknown:
-            lines.append(f"{' and '.join(left)} are left out on {', '.join(unknown)}, whose truth is unknown")
+            lines.append(
+                f"{' and '.join(left)} are left out on {', '.join(unknown)}: the truth is unknown there"
+            )
     for one in candidates:
         own = {split: quality for (split, model), quality in qualities.items() if model == one.label}
         if class_mismatch(one.model, dataset.recipe):
-            lines.append(f"{one.label} knows other classes than these maps have: it is compared by λ alone")
+            lines.append(f"{one.label} is compared by λ alone: its classes are not those of these maps")
         if not one.privileged:
             own_notes = notes_of_model(one.model, dataset, own, baselines, one.trained_on)
             lines += [f"{one.label}: {line}" for line in own_notes]
     height, width = dataset.grid.shape
     where = gpu_name(device) or f"the CPU with {_threads()} thread{'s' * (_threads() > 1)}"
-    lines.append(
-        f"ms a map: median over repeated predictions of one map of {height}×{width} cells, on {where}"
-    )
+    lines.append(f"ms a map: median over repeated predictions of a map of {height}×{width} cells on {where}")
     return lines
 
 
@@ -220,7 +220,7 @@ def _write(out: str, title: str, about: dict[str, Any], comparison: "Comparison"
     show_progress(saved(), "figures")
     write_text(folder / PAGE, comparison_markdown(title, comparison, notes, list(drawn)))
     print(f"wrote {REPORT}, {CSV}, {DIFFERENCES}, {PAGE} and {len(drawn)} figures in {out}")
-    print(f"what the columns and figures mean: {folder / PAGE}")
+    print(f"columns and figures are explained in {folder / PAGE}")
 
 
 def _threads() -> int:

@@ -26,30 +26,28 @@ HEADINGS = {
 } | {
     "pinball": (
         "pinball\nfifth",
-        "pinball loss of the lower fifth: the mean over the levels u = 0.01, 0.02, …, 0.20 of u·(λ − Q(u)) where λ is "
-        "at least the quantile Q(u), else of (1 − u)·(Q(u) − λ); it scores the bad end of the prediction alone, and "
-        "lower is better.",
+        "pinball loss of the lower fifth: u·(λ − Q(u)) where λ is at least the quantile Q(u), else (1 − u)·(Q(u) − λ), "
+        "averaged over the levels u = 0.01, 0.02, …, 0.20. It scores the bad end of the prediction; lower is better.",
     ),
     "width": (
         "width\n90 %",
-        "sharpness: mean width Q(0.95) − Q(0.05) of the central 90 % interval; narrower says more, if “in 90 %” is "
+        "sharpness: mean width Q(0.95) − Q(0.05) of the central 90 % interval; narrower is better where “in 90 %” is "
         "right.",
     ),
     "tail_error": (
         "tail\nerror",
-        "tail calibration: how far the share of observed λ under the VaR at 0.8, 0.9 and 0.95 is from 0.2, 0.1 and "
-        "0.05, in the mean of the three; 0 is perfect.",
+        "tail calibration: mean gap between the share of observed λ below VaR₀.₈, VaR₀.₉ and VaR₀.₉₅, and 0.2, 0.1 and "
+        "0.05; 0 is perfect.",
     ),
     "ause": (
         "AUSE\n",
-        "area under the sparsification error curve: by how much the mean error |λ − E[λ]| of the cells that are left "
-        "is larger when the cells with the widest interval are left out one after another than when those with the "
-        "largest error are; on each map, in the mean over maps; 0 is perfect, and noise of the ground keeps any model "
-        "above it.",
+        "area under the sparsification error curve: cells are removed by uncertainty, and by error; the area between "
+        "the two curves of the mean error |λ − E[λ]| of the rest is averaged over maps. 0 is perfect; noise of the "
+        "ground keeps any model above it.",
     ),
     "prediction_ms": (
         "ms a\nmap",
-        "median time of the prediction of one map alone in milliseconds.",
+        "median time of predicting one map, in milliseconds.",
     ),
     "parameters": (
         "parameters\n",
@@ -62,23 +60,23 @@ PRIVILEGED_MARK = " †"
 FIGURES = {
     "measures": (
         "Measures with their intervals",
-        "A row a model; marks are splits, and lines 95 % intervals over maps. ↑: higher is better, ↓: lower is. Names "
-        "in grey are of privileged models, which see what no model does.",
+        "Each row is a model, each mark a split; lines are 95 % intervals over maps. ↑: higher is better, ↓: lower is "
+        "better. Grey: privileged models, which are given part of the truth.",
     ),
     "calibration": (
-        "Whether the predicted distributions of λ can be trusted",
-        "How much more often than it should λ was under a quantile of its prediction, over the level of the quantile: "
-        "0 is calibrated. Above 0 at the left, bad ground comes more often than predicted.",
+        "Calibration of the predicted distributions of λ",
+        "Share of observed λ below a predicted quantile, less the level of the quantile, over that level. 0 is "
+        "calibrated. Above 0 at the left: bad ground is more frequent than predicted.",
     ),
     "sparsification": (
-        "Whether uncertainty finds the errors",
-        "Mean error |λ − E[λ]| of the cells of a map that are left, over the share that was left out: the most "
-        "uncertain ones first (lines), or those with the largest error first (dotted). The area between is AUSE.",
+        "Sparsification: uncertainty against error",
+        "Mean error |λ − E[λ]| of the remaining cells over the share of cells removed: the most uncertain first "
+        "(lines), or those of largest error first (dotted). The area between the two is AUSE.",
     ),
     "severity": (
         "Quality over the severity of a shift",
-        "CRPS and pinball loss of the lower fifth over the severity of each scenario, from 0, the maps of training, to "
-        "the scenario itself at 1; lines are 95 % intervals over maps.",
+        "CRPS and pinball loss of the lower fifth over the severity of each scenario: 0 is the training maps, 1 the "
+        "scenario itself. Lines are 95 % intervals over maps.",
     ),
 }
 
@@ -150,17 +148,16 @@ def comparison_table(title: str, comparison: Comparison, whole: bool = False) ->
         rows=tuple(rows),
         bold_note=_BOLD if marked else "",
         explained=(
-            ("split", "the maps that were measured."),
-            ("model", "† is privileged: it is given part of the truth; a reference, which does not compete."),
+            ("split", "split of the dataset."),
+            ("model", "† marks privileged models: references that are given part of the truth and do not compete."),
             *explained,
         ),
     )  # fmt: skip
 
 
 _BOLD = (
-    "not significantly worse than the best of its split by this measure (models exchanged on each map, Holm over "
-    f"all pairs, p ≥ {ALPHA}); where nothing is significantly worse none is marked; privileged models (†) do not "
-    "compete."
+    "best of its split by this measure, and all without a significant difference from it (permutation test by map, "
+    f"Holm, p ≥ {ALPHA}). Privileged models (†) do not compete."
 )  # fmt: skip
 
 
@@ -182,10 +179,11 @@ def difference_table(comparison: Comparison) -> Table:
         rows=tuple(rows),
         bold_note=f"p under {ALPHA}." if any(isinstance(row[-1], Bold) for row in rows) else "",
         explained=(
-            ("difference", "of the model less the best by this measure; of “in 90 %” of the distance to 0.9."),
-            ("95 % interval", f"by bootstrap over maps; none under {LEAST_MAPS} maps."),
-            ("p (Holm)", "chance of a difference as large if the two models were exchanged at random on each map; "
-             "Holm's correction is over all pairs of models that compete, within measure and split."),
+            ("difference", "the model less the best, by this measure; of “in 90 %” the difference of the distance to "
+             "0.9."),
+            ("95 % interval", f"bootstrap over maps; no interval under {LEAST_MAPS} maps."),
+            ("p (Holm)", "permutation test by map, which exchanges the two models; corrected over all pairs of models "
+             "that compete, within measure and split (Holm)."),
         ),
     )  # fmt: skip
 

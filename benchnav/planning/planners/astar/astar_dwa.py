@@ -1,4 +1,4 @@
-"""A* + DWA: a global path over the map's cells, followed by the dynamic window approach.
+"""A*+DWA: a global path over the map's cells, followed by the dynamic window approach.
 
 Source: paper IV-A1.
 """
@@ -12,7 +12,7 @@ from benchnav.planning.robots import SPEED, TURN_RATE
 
 @dataclass(frozen=True, kw_only=True)
 class AStarDWAConfig(GuideConfig):
-    """Settings of A* + DWA: those of the global path, and these.
+    """Settings of A*+DWA: those of the global path, and these.
 
     Args:
         dwa: settings of DWA.

@@ -92,8 +92,8 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         slow, fast = objective.path_cost(ends, torch.zeros(2)).tolist()
         if slow == fast and task.rules.free_space.by == "mean":
             found.append(
-                "ground is free by the mean, and λ̂ is no part of what A* minimises: its path is the same under "
-                f"every risk setting, which moves {self.local.name} alone (objective travel_time moves the path)"
+                "A* finds the same path under every risk setting, since its cost does not use λ̂ and free ground is "
+                f"set by the mean; risk moves {self.local.name} alone (objective travel_time moves the path)"
             )
         return tuple(found)
 

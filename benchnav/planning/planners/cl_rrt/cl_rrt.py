@@ -163,12 +163,12 @@ class CLRRT(Planner[CLRRTState]):
         remarks = []
         if follower.wanted_mps < robot.top_speed_mps:
             remarks.append(
-                f"CL-RRT drives at {follower.wanted_mps:g} m/s at most, where the robot's top speed is "
+                f"CL-RRT drives at {follower.wanted_mps:g} m/s at most; the robot's top speed is "
                 f"{robot.top_speed_mps:g} m/s"
             )
         if follower.lookahead_m > max(config.lookahead_m, config.lookahead_s * follower.wanted_mps):
             remarks.append(
-                f"looks {follower.lookahead_m:g} m ahead, as far as the robot drives while its turn rate builds up"
+                f"CL-RRT looks {follower.lookahead_m:g} m ahead, the way of the robot while its turn rate builds up"
             )
         return tuple(remarks)
 

@@ -1,3 +1,4 @@
+import itertools
 from itertools import pairwise
 
 import numpy as np
@@ -8,6 +9,7 @@ from matplotlib.figure import Figure
 
 from benchnav.eval.report.charts.conditions import (
     OUTCOME_COLOURS,
+    OUTCOME_HATCHES,
     SUCCESS_COLOUR,
     distribution_figure,
     outcome_figure,
@@ -45,7 +47,7 @@ def test_each_rate_stands_at_its_name_with_its_interval() -> None:
         )
     )  # fmt: skip
     (panel,) = panels(success_figure(summary))
-    expected = {"straight": 20, "A* + DWA, mean": 90, "A* + DWA, cvar": 80, "MPPI, cvar": 70}
+    expected = {"straight": 20, "A*+DWA, mean": 90, "A*+DWA, CVaR": 80, "MPPI, CVaR": 70}
     assert points(panel) == pytest.approx(expected)
     ends = {tuple(np.round(line.get_xdata(), 6)) for line in panel.lines if line.get_marker() == "None"}
     for low, high in summary[["success_low", "success_high"]].to_numpy():
@@ -101,8 +103,8 @@ def test_models_and_worlds_are_distinguished() -> None:
     )
     assert [panel.get_title() for panel in panels(figure)] == ["std, paper", "std, stakes"]
     first, second = panels(figure)
-    assert points(first) == {"MPPI, a, cvar": 0, "MPPI, b, cvar": 20}
-    expected = {"MPPI, a, cvar": 10, "MPPI, b, cvar": 30}
+    assert points(first) == {"MPPI, a, CVaR": 0, "MPPI, b, CVaR": 20}
+    expected = {"MPPI, a, CVaR": 10, "MPPI, b, CVaR": 30}
     assert dict(zip(points(first), points_by_height(second), strict=True)) == expected
 
 
@@ -112,7 +114,7 @@ def test_one_that_is_told_λ_itself_is_named_by_its_model_and_is_not_drawn_as_bl
         labels = [made.condition(**BLIND), told, *others]
         (panel,) = panels(success_figure(made.summarised(made.rows(*(shares(one, 5) for one in labels)))))
         named = [label.get_text() for label in panel.get_yticklabels()]
-        assert named == ["straight", "A* + DWA, clairvoyant", "A* + DWA, oracle, cvar"][: len(labels)]
+        assert named == ["straight", "A*+DWA, clairvoyant", "A*+DWA, oracle, CVaR"][: len(labels)]
         marked = [line for line in panel.lines if line.get_marker() == "o"]
         grey = [len(set(to_rgb(line.get_color()))) == 1 for line in marked]
         assert grey == [True, False, False][: len(labels)]
@@ -156,6 +158,29 @@ def test_every_failure_has_a_colour_of_its_own() -> None:
     assert len({*OUTCOME_COLOURS.values(), SUCCESS_COLOUR}) == len(OUTCOME_COLOURS) + 1
 
 
+def test_outcomes_differ_in_grey_by_lightness_or_hatching() -> None:
+    assert OUTCOME_HATCHES.keys() == OUTCOME_COLOURS.keys()
+    looks = [(name, OUTCOME_COLOURS[name], OUTCOME_HATCHES[name]) for name in OUTCOME_COLOURS]
+    for (_, one, hatch), (_, other, beside) in itertools.combinations(
+        [*looks, ("success", SUCCESS_COLOUR, "")], 2
+    ):
+        light, dark = (np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722)) for colour in (one, other))
+        assert hatch != beside or abs(light - dark) > 0.25
+
+
+def test_bars_are_hatched_as_their_outcomes_are() -> None:
+    rows = made.rows(
+        made.row(made.condition(), i, None, outcome=name) for i, name in enumerate(OUTCOME_HATCHES)
+    )
+    figure = outcome_figure(made.summarised(rows))
+    drawn = {
+        to_hex(bar.get_facecolor()).upper(): bar.get_hatch()
+        for bar in figure.axes[0].patches
+        if bar.get_width()
+    }
+    assert drawn == {OUTCOME_COLOURS[name]: hatch for name, hatch in OUTCOME_HATCHES.items()}
+
+
 def test_shares_stand_in_one_order_and_fill_the_bar() -> None:
     first, second = made.condition("a"), made.condition("b")
     ends = ["timeout", "immobilised", "immobilised", "timeout", "stuck"]
@@ -195,8 +220,7 @@ def places(panel: Axes) -> np.ndarray:
 
 def dots(panel: Axes) -> list[np.ndarray]:
     """Values of each condition, sorted."""
-    (group,) = panel.collections
-    values, up = np.asarray(group.get_offsets()).T
+    values, up = np.concatenate([np.asarray(group.get_offsets()) for group in panel.collections]).T
     return [np.sort(values[np.abs(up - height) < 0.5]) for _, height in places(panel)]
 
 
@@ -216,9 +240,12 @@ def test_every_episode_is_a_dot_under_its_quantity_and_its_condition() -> None:
     assert medians(met) == pytest.approx([0.1, 0.9])
     quartiles = next(line for line in times.lines if line.get_marker() == "None")
     assert list(quartiles.get_xdata()) == [25, 65]
-    # Successes and failures differ in colour.
-    colours = {tuple(colour) for colour in times.collections[0].get_facecolors()}
-    assert len(colours) == 2
+    # Successes and failures differ in colour, and in shape.
+    arrived, failed = times.collections
+    assert np.sort(np.asarray(arrived.get_offsets())[:, 0]).tolist() == [20, 30, 50, 50]
+    assert np.asarray(failed.get_offsets())[:, 0].tolist() == [100]
+    assert not np.allclose(arrived.get_facecolor(), failed.get_edgecolor())
+    assert len(arrived.get_paths()[0]) != len(failed.get_paths()[0])
     assert figure.get_figwidth() * 25.4 == pytest.approx(180)
 
 

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.figures import planner_colours, save_twice
+from benchnav.core.figures import MARKS, planner_colours, save_twice
 from benchnav.eval.recording import GROUND, Ground
 from benchnav.eval.report import write
 from benchnav.eval.report.charts.maps import driven_figure, read_driven
@@ -61,23 +61,36 @@ def test_every_path_is_drawn_to_its_end_with_its_outcome() -> None:
     rows = episodes({1: [True, False, True]})
     panel, lines = drawn(driven_figure(ground(), rows, [track(i) for i in range(3)]))
     for place, label in enumerate(
-        ("mean: success, 30 s", "cvar:0.5: timeout, 100 s", "cvar:0.9: success, 32 s")
+        ("mean: success, 30 s", "CVaR₀.₅: timeout, 100 s", "CVaR₀.₉: success, 32 s")
     ):
         np.testing.assert_array_equal(lines[label], track(place))
     np.testing.assert_array_equal(lines["goal"], [[24, 15]])
     np.testing.assert_array_equal(lines["start"], track(0)[:1])
-    crosses = [line for line in panel.lines if line.get_marker() == "X"]
-    assert len(crosses) == 1
-    np.testing.assert_array_equal(np.ravel(crosses[0].get_data()), track(1)[-1])
+    (end,) = [line for line in panel.lines if line.get_marker() is MARKS["out of time"]["marker"]]
+    np.testing.assert_array_equal(np.ravel(end.get_data()), track(1)[-1])
     labelled = [line for line in panel.lines if " s" in line.get_label()]
+    assert end.get_color() == labelled[1].get_color()
     assert len({line.get_color() for line in labelled}) == 3
+    # In grey the paths differ by their dashes; `get_linestyle` gives "--" for each pattern.
+    assert len({str(line._dash_pattern) for line in labelled}) == 3
+
+
+def test_an_end_says_how_it_ended() -> None:
+    rows = episodes({1: [False, False, False]}).assign(outcome=["immobilised", "stuck", "planner_error"])
+    figure = driven_figure(ground(), rows, [track(i) for i in range(3)])
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names[-3:] == [
+        f"{name}, in the colour of its path" for name in ("immobilised", "out of time", "failed")
+    ]
+    drawn_marks = [line.get_marker() for line in figure.axes[0].lines]
+    assert all(MARKS[name]["marker"] in drawn_marks for name in ("immobilised", "out of time", "failed"))
 
 
 def test_ends_that_coincide_are_all_seen() -> None:
     rows = episodes({1: [False, False, False]})
     panel, _ = drawn(driven_figure(ground(), rows, [track(0)] * 3))
-    crosses = [line for line in panel.lines if line.get_marker() == "X"]
-    sizes = [line.get_markersize() for line in crosses]
+    ends = [line for line in panel.lines if line.get_marker() is MARKS["out of time"]["marker"]]
+    sizes = [line.get_markersize() for line in ends]
     assert sizes == sorted(sizes, reverse=True)
     assert len(set(sizes)) == 3
 
@@ -88,7 +101,7 @@ def test_the_title_and_the_legend_are_apart_and_planners_go_by_their_names() -> 
     figure.draw_without_rendering()
     (legend,) = figure.legends
     assert not figure.axes[0].title.get_window_extent().overlaps(legend.get_window_extent())
-    assert legend.get_texts()[0].get_text() == "A* + DWA: success, 30 s"
+    assert legend.get_texts()[0].get_text() == "A*+DWA: success, 30 s"
     colours = [line.get_color() for line in legend.get_lines()[:2]]
     assert colours == list(planner_colours(["astar_dwa", "mppi"]).values())
 
@@ -132,7 +145,7 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(tmp_path: Path) -> None:
     assert driven
     name, caption, figure = write._driven(*driven)
     assert name == "driven"
-    assert "std 1, seed 0, realisation 0: of all maps" in caption
+    assert "std 1, seed 0, realisation 0. On this map outcomes differ most." in caption
     _, own, tracks = driven
     assert own["map"].tolist() == [1, 1, 1]
     for place, positions in enumerate(tracks):
@@ -153,7 +166,7 @@ def test_the_paths_are_those_of_the_maps_own_noise(seed: int, realisation: int, 
     driven = read_driven(folder, rows)
     assert driven
     _, caption, _ = write._driven(*driven)
-    assert f"std 1, seed {seed}, realisation {realisation}:" in caption
+    assert f"std 1, seed {seed}, realisation {realisation}." in caption
     _, own, tracks = driven
     assert own["risk"].tolist() == list(RISKS)
     assert set(zip(own["seed"], own["realisation"], own["map"], strict=True)) == {(seed, realisation, 1)}
@@ -174,7 +187,7 @@ def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(tmp_
     driven = read_driven(folder, rows)
     assert driven
     _, caption, figure = write._driven(*driven)
-    assert f"on no map did outcomes differ. {most} of {most + 2} conditions." in caption
+    assert f"Outcomes differ on no map. The figure shows {most} of {most + 2} conditions." in caption
     assert len(figure.axes[0].lines) >= most
 
 

@@ -59,7 +59,10 @@ def test_panels_say_where_when_and_why() -> None:
         np.testing.assert_array_equal(panel.images[0].get_array(), line.recordings[place].predicted)
         marked = [mark for mark in panel.lines if mark.get_marker() != "None"]
         marks = {mark.get_marker(): mark.get_xydata()[0].tolist() for mark in marked}
-        assert marks["X"] == rows.loc[place, ["x_m", "y_m"]].tolist()
+        column, row = (int(rows.loc[place, name] / 0.5) for name in ("x_m", "y_m"))
+        (cell,) = panel.patches
+        np.testing.assert_allclose(cell.get_xy().min(axis=0), [0.5 * column, 0.5 * row])
+        assert ("X", "s")[place] in marks
         assert marks["*"] == [3, 3]
         assert marks["o"] == [0.5, 0.5]
     assert figure.get_figwidth() * 25.4 == pytest.approx(88)
@@ -75,6 +78,6 @@ def test_ground_that_immobilises_a_robot_is_drawn_and_named_where_there_is_such(
     alpha = np.asarray(figure.axes[0].images[1].get_array())[..., 3]
     assert (alpha > 0).tolist() == immobilising.tolist()
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["immobilises a robot", "driven", "start", "goal", "end"]
+    assert names == ["immobilises a robot", "driven", "start", "goal", "immobilised"]
     plain = failure_figure([shown(rows)])
     assert "immobilises a robot" not in [text.get_text() for text in plain.legends[0].get_texts()]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, hatching, outline, save_twice
+from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, hatching, outline, robot_marker, save_twice
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.charts.maps import MOST_PANELS, choose_recordings, trajectory_figure
 from benchnav.eval.report.plan_layers import field_colours
@@ -80,7 +80,7 @@ def test_what_is_drawn_is_what_was_planned_and_driven_by_then() -> None:
     taken = recording()
     above, below = shown(trajectory_figure([taken]))
     now = taken.now
-    assert above.get_title() == f"MPPI, cvar, std 0\nt = {now / 10:g} s; outcome: out of bounds"
+    assert above.get_title() == f"MPPI, CVaR, std 0\nt = {now / 10:g} s; outcome: out of bounds"
     for panel in (above, below):
         lines = [path.vertices for layer in panel.collections for path in layer.get_paths()]
         for layer in taken.plan.lines.values():
@@ -114,18 +114,21 @@ def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended()
     assert paths
     for line in paths:
         np.testing.assert_array_equal(np.stack(line.get_data(), axis=1), taken.track)
-    marks = {
-        (line.get_marker(), line.get_color()): tuple(np.ravel(line.get_data()))
-        for line in last.lines
-        if line.get_marker() != "None"
-    }
-    marks = {name: marks[looks["marker"], looks["color"]] for name, looks in MARKS.items()}
-    assert marks["end"] == marks["robot"] == tuple(taken.track[-1])
-    assert marks["start"] == tuple(taken.track[0])
-    assert marks["goal"] == tuple(taken.goal_m)
-    assert last.get_title() == "driven to the end (17 s), on λ as it was"
-    # Where it was by the moment of the plan is told by the panels above.
+    marks = {line.get_marker(): line for line in last.lines if line.get_marker() != "None"}
+    assert marks.keys() == {MARKS[name]["marker"] for name in ("start", "goal", "immobilised")}
+    for name, place in (("start", taken.track[0]), ("goal", taken.goal_m)):
+        np.testing.assert_array_equal(np.ravel(marks[MARKS[name]["marker"]].get_data()), place)
+    (cell,) = [
+        patch for patch in last.patches if np.isfinite(patch.get_xy()).all() and len(patch.get_xy()) == 5
+    ]
+    np.testing.assert_array_equal(cell.get_xy().min(axis=0), 0.5 * np.floor(taken.track[-1] / 0.5))
+    assert last.get_title() == "path driven in 17 s, over the λ field"
+    # Where it was by the moment of the plan is told by the panels above, and where it headed.
+    heading = robot_marker(taken.states[taken.now, 2]).get_transform()
     for panel in (above, below):
+        (robot,) = [line for line in panel.lines if line.get_label() == "robot"]
+        np.testing.assert_array_equal(np.ravel(robot.get_data()), taken.track[taken.now])
+        np.testing.assert_allclose(robot._marker.get_transform().get_matrix(), heading.get_matrix())
         assert not [line for line in panel.lines if (line.get_marker(), line.get_color()) == ("X", "black")]
         assert max(len(line.get_xdata()) for line in panel.lines) == taken.now + 1 < 170
 
@@ -154,10 +157,10 @@ def test_only_panels_whose_λ_stayed_have_a_third() -> None:
     figure = trajectory_figure([recording(), held(), recording(), recording(), held()])
     titles = [axes.get_title() for axes in shown(figure)]
     assert len(titles) == 5 * 2 + 2
-    assert sum("as it was" in title for title in titles) == 2
+    assert sum("λ field" in title for title in titles) == 2
     figure.draw_without_rendering()
     columns = [
-        axes.get_subplotspec().colspan.start for axes in shown(figure) if "as it was" in axes.get_title()
+        axes.get_subplotspec().colspan.start for axes in shown(figure) if "λ field" in axes.get_title()
     ]
     assert columns == [1, 1]
 
@@ -178,11 +181,11 @@ def test_titles_tell_models_and_worlds_apart_where_they_differ() -> None:
         return [axes.get_title().split("\n")[0] for axes in shown(figure) if "outcome" in axes.get_title()]
 
     blind = {"planner": "straight", "model": "–", "risk": "–"}
-    assert titles({}, blind) == ["MPPI, cvar, std 0", "straight, std 0"]
+    assert titles({}, blind) == ["MPPI, CVaR, std 0", "straight, std 0"]
     told = {"model": "clairvoyant", "risk": "–"}
     assert titles(told) == ["MPPI, clairvoyant, std 0"]
-    assert titles({"model": "oracle"}, told) == ["MPPI, oracle, cvar, std 0", "MPPI, clairvoyant, std 0"]
-    assert titles({}, {"world": "stakes"}) == ["MPPI, paper, cvar, std 0", "MPPI, stakes, cvar, std 0"]
+    assert titles({"model": "oracle"}, told) == ["MPPI, oracle, CVaR, std 0", "MPPI, clairvoyant, std 0"]
+    assert titles({}, {"world": "stakes"}) == ["MPPI, paper, CVaR, std 0", "MPPI, stakes, CVaR, std 0"]
 
 
 def names_in_legend(figure: Figure) -> list[str]:
@@ -217,7 +220,7 @@ def test_whose_map_of_λ_it_is_stands_above_it() -> None:
     blind = {"planner": "straight", "model": "–", "risk": "–"}
     *_, given, none = shown(trajectory_figure([recording(), recording(**blind)]))
     assert given.get_title() == "λ̂ given to the planner"
-    assert none.get_title() == "E[λ] in truth; the planner is given nothing"
+    assert none.get_title() == "true E[λ]; the planner uses no map"
 
 
 def test_an_episode_that_ended_at_once_can_be_drawn(tmp_path: Path) -> None:

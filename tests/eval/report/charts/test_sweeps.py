@@ -5,6 +5,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchnav.core.figures import risk_name
 from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_name
 from tests.eval.report import made
 
@@ -123,7 +124,7 @@ def test_other_settings_of_the_same_planner_are_lines_across_and_blind_ones_grey
     across = {float(np.asarray(line.get_ydata())[0]) for line in above.lines if line.get_marker() == "None"}
     assert across == {30, 10}
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["MPPI, cvar", "mean", "straight"]
+    assert names == ["MPPI, CVaR", "mean", "straight"]
 
 
 def test_each_setting_is_drawn_in_the_style_that_the_legend_gives_it() -> None:
@@ -133,7 +134,7 @@ def test_each_setting_is_drawn_in_the_style_that_the_legend_gives_it() -> None:
         *((made.condition(risk=setting), n) for n, setting in enumerate(settings)),
         (made.condition("straight", "–", model="–"), 8),
     )
-    names = {10.0 * n: name for n, name in enumerate([*settings, "straight"])}
+    names = {10.0 * n: risk_name(name) for n, name in enumerate([*settings, "straight"])}
     # Matplotlib tells a pattern of dashes by a private name alone: `get_linestyle` gives "--" for each.
     legend = {line.get_label(): line._dash_pattern for line in figure.legends[0].get_lines()}
     above, _ = shown(figure)
@@ -144,6 +145,16 @@ def test_each_setting_is_drawn_in_the_style_that_the_legend_gives_it() -> None:
     }
     assert lines == {name: legend[name] for name in names.values()}
     assert len(set(map(repr, lines.values()))) == len(names)
+
+
+def test_lines_of_one_panel_differ_in_marker_as_well_as_in_colour() -> None:
+    planners = ["astar_dwa", "mppi", "cl_rrt"]
+    figure = drawn(*((made.condition(p, f"cvar:{level}"), 5) for p in planners for level in LEVELS))
+    above, _ = shown(figure)
+    looks = [(line.get_marker(), line.get_color()) for line in above.lines if line.get_marker() != "None"]
+    assert [len(set(each)) for each in zip(*looks, strict=True)] == [3, 3]
+    legend = [(line.get_marker(), line.get_color()) for line in figure.legends[0].get_lines()]
+    assert legend == looks
 
 
 def test_scenarios_worlds_and_models_have_panels_of_their_own() -> None:

@@ -6,26 +6,29 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.figures import bytes_of
+from benchnav.core.figures import ROBOT, bytes_of
 from benchnav.eval.recording import Recording
+from benchnav.eval.report.plan_layers import field_colours, predicted_colours, shades
 from benchnav.eval.report.playback.video import (
     FRAMES_A_SECOND,
     HOLD_S,
-    ROBOT,
+    SIZE,
     SPEED,
     Frames,
     frame_times,
     write_video,
 )
+from benchnav.eval.report.words import condition_name
 from tests.eval.report import made
 
 
-def grey(steps: int, **changes: object) -> Recording:
-    """An episode on ground of no colour, so that what is drawn stands out."""
+def flat(steps: int, **changes: object) -> Recording:
+    """An episode on λ̂ of one colour, so that what is drawn stands out."""
     recording = made.recording(steps, plans=(), **changes)
-    return replace(recording, rgb=np.full_like(recording.rgb, 128))
+    return replace(recording, predicted=np.full((40, 60), 0.5, np.float32), free=np.ones((40, 60), bool))
 
 
 def test_a_moment_lasts_a_frame_and_the_end_a_while() -> None:
@@ -38,83 +41,148 @@ def test_a_moment_lasts_a_frame_and_the_end_a_while() -> None:
     assert set(frame_times(0.0)) == {0.0}
 
 
-def robot_at(frame: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-    """Where the robot's mark is in the upper panel of a frame: column and row of its middle."""
-    left, right = panel
-    own = np.abs(frame[:, left:right].astype(int) - bytes_of(ROBOT)[:3]).sum(axis=-1) < 60
-    rows, columns = np.nonzero(own[: frame.shape[0] // 2])
-    return np.array([columns.mean() + left, rows.mean()])
+def orange(frame: np.ndarray) -> np.ndarray:
+    """Which pixels of a frame have the robot's colour."""
+    return np.abs(frame.astype(int) - bytes_of(ROBOT)[:3]).sum(axis=-1) < 60
 
 
-def test_a_video_has_its_frames_size_and_duration_and_the_robot_where_the_path_says(tmp_path: Path) -> None:
-    first, second = grey(40), grey(24, labels=made.condition(risk="mean"))
+def robot_at(frame: np.ndarray, panel: Axes) -> np.ndarray:
+    """Where the robot's mark is on a panel: x and y of its middle, in pixels from below."""
+    box = panel.get_window_extent()
+    rows, columns = np.nonzero(orange(frame))
+    y = SIZE[1] - 1 - rows
+    inside = (columns > box.x0) & (columns < box.x1) & (y > box.y0) & (y < box.y1)
+    return np.array([columns[inside].mean(), y[inside].mean()])
+
+
+def test_a_video_has_its_size_and_duration_and_the_robots_where_their_paths_say(tmp_path: Path) -> None:
+    first, second = flat(40), flat(24, labels=made.condition(risk="mean"))
     second = replace(second, states=second.states * np.array([1, 0.5, 1, 1, 1], np.float32))
     path = tmp_path / "there" / "a.mp4"
     steps = list(write_video([first, second], path))
     times = frame_times(4.0)
     assert steps[-1] == (len(times), len(times))
     assert [p.name for p in path.parent.iterdir()] == ["a.mp4"]
-    frames = Frames([first, second])
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
-        assert (stream.width, stream.height) == frames.size
+        assert (stream.width, stream.height) == SIZE
+        assert SIZE[0] * 9 == SIZE[1] * 16
         assert stream.average_rate == FRAMES_A_SECOND
         decoded = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
         assert container.duration / 1e6 == pytest.approx(len(times) / FRAMES_A_SECOND, abs=0.06)
     assert len(decoded) == len(times)
-    half = frames.size[0] // 2
-    for number in (0, 5, 12, len(times) - 1):
-        for place, recording in enumerate((first, second)):
-            step = min(round(times[number] / recording.dt_s), len(recording.traversability))
-            panel = frames._columns[place].panels[0]
-            x, y = panel.transData.transform(recording.states[step, :2])
-            expected = (x, frames.size[1] - y)
-            found = robot_at(decoded[number], ((0, half), (half, 2 * half))[place])
-            np.testing.assert_allclose(found, expected, atol=5)
+    frames = Frames([first, second])
+    for number in (0, 5, 11):
+        for panel, recording in zip(frames.given, (first, second), strict=True):
+            place = recording.states[round(times[number] / recording.dt_s), :2]
+            found = robot_at(decoded[number], panel)
+            np.testing.assert_allclose(found, panel.transData.transform(place), atol=6)
 
 
 def test_the_robot_points_where_it_heads() -> None:
-    turned = grey(3)
-    states = turned.states.copy()
-    states[:, 2] = np.pi / 2
-    middle = {}
-    for name, recording in (("east", replace(turned, states=states * (1, 1, 0, 1, 1))),
-                            ("north", replace(turned, states=states))):  # fmt: skip
-        frames = Frames([recording])
-        shown = robot_at(frames.draw(0.1), (0, frames.size[0]))
-        own = np.abs(frames.draw(0.1).astype(int) - bytes_of(ROBOT)[:3]).sum(axis=-1) < 60
-        rows, columns = np.nonzero(own[: frames.size[1] // 2])
-        middle[name] = (np.ptp(columns), np.ptp(rows))
-        assert np.isfinite(shown).all()
-    assert middle["east"][0] > middle["east"][1]
-    assert middle["north"][1] > middle["north"][0]
+    turned = flat(3)
+    size = {}
+    for name, heading_rad in (("east", 0.0), ("north", np.pi / 2)):
+        states = turned.states.copy()
+        states[:, 2] = heading_rad
+        frames = Frames([replace(turned, states=states)])
+        box = frames.given[0].get_window_extent()
+        rows, columns = np.nonzero(orange(frames.draw(0.1))[: -int(box.y0), : int(box.x1)])
+        size[name] = (np.ptp(columns), np.ptp(rows))
+    assert size["east"][0] > size["east"][1]
+    assert size["north"][1] > size["north"][0]
 
 
 def test_what_moves_is_told_in_words() -> None:
     recording = made.held_recording(80)
     frames = Frames([recording])
-    column = frames._columns[0]
+    driver, _ = frames.drivers
     frames.draw(2.0)
-    assert column._time.get_text() == f"t =   2.0 s   observed λ = {recording.traversability[20]:.2f}"
-    assert column._outcome.get_text() == ""
-    assert len(column._driven.get_segments()) == 20
-    np.testing.assert_array_equal(column._driven.get_array(), recording.traversability[:20])
+    assert frames._time.get_text() == "t =   2.0 s"
+    assert driver.state is not None
+    assert driver.state.get_text() == f"observed λ = {recording.traversability[20]:.2f}"
+    np.testing.assert_array_equal(np.transpose(driver.path[0].get_data()), recording.track[:21])
     plan = recording.plan_at(2.0).lines["path"][0]
-    np.testing.assert_array_equal(column._layers["path"].get_segments()[0], plan)
+    np.testing.assert_array_equal(driver.layers["path"].get_segments()[0], plan)
+    assert not any(artist.get_visible() for artist in driver.end)
+    assert driver.robot.get_visible()
     frames.draw(99.0)
-    assert column._outcome.get_text() == "immobilised"
-    np.testing.assert_array_equal(np.ravel(column._crosses[0].get_data()), recording.states[-1, :2])
-    assert not column._layers["path"].get_segments()
+    assert driver.state.get_text() == "immobilised, 8.0 s"
+    assert not driver.layers["path"].get_segments()
+    # It gives way to what says how it ended.
+    assert all(artist.get_visible() for artist in driver.end)
+    assert not driver.robot.get_visible()
 
 
-def test_below_is_λ_as_it_was_or_else_what_was_given() -> None:
-    frozen, resampled = made.held_recording(20), made.recording(20, plans=())
-    for recording, words in ((frozen, "λ as it was"), (resampled, "λ̂ given to the planner")):
-        panel = Frames([recording])._columns[0].panels[1]
-        assert words in [text.get_text() for text in panel.texts]
-        shown = np.asarray(panel.images[0].get_array())
-        if recording.field is None:
-            assert ((shown == 64).all(axis=-1) == ~recording.free).all()
+def test_λ_hat_stands_beside_λ_as_it_was_which_episodes_share() -> None:
+    one, other = (
+        made.held_recording(20),
+        made.held_recording(20, predicted=np.full((40, 60), 0.5, np.float32)),
+    )
+    frames = Frames([one, other])
+    for panel, own in zip(frames.given, (one, other), strict=True):
+        np.testing.assert_array_equal(panel.images[0].get_array(), predicted_colours(own.predicted, own.free))
+    (truth,) = frames.truths
+    assert one.field is not None
+    np.testing.assert_array_equal(truth.images[0].get_array(), field_colours(one.field, one.immobilising))
+    widths = [panel.get_window_extent().width for panel in (*frames.given, truth)]
+    assert np.ptp(widths) < 1e-6
+    assert sum(widths) > 0.9 * SIZE[0]
+    assert [driver.path[0].axes for driver in frames.drivers] == [*frames.given, truth, truth]
+    apart = Frames([one, made.held_recording(20, field=one.field[::-1])])
+    assert len(apart.truths) == 2
+    np.testing.assert_array_equal(
+        apart.truths[1].images[0].get_array(), field_colours(one.field[::-1], one.immobilising)
+    )
+
+
+def test_where_λ_is_drawn_anew_its_mean_stands_beside() -> None:
+    recording = made.recording(20, plans=())
+    frames = Frames([recording])
+    np.testing.assert_array_equal(frames.truths[0].images[0].get_array(), shades(recording.true_mean))
+    assert "drawn anew" in words_of(frames.truths[0])
+
+
+def words_of(panel: Axes) -> str:
+    return "; ".join(text.get_text() for text in panel.texts)
+
+
+def test_each_episode_has_the_name_of_its_planner_and_risk_setting_and_of_what_else_differs() -> None:
+    labels = [made.condition("astar_dwa", "mean"), made.condition("astar_dwa", "mean", robot="bicycle")]
+    frames = Frames([made.recording(3, labels=own) for own in labels])
+    for panel, own in zip(frames.given, labels, strict=True):
+        assert words_of(panel).startswith(f"{condition_name(own)}, {own['robot']}; λ̂ given to the planner")
+    (alone,) = Frames([made.recording(3, labels=labels[0])]).given
+    assert words_of(alone).startswith(f"{condition_name(labels[0])}; ")
+    (blind,) = Frames([made.recording(3, labels=made.condition("straight", "–", model="–"))]).given
+    assert words_of(blind).startswith("straight; true mean of λ")
+
+
+@pytest.mark.parametrize(("cell_m", "length_m"), [(0.5, 10.0), (0.1, 2.0), (0.01, 0.5), (20.0, 200.0)])
+def test_the_scale_bar_is_as_long_as_it_says(cell_m: float, length_m: float) -> None:
+    recording = made.recording(3, resolution_m=cell_m)
+    frames = Frames([recording])
+    (bar,) = [panel for panel in frames._figure.axes if panel.get_label() == "scale"]
+    metre = frames.given[0].get_window_extent().width / (60 * cell_m)
+    assert bar.get_window_extent().width == pytest.approx(length_m * metre)
+    assert f"{length_m:g} m" in [text.get_text() for text in frames._figure.texts]
+
+
+def test_how_an_episode_ended_stands_beside_the_cell_where_it_ended() -> None:
+    recording = made.held_recording(80)
+    frames = Frames([recording])
+    frames.draw(99.0)
+    cell_m, panel = recording.resolution_m, frames.truths[0]
+    cell, end = frames.drivers[1].end
+    column, row = np.floor(recording.track[-1] / cell_m).astype(int)
+    np.testing.assert_allclose(cell.get_xy().min(axis=0), cell_m * np.array([column, row]))
+    # The cell keeps the colour that it has on the map.
+    shown = panel.images[0].get_array()[row, column]
+    np.testing.assert_allclose(cell.get_facecolor()[:3], shown / 255)
+    middle = end.get_transform().transform(np.ravel(end.get_data()))
+    half = panel.transData.transform((cell_m, 0))[0] - panel.transData.transform((0, 0))[0]
+    apart = np.linalg.norm(middle - panel.transData.transform(cell_m * np.array([column + 0.5, row + 0.5])))
+    assert apart > half / 2 + end.get_markersize() / 72 * 100 / 2
 
 
 def test_an_episode_that_ended_at_once_is_shown(tmp_path: Path) -> None:

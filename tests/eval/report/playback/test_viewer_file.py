@@ -209,7 +209,7 @@ def test_several_conditions_have_paths_colours_and_maps_of_their_own(tmp_path: P
     path = written(tmp_path, *recordings)
     verify(path)
     colours = []
-    for recording, name in zip(recordings, ("cvar", "mean"), strict=True):
+    for recording, name in zip(recordings, ("CVaR", "mean"), strict=True):
         times, positions = read_path(path, f"/world/conditions/{name}/robot")
         np.testing.assert_array_equal(positions[:, :2], recording.states[:, :2])
         assert times[-1] == pytest.approx(recording.end_s)
@@ -256,7 +256,7 @@ def test_each_planner_is_seen_on_what_it_was_given() -> None:
     assert views["λ̂ given to mean, free: mean λ above 0.2"] == [
         "/map/risk/conditions/mean", "/map/overlay/conditions/mean/**", "/map/places/**"
     ]  # fmt: skip
-    assert views["λ̂ given to cvar:0.9, free: mean λ above 0.1"][0] == "/map/risk/conditions/cvar\\:0.9"
+    assert views["λ̂ given to CVaR₀.₉, free: mean λ above 0.1"][0] == "/map/risk/conditions/CVaR₀.₉"
     assert views["Colour"] == ["/map/colour", "/map/soft/**", *OVERLAY]
 
 
@@ -288,7 +288,7 @@ def test_an_episode_is_told_with_its_outcome_and_the_threshold() -> None:
         "| outcome | **immobilised** |",
         "| time | 4.3 s of 90 s |",
         "| free | mean λ above 0.1 |",
-        "| planner | mppi |",
+        "| planner | MPPI |",
         "std 4",
     ):
         assert words in text
@@ -298,7 +298,7 @@ def test_conditions_are_told_side_by_side() -> None:
     first = made.recording(200, labels=made.condition(risk="cvar:0.9"))
     about = {**made.recording().about, "risk": "mean", "outcome": "out_of_bounds"}
     text = describe(drivers_of([first, made.recording(150, about=about)]))
-    assert "|  | cvar:0.9 | mean |" in text
+    assert "|  | CVaR₀.₉ | mean |" in text
     assert "| outcome | **success** | **out of bounds** |" in text
     assert "| time | 20.0 s of 100 s | 15.0 s of 100 s |" in text
 
@@ -316,7 +316,7 @@ def test_each_layer_has_a_view_of_its_own_beside_the_colours(tmp_path: Path) -> 
     verify(path)
     views = map_views(drivers_of([recording]))
     assert list(views)[:4] == [
-        "Colour", "vegetation_m, 0 to 1.25", "wind azimuth_azimuth_deg, directions", "Mean λ in truth",
+        "Colour", "vegetation_m, 0 to 1.25", "wind azimuth_azimuth_deg, directions", "True mean of λ",
     ]  # fmt: skip
     entity = views["vegetation_m, 0 to 1.25"][0]
     assert entity == "/map/layers/vegetation_m"

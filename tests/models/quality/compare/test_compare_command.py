@@ -76,8 +76,8 @@ def test_a_table_is_printed_and_nothing_written(
         for value in (quality.classes[0].miou, quality.traversability.crps, quality.traversability.nll):
             assert f"{value:.4f}" in [cell.rstrip("*") for cell in row]
     assert err.splitlines()[-1] == "models and splits: 8/8"
-    assert "too few maps" in out
-    assert "units of the statistics: test/std 2 maps, test/hs 2 maps" in out
+    assert "no difference can be significant with so few maps: test/std, test/hs" in out
+    assert "statistical units: test/std 2 maps, test/hs 2 maps" in out
     assert "with 1 thread" in out or "threads" in out
     assert list(tmp_path.iterdir()) == []
 
@@ -226,7 +226,7 @@ def test_a_model_of_other_classes_is_compared_by_traversability_and_said_to_be(
 ) -> None:
     assert call("train", "compare", "colours", "foreign", "--data", dataset.path, "--splits", "[valid]") == 0
     out = capfd.readouterr().out
-    assert "foreign knows other classes than these maps have: it is compared by λ alone" in out
+    assert "foreign is compared by λ alone: its classes are not those of these maps" in out
     first, second = (
         line.split() for line in out.splitlines() if line.startswith("valid ") and "†" not in line
     )
@@ -250,8 +250,8 @@ def test_where_the_truth_is_unknown_no_model_is_given_the_class_table_for_it(
         if line.startswith(("valid ", "test/std ")) and "0." in line
     ]
     assert rows == [["valid", "colours"], *(["test/std", name] for name in ("colours", "oracle", "ideal"))]
-    assert "oracle and ideal are left out on valid, whose truth is unknown" in out
-    assert "RMSE λ" in " ".join(out.split()) or "RMSE E[λ] is – on valid" in out
+    assert "oracle and ideal are left out on valid: the truth is unknown there" in out
+    assert "RMSE λ" in " ".join(out.split()) or "unknown on valid: RMSE E[λ] is a dash" in out
 
 
 def test_a_model_that_is_worse_than_none_is_told_so(
@@ -263,8 +263,8 @@ def test_a_model_that_is_worse_than_none_is_told_so(
         call("train", "compare", "colours", "quantiles", "--data", dataset.path, "--splits", "[valid]") == 0
     )
     out = capfd.readouterr().out.splitlines()
-    assert "colours: warning: the model is right less often than the nearest colour on valid" in out
-    worse = "warning: the model's CRPS is higher than that of one distribution for all cells on valid"
+    assert "colours: warning: the model's accuracy is below that of the nearest colour on valid" in out
+    worse = "warning: the model's CRPS is worse than that of one distribution for all cells on valid"
     crps = {
         name: measure_split(model, dataset, "valid").traversability.crps
         for name, model in (("colours", ColourModel()), ("quantiles", Quantiles()))

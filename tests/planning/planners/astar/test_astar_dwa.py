@@ -1,4 +1,4 @@
-"""A* + DWA in closed loops, from places in which it once stood for ever."""
+"""A*+DWA in closed loops, from places in which it once stood for ever."""
 
 import math
 from dataclasses import replace

@@ -502,7 +502,7 @@ def test_what_tables_say_of_it() -> None:
     (remark,) = planner.remarks(factories.task(DifferentialDrive()))
     assert "looks 1 m ahead" in remark
     slow = CLRRT(CLRRTConfig(follower=FollowerConfig(speed_mps=1.0)))
-    said = ("CL-RRT drives at 1 m/s at most, where the robot's top speed is 3 m/s",)
+    said = ("CL-RRT drives at 1 m/s at most; the robot's top speed is 3 m/s",)
     assert slow.remarks(factories.task(Unicycle(speed_mps=(0.0, 3.0)))) == said
     assert slow.remarks(factories.task(Unicycle())) == ()
     # Backward it would be faster, but it is driven forward alone.
