@@ -124,7 +124,7 @@ print(type(load_model("stakes-v1")).__name__)
 try:
     find_checkpoint("paper-v1")
 except benchnav.ConfigError as error:
-    print(str(error).split(".")[0].replace(" ", "_"))
+    print(str(error).partition(" Copy ")[0].replace(" ", "_"))
 """
     told = subprocess.run(
         [sys.executable, "-P", "-c", look], cwd=here, check=True, capture_output=True, text=True,
@@ -135,7 +135,7 @@ except benchnav.ConfigError as error:
         *(str(site / "benchnav" / "__init__.py"), "datasets", str(inside / "datasets")),
         *(str(inside / "datasets" / f"{name}-test.h5") for name in ("paper-v1", "stakes-v1")),
         *("stakes-v1", str(inside / "checkpoints" / "stakes-v1"), "FusedModel"),
-        "Expected_the_checkpoint_paper-v1,_which_an_installed_wheel_leaves_out_for_its_size,_in_checkpoints/,_got_none",
+        "Expected_the_checkpoint_paper-v1_in_checkpoints/,_got_none:_the_wheel_leaves_it_out_for_its_size.",
     ]
 
 

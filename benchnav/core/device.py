@@ -20,9 +20,9 @@ class DeviceError(BenchnavError):
 
 def gpu_failed(said: object) -> DeviceError:
     """Tells in one line that a GPU failed, and what PyTorch said of it."""
-    line = str(said).strip().splitlines()[0]
+    line = str(said).strip().splitlines()[0].rstrip(".")
     return DeviceError(
-        f"The GPU failed: {line} Finished work is kept: give the same command again, if need be with fewer `jobs`."
+        f"The GPU failed: {line}. Finished work is kept: give the same command again, if need be with fewer `jobs`."
     )
 
 

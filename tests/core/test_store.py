@@ -173,7 +173,7 @@ def test_a_place_is_taken_by_what_is_no_output_always_and_else_unless_it_is_to_b
         refuse_taken(out, False, foreign)
     (out / "notes").touch()
     for overwrite in (False, True):
-        with pytest.raises(ConfigError, match=r"out holds notes\. Choose another"):
+        with pytest.raises(ConfigError, match=r"out, which holds notes\. Choose another"):
             refuse_taken(out, overwrite, foreign)
 
 

@@ -177,7 +177,7 @@ HERE = "tests.elsewhere.units"
 @pytest.mark.parametrize(
     ("changes", "limit_s", "said"),
     [
-        ({"planners": (f"{HERE}:Exhausted",)}, 0.0, "no memory left What was"),
+        ({"planners": (f"{HERE}:Exhausted",)}, 0.0, r"no memory left\. Finished work is kept"),
         ({"planners": ({"part": f"{HERE}:Exhausted", "options": {"at": "init"}},)}, 0.0, "no memory left"),
         ({"planners": (f"{HERE}:Exhausted",)}, 60.0, "no memory left"),
         ({"model": f"{HERE}:Large", "planners": (DWA,)}, 0.0, "device-side assert"),
@@ -193,7 +193,7 @@ def test_a_gpu_that_fails_ends_the_run_and_makes_no_rows(
 
 def test_what_a_gpu_said_comes_back_from_a_worker_as_it_is() -> None:
     failed = gpu_failed(torch.OutOfMemoryError("no memory left.\nwhatever else it says"))
-    assert str(failed).startswith("The GPU failed: no memory left. What was")
+    assert str(failed).startswith("The GPU failed: no memory left. Finished work is kept")
     assert str(pickle.loads(pickle.dumps(failed))) == str(failed)
 
 

@@ -56,7 +56,7 @@ def test_options_are_told_with_types_defaults_and_those_within() -> None:
         name="mine",
         purpose="Plans [somehow].",
         options=(
-            "count: int (has to be given)",
+            "count: int (required)",
             'mode: str = "a"',
             "limit: float | None = null",
             "follower.gain: float = 3.0",
@@ -140,7 +140,7 @@ def test_plain_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[st
     out = capsys.readouterr().out.splitlines()
     assert out == plain_lines("planner")
     at = out.index("planner mine: Plans [somehow].")
-    assert out[at + 1 : at + 3] == ["    count: int (has to be given)", '    mode: str = "a"']
+    assert out[at + 1 : at + 3] == ["    count: int (required)", '    mode: str = "a"']
     print_catalogue("risk", "robot")
     assert capsys.readouterr().out.splitlines() == [*plain_lines("risk"), *plain_lines("robot")]
     print_catalogue("")

@@ -137,7 +137,7 @@ def test_a_worker_of_other_code_or_without_the_data_is_named(
             provenance, "package_modules", lambda names: modules(names) | {"benchnav.eval.run.rollout": "0"}
         )
         with pytest.raises(
-            ConfigError, match=r"tcp://127\.0\.0\.1:\d+: .*others: benchnav\.eval\.run\.rollout"
+            ConfigError, match=r"tcp://127\.0\.0\.1:\d+: .*got changes: benchnav\.eval\.run\.rollout"
         ):
             list(run_suite(suite, tmp_path / "run", scheduler=cluster_of_two.address))
     assert not list((tmp_path / "run").glob("units/*/*"))

@@ -182,8 +182,8 @@ def test_missing_units_are_told_with_their_shards(parts: list[Path], tmp_path: P
     gone.unlink()
     count = len(list(parts[1].glob("units/*/*")))
     for given, expected in (
-        ([parts[0], parts[2]], rf"{count} units of shard 2/3, 1 unit of shard 3/3 in .*part3"),
-        (parts, r"missing: 1 unit of shard 3/3 in .*part3"),
+        ([parts[0], parts[2]], rf"got none for: {count} units of shard 2/3, 1 unit of shard 3/3 in .*part3"),
+        (parts, r"got none for: 1 unit of shard 3/3 in .*part3"),
     ):
         with pytest.raises(ConfigError, match=expected):
             list(merge_shards(given, tmp_path / "all"))
