@@ -9,7 +9,9 @@ one line on standard error and exit status 2; an interruption in status 130.
 import errno
 import inspect
 import os
+import signal
 import sys
+import threading
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -107,6 +109,8 @@ def run(
     """
     # Notices of libraries to their own developers would bury what a user has to read.
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"torch\..*")
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     asked, *words = list(sys.argv[1:] if argv is None else argv) or ["--help"]
     command = commands.get(asked)
     try:
@@ -125,7 +129,7 @@ def run(
         return 0
     except OSError as error:
         return _refuse(program, _unusable(error, command))
-    except KeyboardInterrupt as stopped:
+    except KeyboardInterrupt as stopped:  # by Ctrl-C, or by a scheduler's SIGTERM
         # A command that knows what it has kept says so by the interruption's text.
         print("; ".join([f"{program}: interrupted", *map(str, stopped.args)]), file=sys.stderr)
         return INTERRUPTED
@@ -158,7 +162,7 @@ def show_progress(steps: Iterable[tuple[int, int]], what: str) -> None:
             for done, total in steps:
                 bar.update(task, completed=done, total=total)
         return
-    tenths = 0
+    tenths = -1  # so that work which takes long says at once what it is
     for done, total in steps:
         if done * 10 // total > tenths:
             tenths = done * 10 // total
@@ -310,8 +314,9 @@ def _print_help_of(program: str, command: Command) -> int:
     parser.add_argument("--config", action="config", help=about)
     documented = {p.arg_name: p.description for p in parse(inspect.getdoc(command.function) or "").params}
     for name in command.positionals:
-        many: dict[str, Any] = {"nargs": "*"} if command.options[name].kind == list[str] else {}
-        parser.add_argument(name, type=str, help=documented.get(name), **many)
+        is_list = command.options[name].kind == list[str]
+        action = parser.add_argument(name, help=documented.get(name), nargs="*" if is_list else None)
+        action.required = not is_list  # whether an empty list will do is the function's to say
     skip: set[str | int] = set(command.positionals)
     for kind in command.settings.values():
         parser.add_class_arguments(kind, as_group=False)

@@ -198,6 +198,7 @@ def _report(folder: Path, place: Path) -> None:
     from benchnav.eval.report.write import PAGE, print_report, write_report
     from benchnav.eval.run.recordings import record_driven
 
+    _say("writing the report")
     print_report(write_report(folder, partial(record_driven, folder), place))
     print(f"report:  {place / PAGE}")
 

@@ -86,7 +86,9 @@ def compare_runs(
     shown = comparison_table(table, difference, by)
     notes = (*_about(pairs, table), *_left_out(pairs, by), *_no_partner(conditions, pairs, by), *shown.notes)
     notes += tuple(f"Different code: {line}." for line in lines)
-    notes += tuple(dict.fromkeys(line for run in runs for line in caveats(run.about)))
+    notes += tuple(
+        dict.fromkeys(line for run in runs for line in caveats(_concerning(conditions, run.about)))
+    )
     return table, replace(shown, notes=notes)
 
 
@@ -261,6 +263,13 @@ def _maps(maps: Sequence[int]) -> str:
         return f"maps {maps[0]} to {maps[-1]}"
     more = ", …" if len(maps) > _NAMED else ""
     return f"{len(maps)} maps ({', '.join(map(str, maps[:_NAMED]))}{more})"
+
+
+def _concerning(conditions: Sequence[Compared], about: Mapping[str, Any]) -> dict[str, Any]:
+    """What a run is about, of the pairs that it left out those of planners and robots that are compared."""
+    known = {name: {condition.labels[name] for condition in conditions} for name in ("planner", "robot")}
+    dropped = [pair for pair in about["dropped"] if all(pair[name] in known[name] for name in known)]
+    return {**about, "dropped": dropped}
 
 
 def _no_partner(conditions: Sequence[Compared], pairs: Sequence[Pair], by: str) -> list[str]:

@@ -71,8 +71,8 @@ def propose(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
         folder: a finished run.
 
     Returns:
-        Labels by column, of one condition or of two that differ in their risk setting alone; and `map`, `seed` and
-        `realisation`.
+        Labels by column, of one condition or of two that differ in their risk setting alone, those of the first
+        hypothesis that has such; and `map`, `seed` and `realisation`.
     """
     run = open_run(folder)
     every = [condition.labels for condition, _ in run.conditions.values()]
@@ -83,9 +83,13 @@ def propose(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
     about = Ground.load(folder / GROUND).about
     rows = read_table(folder, EPISODES)
     rows = rows[(rows[list(about)] == pd.Series(about)).all(axis=1)]
+    # Those of the first hypothesis come first.
+    tests = run.about.get("hypotheses", {}).get("tests", ())
+    asked = [condition for test in tests for condition in (test["one"], test["other"])]
+    turn = {condition: place for place, condition in enumerate(dict.fromkeys([*asked, *rows["condition"]]))}
     labels = [
         (run.conditions[row["condition"]][0].labels, bool(row["success"]))
-        for row in rows.to_dict("records")
+        for row in sorted(rows.to_dict("records"), key=lambda row: turn[row["condition"]])
         if row["risk"] != NOT_USED
     ]
     place = {name: int(about[name]) for name in ("map", "seed", "realisation")}

@@ -2,9 +2,11 @@
 
 import pickle
 import random
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,9 +32,11 @@ class Breaches:
         """Begins without a breach, and at no place."""
         self._kind, self._name, self.place = kind, name, ""
         self._found: dict[str, list[str]] = {}
+        self._places: dict[str, None] = {}
 
     def expect(self, kept: bool, breach: str) -> bool:
         """Notes a breach at `place`, unless that part of the contract was kept; gives whether it was."""
+        self._places[self.place] = None
         if not kept:
             places = self._found.setdefault(breach, [])
             if self.place and self.place not in places:
@@ -108,7 +112,10 @@ class Breaches:
         except Exception as error:
             text = " ".join(str(error).split())
             named = text if isinstance(error, BenchnavError) else f"{type(error).__name__}: {text}"
-            self.expect(False, f"Expected an answer from `{what}`, got {named}")
+            frames = traceback.extract_tb(error.__traceback__)
+            frame = [own for own in frames if "site-packages" not in own.filename][-1:] or frames[-1:]
+            where = f"({Path(frame[0].filename).name}, line {frame[0].lineno})"
+            self.expect(False, f"Expected an answer from `{what}`, got {named} {where}")
         after = dict(_leaves(given))
         changed = [name for name, leaf in before.items() if not same(leaf, after.get(name))]
         listed = ", ".join(changed[:3])
@@ -131,11 +138,14 @@ class Breaches:
         """
         if not self._found:
             return
-        lines = [f"{breach} [{', '.join(at)}]" if at else breach for breach, at in self._found.items()]
-        listed = " ".join(f"({number}) {line}" for number, line in enumerate(lines, start=1))
+        tried = sum(bool(place) for place in self._places)
+        listed = ""
+        for number, (breach, at) in enumerate(self._found.items(), start=1):
+            where = "wherever it was tried" if 1 < len(at) == tried else ", ".join(at)
+            listed += f"\n({number}) {breach}{f' [{where}]' if where else ''}"
         raise ConfigError(
             f"Expected a {self._kind} that keeps the contract of `benchnav.testing.check_{self._kind}`, got "
-            f"{self._name}, which breaks it: {listed}"
+            f"{self._name}, which breaks it:{listed}"
         )
 
 

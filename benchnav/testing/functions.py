@@ -3,6 +3,7 @@
 Letters in shapes: *B leading, S state and A action dimensions; of maps B, H×W cells, K components.
 """
 
+import itertools
 import math
 from dataclasses import replace
 from functools import partial
@@ -20,6 +21,8 @@ from benchnav.planning import risk
 from benchnav.planning.free_space import Rules
 from benchnav.planning.robots import Robot, Unicycle
 from benchnav.testing.breaches import NOTHING, Breaches, Draws, same
+
+_HELD_STEPS = 60  # in which robots that gather speed come near their top speed
 
 
 def check_robot(robot: Any, device: torch.device | str = "cpu", stands_at_zero: bool = True) -> None:
@@ -83,6 +86,14 @@ def _drive(robot: Robot, draws: Draws, stands_at_zero: bool, breaches: Breaches)
         held = not stands_at_zero or same(stood[..., :2], state[..., :2], 1e-6)
         expect(held, "Expected no way made on ground of λ = 0, got some. Say so with `stands_at_zero=False`.")
         state = moved
+    # A robot that gathers speed shows its top speed after a while, and with its actions at their bounds.
+    for corner in itertools.product(*zip(robot.action_low, robot.action_high, strict=True)):
+        action, firm = state.new_tensor(corner).expand(*draws.leading, -1), torch.ones_like(ground)
+        driven = robot.initial_state(pose).reshape(state.shape)
+        for _ in range(_HELD_STEPS):
+            before, driven = driven, robot(driven, action, firm)
+        way = torch.linalg.vector_norm((driven - before)[..., :2], dim=-1)
+        expect(bool((way <= reach).all()), "Expected no step longer than `top_speed_mps` allows, got one.")
 
 
 def check_objective(objective: Any, robot: Any = None, device: torch.device | str = "cpu") -> None:

@@ -1,5 +1,6 @@
 """How the commands parse, and what they say of mistakes: one line, status 2, in the user's words."""
 
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -353,6 +354,19 @@ def test_an_interruption_ends_with_130_and_says_what_the_command_kept(
 
     assert run("x", "Does.", {"stop": Command(stop)}, ["stop"]) == 130
     assert capsys.readouterr().err == f"x: interrupted{expected}\n"
+
+
+def test_a_schedulers_signal_to_end_is_an_interruption(capsys: pytest.CaptureFixture[str]) -> None:
+    def stop() -> None:
+        """Stop."""
+        signal.raise_signal(signal.SIGTERM)
+
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        assert run("x", "Does.", {"stop": Command(stop)}, ["stop"]) == 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert capsys.readouterr().err == "x: interrupted\n"
 
 
 class Unread:

@@ -1,6 +1,7 @@
 """The command `replay`, and what `run` says of recordings."""
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from benchnav.eval.find_episodes import propose
+from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.recording import GROUND, Ground
 from benchnav.eval.report.playback import video, web
 from benchnav.eval.report.playback.video import frame_times
@@ -92,6 +94,21 @@ def test_what_is_proposed_are_unlike_outcomes_on_the_map_where_they_differ_most(
             labels, place = propose(folder)
         assert (labels["planner"], labels["risk"]) == (["Faulty"], ["mean", "cvar:0.5"])
         assert place == {"map": 1, "seed": 0, "realisation": 0}
+    # Settings of the first hypothesis come before others.
+    faulty &= rows["map"] == 1
+    ids = {
+        risk: rows.loc[faulty & (rows["risk"] == risk), "condition"].iloc[0] for risk in ("mean", "cvar:0.5")
+    }
+    tests = [{"one": ids["cvar:0.5"], "other": ids["mean"]}]
+    with pytest.MonkeyPatch.context() as patch:
+        run = open_run(folder)
+        patch.setattr(
+            "benchnav.eval.find_episodes.open_run",
+            lambda _: replace(run, about=run.about | {"hypotheses": {"tests": tests}}),
+        )
+        patch.setattr("benchnav.eval.find_episodes.read_table", lambda *_, own=rows: own)
+        patch.setattr(Ground, "load", lambda _, own=about: SimpleNamespace(about=own))
+        assert propose(folder)[0]["risk"] == ["cvar:0.5", "mean"]
     rows["success"] = True
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("benchnav.eval.find_episodes.read_table", lambda *_: rows)

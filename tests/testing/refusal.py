@@ -12,7 +12,7 @@ from benchnav.core.errors import ConfigError
 
 
 def refusal(check: Callable[..., None], part: Any) -> str:
-    """The one line with which a check refuses a part, which may leave the global generators elsewhere."""
+    """How a check refuses a part, which may leave the global generators elsewhere: a line for each breach."""
     states = torch.random.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
     try:
         with pytest.raises(ConfigError) as caught:
@@ -21,5 +21,7 @@ def refusal(check: Callable[..., None], part: Any) -> str:
         torch.random.set_rng_state(states[0])
         np.random.set_state(states[1])  # noqa: NPY002
         random.setstate(states[2])
-    assert "\n" not in str(caught.value)
+    first, *breaches = str(caught.value).split("\n")
+    assert all(line.startswith(f"({number}) ") for number, line in enumerate(breaches, start=1))
+    assert first.endswith("which breaks it:" if breaches else ".")
     return str(caught.value)

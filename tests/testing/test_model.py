@@ -154,7 +154,7 @@ def elsewhere(mixture: TraversabilityMixture, _: Observation) -> TraversabilityM
 
 BAD = {
     "no predict": (object(), "Expected the model to be a subclass of benchnav.models.TraversabilityModel, got object"),
-    "an error": (Needy(), "ValueError: sides differ [20×37]"),
+    "an error": (Needy(), "ValueError: sides differ (test_model.py, line 119) [20×37]"),
     "no mixture": (
         changed(lambda mixture, _: mixture.weights),
         "TraversabilityDistribution of shape [3, 32, 32], got Tensor",
@@ -220,9 +220,7 @@ def test_every_breach_is_named_once_with_the_maps_it_was_found_on() -> None:
         check_model(model, shapes=((9, 9), (12, 7)))
     message = str(caught.value)
     assert message.count("`stds` ≥ 0") == message.count("each of 2 components") == 1
-    assert message.count("[9×9, 12×7]") == 2
-    assert "(1) " in message
-    assert "(2) " in message
+    assert message.count("[wherever it was tried]") == 2
 
 
 def test_components_of_one_class_are_summed_up() -> None:

@@ -54,6 +54,18 @@ class Forgetful(Unicycle):
         return super().__call__(state, action, traversability) * (1 - 1e-4 * len(self.asked))
 
 
+class Gathering(Unicycle):
+    """Gathers speed from step to step, beyond what it says."""
+
+    def initial_state(self, pose: Tensor) -> Tensor:
+        return torch.cat((pose, torch.zeros_like(pose[..., :1])), dim=-1)
+
+    def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
+        speed = 0.95 * state[..., 3:] + 0.08 * action[..., :1]  # up to 1.6 times what is commanded
+        moved = super().__call__(state[..., :3], torch.cat((speed, action[..., 1:]), dim=-1), traversability)
+        return torch.cat((moved, speed), dim=-1)
+
+
 BAD: dict[str, tuple[Any, str]] = {
     "no robot": (object(), "Expected the robot to be a subclass of benchnav.planning.Robot, got object"),
     "no time step": (having(dt_s=0.0), "Expected `dt_s` > 0 and finite, got 0.0"),
@@ -82,6 +94,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "another step": (Forgetful(), "Expected the same from `F` when asked again"),
     "a step of the batch": (moving(lambda moved, *_: moved + 0.01 * moved.mean(0)), "alone and in a batch"),
     "faster than it says": (moving(lambda m, state, *_: state + 1.2 * (m - state)), "than `top_speed_mps` allows"),
+    "faster than it says after a while": (Gathering(), "than `top_speed_mps` allows"),
     "drives on ground of 0": (
         moving(lambda m, state, action, _: torch.cat((m[..., :1] + 0.01 * action[..., :1], m[..., 1:]), -1)),
         "no way made on ground of λ = 0",

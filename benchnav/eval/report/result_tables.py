@@ -284,10 +284,14 @@ def _differences(row: Mapping[Any, Any]) -> tuple[str, ...]:
 def _comparison_notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
     pairs = "1 pair" if len(table) == 1 else f"{len(table)} pairs"
     unit = "group" if (table["n_groups"] < table["n_maps"]).any() else "map"
+    needed = f"{100 * difference:g} points need {count_range(table['maps_needed'])} maps."
+    if np.isinf(table["success_detectable"]).any():
+        needed = (
+            f"These {unit}s are too few for any difference to be significant, and to tell how many it needs."
+        )
     return (
         f"Tests by {unit}: signs of the difference (success) and ranks (T_total), p corrected over {pairs} (Holm).",
-        f"Intervals are of means and not corrected: they can exclude 0 where p > {ALPHA}. "
-        f"{100 * difference:g} points need {count_range(table['maps_needed'])} maps.",
+        f"Intervals are of means and not corrected: they can exclude 0 where p > {ALPHA}. {needed}",
     )
 
 

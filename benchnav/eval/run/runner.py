@@ -106,6 +106,8 @@ def run_work(
             store_files(folder, *files)
         done += 1
         yield done, len(own)
+    if missing:
+        say("measuring the planning time of one robot alone")
     measure_latencies(folder, {unit.condition.id for unit in own}, work.settings)
     finished, reused = _finished(in_table_order(own, conditions), origins, folder, work.reuse_code)
     if work.shard is not None:

@@ -23,12 +23,13 @@ def evaluate(
     """Measure a model on the test splits of a dataset.
 
     Args:
-        checkpoint: Checkpoint folder, or a model by NAME such as oracle, package.module:Name or path/to/file.py:Name.
+        checkpoint: Checkpoint folder, or a model by NAME such as oracle, package.module:Name, path/to/file.py:Name or
+            path/to/file.py:Name@CHECKPOINT.
         data: Path or id of a dataset.
         splits: Which splits, for example [test/std,valid]; every test split when not given.
         out: Folder for quality.json, quality.csv, quality.md and figures; none when not given.
         json: File for what quality.json holds, without the rest.
-        maps: How many maps of each split the map sheets among the figures show.
+        maps: How many maps of each split the map sheets among the figures show; all maps are measured.
         seed: Root seed of the draws that place clipped values within their atoms.
         overwrite: Replace an evaluation that is in `out`.
         device: Where the model is measured; auto takes CUDA where there is a GPU. Figures are made on the CPU.
@@ -76,6 +77,7 @@ def evaluate(
     qualities = {}
 
     def steps() -> Iterator[tuple[int, int]]:
+        yield 0, len(chosen)
         for split, quality in evaluate_model(model, dataset, chosen, seed, place):
             qualities[split] = quality
             yield len(qualities), len(chosen)

@@ -333,6 +333,7 @@ def test_labels_that_differ_have_a_column_and_notes_name_the_family() -> None:
     assert "corrected over 2 pairs (Holm)" in notes
     needed = np.unique(table["maps_needed"])
     assert f"20 points need {needed[0]} maps" in notes
+    assert "too few" not in notes
 
 
 def test_maps_too_few_to_show_any_difference_say_so() -> None:
@@ -341,6 +342,10 @@ def test_maps_too_few_to_show_any_difference_say_so() -> None:
     assert table["success_detectable"][0] > 1
     assert few["detectable"] == "–"
     assert many["detectable"] == f"{100 * table['success_detectable'][1]:.0f}"
+    (_, note) = comparison_table(table, 0.2, "risk").notes
+    assert note.endswith(
+        "These maps are too few for any difference to be significant, and to tell how many it needs."
+    )
 
 
 def test_what_test_p_is_of_stands_in_heading_and_note() -> None:

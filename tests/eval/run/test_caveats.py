@@ -66,6 +66,9 @@ def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
     compared, shown = compare_runs([folder], "", "mean", {}, 0.05)
     assert len(compared) == 3
     assert {LINE, WARNING} <= set(shown.notes)
+    _, shown = compare_runs([folder], "", "mean", {"robot": ["unicycle"]}, 0.05)
+    assert WARNING in shown.notes
+    assert LINE not in shown.notes
     # A run that is extended, and one that is repeated, still say it.
     list(run_suite(suite_on(dataset_path, robots=("unicycle",), seed=1), folder))
     assert open_run(folder).about["dropped"] == [dropped]

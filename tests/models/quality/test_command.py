@@ -39,7 +39,7 @@ def test_a_table_is_printed_and_nothing_written(
     assert f"test/hs {nearest_colour_accuracy(dataset, 'test/hs'):.4f}" in out
     assert out.splitlines()[-1] == "columns: --out FOLDER writes quality.md, which explains them"
     assert max(map(len, out.splitlines())) <= 124
-    assert err.splitlines() == ["splits: 1/2", "splits: 2/2"]
+    assert err.splitlines() == ["splits: 0/2", "splits: 1/2", "splits: 2/2"]
     assert list(tmp_path.iterdir()) == []
 
 

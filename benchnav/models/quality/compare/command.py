@@ -72,6 +72,7 @@ def compare(
     def steps() -> Iterator[tuple[int, int]]:
         from benchnav.models.quality.measure import measure_split
 
+        yield 0, len(pairs)
         for split, one in pairs:
             qualities[split, one.label] = measure_split(one.model, dataset, split, seed, place, by_map=True)
             yield len(qualities), len(pairs)
