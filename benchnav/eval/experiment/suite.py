@@ -98,7 +98,8 @@ class Labels:
     """Which conditions of a run are meant, by what its table calls them: of each column one label or several.
 
     Args:
-        planner: Planners, with commas between; all when not given. The other labels work alike.
+        planner: Planners, with commas between, such as astar_dwa; a part of a file by the name of its class. The other
+            labels work alike.
         risk: Risk settings.
         scenario: Scenarios.
         model: Models.
