@@ -185,8 +185,9 @@ class Recording(Ground):
 
     @property
     def now(self) -> int:
-        """The step that figures show, at most the last."""
-        return min(self.plan.step, len(self.traversability))
+        """The step that figures show: that of the plan; the last where none was recorded."""
+        last = len(self.traversability)
+        return min(self.plan.step, last) if self.own_plans else last
 
     def plan_at(self, time_s: float) -> DrawnPlan:
         """The last plan that was drawn by a time; an empty one where there is none."""

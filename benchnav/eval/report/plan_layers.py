@@ -29,6 +29,7 @@ _END_MARKS = {
     "immobilised": "immobilised",
     **dict.fromkeys(("timeout", "stuck", "stalled"), "out of time"),
 }
+END_CELL = "cell of the end"
 _CAME_CELLS = 2.0  # over which a path shows where it came from
 
 _LINE_WIDTH = 0.4  # of the thinnest line of a plan
@@ -117,7 +118,7 @@ def mark_end(
         resolution_m: edge length of a cell.
         scale: of the mark's size.
         ground: colours of the map, uint8 of shape [H, W, 3], that the cell is shown in over the path.
-        **style: what differs of the mark, as in `Axes.plot`.
+        **style: what differs of the mark, as in `Axes.plot`; a `label` is the cell's too.
 
     Returns:
         The cell and the mark.
@@ -130,7 +131,8 @@ def mark_end(
     if ground is not None and 0 <= row < ground.shape[0] and 0 <= column < ground.shape[1]:
         face = to_hex(ground[row, column] / 255)
     edge = [withStroke(linewidth=2 * scale, foreground="white"), Normal()]
-    (cell,) = panel.fill(*corners.T, fc=face, ec="black", lw=0.7 * scale, zorder=3.9, path_effects=edge)
+    looks_of_cell: dict[str, Any] = {"fc": face, "ec": "black", "lw": 0.7 * scale, "path_effects": edge}
+    (cell,) = panel.fill(*corners.T, **looks_of_cell, zorder=3.9, label=style.get("label", END_CELL))
     away = _beside(track, goal_m, resolution_m)
     right, up = away * (looks["ms"] / 2 + 1.5) / 72
     transform = panel.transData + ScaledTranslation(right, up, panel.figure.dpi_scale_trans)

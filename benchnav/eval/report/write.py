@@ -47,7 +47,7 @@ from benchnav.eval.stats.summary import summarise
 
 PAGE = "report.html"
 
-_MOST_PATHS = 16
+_MOST_PATHS = 8
 _EPISODE = ("condition", "seed", "realisation", "map")
 
 
@@ -223,12 +223,22 @@ def _figures(folder: Path, report: Report, record_driven: RecordDriven | None) -
             failure_figure(sheet),
         )
     recorded = read_recordings(folder)
-    chosen = _on_one_map(driven[1], recorded, record_driven) if driven else []
-    if chosen := chosen or choose_recordings(recorded, list(summary["condition"])):
-        caption = "Plans and driven paths, on the terrain and on the λ̂ that the planner was given."
-        if any(recording.field is not None for recording in chosen):
-            caption += " Below: the whole driven path on the λ field."
+    if driven and (chosen := _on_one_map(driven[1], recorded, record_driven)):
+        caption = _trajectories_in_words(chosen) + _chosen_in_words(len(chosen), len(driven[1]))
         yield "trajectories", caption, trajectory_figure(chosen)
+    elif chosen := choose_recordings(recorded, list(summary["condition"])):
+        yield "trajectories", _trajectories_in_words(chosen), trajectory_figure(chosen)
+
+
+def _trajectories_in_words(chosen: Sequence[Recording]) -> str:
+    """Says what `trajectory_figure` shows."""
+    maps = {(own.about["scenario"], own.about["map"]) for own in chosen}
+    where = " on {}, map {}".format(*maps.pop()) if len(maps) == 1 else ""
+    what = "Plans and driven paths" if any(own.own_plans for own in chosen) else "Driven paths"
+    caption = f"{what}{where}, over the terrain and over the λ̂ that the planner was given."
+    if any(own.field is not None for own in chosen):
+        caption += " Below: the whole driven path over the λ field."
+    return caption
 
 
 def _on_one_map(
@@ -244,8 +254,7 @@ def _on_one_map(
     Returns:
         At most `MOST_PANELS`, in the order of the rows; none where one cannot be made.
     """
-    turn = rows.groupby("success", sort=False).cumcount()
-    chosen = rows.assign(turn=turn).sort_values("turn", kind="stable").head(MOST_PANELS).sort_index()
+    chosen = rows.iloc[_evenly(rows, MOST_PANELS)]
     known = {tuple(str(own.about[name]) for name in _EPISODE): own for own in recorded}
     found = []
     for place, row in chosen.iterrows():
@@ -261,19 +270,31 @@ def _on_one_map(
     return found
 
 
+def _evenly(rows: pd.DataFrame, most: int) -> list[int]:
+    """Places of at most so many episodes in the order of the rows, as many that arrived as not where there are such."""
+    turn = rows.groupby("success", sort=False).cumcount().to_numpy()
+    return sorted(np.argsort(turn, kind="stable")[:most].tolist())
+
+
 def _driven(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarray]) -> tuple[str, str, Figure]:
     """The figure of whole driven paths, as from `read_driven`."""
-    about, shown = ground.about, rows.iloc[:_MOST_PATHS]
+    about, places = ground.about, _evenly(rows, _MOST_PATHS)
+    shown = rows.iloc[places]
     why = (
         "On this map outcomes differ most." if rows["success"].nunique() > 1 else "Outcomes differ on no map."
     )
     caption = (
-        f"Driven paths on {about['scenario']} {about['map']}, seed {about['seed']}, realisation "
+        f"Driven paths on {about['scenario']}, map {about['map']}, seed {about['seed']}, realisation "
         f"{about['realisation']}. {why}"
     )
-    if len(shown) < len(rows):
-        caption += f" The figure shows {len(shown)} of {len(rows)} conditions."
-    return "driven", caption, driven_figure(ground, shown, tracks[:_MOST_PATHS])
+    caption += _chosen_in_words(len(shown), len(rows))
+    return "driven", caption, driven_figure(ground, shown, [tracks[place] for place in places])
+
+
+def _chosen_in_words(shown: int, known: int) -> str:
+    """Says how conditions were chosen by `_evenly`, where not all are shown."""
+    words = f" Shown are {shown} of {known} conditions, as many that arrived as not where there are such."
+    return words if shown < known else ""
 
 
 def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:

@@ -99,6 +99,7 @@ def test_a_forest_has_a_panel_a_metric_with_points_intervals_and_margins() -> No
     assert bands[1].x0 == time.get_xlim()[0]  # of what is better the lower all below the margin is
     assert bands[1].x1 == 0.5
     assert not success.collections
+    assert [label.get_text() for label in success.get_yticklabels()] == ["2. CVaR\n− mean"]
     assert [label.get_text().split(".")[0] for label in time.get_yticklabels()] == ["1", "3"]
 
 

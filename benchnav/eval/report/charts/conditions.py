@@ -106,6 +106,9 @@ def lay_out(
         panel.grid(axis="x", color="0.9")
         if place >= len(every) - across:
             panel.set_xlabel(measures[place % columns])
+        for height in sorted(set(settings["height"]) - set(rows["height"])):
+            looks: dict[str, Any] = {"transform": panel.get_yaxis_transform(), "ha": "center", "va": "center"}
+            panel.text(0.5, height, "not run", color="0.5", size=6, **looks)
     first, _ = panels[0]
     first.set_yticks(settings["height"].tolist(), settings["name"].tolist())
     first.set_ylim(lowest + 0.7, -0.7)
@@ -231,7 +234,7 @@ def forest_figure(tests: pd.DataFrame) -> Figure:
     }
     handles: list[Artist] = [Line2D([], [], color=BLUE, label=label, **look) for label, look in looks.items()]
     if (tests["margin"] > 0).any():
-        handles.append(Patch(color=_MARGIN, label="within the margin"))
+        handles.append(Patch(color=_MARGIN, label="allowed by the margin"))
     legend_outside(figure, handles, 5)
     return figure
 
@@ -257,7 +260,7 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame) -> None:
         beside = panel.get_yaxis_transform()
         panel.text(1.01, height, p_in_words(row["p_holm"]), transform=beside, va="center")
         one, other = map(reading_names, row["names"])
-        names.append(f"{row['number']}. {one}\nless {other}")
+        names.append(f"{row['number']}. {one}\n− {other}")
     panel.set_yticks(range(len(rows)), names)
     panel.tick_params(axis="y", length=0)
     panel.grid(axis="x", color="0.93", zorder=0)

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, to_rgb, to_rgba
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from benchnav.core.figures import (
     ONE_COLUMN_IN,
@@ -34,6 +36,7 @@ from benchnav.eval.recording import GROUND, Ground, Recording
 from benchnav.eval.report.failures import FailedLine
 from benchnav.eval.report.plan_layers import (
     CLOSED,
+    END_CELL,
     IMMOBILISING,
     SOFT,
     STYLES,
@@ -103,11 +106,15 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
     figure = Figure(figsize=(width, (layers * tall + 0.2) * lines + 0.8), layout="compressed")
     stacks = stack_panels(figure, len(recordings), across, layers)
     several = [name for name in ("model", "world") if differ(one.about[name] for one in recordings)]
+    maps = [f"{one.about['scenario']}, map {one.about['map']}" for one in recordings]
     letters = int(panel_in / _LETTER_IN)
     for place, (recording, (above, below, *last)) in enumerate(zip(recordings, stacks, strict=True)):
         about, plan, now = recording.about, recording.plan, recording.now
-        heading = f"{condition_name(about, several)}, {about['scenario']} {about['map']}"
-        moment = f"t = {now * recording.dt_s:g} s; outcome: {recording.outcome}"
+        heading = condition_name(about, several) + (f", {maps[place]}" if len(set(maps)) > 1 else "")
+        has_ended = now == len(recording.traversability)
+        moment = f"{recording.outcome} after {recording.end_s:g} s"
+        if not has_ended:
+            moment = f"t = {now * recording.dt_s:g} s; {moment}"
         driven = _draw_terrain(above, recording)
         above.set_title(f"{heading}\n{moment}")
         _draw_predicted(below, recording)
@@ -116,8 +123,11 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
                 if len(plan.lines.get(name, ())):
                     panel.add_collection(plan_layer(style, plan.lines[name]))
             _mark_places(panel, recording)
-            turned = robot_marker(recording.states[now, 2])
-            mark(panel, "robot", recording.track[now], marker=turned)
+            if has_ended:
+                _mark_end(panel, recording)
+            else:
+                turned = robot_marker(recording.states[now, 2])
+                mark(panel, "robot", recording.track[now], marker=turned)
         if recording.field is not None:
             _draw_field(last[0], recording, recording.field)
         elif last:
@@ -178,17 +188,10 @@ def _draw_field(panel: Axes, recording: Recording, field: np.ndarray) -> None:
     show_map(panel, colours, recording.grid.extent_m)
     draw_edged(panel, recording.track, 1.4)
     _mark_places(panel, recording)
-    mark_end(
-        panel,
-        recording.about["outcome"],
-        recording.track,
-        recording.goal_m,
-        recording.resolution_m,
-        ground=colours,
-    )
+    _mark_end(panel, recording, ground=colours)
     if recording.immobilising.any():
         _name_ground(panel, **_HOLDS)
-    panel.set_title(f"path driven in {recording.end_s:g} s, over the λ field")
+    panel.set_title("whole path, over the λ field")
 
 
 def _mark_places(panel: Axes, recording: Recording) -> None:
@@ -196,6 +199,12 @@ def _mark_places(panel: Axes, recording: Recording) -> None:
     for name, place in (("start", recording.track[0]), ("goal", recording.goal_m)):
         mark(panel, name, place)
     frame_map(panel)
+
+
+def _mark_end(panel: Axes, recording: Recording, ground: np.ndarray | None = None) -> None:
+    """Marks how an episode ended."""
+    outcome, track = recording.about["outcome"], recording.track
+    mark_end(panel, outcome, track, recording.goal_m, recording.resolution_m, ground=ground)
 
 
 def _name_ground(panel: Axes, label: str, **look: Any) -> None:
@@ -235,8 +244,10 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
         tracks: positions of each, shape [N + 1, 2].
     """
     high, wide = ground.grid.shape
-    tall = max(3.4, min(3.8 * high / wide + 0.3, 7.0))
-    figure = Figure(figsize=(TWO_COLUMNS_IN, tall), layout="constrained")
+    # The legend stands below, a line a path.
+    width = ONE_COLUMN_IN if wide < 2 * high else TWO_COLUMNS_IN
+    tall = min(width * high / wide, 7.0) + 0.15 * (len(rows) + 4) + 0.4
+    figure = Figure(figsize=(width, tall), layout="compressed")
     panel = figure.subplots()
     show_map(panel, _backdrop(ground), ground.grid.extent_m)
     names = contender_names(rows[list(NAMING)].to_dict("records"))
@@ -247,8 +258,10 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
         label = f"{names[place]}: {outcome_in_words(row['outcome'])}, {row['end_time_s']:.0f} s"
         draw_edged(panel, track, 0.9 + 2.2 * smaller, colours[place], ls=line_style(place), label=label)
         if not row["success"]:
-            looks = {"color": colours[place], "label": ""}
-            mark(panel, end_mark(row["outcome"]), track[-1], 0.6 + smaller, **looks)
+            looks: dict[str, Any] = {"color": colours[place], "label": ""}
+            mark_end(
+                panel, row["outcome"], track, ground.goal_m, ground.resolution_m, 0.6 + 0.6 * smaller, **looks
+            )
             failed[end_mark(row["outcome"])] = None
     mark(panel, "start", tracks[0][0])
     mark(panel, "goal", ground.goal_m)
@@ -257,10 +270,12 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
     title = "terrain, faded" if ground.field is None else "λ field of the episode; lighter is higher"
     panel.set(xlabel="x [m]", ylabel="y [m]", title=title)
     frame_map(panel)
-    ends = [mark_handle(name) for name in failed]
+    ends: list[Artist] = [mark_handle(name) for name in failed]
     for handle in ends:
         handle.set_label(f"{handle.get_label()}, in the colour of its path")
-    legend_outside(figure, ends, columns=1, side="right upper")
+    if ends:
+        ends.append(Patch(fc="none", ec="black", label=END_CELL))
+    legend_outside(figure, ends, columns=1 if width == ONE_COLUMN_IN else 2)
     return figure
 
 
@@ -297,7 +312,9 @@ def failure_figure(lines: Sequence[FailedLine]) -> Figure:
             if not np.isnan(row["last_traversability"]):
                 words.append(f"observed λ = {row['last_traversability']:.2f}")
             ended = f"{outcome_in_words(row['outcome'])}, {row['end_time_s']:.0f} s"
-            panel.set_title(f"{row['scenario']} {row['map']}: {ended}\n{', '.join(words)}", fontsize="small")
+            panel.set_title(
+                f"{row['scenario']}, map {row['map']}: {ended}\n{', '.join(words)}", fontsize="small"
+            )
         count = f"({len(line.failures)} of {line.among} failures)"
         row_of_panels[0].set_ylabel(f"{line.name}\n{count}", fontsize="small")
     figure.colorbar(panels[0, 0].images[0], ax=panels, fraction=0.03, aspect=30, label="predicted λ̂")

@@ -34,6 +34,7 @@ from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.plan_layers import (
     CLOSED,
+    END_CELL,
     IMMOBILISING,
     STYLES,
     end_mark,
@@ -211,6 +212,7 @@ class Frames:
             mark_handle(name, 0.8 * _MARKS) for name in ("start", "goal", "robot", *ends)
         ]
         handles += [plan_layer(style, scale=_MARKS) for name, style in STYLES.items() if name in layers]
+        handles.append(Patch(fc="none", ec="black", label=END_CELL))
         if any(not own.free.all() for own in recordings):
             handles.append(Patch(color=CLOSED, label="not free"))
         if any(own.immobilising.any() for own in recordings):

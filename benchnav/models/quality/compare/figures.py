@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from benchnav.core.figures import (
     LINE_COLOURS,
@@ -117,7 +119,7 @@ def calibration_figure(tallies: Tallies, looks: Looks) -> Figure:
                 excess = np.concatenate([[0], np.cumsum(counts) / counts.sum()]) - levels
                 panel.plot(levels, excess, label=model, markevery=_MARKED_EVERY, **look)
     figure.supxlabel("level of the quantile")
-    figure.supylabel("share of λ under it less the level", fontsize=TITLE)
+    figure.supylabel("share of λ below it − level", fontsize=TITLE)
     _explain(figure)
     return figure
 
@@ -138,9 +140,10 @@ def sparsification_figure(tallies: Tallies, looks: Looks) -> Figure:
                 panel.plot(left_out, by_width, label=model, markevery=2 * _MARKED_EVERY, **look)
                 panel.plot(left_out, by_error, color=look["color"], lw=0.8, ls=":")
     panel.set_ylim(bottom=0)  # of all, which share it
-    figure.supxlabel("share of cells left out")
+    figure.supxlabel("share of cells left out, those of the widest intervals first")
     figure.supylabel("mean error of the rest", fontsize=TITLE)
-    _explain(figure)
+    best = Line2D([], [], color="0.4", lw=0.8, ls=":", label="largest errors first, the best order")
+    _explain(figure, [best])
     return figure
 
 
@@ -198,5 +201,7 @@ def _panels_of_splits(tallies: Tallies) -> tuple[Figure, dict[str, Axes]]:
     return figure, dict(zip(splits, panels, strict=True))
 
 
-def _explain(figure: Figure) -> None:
-    legend_outside(figure, columns=5 if figure.get_figwidth() == TWO_COLUMNS_IN else 3, side="upper center")
+def _explain(figure: Figure, handles: Sequence[Artist] = ()) -> None:
+    legend_outside(
+        figure, handles, columns=5 if figure.get_figwidth() == TWO_COLUMNS_IN else 3, side="upper center"
+    )

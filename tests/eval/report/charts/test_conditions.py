@@ -121,6 +121,19 @@ def test_one_that_is_told_λ_itself_is_named_by_its_model_and_is_not_drawn_as_bl
         assert len([line for line in panel.lines if line.get_linestyle() == "--"]) == 1
 
 
+def test_a_setting_that_a_block_lacks_is_said_not_to_have_run() -> None:
+    labels = [made.condition(), made.condition(risk="mean"), made.condition(risk="mean", scenario="hs")]
+    summary = made.summarised(made.rows(*(shares(one, 5) for one in labels)))
+    for figure in (success_figure(summary), outcome_figure(summary)):
+        names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+        heights = dict(zip(names, figure.axes[0].get_yticks(), strict=True))
+        said = {
+            panel.get_title(): [(text.get_text(), text.get_position()[1]) for text in panel.texts]
+            for panel in panels(figure)
+        }
+        assert said == {"std": [], "hs": [("not run", heights["MPPI, CVaR"])]}
+
+
 def points_by_height(panel: Axes) -> list[float]:
     marked = [line for line in panel.lines if line.get_marker() == "o"]
     return [float(line.get_xdata()[0]) for line in sorted(marked, key=lambda line: line.get_ydata()[0])]

@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,11 @@ def test_every_path_is_drawn_to_its_end_with_its_outcome() -> None:
     np.testing.assert_array_equal(lines["goal"], [[24, 15]])
     np.testing.assert_array_equal(lines["start"], track(0)[:1])
     (end,) = [line for line in panel.lines if line.get_marker() is MARKS["out of time"]["marker"]]
-    np.testing.assert_array_equal(np.ravel(end.get_data()), track(1)[-1])
+    # Beside the cell in which it ended, which is outlined.
+    (cell,) = [patch for patch in panel.patches if len(patch.get_xy()) == 5]
+    np.testing.assert_array_equal(cell.get_xy().min(axis=0), 0.5 * np.floor(track(1)[-1] / 0.5))
+    middle = cell.get_xy()[:4].mean(axis=0)
+    assert np.linalg.norm(np.ravel(end.get_data()) - middle) == pytest.approx(0.35)
     labelled = [line for line in panel.lines if " s" in line.get_label()]
     assert end.get_color() == labelled[1].get_color()
     assert len({line.get_color() for line in labelled}) == 3
@@ -79,9 +84,10 @@ def test_an_end_says_how_it_ended() -> None:
     rows = episodes({1: [False, False, False]}).assign(outcome=["immobilised", "stuck", "planner_error"])
     figure = driven_figure(ground(), rows, [track(i) for i in range(3)])
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names[-3:] == [
-        f"{name}, in the colour of its path" for name in ("immobilised", "out of time", "failed")
-    ]
+    ends = [f"{name}, in the colour of its path" for name in ("immobilised", "out of time", "failed")]
+    assert names[-4:] == [*ends, "cell of the end"]
+    assert names.count("cell of the end") == 1
+    assert [name for name in names if " s" in name] == names[:3], "paths come first"
     drawn_marks = [line.get_marker() for line in figure.axes[0].lines]
     assert all(MARKS[name]["marker"] in drawn_marks for name in ("immobilised", "out of time", "failed"))
 
@@ -145,7 +151,7 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(tmp_path: Path) -> None:
     assert driven
     name, caption, figure = write._driven(*driven)
     assert name == "driven"
-    assert "std 1, seed 0, realisation 0. On this map outcomes differ most." in caption
+    assert "std, map 1, seed 0, realisation 0. On this map outcomes differ most." in caption
     _, own, tracks = driven
     assert own["map"].tolist() == [1, 1, 1]
     for place, positions in enumerate(tracks):
@@ -166,7 +172,7 @@ def test_the_paths_are_those_of_the_maps_own_noise(seed: int, realisation: int, 
     driven = read_driven(folder, rows)
     assert driven
     _, caption, _ = write._driven(*driven)
-    assert f"std 1, seed {seed}, realisation {realisation}." in caption
+    assert f"std, map 1, seed {seed}, realisation {realisation}." in caption
     _, own, tracks = driven
     assert own["risk"].tolist() == list(RISKS)
     assert set(zip(own["seed"], own["realisation"], own["map"], strict=True)) == {(seed, realisation, 1)}
@@ -174,10 +180,23 @@ def test_the_paths_are_those_of_the_maps_own_noise(seed: int, realisation: int, 
         np.testing.assert_allclose(positions, track(place) + 1 + 5 * seed + 9 * realisation)
 
 
-def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("arrives", "wanted"),
+    [
+        (lambda place: True, [0, 1, 2, 3, 4, 5, 6, 7]),
+        (lambda place: place < 5, [0, 1, 2, 3, 5, 6, 7, 8]),
+        (lambda place: place < 9, [0, 1, 2, 3, 4, 5, 6, 9]),
+    ],
+)
+def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(
+    arrives: Callable[[int], bool], wanted: list[int], tmp_path: Path
+) -> None:
     most = write._MOST_PATHS
+    assert most == 8
     rows = made.rows(
-        made.row(made.condition(risk=f"cvar:0.{i:02}", world="stakes"), map_index)
+        made.row(
+            made.condition(risk=f"cvar:0.{i:02}", world="stakes"), map_index, 30.0 if arrives(i) else None
+        )
         for map_index in range(2)
         for i in range(most + 2)
     )
@@ -187,8 +206,14 @@ def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(tmp_
     driven = read_driven(folder, rows)
     assert driven
     _, caption, figure = write._driven(*driven)
-    assert f"Outcomes differ on no map. The figure shows {most} of {most + 2} conditions." in caption
-    assert len(figure.axes[0].lines) >= most
+    assert f" Shown are {most} of {most + 2} conditions, as many that arrived as not" in caption
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert [name.split(":")[0] for name in legend[:most]] == [f"CVaR₀.₀{'₀₁₂₃₄₅₆₇₈₉'[i]}" for i in wanted]
+    _, lines = drawn(figure)
+    for place, name in zip(wanted, legend, strict=False):
+        np.testing.assert_allclose(lines[name], track(place) + 1)
+    _, caption, _ = write._driven(driven[0], driven[1].iloc[:most], driven[2][:most])
+    assert "Shown are" not in caption
 
 
 def test_trajectories_are_of_that_map_as_many_that_arrived_as_not() -> None:

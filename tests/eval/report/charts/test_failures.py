@@ -51,8 +51,8 @@ def test_panels_say_where_when_and_why() -> None:
     panels = [panel for panel in figure.axes if panel.get_visible() and panel.get_title()]
     told = line.recordings[0].predicted[4, 2]
     assert [panel.get_title() for panel in panels] == [
-        f"hg 0: immobilised, 20 s\nλ̂ = {told:.2f}, observed λ = 0.04",
-        "hg 1: out of bounds, 21 s\noutside the map",
+        f"hg, map 0: immobilised, 20 s\nλ̂ = {told:.2f}, observed λ = 0.04",
+        "hg, map 1: out of bounds, 21 s\noutside the map",
     ]
     assert panels[0].get_ylabel() == "MPPI, mean\n(2 of 9 failures)"
     for panel, place in zip(panels, range(2), strict=True):
@@ -78,6 +78,6 @@ def test_ground_that_immobilises_a_robot_is_drawn_and_named_where_there_is_such(
     alpha = np.asarray(figure.axes[0].images[1].get_array())[..., 3]
     assert (alpha > 0).tolist() == immobilising.tolist()
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["immobilises a robot", "driven", "start", "goal", "immobilised"]
+    assert names == ["immobilises a robot", "driven", "start", "goal", "cell of the end", "immobilised"]
     plain = failure_figure([shown(rows)])
     assert "immobilises a robot" not in [text.get_text() for text in plain.legends[0].get_texts()]

@@ -80,7 +80,7 @@ def test_what_is_drawn_is_what_was_planned_and_driven_by_then() -> None:
     taken = recording()
     above, below = shown(trajectory_figure([taken]))
     now = taken.now
-    assert above.get_title() == f"MPPI, CVaR, std 0\nt = {now / 10:g} s; outcome: out of bounds"
+    assert above.get_title() == f"MPPI, CVaR\nt = {now / 10:g} s; out of bounds after {taken.end_s:g} s"
     for panel in (above, below):
         lines = [path.vertices for layer in panel.collections for path in layer.get_paths()]
         for layer in taken.plan.lines.values():
@@ -122,7 +122,7 @@ def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended()
         patch for patch in last.patches if np.isfinite(patch.get_xy()).all() and len(patch.get_xy()) == 5
     ]
     np.testing.assert_array_equal(cell.get_xy().min(axis=0), 0.5 * np.floor(taken.track[-1] / 0.5))
-    assert last.get_title() == "path driven in 17 s, over the λ field"
+    assert last.get_title() == "whole path, over the λ field"
     # Where it was by the moment of the plan is told by the panels above, and where it headed.
     heading = robot_marker(taken.states[taken.now, 2]).get_transform()
     for panel in (above, below):
@@ -178,14 +178,34 @@ def test_ground_is_not_drawn_where_λ_was_resampled() -> None:
 def test_titles_tell_models_and_worlds_apart_where_they_differ() -> None:
     def titles(*labels: dict[str, str]) -> list[str]:
         figure = trajectory_figure([recording(**one) for one in labels])
-        return [axes.get_title().split("\n")[0] for axes in shown(figure) if "outcome" in axes.get_title()]
+        return [axes.get_title().split("\n")[0] for axes in shown(figure) if " after " in axes.get_title()]
 
     blind = {"planner": "straight", "model": "–", "risk": "–"}
-    assert titles({}, blind) == ["MPPI, CVaR, std 0", "straight, std 0"]
+    assert titles({}, blind) == ["MPPI, CVaR", "straight"]
     told = {"model": "clairvoyant", "risk": "–"}
-    assert titles(told) == ["MPPI, clairvoyant, std 0"]
-    assert titles({"model": "oracle"}, told) == ["MPPI, oracle, CVaR, std 0", "MPPI, clairvoyant, std 0"]
-    assert titles({}, {"world": "stakes"}) == ["MPPI, paper, CVaR, std 0", "MPPI, stakes, CVaR, std 0"]
+    assert titles(told) == ["MPPI, clairvoyant"]
+    assert titles({"model": "oracle"}, told) == ["MPPI, oracle, CVaR", "MPPI, clairvoyant"]
+    assert titles({}, {"world": "stakes"}) == ["MPPI, paper, CVaR", "MPPI, stakes, CVaR"]
+
+
+def test_maps_stand_in_the_titles_where_they_differ() -> None:
+    figure = trajectory_figure([recording(), recording(map_index=3)])
+    titles = [axes.get_title().split("\n")[0] for axes in shown(figure) if " after " in axes.get_title()]
+    assert titles == ["MPPI, CVaR, std, map 0", "MPPI, CVaR, std, map 3"]
+
+
+def test_without_a_recorded_plan_the_whole_path_is_shown_and_how_it_ended() -> None:
+    taken = replace(held(), plans=())
+    above, below, _ = shown(figure := trajectory_figure([taken]))
+    assert above.get_title() == "MPPI, CVaR\nimmobilised after 17 s"
+    (driven,) = [layer for layer in above.collections if layer.get_array() is not None]
+    np.testing.assert_array_equal(driven.get_array(), taken.traversability)
+    assert max(len(line.get_xdata()) for line in below.lines) == 171
+    for panel in (above, below):
+        assert MARKS["immobilised"]["marker"] in [line.get_marker() for line in panel.lines]
+    names = names_in_legend(figure)
+    assert "immobilised" in names
+    assert not {"robot", "planned", "samples", "tree", "reference path"} & set(names)
 
 
 def names_in_legend(figure: Figure) -> list[str]:

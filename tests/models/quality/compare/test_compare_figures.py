@@ -89,6 +89,9 @@ def test_sparsification_shows_both_rankings_of_every_split(tallies: Tallies) -> 
         low, high = axes.get_ylim()
         assert low == 0
         assert high > max(float(np.max(line.get_ydata())) for line in axes.lines)  # type: ignore[arg-type]
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names == [*MODELS, "largest errors first, the best order"]
+    assert axes.lines[1].get_linestyle() == figure.legends[0].get_lines()[-1].get_linestyle() == ":"
 
 
 def test_severity_has_a_line_a_model_and_leaves_out_what_was_not_measured(tallies: Tallies) -> None:
