@@ -34,7 +34,7 @@ from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.mppi import MPPI
 from benchnav.planning.problem import Problem, Rules, Task, pose_problem
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 REPEATS = 31
 LEVELS = (0.3, 0.5, 0.7, 0.9, 0.95)

@@ -28,7 +28,7 @@ from benchnav.planning.objective import distance
 from benchnav.planning.planners.planner import Planner
 from benchnav.planning.problem import Rules, Task, pose_problem
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome
 
 OBJECTIVES, SCENARIOS, BUDGET_S = ("goal_distance", "travel_time"), ("std", "hg", "hs"), 100.0

@@ -24,7 +24,7 @@ from benchnav.planning.planners.mppi import MPPI, MPPIConfig
 from benchnav.planning.planners.planner import Planner
 from benchnav.planning.problem import Problem, Rules, Task, pose_problem
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 SAMPLES = (2000, 5000, 10_000, 20_000, 50_000)
 HORIZONS_S = (1, 2, 5, 10, 20)

@@ -10,7 +10,7 @@ from benchmarks.cai.task import GOAL_M, GOAL_RADIUS_M, STEPS
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.mppi import MPPI, OF_EPISODES, MPPIConfig, advance_chunk, weigh
 from benchnav.planning.problem import Problem
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 _ALWAYS = 0  # is compiled, however few samples
 

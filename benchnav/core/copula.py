@@ -41,6 +41,26 @@ def correlated_normal(
     return field[:, :height, :width].copy()
 
 
+def correlations(size: int, correlation_cells: float) -> ndarray:
+    """Correlations of a field's cells along one axis, as `correlated_normal` makes them.
+
+    Two cells are correlated by the product over both axes. From ℓ of two cells on it is exp(−d²/2ℓ²) within 10⁻³; for
+    less the kernel has few cells, and this is what they make.
+
+    Args:
+        size: number of cells along the axis.
+        correlation_cells: ℓ in cells.
+
+    Returns:
+        By distance in cells, beginning with 1 at distance 0, shape [size].
+    """
+    if correlation_cells == 0:
+        return np.eye(1, size)[0]
+    power = np.abs(np.fft.rfft(_bell(2 * size, correlation_cells))) ** 2
+    found = np.fft.irfft(power, n=2 * size)[:size]
+    return found / found[0]
+
+
 def _bell(size: int, correlation_cells: float) -> ndarray:
     """exp(−d²/ℓ²) at the distances of cells from the first one on a ring, shape [size]."""
     distance = np.minimum(np.arange(size), size - np.arange(size))

@@ -23,7 +23,7 @@ __getattr__, __dir__, __all__ = face(
             "Robot",
             "Unicycle",
         ),
-        "benchnav.planning.sensing": ("Step",),
+        "benchnav.planning.sensing.sensor": ("Step",),
         "benchnav.planning.world.simulation": ("Simulation",),
         "benchnav.planning.world.world": ("Places", "World"),
     },

@@ -8,7 +8,7 @@ from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, Plan
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Bicycle, DifferentialDrive, Robot, Unicycle
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import Places, World
 

@@ -20,7 +20,7 @@ from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.boundary import NOT_FINITE, find_fault, find_layer_faults
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem, Task, pose_problem
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
 
 _RESOLUTION_M = 0.5

@@ -3,7 +3,7 @@ import pytest
 from scipy import stats
 
 from benchnav.core import rng
-from benchnav.core.copula import correlated_normal
+from benchnav.core.copula import correlated_normal, correlations
 
 KEY = rng.stream_key(0, "noise")
 DRAWS = 3000
@@ -76,3 +76,17 @@ def test_the_largest_word_gives_no_infinite_noise(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(rng, "random_bits", lambda *_: ends)
     assert rng.uniform(KEY, np.arange(1), (2,)).tolist() == [[2.0**-54, 1 - 2.0**-53]]
     assert np.isfinite(rng.normal(KEY, np.arange(1), (2,))).all()
+
+
+@pytest.mark.parametrize("length", [0.0, 0.4, 1.0, 2.0, 3.0])
+def test_the_correlations_told_are_those_of_the_fields_that_are_drawn(length: float) -> None:
+    along = correlations(12, length)
+    field = correlated_normal(KEY, np.arange(20_000), (12, 12), length)
+    for down, across in ((0, 0), (0, 1), (1, 1), (2, 0), (0, 5), (4, 3)):
+        found = (field[:, 0, 0] * field[:, down, across]).mean()
+        assert found == pytest.approx(along[down] * along[across], abs=0.03)
+    if length >= 2:
+        np.testing.assert_allclose(along, np.exp(-(np.arange(12) ** 2) / (2 * length**2)), atol=1e-3)
+    # Of a kernel of few cells it is not the bell.
+    if length == 0.4:
+        assert along[1] == pytest.approx(2 * np.exp(-1 / 0.16) / (1 + 2 * np.exp(-2 / 0.16)), rel=1e-3)

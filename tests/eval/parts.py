@@ -15,7 +15,7 @@ from benchnav.models.base import TraversabilityModel
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 
 class Spy(Planner[Any]):

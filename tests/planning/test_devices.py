@@ -23,7 +23,7 @@ from benchnav.planning.planners.planner import Plan
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, pose_problem
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world import realisation
 from benchnav.planning.world import simulation as simulation_module
 from benchnav.planning.world import world as world_module

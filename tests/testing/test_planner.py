@@ -15,7 +15,7 @@ from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from benchnav.testing import check_planner
 from tests.testing.refusal import refusal
 

@@ -17,7 +17,7 @@ from benchnav.core.errors import BenchnavError
 from benchnav.eval.experiment.condition import Condition
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 # Starting a process, importing PyTorch and compiling are not the planner's time.
 _START_S = 120.0

@@ -23,7 +23,7 @@ from benchnav.planning.objective import distance
 from benchnav.planning.planners.boundary import Answer, act, begin, standing_actions
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome, tell_standstill
 from benchnav.planning.world.simulation import Simulation, SimulationState, end
 

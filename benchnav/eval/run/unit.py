@@ -38,7 +38,7 @@ from benchnav.models.predictor import Clairvoyant, load_model
 from benchnav.planning import risk
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem, pose_problem
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import Places

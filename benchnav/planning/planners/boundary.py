@@ -13,7 +13,7 @@ from torch import Tensor
 
 from benchnav.planning.planners.planner import LAYERS, Plan, Planner
 from benchnav.planning.problem import Problem
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 NOT_FINITE = "Expected finite actions, got some that are not."
 

@@ -36,7 +36,7 @@ from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
 from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
 from benchnav.planning.robots import Robot, component_wise, steps_in
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 # A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
 _CHUNK_STEPS = 10

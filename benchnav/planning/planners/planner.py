@@ -17,7 +17,7 @@ from torch import Tensor
 from benchnav.core.errors import expect
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import Robot
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 # What a `Plan` draws, with the dimensions of each layer between that of the episodes and (x, y).
 LAYERS = {"path": "N", "samples": "MN", "reference": "N", "tree": "EN"}

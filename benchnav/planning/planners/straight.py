@@ -12,7 +12,7 @@ from torch import Tensor
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Robot
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 # Turn commanded for a radian of heading error: rad/s of turn rate, or rad of steering.
 _TURN_GAIN = 4.0

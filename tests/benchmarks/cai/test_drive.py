@@ -11,7 +11,7 @@ from benchmarks.cai.world import GRID, draw_vegetation
 from benchnav.core import rng
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 DT_S = 0.1
 

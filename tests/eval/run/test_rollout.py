@@ -10,7 +10,7 @@ from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.planners.straight import steer_toward
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import World

@@ -13,7 +13,7 @@ from benchnav.core import rng
 from benchnav.planning.planners.mppi import advance_chunk, roll_out
 from benchnav.planning.planners.planner import rollout_path
 from benchnav.planning.problem import Problem
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import World
 from tests import factories

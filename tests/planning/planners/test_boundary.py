@@ -9,7 +9,7 @@ from benchnav.planning.planners.boundary import NOT_FINITE, Answer, act, begin, 
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from tests import factories
 
 BATCH = 3

@@ -11,7 +11,7 @@ from benchnav.planning.planners.planner import Plan, Planner, check_steers
 from benchnav.planning.planners.straight import Straight, steer_toward
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
 from tests.planning.planners.driving import drive, first, generator

@@ -31,7 +31,7 @@ from benchnav.planning.problem import (
     stage_cost,
 )
 from benchnav.planning.robots import Robot, component_wise, steps_in
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 # A chunk of the horizon compiles in seconds.
 _CHUNK_STEPS = 10

@@ -19,7 +19,7 @@ from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoi
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, check_finite
 from benchnav.planning.planners.straight import steer_toward
 from benchnav.planning.problem import Problem, Task
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 Local = TypeVar("Local")
 

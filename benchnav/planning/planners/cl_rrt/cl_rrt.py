@@ -57,7 +57,7 @@ from benchnav.planning.planners.cl_rrt.tree import Route, no_route, search
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, check_finite
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, TURN_RATE
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 
 _STALL_M = 0.25  # progress less than this in `stall_s` is none
 

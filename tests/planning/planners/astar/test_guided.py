@@ -16,7 +16,7 @@ from benchnav.planning.planners.astar.waypoint import choose_waypoint, ground_co
 from benchnav.planning.planners.planner import LocalPlanner, Plan
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, Unicycle
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
 from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda, step_at, with_start

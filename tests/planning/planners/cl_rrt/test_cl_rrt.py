@@ -21,7 +21,7 @@ from benchnav.planning.planners.planner import Plan, PlanStatus
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Robot, Unicycle
-from benchnav.planning.sensing import Step
+from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import Immobile, World

@@ -1,0 +1,1 @@
+"""What robots learn on their way: what they sense, and what a belief makes of it."""

@@ -1,0 +1,169 @@
+"""What is believed of λ: the base class of beliefs, the law of the ground that they are told, and the static one.
+
+A belief begins with a model's prediction and the law of the ground, is told what is sensed, and gives the distribution
+of λ in each cell. It is pure: what it knows is in a state that it is given and gives back.
+Letters in shapes: B episodes, H×W cells, M drawn fields.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Generic, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchnav.core.batch import Batch
+from benchnav.core.copula import correlated_normal
+from benchnav.core.distribution import TraversabilityDistribution
+from benchnav.core.errors import expect
+from benchnav.core.grid import Grid
+from benchnav.planning.sensing.sensor import Sensed
+
+State = TypeVar("State", bound=Batch)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Law:
+    """How the λ of a map's cells hangs together.
+
+    Args:
+        grid: size and resolution of the maps.
+        correlation_m: ℓ: normal scores at distance d have the correlation exp(−d²/2ℓ²); 0 where every cell is for
+            itself.
+    """
+
+    grid: Grid
+    correlation_m: float
+
+    def __post_init__(self) -> None:
+        """Refuses lengths that are none."""
+        expect(
+            0 <= self.correlation_m < float("inf"),
+            f"`correlation_m` ≥ 0 and finite, got {self.correlation_m}.",
+        )
+
+    @property
+    def correlation_cells(self) -> float:
+        """ℓ in cells."""
+        return self.correlation_m / self.grid.resolution_m
+
+
+class Belief(ABC, Generic[State]):
+    """Turns what was sensed into the distribution of λ: the base class of the parts of kind `belief`.
+
+    Attributes:
+        learns: whether `update` may change anything; one that does not is never asked to.
+    """
+
+    learns: ClassVar[bool] = True
+
+    @abstractmethod
+    def init(self, prior: TraversabilityDistribution, law: Law) -> State:
+        """What is known before anything was sensed.
+
+        Args:
+            prior: the model's prediction, shape [B, H, W].
+            law: how λ hangs together.
+        """
+
+    @abstractmethod
+    def update(self, state: State, sensed: Sensed, prior: TraversabilityDistribution | None = None) -> State:
+        """What is known when more was sensed.
+
+        Args:
+            state: what was known; it is not changed.
+            sensed: of the same episodes.
+            prior: the model's new prediction, where what it sees has changed.
+        """
+
+    @abstractmethod
+    def distribution(self, state: State) -> TraversabilityDistribution:
+        """What is believed of λ, shape [B, H, W]."""
+
+    @abstractmethod
+    def sample_fields(self, state: State, count: int, keys: Sequence[int]) -> Tensor:
+        """Draws fields of λ, whose cells hang together as what is believed has them.
+
+        Args:
+            state: what is known.
+            count: M.
+            keys: a stream key of each episode, B of them, so that its fields do not depend on the others.
+
+        Returns:
+            λ in [0, 1], shape [B, M, H, W].
+        """
+
+    def select(self, state: State, members: Tensor) -> State:
+        """Keeps some episodes, by index, int64."""
+        return state.select(members)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StaticState(Batch):
+    """What the static belief knows.
+
+    Args:
+        prior: the model's prediction, shape [B, H, W].
+        law: how λ hangs together.
+    """
+
+    prior: TraversabilityDistribution
+    law: Law
+
+
+@dataclass(frozen=True)
+class Static(Belief[StaticState]):
+    """The model's prediction; what is sensed on the way is ignored.
+
+    Args:
+        correlated: fields that are drawn have the law's correlation; else every cell is drawn for itself.
+    """
+
+    learns: ClassVar[bool] = False
+
+    correlated: bool = True
+
+    def init(self, prior: TraversabilityDistribution, law: Law) -> StaticState:
+        """Keeps the prediction."""
+        return StaticState(prior=prior, law=law)
+
+    def update(
+        self, state: StaticState, sensed: Sensed, prior: TraversabilityDistribution | None = None
+    ) -> StaticState:
+        """Takes a new prediction where there is one."""
+        return state if prior is None else StaticState(prior=prior, law=state.law)
+
+    def distribution(self, state: StaticState) -> TraversabilityDistribution:
+        """The prediction."""
+        return state.prior
+
+    def sample_fields(self, state: StaticState, count: int, keys: Sequence[int]) -> Tensor:
+        """Draws fields with the prediction's marginals."""
+        law = state.law if self.correlated else Law(grid=state.law.grid, correlation_m=0.0)
+        return fields_of(state.prior, draw_scores(law, count, keys))
+
+
+def draw_scores(law: Law, count: int, keys: Sequence[int]) -> Tensor:
+    """Draws normal scores as the world does, float64, shape [B, M, H, W].
+
+    Args:
+        law: how they hang together.
+        count: M.
+        keys: a stream key of each episode, B of them.
+    """
+    numbers, shape = np.arange(count), law.grid.shape
+    drawn = [correlated_normal(key, numbers, shape, law.correlation_cells) for key in keys]
+    return torch.from_numpy(np.stack(drawn))
+
+
+def fields_of(distribution: TraversabilityDistribution, scores: Tensor) -> Tensor:
+    """λ of the ranks that normal scores have, shape [B, M, H, W].
+
+    Args:
+        distribution: of λ, shape [B, H, W].
+        scores: shape [B, M, H, W].
+    """
+    scores = scores.to(device=distribution.device, dtype=distribution.dtype)
+    return torch.stack([distribution.from_normal(each) for each in scores.unbind(1)], dim=1)

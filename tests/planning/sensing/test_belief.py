@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from benchnav.core.errors import ConfigError
+from benchnav.planning.sensing.belief import Law, Static
+from benchnav.planning.sensing.sensor import Sensed
+from tests.planning.sensing import made
+
+LAW = made.law(10, 12, 1.5)
+KEYS = (5, 6)
+
+
+def test_static_gives_the_prediction_whatever_is_sensed() -> None:
+    prior, other = made.mixture(2, 10, 12), made.mixture(2, 10, 12, seed=1)
+    belief = Static()
+    state = belief.init(prior, LAW)
+    seen = Sensed(traversability=torch.zeros(2, 10, 12), std=torch.ones(2, 10, 12))
+    assert belief.distribution(belief.update(state, seen)) is prior
+    assert belief.distribution(belief.update(state, seen, other)) is other
+    assert not belief.learns
+    kept = belief.select(state, torch.tensor([1]))
+    assert torch.equal(belief.distribution(kept).mean(), prior.mean()[1:])
+
+
+@pytest.mark.parametrize("correlated", [True, False])
+def test_fields_have_the_marginals_and_the_laws_correlation(correlated: bool) -> None:
+    prior = made.mixture(2, 10, 12)
+    belief = Static(correlated)
+    fields = belief.sample_fields(belief.init(prior, LAW), 800, KEYS)
+    assert fields.shape == (2, 800, 10, 12)
+    for own, row, column in ((0, 0, 0), (1, 9, 11), (0, 4, 5)):
+        drawn = fields[own, :, row, column].numpy()
+        for level in (0.05, 0.3, 0.8):
+            expected = float(prior.cdf(level)[own, row, column])
+            assert (drawn <= level).mean() == pytest.approx(expected, abs=0.07)
+    rank = stats.spearmanr(fields[0, :, 4, 5], fields[0, :, 4, 6])[0]
+    # Spearman's ρ of normal numbers of correlation r is 6/π asin(r/2); atoms make it a little less.
+    expected = 6 / np.pi * np.arcsin(np.exp(-1 / 18) / 2) if correlated else 0
+    assert rank == pytest.approx(expected, abs=0.1)
+
+
+def test_an_episodes_fields_are_its_own_keys() -> None:
+    prior = made.mixture(2, 10, 12)
+    belief = Static()
+    both = belief.sample_fields(belief.init(prior, LAW), 4, KEYS)
+    one = belief.sample_fields(belief.init(prior.select(torch.tensor([1])), LAW), 4, KEYS[1:])
+    assert torch.equal(both[1:], one)
+    more = belief.sample_fields(belief.init(prior, LAW), 6, KEYS)
+    assert torch.equal(more[:, :4], both)
+
+
+def test_a_length_that_is_none_is_refused() -> None:
+    with pytest.raises(ConfigError, match="correlation_m"):
+        Law(grid=LAW.grid, correlation_m=-1.0)
