@@ -11,6 +11,7 @@ from typing import Any, Literal
 import pytest
 
 from benchnav.core.command import Command, run, show_progress, tell
+from benchnav.core.device import gpu_failed
 from benchnav.core.errors import ConfigError
 
 seen: list[Any] = []
@@ -413,3 +414,8 @@ def test_a_flag_of_a_list_that_is_given_again_adds_to_it_where_the_command_says_
 def test_of_any_other_flag_the_last_one_holds() -> None:
     assert call("work", "here", "--some", "[1,2]", "--some", "3") == 0
     assert seen[-1] == ("here", [], False, 1, 3)
+
+
+def test_what_pytorch_says_of_a_gpu_is_one_sentence_with_one_stop() -> None:
+    for said in ("no memory left.\nand more", "no memory left", "\n no memory left. \n"):
+        assert str(gpu_failed(said)).startswith("The GPU failed: no memory left. Finished work is kept")

@@ -257,6 +257,16 @@ def test_maps_of_unequally_many_draws_all_count_and_what_is_left_out_is_named(tm
     ]
 
 
+def test_pairs_that_a_run_left_out_are_told_where_both_planner_and_robot_are_compared(tmp_path: Path) -> None:
+    robot = condition()["robot"]
+    pairs = [("mppi", robot), ("mppi", "bicycle"), ("astar_dwa", robot), ("astar_dwa", "bicycle")]
+    dropped = [{"planner": planner, "robot": name, "reason": "no"} for planner, name in pairs]
+    folder = run_folder(tmp_path / "run", settings(), dropped=dropped)
+    _, shown = compare_runs([folder], "", "mean", {"planner": ("mppi",)}, 0.05)
+    told = [note for note in shown.notes if "cannot steer" in note]
+    assert told == [f"left out: planner mppi cannot steer robot {robot}"]
+
+
 def test_groups_of_maps_are_the_unit(tmp_path: Path) -> None:
     episodes = settings()
     folder = run_folder(tmp_path / "run", episodes.assign(group=episodes["map"] // 3))

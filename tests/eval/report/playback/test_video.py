@@ -185,6 +185,23 @@ def test_how_an_episode_ended_stands_beside_the_cell_where_it_ended() -> None:
     assert apart > half / 2 + end.get_markersize() / 72 * 100 / 2
 
 
+def test_the_legend_names_what_is_there() -> None:
+    taken = made.held_recording(80)
+
+    def named(*recordings: Recording) -> list[str]:
+        (legend,) = Frames(recordings)._figure.legends
+        return [text.get_text() for text in legend.get_texts()]
+
+    ground = ["not free", "immobilises a robot"]
+    assert named(taken)[:4] == ["start", "goal", "robot", "immobilised"]
+    assert named(taken)[-3:] == ["cell of the end", *ground]
+    everywhere = np.ones_like(taken.free)
+    assert named(replace(taken, free=everywhere, immobilising=~everywhere))[-1] == "cell of the end"
+    assert "planned" not in named(replace(taken, plans=()))
+    other = replace(taken, about=taken.about | {"outcome": "success", "planner": "other"})
+    assert named(taken, other)[3:5] == ["immobilised", "arrived"]
+
+
 def test_an_episode_that_ended_at_once_is_shown(tmp_path: Path) -> None:
     list(write_video([made.recording(0, plans=())], tmp_path / "a.mp4"))
     with av.open(str(tmp_path / "a.mp4")) as container:
