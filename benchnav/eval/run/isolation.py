@@ -15,6 +15,7 @@ import torch
 from benchnav.core.device import GPU_FAULTS, gpu_failed
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.experiment.condition import Condition
+from benchnav.planning.planners import boundary
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem
 from benchnav.planning.sensing.sensor import Step
@@ -70,6 +71,11 @@ class IsolatedPlanner(Planner[int]):
         action, plan, self.compiled = self._ask(limit_s, "plan", step)
         return action, plan_state + 1, plan
 
+    def revise(self, plan_state: int, problem: Problem) -> int:
+        """See `Planner`. A planner that has to begin anew does so in the child, which may take as long as `init`."""
+        self._ask(self.limit_s + _START_S, "revise", problem)
+        return plan_state
+
     def _ask(self, limit_s: float, call: str, *arguments: Any) -> Any:
         try:
             self._here.send_bytes(pickle.dumps((call, *arguments)))
@@ -96,6 +102,7 @@ def _serve(connection: Connection, condition: Condition) -> None:
     torch.set_num_threads(1)
     planner: Any = None
     plan_state: Any = None
+    generator = torch.Generator()
     while True:
         try:
             message = connection.recv_bytes()
@@ -111,6 +118,8 @@ def _serve(connection: Connection, condition: Condition) -> None:
                 generator = torch.Generator().manual_seed(seed)
                 generator.set_state(state)
                 plan_state, answer = planner.init(problem, generator), None
+            elif call == "revise":
+                plan_state, answer = boundary.revise(planner, plan_state, arguments[0], generator), None
             else:
                 action, plan_state, plan = planner.plan(arguments[0], plan_state)
                 answer = action, plan, planner.compiled

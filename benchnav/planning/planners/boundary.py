@@ -51,6 +51,23 @@ def begin(planner: Planner[Any], problem: Problem, generator: torch.Generator) -
     return planner.init(problem.clone(), generator)
 
 
+def revise(planner: Planner[Any], plan_state: Any, problem: Problem, generator: torch.Generator) -> Any:
+    """Lets a planner go on under another λ̂, on a copy of the problem; one that cannot begins anew.
+
+    Args:
+        planner: any planner; what it raises passes through.
+        plan_state: from the last answer.
+        problem: B problems that start where the robots are; not changed, whatever the planner does.
+        generator: the planner's randomness, for one that begins anew.
+
+    Returns:
+        The next plan state.
+    """
+    given = problem.clone()
+    revised = planner.revise(plan_state, given)
+    return begin(planner, problem, generator) if revised is NotImplemented else revised
+
+
 def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) -> Answer:
     """Asks a planner for the next actions, on copies, and checks what it answers.
 

@@ -7,7 +7,7 @@ S state and A action dimensions.
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any, Generic, TypeVar
 
@@ -123,6 +123,20 @@ class Planner(ABC, Generic[State]):
         """
         return NotImplemented
 
+    def revise(self, plan_state: State, problem: Problem) -> State:
+        """Goes on under another λ̂, as where more is known of the ground than before.
+
+        Args:
+            plan_state: from the last call; not changed.
+            problem: of the same episodes, which starts where the robots are now; prediction, λ̂ and free ground may be
+                others than before, all else is as it was.
+
+        Returns:
+            A plan state under the new problem; `NotImplemented`, the default, where the planner has to begin anew by
+            `init`.
+        """
+        return NotImplemented
+
     def follows(self, task: Task) -> str:
         """What it minimises in place of the task's J, in one line for tables; empty where that is J alone."""
         return ""
@@ -156,6 +170,10 @@ class LocalPlanner(Planner[State]):
     def select(self, plan_state: Any, members: Tensor) -> State:
         """Keeps some episodes; see `Planner`."""
         return plan_state.select(members)
+
+    def revise(self, plan_state: Any, problem: Problem) -> State:
+        """Keeps all but the problem; see `Planner`."""
+        return replace(plan_state, problem=problem)
 
 
 def check_finite(owner: str, settings: Any, above: tuple[str, ...], least: tuple[str, ...] = ()) -> None:

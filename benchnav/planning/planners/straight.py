@@ -75,6 +75,10 @@ class Straight(Planner[Problem]):
         line = torch.stack((step.state[:, :2], plan_state.goal_m), dim=1)
         return action, plan_state, Plan.empty(len(action), action.device, path=line)
 
+    def revise(self, plan_state: Problem, problem: Problem) -> Problem:
+        """Goes on as before; see `Planner`."""
+        return problem
+
     def select(self, plan_state: Problem, members: Tensor) -> Problem:
         """Keeps some episodes; see `Planner`."""
         return plan_state.select(members)

@@ -97,7 +97,7 @@ class Copula(Belief[CopulaState]):
     ) -> CopulaState:
         """Conditions cells near what is new on what is observed there.
 
-        A second look at a score is averaged with the first. A second look at an interval tells nothing more.
+        Looks at a score are averaged. Of looks at an interval the one with the least noise counts.
         """
         if prior is not None:
             state = _with_prior(state, prior)
@@ -170,7 +170,8 @@ def _note(state: CopulaState, sensed: Sensed) -> tuple[CopulaState, Tensor]:
     score = torch.where(weight < 1, torch.lerp(was_low, low, weight), low)
     shared = torch.where(weight < 1, (weight.sqrt() * std).clamp(min=LEAST_STD), std)
     nothing_new = ((score - was_low).abs() < _SAME_SCORE) & (shared > _SAME_STD * was_std)
-    news = torch.where(number, ~(was_number & nothing_new), ~known)
+    sharper = ~known | (~was_number & (std < was_std))
+    news = torch.where(number, ~(was_number & nothing_new), sharper)
     changed = torch.zeros_like(new)
     changed[new] = news
 

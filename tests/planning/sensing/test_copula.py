@@ -79,7 +79,7 @@ def test_ground_at_zero_is_an_interval_up_to_the_atoms_end() -> None:
     assert float(found.mean()[0, 6, 8]) < float(prior.mean()[0, 6, 8])
 
 
-def test_two_looks_with_noise_are_averaged_and_an_interval_tells_once() -> None:
+def test_two_looks_with_noise_are_averaged_and_an_interval_is_told_by_the_sharpest() -> None:
     prior = made.mixture(1, HEIGHT, WIDTH)
     once, twice = (after(Copula(), prior, *[looked({(6, 6): 0.5}, 0.4)] * n) for n in (1, 2))
     assert float(twice.noise_std[0, 6, 6]) == pytest.approx(0.4 / np.sqrt(2))
@@ -89,6 +89,9 @@ def test_two_looks_with_noise_are_averaged_and_an_interval_tells_once() -> None:
     assert float(apart.lower[0, 6, 6]) == pytest.approx(0.2 * scores[0] + 0.8 * scores[1])
     held, again = (after(Copula(), prior, *[looked({(6, 6): 0.0}, 0.4)] * n) for n in (1, 2))
     assert torch.equal(held.mean, again.mean)
+    sharp, noisy = looked({(6, 6): 0.0}, 0.01), looked({(6, 6): 0.0}, 0.8)
+    for looks in ((sharp, noisy), (noisy, sharp)):
+        torch.testing.assert_close(after(Copula(), prior, *looks).mean, after(Copula(), prior, sharp).mean)
     # A number says more than an interval, whichever comes first.
     for looks in ((0.0, 0.3), (0.3, 0.0)):
         state = after(Copula(), prior, *(looked({(6, 6): value}, 0.4) for value in looks))
@@ -130,6 +133,17 @@ def test_nothing_is_told_beyond_four_lengths() -> None:
     state = after(Copula(), prior, Sensed(traversability=found, std=torch.full_like(found, 0.01)), law=law)
     assert (state.mean != 0).nonzero()[:, 1:].min().item() == 12
     assert (state.mean != 0).nonzero()[:, 1:].max().item() == 28
+
+
+def test_the_reach_is_of_an_episodes_own_cells_whatever_others_sense() -> None:
+    law, prior = made.law(HEIGHT, WIDTH, 0.5), made.mixture(2, HEIGHT, WIDTH)
+    sensed = looked({(6, 6): 0.5}, 0.1, batch=2)
+    sensed.traversability[1, 0, 0] = sensed.traversability[1, 13, 15] = 0.4
+    both = after(Copula(), prior, sensed, law=law)
+    first = torch.tensor([0])
+    alone = after(Copula(), prior.select(first), sensed.select(first), law=law)
+    assert torch.equal(both.mean[:1] != 0, alone.mean != 0)
+    assert torch.equal(both.std[:1] != 1, alone.std != 1)
 
 
 @pytest.mark.parametrize("correlation_m", [0.0, 0.5])

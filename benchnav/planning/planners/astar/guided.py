@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from benchnav.core.batch import Batch
+from benchnav.core.batch import Batch, map_tensors
 from benchnav.planning.objective import GoalDistance, has_path_cost, toward_waypoints
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
@@ -99,8 +99,7 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
 
     def init(self, problem: Problem, generator: torch.Generator) -> GuidedState[Local]:
         """Searches the maps; see `Planner`."""
-        task = replace(problem.task, objective=toward_waypoints(problem.objective))
-        local = self.local.init(replace(problem, task=task), generator)
+        local = self.local.init(_toward_waypoints(problem), generator)
         recovery = Recovery.none(problem.start)
         return GuidedState(problem, astar.search(problem), ground_costs(problem), local, recovery)
 
@@ -123,8 +122,23 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         local = self.local.commit_action(local, action)
         return action, replace(plan_state, local=local, recovery=recovery), plan
 
+    def revise(self, plan_state: GuidedState[Local], problem: Problem) -> GuidedState[Local]:
+        """Searches maps anew whose ground has changed, and keeps the local planner's motion; see `Planner`."""
+        before, field = plan_state.problem, plan_state.field
+        changed = (problem.padded_ground != before.padded_ground).flatten(1).any(1).nonzero()[:, 0]
+        if len(changed):
+            found = astar.search(problem.select(changed))
+            field = map_tensors(field, lambda old, new: old.index_copy(0, changed, new), found)
+        local = self.local.revise(plan_state.local, _toward_waypoints(problem))
+        return replace(plan_state, problem=problem, field=field, ground=ground_costs(problem), local=local)
+
     def select(self, plan_state: GuidedState[Local], members: Tensor) -> GuidedState[Local]:
         """Keeps some episodes; see `Planner`."""
         # The local planner alone knows which of its tensors are of episodes.
         shared: GuidedState[Any] = replace(plan_state, local=None)  # type: ignore[arg-type]
         return replace(shared.select(members), local=self.local.select(plan_state.local, members))
+
+
+def _toward_waypoints(problem: Problem) -> Problem:
+    """The local planner's problem, whose objective is that of driving from way-point to way-point."""
+    return replace(problem, task=replace(problem.task, objective=toward_waypoints(problem.objective)))

@@ -228,6 +228,14 @@ class CLRRT(Planner[CLRRTState]):
         """Keeps some episodes, so that trees are grown for them alone; see `Planner`."""
         return plan_state.select(members)
 
+    def revise(self, plan_state: CLRRTState, problem: Problem) -> CLRRTState:
+        """Keeps the paths over ground that is as free as it was, and leaves the others; see `Planner`."""
+        route, before = plan_state.route, plan_state.problem
+        was, now = (own.ground_at(route.path.nan_to_num(nan=-1.0)) for own in (before, problem))
+        closed = ((was > 0) & (now < 0)).any(dim=1)
+        # At the end of its path a robot looks for another.
+        return replace(plan_state, problem=problem, edge=torch.where(closed, route.depth, plan_state.edge))
+
     def _follow(self, state: Tensor, now: CLRRTState) -> CLRRTState:
         """Moves the progress to where the robots are, on to the next edge where one is done."""
         reference = _reference(now.route, now.edge)

@@ -1,0 +1,171 @@
+"""Planners whose map changes on the way: what they keep, and what they do anew."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchnav.core import registry
+from benchnav.planning.planners import boundary
+from benchnav.planning.planners.astar import astar
+from benchnav.planning.problem import Problem
+from tests import factories
+from tests.planning.planners.driving import first, generator, step_at
+from tests.planning.planners.test_planners import NAMES, make
+
+START, GOAL = (2.0, 6.0), (13.0, 6.0)
+LEARNS = sorted(set(NAMES) - {"straight"})
+
+
+def ground() -> Tensor:
+    return torch.full((2, 24, 30), 0.85)
+
+
+def wall() -> Tensor:
+    """A wall across the straight way, which has its gap far from it; on the first of two maps alone."""
+    changed = ground()
+    changed[0, :20, 14:16] = 0.1
+    return changed
+
+
+def problem(predicted: Tensor, **changes: Any) -> Problem:
+    return factories.problem(predicted, start=START, goal=GOAL, **changes)
+
+
+def taken(planner: Any, plan_state: Any, state: Tensor, steps: int) -> list[Tensor]:
+    """Actions of some steps from a standing robot's place."""
+    actions = []
+    for _ in range(steps):
+        action, plan_state, _ = planner.plan(step_at(state), plan_state)
+        actions.append(action)
+    return actions
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_same_map_changes_no_action(name: str) -> None:
+    planner, posed = make(name), problem(ground())
+    plan_state = planner.init(posed, generator())
+    state = first(posed)
+    _, plan_state, _ = planner.plan(state, plan_state)
+    again = planner.revise(plan_state, problem(ground()))
+    for one, other in zip(
+        taken(planner, plan_state, posed.start, 3), taken(planner, again, posed.start, 3), strict=True
+    ):
+        assert torch.equal(one, other)
+
+
+def drive(planner: Any, first: Problem, then: Problem, steps: int, at: int = 5) -> Tensor:
+    """Where robots are under the true ground of the second problem, which they learn of after some steps."""
+    state, observed = first.start, torch.full_like(first.start[:, 0], torch.nan)
+    plan_state, draws = boundary.begin(planner, first, generator()), generator(1)
+    track = [state]
+    for count in range(steps):
+        if count == at:
+            plan_state = boundary.revise(planner, plan_state, replace(then, start=state), draws)
+        step = replace(step_at(state), traversability=observed, time_s=0.1 * count)
+        answer = boundary.act(planner, step, plan_state, first)
+        plan_state = answer.plan_state
+        observed = then.traversability_at(state)
+        state = first.robot(state, answer.action, observed)
+        track.append(state)
+    return torch.stack(track, 1)
+
+
+@pytest.mark.parametrize("name", sorted(set(LEARNS) - {"mppi"}))
+def test_a_wall_that_is_learnt_of_is_driven_around(name: str) -> None:
+    planner = make(name)
+    track = drive(planner, problem(ground()), problem(wall()), 350)
+    free = problem(wall()).free_at(track)[0]
+    assert bool(free.all()), "it drove into the wall"
+    assert float((track[0, -1, :2] - torch.tensor(GOAL)).norm()) < 1.2
+    assert float(track[0, :, 1].max()) > 9.5
+    # The other map is as it was.
+    assert float((track[1, :, 1] - 6).abs().max()) < 1.0
+
+
+@pytest.mark.parametrize("name", LEARNS)
+def test_a_state_is_not_changed_and_one_episode_is_not_the_others(name: str) -> None:
+    planner = make(name)
+    posed, then = problem(ground()), problem(wall())
+    plan_state = planner.init(posed, generator())
+    _, plan_state, _ = planner.plan(first(posed), plan_state)
+    kept = planner.revise(plan_state, then)
+    whole, own = taken(planner, kept, posed.start, 2), torch.tensor([1])
+    alone = taken(planner, planner.select(plan_state, own), posed.start[1:], 2)
+    # The second map did not change, so that its robot drives as before.
+    for one, other in zip(whole, alone, strict=True):
+        torch.testing.assert_close(one[1:], other, atol=1e-5, rtol=0)
+    before = taken(planner, planner.init(posed, generator()), posed.start, 1)
+    fresh = planner.init(posed, generator())
+    planner.revise(fresh, then)
+    assert torch.equal(taken(planner, fresh, posed.start, 1)[0], before[0])
+
+
+@pytest.mark.parametrize("name", ["astar_dwa", "astar_mppi"])
+def test_a_revised_search_is_the_whole_search_of_the_new_map(name: str) -> None:
+    planner, then = make(name), problem(wall())
+    plan_state = planner.init(problem(ground()), generator())
+    revised, anew = planner.revise(plan_state, then), astar.search(then)
+    assert torch.equal(revised.field.cost, anew.cost)
+    assert torch.equal(revised.field.following, anew.following)
+    assert torch.equal(revised.ground.penalty_per_m, planner.init(then, generator()).ground.penalty_per_m)
+    assert revised.local.problem.risk_map is not plan_state.local.problem.risk_map
+    assert torch.equal(revised.local.problem.risk_map, then.risk_map)
+
+
+def test_local_planners_keep_their_motion() -> None:
+    then = problem(wall())
+    for name, kept in (("astar_dwa", "velocity"), ("astar_mppi", "mean")):
+        planner, posed = make(name), problem(ground())
+        plan_state = planner.init(posed, generator())
+        for _ in range(3):
+            _, plan_state, _ = planner.plan(first(posed), plan_state)
+        revised = planner.revise(plan_state, then)
+        assert torch.equal(getattr(revised.local, kept), getattr(plan_state.local, kept))
+        assert float(getattr(revised.local, kept).abs().max()) > 0
+    planner, posed = make("mppi"), problem(ground())
+    plan_state = planner.plan(first(posed), planner.init(posed, generator()))[1]
+    revised = planner.revise(plan_state, then)
+    assert torch.equal(revised.mean, plan_state.mean)
+    assert torch.equal(revised.problem.risk_map, then.risk_map)
+
+
+def test_cl_rrt_keeps_a_path_that_is_free_and_leaves_one_that_is_no_longer() -> None:
+    planner, posed = make("cl_rrt"), problem(ground())
+    _, plan_state, _ = planner.plan(first(posed), planner.init(posed, generator()))
+    revised = planner.revise(plan_state, problem(wall()))
+    assert revised.edge.tolist() == [int(plan_state.route.depth[0]), int(plan_state.edge[1])]
+    slow = ground()
+    slow[:, :, 14:16] = 0.5
+    assert torch.equal(planner.revise(plan_state, problem(slow)).edge, plan_state.edge)
+    _, after, _ = planner.plan(step_at(posed.start), revised)
+    assert not torch.equal(after.route.path[0].nan_to_num(), plan_state.route.path[0].nan_to_num())
+    assert torch.equal(after.route.path[1].nan_to_num(), plan_state.route.path[1].nan_to_num())
+
+
+class Counts(registry.find("planner", "straight").target):  # type: ignore[misc]
+    """One that cannot revise, and counts how often it begins."""
+
+    begun = 0
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Problem:
+        type(self).begun += 1
+        self.start = problem.start.clone()
+        problem.start.zero_()
+        return problem
+
+    def revise(self, plan_state: Any, problem: Problem) -> Any:
+        return NotImplemented
+
+
+def test_a_planner_that_cannot_revise_begins_anew_where_the_robots_are() -> None:
+    planner, posed = Counts(), problem(ground())
+    plan_state = boundary.begin(planner, posed, generator())
+    moved = replace(problem(wall()), start=posed.start + 1)
+    again = boundary.revise(planner, plan_state, moved, generator())
+    assert planner.begun == 2
+    assert torch.equal(planner.start, posed.start + 1)
+    assert torch.equal(moved.start, posed.start + 1), "it wrote into what is not its own"
+    assert torch.equal(again.risk_map, wall())
