@@ -82,6 +82,20 @@ class Belief(ABC, Generic[State]):
     def distribution(self, state: State) -> TraversabilityDistribution:
         """What is believed of λ, shape [B, H, W]."""
 
+    def at(self, state: State, cells: Tensor) -> TraversabilityDistribution:
+        """What is believed of some cells, as a map of one row, [1, N].
+
+        Args:
+            state: what is known.
+            cells: which of them, bool, shape [B, H, W].
+        """
+        return self.distribution(state).at(cells)
+
+    def changed(self, before: State, after: State) -> Tensor:
+        """Cells of which something else is believed than before, bool, shape [B, H, W]; all, where none can tell."""
+        found = self.distribution(after)
+        return torch.ones(found.shape, dtype=torch.bool, device=found.device)
+
     @abstractmethod
     def sample_fields(self, state: State, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields of λ, whose cells hang together as what is believed has them.

@@ -5,8 +5,10 @@ from torch import Tensor
 
 from benchnav.core import rng
 from benchnav.core.conditioned import ConditionedDistribution
+from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.planning.sensing.belief import Law
 from benchnav.planning.sensing.copula import Copula, CopulaState
 from benchnav.planning.sensing.sensor import LEAST_STD, Contact, Moment, Probe, Sensed
@@ -24,7 +26,7 @@ def looked(values: dict[tuple[int, int], float], std: float = LEAST_STD, batch: 
     return Sensed(traversability=found, std=torch.full_like(found, std))
 
 
-def after(belief: Copula, prior: TraversabilityMixture, *looks: Sensed, law: Law = LAW) -> CopulaState:
+def after(belief: Copula, prior: TraversabilityDistribution, *looks: Sensed, law: Law = LAW) -> CopulaState:
     state = belief.init(prior, law)
     for sensed in looks:
         state = belief.update(state, sensed)
@@ -60,8 +62,8 @@ def test_scores_that_are_observed_condition_the_field_as_linear_algebra_says() -
     across = covariance(where, EVERY)
     mean = (across.T @ np.linalg.solve(inner, score)).reshape(HEIGHT, WIDTH)
     variance = 1 - (across * np.linalg.solve(inner, across)).sum(0).reshape(HEIGHT, WIDTH)
-    np.testing.assert_allclose(state.mean[0], mean, atol=2e-3)
-    np.testing.assert_allclose(state.std[0], np.sqrt(variance), atol=2e-3)
+    np.testing.assert_allclose(state.mean[0], mean, atol=6e-3)
+    np.testing.assert_allclose(state.std[0], np.sqrt(variance), atol=6e-3)
     found = Copula().distribution(state)
     assert isinstance(found, ConditionedDistribution)
     assert found.base is state.prior
@@ -79,6 +81,16 @@ def test_ground_at_zero_is_an_interval_up_to_the_atoms_end() -> None:
     assert float(found.mean()[0, 6, 8]) < float(prior.mean()[0, 6, 8])
 
 
+def test_λ_that_the_prediction_holds_impossible_is_at_its_end() -> None:
+    flat = torch.linspace(0.3, 0.7, len(LEVELS), dtype=torch.float64)[:, None, None]
+    prior = QuantileDistribution(flat.expand(1, len(LEVELS), HEIGHT, WIDTH))
+    for value, side in ((0.0, -1), (0.1, -1), (0.9, 1), (1.0, 1)):
+        state = after(Copula(), prior, looked({(6, 6): value}, 0.1))
+        assert state.mean.isfinite().all()
+        assert side * float(state.mean[0, 6, 6]) > 2
+        assert side * float(state.mean[0, 6, 8]) > 1
+
+
 def test_two_looks_with_noise_are_averaged_and_an_interval_is_told_by_the_sharpest() -> None:
     prior = made.mixture(1, HEIGHT, WIDTH)
     once, twice = (after(Copula(), prior, *[looked({(6, 6): 0.5}, 0.4)] * n) for n in (1, 2))
@@ -91,11 +103,13 @@ def test_two_looks_with_noise_are_averaged_and_an_interval_is_told_by_the_sharpe
     assert torch.equal(held.mean, again.mean)
     sharp, noisy = looked({(6, 6): 0.0}, 0.01), looked({(6, 6): 0.0}, 0.8)
     for looks in ((sharp, noisy), (noisy, sharp)):
-        torch.testing.assert_close(after(Copula(), prior, *looks).mean, after(Copula(), prior, sharp).mean)
+        wanted = after(Copula(), prior, sharp).mean
+        torch.testing.assert_close(after(Copula(), prior, *looks).mean, wanted, atol=0.006, rtol=0)
     # A number says more than an interval, whichever comes first.
     for looks in ((0.0, 0.3), (0.3, 0.0)):
         state = after(Copula(), prior, *(looked({(6, 6): value}, 0.4) for value in looks))
-        torch.testing.assert_close(state.mean, after(Copula(), prior, looked({(6, 6): 0.3}, 0.4)).mean)
+        wanted = after(Copula(), prior, looked({(6, 6): 0.3}, 0.4)).mean
+        torch.testing.assert_close(state.mean, wanted, atol=0.006, rtol=0)
 
 
 def test_the_same_look_without_noise_changes_nothing() -> None:
@@ -111,8 +125,8 @@ def test_the_order_of_looks_and_the_other_episodes_do_not_matter() -> None:
     looks = [looked({(4, 4): 0.55, (4, 5): 0.0}, 0.1), looked({(6, 6): 0.3}, 0.1), looked({(5, 9): 1.0}, 0.1)]
     first = prior.select(torch.tensor([0]))
     forward, backward = after(Copula(), first, *looks), after(Copula(), first, *looks[::-1])
-    torch.testing.assert_close(forward.mean, backward.mean, atol=5e-3, rtol=0)
-    torch.testing.assert_close(forward.std, backward.std, atol=5e-3, rtol=0)
+    torch.testing.assert_close(forward.mean, backward.mean, atol=0.012, rtol=0)
+    torch.testing.assert_close(forward.std, backward.std, atol=0.012, rtol=0)
     state = Copula().init(prior, LAW)
     for place, sensed in enumerate(looks):
         both = sensed.traversability.repeat(2, 1, 1)
@@ -131,8 +145,11 @@ def test_nothing_is_told_beyond_four_lengths() -> None:
     found = torch.full((1, 40, 40), torch.nan, dtype=torch.float64)
     found[0, 20, 20] = 0.2
     state = after(Copula(), prior, Sensed(traversability=found, std=torch.full_like(found, 0.01)), law=law)
-    assert (state.mean != 0).nonzero()[:, 1:].min().item() == 12
-    assert (state.mean != 0).nonzero()[:, 1:].max().item() == 28
+    told = (state.mean != 0).nonzero()[:, 1:] - 20
+    assert 5 <= int(told.abs().max()) <= 8
+    # Nor is anything noted that is under the least change: a correlation of 0.004 here.
+    score = float(state.lower[0, 20, 20])
+    assert float(state.mean[0, 20, 26]) == pytest.approx(score * np.exp(-36 / 8), abs=0.006)
 
 
 def test_the_reach_is_of_an_episodes_own_cells_whatever_others_sense() -> None:
@@ -231,6 +248,39 @@ def test_nine_of_ten_cells_near_the_robot_lie_in_the_90_percent_interval(sensor:
     # And the belief is narrower than the prediction.
     gain = prior.log_prob(field)[asked].mean() - belief.distribution(state).log_prob(field)[asked].mean()
     assert float(gain) < -0.05
+
+
+@pytest.mark.parametrize("base", ["mixture", "quantiles"])
+def test_of_some_cells_it_is_told_quickly_what_is_believed(base: str) -> None:
+    prior: TraversabilityDistribution = made.mixture(2, HEIGHT, WIDTH)
+    if base == "quantiles":
+        values = torch.stack([prior.quantile(level) for level in LEVELS], 1)
+        prior = QuantileDistribution(values)
+    state = Copula().init(prior, LAW)
+    for sensed in (looked({(4, 4): 0.5, (4, 7): 0.0}, 0.05, 2), looked({(9, 9): 1.0}, 0.2, 2)):
+        state = Copula().update(state, sensed)
+    cells = torch.zeros(2, HEIGHT, WIDTH, dtype=torch.bool)
+    cells[0, 3:10, 3:10] = cells[1, 8:, 5] = True
+    found, exact = Copula().at(state, cells), Copula().distribution(state).at(cells)
+    assert found.shape == exact.shape == (1, 49 + 6)
+    for measure in (
+        lambda one: one.mean(), lambda one: one.cvar(0.8), lambda one: one.cvar(0.95), lambda one: one.var(0.9),
+        lambda one: 1 / one.expected_time(0.05), lambda one: one.chance(0.1),
+    ):  # fmt: skip
+        torch.testing.assert_close(measure(found), measure(exact), atol=0.01, rtol=0)
+
+
+def test_cells_are_told_that_have_changed() -> None:
+    prior = made.mixture(2, HEIGHT, WIDTH)
+    before = Copula().init(prior, LAW)
+    sensed = looked({(6, 6): 0.2}, 0.1, 2)
+    sensed.traversability[1] = torch.nan
+    after = Copula().update(before, sensed)
+    changed = Copula().changed(before, after)
+    assert not changed[1].any()
+    assert torch.equal(changed[0], (after.mean[0] != 0) | (after.std[0] != 1))
+    assert changed[0, 6, 6]
+    assert not Copula().changed(after, Copula().update(after, sensed.select(torch.tensor([1, 1])))).any()
 
 
 @pytest.mark.parametrize("noise_std", [LEAST_STD, 0.1])
