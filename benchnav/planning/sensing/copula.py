@@ -23,7 +23,7 @@ from benchnav.core.batch import Batch
 from benchnav.core.conditioned import conditioned
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
-from benchnav.core.quantiles import LEVELS, QuantileDistribution
+from benchnav.core.quantiles import QuantileDistribution
 from benchnav.planning.sensing.belief import Belief, Law, draw_scores, fields_of
 from benchnav.planning.sensing.gaussian import Cells, Field, Observed, condition
 from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
@@ -40,8 +40,13 @@ VALUES: tuple[float, ...] = (
     *(round(0.2 + 0.02 * step, 2) for step in range(41)),
 )
 """λ between which a belief's quantiles are linear in the normal score: denser where risk is."""
+_LEVELS: tuple[float, ...] = (
+    *(round(0.0025 * step, 4) for step in range(80)),
+    *(round(0.2 + 0.02 * step, 2) for step in range(40)),
+    *(0.99, 0.995, 0.9975, 1.0),
+)
 _MOST_SCORE = 9.0  # beyond which ranks are alike
-_LAST_RANK = 3.65  # at levels 0 and 1, so that the mean of the ranks beyond the next level is right
+_LAST_RANK = 3.4  # at levels 0 and 1, so that the mean of the ranks beyond the next level is right
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +148,7 @@ class Copula(Belief[CopulaState]):
         low, high = scores.gather(1, after - 1), scores.gather(1, after)
         part = ((wanted - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1)
         found = torch.lerp(values[after - 1], values[after], part)
-        return QuantileDistribution(found.T[:, None].to(state.prior.dtype))
+        return QuantileDistribution(found.T[:, None].to(state.prior.dtype), _LEVELS)
 
     def changed(self, before: CopulaState, after: CopulaState) -> Tensor:
         """Cells whose score, or whose prediction, is another."""
@@ -181,8 +186,8 @@ def scores_of(prior: TraversabilityDistribution) -> Tensor:
 
 
 def _ranks(device: torch.device) -> Tensor:
-    """Standard normal numbers of the levels of a `QuantileDistribution`."""
-    levels = torch.tensor(LEVELS, dtype=torch.float64, device=device)
+    """Standard normal numbers of the levels of what is told of some cells."""
+    levels = torch.tensor(_LEVELS, dtype=torch.float64, device=device)
     return torch.special.ndtri(levels).clamp(-_LAST_RANK, _LAST_RANK)
 
 

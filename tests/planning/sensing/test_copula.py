@@ -267,7 +267,9 @@ def test_of_some_cells_it_is_told_quickly_what_is_believed(base: str) -> None:
         lambda one: one.mean(), lambda one: one.cvar(0.8), lambda one: one.cvar(0.95), lambda one: one.var(0.9),
         lambda one: 1 / one.expected_time(0.05), lambda one: one.chance(0.1),
     ):  # fmt: skip
-        torch.testing.assert_close(measure(found), measure(exact), atol=0.01, rtol=0)
+        torch.testing.assert_close(
+            measure(found), measure(exact), atol=0.005 if base == "mixture" else 0.01, rtol=0
+        )
 
 
 def test_cells_are_told_that_have_changed() -> None:
