@@ -13,6 +13,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
+from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, withStroke
 from matplotlib.transforms import ScaledTranslation
 
@@ -29,7 +30,6 @@ _END_MARKS = {
     "immobilised": "immobilised",
     **dict.fromkeys(("timeout", "stuck", "stalled"), "out of time"),
 }
-END_CELL = "cell of the end"
 _CAME_CELLS = 2.0  # over which a path shows where it came from
 
 _LINE_WIDTH = 0.4  # of the thinnest line of a plan
@@ -118,7 +118,7 @@ def mark_end(
         resolution_m: edge length of a cell.
         scale: of the mark's size.
         ground: colours of the map, uint8 of shape [H, W, 3], that the cell is shown in over the path.
-        **style: what differs of the mark, as in `Axes.plot`; a `label` is the cell's too.
+        **style: what differs of the mark, as in `Axes.plot`.
 
     Returns:
         The cell and the mark.
@@ -131,8 +131,7 @@ def mark_end(
     if ground is not None and 0 <= row < ground.shape[0] and 0 <= column < ground.shape[1]:
         face = to_hex(ground[row, column] / 255)
     edge = [withStroke(linewidth=2 * scale, foreground="white"), Normal()]
-    looks_of_cell: dict[str, Any] = {"fc": face, "ec": "black", "lw": 0.7 * scale, "path_effects": edge}
-    (cell,) = panel.fill(*corners.T, **looks_of_cell, zorder=3.9, label=style.get("label", END_CELL))
+    (cell,) = panel.fill(*corners.T, fc=face, ec="black", lw=0.7 * scale, zorder=3.9, path_effects=edge)
     away = _beside(track, goal_m, resolution_m)
     right, up = away * (looks["ms"] / 2 + 1.5) / 72
     transform = panel.transData + ScaledTranslation(right, up, panel.figure.dpi_scale_trans)
@@ -140,6 +139,18 @@ def mark_end(
     middle = corners.mean(axis=0)
     (drawn,) = panel.plot(*(middle + 0.7 * resolution_m * away), **looks, transform=transform, clip_on=False)
     return [cell, drawn]
+
+
+def end_cell_handle(scale: float = 1.0) -> Line2D:
+    """The entry of a legend for the cell in which an episode ended."""
+    looks: dict[str, Any] = {
+        "marker": "s",
+        "ms": 4 * scale,
+        "mfc": "none",
+        "mec": "black",
+        "mew": 0.7 * scale,
+    }
+    return Line2D([], [], ls="none", label="cell of the end", **looks)
 
 
 def _beside(track: np.ndarray, goal_m: np.ndarray, resolution_m: float) -> np.ndarray:

@@ -219,7 +219,7 @@ def _figures(folder: Path, report: Report, record_driven: RecordDriven | None) -
         yield (
             "failures" if len(sheets) == 1 else f"failures-{place}",
             f"Failures of the settings with the highest and the lowest success rate, {title}: predicted λ̂ (colour), "
-            "driven path and its end. Observed λ is the mean of the last 2 s.",
+            "driven path and its end. λ̂ is that of the cell of the end, observed λ the mean of the last 2 s.",
             failure_figure(sheet),
         )
     recorded = read_recordings(folder)

@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, to_rgb, to_rgba
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
 from benchnav.core.figures import (
     ONE_COLUMN_IN,
@@ -36,13 +35,13 @@ from benchnav.eval.recording import GROUND, Ground, Recording
 from benchnav.eval.report.failures import FailedLine
 from benchnav.eval.report.plan_layers import (
     CLOSED,
-    END_CELL,
     IMMOBILISING,
     SOFT,
     STYLES,
     draw_driven,
     draw_soft,
     driven_path,
+    end_cell_handle,
     end_mark,
     field_colours,
     mark_end,
@@ -140,7 +139,8 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
             # Broken where it is wider than the panel.
             title = (textwrap.fill(line, letters) for line in panel.get_title().splitlines())
             panel.set_title("\n".join(title), fontsize="small")
-    legend_outside(figure, columns=1 if across == 1 else 4)
+    ended = any(own.field is not None or own.now == len(own.traversability) for own in recordings)
+    legend_outside(figure, [end_cell_handle()] if ended else [], columns=1 if across == 1 else 4)
     shrink = min(1.0, 4 / figure.get_figheight())
     figure.colorbar(
         driven,
@@ -274,7 +274,7 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
     for handle in ends:
         handle.set_label(f"{handle.get_label()}, in the colour of its path")
     if ends:
-        ends.append(Patch(fc="none", ec="black", label=END_CELL))
+        ends.append(end_cell_handle())
     legend_outside(figure, ends, columns=1 if width == ONE_COLUMN_IN else 2)
     return figure
 
@@ -318,7 +318,7 @@ def failure_figure(lines: Sequence[FailedLine]) -> Figure:
         count = f"({len(line.failures)} of {line.among} failures)"
         row_of_panels[0].set_ylabel(f"{line.name}\n{count}", fontsize="small")
     figure.colorbar(panels[0, 0].images[0], ax=panels, fraction=0.03, aspect=30, label="predicted λ̂")
-    legend_outside(figure, columns=5 if across > 2 else 3)
+    legend_outside(figure, [end_cell_handle()], columns=6 if across > 2 else 3)
     return figure
 
 

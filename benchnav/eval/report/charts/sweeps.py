@@ -143,8 +143,10 @@ def curve_figure(number: str, lines: Sequence[Line], summary: pd.DataFrame) -> F
                     blind = row["model"] == NOT_USED
                     # A pattern of dashes for each setting, with more and more dots between.
                     dashes = (0, (6, 2, *(1, 1.5) * len(references)))
-                    look = references.setdefault(label, {"color": BLIND if blind else "0.2", "ls": dashes})
                     colour = BLIND if blind else colours[name]
+                    look = references.setdefault(label, {"color": colour, "ls": dashes})
+                    if look["color"] != colour:  # of several planners
+                        look["color"] = "0.2"
                     panel.axhline(scale * row[names[0]], color=colour, ls=look["ls"], lw=1, zorder=1)
                 rate, low, high = (scale * own[column] for column in names)
                 marker = MARKERS[list(colours).index(name) % len(MARKERS)]

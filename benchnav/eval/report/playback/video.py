@@ -15,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 
@@ -34,9 +35,9 @@ from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.plan_layers import (
     CLOSED,
-    END_CELL,
     IMMOBILISING,
     STYLES,
+    end_cell_handle,
     end_mark,
     field_colours,
     mark_end,
@@ -212,7 +213,9 @@ class Frames:
             mark_handle(name, 0.8 * _MARKS) for name in ("start", "goal", "robot", *ends)
         ]
         handles += [plan_layer(style, scale=_MARKS) for name, style in STYLES.items() if name in layers]
-        handles.append(Patch(fc="none", ec="black", label=END_CELL))
+        handles.append(end_cell_handle(_MARKS))
+        words = "driven" if len(recordings) == 1 else "driven, in the colour of its title"
+        handles.append(Line2D([], [], color="black", lw=_PATH, label=words))
         if any(not own.free.all() for own in recordings):
             handles.append(Patch(color=CLOSED, label="not free"))
         if any(own.immobilising.any() for own in recordings):

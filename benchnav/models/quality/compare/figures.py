@@ -119,7 +119,7 @@ def calibration_figure(tallies: Tallies, looks: Looks) -> Figure:
                 excess = np.concatenate([[0], np.cumsum(counts) / counts.sum()]) - levels
                 panel.plot(levels, excess, label=model, markevery=_MARKED_EVERY, **look)
     figure.supxlabel("level of the quantile")
-    figure.supylabel("share of λ below it − level", fontsize=TITLE)
+    figure.supylabel("share of λ below\nthe quantile − level", fontsize=TITLE)
     _explain(figure)
     return figure
 
@@ -141,7 +141,7 @@ def sparsification_figure(tallies: Tallies, looks: Looks) -> Figure:
                 panel.plot(left_out, by_error, color=look["color"], lw=0.8, ls=":")
     panel.set_ylim(bottom=0)  # of all, which share it
     figure.supxlabel("share of cells left out, those of the widest intervals first")
-    figure.supylabel("mean error of the rest", fontsize=TITLE)
+    figure.supylabel("mean |E[λ] − λ| of the rest", fontsize=TITLE)
     best = Line2D([], [], color="0.4", lw=0.8, ls=":", label="largest errors first, the best order")
     _explain(figure, [best])
     return figure

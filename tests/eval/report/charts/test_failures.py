@@ -78,6 +78,6 @@ def test_ground_that_immobilises_a_robot_is_drawn_and_named_where_there_is_such(
     alpha = np.asarray(figure.axes[0].images[1].get_array())[..., 3]
     assert (alpha > 0).tolist() == immobilising.tolist()
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["immobilises a robot", "driven", "start", "goal", "cell of the end", "immobilised"]
+    assert names == ["immobilises a robot", "driven", "start", "goal", "immobilised", "cell of the end"]
     plain = failure_figure([shown(rows)])
     assert "immobilises a robot" not in [text.get_text() for text in plain.legends[0].get_texts()]

@@ -194,12 +194,13 @@ def test_the_legend_names_what_is_there() -> None:
 
     ground = ["not free", "immobilises a robot"]
     assert named(taken)[:4] == ["start", "goal", "robot", "immobilised"]
-    assert named(taken)[-3:] == ["cell of the end", *ground]
+    assert named(taken)[-4:] == ["cell of the end", "driven", *ground]
     everywhere = np.ones_like(taken.free)
-    assert named(replace(taken, free=everywhere, immobilising=~everywhere))[-1] == "cell of the end"
+    assert named(replace(taken, free=everywhere, immobilising=~everywhere))[-1] == "driven"
     assert "planned" not in named(replace(taken, plans=()))
     other = replace(taken, about=taken.about | {"outcome": "success", "planner": "other"})
     assert named(taken, other)[3:5] == ["immobilised", "arrived"]
+    assert "driven, in the colour of its title" in named(taken, other)
 
 
 def test_an_episode_that_ended_at_once_is_shown(tmp_path: Path) -> None:
