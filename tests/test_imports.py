@@ -9,7 +9,7 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "benchnav"
 
 # The values that the folders of `planning` share, and the shells that Gymnasium is given.
-VALUES = ("free_space", "objective", "problem", "risk", "robots", "sensing")
+VALUES = ("free_space", "objective", "problem", "risk", "robots")
 PLANNING = tuple(f"planning.{name}" for name in VALUES)
 SYNTHESIS = ("datagen.synth", "datagen.recipe", "datagen.schema")
 # Whatever is known of models beside their training and their quality.
@@ -47,7 +47,8 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "models/quality": ("models.quality", *MODELS, "datagen"),
     "planning": PLANNING,
     "planning/world": (*PLANNING, "planning.world"),
-    "planning/planners": (*PLANNING, "planning.planners"),
+    "planning/sensing": ("planning.sensing",),
+    "planning/planners": (*PLANNING, "planning.sensing", "planning.planners"),
     "env": ("env", "models", "planning", "datagen"),
     "testing": ("testing", "models", "planning", "datagen"),
     "eval": ("eval", "models", "planning", "datagen"),

@@ -195,9 +195,13 @@ def _say(line: str) -> None:
 
 
 def _report(folder: Path, place: Path) -> None:
+    from benchnav.eval.folder.run_folder import EPISODES, open_run, read_table
     from benchnav.eval.report.write import PAGE, print_report, write_report
     from benchnav.eval.run.recordings import record_driven
 
+    # What is no finished run is refused before anything is said.
+    open_run(folder)
+    read_table(folder, EPISODES)
     _say("writing the report")
     print_report(write_report(folder, partial(record_driven, folder), place))
     print(f"report:  {place / PAGE}")
@@ -236,13 +240,14 @@ def _print_replay(folder: Path) -> None:
 def _failed(folder: Path) -> int:
     """Exit status of a finished run or shard: 1 where a planner or model failed, which one line says."""
     from benchnav.eval.folder.run_folder import EPISODES, ERRORS, read_table
+    from benchnav.planning.world.outcome import ERROR_OUTCOMES
 
     if not (folder / ERRORS).exists():
         return 0
     said = "warning: a planner or model failed in some episodes"
     if (folder / EPISODES).exists():  # which a shard does not have
         rows = read_table(folder, EPISODES)
-        faults = rows[rows["outcome"].isin(["planner_error", "model_error"])]
+        faults = rows[rows["outcome"].isin(ERROR_OUTCOMES)]
         counts = faults["outcome"].value_counts()
         counted = " and ".join(f"{count} {kind}" for kind, count in counts.items())
         first = faults["error"].iloc[0]

@@ -44,6 +44,7 @@ from benchnav.eval.report.words import NOT_USED, joined, maps_in_words, unit_of_
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
 from benchnav.eval.stats.summary import summarise
+from benchnav.planning.world.outcome import ERROR_OUTCOMES
 
 PAGE = "report.html"
 
@@ -118,7 +119,7 @@ def read_report(folder: Path, record_driven: RecordDriven | None = None) -> Repo
         explored = {f"Exploratory: {title}": sentences for title, sentences in said.items()}
         said = hypothesis_findings(tests, about, unit_of_statistics(summary)) | explored
     warnings = caveats(about)
-    if count := summary[["planner_error_count", "model_error_count"]].to_numpy().sum():
+    if count := summary[[f"{name}_count" for name in ERROR_OUTCOMES]].to_numpy().sum():
         episodes_in_words = "1 episode" if count == 1 else f"{count} episodes"
         warnings.append(f"warning: a planner or model failed in {episodes_in_words}; see {folder / ERRORS}")
     if sheets.left_out:

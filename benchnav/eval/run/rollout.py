@@ -19,8 +19,9 @@ from torch import Tensor
 from benchnav.core.device import GPU_FAULTS, DeviceError, gpu_failed
 from benchnav.core.errors import BenchnavError
 from benchnav.core.settings import one_line
+from benchnav.eval.run.knowledge import Knowledge, KnowledgeError, Learning
 from benchnav.planning.objective import distance
-from benchnav.planning.planners.boundary import Answer, act, begin, standing_actions
+from benchnav.planning.planners.boundary import Answer, act, begin, revise, standing_actions
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem
 from benchnav.planning.sensing.sensor import Step
@@ -47,6 +48,8 @@ class Episodes:
         begin_s: wall time of what the planner prepared for the whole batch.
         planning_s: wall time of each step's plan, shape [N].
         planned: how many episodes it was for, int64, shape [N].
+        revisions: how often each episode's map changed on the way, int64, shape [B].
+        learning_s: wall time of what the robots learnt, all steps together.
         errors: one line for each episode that ended by a fault of its planner, empty for the others, B of
             them.
         traceback: where the planner raised; empty where it did not.
@@ -61,6 +64,8 @@ class Episodes:
     begin_s: float
     planning_s: Tensor
     planned: Tensor
+    revisions: Tensor
+    learning_s: float
     errors: tuple[str, ...]
     traceback: str = ""
 
@@ -109,6 +114,7 @@ class _Log:
         none = start.state.new_zeros(len(start.state), 0)
         self._steps = [[none[..., None].expand(-1, 0, len(problem.robot.action_low)), none, none, none]]
         self.clock = Clock(start.state.device)  # what is prepared, then each plan
+        self.learning = Clock(start.state.device)
         self.planned: list[int] = []
         self._reasons: list[str] = []
         # The reason of each episode, by its place in the list.
@@ -127,7 +133,7 @@ class _Log:
         self._steps.append([value.unsqueeze(1) for value in kept])
         self.states.append(after.state)
 
-    def episodes(self, now: SimulationState, traceback_: str) -> Episodes:
+    def episodes(self, now: SimulationState, traceback_: str, knowledge: Knowledge | None) -> Episodes:
         track, taken = torch.stack(self.states, dim=1), len(self._steps) - 1
         actions, met, driven, turned = (torch.cat(values, dim=1) for values in zip(*self._steps, strict=True))
         seconds = self.clock.seconds()
@@ -142,6 +148,8 @@ class _Log:
             # A planner that raised has no step for its last plan.
             planning_s=torch.tensor(seconds[1 : taken + 1], dtype=torch.float64),
             planned=torch.tensor(self.planned[:taken]),
+            revisions=torch.zeros_like(now.step).cpu() if knowledge is None else knowledge.revisions.cpu(),
+            learning_s=sum(self.learning.seconds()),
             errors=tuple("" if place < 0 else self._reasons[place] for place in self._fault.tolist()),
             traceback=traceback_,
         )
@@ -155,6 +163,7 @@ def run_episodes(
     watch: Watcher | None = None,
     watch_every: int = 1,
     enough: Callable[[int], bool] = lambda step: False,
+    learning: Learning | None = None,
 ) -> Episodes:
     """Runs a batch of episodes to the end of the last.
 
@@ -170,6 +179,8 @@ def run_episodes(
         watch_every: of so many steps one is watched, from the first on.
         enough: is asked before each step, by its number, whether to leave it there; episodes that still run are then
             left running.
+        learning: how the robots learn on their way, whose planner then goes on under what they know; None where they
+            learn nothing.
 
     Returns:
         What happened.
@@ -182,8 +193,10 @@ def run_episodes(
     log = _Log(now, problem)
     observed = torch.full_like(now.state[:, 0], torch.nan)
     look_every = 1 if observed.device.type == "cpu" else _LOOK_EVERY
-    trace = ""
+    trace, knowledge = "", None
     try:
+        with log.learning.timed():
+            knowledge = None if learning is None else Knowledge(learning, problem)
         with log.clock.timed():
             plan_state = begin(planner, problem, generator)
         batch = _Batch(planner, problem, plan_state)
@@ -194,10 +207,18 @@ def run_episodes(
                 running = now.running.cpu()
                 if not bool(running.any()):
                     break
-                batch.drop_ended(running)
+                left = batch.drop_ended(running)
+                if knowledge is not None and left is not None:
+                    knowledge.keep(left)
+            revised = None
+            if knowledge is not None:
+                with log.learning.timed():
+                    revised = knowledge.learn(count, batch.part_of(now.state), batch.part_of(now.running))
             watched = watch is not None and count % watch_every == 0
             step = Step(state=now.state, traversability=observed, time_s=count * problem.dt_s, draw=watched)
             with log.clock.timed():
+                if revised is not None:
+                    batch.revise(revised, generator)
                 answer = batch.act(step)
             log.planned.append(len(batch.members))
             if watched and watch is not None:
@@ -215,8 +236,9 @@ def run_episodes(
     except (Exception, SystemExit) as error:
         trace = traceback.format_exc() if bool(now.running.any()) else ""
         log.blame(now.running, fault(error))
-        now = end(now, now.running, Outcome.PLANNER_ERROR)
-    return log.episodes(now, trace)
+        outcome = error.outcome if isinstance(error, KnowledgeError) else Outcome.PLANNER_ERROR
+        now = end(now, now.running, outcome)
+    return log.episodes(now, trace, knowledge)
 
 
 class _Batch:
@@ -233,21 +255,34 @@ class _Batch:
         self._planner, self._whole, self._part, self._state = planner, problem, problem, plan_state
         self._index = self.members.to(problem.start.device)
 
-    def drop_ended(self, running: Tensor) -> None:
+    def drop_ended(self, running: Tensor) -> Tensor | None:
         """Lets ended episodes leave, where the planner can do without them and a quarter has ended.
 
         Args:
             running: which episodes go on, bool on the CPU, shape [B].
+
+        Returns:
+            Places of those that stay among those that there were, int64; None where none has left.
         """
         left = running[self.members].nonzero()[:, 0]
         if len(left) > _FULL * len(self.members):
-            return
-        state = self._planner.select(self._state, left.to(self._index.device))
+            return None
+        places = left.to(self._index.device)
+        state = self._planner.select(self._state, places)
         if state is NotImplemented:
-            return
+            return None
         self._state, self.members = state, self.members[left]
         self._index = self.members.to(self._index.device)
-        self._part = self._whole.select(self._index)
+        self._part = self._part.select(places)
+        return places
+
+    def part_of(self, values: Tensor) -> Tensor:
+        """Of values of all episodes, [B, ...], those of the ones that are left."""
+        return values[self._index]
+
+    def revise(self, problem: Problem, generator: torch.Generator) -> None:
+        """Tells the planner of another problem, of the episodes that are left."""
+        self._state, self._part = revise(self._planner, self._state, problem, generator), problem
 
     def act(self, step: Step) -> Answer:
         """Asks the planner, for the episodes that are left."""

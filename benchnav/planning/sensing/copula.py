@@ -89,7 +89,7 @@ class Copula(Belief[CopulaState]):
 
     Args:
         correlation_m: ℓ that is believed; that of the world where it is not given, which is privileged knowledge.
-        window: most observations that an update looks at, those nearest to what is new.
+        window: most observations that an update looks at, those nearest to what is new; more where more is new.
     """
 
     correlation_m: float | None = None
@@ -259,7 +259,7 @@ def _updated(state: CopulaState, changed: Tensor, window: int) -> CopulaState:
     shape, device = state.law.grid.shape, state.mean.device
     field = Field.of(shape, state.law.correlation_cells, device)
     first, last = _bounds(changed)
-    cells, there = _nearest(state.observed, first, last, window)
+    cells, there = _nearest(state.observed, changed, first, last, window)
     member = torch.arange(len(changed), device=device)[:, None]
 
     def of(values: Tensor, empty: float) -> Tensor:
@@ -309,16 +309,19 @@ def _bounds(changed: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack((top, left), 1), torch.stack((bottom, right), 1)
 
 
-def _nearest(observed: Tensor, first: Tensor, last: Tensor, window: int) -> tuple[Cells, Tensor]:
-    """The observed cells nearest to a rectangle, and which of them are there, bool, shape [B, N]."""
-    count = min(window, int(observed.flatten(1).sum(1).max()))
+def _nearest(
+    observed: Tensor, changed: Tensor, first: Tensor, last: Tensor, window: int
+) -> tuple[Cells, Tensor]:
+    """What has changed and the observed cells nearest to it, and which of them are there, bool, shape [B, N]."""
+    new, known = (int(cells.flatten(1).sum(1).max()) for cells in (changed, observed))
+    count = min(max(window, new), known)
     away = [
         (torch.maximum(low[:, None] - at, at - high[:, None])).clamp(min=0)
         for low, high, size in zip(first.T, last.T, observed.shape[1:], strict=True)
         for at in (torch.arange(size, device=observed.device),)
     ]
     distance = (away[0].square()[:, :, None] + away[1].square()[:, None]).double()
-    distance = torch.where(observed, distance, torch.inf).flatten(1)
+    distance = torch.where(changed, -1.0, torch.where(observed, distance, torch.inf)).flatten(1)
     # Of equal distances the first cell goes first, on every machine.
     place = distance.argsort(dim=1, stable=True)[:, :count]
     width = observed.shape[2]

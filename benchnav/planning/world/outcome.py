@@ -27,8 +27,12 @@ class Outcome(IntEnum):
     PLANNER_ERROR = 7  # the planner raised, ran out of time, or returned what no robot can do
     MODEL_ERROR = 8  # the model or the risk measure raised, or gave no distribution
     IMMOBILISED = 9  # on ground that immobilises a robot, for as long as the world allows
+    SENSOR_ERROR = 10  # the sensor raised, or gave what is none
+    BELIEF_ERROR = 11  # the belief raised, or gave what is none
 
 
+# Which a fault of some code is to blame for.
+ERROR_OUTCOMES = ("planner_error", "model_error", "sensor_error", "belief_error")
 FAILURES = tuple(o for o in Outcome if o not in (Outcome.RUNNING, Outcome.SUCCESS))
 
 

@@ -171,8 +171,9 @@ def test_a_shard_without_units_is_not_needed(suite: Suite, tmp_path: Path) -> No
         assert steps in ([], [(0, 1), (1, 1)])
     full = [folder for folder in folders if (folder / "units").exists()]
     assert len(full) == 1
-    (line,) = said
+    (line,) = [one for one in said if "measuring" not in one]
     assert line.endswith(" holds none of the 1 units")
+    assert len(said) == 2
     list(merge_shards(full, tmp_path / "all"))
     assert len(pd.read_parquet(tmp_path / "all" / "episodes.parquet")) == 2
 

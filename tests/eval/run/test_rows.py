@@ -34,6 +34,8 @@ def made(**changes: object) -> tuple:  # type: ignore[type-arg]
         begin_s=0.6,
         planning_s=torch.tensor([1.0, 0.2, 0.4, 0.1], dtype=torch.float64),
         planned=torch.tensor([2, 2, 1, 1]),
+        revisions=torch.tensor([0, 3]),
+        learning_s=0.5,
         errors=("", "late"),
     )
     return problem, episodes

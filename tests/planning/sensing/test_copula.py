@@ -187,6 +187,16 @@ def test_a_window_looks_at_what_is_near_and_loses_little() -> None:
     ).abs().max()
 
 
+def test_a_look_at_more_cells_than_the_window_tells_of_all() -> None:
+    prior = made.mixture(1, HEIGHT, WIDTH)
+    field = prior.from_normal(made.scores(LAW, 1))
+    sensed = Sensed(traversability=field, std=torch.full_like(field, 0.1))
+    state = after(Copula(window=16), prior, sensed)
+    assert (state.std < 0.5).all()
+    held = field < 0.02
+    assert float(Copula().distribution(state).mean()[held].max()) < 0.1
+
+
 def test_another_prediction_is_conditioned_on_the_same_λ() -> None:
     prior, other = made.mixture(1, HEIGHT, WIDTH), made.mixture(1, HEIGHT, WIDTH, seed=3)
     looks = [looked({(4, 4): 0.5, (6, 6): 0.0}, 0.1), looked({(10, 12): 0.4}, 0.1)]

@@ -44,6 +44,8 @@ OUTCOME_COLOURS = {
     "planner_failure": GREEN,
     "planner_error": "#000000",
     "model_error": "#7F7F7F",
+    "sensor_error": "#4D4D4D",
+    "belief_error": "#A6A6A6",
 }
 SUCCESS_COLOUR = "#E4E4E4"
 # In white, so that outcomes of one lightness differ in grey.
@@ -56,6 +58,8 @@ OUTCOME_HATCHES = {
     "planner_failure": "-----",
     "planner_error": "",
     "model_error": "\\\\\\\\\\",
+    "sensor_error": "ooo",
+    "belief_error": "+++++",
 }
 
 _ROW_IN, _GAP_ROWS = 0.145, 0.6

@@ -1,0 +1,357 @@
+"""Robots that learn on their way: what they are told, when, and what that changes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchnav.core import rng
+from benchnav.core.distribution import TraversabilityDistribution
+from benchnav.core.errors import ConfigError
+from benchnav.eval.run.knowledge import Knowledge, KnowledgeError, Learning
+from benchnav.eval.run.rollout import Episodes, run_episodes
+from benchnav.planning import risk
+from benchnav.planning.free_space import FreeSpace, Rules, cells_at_goal
+from benchnav.planning.objective import TravelTime
+from benchnav.planning.planners.planner import Planner
+from benchnav.planning.problem import Problem, Task, pose_problem
+from benchnav.planning.robots import Unicycle
+from benchnav.planning.sensing.belief import Belief, Law, Static, StaticState
+from benchnav.planning.sensing.copula import Copula
+from benchnav.planning.sensing.sensor import Contact, Moment, Probe, Sensed, Sensor
+from benchnav.planning.world.outcome import Outcome
+from benchnav.planning.world.realisation import joined
+from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.world import Immobile, Places, World
+from tests.planning.planners.driving import generator
+from tests.planning.planners.test_planners import NAMES, make
+from tests.planning.sensing import made
+
+BATCH, SIZE = 8, 24
+IMMOBILE = Immobile()
+WORLD = World(noise="stored", immobile=IMMOBILE, time_budget_s=24.0)
+RULES = Rules(free_space=FreeSpace(by="mean", above=0.1), min_traversability=0.05)
+LAW = made.law(SIZE, SIZE, 1.5)
+KEYS = tuple(range(BATCH))
+SHIPPED = sorted(set(NAMES) - {"straight"})
+
+
+def measure(distribution: TraversabilityDistribution) -> Tensor:
+    return risk.expected_time(distribution, 0.05)
+
+
+@dataclass
+class Drives:
+    """A batch of episodes on ground whose soft spots no map shows."""
+
+    problem: Problem
+    simulation: Simulation
+    learning: Learning
+
+    def run(self, planner: Any, learning: Learning | None, **options: Any) -> Episodes:
+        return run_episodes(planner, self.problem, self.simulation, generator(), learning=learning, **options)
+
+
+def drives(seed: int = 0, **changes: Any) -> Drives:
+    # The first draws with a feasible path.
+    truth = made.mixture(40, SIZE, SIZE, seed=3)
+    truth = type(truth)(truth.weights.float(), truth.means.float(), truth.stds.float())
+    start, goal = (torch.tensor([place] * 40) for place in ((1.25, 1.25), (10.25, 9.75)))
+    places = Places(start_m=start, goal_m=goal, reference_time_s=torch.full((40,), torch.nan))
+    field = truth.from_normal(made.scores(LAW, 40, seed).float())
+    kept = joined(field >= IMMOBILE.below, LAW.grid, places).nonzero()[:BATCH, 0]
+    truth, field, places = truth.select(kept), field[kept], places.select(kept)
+    start, goal, terrain = places.start_m, places.goal_m, made.terrain(truth, field)
+    task = Task(robot=Unicycle(), objective=TravelTime(robot=Unicycle(), goal_radius_m=1.0), rules=RULES)
+    simulation = Simulation(terrain, task, WORLD, places, rng.stream_key(0, "noise"), range(BATCH))
+    problem = pose_problem(task, terrain.observe(), truth, measure(truth), start, goal, 24.0)
+    given: dict[str, Any] = {
+        "ground": Probe(1.5), "belief": Copula(), "law": LAW, "measure": measure, "terrain": terrain, "field": field,
+        "keys": KEYS,
+    }  # fmt: skip
+    return Drives(problem, simulation, Learning(**given | changes))
+
+
+def same(one: Episodes, other: Episodes) -> bool:
+    names = ("states", "actions", "traversability", "outcome", "steps")
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in names)
+
+
+@dataclass(frozen=True)
+class Deaf(Static):
+    """Told all, and believing what it did: a belief that updates to no purpose."""
+
+    learns = True
+
+    def changed(self, before: StaticState, after: StaticState) -> Tensor:
+        return torch.zeros(after.prior.shape, dtype=torch.bool)
+
+
+@dataclass(frozen=True)
+class Same(Static):
+    """Says that all has changed, and believes what it did."""
+
+    learns = True
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("belief", [Deaf(), Same()])
+def test_a_belief_that_learns_nothing_drives_as_if_there_were_none(name: str, belief: Belief[Any]) -> None:
+    given = drives(belief=belief)
+    options: dict[str, Any] = {"enough": lambda step: step == 12}
+    found = given.run(make(name), given.learning, **options)
+    assert same(given.run(make(name), None, **options), found)
+    assert (found.revisions == 0).all()
+
+
+def test_who_probes_the_ground_is_immobilised_less_often() -> None:
+    held, steps = {}, {}
+    for name, sensor in (("static", None), ("contact", Contact()), ("probe", Probe(1.5))):
+        given = drives() if sensor is None else drives(ground=sensor)
+        found = given.run(make("astar_dwa"), given.learning if sensor else None)
+        held[name] = int((found.outcome == Outcome.IMMOBILISED).sum())
+        steps[name] = torch.where(found.outcome == Outcome.SUCCESS, found.steps, 0)
+        assert bool((found.revisions > 0).any()) == (sensor is not None)
+        assert (found.learning_s > 0.01) == (sensor is not None)
+    assert held["static"] >= 2, held
+    assert held["probe"] == 0, held
+    both = (steps["static"] > 0) & (steps["probe"] > 0)
+    assert int(both.sum()) >= 5
+    assert float(steps["probe"][both].double().mean()) < float(steps["static"][both].double().mean()) - 3
+
+
+class Blindfolded(Sensor):
+    """Senses as another does, on ground that is replaced where it is told nothing up to a step."""
+
+    def __init__(self, inner: Sensor, mask: Tensor) -> None:
+        self.inner, self.mask = inner, mask
+
+    def sense(self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
+        sensed = self.inner.sense(terrain, field, robot_state, moment)
+        members = torch.tensor([KEYS.index(key) for key in moment.keys])
+        self.mask[members] |= sensed.mask
+        return sensed
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_what_was_not_sensed_changes_no_action(name: str) -> None:
+    given = drives()
+    mask = torch.zeros(BATCH, SIZE, SIZE, dtype=torch.bool)
+    steps = 25
+    first = given.run(
+        make(name),
+        replace(given.learning, ground=Blindfolded(Probe(1.0), mask)),
+        enough=lambda step: step == steps,
+    )
+    # Another truth wherever no robot has looked; robots stand within what they probe.
+    field = torch.where(mask, given.learning.field, 1 - given.learning.field)
+    other = made.mixture(BATCH, SIZE, SIZE, seed=9)
+    truth = given.learning.terrain.truth
+    truth = replace(
+        truth,
+        weights=torch.where(mask[:, None], truth.weights, other.weights.float()),
+        means=torch.where(mask[:, None], truth.means, other.means.float()),
+    )
+    terrain = replace(given.learning.terrain, truth=truth, traversability=field)
+    simulation = Simulation(
+        terrain, given.problem.task, WORLD,
+        Places(start_m=given.problem.start[:, :2], goal_m=given.problem.goal_m,
+               reference_time_s=torch.full((BATCH,), torch.nan)), 1, range(BATCH),
+    )  # fmt: skip
+    blind = replace(given.learning, ground=Probe(1.0), terrain=terrain, field=field)
+    again = run_episodes(
+        make(name), given.problem, simulation, generator(), learning=blind, enough=lambda step: step == steps
+    )
+    assert same(first, again)
+
+
+def told(learning: Learning, problem: Problem, steps: int) -> list[tuple[int, Problem]]:
+    """When robots that drive along x are told of another map, and of which."""
+    knowledge, state, found = Knowledge(learning, problem), problem.start.clone(), []
+    for step in range(steps):
+        revised = knowledge.learn(step, state, torch.ones(BATCH, dtype=torch.bool))
+        if revised is not None:
+            found.append((step, revised))
+        state = state + torch.tensor([0.1, 0.0, 0.0])
+    return found
+
+
+@pytest.mark.parametrize("every", [0.1, 0.5, 1.0])
+def test_maps_are_revised_when_it_is_due_and_where_something_is_known(every: float) -> None:
+    given = drives(replan_every_s=every)
+    found = told(given.learning, given.problem, 30)
+    assert found
+    assert all(step % round(every / 0.1) == 0 for step, _ in found)
+    assert len(found) > 0.6 * 30 / round(every / 0.1)
+    step, last = found[-1]
+    # What is told is λ̂ of what is believed, within what is too little to be told.
+    belief, seen = Copula(), given.learning
+    state = belief.init(given.problem.distribution, LAW)
+    sensed: Sensed | None = None
+    at = given.problem.start.clone()
+    for now in range(step + 1):
+        new = Probe(1.5).sense(seen.terrain, seen.field, at, Moment(KEYS, now))
+        sensed = (
+            new
+            if sensed is None
+            else Sensed(
+                traversability=torch.where(new.mask, new.traversability, sensed.traversability), std=new.std
+            )
+        )
+        if now % round(every / 0.1) == 0:
+            state, sensed = belief.update(state, sensed), None
+        at = at + torch.tensor([0.1, 0.0, 0.0])
+    believed = belief.distribution(state)
+    assert (last.risk_map - measure(believed)).abs().max() < 0.035
+    assert (last.risk_map - given.problem.risk_map).abs().max() > 0.3
+    closed = (believed.mean() < 0.09) & ~given.problem.free
+    assert not last.free[(believed.mean() < 0.09) & given.problem.free].any() or bool(closed.any())
+    torch.testing.assert_close(last.distribution.mean(), believed.mean(), atol=1e-5, rtol=0)
+    assert torch.equal(last.start[:, 1:], given.problem.start[:, 1:])
+    assert float(last.start[0, 0] - given.problem.start[0, 0]) == pytest.approx(0.1 * step, abs=1e-5)
+
+
+def test_the_goal_stays_free_whatever_is_known_of_it() -> None:
+    given = drives(ground=Probe(30.0))
+    column, row = (given.problem.goal_m[0] / 0.5).long().tolist()
+    field = given.learning.field.clone()
+    field[:, row - 4 : row + 5, column - 4 : column + 5] = 0
+    (_, first), *_ = told(replace(given.learning, field=field), given.problem, 3)
+    assert first.free[:, row, column].all()
+    assert not first.free[:, row - 3, column - 2].any()
+    at_goal = cells_at_goal(LAW.grid, given.problem.goal_m, RULES.goal_radius_m)
+    assert first.free[at_goal].all()
+    assert (~first.free)[(field < 0.02) & ~at_goal].double().mean() > 0.9
+
+
+def test_episodes_that_left_do_not_change_the_others() -> None:
+    given = drives()
+    options: dict[str, Any] = {"enough": lambda step: step == 165}
+    whole = given.run(make("astar_dwa"), given.learning, **options)
+    assert sorted(whole.steps.tolist())[3] < 160, "nobody left early"
+
+    class Stays(type(make("astar_dwa"))):  # type: ignore[misc]
+        def select(self, plan_state: Any, members: Tensor) -> Any:
+            return NotImplemented
+
+    stayed = given.run(Stays(), given.learning, **options)
+    torch.testing.assert_close(whole.states, stayed.states, atol=1e-3, rtol=0)
+    assert torch.equal(whole.outcome, stayed.outcome)
+    assert torch.equal(whole.revisions, stayed.revisions)
+
+
+def fails(error: str = "no echo") -> Callable[..., Any]:
+    def call(*given: Any, **named: Any) -> Any:
+        raise ValueError(error)
+
+    return call
+
+
+class Wrong(Sensor):
+    def __init__(self, said: Callable[..., Any]) -> None:
+        self.said = said
+
+    def sense(self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment) -> Any:
+        return self.said(field)
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        (fails(), "ValueError: no echo"),
+        (lambda field: None, "Expected a Sensed from `sense`, got NoneType."),
+        (lambda field: Sensed(traversability=field[:1], std=field), "`Sensed.traversability`"),
+        (lambda field: Sensed(traversability=field, std=field.double()), "`Sensed.std`"),
+        (lambda field: Sensed(traversability=field + 1, std=field), "in [0, 1]"),
+    ],
+)
+def test_a_sensor_that_fails_ends_its_episodes(said: Callable[..., Any], words: str) -> None:
+    given = drives(ground=Wrong(said))
+    found = given.run(make("astar_dwa"), given.learning)
+    assert (found.outcome == Outcome.SENSOR_ERROR).all()
+    assert all(words in error for error in found.errors), found.errors[0]
+    assert (found.traceback != "") == (found.errors[0] != "")
+
+
+@pytest.mark.parametrize("call", ["init", "update", "at", "changed", "distribution"])
+def test_a_belief_that_fails_ends_its_episodes(call: str) -> None:
+    class Broken(Copula):
+        pass
+
+    setattr(Broken, call, fails("lost"))
+    given = drives(belief=Broken())
+    found = given.run(make("astar_dwa"), given.learning)
+    assert (found.outcome == Outcome.BELIEF_ERROR).all()
+    assert set(found.errors) == {"ValueError: lost"}
+
+
+def test_a_measure_that_fails_on_what_is_believed_is_a_model_error() -> None:
+    given = drives(measure=fails("no tail"))
+    found = given.run(make("astar_dwa"), given.learning)
+    assert (found.outcome == Outcome.MODEL_ERROR).all()
+
+
+def test_a_planner_that_raises_while_robots_learn_is_a_planner_error() -> None:
+    class Raises(type(make("astar_dwa"))):  # type: ignore[misc]
+        def revise(self, plan_state: Any, problem: Problem) -> Any:
+            raise ValueError("stuck")
+
+    given = drives()
+    found = given.run(Raises(), given.learning)
+    assert set(found.outcome.tolist()) == {Outcome.PLANNER_ERROR}
+
+
+def test_a_sensor_and_a_belief_may_write_into_what_they_are_given() -> None:
+    class Scribbles(Sensor):
+        def sense(self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
+            sensed = Probe(1.5).sense(terrain, field, robot_state, moment)
+            field.zero_()
+            robot_state.zero_()
+            terrain.truth.means.zero_()
+            return sensed
+
+    class Scrawls(Copula):
+        def update(self, state: Any, sensed: Sensed, prior: Any = None) -> Any:
+            found = super().update(state, sensed, prior)
+            sensed.traversability.zero_()
+            return found
+
+    given = drives()
+    options: dict[str, Any] = {"enough": lambda step: step == 40}
+    wanted = given.run(make("astar_dwa"), given.learning, **options)
+    wrote = given.run(
+        make("astar_dwa"), replace(given.learning, ground=Scribbles(), belief=Scrawls()), **options
+    )
+    assert same(wanted, wrote)
+
+
+def test_a_planner_that_begins_anew_learns_too() -> None:
+    class Forgets(type(make("astar_dwa"))):  # type: ignore[misc]
+        def revise(self, plan_state: Any, problem: Problem) -> Any:
+            return NotImplemented
+
+    given = drives()
+    options: dict[str, Any] = {"enough": lambda step: step == 60}
+    found = given.run(Forgets(), given.learning, **options)
+    assert (found.revisions > 5).all()
+    assert not same(given.run(Forgets(), None, **options), found)
+    # All that A*+DWA keeps is a velocity: begun anew from it, the unicycle takes the same way.
+    assert same(given.run(make("astar_dwa"), given.learning, **options), found)
+
+
+@pytest.mark.parametrize("every", [0.0, float("inf")])
+def test_times_that_never_come_are_refused(every: float) -> None:
+    with pytest.raises(ConfigError, match="replan_every_s"):
+        drives(replan_every_s=every)
+
+
+def test_the_error_keeps_how_episodes_end() -> None:
+    given = drives(belief=type("Broken", (Copula,), {"init": fails()})())
+    with pytest.raises(KnowledgeError) as error:
+        Knowledge(given.learning, given.problem)
+    assert error.value.outcome == Outcome.BELIEF_ERROR
+    assert isinstance(make("astar_dwa"), Planner)
+    assert isinstance(LAW, Law)
