@@ -229,7 +229,7 @@ def test_the_goal_stays_free_whatever_is_known_of_it() -> None:
 
 def test_episodes_that_left_do_not_change_the_others() -> None:
     given = drives()
-    options: dict[str, Any] = {"enough": lambda step: step == 165}
+    options: dict[str, Any] = {"enough": lambda step: step == 190}
     whole = given.run(make("astar_dwa"), given.learning, **options)
     assert sorted(whole.steps.tolist())[3] < 160, "nobody left early"
 
