@@ -110,7 +110,7 @@ class Knowledge:
 
         Args:
             step: steps taken so far.
-            robot_state: where the robots are that are left, shape [B, S].
+            robot_state: where the robots are that are left, a copy, shape [B, S].
             running: which of these episodes go on, bool, shape [B].
 
         Returns:
@@ -123,7 +123,7 @@ class Knowledge:
         if step % self._every or not bool(self._sensed.mask.any()):
             return None
         how, before = self._how, self._state
-        self._state = _call(Outcome.BELIEF_ERROR, lambda: how.belief.update(before, self._sensed.clone()))
+        self._state = _call(Outcome.BELIEF_ERROR, lambda: how.belief.update(before, self._sensed))
         self._sensed = self._nothing()
         changed = _call(
             Outcome.BELIEF_ERROR, lambda: self._checked_cells(how.belief.changed(before, self._state))
@@ -138,7 +138,7 @@ class Knowledge:
         moment = Moment(self._keys, step)
 
         def look() -> Sensed:
-            given = self._terrain.clone(), self._field.clone(), robot_state.clone(), moment
+            given = self._terrain.clone(), self._field.clone(), robot_state, moment
             return self._checked(self._how.ground.sense(*given))
 
         new = _call(Outcome.SENSOR_ERROR, look)
