@@ -16,10 +16,11 @@ from benchnav.eval.run.rollout import Episodes, run_episodes
 from benchnav.planning import risk
 from benchnav.planning.free_space import FreeSpace, Rules, cells_at_goal
 from benchnav.planning.objective import TravelTime
-from benchnav.planning.planners.planner import Planner
+from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig
+from benchnav.planning.planners.astar.dwa import DWAConfig
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing.belief import Belief, Law, Static, StaticState
+from benchnav.planning.sensing.belief import Belief, Static, StaticState
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.sensor import Contact, Moment, Probe, Sensed, Sensor
 from benchnav.planning.world.outcome import Outcome
@@ -37,6 +38,11 @@ RULES = Rules(free_space=FreeSpace(by="mean", above=0.1), min_traversability=0.0
 LAW = made.law(SIZE, SIZE, 1.5)
 KEYS = tuple(range(BATCH))
 SHIPPED = sorted(set(NAMES) - {"straight"})
+CONFIG = AStarDWAConfig(dwa=DWAConfig(speeds=5, turn_rates=11, horizon_s=4.0))  # few arcs, which is quick
+
+
+def astar_dwa() -> AStarDWA:
+    return AStarDWA(CONFIG)
 
 
 def measure(distribution: TraversabilityDistribution) -> Tensor:
@@ -111,7 +117,7 @@ def test_who_probes_the_ground_is_immobilised_less_often() -> None:
     held, steps = {}, {}
     for name, sensor in (("static", None), ("contact", Contact()), ("probe", Probe(1.5))):
         given = drives() if sensor is None else drives(ground=sensor)
-        found = given.run(make("astar_dwa"), given.learning if sensor else None)
+        found = given.run(astar_dwa(), given.learning if sensor else None)
         held[name] = int((found.outcome == Outcome.IMMOBILISED).sum())
         steps[name] = torch.where(found.outcome == Outcome.SUCCESS, found.steps, 0)
         assert bool((found.revisions > 0).any()) == (sensor is not None)
@@ -230,14 +236,14 @@ def test_the_goal_stays_free_whatever_is_known_of_it() -> None:
 def test_episodes_that_left_do_not_change_the_others() -> None:
     given = drives()
     options: dict[str, Any] = {"enough": lambda step: step == 190}
-    whole = given.run(make("astar_dwa"), given.learning, **options)
+    whole = given.run(astar_dwa(), given.learning, **options)
     assert sorted(whole.steps.tolist())[3] < 160, "nobody left early"
 
-    class Stays(type(make("astar_dwa"))):  # type: ignore[misc]
+    class Stays(AStarDWA):
         def select(self, plan_state: Any, members: Tensor) -> Any:
             return NotImplemented
 
-    stayed = given.run(Stays(), given.learning, **options)
+    stayed = given.run(Stays(CONFIG), given.learning, **options)
     torch.testing.assert_close(whole.states, stayed.states, atol=1e-3, rtol=0)
     assert torch.equal(whole.outcome, stayed.outcome)
     assert torch.equal(whole.revisions, stayed.revisions)
@@ -270,7 +276,7 @@ class Wrong(Sensor):
 )
 def test_a_sensor_that_fails_ends_its_episodes(said: Callable[..., Any], words: str) -> None:
     given = drives(ground=Wrong(said))
-    found = given.run(make("astar_dwa"), given.learning)
+    found = given.run(astar_dwa(), given.learning)
     assert (found.outcome == Outcome.SENSOR_ERROR).all()
     assert all(words in error for error in found.errors), found.errors[0]
     assert (found.traceback != "") == (found.errors[0] != "")
@@ -283,24 +289,24 @@ def test_a_belief_that_fails_ends_its_episodes(call: str) -> None:
 
     setattr(Broken, call, fails("lost"))
     given = drives(belief=Broken())
-    found = given.run(make("astar_dwa"), given.learning)
+    found = given.run(astar_dwa(), given.learning)
     assert (found.outcome == Outcome.BELIEF_ERROR).all()
     assert set(found.errors) == {"ValueError: lost"}
 
 
 def test_a_measure_that_fails_on_what_is_believed_is_a_model_error() -> None:
     given = drives(measure=fails("no tail"))
-    found = given.run(make("astar_dwa"), given.learning)
+    found = given.run(astar_dwa(), given.learning)
     assert (found.outcome == Outcome.MODEL_ERROR).all()
 
 
 def test_a_planner_that_raises_while_robots_learn_is_a_planner_error() -> None:
-    class Raises(type(make("astar_dwa"))):  # type: ignore[misc]
+    class Raises(AStarDWA):
         def revise(self, plan_state: Any, problem: Problem) -> Any:
             raise ValueError("stuck")
 
     given = drives()
-    found = given.run(Raises(), given.learning)
+    found = given.run(Raises(CONFIG), given.learning)
     assert set(found.outcome.tolist()) == {Outcome.PLANNER_ERROR}
 
 
@@ -321,25 +327,23 @@ def test_a_sensor_and_a_belief_may_write_into_what_they_are_given() -> None:
 
     given = drives()
     options: dict[str, Any] = {"enough": lambda step: step == 40}
-    wanted = given.run(make("astar_dwa"), given.learning, **options)
-    wrote = given.run(
-        make("astar_dwa"), replace(given.learning, ground=Scribbles(), belief=Scrawls()), **options
-    )
+    wanted = given.run(astar_dwa(), given.learning, **options)
+    wrote = given.run(astar_dwa(), replace(given.learning, ground=Scribbles(), belief=Scrawls()), **options)
     assert same(wanted, wrote)
 
 
 def test_a_planner_that_begins_anew_learns_too() -> None:
-    class Forgets(type(make("astar_dwa"))):  # type: ignore[misc]
+    class Forgets(AStarDWA):
         def revise(self, plan_state: Any, problem: Problem) -> Any:
             return NotImplemented
 
     given = drives()
     options: dict[str, Any] = {"enough": lambda step: step == 60}
-    found = given.run(Forgets(), given.learning, **options)
+    found = given.run(Forgets(CONFIG), given.learning, **options)
     assert (found.revisions > 5).all()
-    assert not same(given.run(Forgets(), None, **options), found)
+    assert not same(given.run(Forgets(CONFIG), None, **options), found)
     # All that A*+DWA keeps is a velocity: begun anew from it, the unicycle takes the same way.
-    assert same(given.run(make("astar_dwa"), given.learning, **options), found)
+    assert same(given.run(astar_dwa(), given.learning, **options), found)
 
 
 @pytest.mark.parametrize("every", [0.0, float("inf")])
@@ -353,5 +357,3 @@ def test_the_error_keeps_how_episodes_end() -> None:
     with pytest.raises(KnowledgeError) as error:
         Knowledge(given.learning, given.problem)
     assert error.value.outcome == Outcome.BELIEF_ERROR
-    assert isinstance(make("astar_dwa"), Planner)
-    assert isinstance(LAW, Law)
