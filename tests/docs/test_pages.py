@@ -39,3 +39,14 @@ def test_the_site_shows_every_page() -> None:
     assert {page.relative_to(DOCS).as_posix() for page in pages()[1:]} == {
         page for page in shown if not page.startswith("reference/commands/")
     }
+
+
+@pytest.mark.parametrize("page", [*pages(), ROOT / "CONTRIBUTING.md"], ids=name)
+def test_a_list_begins_after_an_empty_line(page: Path) -> None:
+    """Without one a list is set as running text on the site, though not in a repository's view."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    item = re.compile(r"\s*(\d+\.|[-*]) ")
+    for paragraph in re.split(r"\n\s*\n", text):
+        lines = paragraph.strip("\n").splitlines()
+        begun = [bool(item.match(line)) for line in lines]
+        assert not any(begun) or begun[0] or lines[0].startswith(("#", "|", "<", " ", "???", "!!!")), lines[0]
