@@ -390,3 +390,8 @@ def check_known(what: str, value: Any, known: Iterable[str]) -> None:
 def one_line(error: BaseException) -> str:
     """An error as one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def fault(error: BaseException) -> str:
+    """An error of a part as one line; our own errors speak for themselves."""
+    return " ".join(str(error).split()) if isinstance(error, BenchnavError) else one_line(error)

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from benchnav.core.device import GPU_FAULTS
-from benchnav.core.errors import BenchnavError, expect
-from benchnav.core.settings import one_line
+from benchnav.core.distribution import TraversabilityDistribution
+from benchnav.core.errors import BenchnavError, ConfigError, expect
+from benchnav.core.settings import fault
 from benchnav.core.terrain import Terrain
 from benchnav.planning import risk
 from benchnav.planning.free_space import cells_at_goal
@@ -151,9 +152,19 @@ class Knowledge:
     def _infer(self, changed: Tensor) -> None:
         """Tells λ̂ and what is free of the cells of which something else is believed."""
         how, rules = self._how, self._problem.task.rules
-        believed = _call(Outcome.BELIEF_ERROR, lambda: how.belief.at(self._state, changed))
+        wanted = (1, int(changed.sum()))
+
+        def believe() -> TraversabilityDistribution:
+            believed = how.belief.at(self._state, changed)
+            expect(
+                believed.shape == wanted,
+                f"a distribution of shape {list(wanted)} from `at`, got {list(believed.shape)}.",
+            )
+            return believed
+
+        believed = _call(Outcome.BELIEF_ERROR, believe)
         found = _call(Outcome.MODEL_ERROR, lambda: risk.apply(how.measure, believed))
-        free = rules.free_space.mask(found, believed)
+        free = _call(Outcome.BELIEF_ERROR, lambda: rules.free_space.mask(found, believed))
         self._risk_map, self._free = self._risk_map.clone(), self._free.clone()
         self._risk_map[changed] = found[0].to(self._risk_map.dtype)
         self._free[changed] = free[0]
@@ -185,21 +196,20 @@ class Knowledge:
         """What a sensor said, where it is what a sensor may say."""
         expect(isinstance(sensed, Sensed), f"a Sensed from `sense`, got {type(sensed).__name__}.")
         for name in ("traversability", "std"):
-            values = getattr(sensed, name)
-            fault = find_tensor_fault(
-                f"`Sensed.{name}`", values, self._field.dtype, tuple(self._field.shape), self._field.device
-            )
-            expect(not fault, fault.removeprefix("Expected ").removesuffix("."))
+            self._check(f"`Sensed.{name}`", getattr(sensed, name), self._field.dtype)
         seen = sensed.traversability[sensed.mask]
         expect(bool(((seen >= 0) & (seen <= 1)).all()), "`Sensed.traversability` in [0, 1], or NaN.")
         return sensed
 
     def _checked_cells(self, cells: Any) -> Tensor:
-        fault = find_tensor_fault(
-            "cells from `changed`", cells, torch.bool, tuple(self._field.shape), self._field.device
-        )
-        expect(not fault, fault.removeprefix("Expected ").removesuffix("."))
+        self._check("cells from `changed`", cells, torch.bool)
         return cells
+
+    def _check(self, what: str, values: Any, dtype: torch.dtype) -> None:
+        """Refuses what is no map of all cells."""
+        like = self._field
+        if wrong := find_tensor_fault(what, values, dtype, tuple(like.shape), like.device):
+            raise ConfigError(wrong)
 
 
 def _call(outcome: Outcome, work: Callable[[], Result]) -> Result:
@@ -209,6 +219,4 @@ def _call(outcome: Outcome, work: Callable[[], Result]) -> Result:
     except GPU_FAULTS:
         raise
     except (Exception, SystemExit) as error:
-        text = " ".join(str(error).split())
-        line = text if isinstance(error, BenchnavError) else one_line(error)
-        raise KnowledgeError(line, outcome) from error
+        raise KnowledgeError(fault(error), outcome) from error

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from benchnav.core.device import GPU_FAULTS, DeviceError, gpu_failed
 from benchnav.core.errors import BenchnavError
-from benchnav.core.settings import one_line
+from benchnav.core.settings import fault
 from benchnav.eval.run.knowledge import Knowledge, KnowledgeError, Learning
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.boundary import Answer, act, begin, revise, standing_actions
@@ -317,9 +317,3 @@ def _move(
     except Exception as error:
         robot = type(simulation.robot).__name__
         raise RobotError(f"Robot {robot} failed in the simulation: {fault(error)}") from error
-
-
-def fault(error: BaseException) -> str:
-    """An error as one line; our own errors speak for themselves."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, BenchnavError) else one_line(error)

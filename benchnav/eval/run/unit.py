@@ -22,6 +22,7 @@ from benchnav.core.device import CPU, GPU_FAULTS, gpu_failed
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.registry import Part
+from benchnav.core.settings import fault
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
@@ -31,7 +32,7 @@ from benchnav.eval.folder.run_folder import clear_unit, write_unit
 from benchnav.eval.folder.steps import write_steps
 from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.recorder import Recorder
-from benchnav.eval.run.rollout import Episodes, fault, run_episodes
+from benchnav.eval.run.rollout import Episodes, run_episodes
 from benchnav.eval.run.rows import episode_rows, error_rows, step_table
 from benchnav.models.base import predict
 from benchnav.models.predictor import Clairvoyant, load_model

@@ -152,11 +152,10 @@ class Copula(Belief[CopulaState]):
 
     def changed(self, before: CopulaState, after: CopulaState) -> Tensor:
         """Cells whose score, or whose prediction, is another."""
-        if before.prior is not after.prior and before.prior.shape == after.prior.shape:
-            moved = (before.scores != after.scores).any(1)
-        else:
-            moved = torch.zeros_like(after.mean, dtype=torch.bool)
-        return moved | (before.mean != after.mean) | (before.std != after.std)
+        moved = (before.mean != after.mean) | (before.std != after.std)
+        # Maps of many values, which an update without a new prediction hands on as they are.
+        same = before.scores is after.scores
+        return moved if same else moved | (before.scores != after.scores).any(1)
 
     def sample_fields(self, state: CopulaState, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields given all observations, by Matheron's rule: a field of the law, moved to what was observed."""
@@ -186,7 +185,7 @@ def scores_of(prior: TraversabilityDistribution) -> Tensor:
 
 
 def _ranks(device: torch.device) -> Tensor:
-    """Standard normal numbers of the levels of what is told of some cells."""
+    """Standard normal numbers of `_LEVELS`."""
     levels = torch.tensor(_LEVELS, dtype=torch.float64, device=device)
     return torch.special.ndtri(levels).clamp(-_LAST_RANK, _LAST_RANK)
 

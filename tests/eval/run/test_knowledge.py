@@ -1,7 +1,8 @@
 """Robots that learn on their way: what they are told, when, and what that changes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import pytest
@@ -11,6 +12,10 @@ from torch import Tensor
 from benchnav.core import rng
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
+from benchnav.core.quantiles import QuantileDistribution
+from benchnav.eval.experiment.condition import conditions_of
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.knowledge import Knowledge, KnowledgeError, Learning
 from benchnav.eval.run.rollout import Episodes, run_episodes
 from benchnav.planning import risk
@@ -193,7 +198,7 @@ def test_maps_are_revised_when_it_is_due_and_where_something_is_known(every: flo
     assert all(step % round(every / 0.1) == 0 for step, _ in found)
     assert len(found) > 0.6 * 30 / round(every / 0.1)
     step, last = found[-1]
-    # What is told is λ̂ of what is believed, within what is too little to be told.
+    # The planner's λ̂ is that of the belief, within the least change.
     belief, seen = Copula(), given.learning
     state = belief.init(given.problem.distribution, LAW)
     sensed: Sensed | None = None
@@ -292,6 +297,51 @@ def test_a_belief_that_fails_ends_its_episodes(call: str) -> None:
     found = given.run(astar_dwa(), given.learning)
     assert (found.outcome == Outcome.BELIEF_ERROR).all()
     assert set(found.errors) == {"ValueError: lost"}
+
+
+@pytest.mark.parametrize("said", ["shape", "mean"])
+def test_a_belief_whose_cells_are_none_is_to_blame_itself(said: str) -> None:
+    class Misfit(Copula):
+        def at(self, state: Any, cells: Tensor) -> Any:
+            found = super().at(state, cells)
+            return self.distribution(state) if said == "shape" else _NoMean(found.values, found.levels)
+
+    given = drives(belief=Misfit())
+    found = given.run(astar_dwa(), given.learning)
+    assert (found.outcome == Outcome.BELIEF_ERROR).all()
+    expected = "a distribution of shape [1, " if said == "shape" else "ValueError: no mean"
+    assert all(expected in error for error in found.errors), found.errors[0]
+
+
+class _NoMean(QuantileDistribution):
+    """Has an expected time, by which risk is told, and no mean, by which ground is free."""
+
+    def mean(self) -> Tensor:
+        raise ValueError("no mean")
+
+
+def test_cells_that_are_no_map_are_the_beliefs_fault() -> None:
+    class Counts(Copula):
+        def changed(self, before: Any, after: Any) -> Any:
+            return super().changed(before, after).long()
+
+    given = drives(belief=Counts())
+    found = given.run(astar_dwa(), given.learning)
+    assert (found.outcome == Outcome.BELIEF_ERROR).all()
+    assert "cells from `changed` as torch.bool" in found.errors[0]
+
+
+def test_a_planner_in_a_process_of_its_own_learns_as_one_here() -> None:
+    suite = Suite(
+        model="oracle", planners=({"part": "astar_dwa", "options": asdict(CONFIG)},), risks=("mean",)
+    )
+    (condition,) = conditions_of(suite, lambda data: ["std"])
+    given = drives()
+    options: dict[str, Any] = {"enough": lambda step: step == 25}
+    with closing(IsolatedPlanner(condition, 20.0)) as isolated:
+        found = given.run(isolated, given.learning, **options)
+    assert (found.revisions > 0).any()
+    assert same(given.run(astar_dwa(), given.learning, **options), found)
 
 
 def test_a_measure_that_fails_on_what_is_believed_is_a_model_error() -> None:

@@ -204,6 +204,8 @@ def test_another_prediction_is_conditioned_on_the_same_λ() -> None:
     nothing = looked({})
     found, wanted = Copula().update(state, nothing, other), after(Copula(), other, *looks)
     assert found.prior is other
+    # λ̂ is another everywhere, where the score stayed as well.
+    assert Copula().changed(state, found).all()
     torch.testing.assert_close(found.mean, wanted.mean, atol=0.02, rtol=0)
     torch.testing.assert_close(found.std, wanted.std, atol=0.02, rtol=0)
 
