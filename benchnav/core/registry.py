@@ -1,7 +1,7 @@
 """The one registry: how every replaceable part is named, found, configured and identified.
 
-Parts are of five kinds: planners, models, risk measures, robots and objectives. A part is named by one
-of four forms:
+Parts are planners, models, risk measures, robots, objectives, sensors of appearance (`sensor`) and of the ground
+(`ground`), and beliefs. A part is named by one of four forms:
 
 - a shipped name (`mppi`) or the name of an entry point of the group `benchnav.<kind>s` of an installed
   package; the shipped parts are entry points too;
@@ -58,7 +58,7 @@ from benchnav.core.sources import (
     moved,
 )
 
-KINDS = ("planner", "model", "risk", "robot", "objective")
+KINDS = ("planner", "model", "risk", "robot", "objective", "sensor", "ground", "belief")
 
 # What a part of each kind is a subclass of, and where users import that from. A risk measure is any function.
 _BASES = {
@@ -66,6 +66,9 @@ _BASES = {
     "model": ("benchnav.models", "TraversabilityModel"),
     "robot": ("benchnav.planning", "Robot"),
     "objective": ("benchnav.planning", "Objective"),
+    "sensor": ("benchnav.planning", "Sensor"),
+    "ground": ("benchnav.planning", "Sensor"),
+    "belief": ("benchnav.planning", "Belief"),
 }
 
 # Parameters that the program gives, so no options.

@@ -8,7 +8,9 @@ from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, Plan
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Bicycle, DifferentialDrive, Robot, Unicycle
-from benchnav.planning.sensing.sensor import Step
+from benchnav.planning.sensing.belief import Belief, Law, Static
+from benchnav.planning.sensing.copula import Copula
+from benchnav.planning.sensing.sensor import Appearance, Contact, Full, Moment, Probe, Sensed, Sensor, Step
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import Places, World
 
@@ -20,21 +22,32 @@ __all__ = [
     "TURN_RATE",
     "AStarDWA",
     "AStarMPPI",
+    "Appearance",
+    "Belief",
     "Bicycle",
+    "Contact",
+    "Copula",
     "DifferentialDrive",
     "FreeSpace",
+    "Full",
     "GoalDistance",
+    "Law",
     "LocalPlanner",
     "MPPIConfig",
+    "Moment",
     "Objective",
     "Places",
     "Plan",
     "PlanStatus",
     "Planner",
+    "Probe",
     "Problem",
     "Robot",
     "Rules",
+    "Sensed",
+    "Sensor",
     "Simulation",
+    "Static",
     "Step",
     "Straight",
     "Task",

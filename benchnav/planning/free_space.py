@@ -19,6 +19,7 @@ from benchnav.core.grid import Grid
 # Of a step, and of a metre, on ground that is not free; the paper's penalty a step. Higher than what any
 # way over free ground costs.
 PENALTY = 1e4
+UNSEEN = ("prior", "optimistic", "pessimistic")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,11 +52,16 @@ class Rules:
         free_space: which ground is free.
         min_traversability: least λ̂ that motion and path costs are given.
         goal_radius_m: a robot this near to the goal has arrived.
+        unseen: what is believed of ground that was not seen yet: `prior`, the λ of all training maps; `optimistic`,
+            λ of 1; `pessimistic`, the mean of the worst fifth of the prior, never closed.
+        replan_every_s: time between two updates of what a robot knows.
     """
 
     free_space: FreeSpace = FreeSpace()
     min_traversability: float = 0.3
     goal_radius_m: float = 1.0
+    unseen: str = "prior"
+    replan_every_s: float = 0.5
 
     def __post_init__(self) -> None:
         """Refuses rules under which nothing moves or arrives."""
@@ -66,6 +72,14 @@ class Rules:
         expect(
             0 < self.goal_radius_m < float("inf"),
             f"`goal_radius_m` > 0 and finite, got {self.goal_radius_m}.",
+        )
+        expect(
+            self.unseen in UNSEEN,
+            f"`unseen` {', '.join(map(repr, UNSEEN[:-1]))} or {UNSEEN[-1]!r}, got {self.unseen!r}.",
+        )
+        expect(
+            0 < self.replan_every_s < float("inf"),
+            f"`replan_every_s` > 0 and finite, got {self.replan_every_s}.",
         )
 
 

@@ -7,7 +7,7 @@ Letters in shapes: B episodes, H×W cells, M drawn fields.
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
@@ -19,6 +19,7 @@ from benchnav.core.copula import correlated_normal
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
+from benchnav.core.ground import GroundStatistics
 from benchnav.planning.sensing.sensor import Sensed
 
 State = TypeVar("State", bound=Batch)
@@ -32,10 +33,14 @@ class Law:
         grid: size and resolution of the maps.
         correlation_m: ℓ: normal scores at distance d have the correlation exp(−d²/2ℓ²); 0 where every cell is for
             itself.
+        statistics: of the training maps; None where nothing needs them.
+        class_names: of the prediction's classes, in the order of their ids; empty where it tells none.
     """
 
     grid: Grid
     correlation_m: float
+    statistics: GroundStatistics | None = None
+    class_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuses lengths that are none."""
@@ -155,7 +160,7 @@ class Static(Belief[StaticState]):
 
     def sample_fields(self, state: StaticState, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields with the prediction's marginals."""
-        law = state.law if self.correlated else Law(grid=state.law.grid, correlation_m=0.0)
+        law = state.law if self.correlated else replace(state.law, correlation_m=0.0)
         return fields_of(state.prior, draw_scores(law, count, keys))
 
 

@@ -1,13 +1,15 @@
-"""What a robot senses: the λ of the ground under it and near it, and what its planner is told at each time step.
+"""What a robot senses: what ground looks like, its λ, and what its planner is told at each time step.
 
-A sensor of the ground is given the truth and says which cells' λ a robot learns in a step, and how well. Its noise is
-keyed by episode, cell and step, so that every planner and belief meets the same. `contact` is what every robot has:
-the λ of the cell under it. Letters in shapes: B episodes, S state dimensions, H×W cells, N sensed cells.
+A sensor is given the truth and says what of it a robot learns in a step, and how well: what cells look like (kind
+`sensor`), or their λ (kind `ground`). Its noise is keyed by episode, cell and step, so that every planner and belief
+meets the same. `contact` is what every robot has: the λ of the cell under it.
+Letters in shapes: B episodes, S state dimensions, H×W cells, N sensed cells.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -16,7 +18,7 @@ from torch import Tensor
 from benchnav.core import rng
 from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
-from benchnav.core.terrain import Terrain
+from benchnav.core.terrain import Observation, Terrain
 
 LEAST_STD = 1e-3  # of noise, in normal scores: keeps the equations of a belief solvable
 _MOST_SCORE = 8.0  # standard deviations; beyond it a rank within an atom is not told from its end
@@ -40,17 +42,42 @@ class Step(Batch):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Appearance(Batch):
+    """What cells look like in a step.
+
+    Args:
+        seen: which cells are seen, bool, shape [B, H, W].
+        observation: colour, elevation and layers of the seen cells; what it holds of others is not used, nor are its
+            slopes, which are those of the elevation that was seen.
+        doubt: how noisy the look at each cell is, in any unit, shape [B, H, W]; of several looks at a cell the least
+            noisy one is kept.
+    """
+
+    seen: Tensor
+    observation: Observation
+    doubt: Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
 class Sensed(Batch):
-    """What is learnt of the ground in a step.
+    """What is learnt in a step.
 
     Args:
         traversability: λ of the cells that are sensed, NaN in all others, shape [B, H, W].
         std: standard deviation of the noise in normal scores, at least `LEAST_STD`, shape [B, H, W]; of cells that
             are not sensed it means nothing.
+        appearance: what cells look like; None from a sensor that does not look.
     """
 
     traversability: Tensor
     std: Tensor
+    appearance: Appearance | None = None
+
+    @classmethod
+    def looks(cls, appearance: Appearance) -> "Sensed":
+        """What a sensor learns that looks at the ground and senses no λ."""
+        nothing = torch.full_like(appearance.doubt, torch.nan)
+        return cls(traversability=nothing, std=torch.ones_like(nothing), appearance=appearance)
 
     @property
     def mask(self) -> Tensor:
@@ -91,7 +118,13 @@ class Moment:
 
 
 class Sensor(ABC):
-    """What a robot learns of the λ of the ground: the base class of the parts of kind `ground`."""
+    """What a robot learns in a step: the base class of the parts of kinds `sensor` (appearance) and `ground` (λ).
+
+    Attributes:
+        sees_all: it shows the whole map at the start and is never asked.
+    """
+
+    sees_all: ClassVar[bool] = False
 
     @abstractmethod
     def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
@@ -107,6 +140,20 @@ class Sensor(ABC):
             What is learnt. A sensor may look at the truth of the cells that it reports, and at no other: `check_sensor`
             replaces all others.
         """
+
+
+@dataclass(frozen=True)
+class Full(Sensor):
+    """What the whole map looks like, without noise, before the robot sets out."""
+
+    sees_all: ClassVar[bool] = True
+
+    def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
+        """Sees all."""
+        seen = torch.ones_like(field, dtype=torch.bool)
+        return Sensed.looks(
+            Appearance(seen=seen, observation=terrain.observe(), doubt=torch.zeros_like(field))
+        )
 
 
 @dataclass(frozen=True)
