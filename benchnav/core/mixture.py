@@ -265,7 +265,9 @@ class TraversabilityMixture(TraversabilityDistribution):
                 "Expected components that belong to terrain classes for the single-class option, got a "
                 "mixture without `group`. Take another risk measure, or give the mixture its `group`."
             )
-        own = max(self.group) + 1  # of what belongs to no class, which is all there is where ground was not seen
+        own = (
+            max(self.group) + 1
+        )  # of what belongs to no class, which is all there is where ground was not seen
         group = tuple(own if number < 0 else number for number in self.group)
         best = replace(self, group=group).class_probabilities(own + 1).argmax(-3, keepdim=True)
         is_best = torch.tensor(group, device=best.device).view(-1, 1, 1) == best

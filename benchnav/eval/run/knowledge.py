@@ -149,7 +149,9 @@ class Knowing:
             member = cells.nonzero()[:, 0]
             count = torch.bincount(member, minlength=len(cells))
             sums = torch.stack((error.square().double(), score.double().clamp(min=_LEAST_LOG_SCORE)), 1)
-            means = torch.zeros(len(cells), 2, dtype=torch.float64, device=sums.device).index_add_(0, member, sums)
+            means = torch.zeros(len(cells), 2, dtype=torch.float64, device=sums.device).index_add_(
+                0, member, sums
+            )
             means = means / count[:, None]
             found[self.members] = torch.stack((means[:, 0].sqrt(), means[:, 1]), 1).float()
         self.ahead[step] = found
@@ -175,7 +177,8 @@ class Knowing:
                 return values.reshape(self._problem.grid.shape).float().cpu().numpy()
 
             at = robot_state[place][None]
-            reach = learner.sensor if not learner.sensor.sees_all else learner.ground
+            reaches = [sensor.outline(at)[0] for sensor in (learner.sensor, learner.ground)]
+            lines = [torch.cat((line, torch.full_like(line[:1], torch.nan))) for line in reaches if len(line)]
             maps[member] = KnownMap(
                 step=step,
                 predicted=own(known.risk_map),
@@ -184,6 +187,6 @@ class Knowing:
                 spread=whole((high - low) / 2),
                 seen=own(known.seen),
                 sensed=own(known.ever_sensed),
-                outline=reach.outline(at)[0].float().cpu().numpy(),
+                outline=(torch.cat(lines) if lines else at.new_empty(0, 2)).float().cpu().numpy(),
             )
         return maps

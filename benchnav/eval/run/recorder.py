@@ -1,10 +1,11 @@
 """Recordings of episodes, taken while a unit runs."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.unit import Unit
@@ -17,6 +18,7 @@ from benchnav.eval.recording import (
     drawn_plan,
     thinned,
 )
+from benchnav.eval.run.knowledge import Knowing
 from benchnav.eval.run.rollout import Episodes
 from benchnav.planning.planners.planner import Plan
 from benchnav.planning.problem import Problem
@@ -58,14 +60,21 @@ class Recorder:
                 drawn = drawn_plan(step, plan.lines(place))
                 self._plans[member].append(drawn if whole else thinned(drawn))
 
-    def learn(self, known: Mapping[int, KnownMap]) -> None:
-        """Keeps what is known in some episodes from a step on.
+    @property
+    def watching(self) -> dict[str, Any]:
+        """The arguments of `run_episodes` by which it is told of plans and of what is known."""
+        return {"watch": self.watch, "watch_every": self.every, "witness": self.learn}
+
+    def learn(self, step: int, knowing: Knowing, robot_state: Tensor) -> None:
+        """Keeps what is known from a step on.
 
         Args:
-            known: by the number of the unit's episode; of those that are not kept nothing is.
+            step: its number.
+            knowing: what is known.
+            robot_state: of the episodes that are left, shape [B, S].
         """
-        for member in self._known.keys() & known.keys():
-            self._known[member].append(known[member])
+        for member, known in knowing.maps_of(step, robot_state, self._known).items():
+            self._known[member].append(known)
 
     def recording(self, episodes: Episodes, member: int) -> Recording:
         """All that is played back of one episode."""
