@@ -54,7 +54,9 @@ def test_a_clear_look_near_the_robot_is_the_observation_there() -> None:
     states = torch.tensor([[9.0, 9.0, 0.0], [1.0, 9.0, 0.0], [0.3, 0.2, 0.0]])
     memory = Memory.none(terrain)
     for step in range(3):
-        looked = near.sense(terrain, terrain.traversability, states + step, Moment((1, 2, 3), step)).appearance
+        looked = near.sense(
+            terrain, terrain.traversability, states + step, Moment((1, 2, 3), step)
+        ).appearance
         assert looked is not None
         memory = remember(memory, looked)
     known, truth, seen = masked(memory, MEANS), terrain.observe(), memory.seen

@@ -100,7 +100,9 @@ def test_a_wall_hides_what_is_under_the_line_from_the_mast_over_it(
 
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(0.05, 5), st.integers(0, 15), st.integers(0, 17))
 @settings(deadline=None, max_examples=30)
-def test_a_plane_hides_nothing(along_x: float, along_y: float, height_m: float, row: int, column: int) -> None:
+def test_a_plane_hides_nothing(
+    along_x: float, along_y: float, height_m: float, row: int, column: int
+) -> None:
     to_x, to_y = offsets(torch.Size((1, 16, 18)), 0.0, 0.0)
     plane = ground(torch.from_numpy(along_x * to_x + along_y * to_y)[None])
     assert look(replace(CLEAR, range_m=50.0, height_m=height_m), plane, centred(row, column)).seen.all()
