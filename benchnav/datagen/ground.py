@@ -165,7 +165,11 @@ def fit_potts_strength(neighbours: ndarray) -> float:
     design[..., -1] = difference
     for place in range(pairs):
         design[place, :, place] = 1
-    design, of_a, count = design.reshape(-1, pairs + 1), neighbours[..., 1].ravel(), neighbours.sum(-1).ravel()
+    design, of_a, count = (
+        design.reshape(-1, pairs + 1),
+        neighbours[..., 1].ravel(),
+        neighbours.sum(-1).ravel(),
+    )
     found, precision = np.zeros(pairs + 1), 1 / _PRIOR_STD**2
 
     def loss(at: ndarray) -> float:

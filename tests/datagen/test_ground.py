@@ -206,7 +206,8 @@ def test_a_shipped_file_is_what_the_command_makes(
     assert datagen("ground", "tiny.h5") == 0
     assert "wrote tiny.ground.json: λ of 40 maps" in capsys.readouterr().out
     made, shipped = (
-        json.loads(path.read_text()) for path in (Path("tiny.ground.json"), RECIPES / "ground" / "tiny-v1.json")
+        json.loads(path.read_text())
+        for path in (Path("tiny.ground.json"), RECIPES / "ground" / "tiny-v1.json")
     )
     assert made.keys() == shipped.keys()
     for name in ("weights", "means", "stds"):
