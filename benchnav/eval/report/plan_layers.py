@@ -17,13 +17,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, withStroke
 from matplotlib.transforms import ScaledTranslation
 
-from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, bytes_of, hatching, layer_scale
+from benchnav.core.figures import MARKS, ROBOT, TRAVERSABILITY_COLOURS, bytes_of, hatching, layer_scale
 from benchnav.core.grid import is_azimuth, outline
 
 # Dark red lies far from all colours of λ, for the colour-blind too.
 IMMOBILISING = "#a00000"
 SOFT = "white"
 CLOSED = "0.25"  # ground that is not free
+UNSEEN = "0.6"
+REACH = ROBOT  # how far its sensors reach
+SPREAD_COLOURS = "magma"  # what is known is dark
+MOST_SPREAD = 0.5  # of what lies in [0, 1]
 # Which of `MARKS` stands where an episode ended, by its outcome; `failed` for all others.
 _END_MARKS = {
     "success": "arrived",
@@ -189,6 +193,14 @@ def predicted_colours(predicted: np.ndarray, free: np.ndarray) -> np.ndarray:
     colours = shades(predicted)
     colours[~free] = bytes_of(CLOSED)[:3]
     return colours
+
+
+def reach_layer(lines: Sequence[np.ndarray] = (), scale: float = 1.0, label: str = "") -> LineCollection:
+    """How far sensors reach, as lines that can be put on a map, so many times as wide as printed."""
+    edge = [withStroke(linewidth=2 * scale, foreground="black"), Normal()]
+    return LineCollection(
+        list(lines), colors=[REACH], linewidths=scale, label=label, path_effects=edge, zorder=2.2
+    )
 
 
 def field_colours(field: np.ndarray, immobilising: np.ndarray) -> np.ndarray:

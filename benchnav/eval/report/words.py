@@ -17,7 +17,8 @@ FAILURE_COUNTS = {
 }
 _READ = {"planner": planner_name, "risk": risk_name}
 # Labels that tell conditions of one map apart.
-NAMING = ("planner", "risk", "model", "robot", "objective", "world")
+KNOWLEDGE = ("sensor", "ground", "belief")
+NAMING = ("planner", "risk", "model", "robot", "objective", "world", *KNOWLEDGE)
 
 
 def differ(labels: Iterable[str]) -> bool:
