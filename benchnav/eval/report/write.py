@@ -185,7 +185,10 @@ def print_report(report: Report) -> None:
 def _figures(
     folder: Path, report: Report, record_driven: RecordDriven | None
 ) -> Iterator[tuple[str, str, Figure]]:
-    """Names, captions and figures of all that is drawn of a run; first what it was to show, how often, and on which map it is seen best."""
+    """Gives name, caption and figure of all that is drawn of a run.
+
+    First is what it was to show, how often, and on which map it is seen best.
+    """
     summary, sheets = report.summary, report.sheets.shown
     if not report.tests.empty:
         yield (

@@ -42,6 +42,7 @@ from benchnav.eval.report.plan_layers import (
     MOST_SPREAD,
     SPREAD_COLOURS,
     UNSEEN,
+    VEIL,
     end_cell_handle,
     mark_end,
     reach_layer,
@@ -62,7 +63,6 @@ _SHOWN = {
 }
 _MOMENTS = 4
 _SENSED = "white"
-_VEIL = 0.55  # opacity of the grey over what was not seen
 
 _BIN_S = 2.0
 _MOST_LINES, _MOST_ACROSS = 7, 4
@@ -149,7 +149,7 @@ def _draw_known(panel: Axes, known: KnownMap, resolution_m: float) -> None:
     """Veils and hatches what was not seen, outlines what was sensed, and draws how far the sensors reached."""
     height, width = known.seen.shape
     veil = np.zeros((height, width, 4))
-    veil[~known.seen] = to_rgba(UNSEEN, _VEIL)
+    veil[~known.seen] = to_rgba(UNSEEN, VEIL)
     show_map(panel, veil, (width * resolution_m, height * resolution_m))
     panel.add_collection(
         LineCollection(list(hatching(~known.seen, resolution_m)), colors="black", linewidths=0.3)
