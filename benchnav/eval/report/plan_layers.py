@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, withStroke
 from matplotlib.transforms import ScaledTranslation
 
@@ -197,6 +198,16 @@ def predicted_colours(predicted: np.ndarray, free: np.ndarray) -> np.ndarray:
     return colours
 
 
+def unseen_layer(seen: np.ndarray, resolution_m: float, scale: float = 1.0) -> LineCollection:
+    """Hatching of ground that was not seen, that can be put on a map, so many times as wide as printed."""
+    return LineCollection(list(hatching(~seen, resolution_m)), colors="black", linewidths=0.3 * scale)
+
+
+def unseen_handle() -> Patch:
+    """The entry of a legend for ground that was not seen."""
+    return Patch(fc=UNSEEN, ec="black", hatch="////", lw=0, label="not seen")
+
+
 def reach_layer(lines: Sequence[np.ndarray] = (), scale: float = 1.0, label: str = "") -> LineCollection:
     """How far sensors reach, as lines that can be put on a map, so many times as wide as printed."""
     edge = [withStroke(linewidth=2 * scale, foreground="black"), Normal()]
@@ -209,8 +220,8 @@ def known_colours(known: KnownMap) -> dict[str, np.ndarray]:
     """Colours of what was known, under a veil where the ground was not seen; as `field_colours` does.
 
     Returns:
-        `risk`, λ̂ with what is not free; `mean` and `spread` of the belief; and `seen`, where the ground was seen (light)
-        and λ sensed (blue).
+        `risk`, λ̂ with what is not free; `mean` and `spread` of the belief; and `seen`, light where the ground was seen
+        and blue where λ was sensed.
     """
     veil, seen = np.array(bytes_of(UNSEEN)[:3]), known.seen[..., None]
     maps = {

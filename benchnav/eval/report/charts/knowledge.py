@@ -15,7 +15,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, withStroke
 
 from benchnav.core.figures import (
@@ -24,7 +23,6 @@ from benchnav.core.figures import (
     TWO_COLUMNS_IN,
     draw_edged,
     frame_map,
-    hatching,
     legend_outside,
     line_style,
     mark,
@@ -46,6 +44,8 @@ from benchnav.eval.report.plan_layers import (
     end_cell_handle,
     mark_end,
     reach_layer,
+    unseen_handle,
+    unseen_layer,
 )
 from benchnav.eval.report.words import NAMING, contender_names, joined, reading_name
 from benchnav.eval.stats.best import BLOCK
@@ -138,7 +138,7 @@ def knowledge_figure(recording: Recording) -> Figure:
             Line2D([], [], color=_SENSED, lw=0.8, path_effects=edge, label="edge of where λ was sensed")
         )
     if any(not known.seen.all() for known in every):
-        handles.append(Patch(fc=UNSEEN, ec="black", hatch="////", lw=0, label="not seen"))
+        handles.append(unseen_handle())
     if any(known.outlines for known in every):
         handles.append(reach_layer(label="reach of the sensors"))
     legend_outside(figure, handles, 5)
@@ -151,9 +151,7 @@ def _draw_known(panel: Axes, known: KnownMap, resolution_m: float) -> None:
     veil = np.zeros((height, width, 4))
     veil[~known.seen] = to_rgba(UNSEEN, VEIL)
     show_map(panel, veil, (width * resolution_m, height * resolution_m))
-    panel.add_collection(
-        LineCollection(list(hatching(~known.seen, resolution_m)), colors="black", linewidths=0.3)
-    )
+    panel.add_collection(unseen_layer(known.seen, resolution_m))
     sensed = list(outline(known.sensed, resolution_m))
     panel.add_collection(LineCollection(sensed, colors=_SENSED, linewidths=0.5))
     panel.add_collection(reach_layer(known.outlines))
