@@ -6,7 +6,7 @@ sub-environments, N×N cells of the crop, S state and A action dimensions.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -18,7 +18,6 @@ from benchnav.core import registry, rng
 from benchnav.core.errors import expect
 from benchnav.env.environment import EnvBatch, Observations, OffRoadEnv, OffRoadVectorEnv
 from benchnav.env.learning import Learner, Parts
-from benchnav.env.picture import Picture, Scene, Window
 from benchnav.env.view import CHANNELS, View, bounds
 from benchnav.models.base import TraversabilityModel
 from benchnav.models.predictor import Clairvoyant, class_mismatch, load_model
@@ -26,6 +25,9 @@ from benchnav.planning.robots import steps_in
 from benchnav.planning.sensing.belief import Belief, Law
 from benchnav.planning.sensing.sensor import Sensor
 from benchnav.planning.world.outcome import Outcome
+
+if TYPE_CHECKING:
+    from benchnav.env.picture import Picture
 
 AnyPart = str | Mapping[str, Any] | registry.Part
 
@@ -106,7 +108,11 @@ class EgocentricEnv(OffRoadEnv):
         _check_mode(render_mode, self.metadata)
         super().__init__(**arguments, drawn=render_mode is not None)
         self.render_mode = render_mode
-        self._window = Window() if render_mode == "human" else None
+        self._window = None
+        if render_mode == "human":
+            from benchnav.env.picture import Window
+
+            self._window = Window()
 
     @staticmethod
     def _make_batch(size: int, **arguments: Any) -> "EgocentricBatch":
@@ -251,7 +257,12 @@ class EgocentricBatch(EnvBatch):
             )
             self.action_space = spaces.Box(-1.0, 1.0, self.action_space.shape, np.float32)
         self._met = np.ones(size, np.float32)
-        self._picture = Picture(self._maps.grid) if drawn else None
+        self._picture: Picture | None = None
+        if drawn:
+            # Imported here, since Matplotlib takes longer than all else.
+            from benchnav.env.picture import Picture
+
+            self._picture = Picture(self._maps.grid)
         self._tracks: list[list[np.ndarray]] = [[] for _ in range(size)]
 
     def reset(
@@ -304,6 +315,8 @@ class EgocentricBatch(EnvBatch):
 
     def draw(self, member: int) -> np.ndarray:
         """The image of a sub-environment, uint8, shape [480, 640, 3]."""
+        from benchnav.env.picture import Scene
+
         _, now = self._current()
         assert self._picture is not None, "made without a render mode"
         own = torch.tensor([member])

@@ -23,7 +23,7 @@ from benchnav.planning import risk
 from benchnav.planning.sensing.belief import Belief, Law
 from benchnav.planning.sensing.sensor import Moment, Sensed, Sensor
 
-_MOST_KEPT = 256  # predictions of maps, of about half a megabyte each
+_MOST_KEPT = 128  # maps, of up to two megabytes each
 
 Value = TypeVar("Value", bound=Batch)
 
@@ -52,28 +52,16 @@ class Parts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _First(Batch):
-    """What is known of maps before a robot set out on them."""
-
-    prior: TraversabilityDistribution
-    known: Known
-
-
-@dataclass(frozen=True, kw_only=True)
 class _Episodes(Batch):
-    """What B robots know, and what their sensors are given.
+    """What robots know.
 
     Args:
-        terrain: the truth.
         known: what a policy is told.
         belief: state of the belief.
-        sensed: since the last update.
     """
 
-    terrain: Terrain
     known: Known
     belief: Any
-    sensed: Sensed
 
 
 class Learner:
@@ -86,19 +74,19 @@ class Learner:
     def __init__(self, parts: Parts) -> None:
         """Knows nothing of any episode."""
         self._parts = parts
-        self._kept: OrderedDict[int, _First] = OrderedDict()
+        self._senses = parts.belief.learns
+        self._kept: OrderedDict[int, _Episodes] = OrderedDict()  # of maps before a robot set out on them
         self._now: _Episodes | None = None
+        # What sensors are given, and what they gave since the last update; None where none is asked.
+        self._terrain: Terrain | None = None
+        self._sensed: Sensed | None = None
         self._keys: list[int] = []
 
     @property
     def known(self) -> Known:
         """What all robots know now."""
-        return self._episodes.known
-
-    @property
-    def _episodes(self) -> _Episodes:
         assert self._now is not None, "no episode has begun"
-        return self._now
+        return self._now.known
 
     def begin(
         self,
@@ -117,20 +105,18 @@ class Learner:
             field: λ of every cell in these episodes, shape [M, H, W]; None where it is drawn anew at each step.
             keys: a stream key of each episode for the sensors' noise.
         """
-        parts, each = self._parts, range(len(members))
-        first = _join([self._first(maps[i], terrain.select(torch.tensor([i])), _part(field, i)) for i in each])
-        new = _Episodes(
-            terrain=terrain,
-            known=first.known,
-            belief=parts.belief.init(first.prior, parts.law),
-            sensed=_nothing(first.known.risk_map),
+        each = range(len(members))
+        new = _join(
+            [self._first(maps[i], terrain.select(torch.tensor([i])), _part(field, i)) for i in each]
         )
         if self._now is None or len(members) == len(self._keys):
-            self._now, self._keys = new, list(keys)
-            return
-        self._now = put(self._now, members, new)
+            self._keys = list(keys)
         for member, key in zip(members.tolist(), keys, strict=True):
             self._keys[member] = key
+        self._now = self._with(self._now, members, new)
+        if self._senses:
+            self._terrain = self._with(self._terrain, members, terrain)
+            self._sensed = self._with(self._sensed, members, _nothing(new.known.risk_map))
 
     def learn(self, step: Tensor, state: Tensor, field: Tensor | None, which: Tensor) -> None:
         """Senses in some sub-environments, and updates the belief in those of them where that is due.
@@ -141,39 +127,39 @@ class Learner:
             field: λ of every cell, shape [B, H, W]; None where it is drawn anew at each step.
             which: bool, shape [B].
         """
-        if field is None or not self._parts.belief.learns:
+        terrain, kept = self._terrain, self._sensed
+        if terrain is None or kept is None or field is None:
             return
-        now, ground = self._episodes, self._parts.ground
-        given = ground.sense(now.terrain, field, state.clone(), Moment(self._keys, step.tolist()))
-        new, kept = given.mask & which[:, None, None], now.sensed
+        given = self._parts.ground.sense(terrain, field, state.clone(), Moment(self._keys, step.tolist()))
+        new = given.mask & which[:, None, None]
         sensed = Sensed(
             traversability=torch.where(new, given.traversability, kept.traversability),
             std=torch.where(new, given.std, kept.std),
         )
-        self._now = replace(now, sensed=sensed)
-        due = which & (step % self._parts.every == 0)
-        if bool((sensed.mask & due[:, None, None]).any()):
-            self._update(due[:, None, None])
+        due = (which & (step % self._parts.every == 0))[:, None, None]
+        if bool((sensed.mask & due).any()):
+            self._update(_only(sensed, due))
+            sensed = _only(sensed, ~due)
+        self._sensed = sensed
 
-    def _update(self, due: Tensor) -> None:
-        """Tells the belief what was sensed in some episodes, bool [B, 1, 1], and infers what is known by it."""
-        parts, now = self._parts, self._episodes
-        told, left = _only(now.sensed, due), _only(now.sensed, ~due)
+    def _update(self, sensed: Sensed) -> None:
+        """Tells the belief what was sensed, and infers what is known by it."""
+        parts, now = self._parts, self._now
+        assert now is not None
         # The whole batch, since to take states apart and to join them again costs more than the update.
-        state = parts.belief.update(now.belief, told)
-        changed = parts.belief.changed(now.belief, state)
-        risk_map, spread = now.known.risk_map, now.known.spread
+        state = parts.belief.update(now.belief, sensed)
+        changed, known = parts.belief.changed(now.belief, state), now.known
         if bool(changed.any()):
             believed = parts.belief.at(state, changed)
             values = risk.apply(parts.measure, believed)[0], spread_of(believed)[0]
             risk_map, spread = (
-                old.clone().index_put((changed,), new.to(old.dtype))
-                for old, new in zip((risk_map, spread), values, strict=True)
+                old.index_put((changed,), new.to(old.dtype))
+                for old, new in zip((known.risk_map, known.spread), values, strict=True)
             )
-        known = replace(now.known, risk_map=risk_map, spread=spread)
-        self._now = replace(now, belief=state, known=known, sensed=left)
+            known = replace(known, risk_map=risk_map, spread=spread)
+        self._now = _Episodes(known=known, belief=state)
 
-    def _first(self, number: int, terrain: Terrain, field: Tensor | None) -> _First:
+    def _first(self, number: int, terrain: Terrain, field: Tensor | None) -> _Episodes:
         """What is known of a map at first; kept, but of the clairvoyant's λ."""
         if field is not None and isinstance(self._parts.model, Clairvoyant):
             return self._predicted(replace(terrain, traversability=field))
@@ -184,26 +170,22 @@ class Learner:
         self._kept.move_to_end(number)
         return self._kept[number]
 
-    def _predicted(self, terrain: Terrain) -> _First:
-        prior = predict(self._parts.model, terrain)
+    def _predicted(self, terrain: Terrain) -> _Episodes:
+        parts = self._parts
+        prior = predict(parts.model, terrain)
         known = Known(
-            risk_map=risk.apply(self._parts.measure, prior),
+            risk_map=risk.apply(parts.measure, prior),
             spread=spread_of(prior),
             elevation_m=terrain.elevation_m,
             seen=torch.ones_like(terrain.elevation_m, dtype=torch.bool),
         )
-        return _First(prior=prior, known=known)
+        return _Episodes(known=known, belief=parts.belief.init(prior, parts.law) if self._senses else None)
 
-
-def put(whole: Value, members: Tensor, part: Value) -> Value:
-    """Puts some episodes into a batch, in the places of others.
-
-    Args:
-        whole: of B episodes; it is not changed.
-        members: whose places are taken, int64, shape [M].
-        part: of M episodes.
-    """
-    return map_tensors(whole, lambda old, new: old.index_copy(0, members, new), part)
+    def _with(self, whole: Value | None, members: Tensor, part: Value) -> Value:
+        """Puts some episodes in the places of others; all of them in place of all."""
+        if whole is None or len(members) == len(self._keys):
+            return part
+        return map_tensors(whole, lambda old, new: old.index_copy(0, members, new), part)
 
 
 def _join(parts: Sequence[Value]) -> Value:
