@@ -17,7 +17,7 @@ FAILURE_COUNTS = {
 }
 _READ = {"planner": planner_name, "risk": risk_name}
 # Labels that tell conditions of one map apart.
-NAMING = ("planner", "risk", "model", "robot", "objective", "world")
+NAMING = ("planner", "risk", "model", "sensor", "ground", "belief", "robot", "objective", "world")
 
 
 def differ(labels: Iterable[str]) -> bool:

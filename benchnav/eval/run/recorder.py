@@ -1,6 +1,6 @@
 """Recordings of episodes, taken while a unit runs."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,15 @@ import torch
 
 from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.recording import MOMENT_S, DrawnPlan, Recording, drawing_interval, drawn_plan, thinned
+from benchnav.eval.recording import (
+    MOMENT_S,
+    DrawnPlan,
+    KnownMap,
+    Recording,
+    drawing_interval,
+    drawn_plan,
+    thinned,
+)
 from benchnav.eval.run.rollout import Episodes
 from benchnav.planning.planners.planner import Plan
 from benchnav.planning.problem import Problem
@@ -17,7 +25,7 @@ from benchnav.planning.world.simulation import Simulation
 
 
 class Recorder:
-    """Keeps what was planned for some episodes of a unit.
+    """Keeps what was planned for some episodes of a unit, and what was known in them.
 
     Args:
         unit: what is run.
@@ -34,6 +42,7 @@ class Recorder:
         self.unit, self.problem, self.simulation, self.terrain = unit, problem, simulation, terrain
         self.every = drawing_interval(problem.dt_s)
         self._plans: dict[int, list[DrawnPlan]] = {member: [] for member in members}
+        self._known: dict[int, list[KnownMap]] = {member: [] for member in self._plans}
 
     def watch(self, step: int, plan: Plan, planned: list[int]) -> None:
         """Keeps a step's plan; those that no figure will show are thinned, since there may be many.
@@ -48,6 +57,15 @@ class Recorder:
             if member in self._plans:
                 drawn = drawn_plan(step, plan.lines(place))
                 self._plans[member].append(drawn if whole else thinned(drawn))
+
+    def learn(self, known: Mapping[int, KnownMap]) -> None:
+        """Keeps what is known in some episodes from a step on.
+
+        Args:
+            known: by the number of the unit's episode; of those that are not kept nothing is.
+        """
+        for member in self._known.keys() & known.keys():
+            self._known[member].append(known[member])
 
     def recording(self, episodes: Episodes, member: int) -> Recording:
         """All that is played back of one episode."""
@@ -111,4 +129,6 @@ class Recorder:
             traversability=traversability,
             plans=self._plans.get(member, ()),
             layers={name: own(layer) for name, layer in problem.observation.layers.items()},
+            # An ended episode may stay in a batch that goes on.
+            known=tuple(known for known in self._known.get(member, ()) if known.step <= len(actions)),
         )
