@@ -177,7 +177,7 @@ def train_networks(
     parts = [member_name(index, trainable.name) for index in range(members)]
     trained = [GP] * bool(gp) + parts
     fresh = fresh_checkpoint(dataset, trainable.family, trainable.code)
-    target = open_target(out, fresh, trained, training_digest(dataset), options)
+    target = open_target(out, fresh, trained, training_digest(dataset), options, dataset)
     expect(
         not how.conformal or bool(gp) or trainable.family != FUSED or GP in target.checkpoint.parts,
         f"a whole model for `conformal`, got {trainable.name} alone. Train the GPs into {out} first, or take "
