@@ -16,13 +16,15 @@ from torch import Tensor
 
 from benchnav.core import registry, rng
 from benchnav.core.errors import expect
+from benchnav.core.ground import GroundStatistics
 from benchnav.env.environment import EnvBatch, Observations, OffRoadEnv, OffRoadVectorEnv
-from benchnav.env.learning import Learner, Parts
+from benchnav.env.experience import Experience, predict_with
 from benchnav.env.view import CHANNELS, View, bounds
 from benchnav.models.base import TraversabilityModel
-from benchnav.models.predictor import Clairvoyant, class_mismatch, load_model
+from benchnav.models.predictor import Clairvoyant, class_mismatch, find_ground_statistics, load_model
 from benchnav.planning.robots import steps_in
 from benchnav.planning.sensing.belief import Belief, Law
+from benchnav.planning.sensing.knowledge import Learner, Truth, sensor_keys
 from benchnav.planning.sensing.sensor import Sensor
 from benchnav.planning.world.outcome import Outcome
 
@@ -47,7 +49,8 @@ class EgocentricEnv(OffRoadEnv):
     | `model`              | `"oracle"`  | predicts λ from what was seen: a checkpoint or any other model   |
     | `risk`               | `"mean"`    | risk measure that gives λ̂                                        |
     | `belief`             | `"static"`  | what is made of sensed λ; `"copula"` learns from it              |
-    | `replan_every_s`     | `0.5`       | time between two updates of the belief                           |
+    | `unseen`             | `"prior"`   | what is believed of unseen ground; or `"optimistic"`, `"pessimistic"` |
+    | `replan_every_s`     | `0.5`       | time between two updates of what is known                        |
     | `crop_cells`         | `32`        | N: rows and columns of the crop, of the map's cells              |
     | `crop_behind`        | `1/3`       | share of the crop that is behind the robot; 0.5 has it in the middle |
     | `normalised_actions` | `False`     | actions are in [−1, 1], which stands for the robot's bounds      |
@@ -195,7 +198,8 @@ class EgocentricBatch(EnvBatch):
         model: predicts λ.
         risk: gives λ̂.
         belief: what is made of sensed λ.
-        replan_every_s: time between two updates of the belief.
+        unseen: what is believed of ground that was not seen.
+        replan_every_s: time between two updates of what is known.
         crop_cells: N.
         crop_behind: share of the crop that is behind the robot.
         normalised_actions: actions are in [−1, 1].
@@ -212,6 +216,7 @@ class EgocentricBatch(EnvBatch):
         model: AnyPart | TraversabilityModel = "oracle",
         risk: Any = "mean",
         belief: AnyPart | Belief[Any] = "static",
+        unseen: str = "prior",
         replan_every_s: float = 0.5,
         crop_cells: int = 32,
         crop_behind: float = 1 / 3,
@@ -222,33 +227,34 @@ class EgocentricBatch(EnvBatch):
         """Loads the maps of the split, and the model."""
         self.view = View(cells=crop_cells, behind=crop_behind)
         super().__init__(size, **arguments)
-        task, world = self._task, self._world
-        self._task = replace(task, rules=replace(task.rules, replan_every_s=replan_every_s))
-        made: Any = model if isinstance(model, TraversabilityModel) else load_model(model)
-        if mismatch := class_mismatch(made, self._recipe):
+        rules = replace(self._task.rules, unseen=unseen, replan_every_s=replan_every_s)
+        self._task = replace(self._task, rules=rules)
+        predictor: Any = model if isinstance(model, TraversabilityModel) else load_model(model)
+        if mismatch := class_mismatch(predictor, self._dataset.recipe):
             gymnasium.logger.warn(f"{mismatch}.")
-        believed: Any = registry.take("belief", belief)
-        stays = world.noise != "resampled"
+        sees: Any = registry.take("sensor", sensor)
+        believes: Any = registry.take("belief", belief)
+        clairvoyant = isinstance(predictor, Clairvoyant)
         expect(
-            stays or not (believed.learns or isinstance(made, Clairvoyant)),
+            self._world.noise != "resampled" or not (believes.learns or clairvoyant),
             "a world whose λ stays what it is for a belief that learns, and for `clairvoyant`, got one of `noise` "
             "'resampled'. Take world='stakes'.",
         )
-        self._learner = Learner(
-            Parts(
-                sensor=registry.take("sensor", sensor),
-                ground=registry.take("ground", ground),
-                model=made,
-                belief=believed,
-                measure=risk if callable(risk) else registry.make("risk", risk),
-                law=Law(
-                    grid=self._maps.grid,
-                    correlation_m=world.correlation_m if world.noise == "frozen" else 0.0,
-                    class_names=made.class_names,
-                ),
-                every=steps_in(replan_every_s, task.robot.dt_s),
-            )
+        statistics = None
+        if not sees.sees_all or believes.needs_statistics:
+            source: Any = "oracle" if isinstance(model, TraversabilityModel) else model
+            statistics = find_ground_statistics(source, self._dataset)
+        learner = Learner(
+            sensor=sees,
+            ground=registry.take("ground", ground),
+            belief=believes,
+            law=self._law(predictor.class_names, statistics),
+            measure=risk if callable(risk) else registry.make("risk", risk),
+            rules=rules,
+            predict=predict_with(predictor),
         )
+        every = steps_in(replan_every_s, self._task.robot.dt_s)
+        self._experience = Experience(learner, every, alike=not clairvoyant)
         self._bounds: tuple[Tensor, Tensor] | None = None
         if normalised_actions:
             self._bounds = (
@@ -270,19 +276,17 @@ class EgocentricBatch(EnvBatch):
     ) -> None:
         """Starts new episodes in the chosen sub-environments; see `EnvBatch`."""
         super().reset(generators, chosen, map_index)
-        simulation, now = self._current()
-        members = torch.from_numpy(np.flatnonzero(chosen))
-        maps, seeds = (values[chosen].tolist() for values in (self._map, self._noise_seed))
-        field, root = simulation.field, rng.stream_key(0, "environment")
+        _, now = self._current()
+        members, field = torch.from_numpy(np.flatnonzero(chosen)), self._field()
+        maps, seeds = (torch.from_numpy(values[chosen]) for values in (self._map, self._noise_seed))
         with torch.inference_mode(False), torch.no_grad():
-            self._learner.begin(
-                members,
-                maps,
-                self._maps.select(torch.tensor(maps)),
-                None if field is None else field[members],
-                [rng.stream_key(root, seed, "sensing") for seed in seeds],
+            truth = Truth(
+                terrain=self._maps.select(maps),
+                field=field[members],
+                keys=sensor_keys(rng.stream_key(0, "environment"), seeds.tolist()),
             )
-            self._learner.learn(now.step, now.state, field, torch.from_numpy(chosen))
+            self._experience.begin(members, maps.tolist(), truth, now.state[members])
+            self._experience.learn(now.step, now.state, field, torch.from_numpy(chosen))
         self._follow(chosen, anew=True)
 
     def step(
@@ -291,10 +295,10 @@ class EgocentricBatch(EnvBatch):
         """Takes a time step in all sub-environments but those on hold, and senses there; see `EnvBatch`."""
         _, before = self._current()
         answer = super().step(actions, hold)
-        simulation, now = self._current()
+        _, now = self._current()
         moved = now.step > before.step
         with torch.inference_mode(False), torch.no_grad():
-            self._learner.learn(now.step, now.state, simulation.field, moved)
+            self._experience.learn(now.step, now.state, self._field(), moved)
         self._follow(moved.numpy(), anew=False)
         return answer
 
@@ -305,7 +309,7 @@ class EgocentricBatch(EnvBatch):
         self._met = info["traversability"]
         seen = self.view.observe(
             self._maps.grid,
-            self._learner.known,
+            self._experience.known,
             now.state,
             self._goal_m(),
             torch.from_numpy(self._met),
@@ -320,7 +324,7 @@ class EgocentricBatch(EnvBatch):
         _, now = self._current()
         assert self._picture is not None, "made without a render mode"
         own = torch.tensor([member])
-        known, state = self._learner.known.select(own), now.state[own]
+        known, state = self._experience.known.select(own), now.state[own]
         grid, at = self._maps.grid, int(self._map[member])
         return self._picture.draw(
             Scene(
@@ -337,6 +341,21 @@ class EgocentricBatch(EnvBatch):
                 outcome=Outcome(int(now.outcome[member])).name.lower(),
             )
         )
+
+    def _law(self, class_names: tuple[str, ...], statistics: GroundStatistics | None) -> Law:
+        """How the λ of the maps hangs together."""
+        recipe, world = self._dataset.recipe, self._world
+        return Law(
+            grid=self._maps.grid,
+            correlation_m=recipe.correlation_m if world.noise == "stored" else world.correlation_m,
+            statistics=statistics,
+            class_names=class_names or tuple(item.name for item in recipe.classes),
+        )
+
+    def _field(self) -> Tensor:
+        """λ of every cell, for sensors; where it is drawn anew at each step none is sensed, and it means nothing."""
+        simulation, _ = self._current()
+        return self._maps.traversability[self._map] if simulation.field is None else simulation.field
 
     def _command(self, action: Tensor) -> Tensor:
         if self._bounds is None:

@@ -240,8 +240,7 @@ class EnvBatch:
             self._objective = registry.take("objective", objective, robot=made, goal_radius_m=goal_radius_m)
         rules = Rules(goal_radius_m=goal_radius_m)
         self._task = Task(robot=made, objective=self._objective or GoalDistance(), rules=rules)
-        dataset = TerrainDataset(find_dataset(data))
-        self._recipe = dataset.recipe
+        dataset = self._dataset = TerrainDataset(find_dataset(data))
         if not split:
             split = "train" if "train" in dataset.splits else next(iter(dataset.splits))
             if split != "train":

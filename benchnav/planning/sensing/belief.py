@@ -60,10 +60,12 @@ class Belief(ABC, Generic[State]):
     """Turns what was sensed into the distribution of λ: the base class of the parts of kind `belief`.
 
     Attributes:
-        learns: whether `update` may change anything; one that does not is never asked to.
+        learns: whether what is sensed of λ changes what is believed; one that does not is told new predictions alone.
+        needs_statistics: whether `Law.statistics` have to be there.
     """
 
     learns: ClassVar[bool] = True
+    needs_statistics: ClassVar[bool] = False
 
     @abstractmethod
     def init(self, prior: TraversabilityDistribution, law: Law) -> State:
