@@ -16,6 +16,7 @@ from torch import Tensor
 
 from benchnav.core import registry, rng
 from benchnav.core.errors import expect
+from benchnav.core.grid import Grid
 from benchnav.core.ground import GroundStatistics
 from benchnav.env.environment import EnvBatch, Observations, OffRoadEnv, OffRoadVectorEnv
 from benchnav.env.experience import Experience, predict_with
@@ -64,10 +65,10 @@ class EgocentricEnv(OffRoadEnv):
     the bounds. Actions beyond it are clipped.
 
     ## Observation space
-    A `Dict` of two keys, float32. `crop`, shape (4, N, N), is the ground around the robot, turned so that the robot
-    looks along its columns: cell [i, j] has its centre (j + ½)·res − `crop_behind`·N·res ahead of the robot and
-    (i + ½)·res − ½·N·res to its left, where res is the edge length of the map's cells. Its value is that of the map's cell
-    in which this centre lies; all channels are 0 off the map.
+    A `Dict` of two keys, float32. `crop`, shape (4, N, N), is the ground around the robot, turned with it. The centre
+    of its cell [i, j] is (j + ½)·res − `crop_behind`·N·res ahead of the robot and (i + ½)·res − ½·N·res to its left,
+    where res is the edge length of the map's cells. Its value is that of the map's cell in which this centre lies; all
+    channels are 0 off the map.
 
     | channel | range    | meaning                                                                      |
     |---------|----------|------------------------------------------------------------------------------|
@@ -87,9 +88,11 @@ class EgocentricEnv(OffRoadEnv):
     | 5 …   | [−1, 1] | what the robot's state has beyond (x, y, θ), such as velocities: x / (1 + \\|x\\|) |
 
     ## What is known
-    As in `benchnav-eval`: sensors sense at each step, from the start on. Every `replan_every_s` the belief is told
-    what was sensed, and λ̂ and spread change. What is sensed has noise of its own in each episode.
-    `belief="copula"` needs a world in which λ stays what it is, such as `"stakes"`.
+    As in `benchnav-eval`: sensors look and sense at each step, from the start on. Every `replan_every_s` the model
+    predicts from what was seen, the belief is told what was sensed, and λ̂ and spread change. The noise of sensors is
+    the episode's own, so that the same seed gives the same. A belief that learns from λ, such as `"copula"`, needs a
+    world in which λ stays what it is, such as `"stakes"`. What is believed of unseen ground is what the checkpoint
+    knows of its training maps; for privileged models it is what the dataset or its recipe brings.
 
     ## Reward, world, start, end and info
     As of `benchnav/OffRoad-v0`, see `OffRoadEnv`.
@@ -263,12 +266,7 @@ class EgocentricBatch(EnvBatch):
             )
             self.action_space = spaces.Box(-1.0, 1.0, self.action_space.shape, np.float32)
         self._met = np.ones(size, np.float32)
-        self._picture: Picture | None = None
-        if drawn:
-            # Imported here, since Matplotlib takes longer than all else.
-            from benchnav.env.picture import Picture
-
-            self._picture = Picture(self._maps.grid)
+        self._picture = _make_picture(self._maps.grid) if drawn else None
         self._tracks: list[list[np.ndarray]] = [[] for _ in range(size)]
 
     def reset(
@@ -385,6 +383,13 @@ class EgocentricBatch(EnvBatch):
                 "state": spaces.Box(least, most, dtype=np.float32),
             }
         )
+
+
+def _make_picture(grid: Grid) -> "Picture":
+    # Imported here, since Matplotlib takes longer than all else.
+    from benchnav.env.picture import Picture
+
+    return Picture(grid)
 
 
 def _check_mode(render_mode: str | None, metadata: Mapping[str, Any]) -> None:

@@ -177,14 +177,16 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         given, every = options or {}, np.ones(self.num_envs, dtype=bool)
         chosen = np.asarray(given.get("reset_mask", every))
         fits = chosen.shape == every.shape and chosen.dtype == bool and chosen.any()
-        expect(fits, f"option `reset_mask` as bool of shape [{self.num_envs}], at least one true, got {chosen}.")
+        expect(fits, f"option `reset_mask` as bool of shape [{len(every)}], at least one true, got {chosen}.")
         if not self._generators and not chosen.all():
             raise gymnasium.error.ResetNeeded("Call reset() of all sub-environments before that of some.")
         if seed is not None or not self._generators:
             _, root = seeding.np_random(seed)
             fresh = [seeding.np_random(root + i)[0] for i in range(self.num_envs)]
-            before = self._generators or fresh
-            self._generators = [new if own else old for new, old, own in zip(fresh, before, chosen, strict=True)]
+            self._generators = [
+                new if anew else old
+                for new, old, anew in zip(fresh, self._generators or fresh, chosen, strict=True)
+            ]
         self._batch.reset(self._generators, chosen, given.get("map"))
         self._ended = self._ended & ~chosen
         return self._batch.observe()

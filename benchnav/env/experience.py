@@ -125,7 +125,9 @@ class Experience:
             return
         sensed, nothing = now.knowledge.sensed, nothing_sensed(now.spread)
         told, left = (
-            map_tensors(sensed, lambda own, no, which=which: torch.where(which[:, None, None], own, no), nothing)
+            map_tensors(
+                sensed, lambda own, no, which=which: torch.where(which[:, None, None], own, no), nothing
+            )
             for which in (due, ~due)
         )
         news = now.knowledge.news

@@ -122,7 +122,10 @@ class Picture:
         cells = len(values)
         # Ahead is up, and the robot's left is left.
         panel.imshow(
-            shown.transpose(1, 0, 2)[:, ::-1], origin="lower", extent=(0, cells, 0, cells), interpolation="none"
+            shown.transpose(1, 0, 2)[:, ::-1],
+            origin="lower",
+            extent=(0, cells, 0, cells),
+            interpolation="none",
         )
         _draw_robot(panel, cells / 2, scene.behind * cells, np.pi / 2)
         panel.set_title(title, fontsize=_TEXT, loc="left", pad=4)

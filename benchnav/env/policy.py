@@ -12,6 +12,7 @@ from benchnav.core.errors import expect
 from benchnav.env.view import Known, View, spread_of
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem, Task
+from benchnav.planning.sensing.appearance import SEEN
 from benchnav.planning.sensing.sensor import Step
 
 Policy = Callable[[dict[str, np.ndarray]], np.ndarray]
@@ -63,7 +64,7 @@ class PolicyPlanner(Planner[PolicyState]):
 
     def init(self, problem: Problem, generator: torch.Generator) -> PolicyState:
         """Keeps what is predicted; draws nothing. See `Planner`."""
-        return PolicyState(problem=problem, known=known_of(problem))
+        return PolicyState(problem=problem, known=_known_of(problem))
 
     def plan(self, step: Step, plan_state: PolicyState) -> tuple[Tensor, PolicyState, Plan]:
         """Asks the policy; see `Planner`."""
@@ -97,18 +98,19 @@ class PolicyPlanner(Planner[PolicyState]):
 
     def revise(self, plan_state: PolicyState, problem: Problem) -> PolicyState:
         """Goes on under what is known now; see `Planner`."""
-        return PolicyState(problem=problem, known=known_of(problem))
+        return PolicyState(problem=problem, known=_known_of(problem))
 
     def select(self, plan_state: PolicyState, members: Tensor) -> PolicyState:
         """Keeps some episodes; see `Planner`."""
         return plan_state.select(members)
 
 
-def known_of(problem: Problem) -> Known:
+def _known_of(problem: Problem) -> Known:
     """What is known of the ground in a batch of problems."""
+    seen = problem.observation.layers.get(SEEN)
     return Known(
         risk_map=problem.risk_map,
         spread=spread_of(problem.distribution),
         elevation_m=problem.elevation_m,
-        seen=torch.ones_like(problem.free),
+        seen=torch.ones_like(problem.free) if seen is None else seen > 0,
     )
