@@ -18,7 +18,7 @@ FACES = {
     "register",
     "benchnav.datagen": "Recipe TerrainClass TerrainDataset TerrainMaps create_dataset find_dataset generate "
     "load_recipe recipe_from_dict shipped_recipes",
-    "benchnav.env": "OffRoadEnv OffRoadVectorEnv",
+    "benchnav.env": "EgocentricEnv EgocentricVectorEnv OffRoadEnv OffRoadVectorEnv PolicyPlanner",
     "benchnav.eval": "Condition Suite compare_runs open_run read_report read_steps run_suite write_report",
     "benchnav.models": "Checkpoint ModelFamily Part TrainOptions TrainableModel TrainingConfig "
     "TraversabilityModel Window evaluate_model find_checkpoint fit_model list_checkpoints load_checkpoint "
@@ -90,9 +90,12 @@ def test_importing_a_package_loads_nothing_heavy(name: str) -> None:
     assert not {module.partition(".")[0] for module in loaded} & set(HEAVY)
 
 
-def test_importing_the_package_registers_its_environment() -> None:
-    code = "import gymnasium, benchnav; print(gymnasium.spec('benchnav/OffRoad-v0').entry_point)"
-    assert fresh(code).split() == ["benchnav.env.environment:OffRoadEnv"]
+def test_importing_the_package_registers_its_environments() -> None:
+    code = "import gymnasium, benchnav; print(*(gymnasium.spec(f'benchnav/OffRoad-v{n}').entry_point for n in (0, 1)))"
+    assert fresh(code).split() == [
+        "benchnav.env.environment:OffRoadEnv",
+        "benchnav.env.egocentric:EgocentricEnv",
+    ]
 
 
 COMMAND = """

@@ -5,7 +5,7 @@ was seen. A `Learner` holds how that is done, a `Knowledge` what is known by now
 Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of all maps together.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -169,14 +169,16 @@ class Learner:
             free=self.rules.free(risk_map, prior, seen),
         )
 
-    def sense(self, known: Knowledge, truth: Truth, robot_state: Tensor, step: int) -> Knowledge:
+    def sense(
+        self, known: Knowledge, truth: Truth, robot_state: Tensor, step: int | Sequence[int]
+    ) -> Knowledge:
         """Adds what is seen and sensed in a step.
 
         Args:
             known: by now; not changed.
             truth: as it is in this step.
             robot_state: shape [B, S].
-            step: steps taken so far.
+            step: steps taken so far, in all episodes or in each, B of them.
 
         Raises:
             KnowledgeError: a sensor raised, or gave what is none.
