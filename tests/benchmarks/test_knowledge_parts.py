@@ -37,13 +37,17 @@ def elsewhere(**options: Any) -> Probe:
     return made
 
 
-def sense(sensor: Probe, ground: tuple[Terrain, Tensor], keys: tuple[int, ...] = KEYS, step: int = 0) -> Sensed:
+def sense(
+    sensor: Probe, ground: tuple[Terrain, Tensor], keys: tuple[int, ...] = KEYS, step: int = 0
+) -> Sensed:
     return sensor.sense(*ground, STATES[: len(keys)], Moment(keys, step))
 
 
 def scores(sensed: Sensed, terrain: Terrain) -> Tensor:
     """Normal scores of what is sensed, a row an episode."""
-    return terrain.truth.at(sensed.mask).to_normal(sensed.traversability[sensed.mask][None])[0].view(BATCH, -1)
+    return (
+        terrain.truth.at(sensed.mask).to_normal(sensed.traversability[sensed.mask][None])[0].view(BATCH, -1)
+    )
 
 
 @pytest.mark.parametrize("radius_m", [1.0, 2.0])
@@ -93,7 +97,9 @@ def test_elsewhere_is_one_draw_an_episode_by_its_key_and_looks_at_no_field(
         assert torch.equal(alone.nan_to_num(-1), told[own].nan_to_num(-1)) is same
 
 
-def test_revising_searches_each_half_second_and_drives_as_if_it_had_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_revising_searches_each_half_second_and_drives_as_if_it_had_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     ground = torch.full((2, 16, 20), 0.85)
     ground[0, 4:16, 8:10] = 0.2
     posed = factories.problem(ground, goal=(8.25, 6.25))
