@@ -17,8 +17,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, withStroke
 from matplotlib.transforms import ScaledTranslation
 
-from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, bytes_of, hatching, layer_scale, outline
-from benchnav.core.grid import is_azimuth
+from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, bytes_of, hatching, layer_scale
+from benchnav.core.grid import is_azimuth, outline
 
 # Dark red lies far from all colours of λ, for the colour-blind too.
 IMMOBILISING = "#a00000"

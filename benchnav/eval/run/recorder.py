@@ -5,10 +5,20 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.recording import MOMENT_S, DrawnPlan, Recording, drawing_interval, drawn_plan, thinned
+from benchnav.eval.recording import (
+    MOMENT_S,
+    DrawnPlan,
+    KnownMap,
+    Recording,
+    drawing_interval,
+    drawn_plan,
+    thinned,
+)
+from benchnav.eval.run.knowledge import Knowing
 from benchnav.eval.run.rollout import Episodes
 from benchnav.planning.planners.planner import Plan
 from benchnav.planning.problem import Problem
@@ -17,7 +27,7 @@ from benchnav.planning.world.simulation import Simulation
 
 
 class Recorder:
-    """Keeps what was planned for some episodes of a unit.
+    """Keeps what was planned for some episodes of a unit, and what was known in them.
 
     Args:
         unit: what is run.
@@ -34,6 +44,7 @@ class Recorder:
         self.unit, self.problem, self.simulation, self.terrain = unit, problem, simulation, terrain
         self.every = drawing_interval(problem.dt_s)
         self._plans: dict[int, list[DrawnPlan]] = {member: [] for member in members}
+        self._known: dict[int, list[KnownMap]] = {member: [] for member in self._plans}
 
     def watch(self, step: int, plan: Plan, planned: list[int]) -> None:
         """Keeps a step's plan; those that no figure will show are thinned, since there may be many.
@@ -48,6 +59,22 @@ class Recorder:
             if member in self._plans:
                 drawn = drawn_plan(step, plan.lines(place))
                 self._plans[member].append(drawn if whole else thinned(drawn))
+
+    @property
+    def watching(self) -> dict[str, Any]:
+        """The arguments of `run_episodes` by which it is told of plans and of what is known."""
+        return {"watch": self.watch, "watch_every": self.every, "witness": self.learn}
+
+    def learn(self, step: int, knowing: Knowing, robot_state: Tensor) -> None:
+        """Keeps what is known from a step on.
+
+        Args:
+            step: its number.
+            knowing: what is known.
+            robot_state: of the episodes that are left, shape [B, S].
+        """
+        for member, known in knowing.maps_of(step, robot_state, self._known).items():
+            self._known[member].append(known)
 
     def recording(self, episodes: Episodes, member: int) -> Recording:
         """All that is played back of one episode."""
@@ -111,4 +138,6 @@ class Recorder:
             traversability=traversability,
             plans=self._plans.get(member, ()),
             layers={name: own(layer) for name, layer in problem.observation.layers.items()},
+            # An ended episode may stay in a batch that goes on.
+            known=tuple(known for known in self._known.get(member, ()) if known.step <= len(actions)),
         )

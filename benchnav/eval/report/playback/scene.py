@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from benchnav.core.figures import MARKS, bytes_of, hatching, outline
+from benchnav.core.figures import MARKS, bytes_of, hatching
+from benchnav.core.grid import outline
 from benchnav.eval.recording import Recording, drawing_interval, thinned
 from benchnav.eval.report.plan_layers import (
     SOFT,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, hatching, outline, robot_marker, save_twice
+from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, hatching, robot_marker, save_twice
+from benchnav.core.grid import outline
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.charts.maps import MOST_PANELS, choose_recordings, trajectory_figure
 from benchnav.eval.report.plan_layers import field_colours

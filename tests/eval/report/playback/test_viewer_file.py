@@ -5,7 +5,8 @@ import matplotlib
 import numpy as np
 import pytest
 
-from benchnav.core.figures import bytes_of, hatching, outline
+from benchnav.core.figures import bytes_of, hatching
+from benchnav.core.grid import outline
 from benchnav.eval.recording import MOST_POINTS, DrawnPlan, Recording, thinned
 from benchnav.eval.report.plan_layers import IMMOBILISING, field_colours, layer_colours
 from benchnav.eval.report.playback.viewer_file import arrange, describe, drivers_of, map_views, write_rerun
