@@ -16,7 +16,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -109,13 +109,13 @@ class Copula(Belief[CopulaState]):
 
     def init(self, prior: TraversabilityDistribution, law: Law) -> CopulaState:
         """Knows the prediction alone."""
-        given: dict[Any, float] = {"world": law.correlation_m, "estimated": _MEDIAN_M}
-        length = given.get(self.correlation_m, self.correlation_m) / law.grid.resolution_m
+        named = {"world": law.correlation_m, "estimated": _MEDIAN_M}
+        length_m = named[self.correlation_m] if isinstance(self.correlation_m, str) else self.correlation_m
         zeros = torch.zeros(prior.shape, dtype=torch.float64, device=prior.device)
         none = torch.full_like(zeros, torch.nan)
         return CopulaState(
             prior=prior, table=ScoreTable.empty(prior), law=law,
-            field=Field.of(law.grid.shape, [length] * len(zeros), prior.device),
+            field=Field.of(law.grid.shape, [length_m / law.grid.resolution_m] * len(zeros), prior.device),
             estimated_from=zeros[:, 0, 0].long(), value=none, lower=none, upper=none, noise_std=none, precision=zeros,
             shift=zeros, mean=zeros, std=torch.ones_like(zeros),
         )  # fmt: skip
@@ -128,39 +128,37 @@ class Copula(Belief[CopulaState]):
         Looks at a score are averaged. Of looks at an interval the one with the least noise counts. Of a new prediction
         the cells count whose parameters differ by more than 10⁻³ from those known.
         """
-        other = (
-            torch.zeros_like(state.observed)
-            if prior is None
-            else state.prior.differs(prior, _SAME_PREDICTION)
-        )
-        noted = state if prior is None else _with_prior(state, prior, other)
+        noted, other = state, torch.zeros_like(state.observed)
+        if prior is not None:
+            noted, other = _with_prior(state, prior)
         noted, news = _note(noted, sensed)
         news |= other & noted.observed
-        members = news.flatten(1).any(1).nonzero()[:, 0]
-        if len(members):
-            told = [self._learnt(noted.select(member), news[member]) for member in members.split(1)]
-            noted = _put(noted, members, told)
+        members = news.flatten(1).any(1).nonzero()[:, 0].tolist()
+        if members:
+            names = ("field", "estimated_from", "precision", "shift", "mean", "std")
+            noted = replace(noted, **{name: getattr(noted, name).clone() for name in names})
+            for own in members:
+                self._learn(noted, own, news[own])
         moved = other | (state.mean != noted.mean) | (state.std != noted.std)
         return replace(noted, table=noted.table.having(noted.prior, moved))
 
-    def _learnt(self, state: CopulaState, new: Tensor) -> CopulaState:
-        """Makes of what was noted in one episode what is known."""
-        count = int(state.observed.sum())
-        before = int(state.estimated_from)
-        due = self.correlation_m == "estimated" and max(_FEWEST, 2 * before) <= count and before < self.window
-        if not due:
-            return _updated(state, new, self.window)
-        cells = _nearest(state.observed[0], new[0], self.window)
-        length = _estimated_length(
-            state, Cells(row=cells.row[:, : self.window], column=cells.column[:, : self.window])
-        )
-        state = replace(state, estimated_from=torch.full_like(state.estimated_from, count))
-        if length == float(state.field.length):
-            return _updated(state, new, self.window)
-        field = Field.of(state.law.grid.shape, [length], state.mean.device)
-        nothing = torch.zeros_like(state.mean)
-        fresh = replace(state, field=field, mean=nothing, std=nothing + 1)
-        return _updated(fresh, state.observed, self.window)
+    def _learn(self, state: CopulaState, own: int, new: Tensor) -> None:
+        """Makes of what was noted in one episode what is known; writes into the state.
+
+        Episodes go one by one: as many observations as each has, so that none depends on the others.
+        """
+        observed = ~state.value[own].isnan()
+        count, before = int(observed.sum()), int(state.estimated_from[own])
+        if self.correlation_m == "estimated" and max(_FEWEST, 2 * before) <= count and before < self.window:
+            state.estimated_from[own] = count
+            cells = _nearest(observed, new, self.window)
+            kept = Cells(row=cells.row[:, : self.window], column=cells.column[:, : self.window])
+            length = _estimate(state, own, kept)
+            if length != float(state.field.length[own]):
+                state.field.put(own, Field.of(state.law.grid.shape, [length], new.device))
+                state.mean[own], state.std[own] = 0, 1
+                new = observed
+        _condition(state, own, new, self.window)
 
     def distribution(self, state: CopulaState) -> TraversabilityDistribution:
         """The prediction, given what was observed."""
@@ -210,20 +208,26 @@ class Copula(Belief[CopulaState]):
         return fields_of(state.prior, torch.stack(scores))
 
 
-def _with_prior(state: CopulaState, prior: TraversabilityDistribution, other: Tensor) -> CopulaState:
-    """Takes the prediction of some cells, bool [B, H, W], and notes what the λ observed there says under it."""
+def _with_prior(state: CopulaState, prior: TraversabilityDistribution) -> tuple[CopulaState, Tensor]:
+    """Takes the prediction of the cells of which it differs, bool [B, H, W], and what λ observed there says under it."""
+    other = state.prior.differs(prior, _SAME_PREDICTION)
     if not bool(other.any()):
-        return state
+        return state, other
     anew = other & state.observed
-    values = {"lower": state.lower.clone(), "upper": state.upper.clone()}
     low, high = _scores(prior, anew, state.value[anew])
-    values["lower"][anew], values["upper"][anew] = low, high
     precision, shift = _terms(low, high, state.noise_std[anew])
-    values["precision"] = state.precision.index_put((anew,), precision)
-    values["shift"] = state.shift.index_put((anew,), shift)
     # Of the other cells the prediction stays what it was, so that small changes do not add up unseen.
     prior = prior if bool(other.all()) else state.prior.replaced(other, prior)
-    return replace(state, prior=prior, table=state.table.without(other), **values)
+    told = replace(
+        state,
+        prior=prior,
+        table=state.table.without(other),
+        lower=state.lower.index_put((anew,), low),
+        upper=state.upper.index_put((anew,), high),
+        precision=state.precision.index_put((anew,), precision),
+        shift=state.shift.index_put((anew,), shift),
+    )
+    return told, other
 
 
 def _terms(low: Tensor, high: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
@@ -280,59 +284,43 @@ def _note(state: CopulaState, sensed: Sensed) -> tuple[CopulaState, Tensor]:
     return noted, changed
 
 
-def _updated(state: CopulaState, new: Tensor, window: int) -> CopulaState:
-    """Updates terms of observations, and scores of cells, near what is new in one episode."""
-    cells = _nearest(state.observed[0], new[0], window)
-    known = condition(state.field.covariance(cells, cells), _observed(state, cells))
-    reach = math.ceil(_REACH * float(state.field.length))
+def _condition(state: CopulaState, own: int, new: Tensor, window: int) -> None:
+    """Updates terms of observations, and scores of cells, near what is new in one episode; writes into the state."""
+    field = state.field.select(torch.tensor([own], device=new.device))
+    cells = _nearest(~state.value[own].isnan(), new, window)
+    known = condition(field.covariance(cells, cells), _observed(state, own, cells))
+    reach = math.ceil(_REACH * float(field.length))
     rows, columns = (
-        torch.arange(max(low - reach, 0), min(high + reach + 1, size), device=new.device)
-        for (low, high), size in zip(_bounds(new[0]), new.shape[1:], strict=True)
+        slice(max(low - reach, 0), min(high + reach + 1, size))
+        for (low, high), size in zip(_bounds(new), new.shape, strict=True)
     )
-    block = state.field.with_block(cells, rows[None], columns[None])
-    mean, variance = (values.view(len(rows), len(columns)) for values in known.moments(block))
-    std, at_block = variance.sqrt(), (0, rows[:, None], columns)
-    old_mean, old_std = state.mean[at_block], state.std[at_block]
+    lines = [torch.arange(line.start, line.stop, device=new.device)[None] for line in (rows, columns)]
+    mean, variance = known.moments(field.with_block(cells, *lines))
+    old_mean, old_std = state.mean[own, rows, columns], state.std[own, rows, columns]
+    mean, std = mean.view_as(old_mean), variance.sqrt().view_as(old_std)
     moved = torch.maximum((mean - old_mean).abs(), (std - old_std).abs()) >= _LEAST_CHANGE
-    places = torch.zeros_like(cells.row), cells.row, cells.column
-
-    def put(whole: Tensor, where: Any, values: Tensor) -> Tensor:
-        return whole.index_put(tuple(torch.as_tensor(place, device=whole.device) for place in where), values)
-
-    return replace(
-        state,
-        precision=put(state.precision, places, known.precision),
-        shift=put(state.shift, places, known.shift),
-        mean=put(state.mean, at_block, torch.where(moved, mean, old_mean)),
-        std=put(state.std, at_block, torch.where(moved, std, old_std)),
-    )
+    old_mean[moved], old_std[moved] = mean[moved], std[moved]
+    state.precision[own, cells.row, cells.column] = known.precision
+    state.shift[own, cells.row, cells.column] = known.shift
 
 
-def _observed(state: CopulaState, cells: Cells) -> Observed:
+def _observed(state: CopulaState, own: int, cells: Cells) -> Observed:
     """What is known of observed cells of one episode."""
-    names = {
-        "lower": "lower",
-        "upper": "upper",
-        "std": "noise_std",
-        "precision": "precision",
-        "shift": "shift",
-    }
-    found = {name: getattr(state, own)[0, cells.row, cells.column] for name, own in names.items()}
-    return Observed(**found, there=torch.ones_like(cells.row, dtype=torch.bool))
+    lower, upper, std, precision, shift = (
+        values[own, cells.row, cells.column]
+        for values in (state.lower, state.upper, state.noise_std, state.precision, state.shift)
+    )
+    there = torch.ones_like(cells.row, dtype=torch.bool)
+    return Observed(lower=lower, upper=upper, std=std, precision=precision, shift=shift, there=there)
 
 
-def _estimated_length(state: CopulaState, cells: Cells) -> float:
+def _estimate(state: CopulaState, own: int, cells: Cells) -> float:
     """ℓ of one episode, in cells: the mode of its posterior among `_LENGTHS_M`."""
-    field = _candidates(state.law.grid.shape, state.law.grid.resolution_m, state.mean.device)
-    count = len(_LENGTHS_M)
-    covariance = field.covariance(
-        *[Cells(row=cells.row.expand(count, -1), column=cells.column.expand(count, -1))] * 2
-    )
-    observed = map_tensors(_observed(state, cells), lambda values: values.expand(count, -1))
-    away = (
-        torch.tensor(_LENGTHS_M, dtype=torch.float64, device=state.mean.device).div(_MEDIAN_M).log()
-        / _LOG_STD
-    )
+    field = _candidates(state.law.grid.shape, state.law.grid.resolution_m, cells.row.device)
+    observed = map_tensors(_observed(state, own, cells), lambda one: one.expand(len(_LENGTHS_M), -1))
+    cells = map_tensors(cells, lambda one: one.expand(len(_LENGTHS_M), -1))
+    covariance = field.covariance(cells, cells)
+    away = (field.length * (state.law.grid.resolution_m / _MEDIAN_M)).log() / _LOG_STD
     likely = evidence(covariance, observed, condition(covariance, observed)) - 0.5 * away.square()
     return float(field.length[likely.argmax()])
 
@@ -340,20 +328,6 @@ def _estimated_length(state: CopulaState, cells: Cells) -> float:
 @lru_cache(maxsize=8)
 def _candidates(shape: tuple[int, int], resolution_m: float, device: torch.device) -> Field:
     return Field.of(shape, [length / resolution_m for length in _LENGTHS_M], device)
-
-
-def _put(whole: CopulaState, members: Tensor, parts: Sequence[CopulaState]) -> CopulaState:
-    """Puts what some episodes know where it was taken from."""
-
-    def put(values: Any, own: Sequence[Any]) -> Any:
-        if isinstance(values, Field):
-            return map_tensors(values, lambda first, *rest: put(first, rest), *own)
-        return values.index_copy(0, members, torch.cat(list(own)))
-
-    names = ("field", "estimated_from", "precision", "shift", "mean", "std")
-    return replace(
-        whole, **{name: put(getattr(whole, name), [getattr(part, name) for part in parts]) for name in names}
-    )
 
 
 def _bounds(new: Tensor) -> list[tuple[int, int]]:

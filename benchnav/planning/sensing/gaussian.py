@@ -70,6 +70,11 @@ class Field(Batch):
         )
         return cls(torch.tensor(lengths, dtype=torch.float64, device=device), down, across)
 
+    def put(self, own: int, field: "Field") -> None:
+        """Writes the one field of another into this."""
+        for name in ("length", "down", "across"):
+            getattr(self, name)[own] = getattr(field, name)[0]
+
     def covariance(self, one: Cells, other: Cells) -> Tensor:
         """Correlations of N cells with M others, shape [B, N, M]."""
         return _at(self.down, one.row, other.row) * _at(self.across, one.column, other.column)
