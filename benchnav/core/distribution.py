@@ -261,7 +261,7 @@ class TraversabilityDistribution(Batch, ABC):
         map_tensors(self, note, other)
         return found
 
-    def replaced(self, cells: Tensor, other: "TraversabilityDistribution") -> Self:
+    def replaced(self, cells: Tensor, other: "TraversabilityDistribution") -> "TraversabilityDistribution":
         """The same with some cells, bool [*B, H, W], of another prediction, whose parameters are as many."""
         count = len(self.shape) - 2
 
@@ -269,7 +269,8 @@ class TraversabilityDistribution(Batch, ABC):
             which = cells.view(*cells.shape[:count], *[1] * (own.ndim - cells.ndim), *cells.shape[count:])
             return torch.where(which, values, own)
 
-        return map_tensors(self, put, other)
+        found: TraversabilityDistribution = map_tensors(self, put, other)
+        return found
 
     def class_probabilities(self, count: int) -> Tensor:
         """Probability of each of `count` terrain classes, shape [*B, count, H, W].

@@ -209,7 +209,7 @@ class Copula(Belief[CopulaState]):
 
 
 def _with_prior(state: CopulaState, prior: TraversabilityDistribution) -> tuple[CopulaState, Tensor]:
-    """Takes the prediction of the cells of which it differs, bool [B, H, W], and what λ observed there says under it."""
+    """Takes the prediction of cells where it differs, bool [B, H, W], and what the λ observed there says under it."""
     other = state.prior.differs(prior, _SAME_PREDICTION)
     if not bool(other.any()):
         return state, other
