@@ -26,7 +26,7 @@ FACES = {
     "FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Objective Places Plan PlanStatus Planner Probe "
     "Problem Robot Rules SPEED STEERING Sensed Sensor Simulation Static Step Straight TURN_RATE Task TravelTime Unicycle "
     "World distance pose_problem",
-    "benchnav.testing": "check_model check_objective check_planner check_risk check_robot",
+    "benchnav.testing": "check_belief check_model check_objective check_planner check_risk check_robot",
 }
 EACH = pytest.mark.parametrize("name", FACES)
 
