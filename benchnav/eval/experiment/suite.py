@@ -34,8 +34,8 @@ class Suite:
         robots: Robots F.
         objectives: Objectives J.
         world: What λ does: a preset by name, paper or stakes, or {preset: NAME, noise: resampled | stored |
-            frozen, correlation_m: 1.5, immobile: {below: 0.1, for_s: 2}, time_budget_s: T or
-            time_budget_ratio: T over the map's reference time}; or a list of several.
+            frozen, correlation_m: 1.5, kernel: gaussian | matern32, immobile: {below: 0.1, for_s: 2},
+            time_budget_s: T or time_budget_ratio: T over the map's reference time}; or a list of several.
         task: Changes to the preset's rules: {free_space: {by: risk | mean, above: 0.3}, min_traversability: 0.3,
             goal_radius_m: 1.0}.
         maps: Maps of each scenario, the first of its split; 0 takes all.
