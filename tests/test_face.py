@@ -13,20 +13,21 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 FACES = {
-    "benchnav": "BenchnavError CheckpointError ConditionedDistribution ConfigError DatasetError Grid Observation "
-    "QuantileDistribution Terrain TraversabilityDistribution TraversabilityMixture pool register",
+    "benchnav": "BenchnavError CheckpointError ConditionedDistribution ConfigError DatasetError Grid "
+    "Observation QuantileDistribution Terrain TraversabilityDistribution TraversabilityMixture pool "
+    "register",
     "benchnav.datagen": "Recipe TerrainClass TerrainDataset TerrainMaps create_dataset find_dataset generate "
     "load_recipe recipe_from_dict shipped_recipes",
     "benchnav.env": "EgocentricEnv EgocentricVectorEnv OffRoadEnv OffRoadVectorEnv PolicyPlanner",
     "benchnav.eval": "Condition Suite compare_runs open_run read_report read_steps run_suite write_report",
-    "benchnav.models": "Checkpoint ModelFamily Part TrainOptions TrainableModel TrainingConfig TraversabilityModel "
-    "Window evaluate_model find_checkpoint fit_model list_checkpoints load_checkpoint load_model measure_margin "
-    "predict predict_tiles save_checkpoint write_risk_maps",
+    "benchnav.models": "Checkpoint ModelFamily Part TrainOptions TrainableModel TrainingConfig "
+    "TraversabilityModel Window evaluate_model find_checkpoint fit_model list_checkpoints load_checkpoint "
+    "load_model measure_margin predict predict_tiles save_checkpoint write_risk_maps",
     "benchnav.planning": "AStarDWA AStarMPPI Appearance Belief Bicycle CLRRT Contact Copula DifferentialDrive "
-    "FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Near Objective Places Plan PlanStatus Planner Probe "
-    "Problem Robot Rules SPEED STEERING Sensed Sensor Simulation Static Step Straight TURN_RATE Task TravelTime Unicycle "
-    "World distance pose_problem",
-    "benchnav.testing": "check_model check_objective check_planner check_risk check_robot",
+    "FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Near Objective Places Plan "
+    "PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensed Sensor Simulation Static Step "
+    "Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem",
+    "benchnav.testing": "check_model check_objective check_planner check_risk check_robot check_sensor",
 }
 EACH = pytest.mark.parametrize("name", FACES)
 

@@ -44,7 +44,7 @@ _PRIOR_STD = 10.0  # of fields and strength, so that both are finite where class
 
 
 def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
-    """Fits the statistics of a dataset's split `train`, which is read once, some maps at a time.
+    """Fits the statistics of a dataset's split `train`, some maps at a time.
 
     Args:
         dataset: the maps.
@@ -53,17 +53,13 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
         DatasetError: there is no such split, or λ of none of its cells is known.
     """
     pairs = look_alike_pairs(dataset.recipe)
-    layers = (*_SEEN_LAYERS, *dataset.layer_names)
-    sums: dict[str, ndarray] = {name: np.zeros((4 if name == "rgb" else 3,)) for name in layers}
     inner, ends = np.zeros(_BINS), np.zeros(2)
     neighbours = np.zeros((len(pairs), 9, 2))
-    for _, maps in dataset.chunks(TRAIN, (*layers, "traversability", "class_id")):
+    for _, maps in dataset.chunks(TRAIN, ("traversability", "class_id")):
         value = maps["traversability"]
         inside = value[(value > 0) & (value < 1)]
         inner += np.histogram(inside, _BINS, (0, 1))[0]
         ends += (value == 0).sum(), (value == 1).sum()
-        for name in layers:
-            sums[name] += _sums_of(name, maps)
         for place, pair in enumerate(pairs):
             neighbours[place] += count_neighbours(maps["class_id"], pair)
     if not inner.sum() + ends.sum():
@@ -77,10 +73,24 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
         weights=weights,
         means=means,
         stds=stds,
-        layer_means={name: _rounded(_mean_of(name, found)) for name, found in sums.items()},
+        layer_means=layer_means(dataset),
         look_alikes=tuple((names[one], names[other]) for one, other in pairs),
         potts_strength=round(fit_potts_strength(neighbours), _DIGITS) if pairs else 0.0,
     )
+
+
+def layer_means(dataset: TerrainDataset) -> dict[str, tuple[float, ...]]:
+    """Means of the layers of the split `train` over their known cells, by name; of directions the mean direction.
+
+    Returns:
+        Of `rgb` three numbers, of any other layer one, in its unit.
+    """
+    names = (*_SEEN_LAYERS, *dataset.layer_names)
+    sums = {name: np.zeros(4 if name == "rgb" else 3) for name in names}
+    for _, maps in dataset.chunks(TRAIN, names):
+        for name in names:
+            sums[name] += _sums_of(name, maps)
+    return {name: _rounded(_mean_of(name, found)) for name, found in sums.items()}
 
 
 def look_alike_pairs(recipe: Recipe) -> list[tuple[int, int]]:
@@ -165,17 +175,17 @@ def fit_potts_strength(neighbours: ndarray) -> float:
     design[..., -1] = difference
     for place in range(pairs):
         design[place, :, place] = 1
-    design, of_a, count = design.reshape(-1, pairs + 1), neighbours[..., 1].ravel(), neighbours.sum(-1).ravel()
+    rows, of_a, count = design.reshape(-1, pairs + 1), neighbours[..., 1].ravel(), neighbours.sum(-1).ravel()
     found, precision = np.zeros(pairs + 1), 1 / _PRIOR_STD**2
 
     def loss(at: ndarray) -> float:
-        logit = design @ at
+        logit = rows @ at
         return float((count * np.logaddexp(0, logit) - of_a * logit).sum() + precision * at @ at / 2)
 
     for _ in range(100):
-        chance = expit(design @ found)
-        slope = design.T @ (of_a - count * chance) - precision * found
-        curvature = (design.T * (count * chance * (1 - chance))) @ design + precision * np.eye(pairs + 1)
+        chance = expit(rows @ found)
+        slope = rows.T @ (of_a - count * chance) - precision * found
+        curvature = (rows.T * (count * chance * (1 - chance))) @ rows + precision * np.eye(pairs + 1)
         step = np.linalg.solve(curvature, slope)
         while loss(found + step) > loss(found) and np.abs(step).max() > 1e-12:
             step = step / 2
@@ -225,7 +235,7 @@ def _sums_of(name: str, maps: Maps) -> ndarray:
 
 
 def _mean_of(name: str, sums: ndarray) -> ndarray:
-    """Means of the channels of a layer; of directions the mean direction, in degrees."""
+    """Means of a layer from `_sums_of`."""
     count = max(sums[-1], 1)
     if name == "rgb":
         return sums[:3] / count

@@ -2,7 +2,8 @@
 
 `config.json` says what the model is and how each of its parts came to be, and holds its own SHA-256; a part, such as
 `classifier` or `gp`, has its tensors in `PART.safetensors`, whose SHA-256 stands in `config.json`; `ground.json` holds
-statistics of the training maps, which the model itself does not use. A checkpoint is written to a folder beside its own and renamed, so that its name never holds half of one.
+statistics of the training maps, of which the model itself makes no use. A checkpoint is written to a folder beside its
+own and renamed, so that its name never holds half of one.
 """
 
 import hashlib

@@ -137,7 +137,9 @@ class Problem(Batch):
             ConfigError: nothing was said of how λ hangs together.
         """
         if self.fields is None:
-            raise ConfigError("Expected a problem with `fields` to draw from, got None. Pass them to `pose_problem`.")
+            raise ConfigError(
+                "Expected a problem with `fields` to draw from, got None. Pass them to `pose_problem`."
+            )
         return self.fields.sample(count, key).to(self.risk_map)
 
     def select(self, members: Tensor) -> "Problem":

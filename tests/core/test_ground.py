@@ -23,7 +23,9 @@ def test_a_round_trip_gives_the_same_statistics() -> None:
 def test_the_mixture_is_the_same_in_every_cell() -> None:
     mixture = GROUND.mixture((2, 3, 4), torch.zeros(1, dtype=torch.float64))
     assert mixture.shape == (2, 3, 4)
-    torch.testing.assert_close(mixture.mean(), torch.full((2, 3, 4), 0.575, dtype=torch.float64), atol=0.01, rtol=0)
+    torch.testing.assert_close(
+        mixture.mean(), torch.full((2, 3, 4), 0.575, dtype=torch.float64), atol=0.01, rtol=0
+    )
 
 
 @pytest.mark.parametrize(

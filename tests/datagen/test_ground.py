@@ -11,7 +11,6 @@ from scipy.special import ndtr
 from benchnav.core import rng
 from benchnav.core.errors import DatasetError
 from benchnav.core.ground import GroundStatistics
-from benchnav.datagen.files import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.ground import (
     count_neighbours,
@@ -100,8 +99,8 @@ def test_statistics_of_a_dataset_are_those_of_its_training_maps(
 
 def test_layers_of_the_dataset_are_among_the_means_by_what_is_known_of_them(tmp_path: Path) -> None:
     recipe = replace(
-        load_recipe("vegetation-v1"), id="grown", height=32, width=32, class_periods_m=(6, 3), places=small_stakes().places,
-        splits={"train": Split(scenario="std", maps=2)},
+        load_recipe("vegetation-v1"), id="grown", height=32, width=32, class_periods_m=(6, 3),
+        places=small_stakes().places, splits={"train": Split(scenario="std", maps=2)},
     )  # fmt: skip
     dataset = TerrainDataset(tiny_dataset(tmp_path / "grown.h5", recipe))
     stored = dataset.read("train", fields=("vegetation_m",))["vegetation_m"]
@@ -206,7 +205,8 @@ def test_a_shipped_file_is_what_the_command_makes(
     assert datagen("ground", "tiny.h5") == 0
     assert "wrote tiny.ground.json: λ of 40 maps" in capsys.readouterr().out
     made, shipped = (
-        json.loads(path.read_text()) for path in (Path("tiny.ground.json"), RECIPES / "ground" / "tiny-v1.json")
+        json.loads(path.read_text())
+        for path in (Path("tiny.ground.json"), RECIPES / "ground" / "tiny-v1.json")
     )
     assert made.keys() == shipped.keys()
     for name in ("weights", "means", "stds"):

@@ -189,7 +189,9 @@ def check_labels(conditions: Iterable[Condition]) -> None:
     labels: dict[tuple[str, str], str] = {}
     for condition in conditions:
         value = condition.value
-        described = {name: value.get(name) for name in PART_KINDS} | {"world": [value["world"], value["rules"]]}
+        described = {name: value.get(name) for name in PART_KINDS} | {
+            "world": [value["world"], value["rules"]]
+        }
         for name, about in described.items():
             label, digest = condition.labels[name], text_digest(about)
             if label == NOT_USED:
@@ -286,7 +288,8 @@ def _as_run_once(condition: Condition) -> Condition:
     any_risk = Part(part="mean", label=NOT_USED)
     unused = {kind: Part(label=NOT_USED, **default) for kind, default in KNOWLEDGE.items()}
     if condition.make_planner().blind:
-        return replace(condition, model=Part(part="oracle", label=NOT_USED), risk=any_risk, blind=True, **unused)
+        given: dict[str, Any] = {**unused, "model": Part(part="oracle", label=NOT_USED), "risk": any_risk}
+        return replace(condition, blind=True, **given)
     if not condition.make("belief").learns:
         condition = replace(condition, ground=unused["ground"])
     if condition.model.part != "clairvoyant":

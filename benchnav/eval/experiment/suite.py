@@ -50,7 +50,8 @@ class Suite:
         conditions: Several products: mappings of the keys above. A key that a mapping lacks has its value above.
         hypotheses: Hypotheses, fixed before the first unit is run: mappings of `one` and `other`, conditions by
             their labels, such as {planner: mppi, risk: mean}; `metric`: success, T_total, score, traversability or
-            path_length; `kind`: difference, non-inferiority or equivalence; `direction`: higher or lower; `margin`.
+            path_length; `kind`: difference, non-inferiority, superiority or equivalence; `direction`: higher or lower;
+            `margin`.
     """
 
     data: str = "paper-v1"

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav.eval.recording import KnownMap
+from benchnav.eval.recording import KnownMap, reach_outline
 from benchnav.planning.free_space import cells_at_goal
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import steps_in
@@ -149,12 +149,14 @@ class Knowing:
             member = cells.nonzero()[:, 0]
             count = torch.bincount(member, minlength=len(cells))
             sums = torch.stack((error.square().double(), score.double().clamp(min=_LEAST_LOG_SCORE)), 1)
-            means = torch.zeros(len(cells), 2, dtype=torch.float64, device=sums.device).index_add_(0, member, sums)
+            means = torch.zeros(len(cells), 2, dtype=torch.float64, device=sums.device).index_add_(
+                0, member, sums
+            )
             means = means / count[:, None]
             found[self.members] = torch.stack((means[:, 0].sqrt(), means[:, 1]), 1).float()
         self.ahead[step] = found
 
-    def maps_of(self, step: int, robot_state: Tensor, wanted: Iterable[int]) -> dict[int, KnownMap]:
+    def maps_of(self, step: int, wanted: Iterable[int]) -> dict[int, KnownMap]:
         """What is known in some episodes, by their numbers, of those that are left."""
         places = {int(member): place for place, member in enumerate(self.members.tolist())}
         learner, known = self._how.learner, self.known
@@ -174,8 +176,6 @@ class Knowing:
             def whole(values: Tensor) -> np.ndarray:
                 return values.reshape(self._problem.grid.shape).float().cpu().numpy()
 
-            at = robot_state[place][None]
-            reach = learner.sensor if not learner.sensor.sees_all else learner.ground
             maps[member] = KnownMap(
                 step=step,
                 predicted=own(known.risk_map),
@@ -184,6 +184,6 @@ class Knowing:
                 spread=whole((high - low) / 2),
                 seen=own(known.seen),
                 sensed=own(known.ever_sensed),
-                outline=reach.outline(at)[0].float().cpu().numpy(),
+                outline=reach_outline(own(known.reached), self._problem.grid.resolution_m),
             )
         return maps

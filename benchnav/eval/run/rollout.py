@@ -33,7 +33,9 @@ _FULL = 0.75  # share of a batch that still runs, over which it is left as it is
 _LOOK_EVERY = 8  # steps between two looks at which episodes still run, where a look waits for a GPU
 
 Watcher = Callable[[int, Plan, list[int]], None]  # step, plan, and the episodes that are planned for
-Witness = Callable[[int, Knowing, Tensor], None]  # step, what is known, and where the robots are that are left
+Witness = Callable[
+    [int, Knowing, Tensor], None
+]  # step, what is known, and where the robots are that are left
 
 
 @dataclass(frozen=True, kw_only=True)

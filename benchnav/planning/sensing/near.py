@@ -101,7 +101,7 @@ class Near(Sensor):
         visible = in_view & rings.in_sight(rise.where(in_view, -math.inf))
         found = torch.full_like(terrain.elevation_m, math.inf, dtype=distance.dtype)
         member, ray = visible.nonzero(as_tuple=True)
-        found.flatten(1)[member, place[member, ray]] = distance[member, ray]
+        found[member, rows[member, ray], columns[member, ray]] = distance[member, ray]
         return found
 
 

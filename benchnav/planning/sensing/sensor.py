@@ -6,7 +6,6 @@ meets the same. `contact` is what every robot has: the λ of the cell under it.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N sensed cells.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -144,10 +143,6 @@ class Sensor(ABC):
             replaces all others.
         """
 
-    def outline(self, robot_state: Tensor) -> Tensor:
-        """How far it reaches, for pictures: closed polylines (x, y), shape [B, N, 2]; none by default."""
-        return robot_state.new_empty(len(robot_state), 0, 2)
-
 
 @dataclass(frozen=True)
 class Full(Sensor):
@@ -216,10 +211,6 @@ class Probe(Sensor):
         found[wanted] = truth.from_normal(score[None].to(value.dtype))[0].to(field.dtype)
         return Sensed(traversability=found, std=torch.full_like(field, self.noise_std))
 
-    def outline(self, robot_state: Tensor) -> Tensor:
-        """The circle that it reaches."""
-        return arc(robot_state, self.radius_m, 2 * math.pi)
-
     def _near(self, terrain: Terrain, robot_state: Tensor) -> Tensor:
         """Cells whose centres are within the radius, bool, shape [B, H, W]."""
         grid = terrain.grid
@@ -227,10 +218,3 @@ class Probe(Sensor):
         x, y = grid.centre_of(row[:, None], column[None, :])
         away = torch.hypot(x - robot_state[:, 0, None, None], y - robot_state[:, 1, None, None])
         return away <= self.radius_m
-
-
-def arc(robot_state: Tensor, radius_m: float, angle_rad: float) -> Tensor:
-    """Points on a circle around robots, within an angle that their heading halves, shape [B, 49, 2]."""
-    turns = torch.linspace(-0.5, 0.5, 49, dtype=robot_state.dtype, device=robot_state.device) * angle_rad
-    bearing = robot_state[:, 2, None] + turns
-    return robot_state[:, None, :2] + radius_m * torch.stack((bearing.cos(), bearing.sin()), dim=-1)
