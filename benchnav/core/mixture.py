@@ -212,7 +212,8 @@ class TraversabilityMixture(TraversabilityDistribution):
         if z.shape[-3] == 1:
             score = z.squeeze(-3)
         else:  # by the smaller of F and 1 − F, so that neither tail is lost to rounding
-            below, above = ((weights * _probability(side * z)).sum(-3) for side in (1, -1))
+            tail, low = _probability(-z.abs()), z < 0
+            below, above = ((weights * torch.where(side, tail, 1 - tail)).sum(-3) for side in (low, ~low))
             least = torch.minimum(below, above).clamp(min=torch.finfo(torch.float64).tiny)
             score = torch.special.ndtri(least) * torch.where(below <= above, 1.0, -1.0)
         ends = (value <= 0, value > 1), (value < 0, value >= 1)

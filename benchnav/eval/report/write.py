@@ -27,6 +27,7 @@ from benchnav.eval.report.charts.conditions import (
     outcome_figure,
     success_figure,
 )
+from benchnav.eval.report.charts.knowledge import draw_knowledge
 from benchnav.eval.report.charts.maps import (
     MOST_PANELS,
     choose_recordings,
@@ -166,7 +167,7 @@ def write_report(folder: Path, record_driven: RecordDriven | None = None, out: P
     for name, caption, figure in _figures(folder, report, record_driven):
         path = out / "figures" / f"{name}.png"
         # These are as wide as their maps: white borders are cut away.
-        save_twice(figure, path, trim=name in ("trajectories", "driven"))
+        save_twice(figure, path, trim=name.partition("-")[0] in ("trajectories", "driven", "knowledge"))
         figures[path] = caption
     for file in ("summary.md", PAGE):
         write_text(out / file, render(file, report, figures))
@@ -181,11 +182,13 @@ def print_report(report: Report) -> None:
     print("\n".join([*report.warnings, *said]))
 
 
-Drawn = Iterator[tuple[str, str, Figure]]  # name, caption and figure
+def _figures(
+    folder: Path, report: Report, record_driven: RecordDriven | None
+) -> Iterator[tuple[str, str, Figure]]:
+    """Gives name, caption and figure of all that is drawn of a run.
 
-
-def _figures(folder: Path, report: Report, record_driven: RecordDriven | None) -> Drawn:
-    """All that is drawn of a run; first what it was to show, how often, and on which map it is seen best."""
+    First is what it was to show, how often, and on which map it is seen best.
+    """
     summary, sheets = report.summary, report.sheets.shown
     if not report.tests.empty:
         yield (
@@ -224,6 +227,7 @@ def _figures(folder: Path, report: Report, record_driven: RecordDriven | None) -
             failure_figure(sheet),
         )
     recorded = read_recordings(folder)
+    yield from draw_knowledge(folder, report.episodes, summary, recorded)
     if driven and (chosen := _on_one_map(driven[1], recorded, record_driven)):
         caption = _trajectories_in_words(chosen) + _chosen_in_words(len(chosen), len(driven[1]))
         yield "trajectories", caption, trajectory_figure(chosen)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav.eval.recording import KnownMap
+from benchnav.eval.recording import KnownMap, reach_outline
 from benchnav.planning.free_space import cells_at_goal
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import steps_in
@@ -156,7 +156,7 @@ class Knowing:
             found[self.members] = torch.stack((means[:, 0].sqrt(), means[:, 1]), 1).float()
         self.ahead[step] = found
 
-    def maps_of(self, step: int, robot_state: Tensor, wanted: Iterable[int]) -> dict[int, KnownMap]:
+    def maps_of(self, step: int, wanted: Iterable[int]) -> dict[int, KnownMap]:
         """What is known in some episodes, by their numbers, of those that are left."""
         places = {int(member): place for place, member in enumerate(self.members.tolist())}
         learner, known = self._how.learner, self.known
@@ -176,9 +176,6 @@ class Knowing:
             def whole(values: Tensor) -> np.ndarray:
                 return values.reshape(self._problem.grid.shape).float().cpu().numpy()
 
-            at = robot_state[place][None]
-            reaches = [sensor.outline(at)[0] for sensor in (learner.sensor, learner.ground)]
-            lines = [torch.cat((line, torch.full_like(line[:1], torch.nan))) for line in reaches if len(line)]
             maps[member] = KnownMap(
                 step=step,
                 predicted=own(known.risk_map),
@@ -187,6 +184,6 @@ class Knowing:
                 spread=whole((high - low) / 2),
                 seen=own(known.seen),
                 sensed=own(known.ever_sensed),
-                outline=(torch.cat(lines) if lines else at.new_empty(0, 2)).float().cpu().numpy(),
+                outline=reach_outline(own(known.reached), self._problem.grid.resolution_m),
             )
         return maps

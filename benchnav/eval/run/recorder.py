@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.unit import Unit
@@ -65,15 +64,14 @@ class Recorder:
         """The arguments of `run_episodes` by which it is told of plans and of what is known."""
         return {"watch": self.watch, "watch_every": self.every, "witness": self.learn}
 
-    def learn(self, step: int, knowing: Knowing, robot_state: Tensor) -> None:
+    def learn(self, step: int, knowing: Knowing) -> None:
         """Keeps what is known from a step on.
 
         Args:
             step: its number.
             knowing: what is known.
-            robot_state: of the episodes that are left, shape [B, S].
         """
-        for member, known in knowing.maps_of(step, robot_state, self._known).items():
+        for member, known in knowing.maps_of(step, self._known).items():
             self._known[member].append(known)
 
     def recording(self, episodes: Episodes, member: int) -> Recording:
@@ -119,11 +117,11 @@ class Recorder:
                 "outcome": outcome,
             },
             resolution_m=problem.grid.resolution_m,
-            rgb=own(problem.observation.rgb),
+            rgb=own(self.terrain.rgb),
             field=None if simulation.field is None else own(simulation.field),
             immobilising=own(simulation.immobilising),
             goal_m=own(problem.goal_m),
-            elevation_m=own(problem.elevation_m),
+            elevation_m=own(self.terrain.elevation_m),
             true_mean=truth.select(torch.tensor([member])).mean()[0].float().cpu().numpy(),
             soft=(truth.weights[member, 1:] > 0).any(dim=0).cpu().numpy(),
             predicted=own(problem.risk_map),
@@ -137,7 +135,7 @@ class Recorder:
             actions=actions,
             traversability=traversability,
             plans=self._plans.get(member, ()),
-            layers={name: own(layer) for name, layer in problem.observation.layers.items()},
+            layers={name: own(layer) for name, layer in self.terrain.layers.items()},
             # An ended episode may stay in a batch that goes on.
             known=tuple(known for known in self._known.get(member, ()) if known.step <= len(actions)),
         )

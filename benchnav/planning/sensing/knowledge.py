@@ -5,7 +5,7 @@ was seen. A `Learner` holds how that is done, a `Knowledge` what is known by now
 Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of all maps together.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -74,6 +74,7 @@ class Knowledge(Batch):
         news: episodes in which more was seen than the prediction knows of, bool, shape [B].
         sensed: of λ, since the belief was updated; of two looks at a cell the later.
         ever_sensed: cells whose λ was sensed, bool, shape [B, H, W].
+        reached: cells that sensors told of in the last step, bool, shape [B, H, W].
         observation: what the model was given.
         believed: the state of the belief.
         risk_map: λ̂, shape [B, H, W].
@@ -84,6 +85,7 @@ class Knowledge(Batch):
     news: Tensor
     sensed: Sensed
     ever_sensed: Tensor
+    reached: Tensor
     observation: Observation
     believed: Any
     risk_map: Tensor
@@ -160,25 +162,29 @@ class Learner:
             news=torch.zeros(len(robot_state), dtype=torch.bool, device=robot_state.device),
             sensed=nothing_sensed(truth.field),
             ever_sensed=torch.zeros_like(truth.field, dtype=torch.bool),
+            reached=torch.zeros_like(truth.field, dtype=torch.bool),
             observation=observation,
             believed=believed,
             risk_map=risk_map,
             free=self.rules.free(risk_map, prior, seen),
         )
 
-    def sense(self, known: Knowledge, truth: Truth, robot_state: Tensor, step: int) -> Knowledge:
+    def sense(
+        self, known: Knowledge, truth: Truth, robot_state: Tensor, step: int | Sequence[int]
+    ) -> Knowledge:
         """Adds what is seen and sensed in a step.
 
         Args:
             known: by now; not changed.
             truth: as it is in this step.
             robot_state: shape [B, S].
-            step: steps taken so far.
+            step: steps taken so far, in all episodes or in each, B of them.
 
         Raises:
             KnowledgeError: a sensor raised, or gave what is none.
         """
         moment = Moment(truth.keys, step)
+        known = replace(known, reached=torch.zeros_like(known.reached))
         for sensor in (self.sensor, self.ground):
             if sensor.sees_all or (sensor is self.ground and not self.belief.learns):
                 continue
@@ -191,8 +197,10 @@ class Learner:
                     std=torch.where(mask, new.std, before.std),
                 ),
                 ever_sensed=known.ever_sensed | mask,
+                reached=known.reached | mask,
             )
             if new.appearance is not None and known.memory is not None:
+                known = replace(known, reached=known.reached | new.appearance.seen)
                 memory = remember(known.memory, new.appearance)
                 more = (memory.seen & ~known.memory.seen).flatten(1).any(1)
                 known = replace(known, memory=memory, news=known.news | more)

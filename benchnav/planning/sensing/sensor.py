@@ -6,7 +6,6 @@ meets the same. `contact` is what every robot has: the λ of the cell under it.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N sensed cells.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -92,29 +91,31 @@ class Moment:
 
     Args:
         keys: a stream key of each episode, B of them.
-        step: how many steps were taken.
+        step: how many steps were taken, in all episodes or in each, B of them.
     """
 
     keys: Sequence[int]
-    step: int
+    step: int | Sequence[int]
 
-    def normal(self, name: str, wanted: Tensor) -> Tensor:
-        """Standard normals, one for each wanted cell of each episode in this step, whatever else is wanted.
+    def normal(self, name: str, wanted: Tensor, shape: tuple[int, ...] = ()) -> Tensor:
+        """Standard normals for each wanted cell of each episode in this step, whatever else is wanted.
 
         Args:
-            name: of the stream, for a sensor that draws more than one number a cell.
+            name: of the stream, for a sensor that draws more than once.
             wanted: bool, shape [B, H, W].
+            shape: of what is drawn for a cell; four numbers cost hardly more than one.
 
         Returns:
-            Float64, in the order of `wanted.nonzero()`, shape [N].
+            Float64, in the order of `wanted.nonzero()`, shape [N, *shape].
         """
         count, flat = wanted[0].numel(), wanted.flatten(1).cpu()
+        steps = [self.step] * len(self.keys) if isinstance(self.step, int) else self.step
         drawn = [
-            rng.normal(rng.stream_key(key, name), self.step * count + row.nonzero()[:, 0].numpy())
-            for key, row in zip(self.keys, flat, strict=True)
+            rng.normal(rng.stream_key(key, name), step * count + row.nonzero()[:, 0].numpy(), shape)
+            for key, step, row in zip(self.keys, steps, flat, strict=True)
             if bool(row.any())
         ]
-        found = np.concatenate(drawn) if drawn else np.empty(0)
+        found = np.concatenate(drawn) if drawn else np.empty((0, *shape))
         return torch.from_numpy(found).to(wanted.device)
 
 
@@ -141,10 +142,6 @@ class Sensor(ABC):
             What is learnt. A sensor may look at the truth of the cells that it reports, and at no other: `check_sensor`
             replaces all others.
         """
-
-    def outline(self, robot_state: Tensor) -> Tensor:
-        """How far it reaches, for pictures: closed polylines (x, y), shape [B, N, 2]; none by default."""
-        return robot_state.new_empty(len(robot_state), 0, 2)
 
 
 @dataclass(frozen=True)
@@ -214,10 +211,6 @@ class Probe(Sensor):
         found[wanted] = truth.from_normal(score[None].to(value.dtype))[0].to(field.dtype)
         return Sensed(traversability=found, std=torch.full_like(field, self.noise_std))
 
-    def outline(self, robot_state: Tensor) -> Tensor:
-        """The circle that it reaches."""
-        return arc(robot_state, self.radius_m, 2 * math.pi)
-
     def _near(self, terrain: Terrain, robot_state: Tensor) -> Tensor:
         """Cells whose centres are within the radius, bool, shape [B, H, W]."""
         grid = terrain.grid
@@ -225,10 +218,3 @@ class Probe(Sensor):
         x, y = grid.centre_of(row[:, None], column[None, :])
         away = torch.hypot(x - robot_state[:, 0, None, None], y - robot_state[:, 1, None, None])
         return away <= self.radius_m
-
-
-def arc(robot_state: Tensor, radius_m: float, angle_rad: float) -> Tensor:
-    """Points on a circle around robots, within an angle that their heading halves, shape [B, 49, 2]."""
-    turns = torch.linspace(-0.5, 0.5, 49, dtype=robot_state.dtype, device=robot_state.device) * angle_rad
-    bearing = robot_state[:, 2, None] + turns
-    return robot_state[:, None, :2] + radius_m * torch.stack((bearing.cos(), bearing.sin()), dim=-1)

@@ -1,6 +1,7 @@
 """Hand-made rows and recordings."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import LABELS, LATER_LABELS
-from benchnav.eval.recording import Recording, drawn_plan
+from benchnav.eval.recording import KnownMap, Recording, drawn_plan, reach_outline
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.summary import summarise
 
@@ -120,6 +121,32 @@ def held_recording(steps: int = 80, **changes: Any) -> Recording:
     about = {"condition": "t", **condition(world="stakes"), "seed": "0", "realisation": "0", "map": "4"}
     ground = {"field": field, "soft": generator.random((40, 60)) < 0.2, "immobilising": field < 0.15}
     return recording(steps, **({"about": about | {"outcome": "immobilised"}} | ground | changes))
+
+
+def learning_recording(steps: int = 80, every: int = 5, **changes: Any) -> Recording:
+    """An episode of a robot that learns twice a second: it sees 6 m and senses λ within 2 m."""
+    recording = held_recording(steps, **changes)
+    return replace(recording, known=known_maps(recording, range(0, steps + 1, every)))
+
+
+def known_maps(recording: Recording, steps: Iterable[int]) -> tuple[KnownMap, ...]:
+    """What a robot knows that believes in the field where it sensed it, and knows little elsewhere."""
+    rows, columns = np.mgrid[:40, :60]
+    known, seen, sensed = [], np.zeros((40, 60), bool), np.zeros((40, 60), bool)
+    assert recording.field is not None
+    for step in steps:
+        x, y = recording.states[step, :2] / 0.5
+        away_m = 0.5 * np.hypot(columns + 0.5 - x, rows + 0.5 - y)
+        seen, sensed = seen | (away_m < 6), sensed | (away_m < 2)
+        mean = np.where(sensed, recording.field, 0.6).astype(np.float16)
+        known.append(
+            KnownMap(
+                step=step, predicted=(0.8 * mean).astype(np.float16), free=mean > 0.3, mean=mean,
+                spread=np.where(sensed, 0, 0.3).astype(np.float16), seen=seen, sensed=sensed,
+                outline=reach_outline(away_m < 2, 0.5),
+            )
+        )  # fmt: skip
+    return tuple(known)
 
 
 def plan(step: int, state: np.ndarray) -> Any:

@@ -22,10 +22,11 @@ from benchnav.eval.recording import Recording, drawn_plan, thinned
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.recordings import find_recording
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.run.unit import Settings, build
+from benchnav.eval.run.unit import Settings, build, read_block
 from benchnav.planning.planners.planner import Plan
 from tests import factories
 from tests.eval.forged import forge_rows
+from tests.eval.report import made
 
 BELOW, HELD_S, SEEDS = 0.45, 0.4, (3, 4)
 SOFT = (1, 3, 4)  # classes with soft spots
@@ -228,6 +229,23 @@ def test_plans_after_the_moment_of_figures_are_thinned(stakes: Path) -> None:
         for plan, lines in zip(plans, (whole, whole, thinned(whole), thinned(whole)), strict=True):
             for before, after in zip(lines.lines["samples"], plan.lines["samples"], strict=True):
                 np.testing.assert_array_equal(after, before)
+
+
+def test_what_watched_episodes_know_is_kept_to_their_end(stakes: Path) -> None:
+    unit = find_episodes(stakes, {}, None, 0, 1)[0][0]
+    settings = Settings()
+    origin = settings.origins().of(unit)
+    problem, simulation = build(unit, origin)
+    recorder = Recorder(unit, problem, simulation, read_block(unit, origin).terrain, [1, 3])
+    first = made.learning_recording(5).known[0]
+    for step in (0, 4, 5, 8):
+        recorder.learn({member: replace(first, step=step, mean=first.mean + member) for member in (0, 1, 3)})
+    states, actions = np.zeros((6, 3)), np.zeros((5, 2))
+    for member, wanted in ((1, [0, 4, 5]), (3, [0, 4, 5]), (0, [])):
+        known = recorder.driven(member, "stuck", states, actions, np.zeros(5)).known
+        assert [each.step for each in known] == wanted
+        for each in known:
+            np.testing.assert_array_equal(each.mean, first.mean + member)
 
 
 @pytest.mark.parametrize(
