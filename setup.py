@@ -22,6 +22,7 @@ SHIPPED = (
     "checkpoints/stakes-v1/classifier.safetensors",
     "checkpoints/stakes-v1/config.json",
     "checkpoints/stakes-v1/gp.safetensors",
+    "checkpoints/stakes-v1/ground.json",
 )
 
 

@@ -71,3 +71,13 @@ def _tensors(value: Any) -> Iterator[Tensor]:
     )
     for part in parts if isinstance(parts, list | tuple) else ():
         yield from _tensors(part)
+
+
+def find_tensor_fault(
+    what: str, values: Any, dtype: torch.dtype, shape: tuple[int, ...], device: torch.device
+) -> str:
+    """Tells in one line what makes something another tensor than is expected; empty where nothing does."""
+    wanted, got = f"{dtype} of shape {list(shape)} on {device}", type(values).__name__
+    if isinstance(values, Tensor):
+        got = f"{values.dtype} of shape {list(values.shape)} on {values.device}"
+    return "" if got == wanted else f"Expected {what} as {wanted}, got {got}."

@@ -1,4 +1,4 @@
-"""Checks for the tests of whoever writes a planner, model, robot, objective or risk measure."""
+"""Checks for the tests of whoever writes a planner, model, robot, objective, risk measure or sensor."""
 
 from benchnav.core.public_names import face
 
@@ -8,5 +8,6 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.testing.functions": ("check_objective", "check_risk", "check_robot"),
         "benchnav.testing.model": ("check_model",),
         "benchnav.testing.planner": ("check_planner",),
+        "benchnav.testing.sensor": ("check_sensor",),
     },
 )

@@ -19,10 +19,10 @@ from benchnav.eval.report.words import (
     failures_in_words,
     maps_in_words,
     mean_and_std,
+    naming_labels,
     p_value,
     rate_in_words,
     reading_name,
-    several_models,
     short,
     signed,
     signed_interval,
@@ -45,6 +45,9 @@ _COLUMNS = {
     "robot": "motion model of the robot.",
     "objective": "cost J that planners minimise.",
     "model": "predictor of λ; the privileged models ideal, oracle and clairvoyant are given part of the truth.",
+    "sensor": "what a robot sees of its map.",
+    "ground": "what a robot senses of λ on its way.",
+    "belief": "what is made of what is sensed.",
     "planner": "motion planner.",
     "risk": "risk setting, which turns the predicted distribution of λ into λ̂, the one number a planner is given.",
     "groups": "number of groups of maps; the group is the statistical unit.",
@@ -128,7 +131,7 @@ def paper_table(summary: pd.DataFrame, label: str) -> str:
         f"failure counted as the time budget T; and mean observed traversability λ̄. ± is the standard deviation over "
         f"episodes.{note}"
     )
-    several = several_models(summary)
+    several = naming_labels(summary)
     tables = [_across(known[i : i + _MOST_ACROSS], several) for i in range(0, len(known), _MOST_ACROSS)]
     return to_latex(tables, caption, label, wide=len(known) > 1, size="footnotesize")
 

@@ -1,6 +1,6 @@
 """Recordings of episodes, taken while a unit runs."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from benchnav.eval.recording import (
     drawn_plan,
     thinned,
 )
+from benchnav.eval.run.knowledge import Knowing
 from benchnav.eval.run.rollout import Episodes
 from benchnav.planning.planners.planner import Plan
 from benchnav.planning.problem import Problem
@@ -58,14 +59,20 @@ class Recorder:
                 drawn = drawn_plan(step, plan.lines(place))
                 self._plans[member].append(drawn if whole else thinned(drawn))
 
-    def learn(self, known: Mapping[int, KnownMap]) -> None:
-        """Keeps what is known in some episodes from a step on.
+    @property
+    def watching(self) -> dict[str, Any]:
+        """The arguments of `run_episodes` by which it is told of plans and of what is known."""
+        return {"watch": self.watch, "watch_every": self.every, "witness": self.learn}
+
+    def learn(self, step: int, knowing: Knowing) -> None:
+        """Keeps what is known from a step on.
 
         Args:
-            known: by the number of the unit's episode; of those that are not kept nothing is.
+            step: its number.
+            knowing: what is known.
         """
-        for member in self._known.keys() & known.keys():
-            self._known[member].append(known[member])
+        for member, known in knowing.maps_of(step, self._known).items():
+            self._known[member].append(known)
 
     def recording(self, episodes: Episodes, member: int) -> Recording:
         """All that is played back of one episode."""
@@ -110,11 +117,11 @@ class Recorder:
                 "outcome": outcome,
             },
             resolution_m=problem.grid.resolution_m,
-            rgb=own(problem.observation.rgb),
+            rgb=own(self.terrain.rgb),
             field=None if simulation.field is None else own(simulation.field),
             immobilising=own(simulation.immobilising),
             goal_m=own(problem.goal_m),
-            elevation_m=own(problem.elevation_m),
+            elevation_m=own(self.terrain.elevation_m),
             true_mean=truth.select(torch.tensor([member])).mean()[0].float().cpu().numpy(),
             soft=(truth.weights[member, 1:] > 0).any(dim=0).cpu().numpy(),
             predicted=own(problem.risk_map),
@@ -128,7 +135,7 @@ class Recorder:
             actions=actions,
             traversability=traversability,
             plans=self._plans.get(member, ()),
-            layers={name: own(layer) for name, layer in problem.observation.layers.items()},
+            layers={name: own(layer) for name, layer in self.terrain.layers.items()},
             # An ended episode may stay in a batch that goes on.
             known=tuple(known for known in self._known.get(member, ()) if known.step <= len(actions)),
         )

@@ -9,7 +9,7 @@ import pandas as pd
 import torch
 
 from benchnav.core.tables import Bold, Table
-from benchnav.eval.experiment.condition import LABELS
+from benchnav.eval.experiment.condition import LABELS, LATER_LABELS
 from benchnav.eval.recording import KnownMap, Recording, drawn_plan, reach_outline
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.summary import summarise
@@ -22,7 +22,7 @@ PAPER = {
 
 def condition(planner: str = "mppi", risk: str = "cvar", **labels: str) -> dict[str, str]:
     """Labels of a condition."""
-    same = {"data": "paper-v1", "scenario": "std", "world": "paper", "robot": "unicycle"}
+    same = {"data": "paper-v1", "scenario": "std", "world": "paper", "robot": "unicycle", **LATER_LABELS}
     return (
         same | {"objective": "goal_distance", "model": "paper-v1", "planner": planner, "risk": risk} | labels
     )
@@ -40,7 +40,9 @@ def row(
         "traversability": 0.8, "reference_time_s": 25.0, "time_ratio": time_s / 25 if success else np.nan,
         "score": 12.5 / time_s if success else 0.0, "path_length_m": 22.0, "stuck_share": 0.1,
         "roughness_radps2": 2.0, "planning_ms": 1.0, "planning_ms_p95": 3.0, "planning_start_ms": 9.0,
-        "rejected_draws": 0, "compiled": True, "error": "", "code": "c",
+        "revisions": np.nan, "seen_cells": np.nan, "sensed_cells": np.nan, "ahead_rmse": np.nan,
+        "ahead_log_score": np.nan, "learning_ms": np.nan, "rejected_draws": 0, "compiled": True, "error": "",
+        "code": "c",
     }  # fmt: skip
     return made | changes
 

@@ -18,7 +18,7 @@ from benchnav.planning.sensing.gaussian import (
 
 INF = float("inf")
 SHAPE, LENGTH = (10, 11), 2.0
-FIELD = Field.of(SHAPE, LENGTH, "cpu")
+FIELD = Field.of(SHAPE, (LENGTH,), "cpu")
 
 
 def cells(*places: tuple[int, int]) -> Cells:

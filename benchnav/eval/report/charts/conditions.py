@@ -253,8 +253,9 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame) -> None:
     names = []
     for height, row in enumerate(rows.to_dict("records")):
         if row["margin"] > 0:
-            low = -reach if row["direction"] == "lower" else -row["margin"]
-            high = reach if row["direction"] == "higher" else row["margin"]
+            inner = -row["margin"] if row["kind"] == "superiority" else row["margin"]
+            low = -reach if row["direction"] == "lower" else -inner
+            high = reach if row["direction"] == "higher" else inner
             panel.fill_between([low, high], height - 0.36, height + 0.36, color=_MARGIN, lw=0, zorder=0)
         for suffix, width in (("", 0.9), ("_90", 2.6)):
             span = [row[f"low{suffix}"], row[f"high{suffix}"]]

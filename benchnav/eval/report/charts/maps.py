@@ -29,7 +29,7 @@ from benchnav.core.figures import (
     stack_panels,
     styled,
 )
-from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.folder.steps import STEPS, read_steps
 from benchnav.eval.recording import GROUND, Ground, Recording
 from benchnav.eval.report.failures import FailedLine
@@ -104,7 +104,11 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
     tall = panel_in * min(max(tallest, 0.3), 2.0) + 0.35
     figure = Figure(figsize=(width, (layers * tall + 0.2) * lines + 0.8), layout="compressed")
     stacks = stack_panels(figure, len(recordings), across, layers)
-    several = [name for name in ("model", "world") if differ(one.about[name] for one in recordings)]
+    several = [
+        name
+        for name in ("model", *KNOWLEDGE, "world")
+        if differ(one.about.get(name, NOT_USED) for one in recordings)
+    ]
     maps = [f"{one.about['scenario']}, map {one.about['map']}" for one in recordings]
     letters = int(panel_in / _LETTER_IN)
     for place, (recording, (above, below, *last)) in enumerate(zip(recordings, stacks, strict=True)):
