@@ -89,12 +89,12 @@ class ConditionedDistribution(TraversabilityDistribution):
         """Log density on (0, 1), log mass at 0 and at 1, shape [*B, H, W]; not a number where the base has none."""
         value, std = value.double(), self.score_std.double().clamp(min=_SMALLEST_STD)
         lower, upper = self._scores(value)
-        prior = upper * std + self.score_mean.double()  # z of the base, whose density there is known
+        prior = self.base._exact().to_normal(value)[1]  # whose density is known
         inside = (
             self.base._exact().log_prob(value).double() + (prior.square() - upper.square()) / 2 - std.log()
         )
         if self.score_skew is not None:
-            inside = inside - _slope(upper, self.score_skew).log()
+            inside = torch.where(upper.isinf(), -math.inf, inside - _slope(upper, self.score_skew).log())
         mass = torch.where(value <= 0, upper, -lower)
         total = torch.where((value <= 0) | (value >= 1), torch.special.log_ndtr(mass), inside)
         return torch.where((value < 0) | (value > 1), -math.inf, total).to(self.dtype)

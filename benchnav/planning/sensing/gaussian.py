@@ -25,7 +25,7 @@ _ROUNDS = 40
 _ENOUGH = 1e-3  # change of a mean and of a standard deviation, in normal scores
 _LEAST_SHARE = 1e-9  # of the variance that an interval leaves
 _LEAST_VARIANCE = 1e-12
-_MOST_SKEW = 1.5
+_MOST_SKEW = 2.0  # that of an exponential, which a number far out in a tail is
 
 
 @dataclass(frozen=True, kw_only=True)
