@@ -196,6 +196,10 @@ class Static(Belief[StaticState]):
         """The prediction."""
         return state.prior
 
+    def changed(self, before: StaticState, after: StaticState) -> Tensor:
+        """Cells whose prediction is another."""
+        return before.prior.differs(after.prior)
+
     def sample_fields(self, state: StaticState, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields with the prediction's marginals."""
         law = state.law if self.correlated else replace(state.law, correlation_m=0.0)
