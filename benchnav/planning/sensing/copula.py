@@ -188,6 +188,10 @@ class Copula(Belief[CopulaState]):
         moved = _moved(before, after)
         return moved if before.prior is after.prior else moved | before.prior.differs(after.prior)
 
+    def put(self, state: CopulaState, members: Tensor, others: CopulaState) -> CopulaState:
+        """Puts episodes in the places of others; see `Belief`."""
+        return replace(state.put(members, others), table=state.table.put(members, others.table))
+
     def sample_fields(self, state: CopulaState, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields given all observations, by Matheron's rule: a field of the law, moved to what was observed."""
         (height, width), device = state.law.grid.shape, state.mean.device

@@ -54,6 +54,12 @@ class ScoreTable(Batch):
         none = torch.full(prior.shape, -1, dtype=torch.int64, device=prior.device)
         return cls(none, _Rows(scores_of(prior.at(none >= 0))))
 
+    def put(self, members: Tensor, others: "ScoreTable") -> "ScoreTable":
+        """Puts episodes in the places of others; see `Batch`."""
+        place = torch.where(others.place >= 0, others.place + len(self.rows.scores), -1)
+        rows = torch.cat((self.rows.scores, others.rows.scores))
+        return ScoreTable(self.place.index_copy(0, members, place), _Rows(rows))
+
     def without(self, cells: Tensor) -> "ScoreTable":
         """Forgets some cells, bool [B, H, W], whose prediction has changed."""
         return replace(self, place=self.place.masked_fill(cells, -1))

@@ -481,3 +481,26 @@ def test_a_state_is_not_changed_by_an_update() -> None:
     for name in ("lower", "upper", "noise_std", "precision", "shift", "mean", "std"):
         one: Tensor = getattr(state, name)
         torch.testing.assert_close(one, getattr(before, name), rtol=0, atol=0, equal_nan=True)
+
+
+def test_episodes_that_take_the_places_of_others_are_what_they_were_alone() -> None:
+    belief, looks = Copula(), (looked({(4, 4): 0.5, (9, 2): 0.0}, batch=3), looked({(6, 6): 0.3}, batch=2))
+    prior, other = made.mixture(3, HEIGHT, WIDTH), made.mixture(2, HEIGHT, WIDTH, seed=1)
+    one, two = after(belief, prior, looks[0]), after(belief, other, looks[1])
+    whole = belief.put(one, torch.tensor([2, 0]), two)
+    more = looked({(7, 5): 0.6}, batch=3)
+    for state, alone, now in (
+        (whole, (one, two), whole),
+        (
+            belief.update(whole, more),
+            tuple(belief.update(each, more.select(torch.arange(len(each.mean)))) for each in (one, two)),
+            whole,
+        ),
+    ):
+        cells = torch.ones(3, HEIGHT, WIDTH, dtype=torch.bool)
+        found = belief.at(state, cells).mean().view(3, HEIGHT, WIDTH)
+        first, second = (
+            belief.at(each, cells[: len(each.mean)]).mean().view(-1, HEIGHT, WIDTH) for each in alone
+        )
+        torch.testing.assert_close(found, torch.stack((second[1], first[1], second[0])), atol=1e-9, rtol=0)
+        assert belief.changed(now, state).any() == (state is not now)
