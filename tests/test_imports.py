@@ -48,6 +48,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "planning": PLANNING,
     "planning/world": (*PLANNING, "planning.world"),
     "planning/sensing": ("planning.sensing",),
+    "planning/sensing/knowledge.py": (*PLANNING, "planning.sensing", "planning.world"),
     "planning/sensing/appearance.py": ("planning.sensing", "datagen.synth", "datagen.schema"),
     "planning/planners": (*PLANNING, "planning.sensing", "planning.planners"),
     "env": ("env", "models", "planning", "datagen"),

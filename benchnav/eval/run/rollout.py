@@ -33,9 +33,7 @@ _FULL = 0.75  # share of a batch that still runs, over which it is left as it is
 _LOOK_EVERY = 8  # steps between two looks at which episodes still run, where a look waits for a GPU
 
 Watcher = Callable[[int, Plan, list[int]], None]  # step, plan, and the episodes that are planned for
-Witness = Callable[
-    [int, Knowing, Tensor], None
-]  # step, what is known, and where the robots are that are left
+Witness = Callable[[int, Knowing], None]  # step, and what is known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,7 +239,7 @@ def run_episodes(
                 if knowing.is_due(count):
                     knowing.look_ahead(count, at, goes_on)
                     if witness is not None:
-                        witness(count, knowing, at)
+                        witness(count, knowing)
             watched = watch is not None and count % watch_every == 0
             step = Step(state=now.state, traversability=observed, time_s=count * problem.dt_s, draw=watched)
             with log.clock.timed():

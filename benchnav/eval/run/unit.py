@@ -35,12 +35,7 @@ from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rollout import Episodes, run_episodes
 from benchnav.eval.run.rows import episode_rows, error_rows, step_table
 from benchnav.models.base import PrivilegedModel, predict, predict_observation
-from benchnav.models.predictor import Clairvoyant, load_model
-
-
-    raise NotImplementedError
-
-
+from benchnav.models.predictor import Clairvoyant, find_ground_statistics, load_model
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem, heading_to, pose_problem
 from benchnav.planning.sensing.belief import Fields, Law

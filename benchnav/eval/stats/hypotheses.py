@@ -1,7 +1,7 @@
 """Tests of the hypotheses that a suite fixed, map by map.
 
-A difference is tested by flipping signs; non-inferiority, superiority and equivalence by a margin by where the interval of
-the difference ends (two one-sided tests). Holm's correction is over the whole list.
+A difference is tested by flipping signs; non-inferiority, superiority and equivalence by a margin by where the interval
+of the difference ends (two one-sided tests). Holm's correction is over the whole list.
 Sources: Schuirmann (1987), "A comparison of the two one-sided tests procedure and the power approach for assessing the
 equivalence of average bioavailability"; Wellek (2010), "Testing Statistical Hypotheses of Equivalence and
 Noninferiority", 1.

@@ -200,10 +200,10 @@ class Learner:
                 reached=known.reached | mask,
             )
             if new.appearance is not None and known.memory is not None:
-                known = replace(known, reached=known.reached | new.appearance.seen)
                 memory = remember(known.memory, new.appearance)
                 more = (memory.seen & ~known.memory.seen).flatten(1).any(1)
-                known = replace(known, memory=memory, news=known.news | more)
+                reached = known.reached | new.appearance.seen
+                known = replace(known, memory=memory, news=known.news | more, reached=reached)
         return known
 
     def update(self, known: Knowledge, truth: Truth) -> tuple[Knowledge, Tensor]:

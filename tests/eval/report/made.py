@@ -41,7 +41,8 @@ def row(
         "score": 12.5 / time_s if success else 0.0, "path_length_m": 22.0, "stuck_share": 0.1,
         "roughness_radps2": 2.0, "planning_ms": 1.0, "planning_ms_p95": 3.0, "planning_start_ms": 9.0,
         "revisions": np.nan, "seen_cells": np.nan, "sensed_cells": np.nan, "ahead_rmse": np.nan,
-        "ahead_log_score": np.nan, "learning_ms": np.nan, "rejected_draws": 0, "compiled": True, "error": "", "code": "c",
+        "ahead_log_score": np.nan, "learning_ms": np.nan, "rejected_draws": 0, "compiled": True, "error": "",
+        "code": "c",
     }  # fmt: skip
     return made | changes
 

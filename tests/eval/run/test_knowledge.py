@@ -359,7 +359,7 @@ def test_a_planner_in_a_process_of_its_own_learns_as_one_here() -> None:
 
 def test_a_measure_that_fails_on_what_is_believed_is_a_model_error() -> None:
     def on_whole_maps(distribution: TraversabilityDistribution) -> Tensor:
-        if distribution.shape[1] == 1:
+        if len(distribution.shape) == 2:
             raise ValueError("no tail")
         return measure(distribution)
 

@@ -293,7 +293,7 @@ def _over(panel: Axes, words: str, corner: tuple[int, int], points: float, **sty
 def _head(panel: Axes, heading: str, words: str = "", colour: str = "black") -> None:
     """Writes over a panel what it shows, and under that a line that is not as loud."""
     head = _over(panel, heading, (0, 1), 22 if words else 5, fontsize=_HEAD, weight="bold", color=colour)
-    head.set_fontsize(head.get_fontsize() * _shrunk(head, panel.get_window_extent().width))
+    head.set_fontsize(float(head.get_fontsize()) * _shrunk(head, panel.get_window_extent().width))
     _over(panel, words, (0, 1), 5, color="0.25")
 
 
