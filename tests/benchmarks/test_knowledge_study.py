@@ -1,6 +1,7 @@
 """The study of knowledge: its suites, its maps, its power and its figure."""
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from scipy.stats import norm
 from sklearn.gaussian_process.kernels import Matern
 
 from benchmarks import knowledge_study
@@ -26,6 +28,7 @@ from benchmarks.knowledge_study import (
 from benchnav.core.grid import Grid
 from benchnav.core.settings import of, read
 from benchnav.datagen import TerrainDataset
+from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.eval.experiment.condition import Condition, check_labels, conditions_of
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
@@ -121,12 +124,6 @@ def test_the_kernel_is_materns(length_m: float) -> None:
 def test_maps_with_materns_field_have_all_else_and_a_feasible_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recipe = knowledge_study.yaml.safe_load  # of the shipped recipe with few small maps
-    del recipe
-    from dataclasses import replace
-
-    from benchnav.datagen.recipe.recipe import load_recipe
-
     whole = load_recipe("stakes-v1")
     few = replace(whole, splits={"test/std": replace(whole.splits["test/std"], maps=6)})
     dataset = TerrainDataset(factories.tiny_dataset(tmp_path / "few.h5", few))
@@ -162,8 +159,6 @@ def test_maps_with_materns_field_have_all_else_and_a_feasible_path(
     ],
 )
 def test_power_is_the_share_of_studies_that_support_it(row: dict[str, Any]) -> None:
-    from scipy.stats import norm
-
     error, alpha = 1.2, 0.05
     z = norm.ppf(1 - alpha)
     true = row["difference"] if row["kind"] in ("difference", "superiority") else 0.0
@@ -195,7 +190,16 @@ def test_the_figure_has_a_line_a_risk_setting_over_what_is_known() -> None:
         "planner": "astar_dwa revises",
     }
     rows += [{**rows[0], name: value, "success_rate": 0.01} for name, value in others.items()]
-    rows.append({**rows[0], "model": "clairvoyant", "ground": "–", "risk": "–", "success_rate": 1.0})
+    rows.append(
+        {
+            **rows[0],
+            "model": "clairvoyant",
+            "ground": "–",
+            "risk": "–",
+            "success_rate": 1.0,
+            "success_high": 1.0,
+        }
+    )
     figure = knowledge_figure(pd.DataFrame(rows))
     panel = figure.axes[0]
     assert [label.get_text() for label in panel.get_xticklabels()] == [*KNOWN.values(), ALL_KNOWN]
