@@ -30,7 +30,7 @@ from benchnav.core.figures import (
     stack_panels,
     styled,
 )
-from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.experiment.hypotheses import METRICS
 from benchnav.eval.report.words import blocks, outcome_in_words, p_in_words, reading_names, with_names
 
@@ -70,7 +70,7 @@ _SPREAD = 0.32  # of a row's height, to either side
 _TEST_IN, _METRIC_IN = 0.3, 0.55
 _MARGIN = "0.88"
 
-_SETTING = ["planner", "model", "risk"]
+_SETTING = ["planner", "model", *KNOWLEDGE, "risk"]
 
 
 def lay_out(

@@ -132,7 +132,6 @@ def write_steps(folder: Path, rows: pd.DataFrame, seconds: float = 6.0) -> None:
         # The first map's episode ends early, and a step without an evaluation lies between any two.
         told = np.where(np.arange(len(time_s)) % 2 == 0, 0.1 * place + time_s, np.nan)  # type: ignore[operator]
         told = np.where(own["planner"].iloc[0] == "mppi", np.nan, told)
-        count = 4 if place == 0 else len(time_s)
         table = pd.DataFrame(
             {"seed": 0, "realisation": 0, "map": place, "step": range(len(time_s)), "time_s": time_s}
         )
