@@ -49,7 +49,7 @@ def _scores(key: int, shape: tuple[int, int], correlation_cells: float) -> np.nd
 
 
 class Revising(AStarDWA):
-    """A\\*+DWA that revises its plan as often as a robot that learns, though nothing is learnt: maps are searched anew."""
+    """A\\*+DWA that revises its plan as often as a robot that learns, though nothing is learnt."""
 
     def plan(self, step: Any, plan_state: Any) -> Any:
         problem, every = plan_state.problem, steps_in(Rules().replan_every_s, plan_state.problem.dt_s)

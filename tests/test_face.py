@@ -27,7 +27,8 @@ FACES = {
     "FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Near Objective Places Plan "
     "PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensed Sensor Simulation Static Step "
     "Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem",
-    "benchnav.testing": "check_model check_objective check_planner check_risk check_robot check_sensor",
+    "benchnav.testing": "check_belief check_model check_objective check_planner check_risk check_robot "
+    "check_sensor",
 }
 EACH = pytest.mark.parametrize("name", FACES)
 

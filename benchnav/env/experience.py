@@ -18,7 +18,8 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.terrain import Observation
 from benchnav.env.view import Known, spread_of
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, predict_observation
-from benchnav.planning.sensing.knowledge import Knowledge, Learner, Predict, Truth, nothing_sensed
+from benchnav.planning.sensing.knowledge import Knowledge, Learner, Predict, Truth
+from benchnav.planning.sensing.sensor import Sensed
 
 _MOST_KEPT = 128  # maps, of up to two megabytes each
 
@@ -114,26 +115,25 @@ class Experience:
 
     def _update(self, due: Tensor, truth: Truth) -> None:
         """Updates what is known in some episodes, bool [B]."""
-        now, learner = self._current, self._learner
-        if bool((now.knowledge.news & due).any()):
-            # What a new prediction is made for is worth to be taken apart.
-            members = due.nonzero()[:, 0]
-            part = _Known(
-                knowledge=learner.select(now.knowledge, members), spread=now.spread.index_select(0, members)
+        learner, now = self._learner, self._current
+        news = now.knowledge.news & due
+        if bool(news.any()):
+            # Taken apart, since a prediction costs more than that.
+            members = news.nonzero()[:, 0]
+            known = learner.select(now.knowledge, members)
+            part = _Known(knowledge=known, spread=now.spread.index_select(0, members))
+            now = _put(now, members, self._updated(part, truth.select(members)))
+        told = (due & ~news)[:, None, None]
+        sensed, news = now.knowledge.sensed, now.knowledge.news
+        if bool((sensed.mask & told).any()):
+            # As a whole, since to take it apart costs more than the update.
+            part = replace(
+                now,
+                knowledge=replace(now.knowledge, sensed=_only(sensed, told), news=torch.zeros_like(news)),
             )
-            self._now = _put(now, members, self._updated(part, truth.select(members)))
-            return
-        sensed, nothing = now.knowledge.sensed, nothing_sensed(now.spread)
-        told, left = (
-            map_tensors(
-                sensed, lambda own, no, which=which: torch.where(which[:, None, None], own, no), nothing
-            )
-            for which in (due, ~due)
-        )
-        news = now.knowledge.news
-        part = replace(now, knowledge=replace(now.knowledge, sensed=told, news=torch.zeros_like(news)))
-        updated = self._updated(part, truth)
-        self._now = replace(updated, knowledge=replace(updated.knowledge, sensed=left, news=news))
+            now = self._updated(part, truth)
+            now = replace(now, knowledge=replace(now.knowledge, sensed=_only(sensed, ~told), news=news))
+        self._now = now
 
     def _updated(self, now: _Known, truth: Truth) -> _Known:
         knowledge, changed = self._learner.update(now.knowledge, truth)
@@ -168,6 +168,11 @@ def predict_with(model: TraversabilityModel) -> Predict:
         return predict_observation(model, observation)
 
     return predict
+
+
+def _only(sensed: Sensed, which: Tensor) -> Sensed:
+    """What was sensed in some episodes, bool, shape [B, 1, 1], and nothing in the others."""
+    return replace(sensed, traversability=sensed.traversability.masked_fill(~which, torch.nan))
 
 
 def _put(whole: Value, members: Tensor, part: Value) -> Value:

@@ -167,11 +167,11 @@ def conditions_of(suite: Suite, scenarios_of: Any) -> list[Condition]:
     for product in suite.conditions or ({},):
         here: set[str] = set()
         for condition in _product(_listed(suite, product), scenarios_of):
-            if condition.id in here and condition.risk.label != NOT_USED:
+            if condition.id in here:
                 words = " ".join(label_words(condition.labels))
                 raise ConfigError(f"Expected settings that differ, got {words} twice.")
             here.add(condition.id)
-            every.append(condition)
+            every.append(_as_run_once(condition))
     check_labels(every)
     return list({condition.id: condition for condition in every}.values())
 
@@ -241,7 +241,7 @@ def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Con
                 data=data, scenario=scenario, rules=rules, world=world, world_label=label,
                 **dict(zip(_ORDER, chosen, strict=True)),
             )  # fmt: skip
-            yield _as_run_once(condition)
+            yield condition
 
 
 def is_checkpoint(kind: str, source: str) -> bool:

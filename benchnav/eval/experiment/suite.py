@@ -37,8 +37,8 @@ class Suite:
         grounds: What it senses of λ: `contact`, under it, or `probe`, near it.
         beliefs: What is made of that: `static`, nothing, or `copula` or `classes`.
         world: What λ does: a preset by name, paper or stakes, or {preset: NAME, noise: resampled | stored |
-            frozen, correlation_m: 1.5, immobile: {below: 0.1, for_s: 2}, time_budget_s: T or
-            time_budget_ratio: T over the map's reference time}; or a list of several.
+            frozen, correlation_m: 1.5, kernel: gaussian | matern32, immobile: {below: 0.1, for_s: 2},
+            time_budget_s: T or time_budget_ratio: T over the map's reference time}; or a list of several.
         task: Changes to the preset's rules: {free_space: {by: risk | mean, above: 0.3}, min_traversability: 0.3,
             goal_radius_m: 1.0, unseen: prior | optimistic | pessimistic, replan_every_s: 0.5}.
         maps: Maps of each scenario, the first of its split; 0 takes all.

@@ -339,6 +339,7 @@ def _world(value: Mapping[str, Any]) -> str:
     words = [f"λ {world['noise']}"]
     if "correlation_m" in world:
         words[0] += f", correlated over {world['correlation_m']:g} m"
+        words[0] += " (Matérn-3/2)" if world.get("kernel") == "matern32" else ""
     if "immobile" in world:
         held = world["immobile"]
         words.append(f"λ below {held['below']:g} for {held['for_s']:g} s immobilises the robot")

@@ -189,7 +189,8 @@ def _field(condition: Compared) -> dict[str, Any]:
     if world["noise"] != "frozen":
         return {"noise": world["noise"]}
     below = (world.get("immobile") or {}).get("below")
-    return {"noise": "frozen", "correlation_m": world.get("correlation_m"), "immobile.below": below}
+    drawn = {key: world.get(key) for key in ("correlation_m", "kernel")}
+    return {"noise": "frozen", **drawn, "immobile.below": below}
 
 
 def _pair(one: Compared, other: Compared, by: str) -> Pair:

