@@ -29,9 +29,9 @@ MOMENT_S = 15.0
 MOST_POINTS = 160
 
 _DRAW_EVERY_S = 0.5
-# Maps of what is known, in the file: λ in steps of 1/255, and bits.
+# Maps of what is known: in a file numbers in steps of 1/255, and masks as bits.
+NUMBERS, _MASKS = ("predicted", "mean", "spread"), ("free", "seen", "sensed")
 _LEVELS = 255
-_NUMBERS, _MASKS = ("predicted", "mean", "spread"), ("free", "seen", "sensed")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -363,7 +363,7 @@ def _pack_known(known: Sequence[KnownMap]) -> dict[str, np.ndarray]:
     if not known:
         return {}
     arrays: dict[str, np.ndarray] = {"known:steps": np.array([each.step for each in known], np.int64)}
-    for name in _NUMBERS:
+    for name in NUMBERS:
         levels = np.stack([getattr(each, name) for each in known]).astype(np.float32).clip(0, 1) * _LEVELS
         # Differences of whole numbers modulo 256, which sums take back.
         arrays[f"known:{name}"] = np.diff(levels.round().astype(np.uint8), axis=0, prepend=np.uint8(0))
@@ -379,16 +379,14 @@ def _pack_known(known: Sequence[KnownMap]) -> dict[str, np.ndarray]:
 
 def _unpack_known(arrays: Mapping[str, np.ndarray]) -> tuple[KnownMap, ...]:
     values = {name.removeprefix("known:"): array for name, array in arrays.items()}
-    width = values[_NUMBERS[0]].shape[-1]
-    for name in _NUMBERS:
+    width = values[NUMBERS[0]].shape[-1]
+    for name in NUMBERS:
         values[name] = values[name].cumsum(axis=0, dtype=np.uint8).astype(np.float32) / _LEVELS
     for name in _MASKS:
         changed = np.unpackbits(values[name], axis=-1, count=width)
         values[name] = np.logical_xor.accumulate(changed.astype(bool), axis=0)
     outlines = _cut(values["outline"], values["sizes"])
     return tuple(
-        KnownMap(
-            step=int(step), outline=lines, **{name: values[name][place] for name in (*_NUMBERS, *_MASKS)}
-        )
+        KnownMap(step=int(step), outline=lines, **{name: values[name][place] for name in (*NUMBERS, *_MASKS)})
         for place, (step, lines) in enumerate(zip(values["steps"], outlines, strict=True))
     )

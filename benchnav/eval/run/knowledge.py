@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchnav.eval.folder.steps import AHEAD_DEG, AHEAD_M
 from benchnav.eval.recording import KnownMap, reach_outline
 from benchnav.planning.free_space import cells_at_goal
 from benchnav.planning.problem import Problem
@@ -21,7 +22,6 @@ from benchnav.planning.sensing.belief import Fields
 from benchnav.planning.sensing.knowledge import Knowledge, Learner, Truth
 
 _LEAST_CHANGE = 0.02  # of λ̂ somewhere on a map, for which its planner is told
-_AHEAD_M, _AHEAD_RAD = 5.0, math.pi / 4  # how far and how far to either side ground is ahead of a robot
 _LEAST_LOG_SCORE = -10.0  # of λ that was held impossible
 
 
@@ -139,7 +139,7 @@ class Knowing:
         away_x, away_y = x - robot_state[:, 0, None, None], y - robot_state[:, 1, None, None]
         turn = torch.atan2(away_y, away_x) - robot_state[:, 2, None, None]
         turn = torch.atan2(turn.sin(), turn.cos())
-        near = (torch.hypot(away_x, away_y) <= _AHEAD_M) & (turn.abs() <= _AHEAD_RAD)
+        near = (torch.hypot(away_x, away_y) <= AHEAD_M) & (turn.abs() <= math.radians(AHEAD_DEG))
         cells = near & ~known.ever_sensed & running[:, None, None]
         found = torch.full((len(self.revisions), 2), torch.nan, device=robot_state.device)
         if bool(cells.any()):

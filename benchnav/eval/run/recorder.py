@@ -1,6 +1,7 @@
 """Recordings of episodes, taken while a unit runs."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.recording import (
     MOMENT_S,
+    NUMBERS,
     DrawnPlan,
     KnownMap,
     Recording,
@@ -72,7 +74,9 @@ class Recorder:
             knowing: what is known.
         """
         for member, known in knowing.maps_of(step, self._known).items():
-            self._known[member].append(known)
+            # Half as large, and finer than what a file keeps.
+            less = {name: getattr(known, name).astype(np.float16) for name in NUMBERS}
+            self._known[member].append(replace(known, **less))
 
     def recording(self, episodes: Episodes, member: int) -> Recording:
         """All that is played back of one episode."""

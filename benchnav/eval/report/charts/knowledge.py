@@ -33,7 +33,7 @@ from benchnav.core.figures import (
 )
 from benchnav.core.grid import outline
 from benchnav.core.resampling import LEAST_MAPS, bootstrap_counts
-from benchnav.eval.folder.steps import open_steps, rows_of
+from benchnav.eval.folder.steps import AHEAD_COLUMNS, AHEAD_DEG, AHEAD_M, open_steps, rows_of
 from benchnav.eval.recording import KnownMap, Recording
 from benchnav.eval.report.charts.maps import choose_recordings
 from benchnav.eval.report.plan_layers import (
@@ -50,11 +50,9 @@ from benchnav.eval.report.plan_layers import (
 from benchnav.eval.report.words import NAMING, contender_names, joined, reading_name
 from benchnav.eval.stats.best import BLOCK
 
-# Columns of steps, with what a panel of each is called and which way is better.
-METRICS = {
-    "ahead_rmse": "RMSE of λ̂ ahead (lower is better)",
-    "ahead_log_score": "log score ahead (higher is better)",
-}
+# Of each column what its panels are called, and which way is better.
+_CALLED = ("RMSE of E[λ] ahead (lower is better)", "log score ahead (higher is better)")
+METRICS = dict(zip(AHEAD_COLUMNS, _CALLED, strict=True))
 
 # Of each line of the figure of what was known its label, its colours, and what has the lightest.
 _SHOWN = {
@@ -88,9 +86,10 @@ def draw_knowledge(
     if len(curves):
         yield (
             "learning",
-            "RMSE of λ̂ and log score of what was believed of λ ahead of the robot, over the time since it set out: "
-            f"means over the maps on which it still drives, one for every {_BIN_S:g} s, with 95 % intervals (bootstrap "
-            f"over maps). Times that fewer than {LEAST_MAPS} maps tell of are left out.",
+            f"What robots know of the ground ahead of them, within {AHEAD_M:g} m and {AHEAD_DEG:g}° to either side, "
+            "where they have not sensed λ: RMSE of E[λ] and mean log score of the belief, over the time since they set "
+            f"out. Means over the maps on which a robot still drives, one for every {_BIN_S:g} s, with 95 % intervals "
+            f"(bootstrap over maps). Times that fewer than {LEAST_MAPS} maps tell of are left out.",
             learning_figure(curves, summary),
         )
     chosen = choose_recordings([own for own in recorded if own.known], list(summary["condition"]))

@@ -35,7 +35,7 @@ from benchnav.core.figures import (
     show_map,
 )
 from benchnav.core.store import replacing
-from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.plan_layers import (
     CLOSED,
@@ -53,7 +53,7 @@ from benchnav.eval.report.plan_layers import (
     unseen_handle,
     unseen_layer,
 )
-from benchnav.eval.report.words import KNOWLEDGE, NAMING, condition_name, differ, joined
+from benchnav.eval.report.words import NAMING, condition_name, differ, joined
 
 SIZE = (1280, 720)  # of a frame: width and height in pixels
 FRAMES_A_SECOND = 20
