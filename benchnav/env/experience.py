@@ -116,13 +116,13 @@ class Experience:
         if not self._senses or self._truth is None:
             return
         truth, (before, _) = replace(self._truth, field=field), self._current()
-        after = self._learner.sense(before, truth, state, step.tolist())
+        due = which & (step % self._every == 0)
+        after = self._learner.sense(before, truth, state, step.tolist(), due)
         # Others have sensed in this step before, or have ended.
         sensed = map_tensors(
             after.sensed, lambda new, old: torch.where(which[:, None, None], new, old), before.sensed
         )
         self._knowledge = replace(after, sensed=sensed)
-        due = which & (step % self._every == 0)
         if bool(due.any()):
             self._update(due, truth)
 

@@ -98,8 +98,10 @@ class Knowing:
         how = self._how
         if how.field_at is not None:
             self._truth = replace(self._truth, field=how.field_at(step)[self.members])
-        self.known = how.learner.sense(self.known, self._truth, robot_state, step)
-        if not self.is_due(step):
+        due = self.is_due(step)
+        looks = torch.full_like(running, due)
+        self.known = how.learner.sense(self.known, self._truth, robot_state, step, looks)
+        if not due:
             return None
         known, changed = how.learner.update(self.known, self._truth)
         self.known = known

@@ -158,7 +158,7 @@ class Copula(Belief[CopulaState]):
             kept = Cells(row=cells.row[:, : self.window], column=cells.column[:, : self.window])
             length = _estimate(state, own, kept)
             if length != float(state.field.length[own]):
-                state.field.put(own, Field.of(state.law.grid.shape, [length], new.device))
+                state.field.write(own, Field.of(state.law.grid.shape, [length], new.device))
                 state.mean[own], state.std[own], state.skew[own] = 0, 1, 0
                 new = observed
         _condition(state, own, new, self.window)

@@ -71,7 +71,7 @@ class Field(Batch):
         )
         return cls(torch.tensor(lengths, dtype=torch.float64, device=device), down, across)
 
-    def put(self, own: int, field: "Field") -> None:
+    def write(self, own: int, field: "Field") -> None:
         """Writes the one field of another into this."""
         for name in ("length", "down", "across"):
             getattr(self, name)[own] = getattr(field, name)[0]

@@ -183,26 +183,30 @@ class Learner:
         return call(Outcome.BELIEF_ERROR, lambda: self.belief.init(prediction.clone(), self.law))
 
     def sense(
-        self, known: Knowledge, truth: Truth, robot_state: Tensor, step: int | Sequence[int]
+        self, known: Knowledge, truth: Truth, robot_state: Tensor, step: int | Sequence[int], looks: Tensor
     ) -> Knowledge:
-        """Adds what is seen and sensed in a step.
+        """Adds what is sensed in a step, and what is seen where a robot looks.
+
+        To look at each step tells hardly more than to look when what is known is updated, and takes far longer.
 
         Args:
             known: by now; not changed.
             truth: as it is in this step.
             robot_state: shape [B, S].
             step: steps taken so far, in all episodes or in each, B of them.
+            looks: in which episodes the sensor of appearance is asked, bool, shape [B].
 
         Raises:
             KnowledgeError: a sensor raised, or gave what is none.
         """
         moment = Moment(truth.keys, step)
         known = replace(known, reached=torch.zeros_like(known.reached))
-        for sensor in (self.sensor, self.ground):
-            if sensor.sees_all or (sensor is self.ground and not self.belief.learns):
+        every = torch.ones_like(looks)
+        for sensor, asked in ((self.sensor, looks), (self.ground, every if self.belief.learns else ~every)):
+            if sensor.sees_all or not bool(asked.any()):
                 continue
-            new = self._look(sensor, truth, robot_state, moment)
-            mask, before = new.mask, known.sensed
+            new, told = self._look(sensor, truth, robot_state, moment), asked[:, None, None]
+            mask, before = new.mask & told, known.sensed
             known = replace(
                 known,
                 sensed=Sensed(
@@ -213,9 +217,10 @@ class Learner:
                 reached=known.reached | mask,
             )
             if new.appearance is not None and known.memory is not None:
-                memory = remember(known.memory, new.appearance)
+                appearance = replace(new.appearance, seen=new.appearance.seen & told)
+                memory = remember(known.memory, appearance)
                 more = (memory.seen & ~known.memory.seen).flatten(1).any(1)
-                reached = known.reached | new.appearance.seen
+                reached = known.reached | appearance.seen
                 known = replace(known, memory=memory, news=known.news | more, reached=reached)
         return known
 
