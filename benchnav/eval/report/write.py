@@ -40,7 +40,7 @@ from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_
 from benchnav.eval.report.failures import RecordDriven, Sheets, collect_sheets, failures_table
 from benchnav.eval.report.findings import findings
 from benchnav.eval.report.hypotheses import hypothesis_findings, hypothesis_table
-from benchnav.eval.report.result_tables import LATENCIES, paper_table, result_table
+from benchnav.eval.report.result_tables import LATENCIES, learning_table, paper_table, result_table
 from benchnav.eval.report.words import NOT_USED, joined, maps_in_words, unit_of_statistics
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
@@ -82,6 +82,11 @@ class Report:
     failures: pd.DataFrame
     sheets: Sheets
     about: Mapping[str, Any]
+
+    @property
+    def learning(self) -> Table | None:
+        """What robots learnt on their way; None where none learnt."""
+        return learning_table(self.summary)
 
     @property
     def hypotheses(self) -> Table:
@@ -178,6 +183,8 @@ def print_report(report: Report) -> None:
     """Prints what a run says and its table, as wide as the terminal, or unbroken where none is."""
     print("\n".join(report.header))
     print_table(report.table)
+    if report.learning:
+        print_table(report.learning)
     said = [line for title, lines in report.findings.items() for line in (f"{title}:", *lines)]
     print("\n".join([*report.warnings, *said]))
 
