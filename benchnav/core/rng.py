@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 Name = str | int
 
 _WORDS_PER_COUNT = 4  # Philox4x64 yields four 64-bit words at each count
+_BRIDGED = 64  # counts that are drawn in vain between two elements sooner than to begin anew
 
 
 def stream_key(seed: int, *names: Name) -> int:
@@ -45,14 +46,14 @@ def random_bits(key: int, indices: ndarray, count: int) -> ndarray:
     if indices.size == 0:
         return np.empty((0, count), dtype=np.uint64)
     counts = -(-count // _WORDS_PER_COUNT)
-    runs = np.split(indices, np.flatnonzero(np.diff(indices) != 1) + 1)
-    words = [
-        np.random.Philox(key=key, counter=int(run[0]) * counts).random_raw(
-            len(run) * counts * _WORDS_PER_COUNT
-        )
-        for run in runs
-    ]
-    return np.concatenate(words).reshape(len(indices), -1)[:, :count]
+    steps = np.diff(indices)
+    runs = np.split(indices, np.flatnonzero((steps < 1) | (steps > max(1, _BRIDGED // counts))) + 1)
+    words = []
+    for run in runs:
+        source = np.random.Philox(key=key, counter=int(run[0]) * counts)
+        drawn = source.random_raw((int(run[-1] - run[0]) + 1) * counts * _WORDS_PER_COUNT)
+        words.append(drawn.reshape(-1, counts * _WORDS_PER_COUNT)[run - run[0]])
+    return np.concatenate(words)[:, :count]
 
 
 def uniform(key: int, indices: ndarray, shape: tuple[int, ...] = ()) -> ndarray:
