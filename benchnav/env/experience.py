@@ -122,7 +122,7 @@ class Experience:
             after.sensed, lambda new, old: torch.where(which[:, None, None], new, old), before.sensed
         )
         self._knowledge = replace(after, sensed=sensed)
-        due = which & (step % self._every == 0)
+        due = step % self._every == 0
         if bool(due.any()):
             self._update(due, truth)
 
