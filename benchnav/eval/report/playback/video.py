@@ -35,7 +35,7 @@ from benchnav.core.figures import (
     show_map,
 )
 from benchnav.core.store import replacing
-from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.plan_layers import (
     CLOSED,
@@ -265,9 +265,9 @@ def _names(recordings: Sequence[Recording]) -> list[str]:
     """Names of planner and risk setting, and of what else differs."""
     every = [own.about for own in recordings]
     several = [name for name in NAMING if differ(about.get(name, NOT_USED) for about in every)]
-    more = [name for name in ("robot", "objective", *KNOWLEDGE) if name in several]
+    more = [name for name in ("robot", "objective") if name in several]
     return [
-        joined([condition_name(about, several), *(about.get(name, NOT_USED) for name in more)])
+        joined([condition_name(about, several), *(about[name] for name in more)])
         for about in every
     ]
 
