@@ -279,8 +279,7 @@ def knowledge_figure(summary: pd.DataFrame) -> Figure:
         panel.set_xticks(range(len(names)), names)
         panel.grid(axis="y", color="0.93")
         panel.set_ylabel("success [%]")
-    handles, _ = figure.axes[0].get_legend_handles_labels()
-    legend_outside(figure, handles, len(handles))
+    legend_outside(figure, columns=len(risks))
     return figure
 
 

@@ -17,6 +17,10 @@ class Batch:
         """Keeps some members, by index, int64, shape [M]; one may be taken more than once."""
         return map_tensors(self, lambda values: values[members])
 
+    def put(self, members: Tensor, others: Self) -> Self:
+        """Puts M members in the places of others, by index, int64, shape [M]; this one is not changed."""
+        return map_tensors(self, lambda old, new: old.index_copy(0, members, new), others)
+
     def clone(self) -> Self:
         """A copy that shares no tensor."""
         return map_tensors(self, torch.clone)

@@ -2,13 +2,12 @@
 
 A shell over `benchnav.planning.sensing.knowledge`, by which robots learn in evaluations too: sensors sense at each
 step, and what is known is updated every `replan_every_s` of an episode. Here episodes begin at different times. Letters
-in shapes: B episodes, M of them, S state dimensions, H×W cells.
+in shapes: B episodes, M of them, S state dimensions, H×W cells, N cells of all maps together.
 """
 
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -18,18 +17,37 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.terrain import Observation
 from benchnav.env.view import Known, spread_of
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, predict_observation
+from benchnav.planning.risk import RiskMeasure
 from benchnav.planning.sensing.knowledge import Knowledge, Learner, Predict, Truth
 from benchnav.planning.sensing.sensor import Sensed
 
-_MOST_KEPT = 128  # maps, of up to two megabytes each
+_MOST_KEPT = 256  # maps, of up to a megabyte each
 
-Value = TypeVar("Value", bound=Batch)
+
+class _Measure:
+    """Gives λ̂, and keeps the spread of what it was given: to ask what is believed once more takes as long as all else.
+
+    Args:
+        measure: the risk measure.
+
+    Attributes:
+        spread: of the last distribution.
+    """
+
+    def __init__(self, measure: RiskMeasure) -> None:
+        self._measure = measure
+        self.spread = torch.empty(0)
+
+    def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
+        self.spread = spread_of(distribution)
+        return self._measure(distribution)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Known(Batch):
-    """What is known in some episodes, and the spread of what is believed, shape [B, H, W]."""
+class _First(Batch):
+    """What is known of whole maps before a robot set out: prediction, all but the belief, and spread."""
 
+    prior: TraversabilityDistribution
     knowledge: Knowledge
     spread: Tensor
 
@@ -45,28 +63,25 @@ class Experience:
 
     def __init__(self, learner: Learner, every: int, alike: bool) -> None:
         """Knows nothing of any episode."""
-        self._learner, self._every = learner, every
+        self._measure = _Measure(learner.measure)
+        self._learner, self._every = replace(learner, measure=self._measure), every
         self._senses = learner.belief.learns or not learner.sensor.sees_all
         self._alike = alike and learner.sensor.sees_all
-        self._kept: OrderedDict[int, _Known] = OrderedDict()  # of maps, before a robot set out on them
-        self._now: _Known | None = None
+        self._kept: OrderedDict[int, _First] = OrderedDict()
+        self._knowledge: Knowledge | None = None
+        self._spread: Tensor | None = None
         self._truth: Truth | None = None
 
     @property
     def known(self) -> Known:
         """What all robots know now, as policies are told it."""
-        knowledge = self._current.knowledge
+        knowledge, spread = self._current()
         return Known(
             risk_map=knowledge.risk_map,
-            spread=self._current.spread,
+            spread=spread,
             elevation_m=knowledge.observation.elevation_m,
             seen=knowledge.seen,
         )
-
-    @property
-    def _current(self) -> _Known:
-        assert self._now is not None, "no episode has begun"
-        return self._now
 
     def begin(self, members: Tensor, maps: Sequence[int], truth: Truth, state: Tensor) -> None:
         """Begins new episodes in some sub-environments; in all of them at first.
@@ -78,18 +93,16 @@ class Experience:
             state: where the robots are, shape [M, S].
         """
         if self._alike:
-            own = [torch.tensor([place]) for place in range(len(maps))]
-            first = [
-                self._of_map(number, truth.select(place), state[place])
-                for number, place in zip(maps, own, strict=True)
-            ]
-            new = map_tensors(first[0], lambda *values: torch.cat(values), *first[1:])
+            knowledge, spread = self._begun_on(maps, truth, state)
         else:
-            new = self._begun(truth, state)
-        whole = self._now is None or len(members) == len(self._current.spread)
-        self._now = new if whole else _put(self._current, members, new)
-        if self._senses:
-            self._truth = truth if whole or self._truth is None else _put_truth(self._truth, members, truth)
+            knowledge, spread = self._begun(truth, state)
+        if self._knowledge is None or self._spread is None or len(members) == len(self._spread):
+            self._knowledge, self._spread, self._truth = knowledge, spread, truth
+            return
+        self._knowledge = self._learner.put(self._knowledge, members, knowledge)
+        self._spread = self._spread.index_copy(0, members, spread)
+        if self._senses and self._truth is not None:
+            self._truth = self._truth.put(members, truth)
 
     def learn(self, step: Tensor, state: Tensor, field: Tensor, which: Tensor) -> None:
         """Senses in some sub-environments, and updates what is known in those of them where that is due.
@@ -100,63 +113,74 @@ class Experience:
             field: λ of every cell, shape [B, H, W].
             which: bool, shape [B].
         """
-        if self._truth is None:
+        if not self._senses or self._truth is None:
             return
-        truth, before = replace(self._truth, field=field), self._current.knowledge
+        truth, (before, _) = replace(self._truth, field=field), self._current()
         after = self._learner.sense(before, truth, state, step.tolist())
         # Others have sensed in this step before, or have ended.
         sensed = map_tensors(
             after.sensed, lambda new, old: torch.where(which[:, None, None], new, old), before.sensed
         )
-        self._now = replace(self._current, knowledge=replace(after, sensed=sensed))
+        self._knowledge = replace(after, sensed=sensed)
         due = which & (step % self._every == 0)
         if bool(due.any()):
             self._update(due, truth)
 
     def _update(self, due: Tensor, truth: Truth) -> None:
         """Updates what is known in some episodes, bool [B]."""
-        learner, now = self._learner, self._current
-        news = now.knowledge.news & due
+        learner, (now, spread) = self._learner, self._current()
+        news = now.news & due
         if bool(news.any()):
             # Taken apart, since a prediction costs more than that.
             members = news.nonzero()[:, 0]
-            known = learner.select(now.knowledge, members)
-            part = _Known(knowledge=known, spread=now.spread.index_select(0, members))
-            now = _put(now, members, self._updated(part, truth.select(members)))
+            part = self._updated(learner.select(now, members), spread[members], truth.select(members))
+            now, spread = learner.put(now, members, part[0]), spread.index_copy(0, members, part[1])
         told = (due & ~news)[:, None, None]
-        sensed, news = now.knowledge.sensed, now.knowledge.news
+        sensed, news = now.sensed, now.news
         if bool((sensed.mask & told).any()):
             # As a whole, since to take it apart costs more than the update.
-            part = replace(
-                now,
-                knowledge=replace(now.knowledge, sensed=_only(sensed, told), news=torch.zeros_like(news)),
-            )
-            now = self._updated(part, truth)
-            now = replace(now, knowledge=replace(now.knowledge, sensed=_only(sensed, ~told), news=news))
-        self._now = now
+            now = replace(now, sensed=_only(sensed, told), news=torch.zeros_like(news))
+            now, spread = self._updated(now, spread, truth)
+            now = replace(now, sensed=_only(sensed, ~told), news=news)
+        self._knowledge, self._spread = now, spread
 
-    def _updated(self, now: _Known, truth: Truth) -> _Known:
-        knowledge, changed = self._learner.update(now.knowledge, truth)
-        spread = now.spread
+    def _updated(self, knowledge: Knowledge, spread: Tensor, truth: Truth) -> tuple[Knowledge, Tensor]:
+        """Knowledge and spread after an update."""
+        knowledge, changed = self._learner.update(knowledge, truth)
         if bool(changed.any()):
-            new = spread_of(self._learner.at(knowledge, changed))[0]
-            spread = spread.index_put((changed,), new.to(spread.dtype))
-        return _Known(knowledge=knowledge, spread=spread)
+            spread = spread.index_put((changed,), self._measure.spread[0].to(spread.dtype))
+        return knowledge, spread
 
-    def _of_map(self, number: int, truth: Truth, state: Tensor) -> _Known:
-        """What is known at first of a map that is seen as a whole; it does not depend on the episode."""
-        if number not in self._kept:
-            self._kept[number] = self._begun(truth, state)
-            if len(self._kept) > _MOST_KEPT:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(number)
-        return self._kept[number]
+    def _begun_on(self, maps: Sequence[int], truth: Truth, state: Tensor) -> tuple[Knowledge, Tensor]:
+        """Knowledge and spread at the start on maps that are seen as a whole; kept, since no episode changes them."""
+        every = []
+        for place, number in enumerate(maps):
+            if number not in self._kept:
+                own = torch.tensor([place])
+                knowledge, spread = self._begun(truth.select(own), state[own])
+                prior = self._learner.distribution(knowledge)
+                knowledge = replace(knowledge, believed=None)
+                self._kept[number] = _First(prior=prior, knowledge=knowledge, spread=spread)
+            self._kept.move_to_end(number)
+            every.append(self._kept[number])
+        while len(self._kept) > _MOST_KEPT:
+            self._kept.popitem(last=False)
+        first, *rest = every
+        joined = map_tensors(first, lambda *values: torch.cat(values), *rest)
+        believed = self._learner.believe(joined.prior)
+        return replace(joined.knowledge, believed=believed), joined.spread
 
-    def _begun(self, truth: Truth, state: Tensor) -> _Known:
+    def _begun(self, truth: Truth, state: Tensor) -> tuple[Knowledge, Tensor]:
+        """Knowledge and spread at the start."""
         learner = self._learner
         prediction = learner.predict(truth.terrain.observe(), truth) if learner.sensor.sees_all else None
         knowledge = learner.begin(truth, state, prediction)
-        return _Known(knowledge=knowledge, spread=spread_of(learner.distribution(knowledge)))
+        return knowledge, self._measure.spread
+
+    def _current(self) -> tuple[Knowledge, Tensor]:
+        assert self._knowledge is not None, "no episode has begun"
+        assert self._spread is not None
+        return self._knowledge, self._spread
 
 
 def predict_with(model: TraversabilityModel) -> Predict:
@@ -173,15 +197,3 @@ def predict_with(model: TraversabilityModel) -> Predict:
 def _only(sensed: Sensed, which: Tensor) -> Sensed:
     """What was sensed in some episodes, bool, shape [B, 1, 1], and nothing in the others."""
     return replace(sensed, traversability=sensed.traversability.masked_fill(~which, torch.nan))
-
-
-def _put(whole: Value, members: Tensor, part: Value) -> Value:
-    """Puts some episodes, by index, in the places of others."""
-    return map_tensors(whole, lambda old, new: old.index_copy(0, members, new), part)
-
-
-def _put_truth(whole: Truth, members: Tensor, part: Truth) -> Truth:
-    keys = list(whole.keys)
-    for member, key in zip(members.tolist(), part.keys, strict=True):
-        keys[member] = key
-    return replace(_put(whole, members, part), keys=tuple(keys))

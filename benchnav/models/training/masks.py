@@ -68,7 +68,7 @@ class RandomMasks:
                     slopes = torch.where(masked, self._slopes(noisy), maps["slope_deg"])
                     unsure = torch.nn.functional.max_pool2d((~seen).float(), 3, stride=1, padding=1) > 0
                     found["slope_deg"] = torch.where(unsure, self.means["slope_deg"][0], slopes)
-            elif name != "slope_deg":
+            elif name not in ("slope_deg", SEEN):
                 unknown = UNLABELLED if name == "class_id" else torch.nan
                 found[name] = torch.where(seen, layer, unknown).to(layer.dtype)
         return found

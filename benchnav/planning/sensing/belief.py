@@ -121,6 +121,16 @@ class Belief(ABC, Generic[State]):
         """Keeps some episodes, by index, int64."""
         return state.select(members)
 
+    def put(self, state: State, members: Tensor, others: State) -> State:
+        """Puts episodes in the places of others.
+
+        Args:
+            state: of B episodes; it is not changed.
+            members: whose places are taken, int64, shape [M].
+            others: of M episodes, under the same law.
+        """
+        return state.put(members, others)
+
 
 @dataclass(frozen=True)
 class Fields:
@@ -185,6 +195,10 @@ class Static(Belief[StaticState]):
     def distribution(self, state: StaticState) -> TraversabilityDistribution:
         """The prediction."""
         return state.prior
+
+    def changed(self, before: StaticState, after: StaticState) -> Tensor:
+        """Cells whose prediction is another."""
+        return before.prior.differs(after.prior)
 
     def sample_fields(self, state: StaticState, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields with the prediction's marginals."""

@@ -22,18 +22,19 @@ import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch, map_tensors
-from benchnav.core.conditioned import conditioned
+from benchnav.core.conditioned import ConditionedDistribution, skewed
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.quantiles import QuantileDistribution
 from benchnav.planning.sensing.belief import Belief, Law, draw_scores, fields_of
-from benchnav.planning.sensing.gaussian import Cells, Field, Observed, condition, evidence
+from benchnav.planning.sensing.gaussian import Cells, Field, Observed, condition, evidence, predict
 from benchnav.planning.sensing.score_table import ScoreTable
 from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
 
 _REACH = 4.0  # ℓ; the correlation is 3e-4 there
 _SAME_SCORE, _SAME_STD = 1e-6, 0.99  # a second look that tells less than this is none
 _LEAST_CHANGE = 0.005  # of a score
+_OF_SKEW = 1 / 6  # by how much the score of the median moves with the skewness
 _FARTHEST = 6.0  # score
 _NO_TERM = 1e-12  # precision under which a term says nothing
 _SAME_PREDICTION = 1e-3  # of its parameters; λ̂ is then the same within about as much
@@ -60,6 +61,7 @@ class CopulaState(Batch):
         shift: precision times mean of the term, shape [B, H, W].
         mean: of the score given all observations, shape [B, H, W].
         std: of the score given all observations, shape [B, H, W].
+        skew: of the score given all observations, its skewness, shape [B, H, W].
     """
 
     prior: TraversabilityDistribution
@@ -75,6 +77,7 @@ class CopulaState(Batch):
     shift: Tensor
     mean: Tensor
     std: Tensor
+    skew: Tensor
 
     @property
     def observed(self) -> Tensor:
@@ -117,7 +120,7 @@ class Copula(Belief[CopulaState]):
             prior=prior, table=ScoreTable.empty(prior), law=law,
             field=Field.of(law.grid.shape, [length_m / law.grid.resolution_m] * len(zeros), prior.device),
             estimated_from=zeros[:, 0, 0].long(), value=none, lower=none, upper=none, noise_std=none, precision=zeros,
-            shift=zeros, mean=zeros, std=torch.ones_like(zeros),
+            shift=zeros, mean=zeros, std=torch.ones_like(zeros), skew=zeros,
         )  # fmt: skip
 
     def update(
@@ -135,11 +138,11 @@ class Copula(Belief[CopulaState]):
         news |= other & noted.observed
         members = news.flatten(1).any(1).nonzero()[:, 0].tolist()
         if members:
-            names = ("field", "estimated_from", "precision", "shift", "mean", "std")
+            names = ("field", "estimated_from", "precision", "shift", "mean", "std", "skew")
             noted = replace(noted, **{name: getattr(noted, name).clone() for name in names})
             for own in members:
                 self._learn(noted, own, news[own])
-        moved = other | (state.mean != noted.mean) | (state.std != noted.std)
+        moved = other | _moved(state, noted)
         return replace(noted, table=noted.table.having(noted.prior, moved))
 
     def _learn(self, state: CopulaState, own: int, new: Tensor) -> None:
@@ -156,14 +159,16 @@ class Copula(Belief[CopulaState]):
             length = _estimate(state, own, kept)
             if length != float(state.field.length[own]):
                 state.field.put(own, Field.of(state.law.grid.shape, [length], new.device))
-                state.mean[own], state.std[own] = 0, 1
+                state.mean[own], state.std[own], state.skew[own] = 0, 1, 0
                 new = observed
         _condition(state, own, new, self.window)
 
     def distribution(self, state: CopulaState) -> TraversabilityDistribution:
         """The prediction, given what was observed."""
         dtype = state.prior.dtype
-        return conditioned(state.prior, state.mean.to(dtype), state.std.to(dtype))
+        return ConditionedDistribution(
+            state.prior, state.mean.to(dtype), state.std.to(dtype), state.skew.to(dtype)
+        )
 
     def at(self, state: CopulaState, cells: Tensor) -> QuantileDistribution:
         """What is believed of some cells; see `Belief`.
@@ -171,7 +176,7 @@ class Copula(Belief[CopulaState]):
         By quantiles from a table of scores, which is far quicker than `distribution` and tells λ̂ within 0.01 of it.
         """
         table = state.table.having(state.prior, cells)
-        found = table.quantiles(cells, state.mean[cells], state.std[cells])
+        found = table.quantiles(cells, state.mean[cells], state.std[cells], state.skew[cells])
         return (
             found
             if found.dtype == state.prior.dtype
@@ -180,8 +185,12 @@ class Copula(Belief[CopulaState]):
 
     def changed(self, before: CopulaState, after: CopulaState) -> Tensor:
         """Cells whose score, or whose prediction, is another."""
-        moved = (before.mean != after.mean) | (before.std != after.std)
+        moved = _moved(before, after)
         return moved if before.prior is after.prior else moved | before.prior.differs(after.prior)
+
+    def put(self, state: CopulaState, members: Tensor, others: CopulaState) -> CopulaState:
+        """Puts episodes in the places of others; see `Belief`."""
+        return replace(state.put(members, others), table=state.table.put(members, others.table))
 
     def sample_fields(self, state: CopulaState, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields given all observations, by Matheron's rule: a field of the law, moved to what was observed."""
@@ -205,7 +214,14 @@ class Copula(Belief[CopulaState]):
             away = (shift / precision - drawn[:, row, column] - noise).T
             moved = torch.cholesky_solve(away, torch.linalg.cholesky(inner))
             drawn += (field.with_block(cells, *lines)[0].T @ moved).T.view_as(drawn)
-        return fields_of(state.prior, torch.stack(scores))
+        mean, std, skew = (values[:, None] for values in (state.mean, state.std, state.skew))
+        normal = (torch.stack(scores) - mean) / std.clamp(min=_NO_TERM)
+        return fields_of(state.prior, mean + std * skewed(normal, skew))
+
+
+def _moved(before: CopulaState, after: CopulaState) -> Tensor:
+    """Of which cells something else is believed of the score, bool, shape [B, H, W]."""
+    return (before.mean != after.mean) | (before.std != after.std) | (before.skew != after.skew)
 
 
 def _with_prior(state: CopulaState, prior: TraversabilityDistribution) -> tuple[CopulaState, Tensor]:
@@ -288,18 +304,23 @@ def _condition(state: CopulaState, own: int, new: Tensor, window: int) -> None:
     """Updates terms of observations, and scores of cells, near what is new in one episode; writes into the state."""
     field = state.field.select(torch.tensor([own], device=new.device))
     cells = _nearest(~state.value[own].isnan(), new, window)
-    known = condition(field.covariance(cells, cells), _observed(state, own, cells))
+    covariance, observed = field.covariance(cells, cells), _observed(state, own, cells)
+    known = condition(covariance, observed)
     reach = math.ceil(_REACH * float(field.length))
     rows, columns = (
         slice(max(low - reach, 0), min(high + reach + 1, size))
         for (low, high), size in zip(_bounds(new), new.shape, strict=True)
     )
     lines = [torch.arange(line.start, line.stop, device=new.device)[None] for line in (rows, columns)]
-    mean, variance = known.moments(field.with_block(cells, *lines))
-    old_mean, old_std = state.mean[own, rows, columns], state.std[own, rows, columns]
-    mean, std = mean.view_as(old_mean), variance.sqrt().view_as(old_std)
-    moved = torch.maximum((mean - old_mean).abs(), (std - old_std).abs()) >= _LEAST_CHANGE
-    old_mean[moved], old_std[moved] = mean[moved], std[moved]
+    mean, variance, skew = predict(known, covariance, observed, field.with_block(cells, *lines))
+    new_values, old_values = (mean, variance.sqrt(), skew), (state.mean, state.std, state.skew)
+    moved = torch.zeros_like(new)
+    for scale, values, whole in zip((1, 1, _OF_SKEW), new_values, old_values, strict=True):
+        old = whole[own, rows, columns]
+        moved[rows, columns] |= (values.view_as(old) - old).abs() * scale >= _LEAST_CHANGE
+    for values, whole in zip(new_values, old_values, strict=True):
+        old = whole[own, rows, columns]
+        old.copy_(torch.where(moved[rows, columns], values.view_as(old), old))
     state.precision[own, cells.row, cells.column] = known.precision
     state.shift[own, cells.row, cells.column] = known.shift
 

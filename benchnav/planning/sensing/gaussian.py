@@ -25,6 +25,7 @@ _ROUNDS = 40
 _ENOUGH = 1e-3  # change of a mean and of a standard deviation, in normal scores
 _LEAST_SHARE = 1e-9  # of the variance that an interval leaves
 _LEAST_VARIANCE = 1e-12
+_MOST_SKEW = 2.0  # that of an exponential, which a number far out in a tail is
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +123,11 @@ class Observed:
         """Which cells are known to lie in an interval, bool, shape [B, N]."""
         return self.there & (self.upper > self.lower)
 
+    @property
+    def most(self) -> int:
+        """The greatest number of intervals of a field."""
+        return int(self.interval.sum(1).max())
+
 
 @dataclass(frozen=True, kw_only=True)
 class Posterior:
@@ -180,14 +186,13 @@ def condition(covariance: Tensor, observed: Observed) -> Posterior:
         covariance: K of the observed cells, shape [B, N, N].
         observed: what is known of them; the terms that it has are where intervals begin.
     """
-    interval = observed.interval
+    interval, most = observed.interval, observed.most
     known = torch.where(observed.there & ~interval, 1 / observed.std.square(), 0.0)
     numbers = posterior(covariance, known, known * torch.where(interval, 0.0, observed.lower))
-    most = int(interval.sum(1).max()) if len(interval) else 0
     if most == 0:
         return numbers
     # The intervals alone, as a field of few cells that the numbers have given a mean.
-    place = (~interval).int().argsort(dim=1, stable=True)[:, :most]
+    place = _first(interval, most)
     held, lower, upper, std, precision, shift = (
         values.gather(1, place)
         for values in (
@@ -244,6 +249,55 @@ def evidence(covariance: Tensor, observed: Observed, found: Posterior) -> Tensor
     return whole + torch.where(observed.interval, mass - term, 0.0).sum(1)
 
 
+def predict(
+    found: Posterior, covariance: Tensor, observed: Observed, block: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, variance and skewness of M cells, each of shape [B, M].
+
+    An interval leaves its cell skew, and by the correlation that is left its neighbours: a cell's third cumulant is the
+    sum of those of the intervals' cells times the cube of the cell's regression on each, which is right for a single
+    interval and of first order for several (Opper, Paquet and Winther 2013, "Perturbative corrections for approximate
+    inference in Gaussian latent variable models").
+
+    Args:
+        found: the field given what is observed, from `condition`.
+        covariance: K of the observed cells, shape [B, N, N].
+        observed: what is known of them.
+        block: covariances of the observed cells with the M, shape [B, N, M].
+    """
+    taken = found.reduced(block)
+    mean = torch.einsum("bn,bnm->bm", found.weights, block)
+    variance = (1 - taken.square().sum(1)).clamp(min=0)
+    most = observed.most
+    if most == 0:
+        return mean, variance, torch.zeros_like(mean)
+    place = _first(observed.interval, most)
+    held, lower, upper, std, precision, shift = (
+        values.gather(1, place)
+        for values in (
+            observed.interval, observed.lower, observed.upper, observed.std, found.precision, found.shift,
+        )
+    )  # fmt: skip
+    columns = covariance.gather(2, place[:, None].expand(-1, covariance.shape[1], -1))
+    own = found.reduced(columns)
+    own_mean = torch.einsum("bn,bnm->bm", found.weights, columns)
+    own_variance = (1 - own.square().sum(1)).clamp(min=_LEAST_VARIANCE)
+    centre, without = _Terms(precision, shift).left_out(own_mean, own_variance)
+    ends = torch.where(held, lower, -1.0), torch.where(held, upper, 1.0)
+    total = without + std.square()
+    third = _third_cumulant(centre, total, *ends) * (without / total).pow(3)
+    shared = block.gather(1, place[..., None].expand(-1, -1, block.shape[2])) - own.mT @ taken
+    regression = shared / own_variance[..., None]
+    found_third = torch.einsum("bn,bnm->bm", torch.where(held, third, 0.0), regression.pow(3))
+    skew = found_third / variance.clamp(min=_LEAST_VARIANCE).pow(1.5)
+    return mean, variance, skew.clamp(-_MOST_SKEW, _MOST_SKEW)
+
+
+def _first(which: Tensor, most: int) -> Tensor:
+    """Places of those of each row that are meant, then of others, shape [B, most]."""
+    return (~which).int().argsort(dim=1, stable=True)[:, :most]
+
+
 class _Terms(NamedTuple):
     """Gaussian terms, one a cell: exp(shift · z − precision · z² / 2), each of shape [B, N]."""
 
@@ -291,6 +345,20 @@ def interval_moments(mean: Tensor, variance: Tensor, lower: Tensor, upper: Tenso
     share = (1 + slope - shift.square()).clamp(_LEAST_SHARE, 1)
     shift = torch.maximum(torch.minimum(shift, high), low)
     return mean + variance.sqrt() * torch.where(flipped, -shift, shift), variance * share
+
+
+def _third_cumulant(mean: Tensor, variance: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Third cumulant of a normal number that lies in an interval."""
+    low, high, log_mass, flipped = _standard(mean, variance, lower, upper)
+    at_low, at_high = (torch.where(end.isinf(), 0.0, _density(end, log_mass)) for end in (low, high))
+    low, high = (torch.where(end.isinf(), 0.0, end) for end in (low, high))
+    first = at_low - at_high
+    second = 1 + low * at_low - high * at_high
+    third = (low.square() + 2) * at_low - (high.square() + 2) * at_high
+    # Far out in a tail, where rounding leaves nothing of it, the number is exponential.
+    most = 2 * (second - first.square()).clamp(min=0).pow(1.5)
+    found = torch.clamp(third - 3 * first * second + 2 * first.pow(3), -most, most)
+    return variance.pow(1.5) * torch.where(flipped, -found, found)
 
 
 def _standard(

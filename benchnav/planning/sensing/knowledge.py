@@ -64,6 +64,11 @@ class Truth(Batch):
         """Keeps some episodes, by index, int64."""
         return replace(super().select(members), keys=tuple(self.keys[place] for place in members.tolist()))
 
+    def put(self, members: Tensor, others: "Truth") -> "Truth":
+        """Puts episodes in the places of others, by index, int64."""
+        keys = dict(enumerate(self.keys)) | dict(zip(members.tolist(), others.keys, strict=True))
+        return replace(super().put(members, others), keys=tuple(keys.values()))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Knowledge(Batch):
@@ -154,7 +159,7 @@ class Learner:
             observation, prediction = self._predict(memory, truth)
         assert prediction is not None
         prior = prediction
-        believed = call(Outcome.BELIEF_ERROR, lambda: self.belief.init(prior.clone(), self.law))
+        believed = self.believe(prior)
         risk_map = call(Outcome.MODEL_ERROR, lambda: risk.apply(self.measure, prior))
         seen = None if memory is None else memory.seen
         return Knowledge(
@@ -168,6 +173,14 @@ class Learner:
             risk_map=risk_map,
             free=self.rules.free(risk_map, prior, seen),
         )
+
+    def believe(self, prediction: TraversabilityDistribution) -> Any:
+        """The state of the belief by a prediction alone.
+
+        Raises:
+            KnowledgeError: the belief raised.
+        """
+        return call(Outcome.BELIEF_ERROR, lambda: self.belief.init(prediction.clone(), self.law))
 
     def sense(
         self, known: Knowledge, truth: Truth, robot_state: Tensor, step: int | Sequence[int]
@@ -272,6 +285,18 @@ class Learner:
         """
         believed = call(Outcome.BELIEF_ERROR, lambda: self.belief.select(known.believed, members))
         return replace(replace(known, believed=None).select(members), believed=believed)
+
+    def put(self, known: Knowledge, members: Tensor, others: Knowledge) -> Knowledge:
+        """Puts episodes in the places of others, by index, int64.
+
+        Raises:
+            KnowledgeError: the belief raised.
+        """
+        believed = call(
+            Outcome.BELIEF_ERROR, lambda: self.belief.put(known.believed, members, others.believed)
+        )
+        whole, part = (replace(each, believed=None) for each in (known, others))
+        return replace(whole.put(members, part), believed=believed)
 
     def _inferred(self, known: Knowledge, changed: Tensor) -> Knowledge:
         """Tells λ̂ and what is free of the cells of which something else is believed."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch
+from benchnav.core.conditioned import skewed
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.quantiles import QuantileDistribution
 
@@ -53,6 +54,12 @@ class ScoreTable(Batch):
         none = torch.full(prior.shape, -1, dtype=torch.int64, device=prior.device)
         return cls(none, _Rows(scores_of(prior.at(none >= 0))))
 
+    def put(self, members: Tensor, others: "ScoreTable") -> "ScoreTable":
+        """Puts episodes in the places of others; see `Batch`."""
+        place = torch.where(others.place >= 0, others.place + len(self.rows.scores), -1)
+        rows = torch.cat((self.rows.scores, others.rows.scores))
+        return ScoreTable(self.place.index_copy(0, members, place), _Rows(rows))
+
     def without(self, cells: Tensor) -> "ScoreTable":
         """Forgets some cells, bool [B, H, W], whose prediction has changed."""
         return replace(self, place=self.place.masked_fill(cells, -1))
@@ -74,18 +81,23 @@ class ScoreTable(Batch):
             place[which] = torch.arange(first, first + int(which.sum()), device=place.device)
         return ScoreTable(place, _Rows(rows))
 
-    def quantiles(self, cells: Tensor, mean: Tensor, std: Tensor) -> QuantileDistribution:
+    def quantiles(self, cells: Tensor, mean: Tensor, std: Tensor, skew: Tensor) -> QuantileDistribution:
         """λ of cells whose score has a posterior, as a map of one row, [1, N].
 
         Args:
             cells: which of them, bool, shape [B, H, W]; each has a row.
             mean: of their scores, shape [N].
             std: of their scores, shape [N].
+            skew: of their scores, shape [N].
         """
         scores = self.rows.scores[self.place[cells]]
         device, dtype = scores.device, scores.dtype
         ranks = torch.special.ndtri(torch.tensor(_LEVELS, dtype=torch.float64, device=device))
-        wanted = torch.addcmul(mean[:, None], std[:, None], ranks.clamp(-_LAST_RANK, _LAST_RANK)).to(dtype)
+        ranks = ranks.clamp(-_LAST_RANK, _LAST_RANK).expand(len(mean), -1)
+        some = skew != 0
+        if bool(some.any()):
+            ranks = ranks.contiguous().index_put((some,), skewed(ranks[some], skew[some, None]))
+        wanted = torch.addcmul(mean[:, None], std[:, None], ranks).to(dtype)
         values = torch.tensor(VALUES, dtype=dtype, device=device)
         after = torch.searchsorted(scores, wanted).clamp(1, len(VALUES) - 1)
         low, high = scores.gather(1, after - 1), scores.gather(1, after)
