@@ -32,7 +32,9 @@ AHEAD = np.array([1.0, 0.0], np.float32)
 STAKES = {"preset": "stakes", "time_budget_s": 3.0, "immobile": None}
 SENSES = {
     "full, static": {},
-    "full, probe, copula": {"ground": "probe", "belief": "copula"},
+    "full, probe, copula": {
+        "ground": {"part": "probe", "options": {"radius_m": 1.5, "noise_std": 0.5}}, "belief": "copula",
+    },
     "near, static": {"sensor": {"part": "near", "options": {"range_m": 2.0}}},
     "near, contact, copula": {
         "sensor": {"part": "near", "options": {"range_m": 2.0, "fov_deg": 120.0}}, "belief": "copula",
@@ -98,7 +100,8 @@ def test_each_vector_member_is_the_single_environment_with_its_seed(
         now.step[member] += 4
     generator, ended, episodes = np.random.default_rng(0), [False] * 3, 0
     for _ in range(24):
-        actions = generator.uniform([0, -1], [1, 1], (3, 2)).astype(np.float32)
+        # Mostly ahead, so that cells are sensed from some steps alone.
+        actions = generator.uniform([0.8, -1], [1, 1], (3, 2)).astype(np.float32)
         batch, reward, terminated, truncated, info = vector.step(actions)
         for i, env in enumerate(singles):
             if ended[i]:
@@ -235,6 +238,22 @@ def test_what_is_known_changes_when_it_is_due_alone(dataset_path: Path) -> None:
     assert changes_at(dataset_path, replan_every_s=0.7, **learning) == [7, 14]
     slow = {"part": "unicycle", "options": {"dt_s": 0.25}}  # twelve steps to the end
     assert changes_at(dataset_path, robot=slow, **learning) == [2, 4, 6, 8, 10, 12]
+
+
+def test_the_time_left_is_a_share_of_the_budget(dataset_path: Path) -> None:
+    env = make(dataset_path, robot={"part": "unicycle", "options": {"dt_s": 0.25}})
+    left = [float(seen["state"][4]) for seen in drive(env, 3)]
+    np.testing.assert_allclose(left, [1, 2.75 / 3, 2.5 / 3, 2.25 / 3], atol=1e-6)
+
+
+def test_the_belief_is_told_how_the_λ_of_this_world_hangs_together(dataset_path: Path) -> None:
+    def length(**world: Any) -> float:
+        env = make(dataset_path, belief="copula", world={**STAKES, **world})
+        return batch_of(env)._experience._learner.law.correlation_m
+
+    assert length() == 1.5
+    assert length(correlation_m=0.7) == 0.7
+    assert length(noise="stored") == 0
 
 
 def test_λ_is_learnt_from_the_start_and_the_more_the_farther_it_is_probed(dataset_path: Path) -> None:

@@ -208,12 +208,11 @@ def unseen_handle() -> Patch:
     return Patch(fc=UNSEEN, ec="black", hatch="////", lw=0, label="not seen")
 
 
-def reach_layer(lines: Sequence[np.ndarray] = (), scale: float = 1.0, label: str = "") -> LineCollection:
-    """How far sensors reach, as lines that can be put on a map, so many times as wide as printed."""
-    edge = [withStroke(linewidth=2 * scale, foreground="black"), Normal()]
-    return LineCollection(
-        list(lines), colors=[REACH], linewidths=scale, label=label, path_effects=edge, zorder=2.2
-    )
+def reach_line(reach: np.ndarray, scale: float = 1.0, label: str = "_reach") -> Line2D:
+    """How far sensors reach, from `KnownMap.outline`, that can be put on a map, so many times as wide as printed."""
+    edge = [withStroke(linewidth=1.8 * scale, foreground="black"), Normal()]
+    # One line with gaps, so that no piece has its edge on another.
+    return Line2D(*reach.T, color=REACH, lw=0.9 * scale, path_effects=edge, label=label, zorder=2.2)
 
 
 def known_colours(known: KnownMap) -> dict[str, np.ndarray]:

@@ -1,4 +1,5 @@
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchnav.core.device import CPU
 from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.terrain import Observation
 from benchnav.datagen.files.reader import TerrainDataset
@@ -231,6 +233,27 @@ def test_a_masked_training_is_kept_gone_on_with_and_told_from_others(
     ]
     assert torch.equal(given[0], given[1])
     assert not torch.equal(given[0], given[2])
+
+
+def test_networks_and_the_pool_of_them_meet_masked_maps(
+    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exact = {"precision": "32-true", "max_epochs": 1}
+    met: list[MapDataset] = []
+
+    def spy(self: MapDataset, device: torch.device = CPU) -> Iterator[tuple[range, dict[str, Tensor]]]:
+        met.append(self)
+        return chunks(self, device)
+
+    chunks = MapDataset.chunks
+    monkeypatch.setattr(MapDataset, "chunks", spy)
+    read = MapDataset.__getitem__
+    monkeypatch.setattr(MapDataset, "__getitem__", lambda self, key: met.append(self) or read(self, key))
+    how = TrainOptions(device="cpu", trainer=exact)
+    train_networks(how, str(dataset.path), str(tmp_path / "c"), classifier_of(MASKED), members=2)
+    laws = [maps.masks.law if maps.masks else None for maps in met]
+    assert {maps.split for maps in met} == {"train", "valid"}
+    assert laws == [MASKED.masking] * len(met)
 
 
 def test_any_trainable_model_learns_from_masked_maps(dataset: TerrainDataset) -> None:

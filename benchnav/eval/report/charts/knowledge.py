@@ -43,7 +43,7 @@ from benchnav.eval.report.plan_layers import (
     VEIL,
     end_cell_handle,
     mark_end,
-    reach_layer,
+    reach_line,
     unseen_handle,
     unseen_layer,
 )
@@ -139,7 +139,7 @@ def knowledge_figure(recording: Recording) -> Figure:
     if any(not known.seen.all() for known in every):
         handles.append(unseen_handle())
     if any(known.outlines for known in every):
-        handles.append(reach_layer(label="reach of the sensors"))
+        handles.append(reach_line(np.empty((0, 2)), label="reach of the sensors"))
     legend_outside(figure, handles, 5)
     return figure
 
@@ -153,7 +153,7 @@ def _draw_known(panel: Axes, known: KnownMap, resolution_m: float) -> None:
     panel.add_collection(unseen_layer(known.seen, resolution_m))
     sensed = list(outline(known.sensed, resolution_m))
     panel.add_collection(LineCollection(sensed, colors=_SENSED, linewidths=0.5))
-    panel.add_collection(reach_layer(known.outlines))
+    panel.add_line(reach_line(known.outline))
 
 
 def _draw_robot(panel: Axes, recording: Recording, step: int) -> None:

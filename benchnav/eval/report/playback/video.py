@@ -35,7 +35,7 @@ from benchnav.core.figures import (
     show_map,
 )
 from benchnav.core.store import replacing
-from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.plan_layers import (
     CLOSED,
@@ -48,7 +48,7 @@ from benchnav.eval.report.plan_layers import (
     mark_end,
     plan_layer,
     predicted_colours,
-    reach_layer,
+    reach_line,
     shades,
     unseen_handle,
     unseen_layer,
@@ -235,7 +235,7 @@ class Frames:
         if any(not known.seen.all() for known in every):
             handles.append(unseen_handle())
         if any(known.outlines for known in every):
-            handles.append(reach_layer(scale=_MARKS, label="reach of the sensors"))
+            handles.append(reach_line(np.empty((0, 2)), _MARKS, "reach of the sensors"))
         lines = 2 if len(handles) <= _MOST_IN_TWO else 3
         columns, between = -(-len(handles) // lines), 0.5 + (length - _BAR) / 2 / SIZE[0]
 
@@ -265,11 +265,8 @@ def _names(recordings: Sequence[Recording]) -> list[str]:
     """Names of planner and risk setting, and of what else differs."""
     every = [own.about for own in recordings]
     several = [name for name in NAMING if differ(about.get(name, NOT_USED) for about in every)]
-    more = [name for name in ("robot", "objective", *KNOWLEDGE) if name in several]
-    return [
-        joined([condition_name(about, several), *(about.get(name, NOT_USED) for name in more)])
-        for about in every
-    ]
+    more = [name for name in ("robot", "objective") if name in several]
+    return [joined([condition_name(about, several), *(about[name] for name in more)]) for about in every]
 
 
 def _alike(recordings: Sequence[Recording]) -> list[list[int]]:
@@ -316,10 +313,11 @@ class _Known:
 
     def __init__(self, panel: Axes, recording: Recording, image: AxesImage) -> None:
         self._recording, self._image, self._shown = recording, image, -1
-        unseen = unseen_layer(recording.known[0].seen, recording.resolution_m, _MARKS)
-        self._unseen, self._reach = unseen, reach_layer(scale=_MARKS)
-        for layer in (self._unseen, self._reach):
-            panel.add_collection(layer)
+        first = recording.known[0]
+        self._unseen = unseen_layer(first.seen, recording.resolution_m, _MARKS)
+        self._reach = reach_line(first.outline, _MARKS)
+        panel.add_collection(self._unseen)
+        panel.add_line(self._reach)
         self.moving: list[Artist] = [image, self._unseen, self._reach, *panel.spines.values()]
 
     def move(self, step: int) -> None:
@@ -330,7 +328,7 @@ class _Known:
         self._shown = known.step
         self._image.set_data(known_colours(known)["risk"])
         self._unseen.set_segments(list(hatching(~known.seen, self._recording.resolution_m)))
-        self._reach.set_segments(known.outlines)
+        self._reach.set_data(*known.outline.T)
 
 
 class _Driver:

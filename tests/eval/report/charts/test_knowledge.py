@@ -65,9 +65,12 @@ def test_four_moments_from_start_to_end_show_what_was_known_by_then() -> None:
             np.testing.assert_array_equal(image.get_array(), values)
             assert image.get_clim() == (0, most)
             np.testing.assert_array_equal(veil.get_array()[..., 3] > 0, ~known.seen)
-            wanted = [as_lines(hatching(~known.seen, 0.5)), as_lines(outline(known.sensed, 0.5)),
-                      as_lines(known.outlines)]  # fmt: skip
-            assert lines_of(panel) == wanted
+            assert lines_of(panel) == [
+                as_lines(hatching(~known.seen, 0.5)),
+                as_lines(outline(known.sensed, 0.5)),
+            ]
+            (reach,) = [line for line in panel.lines if line.get_label() == "_reach"]
+            np.testing.assert_array_equal(np.transpose(reach.get_data()), known.outline)
             (driven,) = [line for line in panel.lines if line.get_label() == "driven"]
             np.testing.assert_array_equal(np.transpose(driven.get_data()), recording.track[: step + 1])
             assert (panel.get_xlim(), panel.get_ylim()) == ((0, 30), (0, 20))
