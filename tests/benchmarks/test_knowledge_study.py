@@ -221,3 +221,29 @@ def test_the_figure_has_a_line_a_risk_setting_over_what_is_known() -> None:
     (bar,) = panel.containers[0].lines[2]
     np.testing.assert_allclose(bar.get_segments()[1][:, 1], [56, 63])
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["mean", "CVaR₀.₈"]
+
+
+def test_power_is_of_the_maps_that_the_study_confirms_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    row = {
+        "claim": "it pays",
+        "kind": "difference",
+        "direction": "higher",
+        "margin": 0.0,
+        "difference": 3.0,
+        "n_maps": 100,
+    }
+    tests = pd.DataFrame([{**row, "low": 3 - 1.96 * 3, "high": 3 + 1.96 * 3}] * 4)
+
+    class Read:
+        def __init__(self, folder: Path) -> None:
+            assert folder == tmp_path / "knowledge-developed"
+            self.tests = tests
+
+    monkeypatch.setattr(knowledge_study, "read_report", Read)
+    # A standard error of 3 over 100 maps is one of 1.5 over 400.
+    first, last = (norm.cdf(3 / 1.5 - norm.ppf(1 - alpha)) for alpha in (0.05 / 4, 0.05))
+    assert f"| 1 | it pays | +3.00 (-2.9 to +8.9) | {first:.2f} | {last:.2f} |" in knowledge_study.power(
+        tmp_path
+    )
