@@ -126,6 +126,11 @@ class Condition:
         """Whether the robot learns anything on its way."""
         return not self.make("sensor").sees_all or self.make("belief").learns
 
+    @property
+    def needs_statistics(self) -> bool:
+        """Whether statistics of the training maps have to be there."""
+        return not self.make("sensor").sees_all or self.make("belief").needs_statistics
+
     def make(self, kind: str) -> Any:
         """Makes the part of a kind that needs nothing else to be made."""
         return registry.make(kind, getattr(self, kind))
