@@ -33,7 +33,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.condition import PART_KINDS, Condition, is_checkpoint
 from benchnav.eval.experiment.unit import Conditions, Unit
 from benchnav.models.checkpoint import digests_of, read_config
-from benchnav.models.predictor import find_checkpoint, find_family, split_own
+from benchnav.models.predictor import find_checkpoint, find_family, find_ground_statistics, split_own
 from benchnav.planning.planners.compilation import can_compile
 
 PACKAGES = ("torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch")
@@ -127,6 +127,10 @@ def describe_parts(condition: Condition) -> Code:
             parts[name] = text_digest([found.origin, found.digest])
         files = registry.option_files(kind, part)
         parts |= {f"{text} of {name}": digest for text, digest in files.items()}
+    if condition.needs_statistics:
+        dataset = TerrainDataset(find_dataset(condition.data))
+        statistics = find_ground_statistics(condition.model, dataset)
+        parts["statistics of the ground"] = text_digest(statistics.to_json())
     return {"modules": package_modules(modules), "parts": parts}
 
 

@@ -225,12 +225,11 @@ def _learner(unit: Unit, origin: Origin, device: torch.device) -> Learner:
     world, part = condition.world, condition.model
     sensor = call(Outcome.SENSOR_ERROR, lambda: condition.make("sensor"))
     belief = call(Outcome.BELIEF_ERROR, lambda: condition.make("belief"))
-    needed = not sensor.sees_all or belief.needs_statistics
     model = call(Outcome.MODEL_ERROR, lambda: _model(_model_key(unit, origin)))
     law = Law(
         grid=block.terrain.grid,
         correlation_m=dataset.recipe.correlation_m if world.noise == "stored" else world.correlation_m,
-        statistics=find_ground_statistics(part, dataset) if needed else None,
+        statistics=find_ground_statistics(part, dataset) if condition.needs_statistics else None,
         class_names=model.class_names or tuple(item.name for item in dataset.recipe.classes),
     )
 
