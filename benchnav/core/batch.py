@@ -56,6 +56,20 @@ def _changed(first: Any, change: Callable[..., Tensor], rest: list[Any]) -> Any:
     return first
 
 
+def put_if_alike(value: Value, members: Tensor, others: Value) -> Value:
+    """Puts some members of another batch in the same places of this one; of an unlike kind or size, gives the other.
+
+    Args:
+        value: of B members; it is not changed.
+        members: which ones, by index, int64.
+        others: of B members too.
+    """
+    alike = [[own.shape for own in _tensors(each)] for each in (value, others)]
+    if type(value) is not type(others) or alike[0] != alike[1]:
+        return others
+    return value.put(members, others.select(members))
+
+
 def first_tensor(value: Batch) -> Tensor:
     """The first tensor of a dataclass, the batches and tuples of batches in it included.
 

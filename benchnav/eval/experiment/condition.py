@@ -34,8 +34,6 @@ PART_KINDS = ("model", "risk", "planner", "robot", "objective", *KNOWLEDGE)
 # Columns of `Condition.labels`, in the order of tables.
 LABELS = ("data", "scenario", "world", "robot", "objective", "model", *KNOWLEDGE, "planner", "risk")
 NOT_USED = "–"
-# Labels of conditions of the versions that had no such column.
-LATER_LABELS = {"sensor": "full", "ground": NOT_USED, "belief": "static"}
 _ORDER = ("robot", "objective", "model", *KNOWLEDGE, "risk", "planner")  # of tables
 # What a product lists, by the names that a suite has for it.
 _LISTED = ("data", "scenarios", *(f"{kind}s" for kind in PART_KINDS), "world", "task")
@@ -140,9 +138,16 @@ class Condition:
         return registry.make("planner", self.planner)
 
 
+def later_labels(model: str, risk: str) -> dict[str, str]:
+    """Labels of a condition that a version made which had no such columns, by its labels of two others."""
+    unused = {"sensor": model == NOT_USED, "ground": True, "belief": risk == NOT_USED}
+    return {kind: NOT_USED if unused[kind] else default["part"] for kind, default in KNOWLEDGE.items()}
+
+
 def condition_from(about: Mapping[str, Any]) -> Condition:
     """Rebuilds a condition from its `value` and `labels`, as `run.json` holds them."""
-    value, labels = {**KNOWLEDGE, **about["value"]}, {**LATER_LABELS, **about["labels"]}
+    value, labels = {**KNOWLEDGE, **about["value"]}, about["labels"]
+    labels = later_labels(labels["model"], labels["risk"]) | labels
     parts = {
         kind: Part(part=value[kind]["part"], label=labels[kind], options=value[kind]["options"])
         for kind in PART_KINDS

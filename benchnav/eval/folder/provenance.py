@@ -13,7 +13,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -128,8 +128,9 @@ def describe_parts(condition: Condition) -> Code:
         files = registry.option_files(kind, part)
         parts |= {f"{text} of {name}": digest for text, digest in files.items()}
     if condition.needs_statistics:
-        statistics = find_ground_statistics(condition.model, TerrainDataset(find_dataset(condition.data)))
-        parts["statistics of the ground"] = text_digest(asdict(statistics))
+        dataset = TerrainDataset(find_dataset(condition.data))
+        statistics = find_ground_statistics(condition.model, dataset)
+        parts["statistics of the ground"] = text_digest(statistics.to_json())
     return {"modules": package_modules(modules), "parts": parts}
 
 

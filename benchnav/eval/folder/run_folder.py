@@ -23,7 +23,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.settings import one_line
 from benchnav.core.sources import digest_of_path
 from benchnav.core.store import Shard, replacing, seal, unseal, write_text
-from benchnav.eval.experiment.condition import LATER_LABELS, Condition, condition_from
+from benchnav.eval.experiment.condition import KNOWLEDGE, Condition, condition_from, later_labels
 from benchnav.eval.experiment.suite import RECORDS
 from benchnav.eval.experiment.unit import DRAW, Extent, Unit
 from benchnav.eval.folder.provenance import Origin, code_digest
@@ -281,11 +281,12 @@ def unit_rows(finished: Finished) -> pd.DataFrame:
 
 def _with_all_labels(rows: pd.DataFrame) -> pd.DataFrame:
     """Rows with the labels that the version which made them did not have."""
-    if "model" not in rows or set(LATER_LABELS) <= set(rows):
+    if "model" not in rows or set(KNOWLEDGE) <= set(rows):
         return rows
     place = rows.columns.get_loc("model")
-    for after, (name, label) in enumerate(LATER_LABELS.items(), start=1):
-        rows.insert(place + after, name, label)
+    labels = [later_labels(model, risk) for model, risk in zip(rows["model"], rows["risk"], strict=True)]
+    for after, name in enumerate(KNOWLEDGE, start=1):
+        rows.insert(place + after, name, [own[name] for own in labels])
     return rows
 
 

@@ -18,14 +18,14 @@ from benchnav.core.terrain import Grid, Observation
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
-from benchnav.eval.experiment.condition import PART_KINDS, Condition, conditions_of, is_checkpoint
+from benchnav.eval.experiment.condition import KNOWLEDGE, PART_KINDS, Condition, conditions_of, is_checkpoint
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import BLOCK_MAPS, Extent
 from benchnav.eval.run.unit import noise_key, read_maps
 from benchnav.models.base import PrivilegedModel
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.predictor import class_mismatch, find_checkpoint, load_model
+from benchnav.models.predictor import class_mismatch, find_checkpoint, find_ground_statistics, load_model
 from benchnav.planning.planners.planner import check_steers
 from benchnav.planning.problem import Task, pose_problem
 from benchnav.planning.world.realisation import check_known
@@ -146,6 +146,8 @@ def build_each(conditions: Iterable[Condition], seed: int, maps: int) -> list[st
             noise = noise_key(seed, condition.split, 0)
             Simulation(first.terrain, task, world, first.places, noise, [0])
             warnings += _late(condition, task, dataset, maps)
+        if is_new("knowledge", *place, condition.model, *(getattr(condition, kind) for kind in KNOWLEDGE)):
+            _check_knowledge(condition, dataset)
         if not condition.blind and is_new(
             "model", condition.model, condition.data, condition.risk.part, condition.belief, condition.sensor
         ):
@@ -206,6 +208,14 @@ def _check_planner(condition: Condition, task: Task) -> None:
         prepare,
         {},
     )
+
+
+def _check_knowledge(condition: Condition, dataset: TerrainDataset) -> None:
+    """Makes what the robot learns by, which may refuse, and looks for the statistics of the ground that it needs."""
+    for kind in KNOWLEDGE:
+        condition.make(kind)
+    if condition.needs_statistics:
+        find_ground_statistics(condition.model, dataset)
 
 
 def _check_known_ground(condition: Condition, dataset: TerrainDataset, maps: int) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import put_if_alike
 from benchnav.eval.folder.steps import AHEAD_DEG, AHEAD_M
 from benchnav.eval.recording import KnownMap, reach_outline
 from benchnav.planning.free_space import cells_at_goal
@@ -118,14 +119,15 @@ class Knowing:
         if not bool(told.any()):
             return None
         self.revisions[self.members[told]] += 1
-        which = told[:, None, None]
+        which, places = told[:, None, None], told.nonzero()[:, 0]
         fields = before.fields
         if isinstance(fields, Fields):
             fields = replace(fields, state=known.believed)
         self._problem = replace(
             before,
-            observation=known.observation,
-            distribution=self._how.learner.distribution(known),
+            # Of other episodes the planner is told nothing, so that none depends on those beside it.
+            observation=put_if_alike(before.observation, places, known.observation),
+            distribution=put_if_alike(before.distribution, places, self._how.learner.distribution(known)),
             risk_map=torch.where(which, known.risk_map, before.risk_map),
             free=torch.where(which, free, before.free),
             start=robot_state,

@@ -111,7 +111,7 @@ def _named(unit: Unit, groups: np.ndarray) -> pd.DataFrame:
 
 
 def _learnt(episodes: Episodes, member: int, steps: int) -> dict[str, float]:
-    """What a robot learnt: `revisions` of its map, shares of the map seen and sensed, errors ahead of it, and the time.
+    """What a robot learnt: `revisions` of its map, how many cells it saw and sensed, errors ahead, and the time.
 
     Args:
         episodes: what happened.

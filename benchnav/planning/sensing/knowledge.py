@@ -279,9 +279,16 @@ class Learner:
         """What is believed, shape [B, H, W].
 
         Raises:
-            KnowledgeError: the belief raised.
+            KnowledgeError: the belief raised, or gave what is none.
         """
-        return call(Outcome.BELIEF_ERROR, lambda: self.belief.distribution(known.believed))
+
+        def believe() -> TraversabilityDistribution:
+            believed = self.belief.distribution(known.believed)
+            wanted, got = tuple(known.free.shape), getattr(believed, "shape", type(believed).__name__)
+            expect(got == wanted, f"a distribution of shape {list(wanted)} from `distribution`, got {got}.")
+            return believed
+
+        return call(Outcome.BELIEF_ERROR, believe)
 
     def select(self, known: Knowledge, members: Tensor) -> Knowledge:
         """Keeps some episodes, by index, int64.
