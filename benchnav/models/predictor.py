@@ -69,6 +69,7 @@ class Clairvoyant(PrivilegedModel):
 
 
 Source = str | Path | Mapping[str, Any] | registry.Part
+MODEL_NUGGET = 0.3
 IN_REPOSITORY_ALONE = "paper-v1"  # a checkpoint that `setup.py` leaves out of wheels
 
 
@@ -241,6 +242,11 @@ def trained_on(source: Source) -> dict[str, str]:
             split, _, digest = entry.partition(":")
             found[digest] = f"{split} of {part['data']['id']}"
     return found
+
+
+def nugget_of(model: TraversabilityModel) -> float:
+    """`Law.nugget` under a model's predictions: 0 where they are each cell's true distribution."""
+    return 0.0 if isinstance(model, Oracle | Clairvoyant) else MODEL_NUGGET
 
 
 def find_ground_statistics(source: Source, dataset: TerrainDataset) -> GroundStatistics:

@@ -96,10 +96,12 @@ class Copula(Belief[CopulaState]):
             on, until the window is full; before, it is the median.
         window: most observations that an update or an estimate looks at, those nearest to what is new; an update looks
             at more where more is new.
+        nugget: share of the variance of a cell's score that is its own and no neighbour's; None for the law's.
     """
 
     correlation_m: float | Literal["world", "estimated"] = "world"
     window: int = 128
+    nugget: float | None = None
 
     def __post_init__(self) -> None:
         """Refuses lengths that are none, and windows without room."""
@@ -109,16 +111,19 @@ class Copula(Belief[CopulaState]):
             f"`correlation_m` ≥ 0 and finite, 'world' or 'estimated', got {given!r}.",
         )
         expect(self.window >= 1, f"`window` of at least 1, got {self.window}.")
+        expect(self.nugget is None or 0 <= self.nugget < 1, f"`nugget` in [0, 1), got {self.nugget}.")
 
     def init(self, prior: TraversabilityDistribution, law: Law) -> CopulaState:
         """Knows the prediction alone."""
         named = {"world": law.correlation_m, "estimated": _MEDIAN_M}
         length_m = named[self.correlation_m] if isinstance(self.correlation_m, str) else self.correlation_m
+        law = law if self.nugget is None else replace(law, nugget=self.nugget)
+        lengths = [length_m / law.grid.resolution_m] * prior.shape[0]
         zeros = torch.zeros(prior.shape, dtype=torch.float64, device=prior.device)
         none = torch.full_like(zeros, torch.nan)
         return CopulaState(
             prior=prior, table=ScoreTable.empty(prior), law=law,
-            field=Field.of(law.grid.shape, [length_m / law.grid.resolution_m] * len(zeros), prior.device),
+            field=Field.of(law.grid.shape, lengths, prior.device, law.nugget),
             estimated_from=zeros[:, 0, 0].long(), value=none, lower=none, upper=none, noise_std=none, precision=zeros,
             shift=zeros, mean=zeros, std=torch.ones_like(zeros), skew=zeros,
         )  # fmt: skip
@@ -158,7 +163,7 @@ class Copula(Belief[CopulaState]):
             kept = Cells(row=cells.row[:, : self.window], column=cells.column[:, : self.window])
             length = _estimate(state, own, kept)
             if length != float(state.field.length[own]):
-                state.field.write(own, Field.of(state.law.grid.shape, [length], new.device))
+                state.field.write(own, Field.of(state.law.grid.shape, [length], new.device, state.law.nugget))
                 state.mean[own], state.std[own], state.skew[own] = 0, 1, 0
                 new = observed
         _condition(state, own, new, self.window)
@@ -208,7 +213,7 @@ class Copula(Belief[CopulaState]):
             cells = Cells(row=row[None], column=column[None])
             precision, shift = state.precision[own, row, column], state.shift[own, row, column]
             # As the white noise of further fields, of which the first cells are taken.
-            noise = draw_scores(replace(law, correlation_m=0.0), 2 * count, keys[own : own + 1])
+            noise = draw_scores(replace(law, correlation_m=0.0, nugget=0.0), 2 * count, keys[own : own + 1])
             noise = noise[0, count:].to(drawn)[:, row, column] / precision.sqrt()
             inner = field.covariance(cells, cells)[0] + torch.diag(1 / precision)
             away = (shift / precision - drawn[:, row, column] - noise).T
@@ -337,7 +342,8 @@ def _observed(state: CopulaState, own: int, cells: Cells) -> Observed:
 
 def _estimate(state: CopulaState, own: int, cells: Cells) -> float:
     """ℓ of one episode, in cells: the mode of its posterior among `_LENGTHS_M`."""
-    field = _candidates(state.law.grid.shape, state.law.grid.resolution_m, cells.row.device)
+    grid = state.law.grid
+    field = _candidates(grid.shape, grid.resolution_m, cells.row.device, state.law.nugget)
     observed = map_tensors(_observed(state, own, cells), lambda one: one.expand(len(_LENGTHS_M), -1))
     cells = map_tensors(cells, lambda one: one.expand(len(_LENGTHS_M), -1))
     covariance = field.covariance(cells, cells)
@@ -347,8 +353,8 @@ def _estimate(state: CopulaState, own: int, cells: Cells) -> float:
 
 
 @lru_cache(maxsize=8)
-def _candidates(shape: tuple[int, int], resolution_m: float, device: torch.device) -> Field:
-    return Field.of(shape, [length / resolution_m for length in _LENGTHS_M], device)
+def _candidates(shape: tuple[int, int], resolution_m: float, device: torch.device, nugget: float) -> Field:
+    return Field.of(shape, [length / resolution_m for length in _LENGTHS_M], device, nugget)
 
 
 def _bounds(new: Tensor) -> list[tuple[int, int]]:
