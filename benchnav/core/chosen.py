@@ -67,6 +67,15 @@ class ChosenDistribution(TraversabilityDistribution):
         """Log density on (0, 1), log mass at 0 and at 1, shape [*B, H, W]; see the base."""
         return self._pick(self.first.log_prob(value), self.second.log_prob(value))
 
+    def from_normal(self, normal: Tensor) -> Tensor:
+        """λ of standard normal numbers, shape [*B, H, W]; see the base."""
+        return self._pick(self.first.from_normal(normal), self.second.from_normal(normal))
+
+    def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
+        """The interval of standard normal numbers, each of shape [*B, H, W]; see the base."""
+        (low, high), (other_low, other_high) = self.first.to_normal(value), self.second.to_normal(value)
+        return self._pick(low, other_low), self._pick(high, other_high)
+
     def _pick(self, first: Tensor, second: Tensor) -> Tensor:
         return torch.where(self.chosen, first, second.to(first.dtype))
 
