@@ -19,24 +19,19 @@ class ChosenDistribution(TraversabilityDistribution):
     """One distribution where cells are chosen, another in all other cells.
 
     Args:
-        chosen: which cells have the first, bool, shape [*B, H, W].
-        first: of shape [*B, H, W].
+        first: of shape [*B, H, W]; its dtype is that of both.
         second: of shape [*B, H, W].
+        chosen: which cells have the first, bool, shape [*B, H, W].
     """
 
-    chosen: Tensor
     first: TraversabilityDistribution
     second: TraversabilityDistribution
+    chosen: Tensor
 
     @property
     def shape(self) -> torch.Size:
         """[*B, H, W]."""
         return self.chosen.shape
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """That of the first."""
-        return self.first.dtype
 
     def cdf(self, value: Tensor | float) -> Tensor:
         """P(λ ≤ value), shape [*B, H, W]; see the base."""
@@ -94,7 +89,7 @@ def choose(
         A mixture again where both are; the components of the second then belong to no class.
     """
     if not isinstance(first, TraversabilityMixture) or not isinstance(second, TraversabilityMixture):
-        return ChosenDistribution(chosen, first, second)
+        return ChosenDistribution(first, second, chosen)
     own = chosen.unsqueeze(-3)
     parts = [first, second]
     weights = torch.cat(

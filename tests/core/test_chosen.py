@@ -46,7 +46,9 @@ def test_each_cell_has_the_one_or_the_other(pair: str, asked: str) -> None:
     first, second = PAIRS[pair]
     found, ask = choose(CHOSEN, first, second), ASKED[asked]
     assert found.shape == SHAPE
-    torch.testing.assert_close(ask(found), torch.where(CHOSEN, ask(first), ask(second)), rtol=1e-6, atol=1e-6, equal_nan=True)
+    torch.testing.assert_close(
+        ask(found), torch.where(CHOSEN, ask(first), ask(second)), rtol=1e-6, atol=1e-6, equal_nan=True
+    )
 
 
 @pytest.mark.parametrize("pair", PAIRS)

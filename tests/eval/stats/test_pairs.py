@@ -29,9 +29,7 @@ def value_of(labels: Mapping[str, str], **changes: Any) -> dict[str, Any]:
     own = {"data": labels["data"], "split": f"test/{labels['scenario']}", "rules": RULES, "world": STAKES}
     known = {kind: {"part": labels[kind], "options": {}} for kind in KNOWLEDGE}
     known = {
-        kind: part
-        for kind, part in known.items()
-        if part["part"] not in (NOT_USED, KNOWLEDGE[kind]["part"])
+        kind: part for kind, part in known.items() if part["part"] not in (NOT_USED, KNOWLEDGE[kind]["part"])
     }
     return own | parts | known | changes
 

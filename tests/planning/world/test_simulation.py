@@ -256,9 +256,14 @@ def test_the_field_of_a_step_is_what_robots_meet_in_it(noise: str) -> None:
         field = sim.field_at(step)
         assert field.shape == (3, 16, 16)
         for own in range(0, 256, 37):
-            at = poses(*[(0.5 * column.flatten()[own].item() + 0.2, 0.5 * row.flatten()[own].item() + 0.4, 0.0)] * 3)
+            at = poses(
+                *[(0.5 * column.flatten()[own].item() + 0.2, 0.5 * row.flatten()[own].item() + 0.4, 0.0)] * 3
+            )
             now = SimulationState(
-                at, torch.zeros(3, dtype=torch.int64), torch.full((3,), step), torch.zeros(3, dtype=torch.int64)
+                at,
+                torch.zeros(3, dtype=torch.int64),
+                torch.full((3,), step),
+                torch.zeros(3, dtype=torch.int64),
             )
             _, met = sim.step(now, AHEAD.expand(3, 2))
             torch.testing.assert_close(met, field[:, row.flatten()[own], column.flatten()[own]])
