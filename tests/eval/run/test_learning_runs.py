@@ -1,4 +1,4 @@
-"""Runs of robots that learn on their way: what suites ask for reaches them, and rows are the same whoever makes them."""
+"""Runs of robots that learn on their way: what suites ask for reaches them; rows are the same whoever makes them."""
 
 import os
 import signal
