@@ -69,6 +69,7 @@ bench: $(STAMP)
 	$(BIN)/python benchmarks/training.py
 	$(BIN)/python benchmarks/engine.py bench.json
 	$(BIN)/python benchmarks/rollouts.py
+	$(BIN)/python benchmarks/knowledge.py
 	$(BIN)/python benchmarks/risk_parts.py
 
 lint: $(STAMP)

@@ -11,7 +11,7 @@ robots at the end of the way. Under two minutes.
 """
 
 import time
-from dataclasses import replace
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -25,6 +25,8 @@ from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.run.knowledge import Learning
 from benchnav.eval.run.rollout import run_episodes
+from benchnav.models.base import predict
+from benchnav.models.predictor import Oracle
 from benchnav.planning import risk
 from benchnav.planning.objective import TravelTime
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
@@ -32,11 +34,12 @@ from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.belief import Law
 from benchnav.planning.sensing.copula import Copula
-from benchnav.planning.sensing.sensor import Moment, Probe, Sensed
+from benchnav.planning.sensing.knowledge import Learner, Truth
+from benchnav.planning.sensing.sensor import Full, Moment, Probe, Sensed
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import PRESETS, Places
 
-EPISODES, STEPS, EVERY = 50, 100, 5  # steps of 0.1 s
+EPISODES, STEPS = 50, 100  # steps of 0.1 s
 UPDATES = 40  # of the second table, 0.5 m apart
 WINDOWS = (64, 128, 256)
 
@@ -61,6 +64,17 @@ def drive() -> tuple[Problem, Simulation, Terrain, Law]:
 
 def measure(distribution: Any) -> torch.Tensor:
     return risk.expected_time(distribution, 0.05)
+
+
+def learns(belief: Copula, problem: Problem, terrain: Terrain, field: torch.Tensor, law: Law) -> Learning:
+    """How robots learn by a belief, and what they know when they set out."""
+    learner = Learner(
+        sensor=Full(), ground=Probe(1.0), belief=belief, law=law, measure=measure, rules=problem.task.rules,
+        predict=partial(predict, Oracle()),
+    )  # fmt: skip
+    truth = Truth(terrain=terrain, field=field, keys=tuple(range(EPISODES)))
+    start = learner.begin(truth, problem.start, problem.distribution)
+    return Learning(learner=learner, start=start, truth=truth)
 
 
 def driven_ms(
@@ -104,10 +118,7 @@ def main() -> None:
     problem, simulation, terrain, law = drive()
     field = simulation.field
     assert field is not None
-    learning = Learning(
-        ground=Probe(1.0), belief=Copula(), law=law, measure=measure, terrain=terrain, field=field,
-        keys=range(EPISODES), replan_every_s=0.1 * EVERY,
-    )  # fmt: skip
+    learning = learns(Copula(), problem, terrain, field, law)
     run_episodes(
         AStarDWA(), problem, simulation, torch.Generator(), enough=lambda step: step == 2, learning=learning
     )
@@ -116,7 +127,7 @@ def main() -> None:
     for name, how in (
         ("static", None),
         ("copula", learning),
-        ("copula, estimated ℓ", replace(learning, belief=Copula("estimated"))),
+        ("copula, estimated ℓ", learns(Copula("estimated"), problem, terrain, field, law)),
     ):
         whole, learnt, planned = driven_ms(problem, simulation, how)
         peer = peer or whole

@@ -6,9 +6,9 @@
     python benchmarks/knowledge_study.py run primary known     # hours; killed and begun again it goes on
     python benchmarks/knowledge_study.py report                # tables, and the figure of success over what is known
 
-Parts are suites of docs/knowledge: `primary` holds the hypotheses; `known` (part A) and `near` (part B) extend its run;
-`sensitivity` and `kernel` (part C) and `seen` have runs of their own. Maps and runs lie in the folders `--maps_in` and
-`--out`, and `--maps` takes the first maps alone, to try it.
+Parts are suites of docs/knowledge: `primary` holds the hypotheses; `known`, `known-mppi` (part A) and `near` (part B)
+extend its run; `sensitivity` and `kernel` (part C) and `seen` have runs of their own. Maps and runs lie in the folders
+`--maps_in` and `--out`, and `--maps` takes the first maps alone, to try it.
 """
 
 import argparse
@@ -59,6 +59,7 @@ SPLIT = "test/std"
 RUNS = {
     "primary": "knowledge",
     "known": "knowledge",
+    "known-mppi": "knowledge",
     "near": "knowledge",
     "sensitivity": "knowledge-sensitivity",
     "kernel": "knowledge-kernel",
@@ -173,7 +174,11 @@ def drive(suite: dict[str, Any], name: str, out: Path, jobs: int, written: str =
 def run(parts: list[str], out: Path, maps_in: Path, maps: int, jobs: int) -> None:
     """Runs parts, the one with the hypotheses first: a run that was begun cannot take any later."""
     for part in sorted(parts, key=list(RUNS).index):
-        if part in ("known", "near") and not (out / RUNS[part] / "run.json").exists():
+        if (
+            part != "primary"
+            and RUNS[part] == RUNS["primary"]
+            and not (out / RUNS[part] / "run.json").exists()
+        ):
             sys.exit(f"Expected `primary` before {part!r}, whose run it extends.")
         begun = time.perf_counter()
         drive(suite_of(part, maps_in, maps), RUNS[part], out, jobs, written=f"knowledge-{part}")

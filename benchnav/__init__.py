@@ -10,6 +10,7 @@ from benchnav.core.public_names import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
+        "benchnav.core.batch": ("Batch",),
         "benchnav.core.conditioned": ("ConditionedDistribution",),
         "benchnav.core.distribution": ("TraversabilityDistribution",),
         "benchnav.core.errors": ("BenchnavError", "CheckpointError", "ConfigError", "DatasetError"),

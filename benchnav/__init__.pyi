@@ -1,3 +1,4 @@
+from benchnav.core.batch import Batch
 from benchnav.core.conditioned import ConditionedDistribution
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError, DatasetError
@@ -9,6 +10,7 @@ from benchnav.core.registry import register
 from benchnav.core.terrain import Observation, Terrain
 
 __all__ = [
+    "Batch",
     "BenchnavError",
     "CheckpointError",
     "ConditionedDistribution",

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 FACES = {
-    "benchnav": "BenchnavError CheckpointError ConditionedDistribution ConfigError DatasetError Grid "
+    "benchnav": "Batch BenchnavError CheckpointError ConditionedDistribution ConfigError DatasetError Grid "
     "Observation QuantileDistribution Terrain TraversabilityDistribution TraversabilityMixture pool "
     "register",
     "benchnav.datagen": "Recipe TerrainClass TerrainDataset TerrainMaps create_dataset find_dataset generate "

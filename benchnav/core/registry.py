@@ -346,6 +346,13 @@ def _read_options(kind: str, part: Part, target: Any) -> dict[str, Any]:
     return read_options(options_of(kind, target), part.options, of(f"{kind} {part.part!r}"), gone=gone)
 
 
+def later_options(kind: str, source: str) -> dict[str, Any]:
+    """Options that came later than the part, with the defaults at which they are left out of what is recorded."""
+    target = find(kind, source).target
+    known = options_of(kind, target)
+    return {name: known[name].default for name in getattr(_owner(kind, target), "added", ())}
+
+
 def _owner(kind: str, target: Any) -> Any:
     """The class or function whose options a part has: its own, or that of its `config`."""
     return config_class(target, _skipped(kind, target)) or target

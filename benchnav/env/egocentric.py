@@ -6,6 +6,7 @@ sub-environments, N×N cells of the crop, S state and A action dimensions.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -19,9 +20,9 @@ from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.core.ground import GroundStatistics
 from benchnav.env.environment import EnvBatch, Observations, OffRoadEnv, OffRoadVectorEnv
-from benchnav.env.experience import Experience, predict_with
+from benchnav.env.experience import Experience
 from benchnav.env.view import CHANNELS, View, bounds
-from benchnav.models.base import TraversabilityModel
+from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.predictor import Clairvoyant, class_mismatch, find_ground_statistics, load_model
 from benchnav.planning.robots import steps_in
 from benchnav.planning.sensing.belief import Belief, Law
@@ -254,7 +255,7 @@ class EgocentricBatch(EnvBatch):
             law=self._law(predictor.class_names, statistics),
             measure=risk if callable(risk) else registry.make("risk", risk),
             rules=rules,
-            predict=predict_with(predictor),
+            predict=partial(predict, predictor),
         )
         every = steps_in(replan_every_s, self._task.robot.dt_s)
         self._experience = Experience(learner, every, alike=not clairvoyant)

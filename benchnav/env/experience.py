@@ -14,11 +14,9 @@ from torch import Tensor
 
 from benchnav.core.batch import Batch, map_tensors
 from benchnav.core.distribution import TraversabilityDistribution
-from benchnav.core.terrain import Observation
 from benchnav.env.view import Known, spread_of
-from benchnav.models.base import PrivilegedModel, TraversabilityModel, predict_observation
 from benchnav.planning.risk import RiskMeasure
-from benchnav.planning.sensing.knowledge import Knowledge, Learner, Predict, Truth
+from benchnav.planning.sensing.knowledge import Knowledge, Learner, Truth
 from benchnav.planning.sensing.sensor import Sensed
 
 _MOST_KEPT = 256  # maps, of up to a megabyte each
@@ -173,7 +171,10 @@ class Experience:
     def _begun(self, truth: Truth, state: Tensor) -> tuple[Knowledge, Tensor]:
         """Knowledge and spread at the start."""
         learner = self._learner
-        prediction = learner.predict(truth.terrain.observe(), truth) if learner.sensor.sees_all else None
+        prediction = None
+        if learner.sensor.sees_all:
+            terrain = replace(truth.terrain, traversability=truth.field)
+            prediction = learner.predict(terrain, terrain.observe())
         knowledge = learner.begin(truth, state, prediction)
         return knowledge, self._measure.spread
 
@@ -181,17 +182,6 @@ class Experience:
         assert self._knowledge is not None, "no episode has begun"
         assert self._spread is not None
         return self._knowledge, self._spread
-
-
-def predict_with(model: TraversabilityModel) -> Predict:
-    """How a model predicts from what was seen; privileged ones from the truth, λ of the episode included."""
-
-    def predict(observation: Observation, truth: Truth) -> TraversabilityDistribution:
-        if isinstance(model, PrivilegedModel):
-            return model.predict_terrain(replace(truth.terrain, traversability=truth.field))
-        return predict_observation(model, observation)
-
-    return predict
 
 
 def _only(sensed: Sensed, which: Tensor) -> Sensed:

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
+from benchnav.core.ground import SEEN
 from benchnav.env.view import Known, View, spread_of
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem, Task
-from benchnav.planning.sensing.appearance import SEEN
 from benchnav.planning.sensing.sensor import Step
 
 Policy = Callable[[dict[str, np.ndarray]], np.ndarray]

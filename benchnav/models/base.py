@@ -109,12 +109,15 @@ def layers_of(observation: Observation, names: Collection[str]) -> dict[str, Ten
     return {name: known[name] for name in names}
 
 
-def predict(model: TraversabilityModel, terrain: Terrain) -> TraversabilityDistribution:
+def predict(
+    model: TraversabilityModel, terrain: Terrain, observation: Observation | None = None
+) -> TraversabilityDistribution:
     """Lets a model predict: the privileged ones from the Terrain, every other from its Observation alone.
 
     Args:
         model: any model.
         terrain: B maps.
+        observation: what is seen of them; all where it is not given.
 
     Returns:
         The distribution, of shape [B, H, W].
@@ -124,7 +127,7 @@ def predict(model: TraversabilityModel, terrain: Terrain) -> TraversabilityDistr
     """
     if isinstance(model, PrivilegedModel):
         return model.predict_terrain(terrain)
-    return predict_observation(model, terrain.observe())
+    return predict_observation(model, terrain.observe() if observation is None else observation)
 
 
 def predict_observation(model: TraversabilityModel, observation: Observation) -> TraversabilityDistribution:

@@ -73,9 +73,11 @@ def test_the_primary_hypotheses_are_twelve_at_most_and_name_all_that_is_run(prim
 
 
 def test_what_extends_a_run_has_its_labels_and_shares_conditions(primary: list[Condition]) -> None:
-    known = conditions("known")
+    parts = [conditions(part) for part in ("known", "known-mppi")]
+    known = [each for part in parts for each in part]
     check_labels([*primary, *known])
-    assert len({each.id for each in primary} & {each.id for each in known}) == 9
+    shared = [len({each.id for each in primary} & {each.id for each in part}) for part in parts]
+    assert shared == [7, 2]
     # Two planners, two models, three risk settings, four states of knowledge; and the clairvoyant.
     assert len(known) == 2 * 2 * 3 * 4 + 2
     assert Counter(known_of(each.labels) for each in known) == {
@@ -83,7 +85,7 @@ def test_what_extends_a_run_has_its_labels_and_shares_conditions(primary: list[C
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("part", [part for part in RUNNABLE if part not in ("primary", "known")])
+@pytest.mark.parametrize("part", [part for part in RUNNABLE if not part.startswith(("primary", "known"))])
 def test_the_parts_of_suites_are_there(part: str) -> None:
     assert conditions(part)
 
@@ -219,3 +221,29 @@ def test_the_figure_has_a_line_a_risk_setting_over_what_is_known() -> None:
     (bar,) = panel.containers[0].lines[2]
     np.testing.assert_allclose(bar.get_segments()[1][:, 1], [56, 63])
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["mean", "CVaR₀.₈"]
+
+
+def test_power_is_of_the_maps_that_the_study_confirms_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    row = {
+        "claim": "it pays",
+        "kind": "difference",
+        "direction": "higher",
+        "margin": 0.0,
+        "difference": 3.0,
+        "n_maps": 100,
+    }
+    tests = pd.DataFrame([{**row, "low": 3 - 1.96 * 3, "high": 3 + 1.96 * 3}] * 4)
+
+    class Read:
+        def __init__(self, folder: Path) -> None:
+            assert folder == tmp_path / "knowledge-developed"
+            self.tests = tests
+
+    monkeypatch.setattr(knowledge_study, "read_report", Read)
+    # A standard error of 3 over 100 maps is one of 1.5 over 400.
+    first, last = (norm.cdf(3 / 1.5 - norm.ppf(1 - alpha)) for alpha in (0.05 / 4, 0.05))
+    assert f"| 1 | it pays | +3.00 (-2.9 to +8.9) | {first:.2f} | {last:.2f} |" in knowledge_study.power(
+        tmp_path
+    )

@@ -1,6 +1,7 @@
 """What the base makes of a CDF alone, against exact forms of the same distributions."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -9,9 +10,11 @@ from hypothesis import strategies as st
 from scipy import stats
 from torch import Tensor
 
+from benchnav.core.batch import map_tensors
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.pooled import PooledDistribution
 from benchnav.core.quantiles import QuantileDistribution
 from tests.core.distributions import Hidden, mixture, quantiles
 
@@ -187,3 +190,16 @@ def test_cells_and_members_are_taken_out_of_what_a_distribution_is_made_of() -> 
     assert isinstance(copied.own, TraversabilityMixture)
     copied.own.means.zero_()
     assert not torch.equal(copied.cdf(0.4), law.cdf(0.4))
+
+
+@pytest.mark.parametrize("kind", ["mixture", "quantiles", "pooled"])
+def test_cells_are_told_in_which_two_predictions_differ(kind: str) -> None:
+    base: Any = quantiles() if kind == "quantiles" else mixture(3, 0.1, 0.4)
+    base = PooledDistribution((base, mixture(2, 0.1, 0.4))) if kind == "pooled" else base
+    cells = torch.zeros(base.shape, dtype=torch.bool)
+    cells[0, 2, 3] = cells[1, 4] = True
+    moved = map_tensors(base, lambda values: values + 1e-3)
+    found = base.replaced(cells, moved)
+    assert torch.equal(base.differs(found), cells)
+    assert not base.differs(found, 2e-3).any()
+    assert base.differs(mixture(5, 0.1, 0.4)).all()

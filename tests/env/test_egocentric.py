@@ -132,7 +132,7 @@ def test_what_is_known_is_what_robots_of_an_evaluation_know(
     terrain = batch._maps.select(chosen)
     keys = batch._experience._truth.keys if batch._experience._truth else (0,)
     truth = Truth(terrain=terrain, field=simulation.field.clone(), keys=keys)
-    whole = learner.predict(terrain.observe(), truth) if learner.sensor.sees_all else None
+    whole = learner.predict(terrain, terrain.observe()) if learner.sensor.sees_all else None
     start = learner.begin(truth, now.state, whole)
     problem = pose_problem(
         batch._task, start.observation, learner.distribution(start), start.risk_map,

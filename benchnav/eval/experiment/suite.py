@@ -21,7 +21,7 @@ _SEEDS = 2**63  # what a table's column of whole numbers holds
 class Suite:
     """What is evaluated: the product of everything listed, or of each mapping in `conditions`.
 
-    A planner, model, risk measure, robot or objective is given as NAME, package.module:Name,
+    A planner, model, risk measure, robot, objective, sensor or belief is given as NAME, package.module:Name,
     path/to/file.py:Name, or {part: NAME, label: LABEL, options: {...}}.
 
     Args:
@@ -33,9 +33,10 @@ class Suite:
         risks: Risk settings, such as `mean` or `cvar:0.9`.
         robots: Robots F.
         objectives: Objectives J.
-        sensors: What a robot sees of its map: `full`, all before it sets out, or `near`.
-        grounds: What it senses of λ: `contact`, under it, or `probe`, near it.
-        beliefs: What is made of that: `static`, nothing, or `copula` or `classes`.
+        sensors: What a robot sees of its map: `full`, all of it before it sets out, or `near`, the ground around it.
+        grounds: Which λ it senses on its way: `contact`, under it, or `probe`, around it.
+        beliefs: What it makes of sensed λ: `static`, nothing; `copula`, what λ is like nearby; `classes`, also which of
+            two look-alike classes ground is of.
         world: What λ does: a preset by name, paper or stakes, or {preset: NAME, noise: resampled | stored |
             frozen, correlation_m: 1.5, kernel: gaussian | matern32, immobile: {below: 0.1, for_s: 2},
             time_budget_s: T or time_budget_ratio: T over the map's reference time}; or a list of several.

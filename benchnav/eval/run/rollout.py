@@ -51,14 +51,14 @@ class Episodes:
         planning_s: wall time of each step's plan, shape [N].
         planned: how many episodes it was for, int64, shape [N].
         revisions: how often each episode's map changed on the way, int64, shape [B].
-        seen_cells: how many cells each robot saw, int64, shape [B]; None where robots learn nothing.
-        sensed_cells: of how many cells each sensed λ, int64, shape [B]; None likewise.
-        ahead: RMSE of E[λ] and log score over the cells ahead of the robot, NaN at steps without an update, shape
-            [B, N, 2]; None likewise. See `Knowing`.
         learning_s: wall time of what the robots learnt, all steps together.
         errors: one line for each episode that ended by a fault of its planner, empty for the others, B of
             them.
         traceback: where the planner raised; empty where it did not.
+        seen_cells: how many cells each robot saw, int64, shape [B]; None where robots learn nothing.
+        sensed_cells: of how many cells each sensed λ, int64, shape [B]; None likewise.
+        ahead: RMSE of E[λ] and log score over the cells ahead of the robot, NaN at steps without an update, shape
+            [B, N, 2]; None likewise. See `Knowing`.
     """
 
     states: Tensor
@@ -71,12 +71,12 @@ class Episodes:
     planning_s: Tensor
     planned: Tensor
     revisions: Tensor
-    seen_cells: Tensor | None
-    sensed_cells: Tensor | None
-    ahead: Tensor | None
     learning_s: float
     errors: tuple[str, ...]
     traceback: str = ""
+    seen_cells: Tensor | None = None
+    sensed_cells: Tensor | None = None
+    ahead: Tensor | None = None
 
 
 class Clock:

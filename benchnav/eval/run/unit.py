@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from benchnav.core.device import CPU, GPU_FAULTS, gpu_failed
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
 from benchnav.core.registry import Part
-from benchnav.core.terrain import Observation, Terrain
+from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.unit import Unit
@@ -34,7 +34,7 @@ from benchnav.eval.run.knowledge import Learning
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rollout import Episodes, run_episodes
 from benchnav.eval.run.rows import episode_rows, error_rows, step_table
-from benchnav.models.base import PrivilegedModel, predict, predict_observation
+from benchnav.models.base import predict
 from benchnav.models.predictor import Clairvoyant, find_ground_statistics, load_model
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem, heading_to, pose_problem
@@ -233,11 +233,6 @@ def _learner(unit: Unit, origin: Origin, device: torch.device) -> Learner:
         class_names=model.class_names or tuple(item.name for item in dataset.recipe.classes),
     )
 
-    def predict_seen(observation: Observation, truth: Truth) -> TraversabilityDistribution:
-        if isinstance(model, PrivilegedModel):
-            return model.predict_terrain(replace(truth.terrain, traversability=truth.field))
-        return predict_observation(model, observation)
-
     return Learner(
         sensor=sensor,
         ground=call(Outcome.SENSOR_ERROR, lambda: condition.make("ground")),
@@ -245,7 +240,7 @@ def _learner(unit: Unit, origin: Origin, device: torch.device) -> Learner:
         law=law,
         measure=call(Outcome.MODEL_ERROR, lambda: condition.make("risk")),
         rules=condition.rules,
-        predict=predict_seen,
+        predict=partial(predict, model),
     )
 
 

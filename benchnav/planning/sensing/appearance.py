@@ -13,13 +13,11 @@ from torch import Tensor
 
 from benchnav.core.batch import Batch
 from benchnav.core.grid import Grid
+from benchnav.core.ground import SEEN
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.schema import quantise
 from benchnav.datagen.synth import elevation
 from benchnav.planning.sensing.sensor import Appearance
-
-SEEN = "seen"
-"""The layer of a masked map that tells a model which cells were seen: 1 there, else 0."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -87,7 +87,7 @@ class CopulaState(Batch):
 
 @dataclass(frozen=True)
 class Copula(Belief[CopulaState]):
-    """Learns through the correlation of the ground.
+    """Learns from sensed λ what λ is like nearby, since neighbouring ground is alike.
 
     Args:
         correlation_m: ℓ that is believed, in metres; `world`, that of the world, which is privileged knowledge; or

@@ -31,8 +31,8 @@ from benchnav.planning.world.outcome import Outcome
 
 _PESSIMISTIC = 0.8  # level of the CVaR that is believed of unseen ground
 
-Predict = Callable[[Observation, "Truth"], TraversabilityDistribution]
-"""Predicts from what was seen; the truth is for privileged models alone."""
+Predict = Callable[[Terrain, Observation], TraversabilityDistribution]
+"""Predicts from what was seen; the terrain, with λ as it is now, is for privileged models alone."""
 
 Result = TypeVar("Result")
 
@@ -76,7 +76,7 @@ class Knowledge(Batch):
 
     Args:
         memory: of what was seen; None where the whole map was seen at the start.
-        news: episodes in which more was seen than the prediction knows of, bool, shape [B].
+        news: episodes in which more was seen, or better, than the prediction knows of, bool, shape [B].
         sensed: of λ, since the belief was updated; of two looks at a cell the later.
         ever_sensed: cells whose λ was sensed, bool, shape [B, H, W].
         reached: cells that sensors told of in the last step, bool, shape [B, H, W].
@@ -219,7 +219,8 @@ class Learner:
             if new.appearance is not None and known.memory is not None:
                 appearance = replace(new.appearance, seen=new.appearance.seen & told)
                 memory = remember(known.memory, appearance)
-                more = (memory.seen & ~known.memory.seen).flatten(1).any(1)
+                # A cell that is seen for the first time, or better than before.
+                more = (memory.doubt != known.memory.doubt).flatten(1).any(1)
                 reached = known.reached | appearance.seen
                 known = replace(known, memory=memory, news=known.news | more, reached=reached)
         return known
@@ -325,7 +326,8 @@ class Learner:
         """What a model is given of what was seen, and what it makes of it; elsewhere what `rules.unseen` says."""
         statistics = self.statistics
         observation = masked(memory, statistics.layer_means)
-        predicted = call(Outcome.MODEL_ERROR, lambda: self.predict(observation, truth))
+        terrain = replace(truth.terrain, traversability=truth.field)
+        predicted = call(Outcome.MODEL_ERROR, lambda: self.predict(terrain, observation))
         unseen = unseen_ground(statistics, self.rules.unseen, memory.seen.shape, truth.field)
         return observation, choose(memory.seen, predicted, unseen)
 

@@ -20,7 +20,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.config import ClassifierConfig, MDNConfig
+from benchnav.models.config import ClassifierConfig, MDNConfig, plain_config
 from benchnav.models.nets.calibration import fit_temperature, sample_logits
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.training import fit as fit_module
@@ -398,7 +398,7 @@ def test_a_command_that_is_killed_and_resumed_ends_as_if_it_had_not_been(
     command = [sys.executable, "-c", "from benchnav.models.cli import main; main()", "classifier"]
     command += ["--data", str(dataset.path), "--out", str(tmp_path / "m"), "--seed", "1"]
     command += ["--trainer.precision", "32-true", "--device", "cpu", "--half-precision", "false"]
-    settings = json.loads(json.dumps(vars(SMALL)))
+    settings = json.loads(json.dumps(plain_config(SMALL)))
     command += [f"--classifier.{name}={value}" for name, value in settings.items()]
     environment = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)

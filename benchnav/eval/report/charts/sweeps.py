@@ -1,7 +1,7 @@
 """Sweeps of a run: conditions that are equal in all but one number, which takes three values or more, as curves."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from benchnav.core import registry
 from benchnav.core.figures import (
     BLIND,
     LINE_COLOURS,
@@ -25,6 +26,7 @@ from benchnav.core.figures import (
 from benchnav.datagen.recipe.scenario import find_series
 from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.report.words import joined
+from benchnav.planning.free_space import Rules
 
 SEVERITY = "severity"
 LEAST_VALUES = 3
@@ -72,7 +74,11 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
         Lines in the order of the run, by the name of their number with dots, such as `risk.options.level`;
         `severity` is that of scenarios.
     """
-    values = {name: about["value"] for name, about in conditions.items() if "split" in about["value"]}
+    values = {
+        name: _with_defaults(about["value"])
+        for name, about in conditions.items()
+        if "split" in about["value"]
+    }
     flat = [pd.json_normalize(value).to_dict("records")[0] for value in values.values()]
     known = pd.DataFrame(flat, index=list(values), dtype=object)
     tables = [(number, known) for number in sorted(known)]
@@ -94,6 +100,20 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
                 )
                 sweeps.setdefault(number, []).append(line)
     return sweeps
+
+
+def _with_defaults(value: Mapping[str, Any]) -> dict[str, Any]:
+    """A condition's value with rules and options of shipped planners that stand in it only where they differ."""
+    planner = value["planner"]
+    later = {}
+    if planner["part"] in registry.names("planner"):
+        later = registry.later_options("planner", planner["part"])
+    options = {**later, **planner["options"]}
+    return {
+        **value,
+        "rules": {**asdict(Rules()), **value.get("rules", {})},
+        "planner": {**planner, "options": options},
+    }
 
 
 def _is_number(value: Any) -> bool:

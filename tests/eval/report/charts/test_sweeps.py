@@ -42,6 +42,20 @@ def test_switches_and_lists_are_no_numbers() -> None:
     assert list(found(*(condition(samples=value) for value in (2, 3, 4)))) == ["planner.options.samples"]
 
 
+def test_what_stands_in_no_value_at_its_default_is_a_number_too() -> None:
+    def guided(**options: Any) -> dict[str, Any]:
+        about = condition()
+        return {"value": {**about["value"], "planner": {"part": "astar_dwa", "options": options}}}
+
+    lines = found(guided(), guided(explore=1.0), guided(explore=0.5))
+    assert lines == {"planner.options.explore": [((0.0, 0.5, 1.0), ("0", "2", "1"))]}
+    every = [
+        {"value": {**condition()["value"], "rules": rules}}
+        for rules in ({}, {"replan_every_s": 2.0}, {"replan_every_s": 0.2})
+    ]
+    assert found(*every) == {"rules.replan_every_s": [((0.2, 0.5, 2.0), ("2", "0", "1"))]}
+
+
 def test_scenarios_of_a_series_make_a_line_over_severity_that_std_begins() -> None:
     lines = found(
         condition("test/hg-050"), condition("test/std"), condition("test/hg-100"), condition("test/hs")
