@@ -57,7 +57,7 @@ class Model:
 
     seen: list[Observation] = field(default_factory=list)
 
-    def __call__(self, observation: Observation, truth: Truth) -> TraversabilityDistribution:
+    def __call__(self, terrain: Terrain, observation: Observation) -> TraversabilityDistribution:
         self.seen.append(observation)
         means = observation.rgb[:, :1].float() / 255
         return TraversabilityMixture(torch.ones_like(means), means, torch.full_like(means, 0.1), (0,))
@@ -130,7 +130,7 @@ def test_what_is_believed_is_the_prediction_where_ground_was_seen_and_the_prior_
 
 
 def test_a_model_of_another_kind_than_mixtures_is_taken_too() -> None:
-    def quantiles(observation: Observation, truth: Truth) -> TraversabilityDistribution:
+    def quantiles(terrain: Terrain, observation: Observation) -> TraversabilityDistribution:
         red = observation.rgb[:, 0].float() / 255
         return QuantileDistribution(torch.stack([(red + 0.2 * (own - 0.5)).clamp(0, 1) for own in LEVELS], 1))
 
@@ -142,14 +142,22 @@ def test_a_model_of_another_kind_than_mixtures_is_taken_too() -> None:
 
 
 def test_privileged_models_tell_of_seen_ground_alone() -> None:
-    def oracle(observation: Observation, truth: Truth) -> TraversabilityDistribution:
-        return truth.terrain.truth
+    def oracle(terrain: Terrain, observation: Observation) -> TraversabilityDistribution:
+        return terrain.truth
 
     known = begin(how := learner(oracle))
     believed, seen = how.distribution(known).mean(), near()
     torch.testing.assert_close(believed[seen], TRUTH.terrain.truth.mean()[seen])
     prior = STATISTICS.mixture((BATCH, SIZE, SIZE), believed)
     torch.testing.assert_close(believed[~seen], prior.mean()[~seen])
+
+    # One that knows λ itself knows it as it is now.
+    def clairvoyant(terrain: Terrain, observation: Observation) -> TraversabilityDistribution:
+        return factories.certain(terrain.traversability)
+
+    later = learner(clairvoyant)
+    now = later.begin(replace(TRUTH, field=1 - TRUTH.field), START, None)
+    torch.testing.assert_close(later.distribution(now).mean()[seen], 1 - TRUTH.field[seen])
 
 
 @pytest.mark.parametrize("unseen", ["prior", "optimistic", "pessimistic"])
