@@ -19,24 +19,19 @@ class ChosenDistribution(TraversabilityDistribution):
     """One distribution where cells are chosen, another in all other cells.
 
     Args:
-        chosen: which cells have the first, bool, shape [*B, H, W].
-        first: of shape [*B, H, W].
+        first: of shape [*B, H, W]; its dtype is that of both.
         second: of shape [*B, H, W].
+        chosen: which cells have the first, bool, shape [*B, H, W].
     """
 
-    chosen: Tensor
     first: TraversabilityDistribution
     second: TraversabilityDistribution
+    chosen: Tensor
 
     @property
     def shape(self) -> torch.Size:
         """[*B, H, W]."""
         return self.chosen.shape
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """That of the first."""
-        return self.first.dtype
 
     def cdf(self, value: Tensor | float) -> Tensor:
         """P(λ ≤ value), shape [*B, H, W]; see the base."""
@@ -67,6 +62,15 @@ class ChosenDistribution(TraversabilityDistribution):
         """Log density on (0, 1), log mass at 0 and at 1, shape [*B, H, W]; see the base."""
         return self._pick(self.first.log_prob(value), self.second.log_prob(value))
 
+    def from_normal(self, normal: Tensor) -> Tensor:
+        """λ of standard normal numbers, shape [*B, H, W]; see the base."""
+        return self._pick(self.first.from_normal(normal), self.second.from_normal(normal))
+
+    def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
+        """The interval of standard normal numbers, each of shape [*B, H, W]; see the base."""
+        (low, high), (other_low, other_high) = self.first.to_normal(value), self.second.to_normal(value)
+        return self._pick(low, other_low), self._pick(high, other_high)
+
     def _pick(self, first: Tensor, second: Tensor) -> Tensor:
         return torch.where(self.chosen, first, second.to(first.dtype))
 
@@ -85,7 +89,7 @@ def choose(
         A mixture again where both are; the components of the second then belong to no class.
     """
     if not isinstance(first, TraversabilityMixture) or not isinstance(second, TraversabilityMixture):
-        return ChosenDistribution(chosen, first, second)
+        return ChosenDistribution(first, second, chosen)
     own = chosen.unsqueeze(-3)
     parts = [first, second]
     weights = torch.cat(

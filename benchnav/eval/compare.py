@@ -125,8 +125,8 @@ def read_conditions(runs: Sequence[Run]) -> list[Compared]:
     found = []
     for run, name in zip(runs, names, strict=True):
         episodes = dict(list(read_table(run.folder, EPISODES).groupby("condition", sort=False)))
-        for condition, about in run.about["conditions"].items():
-            labels, value, rows = about["labels"], about["value"], episodes[condition]
+        for condition, (known, _) in run.conditions.items():
+            labels, value, rows = known.labels, known.value, episodes[condition]
             found.append(
                 Compared(
                     labels={**labels, "run": name if shared[condition] > 1 else NOT_USED},

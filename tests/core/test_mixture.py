@@ -418,3 +418,22 @@ def test_the_components_of_a_class_are_added_up_in_the_order_of_the_classes() ->
 def test_one_component_a_class_is_left_as_it_is(group: tuple[int, ...] | None) -> None:
     made = grouped(group)
     assert made.class_probabilities(3) is made.weights
+
+
+def test_components_of_no_class_are_none_of_the_classes_and_together_one_more() -> None:
+    made = grouped((0, -1, 1, -1), 4)
+    classes = made.class_probabilities(2)
+    assert torch.equal(classes, made.weights[:, [0, 2]])
+    rest = 1 - classes.sum(1)
+    likely = made.most_likely()
+    without = rest > classes.amax(1)
+    assert without.any()
+    assert not without.all()
+    alone = made.weights[:, [1, 3]] / made.weights[:, [1, 3]].sum(1, keepdim=True)
+    wanted = (alone * made.means[:, [1, 3]]).sum(1)
+    best = torch.gather(made.means[:, [0, 2]], 1, classes.argmax(1, keepdim=True))[:, 0]
+    exact = TraversabilityMixture(alone, made.means[:, [1, 3]], made.stds[:, [1, 3]]).mean()
+    torch.testing.assert_close(likely.mean()[without], exact[without])
+    assert wanted.shape == exact.shape
+    one = TraversabilityMixture(torch.ones_like(best)[:, None], best[:, None], best[:, None]).mean()
+    torch.testing.assert_close(likely.mean()[~without], one[~without])

@@ -191,6 +191,31 @@ def least(mixture: TraversabilityMixture, factor: float = 1.0) -> torch.Tensor:
     return (mixture.means.amin(dim=1) * factor).clamp(0, 1)
 
 
+class Noting(Still):
+    """Stands still, and keeps each problem that it is given in a file."""
+
+    writes = ("log",)
+
+    def __init__(self, log: str) -> None:
+        super().__init__()
+        self.log = Path(log)
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Problem:
+        return self._noted(problem)
+
+    def revise(self, plan_state: Problem, problem: Problem) -> Problem:
+        return self._noted(problem)
+
+    def select(self, plan_state: Problem, members: torch.Tensor) -> Problem:
+        return plan_state.select(members)
+
+    def _noted(self, problem: Problem) -> Problem:
+        observation = problem.observation
+        note = {"rgb": observation.rgb, "seen": observation.layers.get("seen"), "risk_map": problem.risk_map}
+        torch.save(note, self.log / f"{len(list(self.log.iterdir())):03d}.pt")
+        return problem
+
+
 class Asleep(Planner[Problem]):
     """Writes down which process began it, and does not wake."""
 

@@ -11,7 +11,7 @@ from benchnav.planning.free_space import PENALTY, FreeSpace, Rules, cells_at_goa
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.astar.dwa import DWAConfig, score
 from benchnav.planning.planners.planner import rollout_path
-from benchnav.planning.problem import Problem
+from benchnav.planning.problem import Problem, pose_problem
 from tests import factories
 from tests.planning.planners.driving import held_paths, rollout_cost
 
@@ -196,10 +196,40 @@ def test_free_space_that_means_nothing_is_refused(settings: dict[str, object], e
         ({"min_traversability": 1.1}, "min_traversability"),
         ({"goal_radius_m": 0.0}, "goal_radius_m"),
         ({"goal_radius_m": float("inf")}, "goal_radius_m"),
+        ({"unseen": "hopeful"}, "'prior', 'optimistic' or 'pessimistic', got 'hopeful'"),
+        ({"replan_every_s": 0.0}, "replan_every_s"),
+        ({"replan_every_s": float("inf")}, "replan_every_s"),
+        ({"replan_every_s": float("nan")}, "replan_every_s"),
     ],
 )
 def test_rules_under_which_nothing_moves_or_arrives_are_refused(
-    settings: dict[str, float], expected: str
+    settings: dict[str, object], expected: str
 ) -> None:
     with pytest.raises(ConfigError, match=expected):
         Rules(**settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("unseen", ["prior", "optimistic", "pessimistic"])
+def test_ground_that_was_not_seen_is_closed_by_no_pessimism(unseen: str) -> None:
+    ground = torch.full((1, 4, 4), 0.2)
+    ground[0, 0] = 0.8
+    seen = torch.zeros(1, 4, 4, dtype=torch.bool)
+    seen[0, :, :2] = True
+    rules = Rules(unseen=unseen)
+    free, certain = ground > 0.3, factories.certain(ground)
+    assert torch.equal(rules.free(ground, certain), free)
+    wanted = free | ~seen if unseen == "pessimistic" else free
+    assert torch.equal(rules.free(ground, certain, seen), wanted)
+    task = replace(factories.task(rules=rules))
+    posed = factories.problem(ground)
+    places = posed.start[:, :2], torch.tensor([[50.0, 50.0]])
+    problem = pose_problem(task, posed.observation, certain, ground, *places, 9.0, seen)
+    assert torch.equal(problem.free, wanted)
+
+
+def test_rules_say_what_came_with_later_versions_where_it_is_no_default() -> None:
+    paper = {"free_space": {"by": "risk", "above": 0.3}, "min_traversability": 0.3, "goal_radius_m": 1.0}
+    assert Rules().to_dict() == paper
+    assert Rules(unseen="optimistic").to_dict() == paper | {"unseen": "optimistic"}
+    assert Rules(replan_every_s=2.0).to_dict() == paper | {"replan_every_s": 2.0}
+    assert Rules(goal_radius_m=2.0).to_dict() == paper | {"goal_radius_m": 2.0}

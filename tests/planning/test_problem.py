@@ -1,5 +1,6 @@
 import math
 from dataclasses import fields, replace
+from typing import Any
 
 import pytest
 import torch
@@ -13,6 +14,9 @@ from benchnav.core.terrain import Observation
 from benchnav.planning.free_space import FreeSpace, Rules, cells_at_goal
 from benchnav.planning.problem import Problem, heading_to, pose_problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
+from benchnav.planning.sensing.belief import Belief, Fields, Law, Static
+from benchnav.planning.sensing.copula import Copula
+from benchnav.planning.sensing.sensor import Sensed
 from tests import factories
 from tests.core.distributions import quantiles
 
@@ -79,6 +83,7 @@ def test_headings_look_at_the_goal() -> None:
 def test_no_truth_is_in_it() -> None:
     assert {field.name for field in fields(Problem)} == {
         "task", "observation", "distribution", "risk_map", "free", "start", "goal_m", "time_budget_s",
+        "fields",
     }  # fmt: skip
     assert not any("class_id" in name or "truth" in name for name in tensors(varied()))
 
@@ -164,3 +169,74 @@ def test_any_distribution_is_posed_and_taken_apart_with_the_batch() -> None:
     assert torch.equal(kept.distribution.cdf(0.4), law.cdf(0.4)[2:])
     with pytest.raises(ConfigError, match="`distribution` of shape"):
         replace(problem, distribution=law.select(torch.tensor([0])))
+
+
+def drawing(belief: Belief[Any], sensed: Tensor | None = None, correlation_m: float = 1.5) -> Problem:
+    """Three problems whose fields are drawn from a belief, which was told some λ, [B, H, W]."""
+    problem = varied()
+    law = Law(grid=problem.grid, correlation_m=correlation_m)
+    state = belief.init(problem.distribution, law)
+    if sensed is not None:
+        state = belief.update(state, Sensed(traversability=sensed, std=torch.full_like(sensed, 0.01)))
+    return replace(problem, fields=Fields(belief, state, (7, 3, 11)))
+
+
+@pytest.mark.parametrize("correlated", [True, False])
+def test_fields_have_the_prediction_and_hang_together_as_the_belief_says(correlated: bool) -> None:
+    torch.manual_seed(0)
+    problem = drawing(Static(correlated))
+    drawn = problem.sample_fields(600, 5)
+    assert drawn.shape == (BATCH, 600, HEIGHT, WIDTH)
+    assert drawn.dtype == problem.risk_map.dtype
+    assert float(drawn.min()) >= 0
+    assert float(drawn.max()) <= 1
+    # Neighbouring cells are of one episode and hang together; E[λ] is within 4 standard errors in nearly all.
+    off = (drawn.mean(1) - problem.distribution.mean()).abs() * 600**0.5 / drawn.std(1)
+    assert float((off < 4).double().mean()) > 0.99
+    ranks = drawn.argsort(1).argsort(1).double()
+    ranks = (ranks - ranks.mean(1, keepdim=True)) / ranks.std(1, keepdim=True)
+    beside = (ranks[..., 1:] * ranks[..., :-1]).mean()
+    expected = 6 / math.pi * math.asin(math.exp(-1 / 18) / 2) if correlated else 0.0
+    assert float(beside) == pytest.approx(expected, abs=0.03)
+    again = problem.sample_fields(600, 5)
+    assert torch.equal(drawn, again)
+    assert not torch.equal(problem.sample_fields(600, 6), drawn)
+
+
+@pytest.mark.parametrize("belief", [Static(), Copula()])
+def test_an_episodes_fields_depend_on_no_other(belief: Belief[Any]) -> None:
+    sensed = torch.full((BATCH, HEIGHT, WIDTH), torch.nan)
+    sensed[:, 4, 5] = torch.tensor([0.3, 0.5, 0.7])
+    problem = drawing(belief, sensed)
+    whole = problem.sample_fields(3, 5)
+    kept = problem.select(torch.tensor([2, 0])).sample_fields(3, 5)
+    torch.testing.assert_close(kept, whole[[2, 0]])
+    assert (whole[0] - whole[1]).abs().max() > 0.1
+
+
+def test_fields_are_those_that_what_was_sensed_allows() -> None:
+    torch.manual_seed(0)
+    sensed = torch.full((BATCH, HEIGHT, WIDTH), torch.nan)
+    value = varied().distribution.quantile(0.25)[:, 4, 5]
+    torch.manual_seed(0)
+    sensed[:, 4, 5] = value
+    drawn = drawing(Copula(), sensed).sample_fields(200, 5)
+    assert (drawn[:, :, 4, 5] - value[:, None]).abs().max() < 0.05
+    torch.manual_seed(0)
+    before = drawing(Copula()).sample_fields(200, 5)
+    # A cell beside it is as much worse ground as the correlation has it; one far away is what it was.
+    torch.manual_seed(0)
+    distribution = varied().distribution
+    rank = torch.stack([distribution.cdf(own) for own in drawn.unbind(1)], 1)
+    score = -0.6745 * math.exp(-1 / 18)
+    spread = math.sqrt(1 - math.exp(-1 / 9))
+    beside = torch.special.ndtri(rank[:, :, 4, 6].double().clamp(1e-6, 1 - 1e-6))
+    assert beside.mean(1).tolist() == pytest.approx([score] * BATCH, abs=4 * spread / 200**0.5 + 0.02)
+    torch.testing.assert_close(drawn[..., 19], before[..., 19], atol=0.02, rtol=0)
+
+
+def test_a_problem_that_nobody_gave_fields_has_none_to_draw() -> None:
+    with pytest.raises(ConfigError, match="with `fields` to draw from, got None"):
+        varied().sample_fields(1, 0)
+    kept = varied().select(torch.tensor([1]))
+    assert kept.fields is None

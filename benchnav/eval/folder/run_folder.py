@@ -281,9 +281,9 @@ def unit_rows(finished: Finished) -> pd.DataFrame:
 
 def _with_all_labels(rows: pd.DataFrame) -> pd.DataFrame:
     """Rows with the labels that the version which made them did not have."""
-    if "model" not in rows or set(KNOWLEDGE) <= set(rows):
+    if "objective" not in rows or set(KNOWLEDGE) <= set(rows):
         return rows
-    place = rows.columns.get_loc("model")
+    place = rows.columns.get_loc("objective")
     labels = [later_labels(model, risk) for model, risk in zip(rows["model"], rows["risk"], strict=True)]
     for after, name in enumerate(KNOWLEDGE, start=1):
         rows.insert(place + after, name, [own[name] for own in labels])

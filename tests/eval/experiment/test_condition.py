@@ -1,12 +1,22 @@
 """Conditions as values, and how a suite becomes a list of them."""
 
 from dataclasses import replace
-from itertools import pairwise
+from importlib.resources import files
+from itertools import pairwise, product
 
 import pytest
+import yaml
 
 from benchnav.core.errors import ConfigError
-from benchnav.eval.experiment.condition import Condition, condition_from, conditions_of
+from benchnav.eval.experiment.condition import (
+    KNOWLEDGE,
+    NOT_USED,
+    Condition,
+    check_labels,
+    condition_from,
+    conditions_of,
+    later_labels,
+)
 from benchnav.eval.experiment.suite import Suite
 from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.world.world import PRESETS, Immobile, World
@@ -59,6 +69,15 @@ def test_the_id_is_that_of_the_value_and_not_of_the_label() -> None:
         {"task": {"goal_radius_m": 0.5}},
         {"task": {"free_space": {"by": "mean"}}},
         {"task": {"free_space": {"above": 0.1}}},
+        {"task": {"unseen": "optimistic"}},
+        {"task": {"replan_every_s": 1.0}},
+        {"sensors": ("near",)},
+        {"sensors": ({"part": "near", "options": {"range_m": 4.0}},)},
+        {"beliefs": ({"part": "static", "options": {"correlated": False}},)},
+        {"beliefs": ("copula",)},
+        {"beliefs": ("copula",), "grounds": ("probe",)},
+        {"beliefs": ("copula",), "grounds": ({"part": "probe", "options": {"radius_m": 2.0}},)},
+        {"beliefs": ("copula",), "sensors": ("near",)},
     )
     ids = [condition.id, *(one(**change).id for change in changes)]
     assert len(set(ids)) == len(ids)
@@ -253,3 +272,138 @@ def test_the_clairvoyant_is_one_condition_a_planner_for_all_risks() -> None:
     )
     for condition in made:
         assert condition_from({"value": condition.value, "labels": condition.labels}) == condition
+
+
+# Of the suites of version 0.10.0, whose runs go on under this one.
+IDS = {
+    "demo": {"84d239b3a1f2a5fd", "d1855ba4455918de"},
+    "paper": {"5dbed6747e6870d3", "fb91f100b66ed556"},
+    "risk": {"d1855ba4455918de", "01852dbaf2655229"},
+    "full": {"431bbb85e715853d", "a4fb112c0e776709"},
+    "severity": {"d1855ba4455918de", "bb7f4a68325b35a3"},
+}
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_conditions_of_earlier_versions_have_their_ids(name: str) -> None:
+    about = yaml.safe_load(files("benchnav.eval").joinpath("suites", f"{name}.yaml").read_text())
+    lists = {key: tuple(value) if isinstance(value, list) else value for key, value in about.items()}
+    ids = [condition.id for condition in conditions_of(Suite(**lists), lambda data: ["std"])]
+    assert {ids[0], ids[-1]} == IDS[name]
+
+
+def known(made: list[Condition]) -> list[tuple[str, ...]]:
+    """Labels of what robots know by, a tuple a condition."""
+    return [tuple(condition.labels[kind] for kind in KNOWLEDGE) for condition in made]
+
+
+def test_a_belief_that_does_not_learn_is_one_condition_for_all_sensors_of_the_ground() -> None:
+    made = conditions(
+        scenarios=("std",), grounds=("contact", "probe", "probe:2"), beliefs=("static", "copula"),
+        sensors=("full", "near"),
+    )  # fmt: skip
+    beside = [("copula", ground) for ground in ("contact", "probe", "probe:2")]
+    wanted = [(sensor, NOT_USED, "static") for sensor in ("full", "near")]
+    wanted += [(sensor, ground, belief) for sensor in ("full", "near") for belief, ground in beside]
+    assert sorted(known(made)) == sorted(wanted)
+    static = next(c for c in made if c.labels["belief"] == "static" and c.labels["sensor"] == "full")
+    assert static.id == one().id
+    assert not static.learns
+    assert all(condition.learns for condition in made if condition is not static)
+    assert not set(KNOWLEDGE) & set(static.value)
+
+
+def test_a_blind_planner_is_one_condition_whatever_robots_know_by() -> None:
+    (blind,) = conditions(
+        planners=("straight",), scenarios=("std",), grounds=("contact", "probe"), beliefs=("static", "copula"),
+        sensors=("full", "near"),
+    )  # fmt: skip
+    assert known([blind]) == [(NOT_USED,) * 3]
+    assert blind.id == one(planners=("straight",)).id
+    assert not blind.learns
+
+
+def test_a_clairvoyant_that_sees_all_has_nothing_to_learn() -> None:
+    made = conditions(
+        scenarios=("std",), models=("clairvoyant",), world="stakes", risks=("mean", "cvar"),
+        grounds=("contact", "probe"), beliefs=("static", "copula"), sensors=("full", "near"),
+    )  # fmt: skip
+    assert sorted(known(made)) == sorted(
+        [
+            ("full", NOT_USED, NOT_USED), ("near", NOT_USED, "static"), ("near", "contact", "copula"),
+            ("near", "probe", "copula"),
+        ]
+    )  # fmt: skip
+    alone = one(models=("clairvoyant",), world="stakes")
+    assert [condition.id for condition in made if condition.labels["sensor"] == "full"] == [alone.id]
+
+
+def test_grounds_and_beliefs_are_crossed_and_their_options_swept() -> None:
+    made = conditions(
+        scenarios=("std",),
+        grounds=("contact", {"part": "probe", "options": {"radius_m": [1.0, 2.0], "noise_std": [0.1, 0.3]}}),
+        beliefs=({"part": "copula", "options": {"correlation_m": ["world", 1.0]}},),
+    )
+    found = {(ground, belief) for _, ground, belief in known(made)}
+    assert len(made) == len(found) == 10
+    assert {condition.make("belief").correlation_m for condition in made} == {"world", 1.0}
+    probes = [condition.make("ground") for condition in made if condition.ground.part == "probe"]
+    chosen = {(probe.radius_m, probe.noise_std) for probe in probes}
+    assert (len(probes), chosen) == (8, set(product((1.0, 2.0), (0.1, 0.3))))
+    for first, second in pairwise(made):
+        assert first.id != second.id
+
+
+def test_what_robots_know_by_is_read_back() -> None:
+    made = conditions(
+        planners=(FAN, "straight"), scenarios=("std",), grounds=("contact", "probe:2"),
+        beliefs=("static", "copula", {"part": "static", "label": "free", "options": {"correlated": False}}),
+        sensors=("full", {"part": "near", "label": "far", "options": {"range_m": 16.0}}),
+        task={"unseen": "pessimistic", "replan_every_s": 0.2},
+    )  # fmt: skip
+    for condition in made:
+        again = condition_from({"value": condition.value, "labels": condition.labels})
+        assert (again, again.id) == (condition, condition.id)
+        assert (again.rules.unseen, again.rules.replan_every_s) == ("pessimistic", 0.2)
+
+
+def test_conditions_of_versions_without_sensors_have_the_labels_of_todays() -> None:
+    made = conditions(
+        planners=(FAN, "straight"), scenarios=("std",), models=("oracle", "clairvoyant"), world="stakes"
+    )
+    assert len(made) == 3
+    for condition in made:
+        labels = {name: label for name, label in condition.labels.items() if name not in KNOWLEDGE}
+        assert later_labels(labels["model"], labels["risk"]) | labels == condition.labels
+        assert condition_from({"value": condition.value, "labels": labels}) == condition
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"grounds": ("probe", "probe:1")}, "twice"),
+        ({"grounds": ("probe", {"part": "probe", "options": {"radius_m": 2.0}})}, "both called 'probe'"),
+        ({"sensors": ("near", {"part": "near", "options": {"range_m": 2.0}})}, "both called 'near'"),
+        ({"beliefs": ({"part": "copula", "options": {"windw": 3}},)}, "Did you mean 'window'"),
+        ({"grounds": ("prob",)}, "Did you mean 'probe'"),
+        ({"sensors": ("nera",)}, "Did you mean 'near'"),
+        ({"beliefs": ("copla",)}, "Did you mean 'copula'"),
+        ({"beliefs": ()}, "one or more `beliefs`"),
+        ({"task": {"unseen": "dark"}}, "unseen"),
+        ({"task": {"replan_every_s": -1}}, "replan_every_s"),
+    ],
+)
+def test_what_robots_cannot_know_by_is_refused(changes: dict[str, object], expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        conditions(**({"beliefs": ("copula",)} | changes))
+
+
+def test_labels_of_what_robots_know_by_are_one_each() -> None:
+    probe, far = one(beliefs=("copula",), grounds=("probe",)), one(beliefs=("copula",), grounds=("probe:2",))
+    check_labels([probe, far, one()])
+    with pytest.raises(ConfigError, match="two settings that are both called 'probe'"):
+        check_labels([probe, replace(far, ground=replace(far.ground, label="probe"))])
+    with pytest.raises(ConfigError, match="for one ground, got 'mine' and 'probe'"):
+        check_labels([probe, replace(probe, ground=replace(probe.ground, label="mine"))])
+    # What is not used has no label that it could share.
+    check_labels([one(), one(planners=("straight",)), one(sensors=("near",))])

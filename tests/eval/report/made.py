@@ -9,7 +9,7 @@ import pandas as pd
 import torch
 
 from benchnav.core.tables import Bold, Table
-from benchnav.eval.experiment.condition import LABELS
+from benchnav.eval.experiment.condition import LABELS, later_labels
 from benchnav.eval.recording import KnownMap, Recording, drawn_plan, reach_outline
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.summary import summarise
@@ -23,10 +23,10 @@ PAPER = {
 def condition(planner: str = "mppi", risk: str = "cvar", **labels: str) -> dict[str, str]:
     """Labels of a condition."""
     same = {"data": "paper-v1", "scenario": "std", "world": "paper", "robot": "unicycle"}
-    same |= {"sensor": "full", "ground": "–", "belief": "static"}
-    return (
+    given = (
         same | {"objective": "goal_distance", "model": "paper-v1", "planner": planner, "risk": risk} | labels
     )
+    return later_labels(given["model"], given["risk"]) | given
 
 
 def row(

@@ -1,5 +1,6 @@
 """Robots that learn on their way: what they are told, when, and what that changes."""
 
+import math
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -94,7 +95,9 @@ def drives(seed: int = 0, replan_every_s: float = 0.5, **changes: Any) -> Drives
     simulation = Simulation(terrain, task, WORLD, places, rng.stream_key(0, "noise"), range(BATCH))
     problem = pose_problem(task, terrain.observe(), truth, measure(truth), start, goal, 24.0)
     known = Truth(terrain=terrain, field=field, keys=KEYS)
-    return Drives(problem, simulation, learning(problem, known, **changes))
+    how = learning(problem, known, **changes)
+    believed = how.learner.distribution(how.start)
+    return Drives(replace(problem, distribution=believed), simulation, how)
 
 
 def same(one: Episodes, other: Episodes) -> bool:
@@ -425,3 +428,85 @@ def test_the_error_keeps_how_episodes_end() -> None:
     with pytest.raises(KnowledgeError) as error:
         drives(belief=type("Broken", (Copula,), {"init": fails()})())
     assert error.value.outcome == Outcome.BELIEF_ERROR
+
+
+def test_what_is_measured_ahead_is_what_each_cell_ahead_tells() -> None:
+    given = drives(ground=Probe(1.0))
+    problem, truth, how = given.problem, given.learning.truth, given.learning.learner
+    knowing = Knowing(given.learning, problem)
+    states = problem.start.clone()
+    states[:, 2] = torch.linspace(-3, 3, BATCH)
+    states[3, :2] = torch.tensor([6.1, 5.7])
+    running = torch.arange(BATCH) != 5
+    for step in range(6):
+        knowing.learn(step, states, running)
+    knowing.look_ahead(5, states, running)
+    found, believed = knowing.ahead[5], how.distribution(knowing.known)
+    probability = believed.log_prob(truth.field).clamp(min=-10)
+    assert found[5].isnan().all()
+    for own in (0, 3, 7):
+        errors, scores = [], []
+        x, y, heading = states[own].tolist()
+        for row in range(SIZE):
+            for column in range(SIZE):
+                away = (column + 0.5) / 2 - x, (row + 0.5) / 2 - y
+                turn = math.atan2(away[1], away[0]) - heading
+                turn = (turn + math.pi) % (2 * math.pi) - math.pi
+                known = bool(knowing.known.ever_sensed[own, row, column])
+                if math.hypot(*away) <= 5 and abs(turn) <= math.pi / 4 and not known:
+                    errors.append(float(believed.mean()[own, row, column] - truth.field[own, row, column]))
+                    scores.append(float(probability[own, row, column]))
+        assert len(errors) >= 3
+        rmse = math.sqrt(sum(error**2 for error in errors) / len(errors))
+        assert float(found[own, 0]) == pytest.approx(rmse, abs=0.005)
+        assert float(found[own, 1]) == pytest.approx(sum(scores) / len(scores), abs=0.01)
+
+
+def part_of(given: Drives, members: list[int]) -> Drives:
+    """Some of the episodes, as if there were no others."""
+    kept, truth = torch.tensor(members), given.learning.truth
+    problem, own = given.problem.select(kept), truth.select(kept)
+    places = Places(
+        start_m=problem.start[:, :2], goal_m=problem.goal_m,
+        reference_time_s=torch.full((len(members),), torch.nan),
+    )  # fmt: skip
+    simulation = Simulation(own.terrain, problem.task, WORLD, places, 0, members)
+    learner = given.learning.learner
+    start = learner.begin(own, problem.start, own.terrain.truth)
+    return Drives(problem, simulation, Learning(learner=learner, start=start, truth=own))
+
+
+EXPLORES = AStarDWA(replace(CONFIG, explore=1.0))
+
+
+@pytest.mark.parametrize("planner", [*SHIPPED, EXPLORES], ids=[*SHIPPED, "explores"])
+def test_what_an_episode_learns_depends_on_no_other(planner: Any) -> None:
+    given = drives(ground=Contact())
+    options: dict[str, Any] = {"enough": lambda step: step == 25}
+    one = make(planner) if isinstance(planner, str) else planner
+    whole = given.run(one, given.learning, **options)
+    for members in ([2], [7, 1]):
+        part = part_of(given, members)
+        alone = part.run(one, part.learning, **options)
+        torch.testing.assert_close(alone.states, whole.states[members], atol=1e-4, rtol=0)
+        assert torch.equal(alone.revisions, whole.revisions[members])
+        assert alone.ahead is not None
+        assert whole.ahead is not None
+        torch.testing.assert_close(alone.ahead, whole.ahead[members], atol=1e-4, rtol=0, equal_nan=True)
+
+
+def test_planners_are_told_nothing_of_episodes_whose_map_stays() -> None:
+    given = drives(ground=Probe(1.0))
+    knowing = Knowing(given.learning, given.problem)
+    running = torch.arange(BATCH) < 3
+    (told,) = [knowing.learn(0, given.problem.start, running)]
+    assert told is not None
+    assert knowing.revisions.tolist() == [1] * 3 + [0] * (BATCH - 3)
+    before, after = given.problem.distribution.mean(), told.distribution.mean()
+    torch.testing.assert_close(after[3:], before[3:])
+    assert torch.equal(told.risk_map[3:], given.problem.risk_map[3:])
+    assert torch.equal(told.free[3:], given.problem.free[3:])
+    assert ((after - before)[:3].abs().flatten(1).amax(1) > 0.1).all()
+    # A change that is too small for a new plan comes with the next that is not.
+    believed = given.learning.learner.distribution(knowing.known).mean()
+    torch.testing.assert_close(after[:3], believed[:3])

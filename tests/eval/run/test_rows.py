@@ -1,4 +1,7 @@
+from dataclasses import replace
+
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -6,7 +9,8 @@ from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.rollout import Episodes
-from benchnav.eval.run.rows import episode_rows, error_rows, score
+from benchnav.eval.run.rows import episode_rows, error_rows, score, step_table
+from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
@@ -19,7 +23,7 @@ def unit(**changes: object) -> Unit:
     return Unit(**given)  # type: ignore[arg-type]
 
 
-def made(**changes: object) -> tuple:  # type: ignore[type-arg]
+def made(**changes: object) -> tuple[Problem, Episodes]:
     problem = factories.problem(torch.full((2, 16, 16), 0.8), **changes)  # type: ignore[arg-type]
     states = torch.zeros(2, 5, 3)
     states[0, :, 0] = torch.tensor([0.0, 3.0, 3.0, 3.0, 3.0])
@@ -35,10 +39,28 @@ def made(**changes: object) -> tuple:  # type: ignore[type-arg]
         planning_s=torch.tensor([1.0, 0.2, 0.4, 0.1], dtype=torch.float64),
         planned=torch.tensor([2, 2, 1, 1]),
         revisions=torch.tensor([0, 3]),
-        learning_s=0.5,
+        seen_cells=None,
+        sensed_cells=None,
+        ahead=None,
+        learning_s=0.0,
         errors=("", "late"),
     )
     return problem, episodes
+
+
+NAN = float("nan")
+AHEAD = [
+    [[0.2, -1.0], [NAN, NAN], [9, 9], [9, 9]],
+    [[NAN, NAN], [0.1, 0.5], [0.3, -0.1], [NAN, NAN]],
+]
+
+
+def learnt() -> tuple[Problem, Episodes]:
+    """The same episodes of robots that learnt, with what was measured in steps 0, or 1 and 2."""
+    problem, episodes = made()
+    ahead = torch.tensor(AHEAD)
+    seen, sensed = torch.tensor([40, 256]), torch.tensor([7, 0])
+    return problem, replace(episodes, seen_cells=seen, sensed_cells=sensed, ahead=ahead, learning_s=0.6)
 
 
 GROUPS = np.array([4, 4])
@@ -96,13 +118,57 @@ def test_an_episode_that_ends_at_once_has_no_flattering_zeros() -> None:
 def test_rows_of_a_failed_model_have_the_columns_of_all_rows() -> None:
     problem, episodes = made()
     table = episode_rows(unit(), GROUPS, problem, episodes, np.array([0.1, 20.0]), [0, 3], True)
-    failed = error_rows(unit(), GROUPS, torch.tensor([50.0, 60.0]), "ValueError: no idea")
+    failed = error_rows(
+        unit(), GROUPS, torch.tensor([50.0, 60.0]), Outcome.MODEL_ERROR, "ValueError: no idea"
+    )
     assert list(failed.columns) == list(table.columns)
     assert [str(t) for t in failed.dtypes] == [str(t) for t in table.dtypes]
     assert set(failed["outcome"]) == {"model_error"}
     assert failed["total_time_s"].tolist() == [50.0, 60.0]
     assert not failed["success"].any()
     assert failed["error"].tolist() == ["ValueError: no idea"] * 2
+
+
+LEARNT = ["revisions", "seen_cells", "sensed_cells", "ahead_rmse", "ahead_log_score", "learning_ms"]
+
+
+def test_rows_tell_what_was_learnt_in_the_steps_of_each_episode() -> None:
+    table = episode_rows(unit(), GROUPS, *learnt(), np.array([0.1, 20.0]), [0, 3], True)
+    # Six plans of an episode took 0.6 s of learning.
+    wanted = [[0, 40, 7, 0.2, -1.0, 100.0], [3, 256, 0, 0.2, 0.2, 100.0]]
+    assert table[LEARNT].to_numpy().tolist() == [pytest.approx(row) for row in wanted]
+    problem, episodes = learnt()
+    early = replace(episodes, steps=torch.tensor([2, 2]))
+    second = episode_rows(unit(), GROUPS, problem, early, np.array([0.1, 20.0]), [0, 3], True).iloc[1]
+    assert (second["ahead_rmse"], second["ahead_log_score"]) == (pytest.approx(0.1), pytest.approx(0.5))
+    at_once = replace(episodes, steps=torch.tensor([0, 1]))
+    first, second = (row for _, row in episode_rows(
+        unit(), GROUPS, problem, at_once, np.array([0.1, 20.0]), [0, 3], True
+    ).iterrows())  # fmt: skip
+    assert np.isnan([first["ahead_rmse"], second["ahead_rmse"], second["ahead_log_score"]]).all()
+    assert first["seen_cells"] == 40
+
+
+def test_rows_of_robots_that_learn_nothing_say_nothing_of_it() -> None:
+    table = episode_rows(unit(), GROUPS, *made(), np.array([0.1, 20.0]), [0, 3], True)
+    assert table[LEARNT].isna().all(axis=None)
+    # In any case the columns are of one type, so that tables of both kinds go together.
+    other = episode_rows(unit(), GROUPS, *learnt(), np.array([0.1, 20.0]), [0, 3], True)
+    assert list(other.columns) == list(table.columns)
+    assert (other.dtypes == table.dtypes).all()
+
+
+def test_steps_tell_what_was_measured_ahead_where_robots_learn() -> None:
+    rows = step_table(unit(), *learnt()).to_pandas()
+    assert list(rows.columns[-3:]) == ["ahead_rmse", "ahead_log_score", "traversability"]
+    first, second = (rows[rows["map"] == own] for own in unit().maps)
+    nan = np.nan
+    np.testing.assert_allclose(first["ahead_rmse"], [0.2, nan, nan])
+    np.testing.assert_allclose(second["ahead_rmse"], [nan, 0.1, 0.3, nan, nan])
+    np.testing.assert_allclose(second["ahead_log_score"], [nan, 0.5, -0.1, nan, nan])
+    plain = step_table(unit(), *made()).to_pandas()
+    assert not {"ahead_rmse", "ahead_log_score"} & set(plain.columns)
+    pd.testing.assert_frame_equal(rows[plain.columns], plain)
 
 
 def test_score_is_barns() -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from benchnav.core.errors import ConfigError
-from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.stats.pairs import Compared, Pair, check_one_value_each, find_pairs
 from tests.eval.report.made import condition, row, rows
 
@@ -27,7 +27,11 @@ def value_of(labels: Mapping[str, str], **changes: Any) -> dict[str, Any]:
         for kind in kinds
     }
     own = {"data": labels["data"], "split": f"test/{labels['scenario']}", "rules": RULES, "world": STAKES}
-    return own | parts | changes
+    known = {kind: {"part": labels[kind], "options": {}} for kind in KNOWLEDGE}
+    known = {
+        kind: part for kind, part in known.items() if part["part"] not in (NOT_USED, KNOWLEDGE[kind]["part"])
+    }
+    return own | parts | known | changes
 
 
 def compared(planner: str = "mppi", risk: str = "mean", **changes: Any) -> Compared:
@@ -282,3 +286,32 @@ def test_pairs_hold_every_measure_of_both() -> None:
         0.8,
         100.0,
     )
+
+
+def learning(ground: str, belief: str = "copula", **changes: Any) -> Compared:
+    """A condition of robots that learn by some sensor of the ground."""
+    return compared("mppi", **({"ground": ground, "belief": belief} | changes))
+
+
+def test_what_robots_know_by_is_compared_one_thing_at_a_time() -> None:
+    known = [learning("contact"), learning("probe"), learning("probe", "classes"), compared("mppi")]
+    assert names(find_pairs(known, "ground")) == [("probe", "contact")]
+    # A belief that does not learn is given nothing of the ground, whatever the other senses.
+    assert sorted(names(find_pairs(known, "belief"))) == sorted(
+        [("static", "copula"), ("static", "copula"), ("static", "classes"), ("classes", "copula")]
+    )
+    seen = [compared("mppi"), compared("mppi", sensor="near"), learning("probe", sensor="near")]
+    assert names(find_pairs(seen, "sensor")) == [("near", "full")]
+    assert names(find_pairs(seen, "belief")) == [("copula", "static")]
+    for label, by in (("probe", "ground"), ("near", "sensor"), ("static", "belief")):
+        (pair, *_) = find_pairs([*known, *seen], against=label)
+        assert pair.other == label
+        assert pair.members[0].labels[by] != label
+    with pytest.raises(ConfigError, match=r"They differ in .*belief \(copula, static\): try `--by belief`"):
+        find_pairs([learning("contact"), compared("mppi")], "risk")
+
+
+def test_a_blind_planner_is_compared_with_one_that_learns() -> None:
+    blind = compared("straight", NOT_USED, model=NOT_USED)
+    assert blind.labels["belief"] == NOT_USED
+    assert names(find_pairs([learning("probe", sensor="near"), blind], "planner")) == [("straight", "mppi")]

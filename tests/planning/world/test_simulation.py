@@ -245,3 +245,36 @@ def test_some_episodes_are_exchanged_with_their_time_budgets() -> None:
     mixed.exchange_(torch.tensor([1, 0]), sim(4.0))
     assert mixed.steps.tolist() == [32, 16]
     assert mixed.time_budget_s.tolist() == pytest.approx([3.2, 1.6])
+
+
+@pytest.mark.parametrize("noise", ["resampled", "stored", "frozen"])
+def test_the_field_of_a_step_is_what_robots_meet_in_it(noise: str) -> None:
+    mean = 0.2 + 0.6 * torch.rand(3, 16, 16)
+    sim = simulation(mean, FAR, std=0.2, noise=noise, time_budget_s=1.0)
+    row, column = torch.meshgrid(torch.arange(16), torch.arange(16), indexing="ij")
+    for step in (0, 4, 9, 30):
+        field = sim.field_at(step)
+        assert field.shape == (3, 16, 16)
+        for own in range(0, 256, 37):
+            at = poses(
+                *[(0.5 * column.flatten()[own].item() + 0.2, 0.5 * row.flatten()[own].item() + 0.4, 0.0)] * 3
+            )
+            now = SimulationState(
+                at,
+                torch.zeros(3, dtype=torch.int64),
+                torch.full((3,), step),
+                torch.zeros(3, dtype=torch.int64),
+            )
+            _, met = sim.step(now, AHEAD.expand(3, 2))
+            torch.testing.assert_close(met, field[:, row.flatten()[own], column.flatten()[own]])
+    assert torch.equal(sim.field_at(4), sim.field_at(9)) == (noise != "resampled")
+    if noise != "resampled":
+        assert torch.equal(sim.field_at(7), sim.field)
+
+
+def test_fields_of_exchanged_episodes_are_those_of_the_others() -> None:
+    sim, other = (simulation(torch.rand(2, 16, 16), FAR, std=0.2, noise="resampled") for _ in range(2))
+    before, new = sim.field_at(3), other.field_at(3)
+    sim.exchange_(torch.tensor([1, 0]), other)
+    torch.testing.assert_close(sim.field_at(3), new[[1, 0]])
+    assert not torch.equal(sim.field_at(3), before)
