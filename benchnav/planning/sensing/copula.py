@@ -159,6 +159,10 @@ class Copula(Belief[CopulaState]):
 
     def sample_fields(self, state: CopulaState, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields given all observations, by Matheron's rule: a field of the law, moved to what was observed."""
+        return fields_of(state.prior, self.sample_scores(state, count, keys))
+
+    def sample_scores(self, state: CopulaState, count: int, keys: Sequence[int]) -> Tensor:
+        """The normal scores of `sample_fields`, shape [B, M, H, W]."""
         field = Field.of(state.law.grid.shape, state.law.correlation_cells, state.mean.device)
         scores = draw_scores(state.law, count, keys).to(state.mean.device)
         every = _all_cells(state.law.grid.shape, state.mean.device)
@@ -175,7 +179,7 @@ class Copula(Belief[CopulaState]):
             away = (shift / precision - drawn[:, row, column] - noise).T
             moved = torch.cholesky_solve(away, torch.linalg.cholesky(inner))
             drawn += (field.covariance(every, cells)[0] @ moved).T.view_as(drawn)
-        return fields_of(state.prior, scores)
+        return scores
 
 
 def scores_of(prior: TraversabilityDistribution) -> Tensor:
