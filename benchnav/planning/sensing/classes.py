@@ -164,7 +164,7 @@ class Classes(Belief[ClassesState]):
         window = self.window if prior is None else changed[0].numel()
         drawn = (changed.flatten(1).any(1) & state.pair.flatten(1).any(1)).nonzero()[:, 0]
         if len(drawn) > 0:
-            some = _drawn(state.select(drawn), changed[drawn], self._strength(state.law), window)
+            some = _drawn(_light(state).select(drawn), changed[drawn], self._strength(state.law), window)
             state = replace(
                 state, **{
                     name: getattr(state, name).index_copy(0, drawn, getattr(some, name))
@@ -388,7 +388,26 @@ def _at_labels(state: ClassesState, changed: Tensor, window: int) -> CopulaState
     members = changed.flatten(1).any(1).nonzero()[:, 0]
     if len(members) == 0:
         return copula
-    return within._put(copula, members, within._updated(copula.select(members), changed[members], window))
+    some = _scores_alone(copula).select(members)
+    return within._put(copula, members, within._updated(some, changed[members], window))
+
+
+def _scores_alone(copula: CopulaState) -> CopulaState:
+    """As much of a state as conditions scores, without the large tables of a prediction, which take long to copy."""
+    prior = cast(TraversabilityMixture, copula.prior)
+    thin = TraversabilityMixture(*(own[:, :1] for own in (prior.weights, prior.means, prior.stds)))
+    return replace(copula, prior=thin, scores=copula.scores[:, :0])
+
+
+def _light(state: ClassesState) -> ClassesState:
+    """As much of a state as draws labels."""
+    first, second = state.looks
+    return replace(
+        state,
+        copula=_scores_alone(state.copula),
+        looks=(_scores_alone(first), _scores_alone(second)),
+        scores=state.scores[:, :0],
+    )
 
 
 def _moments(state: ClassesState) -> tuple[Tensor, Tensor]:
@@ -562,10 +581,18 @@ def _drawn(state: ClassesState, changed: Tensor, strength: float, window: int) -
     )
     visited = [int(place) for place in open_.any(0).nonzero()[:, 0].flip(0)]
     begin = min(visited)
+    numbers = inside & ~interval & (state.pair[at] > 0)
+    takes = torch.zeros_like(labels, dtype=torch.bool).scatter_(1, cell, numbers)
+    barred = (pair > 0) & (~own | (observed & ~takes.view(size)))
     chances, joins = torch.zeros_like(sites.std), torch.zeros_like(chance)
     for turn in range(_ROUNDS):
         drawn = noise(sweeps, row, column, degree, strength, torus)
         words = swept(labels.view(size), lattice, free, even, drawn)
+        if turn == _ROUNDS - _TOLD:
+            seed = torch.zeros_like(labels).scatter_(1, cell[:, -1:], -numbers[:, -1:].long()).view(size)
+            cluster = joined(words, lattice, seed, drawn)
+            toss = _uniforms(sweeps + 1, cells, torus, cell.shape[1] - 1)[:, 0, :, 0]
+            words, scores = _flipped(words, scores, cluster, barred, sites, numbers, inverse, toss)
         if turn >= _ROUNDS - _TOLD:
             labels = words.flatten(1).clone()
             uniforms = _uniforms(sweeps, cells, torus, begin)
@@ -592,6 +619,34 @@ def _drawn(state: ClassesState, changed: Tensor, strength: float, window: int) -
     told = state.chance.index_put(places, torch.where(moved, found, chance).flatten(1))
     told = told.index_put(tuple(place[open_] for place in (member.expand_as(cell), *at[1:])), chances[open_])
     return replace(state, chance=told, labels=state.labels.index_put(places, labels), sweeps=sweeps)
+
+
+def _flipped(
+    words: Tensor,
+    scores: Tensor,
+    cluster: Tensor,
+    barred: Tensor,
+    sites: _Sites,
+    numbers: Tensor,
+    inverse: Tensor,
+    toss: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Gives all cells of a cluster the other label where what was observed allows it (Metropolis).
+
+    Single labels cannot leave a wrong class of a patch, whose observed scores are alike. Clusters with cells that are
+    barred, out of reach or observed as intervals, stay.
+    """
+    inner = unpacked(cluster.flatten(1))
+    stays = (inner & barred.flatten(1)[..., None]).any(1)
+    among = (inner.gather(1, sites.cell[..., None].expand(-1, -1, CHAINS)) & numbers[..., None]).transpose(1, 2)
+    first = unpacked(words.flatten(1).gather(1, sites.cell)).transpose(1, 2)
+    proposed = torch.where(among, torch.where(first, sites.lower[:, 1:], sites.lower[:, :1]), scores)
+    gain = (sites.density[:, 1:] - sites.density[:, :1]) * torch.where(first, 1.0, -1.0)
+    told = torch.where(among, gain, 0.0).sum(2)
+    told = told - 0.5 * (((proposed - scores) @ inverse) * (proposed + scores)).sum(2)
+    taken = ~stays & (toss.log() < told)
+    words = words ^ (cluster & packed(taken)[:, None, None])
+    return words, torch.where(taken[..., None], proposed, scores)
 
 
 def _beside(cell: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
