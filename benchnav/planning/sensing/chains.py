@@ -151,7 +151,7 @@ class _Block:
         at = torch.arange(len(changed), device=changed.device)[:, None], cells.row, cells.column
         row, column, pair, chance, observed = (
             values[at].view(len(changed), -1, across)
-            for values in (*_places(changed), evidence.pair, evidence.chance, ~evidence.noise_std.isnan())
+            for values in (*places_of(changed), evidence.pair, evidence.chance, ~evidence.noise_std.isnan())
         )
         own = torch.ones_like(observed)
         for place, low, high in zip((row, column), first.T, last.T, strict=True):
@@ -390,7 +390,7 @@ def _put(labels: Tensor, cell: Tensor, first: Tensor, new: Tensor) -> Tensor:
     return labels.scatter(1, cell[:, None], word)
 
 
-def _places(like: Tensor) -> tuple[Tensor, Tensor]:
+def places_of(like: Tensor) -> tuple[Tensor, Tensor]:
     """Row and column of each cell, int64, shape [B, H, W]."""
     row, column = (torch.arange(size, device=like.device) for size in like.shape[1:])
     return row[:, None].expand(like.shape), column.expand(like.shape)

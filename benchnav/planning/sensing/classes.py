@@ -39,7 +39,7 @@ from benchnav.core.pooled import PooledDistribution
 from benchnav.core.quantiles import QuantileDistribution
 from benchnav.planning.sensing import copula as within
 from benchnav.planning.sensing.belief import Belief, Law
-from benchnav.planning.sensing.chains import Evidence, draw_labels
+from benchnav.planning.sensing.chains import Evidence, draw_labels, places_of
 from benchnav.planning.sensing.copula import VALUES, Copula, CopulaState, scores_of
 from benchnav.planning.sensing.gaussian import interval_moments
 from benchnav.planning.sensing.labels import CHAINS, Lattice, fair, noise, swept
@@ -47,7 +47,8 @@ from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
 
 _LEAST_MASS, _LEAST_CLASS = 0.05, 0.01  # of a cell's weight: the pair's, and each of its classes'
 _FIRST_SWEEPS = 40  # before anything is sensed
-_SURE = 1e-9
+_SAME_SCORE = 0.05  # a change of an observed score under which its label is not drawn again
+_SURE = 1e-9  # of a probability
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,18 +117,8 @@ class Classes(Belief[ClassesState]):
         Raises:
             ConfigError: the prediction tells no classes, or the law does not say which look alike.
         """
-        if self.correlation_m is not None:
-            law = replace(law, correlation_m=self.correlation_m)
-        first, second, pair, odds = _split(prior, law)
-        copula = self._copula.init(first, law)
-        zeros = torch.zeros_like(copula.mean)
-        labels = fair(*law.grid.shape).to(pair.device).expand_as(pair)
-        state = ClassesState(
-            copula=copula, looks=(_bare(copula, first), _bare(copula, second)),
-            density=torch.stack((zeros, zeros), 1), scores=_second_scores(copula.scores, second, pair), pair=pair,
-            odds=odds, chance=zeros + 0.5, labels=labels, sweeps=torch.zeros_like(pair[:, 0, 0]),
-        )  # fmt: skip
-        return self._swept(state) if bool(pair.any()) else state
+        state = self._begun(prior, law)
+        return self._swept(state) if bool(state.pair.any()) else state
 
     def update(
         self, state: ClassesState, sensed: Sensed, prior: TraversabilityDistribution | None = None
@@ -136,23 +127,24 @@ class Classes(Belief[ClassesState]):
 
         Under a new prediction all observed λ is scored anew, by looks at a cell as one.
         """
-        renewed = torch.zeros_like(sensed.mask)
+        renewed = moved = torch.zeros_like(sensed.mask)
         if prior is not None:
-            renewed, state = state.copula.observed, self._with_prior(state, prior)
+            was, state = state, self._with_prior(state, prior)
+            renewed, moved = state.copula.observed, _moved(was, state)
         if not bool(state.pair.any()):
             known = None if prior is None else state.copula.prior
             return replace(state, copula=self._copula.update(state.copula, sensed, known))
         state, changed = _noted(state, sensed)
-        changed = changed | renewed
-        window = self.window if prior is None else changed[0].numel()
-        members = (changed.flatten(1).any(1) & state.pair.flatten(1).any(1)).nonzero()[:, 0]
+        news = changed | moved
+        members = (news.flatten(1).any(1) & state.pair.flatten(1).any(1)).nonzero()[:, 0]
         if len(members) > 0:
-            some = _evidence(state).select(members)
-            some = draw_labels(some, changed[members], state.law, self._strength(state.law), window)
+            some, strength = _evidence(state).select(members), self._strength(state.law)
+            some = draw_labels(some, news[members], state.law, strength, self.window)
             names = ("chance", "labels", "sweeps")
             put = {name: getattr(state, name).index_copy(0, members, getattr(some, name)) for name in names}
             state = replace(state, **put)
-        return replace(state, copula=_at_labels(state, changed, window))
+        window = self.window if prior is None else changed[0].numel()
+        return replace(state, copula=_at_labels(state, changed | renewed, window))
 
     def distribution(self, state: ClassesState) -> TraversabilityDistribution:
         """The average over the classes of a cell, each given what was observed."""
@@ -208,12 +200,11 @@ class Classes(Belief[ClassesState]):
         """
         scores = self._copula.sample_scores(state.copula, count, keys)
         means, _ = _moments(state)
-        chance, wanted = state.chance, state.probability()
+        chance, wanted = state.chance.clamp(_SURE, 1 - _SURE), state.probability()
         up = ((wanted - chance) / (1 - chance)).clamp(min=0)
         down = ((chance - wanted) / chance).clamp(min=0)
-        numbers = np.stack(
-            [rng.uniform(rng.stream_key(key, "labels"), np.arange(count), (2,)) for key in keys]
-        )
+        streams = [rng.stream_key(key, "labels") for key in keys]
+        numbers = np.stack([rng.uniform(stream, np.arange(count), (2,)) for stream in streams])
         drawn = torch.from_numpy(numbers).to(scores.device)
         fields = []
         for which, scale, own in zip(
@@ -226,19 +217,29 @@ class Classes(Belief[ClassesState]):
             for part, look in enumerate(state.looks):
                 score = (own + means[:, part] - state.copula.mean).to(look.prior.dtype)
                 parts.append(look.prior.from_normal(score))
-            fields.append(torch.where(first, *parts))
+            fields.append(torch.where(first, parts[0], parts[1]))
         return torch.stack(fields, 1)
+
+    def _begun(self, prior: TraversabilityDistribution, law: Law) -> ClassesState:
+        """Knows the prediction alone; each cell has labels for itself."""
+        if self.correlation_m is not None:
+            law = replace(law, correlation_m=self.correlation_m)
+        first, second, pair, odds = _split(prior, law)
+        copula = self._copula.init(first, law)
+        zeros = torch.zeros_like(copula.mean)
+        labels = fair(*law.grid.shape).to(pair.device).expand_as(pair)
+        return ClassesState(
+            copula=copula, looks=(_bare(copula, first), _bare(copula, second)),
+            density=torch.stack((zeros, zeros), 1), scores=_second_scores(copula.scores, second, pair), pair=pair,
+            odds=odds, chance=zeros + 0.5, labels=labels, sweeps=torch.zeros_like(pair[:, 0, 0]),
+        )  # fmt: skip
 
     def _strength(self, law: Law) -> float:
         return self.strength if self.strength is not None else _statistics(law).potts_strength
 
     def _swept(self, state: ClassesState) -> ClassesState:
         """Labels as they are before anything is observed."""
-        row, column = (
-            place.expand_as(state.pair)
-            for place in (torch.arange(size, device=state.pair.device).view(view) for size, view in
-                          zip(state.pair.shape[1:], ((-1, 1), (1, -1)), strict=True))
-        )  # fmt: skip
+        row, column = places_of(state.pair)
         lattice = Lattice.of(state.pair, self._strength(state.law))
         labels, sweeps, degree = state.labels, state.sweeps, lattice.degree()
         free, even = -(state.pair > 0).long(), -((row + column) % 2)
@@ -258,17 +259,22 @@ class Classes(Belief[ClassesState]):
                 look.prior.at(seen).from_normal(middle.to(prior.dtype))[0] for look in state.looks
             )
             value[seen] = torch.where(chosen[seen], first, second).double()
-        fresh = self.init(prior, state.law)
+        fresh = self._begun(prior, state.law)
         std = torch.where(seen, state.copula.noise_std, 1.0)
         fresh, _ = _noted(fresh, Sensed(traversability=value, std=std))
         same = (fresh.pair == state.pair) & (fresh.pair > 0)
-        return replace(
+        fresh = replace(
             fresh,
             labels=torch.where(same, state.labels, fresh.labels),
             chance=torch.where(same, state.chance, fresh.chance),
             sweeps=state.sweeps,
-            copula=_labelled(fresh),
         )
+        copula = _labelled(fresh)
+        # Of an interval the term that it had: it stands for it until all terms are found anew.
+        interval = copula.upper > copula.lower
+        precision = torch.where(interval, state.copula.precision, copula.precision)
+        shift = torch.where(interval, state.copula.shift, copula.shift)
+        return replace(fresh, copula=replace(copula, precision=precision, shift=shift))
 
 
 def _statistics(law: Law) -> GroundStatistics:
@@ -302,8 +308,8 @@ def _split(
     group = torch.tensor(prior.group, device=prior.device).view(-1, 1, 1)
     heaviest = torch.full_like(odds, _LEAST_MASS)
     scales = [torch.ones_like(weights), torch.ones_like(weights)]
-    for number, (one, other) in enumerate(pairs, 1):
-        ids = names.index(one), names.index(other)
+    for number, names_of in enumerate(pairs, 1):
+        ids = names.index(names_of[0]), names.index(names_of[1])
         first, second = (shares[:, own] for own in ids)
         mass = first + second
         own = (mass >= heaviest) & (torch.minimum(first, second) > _LEAST_CLASS)
@@ -314,8 +320,8 @@ def _split(
                 group == kept, (mass / share)[:, None], torch.where(group == sum(ids) - kept, 0.0, 1.0)
             )
             scales[place] = torch.where(own[:, None], scale, scales[place])
-    parts = (replace(prior, weights=(weights * scale).to(prior.dtype)) for scale in scales)
-    return (*parts, pair, odds)
+    one, other = (replace(prior, weights=(weights * scale).to(prior.dtype)) for scale in scales)
+    return one, other, pair, odds
 
 
 def _second_scores(first: Tensor, second: TraversabilityMixture, pair: Tensor) -> Tensor:
@@ -358,6 +364,16 @@ def _noted(state: ClassesState, sensed: Sensed) -> tuple[ClassesState, Tensor]:
     return replace(state, looks=(looks[0], looks[1]), density=torch.stack(densities, 1)), changed
 
 
+def _moved(before: ClassesState, after: ClassesState) -> Tensor:
+    """Observed cells whose scores, or whose pair, are others under a new prediction, bool, shape [B, H, W]."""
+    moved = before.pair != after.pair
+    for old, new in zip(before.looks, after.looks, strict=True):
+        ends = ((old.lower, new.lower), (old.upper, new.upper))
+        for was, now in ends:
+            moved = moved | ~((was == now) | ((was - now).abs() <= _SAME_SCORE))
+    return moved & after.copula.observed & (after.pair > 0)
+
+
 def _evidence(state: ClassesState) -> Evidence:
     """What labels are drawn from."""
     first, second = state.looks
@@ -397,7 +413,7 @@ def _at_labels(state: ClassesState, changed: Tensor, window: int) -> CopulaState
 def _scores_alone(copula: CopulaState) -> CopulaState:
     """As much of a state as conditions scores, without the large tables of a prediction, which take long to copy."""
     prior = cast(TraversabilityMixture, copula.prior)
-    thin = TraversabilityMixture(*(own[:, :1] for own in (prior.weights, prior.means, prior.stds)))
+    thin = TraversabilityMixture(prior.weights[:, :1], prior.means[:, :1], prior.stds[:, :1])
     return replace(copula, prior=thin, scores=copula.scores[:, :0])
 
 
