@@ -95,7 +95,7 @@ def test_members_count_by_their_weights_in_each_cell() -> None:
         torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-4 if name == "cvar" else 1e-6)
     breaches = Breaches("distribution", "pooled")
     check_functions(law, 1e-4, breaches)
-    breaches.finish()
+    breaches.refuse()
     which = OBSERVED > 0
     which[0] = False
     assert torch.equal(law.at(which).cdf(0.4), law.cdf(0.4)[which][None])

@@ -88,8 +88,9 @@ def draw_labels(evidence: Evidence, changed: Tensor, law: Law, strength: float, 
     """
     block = _Block.around(evidence, changed, strength)
     sites = _Sites.of(evidence, changed, block, law, window)
-    labels = evidence.labels[block.at].view_as(block.row)
-    labels, scores = _filtered(labels.flatten(1), sites, evidence.sweeps, block.torus)
+    labels = evidence.labels[block.at]
+    filtered, scores = _filtered(labels, sites, evidence.sweeps, block.torus)
+    labels = torch.where(block.own.flatten(1), filtered, labels)
     inverse, sweeps = torch.cholesky_inverse(sites.factor), evidence.sweeps
     seen, joins = torch.zeros_like(sites.std), torch.zeros_like(block.chance)
     for turn in range(_ROUNDS):
@@ -153,9 +154,12 @@ class _Block:
             values[at].view(len(changed), -1, across)
             for values in (*places_of(changed), evidence.pair, evidence.chance, ~evidence.noise_std.isnan())
         )
-        own = torch.ones_like(observed)
+        away = torch.zeros_like(row)
         for place, low, high in zip((row, column), first.T, last.T, strict=True):
-            own &= (place >= low[:, None, None] - _REACH) & (place <= high[:, None, None] + _REACH)
+            off = torch.maximum(low[:, None, None] - place, place - high[:, None, None])
+            away = torch.maximum(away, off)
+        # Beyond the neighbours of cells in reach nothing counts: what is there depends on the other episodes.
+        pair, own = torch.where(away <= _REACH + 1, pair, 0), away <= _REACH
         lattice = Lattice.of(pair, strength)
         return cls(
             at=at, row=row, column=column, pair=pair, chance=chance, observed=observed, own=own, lattice=lattice,
@@ -234,6 +238,7 @@ class _Sites:
         down, right = cells.row - top, cells.column - left
         inside = there & (down >= 0) & (down < block.row.shape[1]) & (right >= 0) & (right < across)
         cell = torch.where(inside, down * across + right, 0)
+        inside &= block.own.flatten(1).gather(1, cell)
         near, tied = _beside(cell, block.lattice)
 
         def both(values: Tensor) -> Tensor:
