@@ -166,6 +166,23 @@ def test_cells_for_themselves_follow_bayes_rule() -> None:
     )
 
 
+def test_further_looks_at_a_cell_count_with_their_own_noise() -> None:
+    prior, law = mixed(1, 12, 14), law_of(12, 14, 0.0, 0.0)
+    values, stds = (0.62, 0.5, 0.7), (0.5, 0.3, 0.4)
+    looks = [looked((1, 12, 14), {(3, 3): value}, std) for value, std in zip(values, stds, strict=True)]
+    state = after(Classes(), prior, law, *looks)
+    log_odds = float(state.odds[0, 3, 3])
+    for sign, look in zip((1, -1), state.looks, strict=True):
+        own = [torch.full(prior.shape, value).double() for value in values]
+        scores = np.array([float(look.prior.to_normal(value)[0][0, 3, 3]) for value in own])
+        density = (
+            sum(float(look.prior.log_prob(value)[0, 3, 3]) for value in own) - stats.norm.logpdf(scores).sum()
+        )
+        noisy = stats.multivariate_normal(np.zeros(3), 1 + np.diag(np.square(stds)))
+        log_odds += sign * (density + noisy.logpdf(scores))
+    assert float(torch.logit(state.probability()[0, 3, 3])) == pytest.approx(log_odds, abs=1e-3)
+
+
 PLACES = [(row, column) for row in (0, 4, 8) for column in (0, 4, 8)] * 16
 
 
