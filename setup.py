@@ -22,6 +22,12 @@ SHIPPED = (
     "checkpoints/stakes-v1/classifier.safetensors",
     "checkpoints/stakes-v1/config.json",
     "checkpoints/stakes-v1/gp.safetensors",
+    "checkpoints/stakes-v1/ground.json",
+    "checkpoints/stakes-v1-masked/README.md",
+    "checkpoints/stakes-v1-masked/classifier.safetensors",
+    "checkpoints/stakes-v1-masked/config.json",
+    "checkpoints/stakes-v1-masked/gp.safetensors",
+    "checkpoints/stakes-v1-masked/ground.json",
 )
 
 

@@ -101,7 +101,8 @@ def read_shards() -> None:
     """Times an epoch in windows of shards beside one in any order, and beside a file opened for every map."""
     import torch
 
-    from benchnav.models.training.data import MapDataset, MapSampler
+    from benchnav.models.training.data import MapDataset
+    from benchnav.models.training.map_order import MapSampler
 
     torch.set_num_threads(1)
     fields, batch = ("rgb", "class_id"), 16

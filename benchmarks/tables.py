@@ -31,7 +31,6 @@ from benchnav.core.tables import Table, to_markdown
 from benchnav.eval.compare import read_conditions
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.run_folder import EPISODES, open_run
-from benchnav.eval.report.hypotheses import hypothesis_table
 from benchnav.eval.report.write import read_report
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import Pair, find_pairs
@@ -42,7 +41,7 @@ PAPER_EPISODES = 20
 PAPER = {"std": (0.90, 52.7, 22.5), "hg": (0.80, 60.2, 26.1), "hs": (0.85, 58.6, 25.7)}
 
 _BLOCK = re.compile(r"^( *)<!-- (\w+) ([\w-]+) -->\n.*?<!-- end -->", re.DOTALL | re.MULTILINE)
-_BESIDE_RISK = ("data", "scenario", "world", "robot", "model", "planner")
+_BESIDE_RISK = ("data", "scenario", "world", "robot", "model", "sensor", "ground", "belief", "planner")
 
 
 def table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -57,7 +56,7 @@ def results(run: Path) -> str:
 
 def hypotheses(run: Path) -> str:
     """The tests of the run's hypotheses."""
-    return to_markdown(hypothesis_table(read_report(run).tests, grouped=False))
+    return to_markdown(read_report(run).hypotheses)
 
 
 def settings(run: Path) -> str:
@@ -65,7 +64,10 @@ def settings(run: Path) -> str:
     summary = pd.read_csv(run / "summary.csv")
     summary = summary[summary["risk"] != NOT_USED]
     known = list(summary["risk"].unique())
-    several = [name for name in _BESIDE_RISK if summary[name].nunique() > 1] or ["planner"]
+    # Runs of version 0.10.0 and before have no columns of what robots learn.
+    several = [name for name in _BESIDE_RISK if name in summary and summary[name].nunique() > 1] or [
+        "planner"
+    ]
     rows = []
     for labels, found in summary.groupby(several, sort=False):
         cells = {

@@ -1,6 +1,6 @@
 """BenchNav: benchmarks for off-road robot navigation under uncertain traversability.
 
-Importing the package registers the Gymnasium environment `benchnav/OffRoad-v0`, and loads no PyTorch.
+Importing the package registers the Gymnasium environments `benchnav/OffRoad-v0` and `-v1`, and loads no PyTorch.
 """
 
 import gymnasium
@@ -29,4 +29,9 @@ gymnasium.register(
     id="benchnav/OffRoad-v0",
     entry_point="benchnav.env.environment:OffRoadEnv",
     vector_entry_point="benchnav.env.environment:OffRoadVectorEnv",
+)
+gymnasium.register(
+    id="benchnav/OffRoad-v1",
+    entry_point="benchnav.env.egocentric:EgocentricEnv",
+    vector_entry_point="benchnav.env.egocentric:EgocentricVectorEnv",
 )

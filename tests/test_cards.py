@@ -15,7 +15,7 @@ from benchnav.models.checkpoint import digests_of
 from benchnav.models.predictor import find_checkpoint, load_model
 
 ROOT = Path(__file__).parents[1]
-MODELS = [ROOT / "checkpoints" / name for name in ("paper-v1", "stakes-v1")]
+MODELS = [ROOT / "checkpoints" / name for name in ("paper-v1", "stakes-v1", "stakes-v1-masked")]
 CARDS = [
     *(ROOT / "datasets" / f"{name}-test.md" for name in ("paper-v1", "stakes-v1")),
     *(folder / "README.md" for folder in MODELS),

@@ -13,20 +13,22 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 FACES = {
-    "benchnav": "BenchnavError CheckpointError ConditionedDistribution ConfigError DatasetError Grid Observation "
-    "QuantileDistribution Terrain TraversabilityDistribution TraversabilityMixture pool register",
+    "benchnav": "BenchnavError CheckpointError ConditionedDistribution ConfigError DatasetError Grid "
+    "Observation QuantileDistribution Terrain TraversabilityDistribution TraversabilityMixture pool "
+    "register",
     "benchnav.datagen": "Recipe TerrainClass TerrainDataset TerrainMaps create_dataset find_dataset generate "
     "load_recipe recipe_from_dict shipped_recipes",
-    "benchnav.env": "OffRoadEnv OffRoadVectorEnv",
+    "benchnav.env": "EgocentricEnv EgocentricVectorEnv OffRoadEnv OffRoadVectorEnv PolicyPlanner",
     "benchnav.eval": "Condition Suite compare_runs open_run read_report read_steps run_suite write_report",
-    "benchnav.models": "Checkpoint ModelFamily Part TrainOptions TrainableModel TrainingConfig TraversabilityModel "
-    "Window evaluate_model find_checkpoint fit_model list_checkpoints load_checkpoint load_model measure_margin "
-    "predict predict_tiles save_checkpoint write_risk_maps",
-    "benchnav.planning": "AStarDWA AStarMPPI Appearance Belief Bicycle CLRRT Classes Contact Copula DifferentialDrive "
-    "FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Objective Places Plan PlanStatus "
-    "Planner Probe Problem Robot Rules SPEED STEERING Sensed Sensor Simulation Static Step Straight "
-    "TURN_RATE Task TravelTime Unicycle World distance pose_problem",
-    "benchnav.testing": "check_model check_objective check_planner check_risk check_robot",
+    "benchnav.models": "Checkpoint ModelFamily Part TrainOptions TrainableModel TrainingConfig "
+    "TraversabilityModel Window evaluate_model find_checkpoint fit_model list_checkpoints load_checkpoint "
+    "load_model measure_margin predict predict_tiles save_checkpoint write_risk_maps",
+    "benchnav.planning": "AStarDWA AStarMPPI Appearance Belief Bicycle CLRRT Classes Contact Copula "
+    "DifferentialDrive FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Near Objective "
+    "Places Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensed Sensor Simulation Static "
+    "Step Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem",
+    "benchnav.testing": "check_belief check_model check_objective check_planner check_risk check_robot "
+    "check_sensor",
 }
 EACH = pytest.mark.parametrize("name", FACES)
 
@@ -89,9 +91,12 @@ def test_importing_a_package_loads_nothing_heavy(name: str) -> None:
     assert not {module.partition(".")[0] for module in loaded} & set(HEAVY)
 
 
-def test_importing_the_package_registers_its_environment() -> None:
-    code = "import gymnasium, benchnav; print(gymnasium.spec('benchnav/OffRoad-v0').entry_point)"
-    assert fresh(code).split() == ["benchnav.env.environment:OffRoadEnv"]
+def test_importing_the_package_registers_its_environments() -> None:
+    code = "import gymnasium, benchnav; print(*(gymnasium.spec(f'benchnav/OffRoad-v{n}').entry_point for n in (0, 1)))"
+    assert fresh(code).split() == [
+        "benchnav.env.environment:OffRoadEnv",
+        "benchnav.env.egocentric:EgocentricEnv",
+    ]
 
 
 COMMAND = """

@@ -134,7 +134,7 @@ except benchnav.ConfigError as error:
     assert told == [
         *(str(site / "benchnav" / "__init__.py"), "datasets", str(inside / "datasets")),
         *(str(inside / "datasets" / f"{name}-test.h5") for name in ("paper-v1", "stakes-v1")),
-        *("stakes-v1", str(inside / "checkpoints" / "stakes-v1"), "FusedModel"),
+        *("stakes-v1", "stakes-v1-masked", str(inside / "checkpoints" / "stakes-v1"), "FusedModel"),
         "Expected_the_checkpoint_paper-v1_in_checkpoints/,_got_none:_the_wheel_leaves_it_out_for_its_size.",
     ]
 

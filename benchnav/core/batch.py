@@ -17,6 +17,10 @@ class Batch:
         """Keeps some members, by index, int64, shape [M]; one may be taken more than once."""
         return map_tensors(self, lambda values: values[members])
 
+    def put(self, members: Tensor, others: Self) -> Self:
+        """Puts M members in the places of others, by index, int64, shape [M]; this one is not changed."""
+        return map_tensors(self, lambda old, new: old.index_copy(0, members, new), others)
+
     def clone(self) -> Self:
         """A copy that shares no tensor."""
         return map_tensors(self, torch.clone)
@@ -71,3 +75,13 @@ def _tensors(value: Any) -> Iterator[Tensor]:
     )
     for part in parts if isinstance(parts, list | tuple) else ():
         yield from _tensors(part)
+
+
+def find_tensor_fault(
+    what: str, values: Any, dtype: torch.dtype, shape: tuple[int, ...], device: torch.device
+) -> str:
+    """Tells in one line what makes something another tensor than is expected; empty where nothing does."""
+    wanted, got = f"{dtype} of shape {list(shape)} on {device}", type(values).__name__
+    if isinstance(values, Tensor):
+        got = f"{values.dtype} of shape {list(values.shape)} on {values.device}"
+    return "" if got == wanted else f"Expected {what} as {wanted}, got {got}."

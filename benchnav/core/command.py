@@ -80,11 +80,17 @@ class Command:
 
     @cached_property
     def flags(self) -> dict[str, Any]:
-        """Types by flag; flags for the fields of a dataclass have a dot."""
+        """Types by flag; flags for the fields of a dataclass have a dot, those of a dataclass in it two."""
         kinds = {name: option.kind for name, option in self.options.items() if name not in self.positionals}
-        for name, kind in tuple(kinds.items()):
-            within = list_options(dataclass_in(kind)) if dataclass_in(kind) else {}
-            kinds |= {f"{name}.{field}": option.kind for field, option in within.items()}
+        level = kinds
+        while level:
+            level = {
+                f"{name}.{field}": option.kind
+                for name, kind in level.items()
+                if (group := dataclass_in(kind))
+                for field, option in list_options(group).items()
+            }
+            kinds |= level
         return kinds | {"config": str, "print_config": bool}
 
     @cached_property

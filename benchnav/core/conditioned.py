@@ -1,7 +1,9 @@
 """A distribution whose normal score is known better than before: what observations nearby tell of a cell.
 
 A field of λ goes through correlated standard normals, λ = Q(Φ(z)). Where observations give z a posterior N(μ, σ²), λ
-has the quantile function Q(Φ(μ + σ Φ⁻¹(u))) and the CDF Φ((Φ⁻¹(F(x)) − μ) / σ).
+has the quantile function Q(Φ(μ + σ Φ⁻¹(u))) and the CDF Φ((Φ⁻¹(F(x)) − μ) / σ). Where the posterior is skew, as beside
+ground whose score is known to lie in an interval, σ multiplies a shifted log-normal number of that skewness in place
+of the normal one.
 Letters in shapes: H×W cells, *B any leading dimensions.
 """
 
@@ -16,6 +18,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 
 _SMALLEST_STD = 1e-9
+_LEAST_SKEW = 1e-3  # under which a number counts as normal
 
 
 @dataclass(frozen=True)
@@ -26,6 +29,7 @@ class ConditionedDistribution(TraversabilityDistribution):
         base: what is known without the observations, of shape [*B, H, W].
         score_mean: μ, shape [*B, H, W].
         score_std: σ ≥ 0, shape [*B, H, W]; where it is 0, all of λ is Q(Φ(μ)).
+        score_skew: skewness of the score, shape [*B, H, W]; None for none.
 
     Raises:
         ConfigError: the shapes differ.
@@ -34,10 +38,12 @@ class ConditionedDistribution(TraversabilityDistribution):
     base: TraversabilityDistribution
     score_mean: Tensor
     score_std: Tensor
+    score_skew: Tensor | None = None
 
     def __post_init__(self) -> None:
         """Checks the shapes."""
-        if not self.score_mean.shape == self.score_std.shape == self.base.shape:
+        skew = self.score_std if self.score_skew is None else self.score_skew
+        if not self.score_mean.shape == self.score_std.shape == skew.shape == self.base.shape:
             raise ConfigError(
                 f"Expected `score_mean` and `score_std` of the base's shape {list(self.base.shape)}, got "
                 f"{list(self.score_mean.shape)} and {list(self.score_std.shape)}."
@@ -70,6 +76,8 @@ class ConditionedDistribution(TraversabilityDistribution):
 
     def from_normal(self, normal: Tensor) -> Tensor:
         """λ of the rank that a standard normal number has, shape [*B, H, W]; see the base."""
+        if self.score_skew is not None:
+            normal = skewed(normal, self.score_skew).to(self.score_std.dtype)
         return self.base.from_normal(self.score_mean + self.score_std * normal).to(self.dtype)
 
     def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
@@ -81,10 +89,12 @@ class ConditionedDistribution(TraversabilityDistribution):
         """Log density on (0, 1), log mass at 0 and at 1, shape [*B, H, W]; not a number where the base has none."""
         value, std = value.double(), self.score_std.double().clamp(min=_SMALLEST_STD)
         lower, upper = self._scores(value)
-        prior = upper * std + self.score_mean.double()  # z of the base, whose density there is known
+        prior = self.base._exact().to_normal(value)[1]  # whose density is known
         inside = (
             self.base._exact().log_prob(value).double() + (prior.square() - upper.square()) / 2 - std.log()
         )
+        if self.score_skew is not None:
+            inside = torch.where(upper.isinf(), -math.inf, inside - _slope(upper, self.score_skew).log())
         mass = torch.where(value <= 0, upper, -lower)
         total = torch.where((value <= 0) | (value >= 1), torch.special.log_ndtr(mass), inside)
         return torch.where((value < 0) | (value > 1), -math.inf, total).to(self.dtype)
@@ -93,7 +103,49 @@ class ConditionedDistribution(TraversabilityDistribution):
         """Standard normal numbers in float64, whose Φ are P(λ < value) and P(λ ≤ value)."""
         lower, upper = self.base._exact().to_normal(value)
         mean, std = self.score_mean.double(), self.score_std.double().clamp(min=_SMALLEST_STD)
-        return (lower - mean) / std, (upper - mean) / std
+        ends = (lower - mean) / std, (upper - mean) / std
+        if self.score_skew is None:
+            return ends
+        return unskewed(ends[0], self.score_skew), unskewed(ends[1], self.score_skew)
+
+
+def skewed(normal: Tensor, skew: Tensor) -> Tensor:
+    """Makes of a standard normal number one of mean 0 and variance 1 that is skew, a shifted log-normal one, float64.
+
+    Args:
+        normal: any shape.
+        skew: its skewness, of a shape that broadcasts.
+    """
+    sign, root, scale, width = _log_normal(skew)
+    found = sign * ((sign * width * normal).exp() - root) / scale
+    return torch.where(skew.abs() < _LEAST_SKEW, normal.double(), found)
+
+
+def unskewed(value: Tensor, skew: Tensor) -> Tensor:
+    """The number that `skewed` makes a value of; infinite beyond its range."""
+    sign, root, scale, width = _log_normal(skew)
+    found = sign * (root + sign * value * scale).clamp(min=0).log() / width
+    return torch.where(skew.abs() < _LEAST_SKEW, value, found)
+
+
+def _slope(normal: Tensor, skew: Tensor) -> Tensor:
+    """Derivative of `skewed`."""
+    sign, _, scale, width = _log_normal(skew)
+    return torch.where(skew.abs() < _LEAST_SKEW, 1.0, width * (sign * width * normal).exp() / scale)
+
+
+def _log_normal(skew: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of exp(σ z) for the σ that gives it a skewness: the sign, the mean, the standard deviation, and σ."""
+    size = skew.double().abs().clamp(min=_LEAST_SKEW)
+    half = 1 + size.square() / 2
+    third = (half + (half.square() - 1).sqrt()).pow(1 / 3)
+    power = third + 1 / third - 1  # exp(σ²)
+    return (
+        torch.where(skew < 0, -1.0, 1.0).double(),
+        power.sqrt(),
+        (power * (power - 1)).sqrt(),
+        power.log().sqrt(),
+    )
 
 
 def conditioned(base: TraversabilityDistribution, mean: Tensor, std: Tensor) -> TraversabilityDistribution:

@@ -19,8 +19,9 @@ Letters in shapes: H×W cells, *B any leading dimensions, b×h×w cells of a pie
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import fields
 from functools import partial
-from typing import Self
+from typing import Any, Self, cast
 
 import torch
 from torch import Tensor
@@ -240,6 +241,37 @@ class TraversabilityDistribution(Batch, ABC):
         which = cells.reshape(-1, *cells.shape[-2:])
         return map_tensors(self._in_members(), lambda values: values.movedim(0, -3)[..., which].unsqueeze(-2))
 
+    def differs(self, other: "TraversabilityDistribution", tolerance: float = 0.0) -> Tensor:
+        """Tells of which cells something else is predicted, bool, shape [*B, H, W].
+
+        Args:
+            other: of the same shape.
+            tolerance: by how much a parameter may differ. Of distributions of other kinds all cells differ.
+        """
+        count = len(self.shape) - 2
+        found = torch.zeros(self.shape, dtype=torch.bool, device=self.device)
+
+        def note(own: Tensor, values: Tensor) -> Tensor:
+            away = (own - values).abs() > tolerance
+            found.logical_or_(away.flatten(count, -3).any(count) if away.ndim > len(self.shape) else away)
+            return own
+
+        if not _are_alike(self, other):
+            return ~found
+        map_tensors(self, note, other)
+        return found
+
+    def replaced(self, cells: Tensor, other: "TraversabilityDistribution") -> "TraversabilityDistribution":
+        """The same with some cells, bool [*B, H, W], of another prediction, whose parameters are as many."""
+        count = len(self.shape) - 2
+
+        def put(own: Tensor, values: Tensor) -> Tensor:
+            which = cells.view(*cells.shape[:count], *[1] * (own.ndim - cells.ndim), *cells.shape[count:])
+            return torch.where(which, values, own)
+
+        found: TraversabilityDistribution = map_tensors(self, put, other)
+        return found
+
     def class_probabilities(self, count: int) -> Tensor:
         """Probability of each of `count` terrain classes, shape [*B, count, H, W].
 
@@ -299,6 +331,19 @@ class TraversabilityDistribution(Batch, ABC):
                     for top in range(0, height, rows)
                 ], dim=1))  # fmt: skip
             return torch.cat(done).view(self.shape).to(self.dtype)
+
+
+def _are_alike(one: Any, other: Any) -> bool:
+    """Whether two predictions have parameters of the same names and shapes, and all else the same."""
+    if isinstance(one, Tensor) and isinstance(other, Tensor):
+        return one.shape == other.shape
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return len(one) == len(other) and all(map(_are_alike, one, other))
+    if isinstance(one, Batch) and type(one) is type(other):
+        return all(
+            _are_alike(getattr(one, each.name), getattr(other, each.name)) for each in fields(cast(Any, one))
+        )
+    return bool(one == other)
 
 
 def tail_of(level: float) -> float:

@@ -223,25 +223,6 @@ def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) 
     return panel.imshow(values, origin="lower", extent=(0, width, 0, height), interpolation="none", **style)
 
 
-def outline(region: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Finds the edges between cells of a region and those that are not of it, the map's border among them.
-
-    Args:
-        region: bool, shape [H, W].
-        resolution_m: edge length of a cell.
-
-    Returns:
-        Both ends (x, y) of each edge in metres, float32, shape [M, 2, 2].
-    """
-    framed = np.pad(region, 1)
-    rows, columns = np.nonzero(np.diff(framed[:, 1:-1], axis=0))
-    along_x = np.stack((columns, rows, columns + 1, rows), axis=1)
-    rows, columns = np.nonzero(np.diff(framed[1:-1], axis=1))
-    along_y = np.stack((columns, rows, columns, rows + 1), axis=1)
-    edges = np.concatenate((along_x, along_y)).reshape(-1, 2, 2)
-    return (edges * resolution_m).astype(np.float32)
-
-
 def hatching(region: np.ndarray, resolution_m: float) -> np.ndarray:
     """Draws diagonals through a region, which tell it from what it surrounds.
 

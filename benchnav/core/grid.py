@@ -10,6 +10,8 @@ PyTorch is imported where it is called: making and listing datasets does without
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from benchnav.core.errors import expect
 
 if TYPE_CHECKING:
@@ -106,3 +108,22 @@ class Grid:
 def is_azimuth(layer: str) -> bool:
     """Tells by its name a layer of directions: in degrees from +x towards +y, which turn with the map."""
     return layer.endswith("_azimuth_deg")
+
+
+def outline(region: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Finds the edges between cells of a region and those that are not of it, the map's border among them.
+
+    Args:
+        region: bool, shape [H, W].
+        resolution_m: edge length of a cell.
+
+    Returns:
+        Both ends (x, y) of each edge in metres, float32, shape [M, 2, 2].
+    """
+    framed = np.pad(region, 1)
+    rows, columns = np.nonzero(np.diff(framed[:, 1:-1], axis=0))
+    along_x = np.stack((columns, rows, columns + 1, rows), axis=1)
+    rows, columns = np.nonzero(np.diff(framed[1:-1], axis=1))
+    along_y = np.stack((columns, rows, columns, rows + 1), axis=1)
+    edges = np.concatenate((along_x, along_y)).reshape(-1, 2, 2)
+    return (edges * resolution_m).astype(np.float32)

@@ -10,10 +10,12 @@ from typing import Any
 
 import torch
 
-from benchnav.core.errors import expect
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
 
 FORMAT = "benchnav-ground-1"
+SEEN = "seen"
+"""Layer of an observation that is 1 where a cell was seen and 0 elsewhere, for models that declare it as an input."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,16 +70,24 @@ class GroundStatistics:
         """Reads what `to_json` wrote.
 
         Raises:
-            ConfigError: it is of another format.
+            ConfigError: it is of another format, or damaged.
         """
-        about: dict[str, Any] = json.loads(text)
-        found = about.pop("format", None)
-        expect(found == FORMAT, f"ground statistics of the format {FORMAT}, got {found!r}.")
-        return cls(
-            weights=tuple(about["weights"]),
-            means=tuple(about["means"]),
-            stds=tuple(about["stds"]),
-            layer_means={name: tuple(values) for name, values in about["layer_means"].items()},
-            look_alikes=tuple((one, other) for one, other in about["look_alikes"]),
-            potts_strength=about["potts_strength"],
-        )
+        try:
+            about: dict[str, Any] = json.loads(text)
+            found = about.pop("format", None)
+            expect(found == FORMAT, f"ground statistics of the format {FORMAT}, got {found!r}.")
+            return cls(
+                weights=tuple(about["weights"]),
+                means=tuple(about["means"]),
+                stds=tuple(about["stds"]),
+                layer_means={name: tuple(values) for name, values in about["layer_means"].items()},
+                look_alikes=tuple((one, other) for one, other in about["look_alikes"]),
+                potts_strength=about["potts_strength"],
+            )
+        except ConfigError:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ConfigError(
+                f"Expected ground statistics as `benchnav-datagen ground` writes them, got {type(error).__name__} "
+                f"{error}. Make them again."
+            ) from error

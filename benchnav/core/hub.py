@@ -17,7 +17,7 @@ from benchnav.core.errors import BenchnavError, quiet
 Kind = Literal["model", "dataset"]
 
 FILES: dict[Kind, tuple[str, ...]] = {
-    "model": ("config.json", "*.safetensors", "README.md"),
+    "model": ("config.json", "ground.json", "*.safetensors", "README.md"),
     "dataset": ("*.h5", "manifest.json", "README.md"),
 }
 """What is downloaded, by kind of repository."""
@@ -83,9 +83,9 @@ def _is_whole(folder: Path, kind: Kind) -> bool:
     """Tells whether all files are there that the first of them names: a download may have been cut short."""
     try:
         if kind == "model":
-            named = [
-                f"{part}.safetensors" for part in json.loads((folder / "config.json").read_text())["parts"]
-            ]
+            config = json.loads((folder / "config.json").read_text())
+            named = [f"{part}.safetensors" for part in config["parts"]]
+            named += ["ground.json"] if "ground" in config else []
         elif (folder / "manifest.json").exists():
             shards = json.loads((folder / "manifest.json").read_text())["shards"]
             named = [shard["file"] for own in shards.values() for shard in own]

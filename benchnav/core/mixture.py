@@ -50,7 +50,7 @@ class TraversabilityMixture(TraversabilityDistribution):
         means: component means before clipping, shape [*B, K, H, W].
         stds: component standard deviations before clipping, ≥ 0, shape [*B, K, H, W].
         group: K numbers: in a cell the components of one number belong to one terrain class together; None
-            where components are no classes.
+            where components are no classes. Components of −1 belong to none, as of ground that was not seen.
 
     Raises:
         ConfigError: the shapes differ or have fewer than three dimensions, or `group` has another length.
@@ -212,7 +212,8 @@ class TraversabilityMixture(TraversabilityDistribution):
         if z.shape[-3] == 1:
             score = z.squeeze(-3)
         else:  # by the smaller of F and 1 − F, so that neither tail is lost to rounding
-            below, above = ((weights * _probability(side * z)).sum(-3) for side in (1, -1))
+            tail, low = _probability(-z.abs()), z < 0
+            below, above = ((weights * torch.where(side, tail, 1 - tail)).sum(-3) for side in (low, ~low))
             least = torch.minimum(below, above).clamp(min=torch.finfo(torch.float64).tiny)
             score = torch.special.ndtri(least) * torch.where(below <= above, 1.0, -1.0)
         ends = (value <= 0, value > 1), (value < 0, value >= 1)
@@ -247,9 +248,10 @@ class TraversabilityMixture(TraversabilityDistribution):
         if self.group in (None, tuple(range(count))):
             return self.weights
         weights = self.weights.movedim(-3, 0)
-        total = weights.new_zeros(count, *weights.shape[1:])
-        total.index_add_(0, torch.tensor(self.group, device=weights.device), weights)
-        return total.movedim(0, -3)
+        total = weights.new_zeros(count + 1, *weights.shape[1:])  # the last for what belongs to no class
+        places = [count if number < 0 else number for number in self.group]
+        total.index_add_(0, torch.tensor(places, device=weights.device), weights)
+        return total[:count].movedim(0, -3)
 
     def most_likely(self) -> "TraversabilityMixture":
         """Keeps the heaviest class of each cell alone, all its components: the paper's single-class option.
@@ -264,9 +266,13 @@ class TraversabilityMixture(TraversabilityDistribution):
                 "Expected components that belong to terrain classes for the single-class option, got a "
                 "mixture without `group`. Take another risk measure, or give the mixture its `group`."
             )
-        best = self.class_probabilities(max(self.group) + 1).argmax(-3, keepdim=True)
-        is_best = torch.tensor(self.group, device=best.device).view(-1, 1, 1) == best
-        if len(set(self.group)) == len(self.group):  # the others need not be kept at no weight
+        own = (
+            max(self.group) + 1
+        )  # of what belongs to no class, which is all there is where ground was not seen
+        group = tuple(own if number < 0 else number for number in self.group)
+        best = replace(self, group=group).class_probabilities(own + 1).argmax(-3, keepdim=True)
+        is_best = torch.tensor(group, device=best.device).view(-1, 1, 1) == best
+        if len(set(group)) == len(group):  # the others need not be kept at no weight
             order = is_best.int().argmax(-3, keepdim=True)
             means, stds = (torch.gather(values, -3, order) for values in (self.means, self.stds))
             return TraversabilityMixture(torch.ones_like(means), means, stds, (0,))

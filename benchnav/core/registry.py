@@ -15,7 +15,9 @@ that is a function is called with them beside its mixture.
 
 A part is identified by its source and all that this imports, by every file or folder that an option names, and by
 those that its class or function lists as `files`, relative to its own file: `files = ("weights.npz",)`. Options that
-name what it writes stand in `writes`: `writes = ("log",)`.
+name what it writes stand in `writes`: `writes = ("log",)`. Options that came later stand in `added`, as
+`added = ("explore",)`, on the class or on that of its `config`: at their default they are left out of what is recorded,
+so that what was recorded before they came is still the same part.
 """
 
 import importlib
@@ -188,14 +190,20 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
 def complete(kind: str, part: Part) -> Part:
     """Checks a part's options and fills in their defaults, so that like parts have like options.
 
+    Those that the part lists as `added` are left out at their default.
+
     Raises:
         ConfigError: there is no such part or option, or a value is of another type.
     """
     target = find(kind, part.part).target
     given, options = _read_options(kind, part, target), {}
+    added = getattr(_owner(kind, target), "added", ())
     for name, option in options_of(kind, target).items():
+        value = given.get(name, option.default)
+        if name in added and value == option.default:
+            continue
         try:
-            options[name] = plain(given.get(name, option.default))
+            options[name] = plain(value)
         except ConfigError as error:
             raise ConfigError(
                 f"Option {name!r} of {kind} {part.part!r} cannot be recorded. {error}"
@@ -334,8 +342,13 @@ def _split_value(kind: str, text: str) -> tuple[str, str | None]:
 
 
 def _read_options(kind: str, part: Part, target: Any) -> dict[str, Any]:
-    gone = getattr(config_class(target, _skipped(kind, target)) or target, "gone", {})
+    gone = getattr(_owner(kind, target), "gone", {})
     return read_options(options_of(kind, target), part.options, of(f"{kind} {part.part!r}"), gone=gone)
+
+
+def _owner(kind: str, target: Any) -> Any:
+    """The class or function whose options a part has: its own, or that of its `config`."""
+    return config_class(target, _skipped(kind, target)) or target
 
 
 def _skipped(kind: str, target: Any) -> tuple[str, ...]:

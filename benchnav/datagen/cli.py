@@ -12,7 +12,7 @@ from typing import Literal
 from benchnav import datagen
 from benchnav.core.command import INTERRUPTED, Command, run, show_progress, tell
 from benchnav.core.errors import DatasetError, choose, expect
-from benchnav.core.store import output_path, read_shard, replacing
+from benchnav.core.store import output_path, read_shard, replacing, write_text
 from benchnav.core.tables import Table, print_table
 from benchnav.datagen.import_commands import import_dem, import_drives
 
@@ -190,6 +190,33 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
     written(path)
 
 
+def ground(file: str, out: str = "", overwrite: bool = False) -> None:
+    """Write what is known of ground before any of it is seen: statistics of all maps of the split train together.
+
+    Beliefs need them of cells that a robot has not seen yet, and of classes that look alike.
+
+    Args:
+        file: Path or id of a dataset with a split train.
+        out: File .json to write; beside the dataset, as DATASET.ground.json, when not given. There they are found of
+            any model that brings none of its own.
+        overwrite: Replace a file that is there.
+    """
+    from benchnav.datagen.ground import fit_ground, ground_file
+
+    dataset = _opened(file)
+    path = output_path(out) if out else ground_file(dataset.path)
+    expect(path.suffix == ".json", f"`out` as a file .json, got {out!r}.")
+    expect(
+        overwrite or not path.exists(),
+        f"`out` as a new file, got {path}, which exists. Pass --overwrite to replace it.",
+    )
+    found = fit_ground(dataset)
+    write_text(path, found.to_json())
+    pairs = ", ".join(" and ".join(pair) for pair in found.look_alikes)
+    alike = f"; {pairs} look alike, strength of the field {found.potts_strength:.2f}" if pairs else ""
+    print(f"wrote {path}: λ of {dataset.map_count('train')} maps by {len(found.weights)} Gaussians{alike}")
+
+
 def export(
     file: str,
     out: str,
@@ -290,6 +317,7 @@ COMMANDS = {
     "merge": Command(merge, ("files",)),
     "import-dem": Command(import_dem, ("dem", "overrides"), repeated=("layer",)),
     "import-drives": Command(import_drives, ("drives", "overrides"), repeated=("layer",)),
+    "ground": Command(ground, ("file",)),
     "export": Command(export, ("file",)),
     "preview": Command(preview, ("file",)),
 }

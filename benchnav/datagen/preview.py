@@ -33,11 +33,10 @@ from benchnav.core.figures import (
     legend_outside,
     mark,
     mark_handle,
-    outline,
     show_map,
     styled,
 )
-from benchnav.core.grid import is_azimuth
+from benchnav.core.grid import is_azimuth, outline
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED

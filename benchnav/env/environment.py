@@ -1,4 +1,4 @@
-"""The Gymnasium environment `benchnav/OffRoad-v0`, single and vectorised.
+"""The Gymnasium environment `benchnav/OffRoad-v0`, single and vectorised, and what all versions share.
 
 Observations hold what a robot may know: where it is, its goal, and the paper's Observation of the map;
 never the truth. Letters in shapes: B sub-environments, H×W cells, S state and A action dimensions.
@@ -112,12 +112,17 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - the base class's contract
+    _batch: "EnvBatch"
 
     def __init__(self, **arguments: Any) -> None:
         """Loads the maps of the split; see the class."""
-        self._batch = EnvBatch(1, **arguments)
+        self._batch = self._make_batch(1, **arguments)
         self.observation_space = self._batch.observation_space
         self.action_space = self._batch.action_space
+
+    @staticmethod
+    def _make_batch(size: int, **arguments: Any) -> "EnvBatch":
+        return EnvBatch(size, **arguments)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -148,11 +153,12 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012
+    _batch: "EnvBatch"
 
     def __init__(self, num_envs: int = 1, **arguments: Any) -> None:
         """Loads the maps of the split; see the class."""
         self.num_envs = num_envs
-        self._batch = EnvBatch(num_envs, **arguments)
+        self._batch = self._make_batch(num_envs, **arguments)
         self.single_observation_space = self._batch.observation_space
         self.single_action_space = self._batch.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -160,15 +166,29 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self._generators: list[np.random.Generator] = []
         self._ended = np.zeros(num_envs, dtype=bool)
 
+    @staticmethod
+    def _make_batch(size: int, **arguments: Any) -> "EnvBatch":
+        return EnvBatch(size, **arguments)
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Starts an episode in each sub-environment."""
+        """Starts an episode in each sub-environment, or in those of `options={"reset_mask": …}`, bool [B]."""
+        given, every = options or {}, np.ones(self.num_envs, dtype=bool)
+        chosen = np.asarray(given.get("reset_mask", every))
+        fits = chosen.shape == every.shape and chosen.dtype == bool and chosen.any()
+        expect(fits, f"option `reset_mask` as bool of shape [{len(every)}], at least one true, got {chosen}.")
+        if not self._generators and not chosen.all():
+            raise gymnasium.error.ResetNeeded("Call reset() of all sub-environments before that of some.")
         if seed is not None or not self._generators:
             _, root = seeding.np_random(seed)
-            self._generators = [seeding.np_random(root + i)[0] for i in range(self.num_envs)]
-        self._batch.reset(self._generators, np.ones(self.num_envs, bool), (options or {}).get("map"))
-        self._ended = np.zeros(self.num_envs, dtype=bool)
+            fresh = [seeding.np_random(root + i)[0] for i in range(self.num_envs)]
+            self._generators = [
+                new if anew else old
+                for new, old, anew in zip(fresh, self._generators or fresh, chosen, strict=True)
+            ]
+        self._batch.reset(self._generators, chosen, given.get("map"))
+        self._ended = self._ended & ~chosen
         return self._batch.observe()
 
     def step(
@@ -222,7 +242,7 @@ class EnvBatch:
             self._objective = registry.take("objective", objective, robot=made, goal_radius_m=goal_radius_m)
         rules = Rules(goal_radius_m=goal_radius_m)
         self._task = Task(robot=made, objective=self._objective or GoalDistance(), rules=rules)
-        dataset = TerrainDataset(find_dataset(data))
+        dataset = self._dataset = TerrainDataset(find_dataset(data))
         if not split:
             split = "train" if "train" in dataset.splits else next(iter(dataset.splits))
             if split != "train":
@@ -302,7 +322,7 @@ class EnvBatch:
         expected = (len(self._map), *space.shape)
         expect(given.shape == expected, f"actions of shape {list(expected)}, got {list(given.shape)}.")
         waits = torch.zeros_like(now.running) if hold is None else torch.from_numpy(hold)
-        action = torch.from_numpy(given.clip(space.low, space.high))
+        action = self._command(torch.from_numpy(given.clip(space.low, space.high)))
         moved, met = simulation.step(now, action)
         self._now = map_tensors(
             now, lambda old, new: torch.where(waits[:, None] if new.ndim > 1 else waits, old, new), moved
@@ -326,14 +346,22 @@ class EnvBatch:
             "slope_deg": self._maps.slope_deg[self._map].numpy(),
             **{name: layer[self._map].nan_to_num().numpy() for name, layer in self._maps.layers.items()},
         }
-        info = {
+        return seen, self._diagnose(met)
+
+    def _diagnose(self, met: np.ndarray | None) -> Observations:
+        """Diagnostics with the observed λ, 1 if not given."""
+        _, now = self._current()
+        return {
             "map": self._map.copy(),
             "outcome": now.outcome.numpy().copy(),
             "is_success": (now.outcome == Outcome.SUCCESS).numpy(),
             "traversability": np.ones(len(self._map), np.float32) if met is None else met,
             "distance_m": self._distance_m(now).numpy(),
         }
-        return seen, info
+
+    def _command(self, action: Tensor) -> Tensor:
+        """What the robots are commanded by actions within the bounds, both of shape [B, A]."""
+        return action
 
     def _reward(self, before: SimulationState, now: SimulationState, action: Tensor, met: Tensor) -> Tensor:
         """Progress less time, and a prize or fine at the end; or minus J's stage cost; shape [B]."""

@@ -20,6 +20,9 @@ TITLES = {
     "risk": "risk measures",
     "robot": "robots",
     "objective": "objectives",
+    "sensor": "sensors of appearance: what a robot sees of its map",
+    "ground": "sensors of the ground: what a robot senses of λ",
+    "belief": "beliefs: what is made of what is sensed",
     "world": "worlds, each with its rules of the task",
 }
 HELP = (

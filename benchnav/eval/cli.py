@@ -106,10 +106,10 @@ def rerun(
 
 
 def list_command(kinds: list[str]) -> None:
-    """List planners, models, risk measures, robots, objectives and worlds with their options.
+    """List planners, models, risk measures, robots, objectives, sensors, beliefs and worlds with their options.
 
     Args:
-        kinds: Some of planner, model, risk, robot, objective and world; all when none is named.
+        kinds: Some of planner, model, risk, robot, objective, sensor, ground, belief and world; all when none is named.
     """
     from benchnav.eval.catalogue import print_catalogue
 
@@ -141,8 +141,9 @@ def compare(
         labels: Of the conditions to compare.
         folders: Folders of finished runs, one or more.
         against: Label that all others are compared with, such as mean or straight; all pairs when not given.
-        by: The one thing in which the conditions of a pair differ: risk, planner, model, objective, robot, world or
-            run. When not given: the kind of `against`; run where runs share conditions; else risk.
+        by: The one thing in which the conditions of a pair differ: risk, planner, model, objective, robot, sensor,
+            ground, belief, world or run. When not given: the kind of `against`; run where runs share conditions; else
+            risk.
         points: Difference of success in percentage points; a note tells how many maps it needs.
         allow_different: code also compares conditions made by different code, and says so under the table.
         out: Path without a suffix, to which .csv, .md and .tex are added.

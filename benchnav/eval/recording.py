@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from torch import Tensor
 
-from benchnav.core.grid import Grid
+from benchnav.core.grid import Grid, outline
 from benchnav.core.store import replacing
 from benchnav.eval.folder.run_folder import damaged
 from benchnav.planning.world.outcome import Outcome
@@ -29,6 +29,9 @@ MOMENT_S = 15.0
 MOST_POINTS = 160
 
 _DRAW_EVERY_S = 0.5
+# Maps of what is known: in a file numbers in steps of 1/255, and masks as bits.
+NUMBERS, _MASKS = ("predicted", "mean", "spread"), ("free", "seen", "sensed")
+_LEVELS = 255
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +45,50 @@ class DrawnPlan:
 
     step: int
     lines: Mapping[str, Sequence[np.ndarray]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownMap:
+    """What a robot knew of its map from a step on.
+
+    Args:
+        step: the first step at which it held.
+        predicted: λ̂ as the risk setting gives it, shape [H, W].
+        free: S_free, bool, shape [H, W].
+        mean: E[λ] of the belief, shape [H, W].
+        spread: half of the range from the 16 % to the 84 % quantile of λ, shape [H, W].
+        seen: cells whose appearance was seen by then, bool, shape [H, W].
+        sensed: cells whose λ was sensed by then, bool, shape [H, W].
+        outline: of the ground that the sensors reached at that step, (x, y) in metres, shape [P, 2]; rows of NaN part
+            one line from the next.
+    """
+
+    step: int
+    predicted: np.ndarray
+    free: np.ndarray
+    mean: np.ndarray
+    spread: np.ndarray
+    seen: np.ndarray
+    sensed: np.ndarray
+    outline: np.ndarray
+
+    @property
+    def outlines(self) -> list[np.ndarray]:
+        """The lines of the outline, each of shape [P, 2]."""
+        ends = np.flatnonzero(np.isnan(self.outline[:, 0]))
+        lines = [line[~np.isnan(line[:, 0])] for line in np.split(self.outline, ends)]
+        return [line for line in lines if len(line) > 1]
+
+
+def reach_outline(cells: np.ndarray, resolution_m: float) -> np.ndarray:
+    """The `KnownMap.outline` of cells that sensors reached.
+
+    Args:
+        cells: bool, shape [H, W].
+        resolution_m: edge length of a cell.
+    """
+    edges = outline(cells, resolution_m)
+    return np.pad(edges, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,8 +154,8 @@ class Recording(Ground):
         elevation_m: shape [H, W].
         true_mean: E[λ] of the truth, shape [H, W].
         soft: ground with soft spots that do not show, bool, shape [H, W].
-        predicted: λ̂, the map the planner was given, shape [H, W].
-        free: S_free, bool, shape [H, W].
+        predicted: λ̂, the map the planner was given when it set out, shape [H, W].
+        free: S_free of that map, bool, shape [H, W].
         free_by: the map that decides what is free, `risk` or `mean`.
         free_above: what that map has to exceed.
         dt_s: time step.
@@ -119,6 +166,7 @@ class Recording(Ground):
         traversability: observed λ, shape [N].
         plans: what was planned, in order of steps; those after the episode's end are left out.
         layers: optional fields of the map, by name, each of shape [H, W].
+        known: what the robot knew of its map, in order of steps; empty where it learnt nothing on the way.
     """
 
     elevation_m: np.ndarray
@@ -136,6 +184,7 @@ class Recording(Ground):
     traversability: np.ndarray
     plans: Sequence[DrawnPlan] = ()
     layers: Mapping[str, np.ndarray] = field(default_factory=dict)
+    known: tuple[KnownMap, ...] = ()
 
     _REMEDY: ClassVar[str] = "Remove it and its .rrd; `replay` makes them again."
 
@@ -195,10 +244,20 @@ class Recording(Ground):
         known = [plan for plan in self.own_plans if plan.step <= due]
         return known[-1] if known else DrawnPlan(step=0, lines={})
 
+    def known_at(self, step: int) -> KnownMap | None:
+        """What was known at a step; None where the robot learnt nothing on the way."""
+        return next((known for known in reversed(self.known) if known.step <= step), None)
+
+    def given_at(self, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """λ̂ and S_free as the planner had them at a step, each of shape [H, W]."""
+        known = self.known_at(step)
+        return (self.predicted, self.free) if known is None else (known.predicted, known.free)
+
     def _stored(self) -> dict[str, Any]:
-        """Its values; plans are thinned but the one of figures, and packed into few arrays."""
+        """Its values; plans are thinned but the one of figures, and packed into few arrays, as what was known is."""
         values, shown = super()._stored(), self.plan.step
         del values["plans"]
+        values |= _pack_known(values.pop("known"))
         values |= {f"layers:{name}": layer for name, layer in values.pop("layers").items()}
         return values | _pack([plan if plan.step == shown else thinned(plan) for plan in self.own_plans])
 
@@ -206,10 +265,12 @@ class Recording(Ground):
     def _read(cls, values: dict[str, Any]) -> Self:
         packed = {name: values.pop(name) for name in list(values) if name.startswith("plans:")}
         layers = {name: values.pop(name) for name in list(values) if name.startswith("layers:")}
+        known = {name: values.pop(name) for name in list(values) if name.startswith("known:")}
         return cls(
             **values
             | {
                 "plans": _unpack(packed),
+                "known": _unpack_known(known) if known else (),
                 "action_names": tuple(values["action_names"]),
                 "layers": {name.removeprefix("layers:"): layer for name, layer in layers.items()},
             }
@@ -288,3 +349,44 @@ def _cut(values: Any, sizes: np.ndarray) -> list[Any]:
     """Cuts a sequence into consecutive pieces of given sizes."""
     ends = sizes.cumsum()
     return [values[end - size : end] for end, size in zip(ends, sizes, strict=True)]
+
+
+def _pack_known(known: Sequence[KnownMap]) -> dict[str, np.ndarray]:
+    """Packs what was known into few arrays, which `_unpack_known` takes apart; none where there is none.
+
+    Of each map only its difference from the one before is kept, which compresses well: most cells stay as they were.
+
+    Returns:
+        `known:steps`; by field of λ `known:NAME`, uint8, and by mask the same in bits; the outlines' points as
+        `known:outline`, and how many each map has as `known:sizes`.
+    """
+    if not known:
+        return {}
+    arrays: dict[str, np.ndarray] = {"known:steps": np.array([each.step for each in known], np.int64)}
+    for name in NUMBERS:
+        levels = np.stack([getattr(each, name) for each in known]).astype(np.float32).clip(0, 1) * _LEVELS
+        # Differences of whole numbers modulo 256, which sums take back.
+        arrays[f"known:{name}"] = np.diff(levels.round().astype(np.uint8), axis=0, prepend=np.uint8(0))
+    for name in _MASKS:
+        masks = np.stack([getattr(each, name) for each in known])
+        changed = np.diff(masks, axis=0, prepend=False)
+        arrays[f"known:{name}"] = np.packbits(changed, axis=-1)
+    outlines = [each.outline for each in known]
+    arrays["known:outline"] = np.concatenate(outlines).astype(np.float32)
+    arrays["known:sizes"] = np.array([len(each) for each in outlines], np.int64)
+    return arrays
+
+
+def _unpack_known(arrays: Mapping[str, np.ndarray]) -> tuple[KnownMap, ...]:
+    values = {name.removeprefix("known:"): array for name, array in arrays.items()}
+    width = values[NUMBERS[0]].shape[-1]
+    for name in NUMBERS:
+        values[name] = values[name].cumsum(axis=0, dtype=np.uint8).astype(np.float32) / _LEVELS
+    for name in _MASKS:
+        changed = np.unpackbits(values[name], axis=-1, count=width)
+        values[name] = np.logical_xor.accumulate(changed.astype(bool), axis=0)
+    outlines = _cut(values["outline"], values["sizes"])
+    return tuple(
+        KnownMap(step=int(step), outline=lines, **{name: values[name][place] for name in (*NUMBERS, *_MASKS)})
+        for place, (step, lines) in enumerate(zip(values["steps"], outlines, strict=True))
+    )

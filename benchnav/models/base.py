@@ -6,14 +6,16 @@ Terrain. Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, 
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Collection
 from typing import Any, TypeGuard
 
+import torch
 from torch import Tensor
 
 from benchnav.core.device import exact_convolutions
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError, expect
+from benchnav.core.ground import SEEN
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.models.checkpoint import Checkpoint
 
@@ -82,8 +84,10 @@ def is_family(target: Any) -> TypeGuard[type[ModelFamily]]:
     return inspect.isclass(target) and issubclass(target, ModelFamily)
 
 
-def layers_of(observation: Observation, names: Iterable[str]) -> dict[str, Tensor]:
+def layers_of(observation: Observation, names: Collection[str]) -> dict[str, Tensor]:
     """The layers of an observation that a model was trained on, by name.
+
+    The layer `seen`, for models that declare it, is 1 everywhere where the observation does not say what was seen.
 
     Raises:
         ConfigError: the maps lack one.
@@ -94,6 +98,8 @@ def layers_of(observation: Observation, names: Iterable[str]) -> dict[str, Tenso
         "slope_deg": observation.slope_deg,
         **observation.layers,
     }
+    if SEEN in names and SEEN not in known:
+        known[SEEN] = torch.ones_like(observation.elevation_m, dtype=torch.float32)
     lacking = [name for name in names if name not in known]
     expect(
         not lacking,

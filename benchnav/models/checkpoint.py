@@ -1,8 +1,9 @@
 """Checkpoints: a trained model as a folder of data that runs no code when it is read.
 
 `config.json` says what the model is and how each of its parts came to be, and holds its own SHA-256; a part, such as
-`classifier` or `gp`, has its tensors in `PART.safetensors`, whose SHA-256 stands in `config.json`. A checkpoint is
-written to a folder beside its own and renamed, so that its name never holds half of one.
+`classifier` or `gp`, has its tensors in `PART.safetensors`, whose SHA-256 stands in `config.json`; `ground.json` holds
+statistics of the training maps, of which the model itself makes no use. A checkpoint is written to a folder beside its
+own and renamed, so that its name never holds half of one.
 """
 
 import hashlib
@@ -23,7 +24,8 @@ from torch import Tensor
 
 import benchnav
 from benchnav.core import registry
-from benchnav.core.errors import CheckpointError
+from benchnav.core.errors import CheckpointError, ConfigError
+from benchnav.core.ground import GroundStatistics
 from benchnav.core.sources import digest_of_path
 from benchnav.core.store import (
     building,
@@ -44,7 +46,7 @@ FORMAT = "benchnav-checkpoint"
 FORMAT_VERSION = (2, 3)
 OLDEST_VERSION = (2, 0)
 _SEALED = (2, 2)  # from which on config.json holds its own digest
-CONFIG = "config.json"
+CONFIG, GROUND = "config.json", "ground.json"
 FUSED = "fused"
 CLASSIFIER, GP = "classifier", "gp"
 
@@ -100,6 +102,7 @@ class Checkpoint:
         code: digest of the code of the class; empty where that is ours.
         conformal: a `models.conformal.ConformalTable` as plain data, by which the whole model is recalibrated; empty
             where it is not.
+        ground: statistics of the maps that it was trained on last; None where it was trained on none.
     """
 
     class_names: tuple[str, ...]
@@ -108,6 +111,7 @@ class Checkpoint:
     pool_temperature: float = 1.0
     code: str = ""
     conformal: Mapping[str, Any] = field(default_factory=dict)
+    ground: GroundStatistics | None = None
 
     def part(self, name: str) -> Part:
         """Gives a part.
@@ -147,8 +151,9 @@ def is_member(name: str, stem: str) -> bool:
 
 
 def digests_of(folder: Path) -> dict[str, str]:
-    """SHA-256 of each file of a checkpoint, by name; a card beside them is none."""
-    files = sorted(path for path in folder.iterdir() if path.suffix in (".json", ".safetensors"))
+    """SHA-256 of each file that predictions depend on, by name: not of the card, nor of statistics of the ground."""
+    kinds = (".json", ".safetensors")
+    files = sorted(path for path in folder.iterdir() if path.suffix in kinds and path.name != GROUND)
     return {path.name: digest_of_path(path) for path in files}
 
 
@@ -224,6 +229,7 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         return Checkpoint(
             class_names=tuple(names), parts=parts, model=config["model"], pool_temperature=pooled,
             code=str(config.get("code", "")), conformal=dict(config.get("conformal", {})),
+            ground=read_ground(folder, config),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
@@ -290,6 +296,29 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
+def read_ground(folder: Path, config: Mapping[str, Any]) -> GroundStatistics | None:
+    """Reads the statistics of the ground that a checkpoint brings.
+
+    Args:
+        folder: of the checkpoint.
+        config: what `read_config` gave of it. One that was written before there were such statistics does not name
+            them; they may have been put beside its tensors since.
+
+    Raises:
+        CheckpointError: they are missing or damaged.
+    """
+    path, sha256 = folder / GROUND, config.get("ground", {}).get("sha256")
+    if not sha256 and not path.is_file():
+        return None
+    try:
+        content = path.read_bytes()
+        if sha256 and hashlib.sha256(content).hexdigest() != sha256:
+            raise _damaged(path, "its SHA-256 is not the one in config.json")
+        return GroundStatistics.from_json(content.decode())
+    except (OSError, UnicodeDecodeError, ConfigError) as error:
+        raise _damaged(path, str(error)) from error
+
+
 def _write(folder: Path, checkpoint: Checkpoint, name: str) -> None:
     parts = {}
     for part_name, part in checkpoint.parts.items():
@@ -310,6 +339,10 @@ def _write(folder: Path, checkpoint: Checkpoint, name: str) -> None:
         optional["code"] = checkpoint.code
     if checkpoint.conformal:
         optional["conformal"] = dict(checkpoint.conformal)
+    if checkpoint.ground:
+        text = checkpoint.ground.to_json()
+        write_text(folder / GROUND, text)
+        optional["ground"] = {"sha256": hashlib.sha256(text.encode()).hexdigest()}
     config = {
         "format": FORMAT,
         "format_version": ".".join(map(str, FORMAT_VERSION)),

@@ -1,7 +1,7 @@
 """Settings of models and of their training; light to import, so that commands start fast."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from benchnav.core.command import Device
@@ -45,12 +45,40 @@ class TrainOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Masking:
+    """What training maps are masked by, as a robot that sees what is near would see them.
+
+    A masked map is known within a radius of a straight path on it, and that the worse the farther from the path.
+
+    Args:
+        share: of the maps that are masked, those of valid among them; 0 masks none.
+        radius_m: least and greatest radius, between which each map has its own; small ones are as frequent as large
+            ones by their logarithm.
+        colour_noise: standard deviation of each channel of a colour, 0–255, for each metre of distance to the path.
+        elevation_noise: standard deviation of elevation in metres, for each metre of distance to the path.
+    """
+
+    share: float = 0.0
+    radius_m: tuple[float, float] = (2.0, 16.0)
+    colour_noise: float = 0.5
+    elevation_noise: float = 0.002
+
+    def __post_init__(self) -> None:
+        """Refuses masks that are none."""
+        _check(self, 0 <= self.share <= 1, "share", "in [0, 1]")
+        low, high = self.radius_m
+        _check(self, 0 < low <= high < math.inf, "radius_m", "of two radii > 0, ordered and finite")
+        for name in ("colour_noise", "elevation_noise"):
+            _check(self, 0 <= getattr(self, name) < math.inf, name, "≥ 0 and finite")
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainingConfig:
     """What any trainable model is given, and how it is trained; a model of one's own adds its own settings.
 
     Args:
         inputs: layers of the maps that the network is given: rgb, elevation_m, slope_deg, and others that they have,
-            such as vegetation_m.
+            such as vegetation_m; and seen, 1 where a cell was seen and 0 elsewhere.
         jitter: largest relative change of brightness, contrast and saturation of a training map. At 0
             low light stays unseen in training.
         symmetries: turn and mirror training maps at random; false for photos, whose light comes from one direction.
@@ -60,6 +88,7 @@ class TrainingConfig:
         batch_size: most maps a batch.
         max_epochs: length of the schedule.
         patience: epochs without a better validation loss after which training stops.
+        masking: what of the maps is seen; a network with the input seen is told which cells these are.
     """
 
     inputs: tuple[str, ...] = ("rgb", "slope_deg")
@@ -71,6 +100,7 @@ class TrainingConfig:
     batch_size: int = 16
     max_epochs: int = 20
     patience: int = 10
+    masking: Masking = field(default_factory=Masking)
 
     def __post_init__(self) -> None:
         """Refuses numbers that cannot train."""
@@ -228,6 +258,16 @@ class MDNConfig(JoinedConfig):
         """Refuses numbers that cannot train."""
         super().__post_init__()
         _check_least(self, 1, "components")
+
+
+def plain_config(config: Any) -> dict[str, Any]:
+    """The settings of a network as plain data; without `masking` where no map is masked.
+
+    Args:
+        config: a `TrainingConfig`.
+    """
+    data = asdict(config)
+    return {name: value for name, value in data.items() if name != "masking" or config.masking.share}
 
 
 def check_seed(seed: int, count: int = 1) -> None:

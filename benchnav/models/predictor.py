@@ -16,9 +16,12 @@ import torch
 from benchnav.core import hub, registry
 from benchnav.core.command import tell
 from benchnav.core.errors import CheckpointError, ConfigError, expect
+from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.shipped_files import shipped_folder
 from benchnav.core.terrain import Terrain
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.ground import TRAIN, find_ground, ground_file
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, is_family
 from benchnav.models.checkpoint import (
@@ -28,6 +31,7 @@ from benchnav.models.checkpoint import (
     Checkpoint,
     load_checkpoint,
     read_config,
+    read_ground,
     refuse_unfinished,
 )
 from benchnav.models.conformal import ConformalModel, ConformalTable
@@ -236,6 +240,32 @@ def trained_on(source: Source) -> dict[str, str]:
         for entry in part["data"]["digest"].split(","):
             split, _, digest = entry.partition(":")
             found[digest] = f"{split} of {part['data']['id']}"
+    return found
+
+
+def find_ground_statistics(source: Source, dataset: TerrainDataset) -> GroundStatistics:
+    """Finds what is known of ground before any of it is seen.
+
+    Args:
+        source: as `load_model` takes it. The statistics that a checkpoint brings are those of the maps that it was
+            trained on.
+        dataset: the maps that are driven on, for models that bring none: the statistics beside it, else those of the
+            shipped recipe of its maps.
+
+    Raises:
+        ConfigError: there are none.
+        CheckpointError: those of the checkpoint are damaged.
+    """
+    place = _as_part(source)
+    found = read_ground(place, read_config(place)) if isinstance(place, Path) else None
+    found = found or find_ground(dataset)
+    if found is None:
+        path = ground_file(dataset.path)
+        how = f"{dataset.path}" if TRAIN in dataset.splits else f"TRAINING_DATA --out {path}"
+        raise ConfigError(
+            f"Expected statistics of the ground in {path}, got none. Make them of maps of the split {TRAIN} with "
+            f"`benchnav-datagen ground {how}`."
+        )
     return found
 
 

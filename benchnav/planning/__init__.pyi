@@ -11,6 +11,7 @@ from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Bicycle, Differ
 from benchnav.planning.sensing.belief import Belief, Law, Static
 from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.copula import Copula
+from benchnav.planning.sensing.near import Near
 from benchnav.planning.sensing.sensor import Appearance, Contact, Full, Moment, Probe, Sensed, Sensor, Step
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import Places, World
@@ -37,6 +38,7 @@ __all__ = [
     "LocalPlanner",
     "MPPIConfig",
     "Moment",
+    "Near",
     "Objective",
     "Places",
     "Plan",

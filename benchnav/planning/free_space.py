@@ -7,7 +7,8 @@ The λ̂ that motion and path costs are given is at least `min_traversability`, 
 it can plan its way out. Beyond the paper, whose equation 2e forbids such ground.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ from benchnav.core.grid import Grid
 # way over free ground costs.
 PENALTY = 1e4
 UNSEEN = ("prior", "optimistic", "pessimistic")
+_LATER = {"unseen": "prior", "replan_every_s": 0.5}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +83,24 @@ class Rules:
             0 < self.replan_every_s < float("inf"),
             f"`replan_every_s` > 0 and finite, got {self.replan_every_s}.",
         )
+
+    def free(
+        self, risk_map: Tensor, distribution: TraversabilityDistribution, seen: Tensor | None = None
+    ) -> Tensor:
+        """Tells which cells are free, bool [B, H, W], without those at the goal.
+
+        Args:
+            risk_map: λ̂, shape [B, H, W].
+            distribution: what is believed of λ, shape [B, H, W].
+            seen: which cells were seen, bool, shape [B, H, W]; None for all. `pessimistic` closes no other.
+        """
+        free = self.free_space.mask(risk_map, distribution)
+        return free if seen is None or self.unseen != "pessimistic" else free | ~seen
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain data for JSON; what came with later versions is left out where it stands at its default."""
+        later = {name: value for name, value in _LATER.items() if getattr(self, name) == value}
+        return {name: value for name, value in asdict(self).items() if name not in later}
 
 
 def cells_at_goal(grid: Grid, goal_m: Tensor, radius_m: float) -> Tensor:

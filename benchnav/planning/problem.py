@@ -4,15 +4,16 @@ It holds what is *predicted* alone: the truth stays with the simulation. Letters
 cells, S state and A action dimensions, *K any further dimensions.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch
 from benchnav.core.distribution import TraversabilityDistribution
-from benchnav.core.errors import expect
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.core.terrain import Observation
 from benchnav.planning.free_space import PENALTY, Rules, cells_at_goal
@@ -21,6 +22,16 @@ from benchnav.planning.robots import Robot
 
 # Stands for a λ̂ of 0 in maps for lookups, where the sign tells whether ground is free and 0 is off the map.
 _ZERO = 1e-30
+
+
+class FieldSource(Protocol):
+    """Draws fields of λ for B episodes: `benchnav.planning.sensing.belief.Fields`."""
+
+    def sample(self, count: int, key: int) -> Tensor:
+        """See `Problem.sample_fields`."""
+
+    def select(self, members: Tensor) -> Self:
+        """Keeps some episodes, by index, int64."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +62,7 @@ class Problem(Batch):
         start: initial states, shape [B, S].
         goal_m: (x, y) of the goals, shape [B, 2].
         time_budget_s: T of each episode, shape [B].
+        fields: draws whole fields of λ, whose cells hang together; see `sample_fields`.
     """
 
     task: Task
@@ -61,6 +73,7 @@ class Problem(Batch):
     start: Tensor
     goal_m: Tensor
     time_budget_s: Tensor
+    fields: FieldSource | None = None
 
     def __post_init__(self) -> None:
         """Checks that the batch is one batch."""
@@ -109,6 +122,30 @@ class Problem(Batch):
     def dt_s(self) -> float:
         """Time step of the robot."""
         return self.robot.dt_s
+
+    def sample_fields(self, count: int, key: int) -> Tensor:
+        """Draws fields of λ as what is believed has them, each whole: its cells hang together.
+
+        Args:
+            count: M.
+            key: a stream key, see `benchnav.core.rng`; another key draws other fields.
+
+        Returns:
+            λ in [0, 1], shape [B, M, H, W]; those of an episode do not depend on the others.
+
+        Raises:
+            ConfigError: nothing was said of how λ hangs together.
+        """
+        if self.fields is None:
+            raise ConfigError(
+                "Expected a problem with `fields` to draw from, got None. Pass them to `pose_problem`."
+            )
+        return self.fields.sample(count, key).to(self.risk_map)
+
+    def select(self, members: Tensor) -> "Problem":
+        """Keeps some episodes, by index, int64."""
+        kept = super().select(members)
+        return kept if self.fields is None else replace(kept, fields=self.fields.select(members))
 
     @cached_property
     def traversability(self) -> Tensor:
@@ -204,6 +241,8 @@ def pose_problem(
     start_m: Tensor,
     goal_m: Tensor,
     time_budget_s: Tensor | float,
+    seen: Tensor | None = None,
+    fields: FieldSource | None = None,
 ) -> Problem:
     """Poses the problem of driving from start to goal, heading at the goal.
 
@@ -215,6 +254,8 @@ def pose_problem(
         start_m: (x, y), shape [B, 2].
         goal_m: (x, y), shape [B, 2].
         time_budget_s: T, of all or of each, shape [B].
+        seen: which cells were seen, bool, shape [B, H, W]; None for all.
+        fields: draws whole fields of λ; None where nobody asks for them.
     """
     rules = task.rules
     at_goal = cells_at_goal(observation.grid, goal_m, rules.goal_radius_m)
@@ -223,12 +264,13 @@ def pose_problem(
         observation=observation,
         distribution=distribution,
         risk_map=risk_map,
-        free=rules.free_space.mask(risk_map, distribution) | at_goal,
+        free=rules.free(risk_map, distribution, seen) | at_goal,
         start=task.robot.initial_state(heading_to(start_m, goal_m)),
         goal_m=goal_m,
         time_budget_s=torch.as_tensor(time_budget_s, dtype=torch.float64, device=goal_m.device)
         .expand(len(goal_m))
         .clone(),
+        fields=fields,
     )
 
 

@@ -1,12 +1,14 @@
-"""Checks for the tests of whoever writes a planner, model, robot, objective or risk measure."""
+"""Checks for the tests of whoever writes a planner, model, robot, objective, risk measure, sensor or belief."""
 
 from benchnav.core.public_names import face
 
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
+        "benchnav.testing.belief": ("check_belief",),
         "benchnav.testing.functions": ("check_objective", "check_risk", "check_robot"),
         "benchnav.testing.model": ("check_model",),
         "benchnav.testing.planner": ("check_planner",),
+        "benchnav.testing.sensor": ("check_sensor",),
     },
 )

@@ -2,10 +2,11 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
-from benchnav.core.conditioned import ConditionedDistribution, conditioned
+from benchnav.core.conditioned import ConditionedDistribution, conditioned, skewed
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
@@ -21,13 +22,19 @@ def posterior(least: float = 0.2) -> tuple[torch.Tensor, torch.Tensor]:
     return mean, least + torch.rand(SHAPE, generator=generator, dtype=torch.float64)
 
 
+@pytest.mark.parametrize("skew", [None, 0.0, -0.7, 1.2])
 @pytest.mark.parametrize("base", [mixture(3, 0.02, 0.3), quantiles()], ids=["mixture", "quantiles"])
-def test_it_is_the_distribution_of_scores_that_go_through_the_base(base: TraversabilityDistribution) -> None:
+def test_it_is_the_distribution_of_scores_that_go_through_the_base(
+    base: TraversabilityDistribution, skew: float | None
+) -> None:
     mean, std = posterior()
-    law = ConditionedDistribution(base, mean, std)
+    law = ConditionedDistribution(base, mean, std, None if skew is None else torch.full_like(mean, skew))
     # Normal numbers at the middles of equal shares are draws without chance.
     shares = (torch.arange(DRAWS, dtype=torch.float64) + 0.5) / DRAWS
-    scores = torch.special.ndtri(shares).repeat_interleave(2).view(-1, 1, 1)
+    scores = torch.special.ndtri(shares)
+    if skew:
+        scores = skewed(scores, torch.tensor(skew, dtype=torch.float64))
+    scores = scores.repeat_interleave(2).view(-1, 1, 1)
     many = torch.arange(2).repeat(DRAWS)
     draws = base.select(many).from_normal(mean[many] + std[many] * scores).view(DRAWS, *SHAPE)
     torch.testing.assert_close(law.mean(), draws.mean(0), rtol=0, atol=1e-3)
@@ -40,6 +47,15 @@ def test_it_is_the_distribution_of_scores_that_go_through_the_base(base: Travers
         torch.testing.assert_close(law.chance(value), (draws >= value).double().mean(0), rtol=0, atol=1e-3)
     for place in (40, 1000, DRAWS - 1):
         torch.testing.assert_close(law.quantile(float(shares[place])), draws[place], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("skew", [-1.5, -0.6, -0.01, 0.0, 0.002, 0.3, 1.4])
+def test_a_skew_number_has_mean_0_variance_1_and_its_skewness(skew: float) -> None:
+    nodes, weights = np.polynomial.hermite_e.hermegauss(60)
+    found = skewed(torch.from_numpy(nodes), torch.tensor(skew)).numpy()
+    for power, moment in ((1, 0.0), (2, 1.0), (3, skew)):
+        assert (weights * found**power).sum() / weights.sum() == pytest.approx(moment, abs=2e-3)
+    assert (np.diff(found) > 0).all()
 
 
 def test_without_news_it_is_the_base() -> None:
@@ -74,8 +90,10 @@ def test_of_one_gaussian_it_is_another(base: TraversabilityMixture) -> None:
         torch.testing.assert_close(found, wanted, rtol=0, atol=1e-4)
 
 
-def test_its_density_is_the_slope_of_its_cdf_and_its_atoms_have_their_mass() -> None:
-    law, step = ConditionedDistribution(mixture(3, 0.1, 0.4), *posterior(0.5)), 1e-5
+@pytest.mark.parametrize("skew", [0.0, -0.7, 0.5])
+def test_its_density_is_the_slope_of_its_cdf_and_its_atoms_have_their_mass(skew: float) -> None:
+    known = *posterior(0.5), torch.full(SHAPE, skew, dtype=torch.float64)
+    law, step = ConditionedDistribution(mixture(3, 0.1, 0.4), *known), 1e-5
     for value in (0.05, 0.4, 0.9):
         slope = (law.cdf(value + step) - law.cdf(value - step)) / (2 * step)
         found = law.log_prob(torch.full(SHAPE, value, dtype=torch.float64)).exp()

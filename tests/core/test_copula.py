@@ -39,6 +39,32 @@ def test_the_correlation_is_the_bell_of_the_distance(length: float) -> None:
         assert found == pytest.approx(np.exp(-(down**2 + across**2) / (2 * length**2)), abs=0.03)
 
 
+@pytest.mark.parametrize("length", [1.0, 2.0, 4.0, 6.0])
+def test_a_matern_field_has_its_correlation_and_that_of_the_bell_at_the_length(length: float) -> None:
+    field = correlated_normal(KEY, np.arange(DRAWS), (24, 30), length, "matern32")
+    for row, column in ((0, 0), (23, 29), (12, 7)):
+        assert stats.kstest(field[:, row, column], "norm").pvalue > 1e-3
+    for down, across in ((0, 1), (1, 0), (2, 0), (0, 3), (3, 4), (0, 6), (6, 0), (0, 12), (23, 0), (23, 29)):
+        found = (field[:, : 24 - down, : 30 - across] * field[:, down:, across:]).mean()
+        away = np.hypot(down, across) / length
+        expected = (1 + 1.357677 * away) * np.exp(-1.357677 * away)
+        assert found == pytest.approx(expected, abs=0.035)
+        if away == 1:
+            assert found == pytest.approx(np.exp(-0.5), abs=0.035)
+
+
+def test_the_kernel_is_the_bell_when_none_is_named_and_filters_the_same_white_noise() -> None:
+    given = KEY, np.arange(3), (12, 14)
+    one, named, other = (
+        correlated_normal(*given, 2.0, *kernel) for kernel in ((), ("gaussian",), ("matern32",))
+    )
+    np.testing.assert_array_equal(one, named)
+    assert 0.8 < np.corrcoef(one.ravel(), other.ravel())[0, 1] < 0.99
+    # It is rougher: it bends more from cell to cell.
+    assert np.diff(other, 2).std() > 1.4 * np.diff(one, 2).std()
+    np.testing.assert_array_equal(correlated_normal(*given, 0.0, "matern32"), correlated_normal(*given, 0.0))
+
+
 def test_at_length_zero_every_cell_is_for_itself() -> None:
     field = correlated_normal(KEY, np.arange(400), (12, 14), 0.0)
     for down, across in ((0, 1), (1, 0), (1, 1)):

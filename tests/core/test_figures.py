@@ -19,7 +19,6 @@ from benchnav.core.figures import (
     hatching,
     layer_scale,
     line_style,
-    outline,
     planner_colours,
     planner_name,
     risk_name,
@@ -27,6 +26,7 @@ from benchnav.core.figures import (
     save_twice,
     styled,
 )
+from benchnav.core.grid import outline
 from benchnav.core.registry import find, names
 
 

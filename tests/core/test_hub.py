@@ -186,6 +186,7 @@ def test_a_checkpoint_is_downloaded_and_what_is_here_goes_first(
 
     folder = Path(call())
     assert folder.name == COMMIT
+    assert (folder / "ground.json").read_bytes() == (shipped / "ground.json").read_bytes()
     code = code.replace("@main", f"@{COMMIT}")
     (folder / "gp.safetensors").unlink()  # as a download leaves it that was cut short
     shutil.rmtree(folder.parents[1] / "trees")  # of what there is, which not every version keeps

@@ -355,6 +355,24 @@ def test_complete_fills_in_defaults_as_plain_data_so_that_like_parts_are_alike(f
     )
 
 
+def test_options_that_came_later_are_left_out_at_their_default(tmp_path: Path) -> None:
+    path = tmp_path / "later.py"
+    path.write_text(
+        "from dataclasses import dataclass\n\n@dataclass\nclass Config:\n    added = ('extra',)\n"
+        "    first: float = 1.0\n    extra: float = 2.0\n\nclass Planner:\n"
+        "    def __init__(self, config: Config):\n        self.config = config\n\n"
+        "class Plain:\n    added = ('extra',)\n    def __init__(self, extra: int = 3): ...\n"
+    )
+
+    def options(name: str, **given: object) -> object:
+        return complete("planner", read_part("planner", {"part": f"{path}:{name}", "options": given})).options
+
+    assert options("Planner") == options("Planner", extra=2) == {"first": 1.0}
+    assert options("Planner", extra=2.5) == {"first": 1.0, "extra": 2.5}
+    assert options("Plain", extra=3) == {}
+    assert options("Plain", extra=4) == {"extra": 4}
+
+
 @pytest.mark.parametrize(
     ("name", "options", "expected"),
     [

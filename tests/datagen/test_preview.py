@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from benchnav.core.errors import DatasetError
-from benchnav.core.figures import TWO_COLUMNS_IN, hatching, outline, save
+from benchnav.core.figures import TWO_COLUMNS_IN, hatching, save
+from benchnav.core.grid import outline
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.preview import (
     FIELDS,

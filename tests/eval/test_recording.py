@@ -1,3 +1,4 @@
+import json
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -8,9 +9,11 @@ import torch
 from benchnav.core.errors import ConfigError
 from benchnav.eval.recording import (
     DrawnPlan,
+    KnownMap,
     Recording,
     drawing_interval,
     drawn_plan,
+    reach_outline,
     read_recordings,
     thinned,
 )
@@ -81,7 +84,7 @@ def test_a_recording_comes_back_as_it_was(recording: Recording, tmp_path: Path) 
         if isinstance(before, np.ndarray):
             assert before.dtype == after.dtype
             np.testing.assert_array_equal(after, before)
-        elif item.name != "plans":
+        elif item.name not in ("plans", "known"):
             assert after == before
     # The plan of figures is whole; the others are thinned, as the viewer is given them.
     moment = recording.plan.step
@@ -180,3 +183,90 @@ def test_layers_are_kept_in_the_file(tmp_path: Path) -> None:
     with np.load(tmp_path / "b.npz") as stored:
         assert not any("layers" in name for name in stored)  # as before there were any
     assert Recording.load(tmp_path / "b.npz").layers == {}
+
+
+def test_what_was_known_comes_back_within_a_level(tmp_path: Path) -> None:
+    recording = made.learning_recording(60)
+    first, *others = recording.known
+    # Masks and numbers that go both ways, and maps without an outline.
+    flipped = replace(first, step=61, seen=~first.seen, mean=1 - first.mean, outline=np.empty((0, 2)))
+    recording = replace(recording, known=(first, *others, flipped, replace(first, step=62)))
+    recording.save(tmp_path / "a.npz")
+    again = Recording.load(tmp_path / "a.npz")
+    assert len(again.known) == len(recording.known) == 15
+    for before, after in zip(recording.known, again.known, strict=True):
+        assert after.step == before.step
+        for name in ("free", "seen", "sensed"):
+            assert getattr(after, name).dtype == bool
+            np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+        for name in ("predicted", "mean", "spread"):
+            np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=0.5 / 255 + 1e-6)
+        np.testing.assert_array_equal(after.outline, before.outline)
+    # Stored again it stays as it is.
+    again.save(tmp_path / "b.npz")
+    for one, other in zip(again.known, Recording.load(tmp_path / "b.npz").known, strict=True):
+        for item in fields(KnownMap):
+            np.testing.assert_array_equal(getattr(one, item.name), getattr(other, item.name))
+
+
+def test_files_without_it_are_as_before(tmp_path: Path) -> None:
+    made.recording(10).save(tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as stored:
+        assert not any("known" in name for name in (*stored, *json.loads(str(stored["scalars"]))))
+    assert Recording.load(tmp_path / "a.npz").known == ()
+
+
+def test_forty_seconds_of_learning_are_small(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    recording = made.recording(400, predicted=generator.random((64, 64)), free=np.ones((64, 64), bool))
+    recording.save(tmp_path / "without.npz")
+    numbers = {
+        name: generator.random((64, 64)).astype(np.float16) for name in ("predicted", "mean", "spread")
+    }
+    masks = {name: np.zeros((64, 64), bool) for name in ("free", "seen", "sensed")}
+    known = []
+    for place in range(80):
+        # Each update changes cells within 4 m, in all that is kept.
+        row, column = (range(max(0, middle - 8), middle + 8) for middle in (place * 48 // 80 + 8, 30))
+        cells = np.ix_(list(row), list(column))
+        for values in (numbers, masks):
+            for name, value in values.items():
+                values[name] = value.copy()
+                values[name][cells] = generator.random((len(row), len(column))) > (
+                    0.5 if values is masks else -1
+                )
+        for value in numbers.values():
+            value[cells] = generator.random((len(row), len(column)))
+        known.append(KnownMap(step=5 * place, **numbers, **masks, outline=reach_outline(masks["seen"], 0.5)))
+    replace(recording, known=tuple(known)).save(tmp_path / "with.npz")
+    sizes = [(tmp_path / f"{name}.npz").stat().st_size for name in ("with", "without")]
+    assert sizes[0] - sizes[1] < 400_000
+
+
+def test_what_is_known_holds_until_more_is() -> None:
+    recording = made.learning_recording(40)
+    for step in (0, 4, 5, 39, 40, 99):
+        known = recording.known_at(step)
+        assert known is recording.known[min(step, 40) // 5]
+        assert known is not None
+        predicted, free = recording.given_at(step)
+        assert predicted is known.predicted
+        assert free is known.free
+    later = replace(recording, known=recording.known[1:])
+    for unlearnt in (later.known_at(4), made.recording(40).known_at(4)):
+        assert unlearnt is None
+    assert later.given_at(4) == (later.predicted, later.free)
+
+
+def test_an_outline_goes_around_what_was_reached_line_by_line() -> None:
+    cells = np.zeros((6, 5), bool)
+    cells[2, 3] = True
+    (known, *_) = made.learning_recording(5).known
+    lines = replace(known, outline=reach_outline(cells, 0.5)).outlines
+    assert sorted(line.tolist() for line in lines) == [
+        [[1.5, 1.0], [1.5, 1.5]], [[1.5, 1.0], [2.0, 1.0]], [[1.5, 1.5], [2.0, 1.5]], [[2.0, 1.0], [2.0, 1.5]],
+    ]  # fmt: skip
+    whole = np.array([[0.0, 1], [1, 1], [2, 0]])
+    (line,) = replace(known, outline=whole).outlines
+    np.testing.assert_array_equal(line, whole)
+    assert not replace(known, outline=np.empty((0, 2))).outlines

@@ -10,10 +10,12 @@ import pytest
 import torch
 
 from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError
+from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.store import seal, unseal
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.ground import fit_ground
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models import checkpoint as module
 from benchnav.models.base import predict
@@ -41,6 +43,48 @@ def edit(folder: Path, **changes: object) -> None:
 
 def full(part: Part) -> Part:
     return replace(part, half_precision=False)
+
+
+def test_training_keeps_the_statistics_of_its_maps(folder: Path, dataset: TerrainDataset) -> None:
+    assert load_checkpoint(folder).ground == fit_ground(dataset)
+    assert GroundStatistics.from_json((folder / "ground.json").read_text()) == fit_ground(dataset)
+
+
+def test_statistics_of_the_ground_survive_a_copy_and_a_new_part(folder: Path, tmp_path: Path) -> None:
+    there = load_checkpoint(folder)
+    save_checkpoint(tmp_path / "again", there.with_part("gp", there.part("gp")))
+    assert load_checkpoint(shutil.copytree(tmp_path / "again", tmp_path / "moved")).ground == there.ground
+    save_checkpoint(folder, replace(there, ground=None))
+    assert not (folder / "ground.json").exists()
+    assert load_checkpoint(folder).ground is None
+
+
+@pytest.mark.parametrize("harm", ["edit", "drop", "swap"])
+def test_statistics_of_the_ground_are_covered_by_the_checkpoints_digest(folder: Path, harm: str) -> None:
+    path = folder / "ground.json"
+    if harm == "drop":
+        path.unlink()
+    elif harm == "edit":
+        path.write_text(path.read_text().replace('"potts_strength": 0.0', '"potts_strength": 1.0'))
+    else:
+        path.write_text("{}")
+    with pytest.raises(CheckpointError, match=r"ground\.json is damaged"):
+        load_checkpoint(folder)
+
+
+def test_a_checkpoint_of_before_may_have_statistics_put_beside_it(folder: Path) -> None:
+    config = unseal((folder / "config.json").read_text())
+    del config["ground"]
+    (folder / "config.json").write_text(seal(config))
+    text = (folder / "ground.json").read_text()
+    found = load_checkpoint(folder).ground
+    assert found is not None
+    assert found.to_json() == text
+    (folder / "ground.json").unlink()
+    assert load_checkpoint(folder).ground is None
+    (folder / "ground.json").write_text("{")
+    with pytest.raises(CheckpointError, match=r"ground\.json is damaged"):
+        load_checkpoint(folder)
 
 
 def test_a_round_trip_gives_equal_predictions(folder: Path, tmp_path: Path) -> None:

@@ -14,9 +14,10 @@ from benchnav.core import registry
 from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
+from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models import fused
-from benchnav.models.base import TraversabilityModel, predict
+from benchnav.models.base import TraversabilityModel, layers_of, predict
 from benchnav.models.checkpoint import Checkpoint, Part, digests_of, load_checkpoint, save_checkpoint
 from benchnav.models.config import MDNConfig
 from benchnav.models.fused import FusedModel
@@ -24,6 +25,7 @@ from benchnav.models.nets.mdn import MixtureDensityModel
 from benchnav.models.predictor import (
     Oracle,
     class_mismatch,
+    find_ground_statistics,
     load_model,
     open_checkpoint,
 )
@@ -287,6 +289,69 @@ def test_the_digests_of_a_checkpoint_change_with_its_files(checkpoint_path: Path
         file.write(b" ")
     after = digests_of(copy)
     assert {name for name in before if before[name] != after[name]} == {"gp.safetensors"}
+
+
+def test_statistics_of_the_ground_do_not_move_the_digests_of_a_checkpoint(
+    checkpoint_path: Path, tmp_path: Path
+) -> None:
+    copy = Path(shutil.copytree(checkpoint_path, tmp_path / "copy"))
+    (copy / "ground.json").unlink()
+    assert digests_of(copy) == digests_of(checkpoint_path)
+
+
+def test_statistics_of_the_ground_are_the_checkpoints_own_first(
+    checkpoint_path: Path, dataset: TerrainDataset, tmp_path: Path
+) -> None:
+    moved = TerrainDataset(shutil.copy(dataset.path, tmp_path / "d.h5"))
+    own = load_checkpoint(checkpoint_path).ground
+    assert own is not None
+    beside = replace(own, potts_strength=0.25)
+    (tmp_path / "d.ground.json").write_text(beside.to_json())
+    assert find_ground_statistics(str(checkpoint_path), moved) == own
+    assert find_ground_statistics({"part": "oracle"}, moved) == beside
+    assert find_ground_statistics("somewhere.py:Mine", moved) == beside
+    (tmp_path / "d.ground.json").unlink()
+    shipped = find_ground_statistics("ideal", moved)  # of tiny-v1, of more maps than these
+    assert shipped not in (own, beside)
+    assert shipped.layer_means["rgb"] == pytest.approx(own.layer_means["rgb"], rel=0.1)
+
+
+@pytest.mark.parametrize(("name", "pairs"), [("stakes-v1", 2), ("paper-v1", 0)])
+def test_shipped_checkpoints_bring_the_statistics_of_their_recipe(name: str, pairs: int) -> None:
+    dataset = TerrainDataset(find_dataset(f"{name}-test"))
+    found = find_ground_statistics(name, dataset)
+    assert found == find_ground_statistics("oracle", dataset)
+    assert len(found.look_alikes) == pairs
+    assert (found.potts_strength > 0) == bool(pairs)
+
+
+def test_missing_statistics_of_the_ground_are_refused_with_the_command_that_makes_them(
+    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved = TerrainDataset(shutil.copy(dataset.path, tmp_path / "d.h5"))
+    other = replace(dataset.recipe, occupancy=(*reversed(dataset.recipe.occupancy),))
+    monkeypatch.setattr(TerrainDataset, "recipe", other)
+    with pytest.raises(ConfigError, match=f"`benchnav-datagen ground {moved.path}`"):
+        find_ground_statistics("oracle", moved)
+    monkeypatch.setattr(TerrainDataset, "splits", {"test/std": {}})
+    with pytest.raises(
+        ConfigError, match=r"`benchnav-datagen ground TRAINING_DATA --out .*/d\.ground\.json`"
+    ):
+        find_ground_statistics("oracle", moved)
+
+
+def test_the_layer_seen_is_one_where_nothing_is_said_of_it() -> None:
+    observation = make_terrain(batch=2, size=8).observe()
+    given = layers_of(observation, ("rgb", "seen"))
+    assert given["seen"].dtype == torch.float32
+    assert torch.equal(given["seen"], torch.ones(2, 8, 8))
+    mask = (torch.arange(8) < 3).float().expand(2, 8, 8)
+    masked = replace(observation, layers={"seen": mask})
+    assert torch.equal(layers_of(masked, ("seen",))["seen"], mask)
+    assert set(layers_of(masked, ("rgb",))) == {"rgb"}
+    with pytest.raises(ConfigError) as refused:
+        layers_of(observation, ("vegetation_m",))
+    assert "seen" not in str(refused.value)
 
 
 def test_another_class_table_is_told_in_one_line(checkpoint_path: Path, dataset: TerrainDataset) -> None:

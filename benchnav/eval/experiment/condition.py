@@ -7,7 +7,7 @@ is run, and belong to the suite.
 
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -24,13 +24,21 @@ from benchnav.planning.free_space import Rules
 from benchnav.planning.problem import Task
 from benchnav.planning.world.world import World, read_world
 
-PART_KINDS = ("model", "risk", "planner", "robot", "objective")
+# What a robot knows of its map, whose defaults stand in no id: they are what there was before there were others.
+KNOWLEDGE: Mapping[str, Mapping[str, Any]] = {
+    "sensor": {"part": "full", "options": {}},
+    "ground": {"part": "contact", "options": {}},
+    "belief": {"part": "static", "options": {"correlated": True}},
+}
+PART_KINDS = ("model", "risk", "planner", "robot", "objective", *KNOWLEDGE)
 # Columns of `Condition.labels`, in the order of tables.
-LABELS = ("data", "scenario", "world", "robot", "objective", "model", "planner", "risk")
+LABELS = ("data", "scenario", "world", "robot", "objective", "model", *KNOWLEDGE, "planner", "risk")
 NOT_USED = "–"
-_ORDER = ("robot", "objective", "model", "risk", "planner")  # of tables
+# Labels of conditions of the versions that had no such column.
+LATER_LABELS = {"sensor": "full", "ground": NOT_USED, "belief": "static"}
+_ORDER = ("robot", "objective", "model", *KNOWLEDGE, "risk", "planner")  # of tables
 # What a product lists, by the names that a suite has for it.
-_LISTED = ("data", "scenarios", "models", "risks", "planners", "robots", "objectives", "world", "task")
+_LISTED = ("data", "scenarios", *(f"{kind}s" for kind in PART_KINDS), "world", "task")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +53,10 @@ class Condition:
         planner: plans.
         robot: F.
         objective: J.
-        rules: free space, least λ̂, goal radius.
+        sensor: what the robot sees of its map.
+        ground: what it senses of λ.
+        belief: what is made of that.
+        rules: free space, least λ̂, goal radius, and when what is known is updated.
         world: what λ does.
         world_label: what tables call rules and world.
         blind: the planner is blind; model and risk stand in for any.
@@ -58,6 +69,9 @@ class Condition:
     planner: Part
     robot: Part
     objective: Part
+    sensor: Part
+    ground: Part
+    belief: Part
     rules: Rules
     world: World
     world_label: str
@@ -71,12 +85,13 @@ class Condition:
     @property
     def value(self) -> dict[str, Any]:
         """All that bears on the condition's rows, as plain data; no labels."""
-        parts = {kind: getattr(self, kind) for kind in PART_KINDS}
+        given = {kind: getattr(self, kind) for kind in PART_KINDS}
+        parts = {kind: {"part": part.part, "options": dict(part.options)} for kind, part in given.items()}
         return {
             "data": self.data,
             "split": self.split,
-            **{kind: {"part": part.part, "options": dict(part.options)} for kind, part in parts.items()},
-            "rules": asdict(self.rules),
+            **{kind: part for kind, part in parts.items() if part != KNOWLEDGE.get(kind)},
+            "rules": self.rules.to_dict(),
             "world": self.world.to_dict(),
         }
 
@@ -90,7 +105,7 @@ class Condition:
         """What tables call it, by column."""
         parts = {kind: getattr(self, kind).label for kind in PART_KINDS}
         if self.blind:
-            parts |= {"model": NOT_USED, "risk": NOT_USED}
+            parts |= dict.fromkeys(("model", "risk", *KNOWLEDGE), NOT_USED)
         return {"data": self.data, "scenario": self.scenario, **parts, "world": self.world_label}
 
     @property
@@ -106,6 +121,15 @@ class Condition:
         )
         return Task(robot=robot, objective=objective, rules=self.rules)
 
+    @property
+    def learns(self) -> bool:
+        """Whether the robot learns anything on its way."""
+        return not self.make("sensor").sees_all or self.make("belief").learns
+
+    def make(self, kind: str) -> Any:
+        """Makes the part of a kind that needs nothing else to be made."""
+        return registry.make(kind, getattr(self, kind))
+
     def make_planner(self) -> Any:
         """Makes the planner."""
         return registry.make("planner", self.planner)
@@ -113,7 +137,7 @@ class Condition:
 
 def condition_from(about: Mapping[str, Any]) -> Condition:
     """Rebuilds a condition from its `value` and `labels`, as `run.json` holds them."""
-    value, labels = about["value"], about["labels"]
+    value, labels = {**KNOWLEDGE, **about["value"]}, {**LATER_LABELS, **about["labels"]}
     parts = {
         kind: Part(part=value[kind]["part"], label=labels[kind], options=value[kind]["options"])
         for kind in PART_KINDS
@@ -143,11 +167,11 @@ def conditions_of(suite: Suite, scenarios_of: Any) -> list[Condition]:
     for product in suite.conditions or ({},):
         here: set[str] = set()
         for condition in _product(_listed(suite, product), scenarios_of):
-            if condition.id in here and condition.risk.label != NOT_USED:
+            if condition.id in here:
                 words = " ".join(label_words(condition.labels))
                 raise ConfigError(f"Expected settings that differ, got {words} twice.")
             here.add(condition.id)
-            every.append(condition)
+            every.append(_as_run_once(condition))
     check_labels(every)
     return list({condition.id: condition for condition in every}.values())
 
@@ -165,7 +189,9 @@ def check_labels(conditions: Iterable[Condition]) -> None:
     labels: dict[tuple[str, str], str] = {}
     for condition in conditions:
         value = condition.value
-        described = {name: value[name] for name in PART_KINDS} | {"world": [value["world"], value["rules"]]}
+        described = {name: value.get(name) for name in PART_KINDS} | {
+            "world": [value["world"], value["rules"]]
+        }
         for name, about in described.items():
             label, digest = condition.labels[name], text_digest(about)
             if label == NOT_USED:
@@ -215,7 +241,7 @@ def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Con
                 data=data, scenario=scenario, rules=rules, world=world, world_label=label,
                 **dict(zip(_ORDER, chosen, strict=True)),
             )  # fmt: skip
-            yield _as_run_once(condition)
+            yield condition
 
 
 def is_checkpoint(kind: str, source: str) -> bool:
@@ -256,11 +282,16 @@ def _parts(kind: str, given: Any) -> list[Part]:
 def _as_run_once(condition: Condition) -> Condition:
     """One condition for every setting that would change nothing.
 
-    What a blind planner is given is not looked at; and of λ that is known every measure of risk is λ itself.
+    What a blind planner is given is not looked at; of λ that is known every measure of risk is λ itself, and nothing is
+    left to be learnt; and a belief that does not learn ignores what is sensed of the ground.
     """
     any_risk = Part(part="mean", label=NOT_USED)
+    unused = {kind: Part(label=NOT_USED, **default) for kind, default in KNOWLEDGE.items()}
     if condition.make_planner().blind:
-        return replace(condition, model=Part(part="oracle", label=NOT_USED), risk=any_risk, blind=True)
+        given: dict[str, Any] = {**unused, "model": Part(part="oracle", label=NOT_USED), "risk": any_risk}
+        return replace(condition, blind=True, **given)
+    if not condition.make("belief").learns:
+        condition = replace(condition, ground=unused["ground"])
     if condition.model.part != "clairvoyant":
         return condition
     if condition.world.noise == "resampled":
@@ -268,6 +299,8 @@ def _as_run_once(condition: Condition) -> Condition:
             f"Expected a world with λ that stays for the model 'clairvoyant', got {condition.world_label!r}, which "
             "resamples λ at each step. Take the world stakes, or `world.noise` frozen or stored."
         )
+    if condition.make("sensor").sees_all:
+        condition = replace(condition, ground=unused["ground"], belief=unused["belief"])
     return replace(condition, risk=any_risk)
 
 

@@ -1,7 +1,7 @@
 """Hypotheses that a suite fixes before its first unit is run: what they claim, and how they are read.
 
 A hypothesis compares two conditions by one metric: that they differ, or that one is not worse than the other by a
-margin, or that they are equal to within it. `benchnav.eval.stats.hypotheses` tests them.
+margin, or better by more than it, or that they are equal to within it. `benchnav.eval.stats.hypotheses` tests them.
 """
 
 import math
@@ -53,15 +53,15 @@ class Hypothesis:
         other: the condition that it is compared with, as well.
         metric: of `METRICS`.
         kind: what is claimed of the difference.
-        direction: of a difference, where `one` lies, or either way if empty; of non-inferiority, which way is better,
-            the metric's if empty.
-        margin: of non-inferiority and equivalence, in the metric's unit.
+        direction: of a difference, where `one` lies, or either way if empty; of non-inferiority and superiority, which
+            way is better, the metric's if empty.
+        margin: of all but a difference, in the metric's unit.
     """
 
     one: Any
     other: Any
     metric: Literal["success", "T_total", "score", "traversability", "path_length"]
-    kind: Literal["difference", "non-inferiority", "equivalence"] = "difference"
+    kind: Literal["difference", "non-inferiority", "superiority", "equivalence"] = "difference"
     direction: Literal["", "higher", "lower"] = ""
     margin: float = 0.0
 
@@ -74,6 +74,8 @@ class Hypothesis:
         if self.kind == "non-inferiority":
             worse = "lower" if self.direction == "higher" else "higher"
             return f"{metric.name} of {one} is less than {margin} {worse} than that of {other}"
+        if self.kind == "superiority":
+            return f"{metric.name} of {one} is more than {margin} {self.direction} than that of {other}"
         if self.direction:
             return f"{metric.name} of {one} is {self.direction} than that of {other}"
         return f"{metric.name} of {one} differs from that of {other}"
@@ -128,7 +130,7 @@ def _read(given: Mapping[str, Any], where: str, conditions: Sequence[Condition])
         )
     if kind == "equivalence" and asked.direction:
         raise ConfigError(f"Expected no `direction` of {where}, an equivalence, got {asked.direction!r}.")
-    if kind == "non-inferiority" and not asked.direction:
+    if kind in ("non-inferiority", "superiority") and not asked.direction:
         asked = replace(asked, direction=metric.better)
     one, ones = _named(asked.one, "one", where, conditions)
     other, others = _named(asked.other, "other", where, conditions)

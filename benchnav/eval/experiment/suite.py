@@ -33,11 +33,14 @@ class Suite:
         risks: Risk settings, such as `mean` or `cvar:0.9`.
         robots: Robots F.
         objectives: Objectives J.
+        sensors: What a robot sees of its map: `full`, all before it sets out, or `near`.
+        grounds: What it senses of λ: `contact`, under it, or `probe`, near it.
+        beliefs: What is made of that: `static`, nothing, or `copula` or `classes`.
         world: What λ does: a preset by name, paper or stakes, or {preset: NAME, noise: resampled | stored |
-            frozen, correlation_m: 1.5, immobile: {below: 0.1, for_s: 2}, time_budget_s: T or
-            time_budget_ratio: T over the map's reference time}; or a list of several.
+            frozen, correlation_m: 1.5, kernel: gaussian | matern32, immobile: {below: 0.1, for_s: 2},
+            time_budget_s: T or time_budget_ratio: T over the map's reference time}; or a list of several.
         task: Changes to the preset's rules: {free_space: {by: risk | mean, above: 0.3}, min_traversability: 0.3,
-            goal_radius_m: 1.0}.
+            goal_radius_m: 1.0, unseen: prior | optimistic | pessimistic, replan_every_s: 0.5}.
         maps: Maps of each scenario, the first of its split; 0 takes all.
         seed: Root seed of all draws.
         seeds: Several root seeds in place of `seed`.
@@ -47,7 +50,8 @@ class Suite:
         conditions: Several products: mappings of the keys above. A key that a mapping lacks has its value above.
         hypotheses: Hypotheses, fixed before the first unit is run: mappings of `one` and `other`, conditions by
             their labels, such as {planner: mppi, risk: mean}; `metric`: success, T_total, score, traversability or
-            path_length; `kind`: difference, non-inferiority or equivalence; `direction`: higher or lower; `margin`.
+            path_length; `kind`: difference, non-inferiority, superiority or equivalence; `direction`: higher or lower;
+            `margin`.
     """
 
     data: str = "paper-v1"
@@ -58,6 +62,9 @@ class Suite:
     risks: tuple[PartSpec, ...] = ("cvar", "var", "mean")
     robots: tuple[PartSpec, ...] = ("unicycle",)
     objectives: tuple[PartSpec, ...] = ("goal_distance",)
+    sensors: tuple[PartSpec, ...] = ("full",)
+    grounds: tuple[PartSpec, ...] = ("contact",)
+    beliefs: tuple[PartSpec, ...] = ("static",)
     world: tuple[PartSpec, ...] | PartSpec = "paper"
     task: dict[str, Any] = field(default_factory=dict)
     maps: int = 20
@@ -70,7 +77,7 @@ class Suite:
 
     def __post_init__(self) -> None:
         """Refuses suites with nothing in them."""
-        for name in ("planners", "risks", "robots", "objectives", "world"):
+        for name in ("planners", "risks", "robots", "objectives", "sensors", "grounds", "beliefs", "world"):
             if not getattr(self, name):
                 raise ConfigError(f"Expected one or more `{name}`, got none.")
         if self.maps < 0:
@@ -105,6 +112,9 @@ class Labels:
         model: Models.
         robot: Robots.
         objective: Objectives.
+        sensor: Sensors of appearance.
+        ground: Sensors of λ.
+        belief: Beliefs.
         world: Worlds.
         data: Datasets.
     """
@@ -115,6 +125,9 @@ class Labels:
     model: tuple[str, ...] = ()
     robot: tuple[str, ...] = ()
     objective: tuple[str, ...] = ()
+    sensor: tuple[str, ...] = ()
+    ground: tuple[str, ...] = ()
+    belief: tuple[str, ...] = ()
     world: tuple[str, ...] = ()
     data: tuple[str, ...] = ()
 

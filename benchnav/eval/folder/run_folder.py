@@ -23,7 +23,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.settings import one_line
 from benchnav.core.sources import digest_of_path
 from benchnav.core.store import Shard, replacing, seal, unseal, write_text
-from benchnav.eval.experiment.condition import Condition, condition_from
+from benchnav.eval.experiment.condition import LATER_LABELS, Condition, condition_from
 from benchnav.eval.experiment.suite import RECORDS
 from benchnav.eval.experiment.unit import DRAW, Extent, Unit
 from benchnav.eval.folder.provenance import Origin, code_digest
@@ -140,7 +140,7 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
     with damaged(path, "Remove it and give the run's command again."):
         if run.about.get("tables", {}).get(name) != digest_of_path(path):
             raise DamageError("it was changed after benchnav wrote it")
-        return pd.read_parquet(path)
+        return _with_all_labels(pd.read_parquet(path))
 
 
 @contextmanager
@@ -276,7 +276,17 @@ def write_errors(folder: Path, finished: Iterable[tuple[Unit, Finished]]) -> Non
 
 def unit_rows(finished: Finished) -> pd.DataFrame:
     """Reads the rows of a finished unit."""
-    return pq.read_table(finished.path, partitioning=None).to_pandas()
+    return _with_all_labels(pq.read_table(finished.path, partitioning=None).to_pandas())
+
+
+def _with_all_labels(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows with the labels that the version which made them did not have."""
+    if "model" not in rows or set(LATER_LABELS) <= set(rows):
+        return rows
+    place = rows.columns.get_loc("model")
+    for after, (name, label) in enumerate(LATER_LABELS.items(), start=1):
+        rows.insert(place + after, name, label)
+    return rows
 
 
 def differences(first: pd.DataFrame, second: pd.DataFrame) -> tuple[pd.DataFrame, pd.Index]:
@@ -306,7 +316,8 @@ def differing_columns(first: pd.DataFrame, second: pd.DataFrame) -> list[str]:
 
 def _results(rows: pd.DataFrame) -> set[str]:
     """Columns of results: no wall times, and not the digest of the code."""
-    return {name for name in rows if name not in (*KEYS, "code") and not name.startswith("planning_")}
+    others = (*KEYS, "code", "learning_ms")
+    return {name for name in rows if name not in others and not name.startswith("planning_")}
 
 
 def _trace(unit: Unit, finished: Finished, folder: Path) -> str:

@@ -26,6 +26,9 @@ from benchnav.eval.folder.run_folder import DamageError, damaged, metadata, open
 STEPS = "steps"
 
 LAST_COLUMN = "traversability"
+# RMSE of E[λ] and mean log score of what is believed of the ground ahead of a robot.
+AHEAD_COLUMNS = ("ahead_rmse", "ahead_log_score")
+AHEAD_M, AHEAD_DEG = 5.0, 45.0  # how far, and how far to either side, ground is ahead of a robot
 _KEYS = ("seed", "realisation", "map")
 _VALUES = ("time_s", "x_m", "y_m", LAST_COLUMN)
 _ORDER = ["condition", *_KEYS, "step"]

@@ -17,9 +17,10 @@ from benchnav.eval.stats.comparison import ALPHA
 _TESTS = {
     "difference": "sign-flip test by {unit} (difference)",
     "non-inferiority": "one-sided test at the margin (non-inferiority)",
+    "superiority": "one-sided test at the margin (superiority)",
     "equivalence": "two one-sided tests (TOST) at the margin (equivalence)",
 }
-_OF_MARGINS = {"equivalence": "equivalent", "non-inferiority": "not inferior"}
+_OF_MARGINS = {"equivalence": "equivalent", "non-inferiority": "not inferior", "superiority": "superior"}
 
 
 def hypothesis_findings(tests: pd.DataFrame, about: Mapping[str, Any], unit: str) -> dict[str, list[str]]:

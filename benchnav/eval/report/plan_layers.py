@@ -14,16 +14,23 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, withStroke
 from matplotlib.transforms import ScaledTranslation
 
-from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, bytes_of, hatching, layer_scale, outline
-from benchnav.core.grid import is_azimuth
+from benchnav.core.figures import MARKS, ROBOT, SKY, TRAVERSABILITY_COLOURS, bytes_of, hatching, layer_scale
+from benchnav.core.grid import is_azimuth, outline
+from benchnav.eval.recording import KnownMap
 
 # Dark red lies far from all colours of λ, for the colour-blind too.
 IMMOBILISING = "#a00000"
 SOFT = "white"
 CLOSED = "0.25"  # ground that is not free
+UNSEEN, VEIL = "0.6", 0.55  # what lies over ground that was not seen, and its opacity
+REACH = ROBOT  # how far its sensors reach
+SPREAD_COLOURS = "magma"  # what is known is dark
+MOST_SPREAD = 0.5  # of what lies in [0, 1]
+_SEEN, _SENSED = "0.9", SKY
 # Which of `MARKS` stands where an episode ended, by its outcome; `failed` for all others.
 _END_MARKS = {
     "success": "arrived",
@@ -171,9 +178,9 @@ def draw_soft(panel: Axes, soft: np.ndarray, resolution_m: float) -> None:
         panel.add_collection(drawn)
 
 
-def shades(values: np.ndarray) -> np.ndarray:
-    """Colours of λ, uint8, from any shape to [..., 3]."""
-    return np.round(255 * matplotlib.colormaps[TRAVERSABILITY_COLOURS](values)[..., :3]).astype(np.uint8)
+def shades(values: np.ndarray, colours: str = TRAVERSABILITY_COLOURS) -> np.ndarray:
+    """Colours of λ, or of what else lies in [0, 1], uint8, from any shape to [..., 3]."""
+    return np.round(255 * matplotlib.colormaps[colours](values)[..., :3]).astype(np.uint8)
 
 
 def layer_colours(name: str, layer: np.ndarray) -> np.ndarray:
@@ -189,6 +196,43 @@ def predicted_colours(predicted: np.ndarray, free: np.ndarray) -> np.ndarray:
     colours = shades(predicted)
     colours[~free] = bytes_of(CLOSED)[:3]
     return colours
+
+
+def unseen_layer(seen: np.ndarray, resolution_m: float, scale: float = 1.0) -> LineCollection:
+    """Hatching of ground that was not seen, that can be put on a map, so many times as wide as printed."""
+    return LineCollection(list(hatching(~seen, resolution_m)), colors="black", linewidths=0.3 * scale)
+
+
+def unseen_handle() -> Patch:
+    """The entry of a legend for ground that was not seen."""
+    return Patch(fc=UNSEEN, ec="black", hatch="////", lw=0, label="not seen")
+
+
+def reach_line(reach: np.ndarray, scale: float = 1.0, label: str = "_reach") -> Line2D:
+    """How far sensors reach, from `KnownMap.outline`, that can be put on a map, so many times as wide as printed."""
+    edge = [withStroke(linewidth=1.8 * scale, foreground="black"), Normal()]
+    # One line with gaps, so that no piece has its edge on another.
+    return Line2D(*reach.T, color=REACH, lw=0.9 * scale, path_effects=edge, label=label, zorder=2.2)
+
+
+def known_colours(known: KnownMap) -> dict[str, np.ndarray]:
+    """Colours of what was known, under a veil where the ground was not seen; as `field_colours` does.
+
+    Returns:
+        `risk`, λ̂ with what is not free; `mean` and `spread` of the belief; and `seen`, light where the ground was seen
+        and blue where λ was sensed.
+    """
+    veil, seen = np.array(bytes_of(UNSEEN)[:3]), known.seen[..., None]
+    maps = {
+        "risk": predicted_colours(known.predicted, known.free),
+        "mean": shades(known.mean),
+        "spread": shades(known.spread / MOST_SPREAD, SPREAD_COLOURS),
+    }
+    for name, colours in maps.items():
+        maps[name] = np.where(seen, colours, (1 - VEIL) * colours + VEIL * veil).round().astype(np.uint8)
+    palette = np.array([bytes_of(colour)[:3] for colour in (UNSEEN, _SEEN, _SENSED)], np.uint8)
+    # A cell may be sensed that was not seen.
+    return maps | {"seen": palette[np.where(known.sensed, 2, known.seen.astype(int))]}
 
 
 def field_colours(field: np.ndarray, immobilising: np.ndarray) -> np.ndarray:

@@ -19,10 +19,10 @@ from benchnav.eval.report.words import (
     failures_in_words,
     maps_in_words,
     mean_and_std,
+    naming_labels,
     p_value,
     rate_in_words,
     reading_name,
-    several_models,
     short,
     signed,
     signed_interval,
@@ -45,6 +45,9 @@ _COLUMNS = {
     "robot": "motion model of the robot.",
     "objective": "cost J that planners minimise.",
     "model": "predictor of λ; the privileged models ideal, oracle and clairvoyant are given part of the truth.",
+    "sensor": "what a robot sees of its map.",
+    "ground": "what a robot senses of λ on its way.",
+    "belief": "what is made of what is sensed.",
     "planner": "motion planner.",
     "risk": "risk setting, which turns the predicted distribution of λ into λ̂, the one number a planner is given.",
     "groups": "number of groups of maps; the group is the statistical unit.",
@@ -66,6 +69,16 @@ _COLUMNS = {
 _TIMES = {ALONE: "latency_median_ms", IN_BATCH: "planning_ms_median"}
 _RESULTS = ("Succ. [%]", "95 % interval", "T_total [s]", "T if success [s]", "λ̄ [%]")
 _PAPER = ("Succ. [%]", "T_total [s]", "λ̄ [%]")
+_LEARNT = {
+    "cells seen": "cells whose appearance a robot saw, mean over episodes.",
+    "cells sensed": "cells whose λ it sensed, mean over episodes.",
+    "revisions": "how often its planner was given another map, mean over episodes.",
+    "RMSE ahead": "root mean square error of the believed E[λ] over the cells ahead of the robot of which λ was not "
+    "sensed, mean over updates and episodes.",
+    "log score ahead": "mean log score of the belief over these cells, at least −10 a cell; higher is better.",
+    "belief [ms]": "time of a step for sensing and belief, of a batch divided by its episodes.",
+    "planning [ms]": "time of a step for planning, likewise: median over steps.",
+}
 _MOST_ACROSS = 3
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -111,6 +124,35 @@ def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, An
     )
 
 
+def learning_table(summary: pd.DataFrame) -> Table | None:
+    """What the robots of each condition learnt on their way; None where none learnt.
+
+    Args:
+        summary: from `summary.summarise`.
+    """
+    learnt = summary[summary["revisions_mean"].notna()]
+    if learnt.empty:
+        return None
+    labels = [name for name in LABELS if name in (*_ALWAYS, "ground", "belief") or differ(summary[name])]
+    rows = [
+        (
+            *(reading_name(name, str(row[name])) for name in labels),
+            *(f"{row[f'{name}_mean']:.0f}" for name in ("seen_cells", "sensed_cells", "revisions")),
+            *(f"{row[f'{name}_mean']:.3f}" for name in ("ahead_rmse", "ahead_log_score")),
+            *(_times(row[name]) for name in ("learning_ms_mean", "planning_ms_median")),
+        )
+        for row in learnt.to_dict("records")
+    ]
+    explained = {name: _COLUMNS[name] for name in labels} | _LEARNT
+    return Table(
+        headings=tuple(explained),
+        labels=len(labels),
+        rows=tuple(rows),
+        explained=tuple(explained.items()),
+        title="What robots learnt on their way",
+    )
+
+
 def paper_table(summary: pd.DataFrame, label: str) -> str:
     """Writes a complete LaTeX table, settings down and blocks across, each with success, T_total and λ̄.
 
@@ -128,7 +170,7 @@ def paper_table(summary: pd.DataFrame, label: str) -> str:
         f"failure counted as the time budget T; and mean observed traversability λ̄. ± is the standard deviation over "
         f"episodes.{note}"
     )
-    several = several_models(summary)
+    several = naming_labels(summary)
     tables = [_across(known[i : i + _MOST_ACROSS], several) for i in range(0, len(known), _MOST_ACROSS)]
     return to_latex(tables, caption, label, wide=len(known) > 1, size="footnotesize")
 
@@ -211,7 +253,7 @@ def _times(*values: float) -> str:
     if np.isnan(values[0]):
         return NOT_USED
     first, *rest = (np.format_float_positional(value, 2, fractional=False, trim="-") for value in values)
-    return f"{first} ({', '.join(rest)})"
+    return f"{first} ({', '.join(rest)})" if rest else first
 
 
 def _notes(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[str]]:

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from benchnav.core.figures import planner_name, risk_name
-from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.stats.best import BLOCK
 from benchnav.planning.world.outcome import FAILURES
 
@@ -17,7 +17,7 @@ FAILURE_COUNTS = {
 }
 _READ = {"planner": planner_name, "risk": risk_name}
 # Labels that tell conditions of one map apart.
-NAMING = ("planner", "risk", "model", "robot", "objective", "world")
+NAMING = ("planner", "risk", "model", *KNOWLEDGE, "robot", "objective", "world")
 
 
 def differ(labels: Iterable[str]) -> bool:
@@ -41,9 +41,9 @@ def reading_names(labels: str) -> str:
     return ", ".join(planner_name(risk_name(label)) for label in labels.split(", "))
 
 
-def several_models(summary: pd.DataFrame) -> list[str]:
-    """The label that names a condition beside planner and risk: its model, where those that look at one differ."""
-    return ["model"] if differ(summary["model"]) else []
+def naming_labels(summary: pd.DataFrame) -> list[str]:
+    """The labels that name a condition beside planner and risk: model and what robots know, where these differ."""
+    return [name for name in ("model", *KNOWLEDGE) if differ(summary[name])]
 
 
 def blocks(summary: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
@@ -57,9 +57,9 @@ def condition_name(labels: Mapping[str, Any], several: Collection[str] = ()) -> 
 
     Args:
         labels: of the condition; what it does not use is `NOT_USED`.
-        several: labels that differ among the conditions shown, of `model` and `world`.
+        several: labels that differ among the conditions shown, of `model`, `world` and what robots know.
     """
-    beside = [labels[name] for name in ("model", "world") if name in several]
+    beside = [labels[name] for name in ("model", *KNOWLEDGE, "world") if name in several]
     # A planner that is given λ itself has a model and no risk setting; a blind one has neither.
     if labels["risk"] == NOT_USED and "model" not in several:
         beside.insert(0, labels["model"])
@@ -68,7 +68,7 @@ def condition_name(labels: Mapping[str, Any], several: Collection[str] = ()) -> 
 
 def with_names(summary: pd.DataFrame) -> pd.DataFrame:
     """Rows of conditions with the `name` of each among them."""
-    several = several_models(summary)
+    several = naming_labels(summary)
     return summary.assign(name=[condition_name(row, several) for row in summary.to_dict("records")])
 
 

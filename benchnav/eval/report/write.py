@@ -27,6 +27,7 @@ from benchnav.eval.report.charts.conditions import (
     outcome_figure,
     success_figure,
 )
+from benchnav.eval.report.charts.knowledge import draw_knowledge
 from benchnav.eval.report.charts.maps import (
     MOST_PANELS,
     choose_recordings,
@@ -39,7 +40,7 @@ from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_
 from benchnav.eval.report.failures import RecordDriven, Sheets, collect_sheets, failures_table
 from benchnav.eval.report.findings import findings
 from benchnav.eval.report.hypotheses import hypothesis_findings, hypothesis_table
-from benchnav.eval.report.result_tables import LATENCIES, paper_table, result_table
+from benchnav.eval.report.result_tables import LATENCIES, learning_table, paper_table, result_table
 from benchnav.eval.report.words import NOT_USED, joined, maps_in_words, unit_of_statistics
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
@@ -81,6 +82,11 @@ class Report:
     failures: pd.DataFrame
     sheets: Sheets
     about: Mapping[str, Any]
+
+    @property
+    def learning(self) -> Table | None:
+        """What robots learnt on their way; None where none learnt."""
+        return learning_table(self.summary)
 
     @property
     def hypotheses(self) -> Table:
@@ -166,7 +172,7 @@ def write_report(folder: Path, record_driven: RecordDriven | None = None, out: P
     for name, caption, figure in _figures(folder, report, record_driven):
         path = out / "figures" / f"{name}.png"
         # These are as wide as their maps: white borders are cut away.
-        save_twice(figure, path, trim=name in ("trajectories", "driven"))
+        save_twice(figure, path, trim=name.partition("-")[0] in ("trajectories", "driven", "knowledge"))
         figures[path] = caption
     for file in ("summary.md", PAGE):
         write_text(out / file, render(file, report, figures))
@@ -177,15 +183,19 @@ def print_report(report: Report) -> None:
     """Prints what a run says and its table, as wide as the terminal, or unbroken where none is."""
     print("\n".join(report.header))
     print_table(report.table)
+    if report.learning:
+        print_table(report.learning)
     said = [line for title, lines in report.findings.items() for line in (f"{title}:", *lines)]
     print("\n".join([*report.warnings, *said]))
 
 
-Drawn = Iterator[tuple[str, str, Figure]]  # name, caption and figure
+def _figures(
+    folder: Path, report: Report, record_driven: RecordDriven | None
+) -> Iterator[tuple[str, str, Figure]]:
+    """Gives name, caption and figure of all that is drawn of a run.
 
-
-def _figures(folder: Path, report: Report, record_driven: RecordDriven | None) -> Drawn:
-    """All that is drawn of a run; first what it was to show, how often, and on which map it is seen best."""
+    First is what it was to show, how often, and on which map it is seen best.
+    """
     summary, sheets = report.summary, report.sheets.shown
     if not report.tests.empty:
         yield (
@@ -224,6 +234,7 @@ def _figures(folder: Path, report: Report, record_driven: RecordDriven | None) -
             failure_figure(sheet),
         )
     recorded = read_recordings(folder)
+    yield from draw_knowledge(folder, report.episodes, summary, recorded)
     if driven and (chosen := _on_one_map(driven[1], recorded, record_driven)):
         caption = _trajectories_in_words(chosen) + _chosen_in_words(len(chosen), len(driven[1]))
         yield "trajectories", caption, trajectory_figure(chosen)
@@ -335,6 +346,7 @@ def _world(value: Mapping[str, Any]) -> str:
     words = [f"λ {world['noise']}"]
     if "correlation_m" in world:
         words[0] += f", correlated over {world['correlation_m']:g} m"
+        words[0] += " (Matérn-3/2)" if world.get("kernel") == "matern32" else ""
     if "immobile" in world:
         held = world["immobile"]
         words.append(f"λ below {held['below']:g} for {held['for_s']:g} s immobilises the robot")

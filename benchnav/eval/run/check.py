@@ -146,7 +146,9 @@ def build_each(conditions: Iterable[Condition], seed: int, maps: int) -> list[st
             noise = noise_key(seed, condition.split, 0)
             Simulation(first.terrain, task, world, first.places, noise, [0])
             warnings += _late(condition, task, dataset, maps)
-        if not condition.blind and is_new("model", condition.model, condition.data, condition.risk.part):
+        if not condition.blind and is_new(
+            "model", condition.model, condition.data, condition.risk.part, condition.belief, condition.sensor
+        ):
             warnings += _check_model(condition, dataset)
     return warnings
 
@@ -237,6 +239,11 @@ def _check_model(condition: Condition, dataset: TerrainDataset) -> list[str]:
     part = condition.model.part
     model: Any = load_model(condition.model)
     knows_classes = bool(model.class_names) or isinstance(model, PrivilegedModel)
+    if condition.risk.part == "single-class" and condition.make("belief").learns:
+        raise ConfigError(
+            "Expected a belief that does not learn for the risk setting 'single-class', got "
+            f"{condition.belief.label!r}: what is learnt of λ is of no class. Take the belief static."
+        )
     if condition.risk.part == "single-class" and not knows_classes:
         raise ConfigError(
             f"Expected a model that predicts classes for the risk setting 'single-class', got "

@@ -112,6 +112,7 @@ def _serve(connection: Connection, condition: Condition) -> None:
             call, *arguments = pickle.loads(message)
             if call == "start":
                 condition.make_task()
+                condition.make("belief")  # whose state a problem holds
                 planner, answer = condition.make_planner(), None
             elif call == "init":
                 problem, seed, state = arguments

@@ -1,7 +1,8 @@
 """How long a planner takes for one step of one robot, which a batch does not tell.
 
-Of each planner, robot and objective of a run one episode is run alone on one thread, without its end: its first step
-prepares and perhaps compiles, and is not counted; each later one is, with whatever the planner plans anew in it.
+Of each planner, robot, objective and way of learning of a run one episode is run alone on one thread, without its end:
+its first step prepares and perhaps compiles, and is not counted; each later one is, with whatever the planner plans
+anew in it.
 """
 
 import time
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchnav.eval.experiment.condition import Condition
+from benchnav.eval.experiment.condition import KNOWLEDGE, Condition
 from benchnav.eval.experiment.unit import Extent, Unit
 from benchnav.eval.folder.run_folder import open_run, write_run
 from benchnav.eval.run.unit import Settings, build, one_thread, simulate
@@ -25,7 +26,8 @@ def measure_latencies(folder: Path, chosen: Collection[str], settings: Settings)
     """Measures the planners of some conditions and writes it into `run.json`, where it is not there yet.
 
     What is written by condition: `median_ms`, `p95_ms` and `max_ms` over `steps` steps. Conditions of one planner,
-    robot and objective share one measurement, on the first map of the first of them. A planner that fails has none.
+    robot, objective and way of learning share one measurement, on the first map of the first of them. A planner that
+    fails has none.
 
     Args:
         folder: the run folder.
@@ -48,7 +50,7 @@ def measure_latencies(folder: Path, chosen: Collection[str], settings: Settings)
 
 
 def _key(entry: Mapping[str, Any]) -> str:
-    return repr([entry["value"][name] for name in ("planner", "robot", "objective")])
+    return repr([entry["value"].get(name) for name in ("planner", "robot", "objective", *KNOWLEDGE)])
 
 
 def _measure(condition: Condition, extent: Extent, settings: Settings) -> dict[str, Any] | None:
@@ -63,8 +65,8 @@ def _measure(condition: Condition, extent: Extent, settings: Settings) -> dict[s
 
     with one_thread():
         try:
-            problem, simulation = build(unit, settings.origins().of(unit), torch.device(settings.device))
-            episodes, _ = simulate(unit, problem, simulation, settings, enough=enough)
+            built = build(unit, settings.origins().of(unit), torch.device(settings.device))
+            episodes, _ = simulate(unit, built, settings, enough=enough)
         except Exception:  # what failed has failed its episodes too, which say how
             return None
     counted = 1e3 * episodes.planning_s[1:].numpy()

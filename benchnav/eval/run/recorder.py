@@ -1,6 +1,7 @@
 """Recordings of episodes, taken while a unit runs."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,17 @@ import torch
 
 from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.recording import MOMENT_S, DrawnPlan, Recording, drawing_interval, drawn_plan, thinned
+from benchnav.eval.recording import (
+    MOMENT_S,
+    NUMBERS,
+    DrawnPlan,
+    KnownMap,
+    Recording,
+    drawing_interval,
+    drawn_plan,
+    thinned,
+)
+from benchnav.eval.run.knowledge import Knowing
 from benchnav.eval.run.rollout import Episodes
 from benchnav.planning.planners.planner import Plan
 from benchnav.planning.problem import Problem
@@ -17,7 +28,7 @@ from benchnav.planning.world.simulation import Simulation
 
 
 class Recorder:
-    """Keeps what was planned for some episodes of a unit.
+    """Keeps what was planned for some episodes of a unit, and what was known in them.
 
     Args:
         unit: what is run.
@@ -34,6 +45,7 @@ class Recorder:
         self.unit, self.problem, self.simulation, self.terrain = unit, problem, simulation, terrain
         self.every = drawing_interval(problem.dt_s)
         self._plans: dict[int, list[DrawnPlan]] = {member: [] for member in members}
+        self._known: dict[int, list[KnownMap]] = {member: [] for member in self._plans}
 
     def watch(self, step: int, plan: Plan, planned: list[int]) -> None:
         """Keeps a step's plan; those that no figure will show are thinned, since there may be many.
@@ -48,6 +60,23 @@ class Recorder:
             if member in self._plans:
                 drawn = drawn_plan(step, plan.lines(place))
                 self._plans[member].append(drawn if whole else thinned(drawn))
+
+    @property
+    def watching(self) -> dict[str, Any]:
+        """The arguments of `run_episodes` by which it is told of plans and of what is known."""
+        return {"watch": self.watch, "watch_every": self.every, "witness": self.learn}
+
+    def learn(self, step: int, knowing: Knowing) -> None:
+        """Keeps what is known from a step on.
+
+        Args:
+            step: its number.
+            knowing: what is known.
+        """
+        for member, known in knowing.maps_of(step, self._known).items():
+            # Half as large, and finer than what a file keeps.
+            less = {name: getattr(known, name).astype(np.float16) for name in NUMBERS}
+            self._known[member].append(replace(known, **less))
 
     def recording(self, episodes: Episodes, member: int) -> Recording:
         """All that is played back of one episode."""
@@ -92,11 +121,11 @@ class Recorder:
                 "outcome": outcome,
             },
             resolution_m=problem.grid.resolution_m,
-            rgb=own(problem.observation.rgb),
+            rgb=own(self.terrain.rgb),
             field=None if simulation.field is None else own(simulation.field),
             immobilising=own(simulation.immobilising),
             goal_m=own(problem.goal_m),
-            elevation_m=own(problem.elevation_m),
+            elevation_m=own(self.terrain.elevation_m),
             true_mean=truth.select(torch.tensor([member])).mean()[0].float().cpu().numpy(),
             soft=(truth.weights[member, 1:] > 0).any(dim=0).cpu().numpy(),
             predicted=own(problem.risk_map),
@@ -110,5 +139,7 @@ class Recorder:
             actions=actions,
             traversability=traversability,
             plans=self._plans.get(member, ()),
-            layers={name: own(layer) for name, layer in problem.observation.layers.items()},
+            layers={name: own(layer) for name, layer in self.terrain.layers.items()},
+            # An ended episode may stay in a batch that goes on.
+            known=tuple(known for known in self._known.get(member, ()) if known.step <= len(actions)),
         )

@@ -18,7 +18,16 @@ from benchnav.eval.folder.steps import LAST_COLUMN, open_steps, read_steps
 from benchnav.eval.recording import GROUND, MAP, Ground, Recording
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rows import path_length_m
-from benchnav.eval.run.unit import Settings, build, noise_key, one_thread, read_block, read_maps, simulate
+from benchnav.eval.run.unit import (
+    Built,
+    Settings,
+    build,
+    noise_key,
+    one_thread,
+    read_block,
+    read_maps,
+    simulate,
+)
 from benchnav.planning.world.simulation import Simulation
 
 
@@ -44,11 +53,8 @@ def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = Non
     with one_thread():
         # Without a time limit of planners, which changes no action.
         settings = Settings(device=device_of_run(open_run(folder).about).type)
-        recorder = _recorder(unit, settings, [member])
-        problem, simulation = recorder.problem, recorder.simulation
-        episodes, _ = simulate(
-            unit, problem, simulation, settings, watch=recorder.watch, watch_every=recorder.every
-        )
+        recorder, built = _recorder(unit, settings, [member])
+        episodes, _ = simulate(unit, built, settings, **recorder.watching)
     recording = recorder.recording(episodes, member)
     if not _repeats(row, recording):
         raise BenchnavError(
@@ -59,11 +65,11 @@ def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = Non
     return recording
 
 
-def _recorder(unit: Unit, settings: Settings, members: Sequence[int]) -> Recorder:
+def _recorder(unit: Unit, settings: Settings, members: Sequence[int]) -> tuple[Recorder, Built]:
     """Makes the problem and the simulation of a unit again."""
     origin, device = settings.origins().of(unit), torch.device(settings.device)
-    problem, simulation = build(unit, origin, device)
-    return Recorder(unit, problem, simulation, read_block(unit, origin, device).terrain, members)
+    built, terrain = build(unit, origin, device), read_block(unit, origin, device).terrain
+    return Recorder(unit, built.problem, built.simulation, terrain, members), built
 
 
 def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
@@ -129,7 +135,7 @@ def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
         if made["parts"].get(part) != digest:
             raise BenchnavError(f"Expected {part} as it was when {run.folder} was run, got a changed one.")
     with one_thread():
-        recorder = _recorder(unit, Settings(), ())
+        recorder, _ = _recorder(unit, Settings(), ())
     kept = read_steps(run.folder, condition=condition.id, seed=seed, realisation=realisation, map=maps)
     driven = kept.groupby("map")
     commands = list(recorder.problem.robot.action_names)

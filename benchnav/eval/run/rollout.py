@@ -8,7 +8,7 @@ tensors until the end. Letters in shapes: B episodes, N steps, S state and A act
 import itertools
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,11 +19,12 @@ from torch import Tensor
 from benchnav.core.device import GPU_FAULTS, DeviceError, gpu_failed
 from benchnav.core.errors import BenchnavError
 from benchnav.core.settings import fault
-from benchnav.eval.run.knowledge import Knowledge, KnowledgeError, Learning
+from benchnav.eval.run.knowledge import Knowing, Learning
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.boundary import Answer, act, begin, revise, standing_actions
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem
+from benchnav.planning.sensing.knowledge import KnowledgeError
 from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome, tell_standstill
 from benchnav.planning.world.simulation import Simulation, SimulationState, end
@@ -32,6 +33,7 @@ _FULL = 0.75  # share of a batch that still runs, over which it is left as it is
 _LOOK_EVERY = 8  # steps between two looks at which episodes still run, where a look waits for a GPU
 
 Watcher = Callable[[int, Plan, list[int]], None]  # step, plan, and the episodes that are planned for
+Witness = Callable[[int, Knowing], None]  # step, and what is known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +51,10 @@ class Episodes:
         planning_s: wall time of each step's plan, shape [N].
         planned: how many episodes it was for, int64, shape [N].
         revisions: how often each episode's map changed on the way, int64, shape [B].
+        seen_cells: how many cells each robot saw, int64, shape [B]; None where robots learn nothing.
+        sensed_cells: of how many cells each sensed λ, int64, shape [B]; None likewise.
+        ahead: RMSE of E[λ] and log score over the cells ahead of the robot, NaN at steps without an update, shape
+            [B, N, 2]; None likewise. See `Knowing`.
         learning_s: wall time of what the robots learnt, all steps together.
         errors: one line for each episode that ended by a fault of its planner, empty for the others, B of
             them.
@@ -65,6 +71,9 @@ class Episodes:
     planning_s: Tensor
     planned: Tensor
     revisions: Tensor
+    seen_cells: Tensor | None
+    sensed_cells: Tensor | None
+    ahead: Tensor | None
     learning_s: float
     errors: tuple[str, ...]
     traceback: str = ""
@@ -133,7 +142,7 @@ class _Log:
         self._steps.append([value.unsqueeze(1) for value in kept])
         self.states.append(after.state)
 
-    def episodes(self, now: SimulationState, traceback_: str, knowledge: Knowledge | None) -> Episodes:
+    def episodes(self, now: SimulationState, traceback_: str, knowing: Knowing | None) -> Episodes:
         track, taken = torch.stack(self.states, dim=1), len(self._steps) - 1
         actions, met, driven, turned = (torch.cat(values, dim=1) for values in zip(*self._steps, strict=True))
         seconds = self.clock.seconds()
@@ -148,11 +157,23 @@ class _Log:
             # A planner that raised has no step for its last plan.
             planning_s=torch.tensor(seconds[1 : taken + 1], dtype=torch.float64),
             planned=torch.tensor(self.planned[:taken]),
-            revisions=torch.zeros_like(now.step).cpu() if knowledge is None else knowledge.revisions.cpu(),
+            revisions=torch.zeros_like(now.step).cpu() if knowing is None else knowing.revisions.cpu(),
+            seen_cells=None if knowing is None else knowing.seen_cells.cpu(),
+            sensed_cells=None if knowing is None else knowing.sensed_cells.cpu(),
+            ahead=None if knowing is None else _by_step(knowing.ahead, len(track), taken),
             learning_s=sum(self.learning.seconds()),
             errors=tuple("" if place < 0 else self._reasons[place] for place in self._fault.tolist()),
             traceback=traceback_,
         )
+
+
+def _by_step(measured: Mapping[int, Tensor], batch: int, steps: int) -> Tensor:
+    """What was measured in some steps, NaN in all others, shape [B, N, 2]."""
+    found = torch.full((batch, steps, 2), torch.nan)
+    for step, values in measured.items():
+        if step < steps:
+            found[:, step] = values.cpu()
+    return found
 
 
 def run_episodes(
@@ -164,6 +185,7 @@ def run_episodes(
     watch_every: int = 1,
     enough: Callable[[int], bool] = lambda step: False,
     learning: Learning | None = None,
+    witness: Witness | None = None,
 ) -> Episodes:
     """Runs a batch of episodes to the end of the last.
 
@@ -181,6 +203,7 @@ def run_episodes(
             left running.
         learning: how the robots learn on their way, whose planner then goes on under what they know; None where they
             learn nothing.
+        witness: is called when what is known was updated, before the step is planned.
 
     Returns:
         What happened.
@@ -193,10 +216,8 @@ def run_episodes(
     log = _Log(now, problem)
     observed = torch.full_like(now.state[:, 0], torch.nan)
     look_every = 1 if observed.device.type == "cpu" else _LOOK_EVERY
-    trace, knowledge = "", None
+    trace, knowing = "", None if learning is None else Knowing(learning, problem)
     try:
-        with log.learning.timed():
-            knowledge = None if learning is None else Knowledge(learning, problem)
         with log.clock.timed():
             plan_state = begin(planner, problem, generator)
         batch = _Batch(planner, problem, plan_state)
@@ -208,12 +229,17 @@ def run_episodes(
                 if not bool(running.any()):
                     break
                 left = batch.drop_ended(running)
-                if knowledge is not None and left is not None:
-                    knowledge.keep(left)
+                if knowing is not None and left is not None:
+                    knowing.keep(left)
             revised = None
-            if knowledge is not None:
+            if knowing is not None:
+                at, goes_on = batch.part_of(now.state), batch.part_of(now.running)
                 with log.learning.timed():
-                    revised = knowledge.learn(count, batch.part_of(now.state), batch.part_of(now.running))
+                    revised = knowing.learn(count, at, goes_on)
+                if knowing.is_due(count):
+                    knowing.look_ahead(count, at, goes_on)
+                    if witness is not None:
+                        witness(count, knowing)
             watched = watch is not None and count % watch_every == 0
             step = Step(state=now.state, traversability=observed, time_s=count * problem.dt_s, draw=watched)
             with log.clock.timed():
@@ -238,7 +264,7 @@ def run_episodes(
         log.blame(now.running, fault(error))
         outcome = error.outcome if isinstance(error, KnowledgeError) else Outcome.PLANNER_ERROR
         now = end(now, now.running, outcome)
-    return log.episodes(now, trace, knowledge)
+    return log.episodes(now, trace, knowing)
 
 
 class _Batch:

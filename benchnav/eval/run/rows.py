@@ -13,7 +13,7 @@ import pyarrow as pa
 from torch import Tensor
 
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.folder.steps import LAST_COLUMN
+from benchnav.eval.folder.steps import AHEAD_COLUMNS, LAST_COLUMN
 from benchnav.eval.run.rollout import Episodes
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
@@ -22,7 +22,8 @@ from benchnav.planning.world.outcome import Outcome
 _RESULTS = (
     *("outcome", "success", "total_time_s", "end_time_s", "traversability", "reference_time_s", "time_ratio"),
     *("score", "path_length_m", "stuck_share", "roughness_radps2", "planning_ms", "planning_ms_p95"),
-    *("planning_start_ms", "rejected_draws", "compiled", "error"),
+    *("planning_start_ms", "revisions", "seen_cells", "sensed_cells", "ahead_rmse", "ahead_log_score"),
+    *("learning_ms", "rejected_draws", "compiled", "error"),
 )
 
 
@@ -52,7 +53,8 @@ def episode_rows(
         `traversability`, the mean of the observed λ; `reference_time_s`; `time_ratio`, over the reference time at
         the robot's top speed, NaN for failures; `score`, BARN's, 0 for failures; `path_length_m`;
         `stuck_share`, share of steps with λ at most λ_stuck; `roughness_radps2`, the mean change of the
-        commanded turn rate; wall times of planning as of `planning_times`; `rejected_draws`; `compiled`; `error`.
+        commanded turn rate; wall times of planning as of `planning_times`; what was learnt on the way, as of
+        `_learnt`; `rejected_draws`; `compiled`; `error`.
         What an episode that ended at once does not have is NaN.
     """
     top_speed, rows = problem.robot.top_speed_mps, []
@@ -81,6 +83,7 @@ def episode_rows(
                 "stuck_share": float(stuck.double().mean()) if steps else np.nan,
                 "roughness_radps2": np.abs(np.diff(turn)).mean() / problem.dt_s if steps > 1 else np.nan,
                 **planning_times(episodes, b),
+                **_learnt(episodes, b, steps),
                 "rejected_draws": rejected_draws[b],
                 "compiled": compiled,
                 "error": episodes.errors[b],
@@ -89,10 +92,12 @@ def episode_rows(
     return _named(unit, groups).join(pd.DataFrame(rows))
 
 
-def error_rows(unit: Unit, groups: np.ndarray, time_budget_s: Tensor, error: str) -> pd.DataFrame:
-    """Rows of episodes that could not begin, since their model or risk measure failed; T of shape [B]."""
+def error_rows(
+    unit: Unit, groups: np.ndarray, time_budget_s: Tensor, outcome: Outcome, error: str
+) -> pd.DataFrame:
+    """Rows of episodes that could not begin, since their model, say, failed; T of shape [B]."""
     failed = dict.fromkeys(_RESULTS, np.nan) | {
-        **{"outcome": Outcome.MODEL_ERROR.name.lower(), "success": False, "end_time_s": 0.0, "score": 0.0},
+        **{"outcome": outcome.name.lower(), "success": False, "end_time_s": 0.0, "score": 0.0},
         **{"rejected_draws": 0, "compiled": False, "error": error},
     }
     return _named(unit, groups).assign(**failed | {"total_time_s": time_budget_s.tolist()})
@@ -103,6 +108,32 @@ def _named(unit: Unit, groups: np.ndarray) -> pd.DataFrame:
     condition = unit.condition
     draw = {"seed": unit.seed, "realisation": unit.realisation, "map": unit.maps, "group": groups}
     return pd.DataFrame({"condition": condition.id, **condition.labels, **draw})
+
+
+def _learnt(episodes: Episodes, member: int, steps: int) -> dict[str, float]:
+    """What a robot learnt: `revisions` of its map, shares of the map seen and sensed, errors ahead of it, and the time.
+
+    Args:
+        episodes: what happened.
+        member: which episode.
+        steps: how many it took.
+
+    Returns:
+        NaN where robots learn nothing. `ahead_rmse` and `ahead_log_score` are means over the updates of the episode;
+        `learning_ms` is the wall time of a step of the batch over its episodes.
+    """
+    names = ("revisions", "seen_cells", "sensed_cells", "ahead_rmse", "ahead_log_score", "learning_ms")
+    if episodes.ahead is None or episodes.seen_cells is None or episodes.sensed_cells is None:
+        return dict.fromkeys(names, np.nan)
+    ahead = episodes.ahead[member, :steps].double().numpy()
+    known = ahead[~np.isnan(ahead[:, 0])]
+    means = known.mean(0) if len(known) else (np.nan, np.nan)
+    planned = int(episodes.planned.sum())
+    values = (
+        *(episodes.revisions[member], episodes.seen_cells[member], episodes.sensed_cells[member]),
+        *(*means, 1e3 * episodes.learning_s / planned if planned else np.nan),
+    )
+    return {name: float(value) for name, value in zip(names, values, strict=True)}
 
 
 def planning_times(episodes: Episodes, member: int) -> dict[str, float]:
@@ -152,7 +183,8 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
 
     Returns:
         `seed`, `realisation`, `map`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`, each action by its
-        name, and `traversability` as met; actions and `traversability` are NaN at the last state.
+        name, where robots learn `AHEAD_COLUMNS` (NaN but where what is known was updated), and `traversability` as
+        met; actions and `traversability` are NaN at the last state.
     """
     every, steps = np.arange(episodes.states.shape[1]), episodes.steps.numpy()[:, None]
     inside = every <= steps
@@ -174,4 +206,7 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
         columns[name] = episodes.states[..., index].numpy().astype(np.float32)[inside]
     for index, name in enumerate(problem.robot.action_names):
         columns[name] = of_steps(episodes.actions[..., index])
+    if episodes.ahead is not None:
+        for index, name in enumerate(AHEAD_COLUMNS):
+            columns[name] = of_steps(episodes.ahead[..., index])
     return pa.table(columns | {LAST_COLUMN: of_steps(episodes.traversability)})

@@ -17,13 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav.core import registry, rng
+from benchnav.core import rng
 from benchnav.core.device import CPU, GPU_FAULTS, gpu_failed
 from benchnav.core.distribution import TraversabilityDistribution
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.core.registry import Part
-from benchnav.core.settings import fault
-from benchnav.core.terrain import Terrain
+from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.unit import Unit
@@ -31,14 +30,16 @@ from benchnav.eval.folder.provenance import Origin, Origins, code_differences
 from benchnav.eval.folder.run_folder import clear_unit, write_unit
 from benchnav.eval.folder.steps import write_steps
 from benchnav.eval.run.isolation import IsolatedPlanner
+from benchnav.eval.run.knowledge import Learning
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rollout import Episodes, run_episodes
 from benchnav.eval.run.rows import episode_rows, error_rows, step_table
-from benchnav.models.base import predict
-from benchnav.models.predictor import Clairvoyant, load_model
-from benchnav.planning import risk
+from benchnav.models.base import PrivilegedModel, predict, predict_observation
+from benchnav.models.predictor import Clairvoyant, find_ground_statistics, load_model
 from benchnav.planning.planners.planner import Plan, Planner
-from benchnav.planning.problem import Problem, pose_problem
+from benchnav.planning.problem import Problem, heading_to, pose_problem
+from benchnav.planning.sensing.belief import Fields, Law
+from benchnav.planning.sensing.knowledge import KnowledgeError, Learner, Truth, call, sensor_keys
 from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
@@ -80,18 +81,18 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
     with one_thread():
         block = read_block(unit, origin, device)
         try:
-            problem, simulation = build(unit, origin, device)
-        except PredictionError as error:
+            built = build(unit, origin, device)
+        except KnowledgeError as error:
             budgets = unit.condition.world.budget_s(
                 block.places.reference_time_s, unit.condition.make_task().robot.top_speed_mps
             )
-            rows = error_rows(unit, block.groups, budgets, str(error))
+            rows = error_rows(unit, block.groups, budgets, error.outcome, str(error))
             write_unit(folder, unit, origin, rows, [str(error)], traceback.format_exc())
             return
+        problem, simulation = built.problem, built.simulation
         watched = unit.watched()
         recorder = Recorder(unit, problem, simulation, block.terrain, watched)
-        watching = {"watch": recorder.watch, "watch_every": recorder.every} if watched else {}
-        episodes, compiled = simulate(unit, problem, simulation, settings, **watching)
+        episodes, compiled = simulate(unit, built, settings, **(recorder.watching if watched else {}))
     succeeded = (episodes.outcome == Outcome.SUCCESS).tolist()
     for member in unit.recorded(succeeded):
         recorder.recording(episodes, member).save(folder / unit.recording_path(member))
@@ -154,12 +155,23 @@ def read_block(unit: Unit, origin: Origin, device: torch.device = CPU) -> Block:
     return _block(unit.condition.data, unit.condition.split, unit.maps, origin.maps, device)
 
 
-class PredictionError(BenchnavError):
-    """A model or a risk measure raised; the cause says what."""
+@dataclass(frozen=True, kw_only=True)
+class Built:
+    """What a unit's episodes are run with.
+
+    Args:
+        problem: of all episodes, when they begin.
+        simulation: with the truth.
+        learning: how the robots learn; None where they learn nothing.
+    """
+
+    problem: Problem
+    simulation: Simulation
+    learning: Learning | None
 
 
-def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> tuple[Problem, Simulation]:
-    """Makes the problem and the simulation of a unit.
+def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
+    """Makes the problem and the simulation of a unit, and what its robots know when they set out.
 
     Args:
         unit: what is to be run.
@@ -167,7 +179,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> tuple[Probl
         device: where all is computed.
 
     Raises:
-        PredictionError: the model or the risk measure failed.
+        KnowledgeError: a sensor, the model, the belief or the risk measure failed.
         DeviceError: the GPU failed.
         BenchnavError: the data cannot be read, or are not enough for the world.
     """
@@ -176,35 +188,84 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> tuple[Probl
     noise = noise_key(unit.seed, condition.split, unit.realisation)
     simulation = Simulation(block.terrain, task, condition.world, block.places, noise, unit.maps)
     try:
-        predicted = _predict(unit, origin, device, simulation.field)
-        risk_map = risk.apply(registry.make("risk", condition.risk), predicted)
+        learner = _learner(unit, origin, device)
+        redrawn = simulation.field is None
+        field = simulation.field_at(0) if condition.learns else block.terrain.traversability
+        truth = Truth(terrain=block.terrain, field=field, keys=sensor_keys(noise, unit.maps))
+        predicted = None
+        if learner.sensor.sees_all:
+            predicted = call(Outcome.MODEL_ERROR, lambda: _predict(unit, origin, device, simulation.field))
+        start = task.robot.initial_state(heading_to(block.places.start_m, block.places.goal_m))
+        known = learner.begin(truth, start, predicted)
+        problem = pose_problem(
+            task,
+            known.observation,
+            learner.distribution(known),
+            known.risk_map,
+            block.places.start_m,
+            block.places.goal_m,
+            simulation.time_budget_s,
+            known.seen,
+            Fields(learner.belief, known.believed, tuple(unit.maps)),
+        )
     except GPU_FAULTS as error:
         raise gpu_failed(error) from error
-    except (Exception, SystemExit) as error:
-        raise PredictionError(fault(error)) from error
-    problem = pose_problem(
-        task,
-        block.terrain.observe(),
-        predicted,
-        risk_map,
-        block.places.start_m,
-        block.places.goal_m,
-        simulation.time_budget_s,
+    if not condition.learns:
+        return Built(problem=problem, simulation=simulation, learning=None)
+    learning = Learning(
+        learner=learner, start=known, truth=truth, field_at=simulation.field_at if redrawn else None
     )
-    return problem, simulation
+    return Built(problem=problem, simulation=simulation, learning=learning)
+
+
+def _learner(unit: Unit, origin: Origin, device: torch.device) -> Learner:
+    """How the robots of a unit learn."""
+    condition, block = unit.condition, read_block(unit, origin, device)
+    dataset = TerrainDataset(find_dataset(condition.data))
+    world, part = condition.world, condition.model
+    sensor = call(Outcome.SENSOR_ERROR, lambda: condition.make("sensor"))
+    belief = call(Outcome.BELIEF_ERROR, lambda: condition.make("belief"))
+    needed = not sensor.sees_all or belief.needs_statistics
+    model = call(Outcome.MODEL_ERROR, lambda: _model(_model_key(unit, origin)))
+    law = Law(
+        grid=block.terrain.grid,
+        correlation_m=dataset.recipe.correlation_m if world.noise == "stored" else world.correlation_m,
+        statistics=find_ground_statistics(part, dataset) if needed else None,
+        class_names=model.class_names or tuple(item.name for item in dataset.recipe.classes),
+    )
+
+    def predict_seen(observation: Observation, truth: Truth) -> TraversabilityDistribution:
+        if isinstance(model, PrivilegedModel):
+            return model.predict_terrain(replace(truth.terrain, traversability=truth.field))
+        return predict_observation(model, observation)
+
+    return Learner(
+        sensor=sensor,
+        ground=call(Outcome.SENSOR_ERROR, lambda: condition.make("ground")),
+        belief=belief,
+        law=law,
+        measure=call(Outcome.MODEL_ERROR, lambda: condition.make("risk")),
+        rules=condition.rules,
+        predict=predict_seen,
+    )
 
 
 def _predict(
     unit: Unit, origin: Origin, device: torch.device, field: Tensor | None
 ) -> TraversabilityDistribution:
     """The prediction of a unit's block, kept for other settings; of the clairvoyant's λ, of this unit alone."""
-    part, block = unit.condition.model, read_block(unit, origin, device)
-    digest = origin.code["parts"].get(f"model {part.part}", "")
-    model = json.dumps([part.part, dict(part.options), digest], sort_keys=True)
+    model, block = _model_key(unit, origin), read_block(unit, origin, device)
     if not isinstance(_model(model), Clairvoyant):
         return _prediction(model, block)
     assert field is not None  # suites are refused in which λ cannot be known
     return predict(_model(model), replace(block.terrain, traversability=field))
+
+
+def _model_key(unit: Unit, origin: Origin) -> str:
+    """What identifies a model, with the digest of its code and files."""
+    part = unit.condition.model
+    digest = origin.code["parts"].get(f"model {part.part}", "")
+    return json.dumps([part.part, dict(part.options), digest], sort_keys=True)
 
 
 def noise_key(seed: int, split: str, realisation: int) -> int:
@@ -216,15 +277,12 @@ def _draw(split: str, realisation: int) -> tuple[str | int, ...]:
     return (split, realisation) if realisation else (split,)
 
 
-def simulate(
-    unit: Unit, problem: Problem, simulation: Simulation, settings: Settings, **options: Any
-) -> tuple[Episodes, bool]:
+def simulate(unit: Unit, built: Built, settings: Settings, **options: Any) -> tuple[Episodes, bool]:
     """Runs a unit's episodes; gives what happened, and whether the planner ran compiled.
 
     Args:
         unit: what is run.
-        problem: the unit's.
-        simulation: the unit's.
+        built: the unit's.
         settings: of them the time limit of planners.
         **options: further arguments of `run_episodes`.
     """
@@ -241,7 +299,9 @@ def simulate(
         # Keyed by seed and split, never by the batch.
         key = rng.stream_key(unit.seed, "planner", *_draw(condition.split, unit.realisation))
         generator = rng.generator(key)
-        episodes = run_episodes(planner, problem, simulation, generator, **options)
+        episodes = run_episodes(
+            planner, built.problem, built.simulation, generator, learning=built.learning, **options
+        )
     return episodes, bool(planner.compiled)
 
 

@@ -1,7 +1,7 @@
 """Tests of the hypotheses that a suite fixed, map by map.
 
-A difference is tested by flipping signs; non-inferiority and equivalence within a margin by where the interval of the
-difference ends (two one-sided tests). Holm's correction is over the whole list.
+A difference is tested by flipping signs; non-inferiority, superiority and equivalence by a margin by where the interval
+of the difference ends (two one-sided tests). Holm's correction is over the whole list.
 Sources: Schuirmann (1987), "A comparison of the two one-sided tests procedure and the power approach for assessing the
 equivalence of average bioavailability"; Wellek (2010), "Testing Statistical Hypotheses of Equivalence and
 Noninferiority", 1.
@@ -104,7 +104,8 @@ def p_of(test: Hypothesis, rows: pd.DataFrame) -> float:
     if test.kind == "difference":
         return _difference_p(test, rows)
     sides = {"higher": (-1.0,), "lower": (1.0,)}.get(test.direction, (-1.0, 1.0))
-    return max(_margin_p(test, rows, side) for side in sides)
+    margin = -test.margin if test.kind == "superiority" else test.margin
+    return max(_margin_p(test.metric, rows, margin, side) for side in sides)
 
 
 def _difference_p(test: Hypothesis, rows: pd.DataFrame) -> float:
@@ -122,7 +123,7 @@ def _difference_p(test: Hypothesis, rows: pd.DataFrame) -> float:
     return float(np.mean(far.get(test.direction, np.abs(flipped) >= abs(seen) - slack)))
 
 
-def _margin_p(test: Hypothesis, rows: pd.DataFrame, side: float) -> float:
+def _margin_p(metric: str, rows: pd.DataFrame, margin: float, side: float) -> float:
     """p that the difference is beyond a margin, below −margin (side −1) or above it (side 1).
 
     It is the level at which the end of the one-sided interval comes to lie on the margin.
@@ -130,14 +131,14 @@ def _margin_p(test: Hypothesis, rows: pd.DataFrame, side: float) -> float:
 
     def end(signed: float) -> float:
         """Of the confidence the end on the margin's side; of a negative one the other end."""
-        _, low, high = _interval(rows, test.metric, abs(signed))
+        _, low, high = _interval(rows, metric, abs(signed))
         return side * (high if (side > 0) == (signed >= 0) else low)
 
     if np.isnan(end(0.5)):
         return 1.0
-    if end(_MOST) < test.margin:
+    if end(_MOST) < margin:
         return (1 - _MOST) / 2
-    if end(-_MOST) > test.margin:
+    if end(-_MOST) > margin:
         return 1.0
-    signed = brentq(lambda confidence: end(confidence) - test.margin, -_MOST, _MOST)
+    signed = brentq(lambda confidence: end(confidence) - margin, -_MOST, _MOST)
     return (1 - float(signed)) / 2

@@ -9,12 +9,12 @@ import pandas as pd
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import check_known
-from benchnav.eval.experiment.condition import LABELS, NOT_USED, differences
+from benchnav.eval.experiment.condition import KNOWLEDGE, LABELS, NOT_USED, differences
 from benchnav.eval.experiment.unit import DRAW
 
 # By what conditions may differ, each with its keys in a condition's value. Other data or scenarios are other maps.
 _KEYS: Mapping[str, tuple[str, ...]] = {
-    **{name: (name,) for name in ("risk", "planner", "model", "objective", "robot")},
+    **{name: (name,) for name in ("risk", "planner", "model", "objective", "robot", *KNOWLEDGE)},
     "world": ("world", "rules"),
     "run": (),
 }
@@ -136,7 +136,7 @@ def check_one_value_each(conditions: Iterable[Compared]) -> None:
     known: dict[tuple[str, str], tuple[dict[str, Any], Compared]] = {}
     for condition in conditions:
         for name, keys in _KEYS.items():
-            value = {key: condition.value[key] for key in keys}
+            value = {key: condition.value.get(key) for key in keys}
             label = condition.labels[name]
             earlier, first = known.setdefault((name, label), (value, condition))
             if earlier != value and label != NOT_USED:
@@ -179,7 +179,7 @@ def _differ_in(one: Compared, other: Compared, by: str) -> bool:
     alike = all(
         one.value.get(key) == other.value.get(key) for key in {*one.value, *other.value} - {*keys, *unused}
     )
-    differ = any(one.value[key] != other.value[key] for key in keys)
+    differ = any(one.value.get(key) != other.value.get(key) for key in keys)
     return alike and differ and by not in unused and _field(one) == _field(other)
 
 
@@ -189,7 +189,8 @@ def _field(condition: Compared) -> dict[str, Any]:
     if world["noise"] != "frozen":
         return {"noise": world["noise"]}
     below = (world.get("immobile") or {}).get("below")
-    return {"noise": "frozen", "correlation_m": world.get("correlation_m"), "immobile.below": below}
+    drawn = {key: world.get(key) for key in ("correlation_m", "kernel")}
+    return {"noise": "frozen", **drawn, "immobile.below": below}
 
 
 def _pair(one: Compared, other: Compared, by: str) -> Pair:

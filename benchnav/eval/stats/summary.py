@@ -28,6 +28,9 @@ _QUANTITIES = {
     "roughness_radps2": ("roughness", "_radps2"),
 }
 
+# Columns of episodes that say what robots learnt on their way.
+LEARNT = ("seen_cells", "sensed_cells", "revisions", "ahead_rmse", "ahead_log_score", "learning_ms")
+
 
 def wilson_interval(rate: float, n: float) -> tuple[float, float]:
     """Wilson's 95 % score interval for a rate. Source: Wilson (1927).
@@ -159,7 +162,8 @@ def summarise(episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]]) -
         counted as T; time of the successes alone; observed λ; time over the reference time; score; path length;
         share of stuck steps; roughness. `total_time_low_s`, `total_time_high_s`, the 95 % interval of its mean,
         from `total_time_interval`. `planning_ms_median`, and so for `planning_ms_p95` and `planning_start_ms`;
-        `compiled_share`; and `OUTCOME_count` of each failure.
+        `NAME_mean` of what `LEARNT` names, NaN where robots learn nothing; `compiled_share`; and `OUTCOME_count` of
+        each failure.
     """
     groups = episodes.groupby("condition", sort=False)
     return pd.DataFrame([_summarise_condition(group, worlds[str(condition)]) for condition, group in groups])
@@ -181,6 +185,8 @@ def _summarise_condition(group: pd.DataFrame, world: Mapping[str, Any]) -> dict[
             _, row["total_time_low_s"], row["total_time_high_s"] = total_time_mean(group, world)
     for name in ("planning_ms", "planning_ms_p95", "planning_start_ms"):
         row[f"{name}_median"] = group[name].median()
+    for name in LEARNT:
+        row[f"{name}_mean"] = group[name].mean() if name in group else np.nan
     row["compiled_share"] = group["compiled"].astype(float).mean()
     outcomes = [outcome.name.lower() for outcome in FAILURES]
     return row | {f"{name}_count": int((group["outcome"] == name).sum()) for name in outcomes}

@@ -18,7 +18,6 @@ Letters in shapes: B maps, H×W cells, N channels of all inputs together.
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any, ClassVar, Self
 
 import lightning
@@ -40,7 +39,7 @@ from benchnav.core.terrain import Observation
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.base import ModelFamily, TraversabilityModel, layers_of
 from benchnav.models.checkpoint import Checkpoint, Part, member_names
-from benchnav.models.config import TrainingConfig
+from benchnav.models.config import TrainingConfig, plain_config
 from benchnav.models.nets.calibration import fit_width, sample_scores
 from benchnav.models.nets.inputs import InputStack, LayerScale, Maps
 
@@ -161,7 +160,7 @@ class TrainableNetwork(lightning.LightningModule):
 
     def settings(self) -> dict[str, Any]:
         """Plain data that it is rebuilt from, beside its tensors: the configuration and the temperature."""
-        return {**asdict(self.config), "temperature": self.temperature}
+        return {**plain_config(self.config), "temperature": self.temperature}
 
     def forward(self, maps: Maps) -> Any:
         """Computes the outputs of the network for maps of any size, which are padded and the outputs cropped.

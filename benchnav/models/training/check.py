@@ -12,6 +12,7 @@ from torch import Tensor
 
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import BenchnavError, ConfigError, expect
+from benchnav.core.ground import SEEN
 from benchnav.core.settings import call, of, one_line, read
 from benchnav.core.shipped_files import PACKAGE
 from benchnav.core.terrain import take_cells
@@ -20,8 +21,9 @@ from benchnav.models.base import predict_observation
 from benchnav.models.config import TrainingConfig
 from benchnav.models.nets.inputs import check_inputs
 from benchnav.models.nets.trainable import TrainableModel, TrainableNetwork, in_single_precision
-from benchnav.models.training.data import TRAIN, VALID, MapDataset, check_maps, squares_a_map
+from benchnav.models.training.data import TRAIN, VALID, MapDataset, check_maps
 from benchnav.models.training.fit import FitOptions, make_trainer, quietly
+from benchnav.models.training.map_order import squares_a_map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +71,11 @@ def check_network(trainable: Trainable, dataset: TerrainDataset, options: FitOpt
     kind, config = trainable.kind, trainable.config
     network = call(f"a model of {kind.__name__}", kind, {"config": config})
     _check_settings(network)
-    check_inputs(network.inputs, ["rgb", "elevation_m", "slope_deg", *dataset.layer_names])
+    check_inputs(network.inputs, ["rgb", "elevation_m", "slope_deg", *dataset.layer_names, SEEN])
+    expect(
+        SEEN not in network.inputs or config.masking.share > 0,
+        f"`masking.share` > 0 for the input {SEEN}, got 0: where all is seen in training, it teaches nothing.",
+    )
     check_maps(dataset, kind.target, config.crop)
     with quietly():
         chosen = options.chosen(max_epochs=config.max_epochs)

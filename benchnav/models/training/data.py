@@ -6,27 +6,27 @@ processes read for it. Letters in shapes: B maps in all, b maps in a batch, H×W
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import lightning
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import DataLoader
 from torchvision.transforms.v2 import functional as photometry
 
-from benchnav.core import rng
 from benchnav.core.device import CPU
 from benchnav.core.errors import DatasetError, expect
 from benchnav.core.grid import is_azimuth
+from benchnav.core.ground import SEEN
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.maps import TerrainMaps
 from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.nets.inputs import LayerScale
-from benchnav.models.training.map_order import map_order
+from benchnav.models.training.map_order import MapKey, MapSampler, crop_origins, draw_looks, squares_a_map
+from benchnav.models.training.masks import RandomMasks
 
 TRAIN, VALID = "train", "valid"
 
@@ -37,33 +37,18 @@ _LEAST_VARIANCE = 1e-4
 Batch = dict[str, Tensor]
 
 
-class MapKey(NamedTuple):
-    """Which maps a batch holds, and what is done to each.
-
-    Args:
-        maps: indices of the maps, int64, shape [b].
-        symmetry: that each is turned by, int64, shape [b].
-        factors: of `apply_jitter`, shape [b, 3].
-        origin: first row and column of the square that is cut from each, int64, shape [b, 2].
-    """
-
-    maps: Tensor
-    symmetry: Tensor
-    factors: Tensor
-    origin: Tensor
-
-
 class MapDataset(TerrainMaps):
     """Maps by field, indexed by a whole batch at a time.
 
     Args:
         path: of the dataset.
         split: name of one of its splits.
-        fields: which to read; `rgb` is uint8, [b, 3, H, W].
+        fields: which to give; `rgb` is uint8, [b, 3, H, W], and `seen` 1 where a cell was seen.
         in_memory: read all maps at once.
         crop: cells of a side of the squares that are cut from maps; 0 takes whole maps.
         seed: root seed of the squares that `chunks` cuts.
         every: n where it is every n-th map that counts, the first among them; the others are never given.
+        masks: what of the maps is seen; all where there are none.
     """
 
     def __init__(
@@ -75,10 +60,15 @@ class MapDataset(TerrainMaps):
         crop: int = 0,
         seed: int = 0,
         every: int = 1,
+        masks: RandomMasks | None = None,
     ) -> None:
         """Checks split and fields, and reads the maps where that is asked for."""
-        super().__init__(path, split, fields)
+        stored = [name for name in fields if name != SEEN]
+        if masks and "slope_deg" in fields and "elevation_m" not in fields:
+            stored.append("elevation_m")  # slopes are those of the elevation that is seen
+        super().__init__(path, split, stored)
         self.crop, self.seed, self.every = crop, seed, every
+        self.given, self.masks = tuple(fields), masks
         if in_memory:
             self._memory = super().read(range(self._maps))
 
@@ -87,8 +77,8 @@ class MapDataset(TerrainMaps):
         return len(range(0, self._maps, self.every))
 
     def read(self, indices: Sequence[int]) -> Batch:
-        """Reads maps by their indices among those that count."""
-        return super().read([self.every * index for index in indices])
+        """Reads maps by their indices among those that count, all of which are seen."""
+        return self._with_seen(super().read([self.every * index for index in indices]))
 
     def __getitem__(self, key: MapKey) -> Batch:  # type: ignore[override]
         """Gives every field of the maps in `key`, shape [b, *, H, W]."""
@@ -103,52 +93,42 @@ class MapDataset(TerrainMaps):
             batch[name] = torch.stack([apply_symmetry(layer, symmetry, name) for layer, symmetry in turned])
         if "rgb" in batch:
             batch["rgb"] = apply_jitter(batch["rgb"], key.factors)
-        return batch
+        return self._masked(batch, key.look)
 
     def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, Batch]]:
         """All maps neither turned nor jittered, in order, some at a time, with their indices; on a device."""
         origins = crop_origins(self.dataset.grid.shape, self.crop, self.seed, 0, len(self))
+        looks = torch.from_numpy(draw_looks(self.seed, 0, len(self)))
         size = self.dataset.grid.maps_in(CHUNK_CELLS)
         for first in range(0, len(self), size):
             indices = range(len(self))[first : first + size]
             maps = self.dataset.read(self.split, [self.every * index for index in indices], self.fields)
-            batch = {name: torch.from_numpy(values) for name, values in maps.items()}
+            batch = self._with_seen({name: torch.from_numpy(values) for name, values in maps.items()})
             if self.crop:
                 chosen = origins[indices.start : indices.stop].tolist()
                 batch = {
                     name: torch.stack([self._cut(*pair) for pair in zip(values, chosen, strict=True)])
                     for name, values in batch.items()
                 }
+            batch = self._masked(batch, looks[indices.start : indices.stop])
             yield indices, {name: values.to(device) for name, values in batch.items()}
+
+    def _with_seen(self, maps: Batch) -> Batch:
+        """Adds the layer `seen` where it is to be given."""
+        shape = next(iter(maps.values())).shape
+        return {**maps, SEEN: torch.ones(shape[0], *shape[-2:])} if SEEN in self.given else maps
+
+    def _masked(self, batch: Batch, look: Tensor) -> Batch:
+        """Masks a batch, and leaves out what was read for that alone."""
+        if self.masks is None:
+            return batch
+        seen = self.masks.apply(batch, look)
+        return {name: seen[name] for name in self.given}
 
     def _cut(self, layer: Tensor, origin: Sequence[int]) -> Tensor:
         """The square of a layer, [*, H, W], from a cell on; the layer itself where none is asked for."""
         row, column = origin
         return layer[..., row : row + self.crop, column : column + self.crop] if self.crop else layer
-
-
-def crop_origins(shape: tuple[int, int], crop: int, seed: int, epoch: int, count: int) -> np.ndarray:
-    """Draws where squares are cut from maps, by (seed, epoch, place).
-
-    Args:
-        shape: (H, W) of the maps.
-        crop: cells of a side; 0 takes whole maps, which begin at 0.
-        seed: root seed.
-        epoch: of the training.
-        count: places in the epoch.
-
-    Returns:
-        First rows and columns, int64, shape [count, 2].
-    """
-    if not crop:
-        return np.zeros((count, 2), dtype=np.int64)
-    drawn = rng.uniform(rng.stream_key(seed, "models", "map crop"), np.array([epoch]), (count, 2))[0]
-    return (drawn * (np.array(shape) - crop + 1)).astype(np.int64)
-
-
-def squares_a_map(shape: tuple[int, int], crop: int) -> int:
-    """Squares that a training map gives an epoch: as many as it has room for; 1 of whole maps."""
-    return (shape[0] // crop) * (shape[1] // crop) if crop else 1
 
 
 def apply_jitter(rgb: Tensor, factors: Tensor) -> Tensor:
@@ -184,69 +164,6 @@ def apply_symmetry(maps: Tensor, which: int, name: str = "") -> Tensor:
     return turned
 
 
-@dataclass(eq=False)
-class MapSampler(Sampler[MapKey]):
-    """Cuts the maps into batches of nearly equal size, in an order keyed by (seed, epoch).
-
-    Args:
-        maps: how many there are.
-        batch_size: most maps a batch.
-        seed: root seed.
-        symmetries: which symmetries to draw from; (0,) leaves maps as they are.
-        jitter: largest relative change of brightness, contrast and saturation.
-        shuffle: whether order, symmetries and squares change each epoch.
-        share: (i, n): of every batch take the i-th of n interleaved parts, for one of n processes.
-        crop: cells of a side of the squares that are cut from maps; 0 takes whole maps.
-        shape: (H, W) of the maps that squares are cut from.
-        epoch: that the next iteration gives.
-        shards: how many maps each file of the dataset holds, in order; none where one holds them all.
-    """
-
-    maps: int
-    batch_size: int
-    seed: int = 0
-    symmetries: tuple[int, ...] = (0,)
-    jitter: float = 0.0
-    shuffle: bool = False
-    share: tuple[int, int] = (0, 1)
-    crop: int = 0
-    shape: tuple[int, int] = (0, 0)
-    epoch: int = 0
-    shards: tuple[int, ...] = ()
-
-    def set_epoch(self, epoch: int) -> None:
-        """Chooses the epoch that the next iteration gives; the trainer calls this."""
-        self.epoch = epoch
-
-    @property
-    def places(self) -> int:
-        """Maps an epoch, or squares of them."""
-        return self.maps * (squares_a_map(self.shape, self.crop) if self.shuffle else 1)
-
-    def __len__(self) -> int:
-        """Batches an epoch."""
-        return -(-self.places // self.batch_size)
-
-    def __iter__(self) -> Iterator[MapKey]:
-        """Yields the batches of the epoch."""
-        count, number = self.places, self.epoch if self.shuffle else 0
-        order, epoch = np.arange(count), np.array([number])
-        if self.shuffle:
-            squares = count // self.maps
-            shards = tuple(squares * maps for maps in self.shards or (self.maps,))
-            order = map_order(shards, self.seed, self.epoch) // squares
-        drawn = rng.uniform(rng.stream_key(self.seed, "models", "map symmetry"), epoch, (count,))[0]
-        symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
-        drawn = rng.uniform(rng.stream_key(self.seed, "models", "map jitter"), epoch, (count, 3))[0]
-        factors = 1 + self.jitter * (2 * drawn - 1)
-        origins = crop_origins(self.shape, self.crop, self.seed, number, count)
-        first, step = self.share
-        pieces = (np.array_split(v, len(self)) for v in (order, symmetry, factors, origins))
-        for batch in zip(*pieces, strict=True):
-            start = min(first, len(batch[0]) - 1)  # no process is left without a map
-            yield MapKey(*(torch.from_numpy(values[start::step]) for values in batch))
-
-
 class MapData(lightning.LightningDataModule):
     """The maps of the splits `train` and `valid`.
 
@@ -265,6 +182,7 @@ class MapData(lightning.LightningDataModule):
         in_memory: hold all maps in memory.
         workers: processes that read ahead; 0 reads in this one.
         valid_every: n where it is every n-th map of `valid` that counts.
+        masks: what of the maps is seen; all where there are none.
 
     Raises:
         DatasetError: a split is missing.
@@ -282,18 +200,21 @@ class MapData(lightning.LightningDataModule):
         in_memory: bool = False,
         workers: int = 0,
         valid_every: int = 1,
+        masks: RandomMasks | None = None,
     ) -> None:
         """Opens the splits."""
         super().__init__()
         self.batch_size, self.seed, self.jitter, self.workers = batch_size, seed, jitter, workers
         self.symmetries = symmetries
         self.train, self.valid = (
-            MapDataset(dataset.path, split, fields, in_memory, crop, seed, every)
+            MapDataset(dataset.path, split, fields, in_memory, crop, seed, every, masks)
             for split, every in ((TRAIN, 1), (VALID, valid_every))
         )
 
     def scale(self, inputs: Sequence[str]) -> dict[str, LayerScale]:
-        """What layers of the training maps are scaled by, from all their cells that are known."""
+        """What layers of the training maps are scaled by, from all their cells that are known; `seen` by nothing."""
+        told = {SEEN: LayerScale(torch.zeros(1), torch.ones(1), torch.ones(()))} if SEEN in inputs else {}
+        inputs = [name for name in inputs if name != SEEN]
         counts = torch.zeros(3, 256, dtype=torch.int64)
         sums: dict[str, Tensor] = {name: torch.zeros(2, dtype=torch.float64) for name in inputs}
         cells = dict.fromkeys(inputs, 0)
@@ -315,7 +236,7 @@ class MapData(lightning.LightningDataModule):
             variance = (share * level**2).sum(1) - mean**2
             # Ground of one colour would have no scale.
             scale["rgb"] = LayerScale(mean.float(), variance.clamp(min=1).sqrt().float(), torch.ones(()))
-        return scale
+        return scale | told
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Augmented batches in random order."""

@@ -73,7 +73,7 @@ def train_gps(data: str, out: str, config: LatentGPConfig, options: FitOptions) 
         _train_on_logs(data, out, config, options)
         return
     dataset = open_dataset(data)
-    target = open_target(out, fresh_checkpoint(dataset), [GP], training_digest(dataset), options)
+    target = open_target(out, fresh_checkpoint(dataset), [GP], training_digest(dataset), options, dataset)
     target.add(GP, train_gps_on_maps(config, dataset, options))
 
 

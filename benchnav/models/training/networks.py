@@ -1,7 +1,7 @@
 """Training networks, whatever they learn: one door for classifiers, trainable models of ours and a user's own."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError, expect
 from benchnav.core.settings import config_class, of, one_line, read
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.ground import layer_means
 from benchnav.models.base import ModelFamily
 from benchnav.models.checkpoint import (
     CLASSIFIER,
@@ -22,7 +23,14 @@ from benchnav.models.checkpoint import (
     member_names,
     training_folder,
 )
-from benchnav.models.config import ClassifierConfig, LatentGPConfig, TrainingConfig, TrainOptions, check_seed
+from benchnav.models.config import (
+    ClassifierConfig,
+    LatentGPConfig,
+    TrainingConfig,
+    TrainOptions,
+    check_seed,
+    plain_config,
+)
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.trainable import TrainableModel
@@ -45,6 +53,7 @@ from benchnav.models.training.fit import (
     say,
 )
 from benchnav.models.training.gaussian_processes import train_gps_on_maps
+from benchnav.models.training.masks import RandomMasks
 from benchnav.models.training.target import Target, fresh_checkpoint, open_target
 
 _FEW_MAPS = 19  # with which 1 / (n + 1) is 0.05
@@ -177,7 +186,7 @@ def train_networks(
     parts = [member_name(index, trainable.name) for index in range(members)]
     trained = [GP] * bool(gp) + parts
     fresh = fresh_checkpoint(dataset, trainable.family, trainable.code)
-    target = open_target(out, fresh, trained, training_digest(dataset), options)
+    target = open_target(out, fresh, trained, training_digest(dataset), options, dataset)
     expect(
         not how.conformal or bool(gp) or trainable.family != FUSED or GP in target.checkpoint.parts,
         f"a whole model for `conformal`, got {trainable.name} alone. Train the GPs into {out} first, or take "
@@ -232,6 +241,7 @@ def fit_network(
     data = MapData(
         dataset, config.batch_size, seed, fields_of(network), config.jitter, config.symmetries, config.crop,
         in_memory=options.in_memory, workers=options.workers, valid_every=stopping_every(options.conformal),
+        masks=masks_of(config, dataset),
     )  # fmt: skip
     network.build(data.scale(network.inputs), class_names(dataset), seed)
     early = [EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)]
@@ -240,7 +250,7 @@ def fit_network(
         part or trainable.name,
         options,
         {
-            "config": asdict(config),
+            "config": plain_config(config),
             "data": training_digest(dataset),
             "seed": seed,
             "half_precision": half_precision,
@@ -266,6 +276,13 @@ def fit_network(
             "Mend it, and train again with --overwrite."
         ) from error
     return network.cpu(), metrics
+
+
+def masks_of(config: TrainingConfig, dataset: TerrainDataset) -> RandomMasks | None:
+    """What masks the maps of a training; None where all of them is seen."""
+    if not config.masking.share:
+        return None
+    return RandomMasks(law=config.masking, means=layer_means(dataset), resolution_m=dataset.grid.resolution_m)
 
 
 def train_parts(target: Target, trainable: Trainable, dataset: TerrainDataset, parts: list[str]) -> None:
@@ -299,7 +316,7 @@ def train_parts(target: Target, trainable: Trainable, dataset: TerrainDataset, p
     members = [trainable.kind.from_tensors(part.config, classes, part.tensors) for part in found]
     maps = MapDataset(
         dataset.path, VALID, fields_of(members[0]), crop=config.crop, seed=options.seed,
-        every=stopping_every(options.conformal),
+        every=stopping_every(options.conformal), masks=masks_of(config, dataset),
     )  # fmt: skip
     temperature = trainable.kind.fit_pool(members, maps, options.seed, options.place)
     say(f"pool of {len(members)} networks: temperature {temperature:.3f}")

@@ -11,8 +11,10 @@ from typing import Any
 
 from rich.filesize import decimal
 
-from benchnav.core.errors import CheckpointError
+from benchnav.core.errors import CheckpointError, DatasetError
+from benchnav.core.ground import GroundStatistics
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.ground import fit_ground
 from benchnav.models.checkpoint import (
     CONFIG,
     FUSED,
@@ -36,6 +38,7 @@ class Target:
         checkpoint: what it holds so far.
         digest: of the data that parts are trained on.
         options: how they are trained.
+        maps: that parts are trained on; None where it is a robot's logs.
         changed: whether anything was saved.
     """
 
@@ -43,6 +46,7 @@ class Target:
     checkpoint: Checkpoint
     digest: str
     options: FitOptions
+    maps: TerrainDataset | None = None
     changed: bool = False
 
     def holds(self, name: str, config: Any, seed: int) -> bool:
@@ -83,8 +87,10 @@ class Target:
         )
 
     def add(self, name: str, part: Part) -> None:
-        """Saves a trained part with the rest."""
+        """Saves a trained part with the rest, and with the statistics of the ground that it was trained on."""
         self.checkpoint = self.checkpoint.with_part(name, part)
+        if self.maps and not self.changed and is_first_process():
+            self.checkpoint = replace(self.checkpoint, ground=_ground_of(self.maps))
         self._save()
         forget(self.options, name)
 
@@ -115,7 +121,12 @@ def fresh_checkpoint(dataset: TerrainDataset, model: str = FUSED, code: str = ""
 
 
 def open_target(
-    out: str | Path, fresh: Checkpoint, parts: list[str], digest: str, options: FitOptions
+    out: str | Path,
+    fresh: Checkpoint,
+    parts: list[str],
+    digest: str,
+    options: FitOptions,
+    maps: TerrainDataset | None = None,
 ) -> Target:
     """Opens the checkpoint that training goes into.
 
@@ -125,6 +136,7 @@ def open_target(
         parts: names of the parts to train.
         digest: of the data that they are trained on.
         options: how to train, and whether what is there may be replaced.
+        maps: that they are trained on; None where it is a robot's logs.
 
     Raises:
         CheckpointError: what is there would be lost or does not fit.
@@ -174,7 +186,15 @@ def open_target(
             f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace it"
             f"{resume}."
         )
-    return Target(folder, checkpoint, digest, options)
+    return Target(folder, checkpoint, digest, options, maps)
+
+
+def _ground_of(dataset: TerrainDataset) -> GroundStatistics | None:
+    """Statistics of a dataset's ground; None where no λ was observed, so that classes alone can be learned."""
+    try:
+        return fit_ground(dataset)
+    except DatasetError:
+        return None
 
 
 def existing(folder: Path, overwrite: bool) -> Checkpoint | None:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import find_tensor_fault
 from benchnav.planning.planners.planner import LAYERS, Plan, Planner
 from benchnav.planning.problem import Problem
 from benchnav.planning.sensing.sensor import Step
@@ -119,16 +120,6 @@ def find_fault(said: Any, problem: Problem) -> str:
     if not isinstance(plan, Plan):
         return f"Expected a Plan beside the actions, got {type(plan).__name__}."
     return find_tensor_fault("`Plan.status`", plan.status, torch.int64, (batch,), like.device)
-
-
-def find_tensor_fault(
-    what: str, values: Any, dtype: torch.dtype, shape: tuple[int, ...], device: torch.device
-) -> str:
-    """Tells in one line what makes something another tensor than is expected; empty where nothing does."""
-    wanted, got = f"{dtype} of shape {list(shape)} on {device}", type(values).__name__
-    if isinstance(values, Tensor):
-        got = f"{values.dtype} of shape {list(values.shape)} on {values.device}"
-    return "" if got == wanted else f"Expected {what} as {wanted}, got {got}."
 
 
 def find_layer_faults(plan: Plan, problem: Problem) -> list[str]:

@@ -8,12 +8,13 @@ Letters in shapes: B episodes, H×W cells, M drawn fields.
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from benchnav.core import rng
 from benchnav.core.batch import Batch
 from benchnav.core.copula import correlated_normal
 from benchnav.core.distribution import TraversabilityDistribution
@@ -59,10 +60,12 @@ class Belief(ABC, Generic[State]):
     """Turns what was sensed into the distribution of λ: the base class of the parts of kind `belief`.
 
     Attributes:
-        learns: whether `update` may change anything; one that does not is never asked to.
+        learns: whether what is sensed of λ changes what is believed; one that does not is told new predictions alone.
+        needs_statistics: whether `Law.statistics` have to be there.
     """
 
     learns: ClassVar[bool] = True
+    needs_statistics: ClassVar[bool] = False
 
     @abstractmethod
     def init(self, prior: TraversabilityDistribution, law: Law) -> State:
@@ -118,6 +121,41 @@ class Belief(ABC, Generic[State]):
         """Keeps some episodes, by index, int64."""
         return state.select(members)
 
+    def put(self, state: State, members: Tensor, others: State) -> State:
+        """Puts episodes in the places of others.
+
+        Args:
+            state: of B episodes; it is not changed.
+            members: whose places are taken, int64, shape [M].
+            others: of M episodes, under the same law.
+        """
+        return state.put(members, others)
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Draws whole fields of λ from what is believed.
+
+    Args:
+        belief: whose state it is.
+        state: of B episodes.
+        names: number of each episode, by which its fields are drawn, B of them.
+    """
+
+    belief: Belief[Any]
+    state: Any
+    names: tuple[int, ...]
+
+    def sample(self, count: int, key: int) -> Tensor:
+        """Draws `count` fields of each episode, shape [B, M, H, W], by a root key."""
+        keys = [rng.stream_key(key, "fields", name) for name in self.names]
+        return self.belief.sample_fields(self.state, count, keys)
+
+    def select(self, members: Tensor) -> "Fields":
+        """Keeps some episodes, by index, int64."""
+        names = tuple(self.names[place] for place in members.tolist())
+        return Fields(self.belief, self.belief.select(self.state, members), names)
+
 
 @dataclass(frozen=True, kw_only=True)
 class StaticState(Batch):
@@ -157,6 +195,10 @@ class Static(Belief[StaticState]):
     def distribution(self, state: StaticState) -> TraversabilityDistribution:
         """The prediction."""
         return state.prior
+
+    def changed(self, before: StaticState, after: StaticState) -> Tensor:
+        """Cells whose prediction is another."""
+        return before.prior.differs(after.prior)
 
     def sample_fields(self, state: StaticState, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields with the prediction's marginals."""

@@ -15,38 +15,32 @@ Letters in shapes: B episodes, H×W cells, N observations, R×C cells of a block
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from benchnav.core.batch import Batch
-from benchnav.core.conditioned import conditioned
+from benchnav.core.batch import Batch, map_tensors
+from benchnav.core.conditioned import ConditionedDistribution, skewed
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.quantiles import QuantileDistribution
 from benchnav.planning.sensing.belief import Belief, Law, draw_scores, fields_of
-from benchnav.planning.sensing.gaussian import Cells, Field, Observed, condition
+from benchnav.planning.sensing.gaussian import Cells, Field, Observed, condition, evidence, predict
+from benchnav.planning.sensing.score_table import ScoreTable
 from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
 
 _REACH = 4.0  # ℓ; the correlation is 3e-4 there
 _SAME_SCORE, _SAME_STD = 1e-6, 0.99  # a second look that tells less than this is none
 _LEAST_CHANGE = 0.005  # of a score
+_OF_SKEW = 1 / 6  # by how much the score of the median moves with the skewness
 _FARTHEST = 6.0  # score
 _NO_TERM = 1e-12  # precision under which a term says nothing
-
-
-VALUES: tuple[float, ...] = (
-    *(round(0.005 * step, 3) for step in range(40)),
-    *(round(0.2 + 0.02 * step, 2) for step in range(41)),
-)
-"""λ between which a belief's quantiles are linear in the normal score: denser where risk is."""
-_LEVELS: tuple[float, ...] = (
-    *(round(0.0025 * step, 4) for step in range(80)),
-    *(round(0.2 + 0.02 * step, 2) for step in range(40)),
-    *(0.99, 0.995, 0.9975, 1.0),
-)
-_MOST_SCORE = 9.0  # beyond which ranks are alike
-_LAST_RANK = 3.4  # at levels 0 and 1, so that the mean of the ranks beyond the next level is right
+_SAME_PREDICTION = 1e-3  # of its parameters; λ̂ is then the same within about as much
+_MEDIAN_M, _LOG_STD = 1.5, math.log(2)  # of ℓ, before anything was observed
+_LENGTHS_M = tuple(_MEDIAN_M * 2 ** (step / 4) for step in range(-8, 9))
+_FEWEST = 8  # observations that an estimate of ℓ takes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +49,11 @@ class CopulaState(Batch):
 
     Args:
         prior: the model's prediction, shape [B, H, W].
-        scores: normal scores of `VALUES` in each cell under the prediction, shape [B, K, H, W].
+        table: scores of λ under the prediction, of the cells of which something else is believed.
         law: how λ hangs together.
+        field: how the scores hang together, B of them.
+        estimated_from: from how many observations ℓ was estimated; 0 where it was not, int64, shape [B].
+        value: observed λ, of several looks the average, float64, shape [B, H, W].
         lower: least observed score of each cell, float64, shape [B, H, W].
         upper: greatest observed score; where it is the least, the score itself, shape [B, H, W].
         noise_std: standard deviation of the noise of the observed score, shape [B, H, W].
@@ -64,11 +61,15 @@ class CopulaState(Batch):
         shift: precision times mean of the term, shape [B, H, W].
         mean: of the score given all observations, shape [B, H, W].
         std: of the score given all observations, shape [B, H, W].
+        skew: of the score given all observations, its skewness, shape [B, H, W].
     """
 
     prior: TraversabilityDistribution
-    scores: Tensor
+    table: ScoreTable
     law: Law
+    field: Field
+    estimated_from: Tensor
+    value: Tensor
     lower: Tensor
     upper: Tensor
     noise_std: Tensor
@@ -76,11 +77,12 @@ class CopulaState(Batch):
     shift: Tensor
     mean: Tensor
     std: Tensor
+    skew: Tensor
 
     @property
     def observed(self) -> Tensor:
         """Cells of which something was observed, bool, shape [B, H, W]."""
-        return ~self.lower.isnan()
+        return ~self.value.isnan()
 
 
 @dataclass(frozen=True)
@@ -88,29 +90,37 @@ class Copula(Belief[CopulaState]):
     """Learns through the correlation of the ground.
 
     Args:
-        correlation_m: ℓ that is believed; that of the world where it is not given, which is privileged knowledge.
-        window: most observations that an update looks at, those nearest to what is new; more where more is new.
+        correlation_m: ℓ that is believed, in metres; `world`, that of the world, which is privileged knowledge; or
+            `estimated` in each episode from what is observed in it: the mode of the posterior of log ℓ under a
+            log-normal prior of median 1.5 m and standard deviation ln 2. It is estimated from 8, 16, 32, … observations
+            on, until the window is full; before, it is the median.
+        window: most observations that an update or an estimate looks at, those nearest to what is new; an update looks
+            at more where more is new.
     """
 
-    correlation_m: float | None = None
+    correlation_m: float | Literal["world", "estimated"] = "world"
     window: int = 128
 
     def __post_init__(self) -> None:
         """Refuses lengths that are none, and windows without room."""
+        given = self.correlation_m
         expect(
-            self.correlation_m is None or 0 <= self.correlation_m < math.inf,
-            f"`correlation_m` ≥ 0 and finite, got {self.correlation_m}.",
+            given in ("world", "estimated") if isinstance(given, str) else 0 <= given < math.inf,
+            f"`correlation_m` ≥ 0 and finite, 'world' or 'estimated', got {given!r}.",
         )
         expect(self.window >= 1, f"`window` of at least 1, got {self.window}.")
 
     def init(self, prior: TraversabilityDistribution, law: Law) -> CopulaState:
         """Knows the prediction alone."""
-        law = law if self.correlation_m is None else replace(law, correlation_m=self.correlation_m)
+        named = {"world": law.correlation_m, "estimated": _MEDIAN_M}
+        length_m = named[self.correlation_m] if isinstance(self.correlation_m, str) else self.correlation_m
         zeros = torch.zeros(prior.shape, dtype=torch.float64, device=prior.device)
         none = torch.full_like(zeros, torch.nan)
         return CopulaState(
-            prior=prior, scores=scores_of(prior), law=law, lower=none, upper=none, noise_std=none,
-            precision=zeros, shift=zeros, mean=zeros, std=torch.ones_like(zeros),
+            prior=prior, table=ScoreTable.empty(prior), law=law,
+            field=Field.of(law.grid.shape, [length_m / law.grid.resolution_m] * len(zeros), prior.device),
+            estimated_from=zeros[:, 0, 0].long(), value=none, lower=none, upper=none, noise_std=none, precision=zeros,
+            shift=zeros, mean=zeros, std=torch.ones_like(zeros), skew=zeros,
         )  # fmt: skip
 
     def update(
@@ -118,98 +128,145 @@ class Copula(Belief[CopulaState]):
     ) -> CopulaState:
         """Conditions cells near what is new on what is observed there.
 
-        Looks at a score are averaged. Of looks at an interval the one with the least noise counts.
+        Looks at a score are averaged. Of looks at an interval the one with the least noise counts. Of a new prediction
+        the cells count whose parameters differ by more than 10⁻³ from those known.
         """
+        noted, other = state, torch.zeros_like(state.observed)
         if prior is not None:
-            state = _with_prior(state, prior)
-        noted, changed = _note(state, sensed)
-        renewed = changed if prior is None else changed | noted.observed
-        members = renewed.flatten(1).any(1).nonzero()[:, 0]
-        if len(members) == 0:
+            noted, other = with_prior(state, prior)
+        noted, news = note(noted, sensed)
+        learnt = self.learn(noted, news | (other & noted.observed))
+        moved = other | _moved(state, learnt)
+        return replace(learnt, table=learnt.table.having(learnt.prior, moved))
+
+    def learn(self, noted: CopulaState, news: Tensor) -> CopulaState:
+        """Conditions cells near what is new.
+
+        Args:
+            noted: of which observations are noted; it is not changed.
+            news: cells of which something was noted that is not yet known, bool, shape [B, H, W].
+        """
+        members = news.flatten(1).any(1).nonzero()[:, 0].tolist()
+        if not members:
             return noted
-        window = self.window if prior is None else renewed[0].numel()
-        return _put(noted, members, _updated(noted.select(members), renewed[members], window))
+        names = ("field", "estimated_from", "precision", "shift", "mean", "std", "skew")
+        noted = replace(noted, **{name: getattr(noted, name).clone() for name in names})
+        for own in members:
+            self._learn(noted, own, news[own])
+        return noted
+
+    def _learn(self, state: CopulaState, own: int, new: Tensor) -> None:
+        """Makes of what was noted in one episode what is known; writes into the state.
+
+        Episodes go one by one: as many observations as each has, so that none depends on the others.
+        """
+        observed = ~state.value[own].isnan()
+        count, before = int(observed.sum()), int(state.estimated_from[own])
+        if self.correlation_m == "estimated" and max(_FEWEST, 2 * before) <= count and before < self.window:
+            state.estimated_from[own] = count
+            cells = nearest(observed, new, self.window)
+            kept = Cells(row=cells.row[:, : self.window], column=cells.column[:, : self.window])
+            length = _estimate(state, own, kept)
+            if length != float(state.field.length[own]):
+                state.field.write(own, Field.of(state.law.grid.shape, [length], new.device))
+                state.mean[own], state.std[own], state.skew[own] = 0, 1, 0
+                new = observed
+        _condition(state, own, new, self.window)
 
     def distribution(self, state: CopulaState) -> TraversabilityDistribution:
         """The prediction, given what was observed."""
         dtype = state.prior.dtype
-        return conditioned(state.prior, state.mean.to(dtype), state.std.to(dtype))
+        return ConditionedDistribution(
+            state.prior, state.mean.to(dtype), state.std.to(dtype), state.skew.to(dtype)
+        )
 
     def at(self, state: CopulaState, cells: Tensor) -> QuantileDistribution:
         """What is believed of some cells; see `Belief`.
 
-        By quantiles between `VALUES`, which is far quicker than `distribution` and tells λ̂ within 0.01 of it.
+        By quantiles from a table of scores, which is far quicker than `distribution` and tells λ̂ within 0.01 of it.
         """
-        scores = state.scores.movedim(1, -1)[cells].contiguous()
-        dtype, device = scores.dtype, scores.device
-        wanted = (state.mean[cells][:, None] + state.std[cells][:, None] * _ranks(device)).to(dtype)
-        values = torch.tensor(VALUES, dtype=dtype, device=device)
-        after = torch.searchsorted(scores, wanted.contiguous()).clamp(1, len(VALUES) - 1)
-        low, high = scores.gather(1, after - 1), scores.gather(1, after)
-        part = ((wanted - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1)
-        found = torch.lerp(values[after - 1], values[after], part)
-        return QuantileDistribution(found.T[:, None].to(state.prior.dtype), _LEVELS)
+        table = state.table.having(state.prior, cells)
+        found = table.quantiles(cells, state.mean[cells], state.std[cells], state.skew[cells])
+        return (
+            found
+            if found.dtype == state.prior.dtype
+            else replace(found, values=found.values.to(state.prior.dtype))
+        )
 
     def changed(self, before: CopulaState, after: CopulaState) -> Tensor:
         """Cells whose score, or whose prediction, is another."""
-        moved = (before.mean != after.mean) | (before.std != after.std)
-        # Maps of many values, which an update without a new prediction hands on as they are.
-        same = before.scores is after.scores
-        return moved if same else moved | (before.scores != after.scores).any(1)
+        moved = _moved(before, after)
+        return moved if before.prior is after.prior else moved | before.prior.differs(after.prior)
+
+    def put(self, state: CopulaState, members: Tensor, others: CopulaState) -> CopulaState:
+        """Puts episodes in the places of others; see `Belief`."""
+        return replace(state.put(members, others), table=state.table.put(members, others.table))
 
     def sample_fields(self, state: CopulaState, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields given all observations, by Matheron's rule: a field of the law, moved to what was observed."""
         return fields_of(state.prior, self.sample_scores(state, count, keys))
 
     def sample_scores(self, state: CopulaState, count: int, keys: Sequence[int]) -> Tensor:
-        """The normal scores of `sample_fields`, shape [B, M, H, W]."""
-        field = Field.of(state.law.grid.shape, state.law.correlation_cells, state.mean.device)
-        scores = draw_scores(state.law, count, keys).to(state.mean.device)
-        every = _all_cells(state.law.grid.shape, state.mean.device)
-        for own, drawn in enumerate(scores):
+        """Normal scores of the fields that `sample_fields` draws, shape [B, M, H, W]."""
+        (height, width), device = state.law.grid.shape, state.mean.device
+        lines = torch.arange(height, device=device)[None], torch.arange(width, device=device)[None]
+        scores = []
+        for own, length in enumerate(state.field.length.tolist()):
+            law = replace(state.law, correlation_m=length * state.law.grid.resolution_m)
+            drawn = draw_scores(law, count, keys[own : own + 1])[0].to(device)
+            scores.append(drawn)
             row, column = (state.precision[own] > _NO_TERM).nonzero(as_tuple=True)
             if len(row) == 0:
                 continue
+            field = state.field.select(torch.tensor([own], device=device))
             cells = Cells(row=row[None], column=column[None])
             precision, shift = state.precision[own, row, column], state.shift[own, row, column]
             # As the white noise of further fields, of which the first cells are taken.
-            noise = draw_scores(replace(state.law, correlation_m=0.0), 2 * count, keys[own : own + 1])
+            noise = draw_scores(replace(law, correlation_m=0.0), 2 * count, keys[own : own + 1])
             noise = noise[0, count:].to(drawn)[:, row, column] / precision.sqrt()
             inner = field.covariance(cells, cells)[0] + torch.diag(1 / precision)
             away = (shift / precision - drawn[:, row, column] - noise).T
             moved = torch.cholesky_solve(away, torch.linalg.cholesky(inner))
-            drawn += (field.covariance(every, cells)[0] @ moved).T.view_as(drawn)
-        return scores
+            drawn += (field.with_block(cells, *lines)[0].T @ moved).T.view_as(drawn)
+        mean, std, skew = (values[:, None] for values in (state.mean, state.std, state.skew))
+        normal = (torch.stack(scores) - mean) / std.clamp(min=_NO_TERM)
+        return mean + std * skewed(normal, skew)
 
 
-def scores_of(prior: TraversabilityDistribution) -> Tensor:
-    """Normal scores of `VALUES` under a prediction, float32, shape [B, K, H, W]; an atom's end at 0 and at 1."""
-    ends = [prior.to_normal(value)[value < 1] for value in VALUES]
-    return torch.stack([end.float().clamp(-_MOST_SCORE, _MOST_SCORE) for end in ends], dim=1)
+def _moved(before: CopulaState, after: CopulaState) -> Tensor:
+    """Of which cells something else is believed of the score, bool, shape [B, H, W]."""
+    return (before.mean != after.mean) | (before.std != after.std) | (before.skew != after.skew)
 
 
-def _ranks(device: torch.device) -> Tensor:
-    """Standard normal numbers of `_LEVELS`."""
-    levels = torch.tensor(_LEVELS, dtype=torch.float64, device=device)
-    return torch.special.ndtri(levels).clamp(-_LAST_RANK, _LAST_RANK)
+def with_prior(state: CopulaState, prior: TraversabilityDistribution) -> tuple[CopulaState, Tensor]:
+    """Takes the prediction of cells where it differs, bool [B, H, W], and what the λ observed there says under it."""
+    other = state.prior.differs(prior, _SAME_PREDICTION)
+    if not bool(other.any()):
+        return state, other
+    anew = other & state.observed
+    low, high = scores_at(prior, anew, state.value[anew])
+    precision, shift = _terms(low, high, state.noise_std[anew])
+    # Of the other cells the prediction stays what it was, so that small changes do not add up unseen.
+    prior = prior if bool(other.all()) else state.prior.replaced(other, prior)
+    told = replace(
+        state,
+        prior=prior,
+        table=state.table.without(other),
+        lower=state.lower.index_put((anew,), low),
+        upper=state.upper.index_put((anew,), high),
+        precision=state.precision.index_put((anew,), precision),
+        shift=state.shift.index_put((anew,), shift),
+    )
+    return told, other
 
 
-def _with_prior(state: CopulaState, prior: TraversabilityDistribution) -> CopulaState:
-    """Knows the same λ of another prediction, and nothing yet of what it tells of other cells."""
-    seen = state.observed
-    lower, upper = state.lower.clone(), state.upper.clone()
-    if bool(seen.any()):
-        middle = torch.where(state.upper > state.lower, _inner(state.lower, state.upper), state.lower)
-        value = state.prior.at(seen).from_normal(middle[seen][None].to(prior.dtype))[0]
-        lower[seen], upper[seen] = _scores(prior, seen, value)
-    zeros = torch.zeros_like(state.mean)
-    return replace(
-        state, prior=prior, scores=scores_of(prior), lower=lower, upper=upper, precision=zeros, shift=zeros, mean=zeros,
-        std=torch.ones_like(zeros),
-    )  # fmt: skip
+def _terms(low: Tensor, high: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
+    """Precision and shift of what is known of scores; nothing yet where it is an interval."""
+    precision = torch.where(high <= low, 1 / std.square(), 0.0)
+    return precision, torch.where(high <= low, precision * low, 0.0)
 
 
-def _scores(prior: TraversabilityDistribution, cells: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+def scores_at(prior: TraversabilityDistribution, cells: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
     """Least and greatest scores of observed λ [N] in some cells, bool [B, H, W]; both the same but for an atom."""
     low, high = (end[0].double() for end in prior.at(cells).to_normal(value[None].to(prior.dtype)))
     number = high <= low
@@ -218,18 +275,13 @@ def _scores(prior: TraversabilityDistribution, cells: Tensor, value: Tensor) -> 
     return torch.where(number, middle, low), torch.where(number, middle, high)
 
 
-def _inner(lower: Tensor, upper: Tensor) -> Tensor:
-    """A number within each interval."""
-    return torch.where(lower.isinf(), upper - 1, torch.where(upper.isinf(), lower + 1, (lower + upper) / 2))
-
-
-def _note(state: CopulaState, sensed: Sensed) -> tuple[CopulaState, Tensor]:
+def note(state: CopulaState, sensed: Sensed) -> tuple[CopulaState, Tensor]:
     """Notes what was sensed, and tells of which cells something new is known, bool of shape [B, H, W]."""
     new = sensed.mask
     if not bool(new.any()):
         return state, new
     value = sensed.traversability[new]
-    low, high = _scores(state.prior, new, value)
+    low, high = scores_at(state.prior, new, value)
     std = sensed.std[new].double().clamp(min=LEAST_STD)
     was_low, was_high, was_std = state.lower[new], state.upper[new], state.noise_std[new]
     known, number, was_number = ~was_low.isnan(), high <= low, was_high <= was_low
@@ -243,110 +295,91 @@ def _note(state: CopulaState, sensed: Sensed) -> tuple[CopulaState, Tensor]:
     changed[new] = news
 
     def put(whole: Tensor, own: Tensor) -> Tensor:
-        return whole.clone().index_put((changed,), own[news])
+        return whole.index_put((changed,), own[news])
 
-    precision = torch.where(number, 1 / shared.square(), 0.0)
+    known_value = torch.where(
+        weight < 1, torch.lerp(state.value[new], value.double(), weight), value.double()
+    )
+    score, high = torch.where(number, score, low), torch.where(number, score, high)
+    precision, shift = _terms(score, high, shared)
     noted = replace(
         state,
-        lower=put(state.lower, torch.where(number, score, low)),
-        upper=put(state.upper, torch.where(number, score, high)),
+        value=put(state.value, known_value),
+        lower=put(state.lower, score),
+        upper=put(state.upper, high),
         noise_std=put(state.noise_std, shared),
         precision=put(state.precision, precision),
-        shift=put(state.shift, torch.where(number, precision * score, 0.0)),
+        shift=put(state.shift, shift),
     )
     return noted, changed
 
 
-def _updated(state: CopulaState, changed: Tensor, window: int) -> CopulaState:
-    """Updates terms of observations, and scores of cells, near what changed in each episode."""
-    shape, device = state.law.grid.shape, state.mean.device
-    field = Field.of(shape, state.law.correlation_cells, device)
-    first, last = _bounds(changed)
-    cells, there = _nearest(state.observed, changed, first, last, window)
-    member = torch.arange(len(changed), device=device)[:, None]
-
-    def of(values: Tensor, empty: float) -> Tensor:
-        return torch.where(there, values[member, cells.row, cells.column], empty)
-
-    known = condition(
-        field.covariance(cells, cells),
-        Observed(
-            lower=of(state.lower, 0.0), upper=of(state.upper, 0.0), std=of(state.noise_std, 1.0),
-            precision=of(state.precision, 0.0), shift=of(state.shift, 0.0), there=there,
-        ),
-    )  # fmt: skip
-    block, own = _block(first, last, math.ceil(_REACH * state.law.correlation_cells), shape)
-    mean, variance = known.moments(field.covariance(cells, block))
-    std, at_block = variance.sqrt(), (member, block.row, block.column)
-    moved = torch.maximum((mean - state.mean[at_block]).abs(), (std - state.std[at_block]).abs())
-    own &= moved >= _LEAST_CHANGE
-
-    def put(whole: Tensor, where: Cells, which: Tensor, values: Tensor) -> Tensor:
-        places = [place[which] for place in (member.expand_as(where.row), where.row, where.column)]
-        return whole.index_put(tuple(places), values[which])
-
-    return replace(
-        state,
-        precision=put(state.precision, cells, there, known.precision),
-        shift=put(state.shift, cells, there, known.shift),
-        mean=put(state.mean, block, own, mean),
-        std=put(state.std, block, own, std),
+def _condition(state: CopulaState, own: int, new: Tensor, window: int) -> None:
+    """Updates terms of observations, and scores of cells, near what is new in one episode; writes into the state."""
+    field = state.field.select(torch.tensor([own], device=new.device))
+    cells = nearest(~state.value[own].isnan(), new, window)
+    covariance, observed = field.covariance(cells, cells), _observed(state, own, cells)
+    known = condition(covariance, observed)
+    reach = math.ceil(_REACH * float(field.length))
+    rows, columns = (
+        slice(max(low - reach, 0), min(high + reach + 1, size))
+        for (low, high), size in zip(bounds(new), new.shape, strict=True)
     )
+    lines = [torch.arange(line.start, line.stop, device=new.device)[None] for line in (rows, columns)]
+    mean, variance, skew = predict(known, covariance, observed, field.with_block(cells, *lines))
+    new_values, old_values = (mean, variance.sqrt(), skew), (state.mean, state.std, state.skew)
+    moved = torch.zeros_like(new)
+    for scale, values, whole in zip((1, 1, _OF_SKEW), new_values, old_values, strict=True):
+        old = whole[own, rows, columns]
+        moved[rows, columns] |= (values.view_as(old) - old).abs() * scale >= _LEAST_CHANGE
+    for values, whole in zip(new_values, old_values, strict=True):
+        old = whole[own, rows, columns]
+        old.copy_(torch.where(moved[rows, columns], values.view_as(old), old))
+    state.precision[own, cells.row, cells.column] = known.precision
+    state.shift[own, cells.row, cells.column] = known.shift
 
 
-def _put(whole: CopulaState, members: Tensor, part: CopulaState) -> CopulaState:
-    """Puts some episodes' terms and scores where they were taken from."""
-    names = ("precision", "shift", "mean", "std")
-    return replace(
-        whole, **{name: getattr(whole, name).index_copy(0, members, getattr(part, name)) for name in names}
+def _observed(state: CopulaState, own: int, cells: Cells) -> Observed:
+    """What is known of observed cells of one episode."""
+    lower, upper, std, precision, shift = (
+        values[own, cells.row, cells.column]
+        for values in (state.lower, state.upper, state.noise_std, state.precision, state.shift)
     )
+    there = torch.ones_like(cells.row, dtype=torch.bool)
+    return Observed(lower=lower, upper=upper, std=std, precision=precision, shift=shift, there=there)
 
 
-def _bounds(changed: Tensor) -> tuple[Tensor, Tensor]:
-    """First and last row and column of some cells of each episode, each int64, shape [B, 2]."""
-    ends = []
-    for along in (changed.any(2), changed.any(1)):
-        size = along.shape[1]
-        ends.append((along.int().argmax(1), size - 1 - along.flip(1).int().argmax(1)))
-    (top, bottom), (left, right) = ends
-    return torch.stack((top, left), 1), torch.stack((bottom, right), 1)
+def _estimate(state: CopulaState, own: int, cells: Cells) -> float:
+    """ℓ of one episode, in cells: the mode of its posterior among `_LENGTHS_M`."""
+    field = _candidates(state.law.grid.shape, state.law.grid.resolution_m, cells.row.device)
+    observed = map_tensors(_observed(state, own, cells), lambda one: one.expand(len(_LENGTHS_M), -1))
+    cells = map_tensors(cells, lambda one: one.expand(len(_LENGTHS_M), -1))
+    covariance = field.covariance(cells, cells)
+    away = (field.length * (state.law.grid.resolution_m / _MEDIAN_M)).log() / _LOG_STD
+    likely = evidence(covariance, observed, condition(covariance, observed)) - 0.5 * away.square()
+    return float(field.length[likely.argmax()])
 
 
-def _nearest(
-    observed: Tensor, changed: Tensor, first: Tensor, last: Tensor, window: int
-) -> tuple[Cells, Tensor]:
-    """What has changed and the observed cells nearest to it, and which of them are there, bool, shape [B, N]."""
-    new, known = (int(cells.flatten(1).sum(1).max()) for cells in (changed, observed))
-    count = min(max(window, new), known)
+@lru_cache(maxsize=8)
+def _candidates(shape: tuple[int, int], resolution_m: float, device: torch.device) -> Field:
+    return Field.of(shape, [length / resolution_m for length in _LENGTHS_M], device)
+
+
+def bounds(new: Tensor) -> list[tuple[int, int]]:
+    """First and last row, and first and last column, of some cells of a map."""
+    places = (new.any(axis).nonzero()[:, 0] for axis in (1, 0))
+    return [(int(place[0]), int(place[-1])) for place in places]
+
+
+def nearest(observed: Tensor, new: Tensor, window: int) -> Cells:
+    """What is new on a map and the observed cells nearest to it, as many as the window has room for."""
     away = [
-        (torch.maximum(low[:, None] - at, at - high[:, None])).clamp(min=0)
-        for low, high, size in zip(first.T, last.T, observed.shape[1:], strict=True)
-        for at in (torch.arange(size, device=observed.device),)
+        torch.maximum(low - at, at - high).clamp(min=0)
+        for (low, high), size in zip(bounds(new), new.shape, strict=True)
+        for at in (torch.arange(size, device=new.device),)
     ]
-    distance = (away[0].square()[:, :, None] + away[1].square()[:, None]).double()
-    distance = torch.where(changed, -1.0, torch.where(observed, distance, torch.inf)).flatten(1)
+    distance = (away[0].square()[:, None] + away[1].square()).masked_fill(new, -1)
+    row, column = observed.nonzero(as_tuple=True)
     # Of equal distances the first cell goes first, on every machine.
-    place = distance.argsort(dim=1, stable=True)[:, :count]
-    width = observed.shape[2]
-    return Cells(row=place // width, column=place % width), distance.gather(1, place).isfinite()
-
-
-def _block(first: Tensor, last: Tensor, reach: int, shape: tuple[int, int]) -> tuple[Cells, Tensor]:
-    """Cells of a block around each rectangle, all of one size, and which of them are within its reach."""
-    lines, near = [], []
-    for low, high, size in zip(first.T, last.T, shape, strict=True):
-        most = min(int((high - low).max()) + 1 + 2 * reach, size)
-        begin = (low - reach).clamp(min=0).clamp(max=size - most)
-        line = begin[:, None] + torch.arange(most, device=low.device)
-        lines.append(line)
-        near.append((line >= low[:, None] - reach) & (line <= high[:, None] + reach))
-    (rows, columns), (down, across) = lines, near
-    row = rows[:, :, None].expand(-1, -1, columns.shape[1])
-    column = columns[:, None].expand(-1, rows.shape[1], -1)
-    own = down[:, :, None] & across[:, None]
-    return Cells(row=row.flatten(1), column=column.flatten(1)), own.flatten(1)
-
-
-def _all_cells(shape: tuple[int, int], device: torch.device) -> Cells:
-    place = torch.arange(shape[0] * shape[1], device=device)[None]
-    return Cells(row=place // shape[1], column=place % shape[1])
+    kept = distance[row, column].argsort(stable=True)[: max(window, int(new.sum()))]
+    return Cells(row=row[None, kept], column=column[None, kept])

@@ -9,17 +9,23 @@ All in float64. Letters in shapes: B fields, N observations (empty places have n
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import Batch
 from benchnav.core.copula import correlations
 
 _DAMPING = 0.8
 _ROUNDS = 40
 _ENOUGH = 1e-3  # change of a mean and of a standard deviation, in normal scores
 _LEAST_SHARE = 1e-9  # of the variance that an interval leaves
+_LEAST_VARIANCE = 1e-12
+_MOST_SKEW = 2.0  # that of an exponential, which a number far out in a tail is
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,29 +42,60 @@ class Cells:
 
 
 @dataclass(frozen=True)
-class Field:
-    """Correlations of the cells of a map, by their distances along both axes.
+class Field(Batch):
+    """Correlations of the cells of maps, by their distances along both axes.
 
     Args:
-        down: by rows, float64, shape [H].
-        across: by columns, float64, shape [W].
+        length: ℓ in cells, float64, shape [B].
+        down: correlations by rows, float64, shape [B, H].
+        across: correlations by columns, float64, shape [B, W].
     """
 
+    length: Tensor
     down: Tensor
     across: Tensor
 
     @classmethod
-    def of(cls, shape: tuple[int, int], correlation_cells: float, device: torch.device | str) -> "Field":
-        """The field that `benchnav.core.copula.correlated_normal` draws."""
+    def of(cls, shape: tuple[int, int], lengths: Sequence[float], device: torch.device | str) -> "Field":
+        """The fields that `benchnav.core.copula.correlated_normal` draws.
+
+        Args:
+            shape: (H, W).
+            lengths: ℓ in cells of each field, B of them.
+            device: where the correlations are.
+        """
+        known = {length: [correlations(size, length) for size in shape] for length in lengths}
         down, across = (
-            torch.from_numpy(correlations(size, correlation_cells)).to(device=device) for size in shape
+            torch.from_numpy(np.stack([known[length][axis] for length in lengths])).to(device)
+            for axis in (0, 1)
         )
-        return cls(down, across)
+        return cls(torch.tensor(lengths, dtype=torch.float64, device=device), down, across)
+
+    def write(self, own: int, field: "Field") -> None:
+        """Writes the one field of another into this."""
+        for name in ("length", "down", "across"):
+            getattr(self, name)[own] = getattr(field, name)[0]
 
     def covariance(self, one: Cells, other: Cells) -> Tensor:
         """Correlations of N cells with M others, shape [B, N, M]."""
-        down = self.down[(one.row[:, :, None] - other.row[:, None]).abs()]
-        return down.mul_(self.across[(one.column[:, :, None] - other.column[:, None]).abs()])
+        return _at(self.down, one.row, other.row) * _at(self.across, one.column, other.column)
+
+    def with_block(self, cells: Cells, rows: Tensor, columns: Tensor) -> Tensor:
+        """Correlations of N cells with those of a block, shape [B, N, R·C].
+
+        Args:
+            cells: N of each map.
+            rows: of the block, int64, shape [B, R].
+            columns: of the block, int64, shape [B, C].
+        """
+        down, across = _at(self.down, cells.row, rows), _at(self.across, cells.column, columns)
+        return (down[..., None] * across[:, :, None]).flatten(2)
+
+
+def _at(correlations: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """Correlations [B, S] at the distances of N lines from M others, shape [B, N, M]."""
+    away = (one[:, :, None] - other[:, None]).abs()
+    return correlations.expand(len(away), -1).gather(1, away.flatten(1)).view_as(away)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +117,16 @@ class Observed:
     precision: Tensor
     shift: Tensor
     there: Tensor
+
+    @property
+    def interval(self) -> Tensor:
+        """Which cells are known to lie in an interval, bool, shape [B, N]."""
+        return self.there & (self.upper > self.lower)
+
+    @property
+    def most(self) -> int:
+        """The greatest number of intervals of a field."""
+        return int(self.interval.sum(1).max())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,8 +150,11 @@ class Posterior:
     def moments(self, covariance: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of M cells of unit variance, from their covariances with the observed, [B, N, M]."""
         mean = torch.einsum("bn,bnm->bm", self.weights, covariance)
-        reduced = torch.linalg.solve_triangular(self.factor, self.root[..., None] * covariance, upper=False)
-        return mean, (1 - reduced.square().sum(1)).clamp(min=0)
+        return mean, (1 - self.reduced(covariance).square().sum(1)).clamp(min=0)
+
+    def reduced(self, covariance: Tensor) -> Tensor:
+        """What the terms take from the covariances of M cells, as a matrix [B, N, M] times its own transpose."""
+        return torch.linalg.solve_triangular(self.factor, self.root[..., None] * covariance, upper=False)
 
 
 def posterior(covariance: Tensor, precision: Tensor, shift: Tensor) -> Posterior:
@@ -128,7 +178,7 @@ def posterior(covariance: Tensor, precision: Tensor, shift: Tensor) -> Posterior
 
 
 def condition(covariance: Tensor, observed: Observed) -> Posterior:
-    """Conditions a field on numbers exactly, and on intervals by expectation propagation.
+    """Conditions a field on numbers exactly, and then on intervals by expectation propagation.
 
     A field's terms do not depend on the others of the batch: each goes on until its own stand still.
 
@@ -136,55 +186,147 @@ def condition(covariance: Tensor, observed: Observed) -> Posterior:
         covariance: K of the observed cells, shape [B, N, N].
         observed: what is known of them; the terms that it has are where intervals begin.
     """
-    lower, upper, there = observed.lower, observed.upper, observed.there
-    interval = there & (upper > lower)
-    known = 1 / observed.std.square()
-    number = there & ~interval
-    precision = torch.where(number, known, torch.where(interval, observed.precision, 0.0))
-    shift = torch.where(number, known * lower, torch.where(interval, observed.shift, 0.0))
-    going = interval.any(1).nonzero()[:, 0]
+    interval, most = observed.interval, observed.most
+    known = torch.where(observed.there & ~interval, 1 / observed.std.square(), 0.0)
+    numbers = posterior(covariance, known, known * torch.where(interval, 0.0, observed.lower))
+    if most == 0:
+        return numbers
+    # The intervals alone, as a field of few cells that the numbers have given a mean.
+    place = _first(interval, most)
+    held, lower, upper, std, precision, shift = (
+        values.gather(1, place)
+        for values in (
+            interval, observed.lower, observed.upper, observed.std, observed.precision, observed.shift,
+        )
+    )  # fmt: skip
+    precision, shift = torch.where(held, precision, 0.0), torch.where(held, shift, 0.0)
+    columns = covariance.gather(2, place[:, None].expand(-1, covariance.shape[1], -1))
+    reduced = numbers.reduced(columns)
+    centre = torch.einsum("bn,bnm->bm", numbers.weights, columns)
+    left = columns.gather(1, place[..., None].expand(-1, -1, most)) - reduced.mT @ reduced
+    going = held.any(1).nonzero()[:, 0]
     for _ in range(_ROUNDS):
         if len(going) == 0:
             break
-        own = posterior(covariance[going], precision[going], shift[going])
-        mean, variance = own.moments(covariance[going])
-        new_precision, new_shift = _terms(
-            mean, variance, precision[going], shift[going],
-            lower[going], upper[going], observed.std[going],
-        )  # fmt: skip
-        held = interval[going]
-        new_precision = torch.where(held, torch.lerp(own.precision, new_precision, _DAMPING), own.precision)
-        new_shift = torch.where(held, torch.lerp(own.shift, new_shift, _DAMPING), own.shift)
+        own = _Terms(precision[going], shift[going])
+        mean, variance = own.moments(left[going], centre[going])
+        new = own.towards(mean, variance, lower[going], upper[going], std[going])
+        new = _Terms(*(torch.where(held[going], *both) for both in zip(new, own, strict=True)))
         # By how much each term moves its own cell, were it alone to change.
-        scale = 1 / (1 / variance.clamp(min=1e-12) + (new_precision - own.precision).clamp(min=0))
-        moved = (
-            scale * ((new_shift - own.shift).abs() + (new_precision - own.precision).abs() * mean.abs())
-        ).amax(1)
-        precision[going], shift[going] = new_precision, new_shift
-        going = going[moved > _ENOUGH]
-    return posterior(covariance, precision, shift)
+        scale = 1 / (1 / variance + (new.precision - own.precision).clamp(min=0))
+        moved = (new.shift - own.shift).abs() + (new.precision - own.precision).abs() * mean.abs()
+        precision[going], shift[going] = new
+        going = going[(scale * moved).amax(1) > _ENOUGH]
+    found = [
+        values.scatter(1, place, torch.where(held, own, values.gather(1, place)))
+        for values, own in ((numbers.precision, precision), (numbers.shift, shift))
+    ]
+    return posterior(covariance, *found)
 
 
-def _terms(
-    mean: Tensor,
-    variance: Tensor,
-    precision: Tensor,
-    shift: Tensor,
-    lower: Tensor,
-    upper: Tensor,
-    std: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Precision and shift of the terms that give each cell the moments of its interval, all else as it is."""
-    variance = variance.clamp(min=1e-12)
-    without = 1 / (1 / variance - precision).clamp(min=1e-12)
-    centre = without * (mean / variance - shift)
+def evidence(covariance: Tensor, observed: Observed, found: Posterior) -> Tensor:
+    """Log likelihood of what is observed, up to what does not depend on the field, shape [B].
+
+    Numbers are exact. Intervals are by expectation propagation (Rasmussen and Williams 2006, equation 3.65).
+
+    Args:
+        covariance: K of the observed cells, shape [B, N, N].
+        observed: what is known of them.
+        found: the field given that, from `condition`.
+    """
+    mean, variance = found.moments(covariance)
+    terms = _Terms(found.precision, found.shift)
+    whole = 0.5 * (found.shift * mean).sum(1) - found.factor.diagonal(dim1=1, dim2=2).log().sum(1)
+    centre, without = terms.left_out(mean, variance.clamp(min=_LEAST_VARIANCE))
+    ends = (
+        torch.where(observed.interval, end, side)
+        for end, side in ((observed.lower, -1.0), (observed.upper, 1.0))
+    )
+    mass = _standard(centre, without + observed.std.square(), *ends)[2]
+    # What the Gaussian term has in the place of the interval.
+    joint = (centre + without * terms.shift).square() / (1 + without * terms.precision)
+    term = (joint - centre.square()) / (2 * without) - 0.5 * torch.log1p(without * terms.precision)
+    return whole + torch.where(observed.interval, mass - term, 0.0).sum(1)
+
+
+def predict(
+    found: Posterior, covariance: Tensor, observed: Observed, block: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, variance and skewness of M cells, each of shape [B, M].
+
+    An interval leaves its cell skew, and by the correlation that is left its neighbours: a cell's third cumulant is the
+    sum of those of the intervals' cells times the cube of the cell's regression on each, which is right for a single
+    interval and of first order for several (Opper, Paquet and Winther 2013, "Perturbative corrections for approximate
+    inference in Gaussian latent variable models").
+
+    Args:
+        found: the field given what is observed, from `condition`.
+        covariance: K of the observed cells, shape [B, N, N].
+        observed: what is known of them.
+        block: covariances of the observed cells with the M, shape [B, N, M].
+    """
+    taken = found.reduced(block)
+    mean = torch.einsum("bn,bnm->bm", found.weights, block)
+    variance = (1 - taken.square().sum(1)).clamp(min=0)
+    most = observed.most
+    if most == 0:
+        return mean, variance, torch.zeros_like(mean)
+    place = _first(observed.interval, most)
+    held, lower, upper, std, precision, shift = (
+        values.gather(1, place)
+        for values in (
+            observed.interval, observed.lower, observed.upper, observed.std, found.precision, found.shift,
+        )
+    )  # fmt: skip
+    columns = covariance.gather(2, place[:, None].expand(-1, covariance.shape[1], -1))
+    own = found.reduced(columns)
+    own_mean = torch.einsum("bn,bnm->bm", found.weights, columns)
+    own_variance = (1 - own.square().sum(1)).clamp(min=_LEAST_VARIANCE)
+    centre, without = _Terms(precision, shift).left_out(own_mean, own_variance)
+    ends = torch.where(held, lower, -1.0), torch.where(held, upper, 1.0)
     total = without + std.square()
-    noisy_mean, noisy_variance = interval_moments(centre, total, lower, upper)
-    pull = (noisy_mean - centre) / total
-    shrink = (1 - noisy_variance / total) / total
-    left = (1 - without * shrink).clamp(min=_LEAST_SHARE)
-    new_precision = shrink / left
-    return new_precision, centre * new_precision + pull / left
+    third = _third_cumulant(centre, total, *ends) * (without / total).pow(3)
+    shared = block.gather(1, place[..., None].expand(-1, -1, block.shape[2])) - own.mT @ taken
+    regression = shared / own_variance[..., None]
+    found_third = torch.einsum("bn,bnm->bm", torch.where(held, third, 0.0), regression.pow(3))
+    skew = found_third / variance.clamp(min=_LEAST_VARIANCE).pow(1.5)
+    return mean, variance, skew.clamp(-_MOST_SKEW, _MOST_SKEW)
+
+
+def _first(which: Tensor, most: int) -> Tensor:
+    """Places of those of each row that are meant, then of others, shape [B, most]."""
+    return (~which).int().argsort(dim=1, stable=True)[:, :most]
+
+
+class _Terms(NamedTuple):
+    """Gaussian terms, one a cell: exp(shift · z − precision · z² / 2), each of shape [B, N]."""
+
+    precision: Tensor
+    shift: Tensor
+
+    def moments(self, covariance: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the cells of a field of covariance [B, N, N] and mean [B, N], given the terms."""
+        found = posterior(covariance, self.precision, self.shift - self.precision * centre)
+        mean = torch.einsum("bn,bnm->bm", found.weights, covariance)
+        taken = found.reduced(covariance).square().sum(1)
+        return centre + mean, (covariance.diagonal(dim1=1, dim2=2) - taken).clamp(min=_LEAST_VARIANCE)
+
+    def left_out(self, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of each cell without its own term."""
+        without = 1 / (1 / variance - self.precision).clamp(min=_LEAST_VARIANCE)
+        return without * (mean / variance - self.shift), without
+
+    def towards(self, mean: Tensor, variance: Tensor, lower: Tensor, upper: Tensor, std: Tensor) -> "_Terms":
+        """Terms that give each cell more nearly the moments of its interval, all else as it is."""
+        centre, without = self.left_out(mean, variance)
+        total = without + std.square()
+        noisy_mean, noisy_variance = interval_moments(centre, total, lower, upper)
+        pull = (noisy_mean - centre) / total
+        shrink = (1 - noisy_variance / total) / total
+        left = (1 - without * shrink).clamp(min=_LEAST_SHARE)
+        precision = shrink / left
+        found = precision, centre * precision + pull / left
+        return _Terms(*(torch.lerp(*both, _DAMPING) for both in zip(self, found, strict=True)))
 
 
 def interval_moments(mean: Tensor, variance: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
@@ -196,6 +338,33 @@ def interval_moments(mean: Tensor, variance: Tensor, lower: Tensor, upper: Tenso
         lower: −∞ for none.
         upper: above `lower`; ∞ for none.
     """
+    low, high, log_mass, flipped = _standard(mean, variance, lower, upper)
+    at_low, at_high = (torch.where(end.isinf(), 0.0, _density(end, log_mass)) for end in (low, high))
+    shift = at_low - at_high
+    slope = torch.where(low.isinf(), 0.0, low) * at_low - torch.where(high.isinf(), 0.0, high) * at_high
+    share = (1 + slope - shift.square()).clamp(_LEAST_SHARE, 1)
+    shift = torch.maximum(torch.minimum(shift, high), low)
+    return mean + variance.sqrt() * torch.where(flipped, -shift, shift), variance * share
+
+
+def _third_cumulant(mean: Tensor, variance: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Third cumulant of a normal number that lies in an interval."""
+    low, high, log_mass, flipped = _standard(mean, variance, lower, upper)
+    at_low, at_high = (torch.where(end.isinf(), 0.0, _density(end, log_mass)) for end in (low, high))
+    low, high = (torch.where(end.isinf(), 0.0, end) for end in (low, high))
+    first = at_low - at_high
+    second = 1 + low * at_low - high * at_high
+    third = (low.square() + 2) * at_low - (high.square() + 2) * at_high
+    # Far out in a tail, where rounding leaves nothing of it, the number is exponential.
+    most = 2 * (second - first.square()).clamp(min=0).pow(1.5)
+    found = torch.clamp(third - 3 * first * second + 2 * first.pow(3), -most, most)
+    return variance.pow(1.5) * torch.where(flipped, -found, found)
+
+
+def _standard(
+    mean: Tensor, variance: Tensor, lower: Tensor, upper: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """An interval in standard deviations, the log of its probability, and whether it was flipped to low numbers."""
     std = variance.sqrt()
     low, high = (lower - mean) / std, (upper - mean) / std
     # On the side where Φ is small, so that nothing is lost to rounding.
@@ -203,13 +372,7 @@ def interval_moments(mean: Tensor, variance: Tensor, lower: Tensor, upper: Tenso
     low, high = torch.where(flipped, -high, low), torch.where(flipped, -low, high)
     log_high = torch.special.log_ndtr(high)
     apart = (torch.special.log_ndtr(low) - log_high).clamp(max=-1e-300)
-    log_mass = log_high + torch.log(-torch.expm1(apart))
-    at_low, at_high = (torch.where(end.isinf(), 0.0, _density(end, log_mass)) for end in (low, high))
-    shift = at_low - at_high
-    slope = torch.where(low.isinf(), 0.0, low) * at_low - torch.where(high.isinf(), 0.0, high) * at_high
-    share = (1 + slope - shift.square()).clamp(_LEAST_SHARE, 1)
-    shift = torch.maximum(torch.minimum(shift, high), low)
-    return mean + std * torch.where(flipped, -shift, shift), variance * share
+    return low, high, log_high + torch.log(-torch.expm1(apart)), flipped
 
 
 def _density(at: Tensor, log_mass: Tensor) -> Tensor:

@@ -91,29 +91,31 @@ class Moment:
 
     Args:
         keys: a stream key of each episode, B of them.
-        step: how many steps were taken.
+        step: how many steps were taken, in all episodes or in each, B of them.
     """
 
     keys: Sequence[int]
-    step: int
+    step: int | Sequence[int]
 
-    def normal(self, name: str, wanted: Tensor) -> Tensor:
-        """Standard normals, one for each wanted cell of each episode in this step, whatever else is wanted.
+    def normal(self, name: str, wanted: Tensor, shape: tuple[int, ...] = ()) -> Tensor:
+        """Standard normals for each wanted cell of each episode in this step, whatever else is wanted.
 
         Args:
-            name: of the stream, for a sensor that draws more than one number a cell.
+            name: of the stream, for a sensor that draws more than once.
             wanted: bool, shape [B, H, W].
+            shape: of what is drawn for a cell; four numbers cost hardly more than one.
 
         Returns:
-            Float64, in the order of `wanted.nonzero()`, shape [N].
+            Float64, in the order of `wanted.nonzero()`, shape [N, *shape].
         """
         count, flat = wanted[0].numel(), wanted.flatten(1).cpu()
+        steps = [self.step] * len(self.keys) if isinstance(self.step, int) else self.step
         drawn = [
-            rng.normal(rng.stream_key(key, name), self.step * count + row.nonzero()[:, 0].numpy())
-            for key, row in zip(self.keys, flat, strict=True)
+            rng.normal(rng.stream_key(key, name), step * count + row.nonzero()[:, 0].numpy(), shape)
+            for key, step, row in zip(self.keys, steps, flat, strict=True)
             if bool(row.any())
         ]
-        found = np.concatenate(drawn) if drawn else np.empty(0)
+        found = np.concatenate(drawn) if drawn else np.empty((0, *shape))
         return torch.from_numpy(found).to(wanted.device)
 
 

@@ -17,6 +17,7 @@ from scipy.ndimage import generate_binary_structure, label
 from torch import Tensor
 
 from benchnav.core import rng
+from benchnav.core.batch import map_tensors
 from benchnav.core.copula import LONGEST_CORRELATION, correlated_normal
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
@@ -60,7 +61,8 @@ class Realisation:
             ConfigError: λ of some cells is not known.
         """
         check_known(terrain, world)
-        self._grid, truth = terrain.grid, terrain.truth
+        self._grid, self._truth = terrain.grid, terrain.truth
+        truth = self._truth
         self.attempts = torch.ones(len(terrain), dtype=torch.int64, device=terrain.traversability.device)
         self.field: Tensor | None = None
         if world.noise == "stored":
@@ -99,6 +101,15 @@ class Realisation:
         met = TraversabilityMixture(weights, means, stds).from_normal(noise)[:, 0, 0]
         return torch.where(self._grid.contains(x, y), met, 0.0)
 
+    def field_at(self, step: int) -> Tensor:
+        """λ of every cell at a step where it is resampled, shape [B, H, W]: one noise a step, in each cell's own scale.
+
+        Args:
+            step: steps taken so far; beyond the last the last.
+        """
+        noise = self._noise[:, min(step, self._noise.shape[1] - 1), None, None]
+        return self._truth.from_normal(noise.expand(-1, *self._grid.shape))
+
     def exchange_(self, members: Tensor, others: "Realisation") -> None:
         """Gives some episodes what they meet in another realisation of the same world, in place.
 
@@ -107,6 +118,9 @@ class Realisation:
             others: of M episodes on maps of the same grid.
         """
         self._ground.index_copy_(0, members, others._ground)
+        self._truth = map_tensors(
+            self._truth, lambda own, new: own.index_copy(0, members, new), others._truth
+        )
         self.attempts.index_copy_(0, members, others.attempts)
         if self.field is not None and others.field is not None:
             self.field.index_copy_(0, members, others.field)
@@ -142,7 +156,7 @@ def draw_frozen(
 
     Args:
         terrain: the true maps.
-        world: correlation length, and what immobilises a robot.
+        world: correlation length and kernel, and what immobilises a robot.
         places: starts and goals.
         key: root key of the noise.
         maps: names each episode's stream under that root, B of them.
@@ -165,7 +179,9 @@ def draw_frozen(
     pending = torch.arange(len(terrain), device=field.device)
     for attempt in range(MOST_ATTEMPTS):
         normals = [
-            correlated_normal(rng.stream_key(key, int(maps[i]), "field", attempt), _FIRST, grid.shape, cells)
+            correlated_normal(
+                rng.stream_key(key, int(maps[i]), "field", attempt), _FIRST, grid.shape, cells, world.kernel
+            )
             for i in pending.tolist()
         ]
         drawn = terrain.truth.select(pending).from_normal(torch.from_numpy(np.concatenate(normals)).to(field))

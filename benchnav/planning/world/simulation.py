@@ -88,6 +88,10 @@ class Simulation:
             return self._goal_m.new_zeros(len(self._goal_m), *self._grid.shape).bool()
         return self.field < self._immobile.below
 
+    def field_at(self, step: int) -> Tensor:
+        """λ of every cell at a step, shape [B, H, W]; where it is resampled, as every robot would meet it then."""
+        return self._realisation.field_at(step) if self.field is None else self.field
+
     def init(self, start: Tensor) -> SimulationState:
         """Puts the robots at their initial states, shape [B, S]."""
         zero = torch.zeros(len(start), dtype=torch.int64, device=start.device)

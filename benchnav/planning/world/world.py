@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch
+from benchnav.core.copula import KERNELS
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.settings import check_known, plain, read
 from benchnav.planning.free_space import FreeSpace, Rules
@@ -62,6 +63,8 @@ class World:
             episode as a correlated field, each cell with its own distribution.
         correlation_m: ℓ of frozen noise: cells at distance d have the correlation exp(−d²/2ℓ²) before each
             takes its own distribution.
+        kernel: of frozen noise: `gaussian`, or `matern32`, a rougher field, whose correlation is the same at distance
+            ℓ; beliefs go on believing the Gaussian.
         immobile: what ends an episode as immobilised; None for nothing.
         time_budget_s: T; an episode that is not at the goal by then has failed.
         time_budget_ratio: T in multiples of the map's grid reference time at the robot's top speed, in place
@@ -70,6 +73,7 @@ class World:
 
     noise: str = "resampled"
     correlation_m: float = 1.5
+    kernel: str = KERNELS[0]
     immobile: Immobile | None = None
     time_budget_s: float | None = 100.0
     time_budget_ratio: float | None = None
@@ -80,6 +84,7 @@ class World:
             self.noise in NOISES,
             f"`noise` {', '.join(map(repr, NOISES[:-1]))} or {NOISES[-1]!r}, got {self.noise!r}.",
         )
+        expect(self.kernel in KERNELS, f"`kernel` {' or '.join(map(repr, KERNELS))}, got {self.kernel!r}.")
         expect(
             0 <= self.correlation_m < float("inf"),
             f"`correlation_m` ≥ 0 and finite, got {self.correlation_m}.",
@@ -134,8 +139,14 @@ class World:
         return steps
 
     def to_dict(self) -> dict[str, Any]:
-        """All that bears on what happens, as plain data for JSON; what the noise does not use is left out."""
-        unused = () if self.noise == "frozen" else ("correlation_m",)
+        """All that bears on what happens, as plain data for JSON.
+
+        What the noise does not use is left out, and the kernel where it is the one that was there before there was a
+        choice, so that ids stay.
+        """
+        unused = () if self.noise == "frozen" else ("correlation_m", "kernel")
+        if self.kernel == KERNELS[0]:
+            unused = (*unused, "kernel")
         return {n: value for n, value in plain(self).items() if value is not None and n not in unused}
 
 
@@ -191,10 +202,11 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
     if len(budgets) == 1:  # of the two ways to give a time budget one takes the other's place
         given |= dict.fromkeys(set(_BUDGETS) - set(budgets))
     changed_world = read(World, given, "`{}`".format, "world", preset.world)
-    expect(
-        "correlation_m" not in given or changed_world.noise == "frozen",
-        f"`world.correlation_m` with `world.noise` frozen, got it with {changed_world.noise!r}.",
-    )
+    for key in ("correlation_m", "kernel"):
+        expect(
+            key not in given or changed_world.noise == "frozen",
+            f"`world.{key}` with `world.noise` frozen, got it with {changed_world.noise!r}.",
+        )
     rules = read(Rules, {} if task is None else task, "`{}`".format, "task", preset.rules)
     changes = _differences(preset.world, changed_world) + _differences(preset.rules, rules)
     return changed_world, rules, " ".join([name, *changes])

@@ -1,6 +1,7 @@
 """Hand-made rows and recordings."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,8 +9,8 @@ import pandas as pd
 import torch
 
 from benchnav.core.tables import Bold, Table
-from benchnav.eval.experiment.condition import LABELS
-from benchnav.eval.recording import Recording, drawn_plan
+from benchnav.eval.experiment.condition import LABELS, LATER_LABELS
+from benchnav.eval.recording import KnownMap, Recording, drawn_plan, reach_outline
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.summary import summarise
 
@@ -21,7 +22,7 @@ PAPER = {
 
 def condition(planner: str = "mppi", risk: str = "cvar", **labels: str) -> dict[str, str]:
     """Labels of a condition."""
-    same = {"data": "paper-v1", "scenario": "std", "world": "paper", "robot": "unicycle"}
+    same = {"data": "paper-v1", "scenario": "std", "world": "paper", "robot": "unicycle", **LATER_LABELS}
     return (
         same | {"objective": "goal_distance", "model": "paper-v1", "planner": planner, "risk": risk} | labels
     )
@@ -39,7 +40,9 @@ def row(
         "traversability": 0.8, "reference_time_s": 25.0, "time_ratio": time_s / 25 if success else np.nan,
         "score": 12.5 / time_s if success else 0.0, "path_length_m": 22.0, "stuck_share": 0.1,
         "roughness_radps2": 2.0, "planning_ms": 1.0, "planning_ms_p95": 3.0, "planning_start_ms": 9.0,
-        "rejected_draws": 0, "compiled": True, "error": "", "code": "c",
+        "revisions": np.nan, "seen_cells": np.nan, "sensed_cells": np.nan, "ahead_rmse": np.nan,
+        "ahead_log_score": np.nan, "learning_ms": np.nan, "rejected_draws": 0, "compiled": True, "error": "",
+        "code": "c",
     }  # fmt: skip
     return made | changes
 
@@ -119,6 +122,32 @@ def held_recording(steps: int = 80, **changes: Any) -> Recording:
     about = {"condition": "t", **condition(world="stakes"), "seed": "0", "realisation": "0", "map": "4"}
     ground = {"field": field, "soft": generator.random((40, 60)) < 0.2, "immobilising": field < 0.15}
     return recording(steps, **({"about": about | {"outcome": "immobilised"}} | ground | changes))
+
+
+def learning_recording(steps: int = 80, every: int = 5, **changes: Any) -> Recording:
+    """An episode of a robot that learns twice a second: it sees 6 m and senses λ within 2 m."""
+    recording = held_recording(steps, **changes)
+    return replace(recording, known=known_maps(recording, range(0, steps + 1, every)))
+
+
+def known_maps(recording: Recording, steps: Iterable[int]) -> tuple[KnownMap, ...]:
+    """What a robot knows that believes in the field where it sensed it, and knows little elsewhere."""
+    rows, columns = np.mgrid[:40, :60]
+    known, seen, sensed = [], np.zeros((40, 60), bool), np.zeros((40, 60), bool)
+    assert recording.field is not None
+    for step in steps:
+        x, y = recording.states[step, :2] / 0.5
+        away_m = 0.5 * np.hypot(columns + 0.5 - x, rows + 0.5 - y)
+        seen, sensed = seen | (away_m < 6), sensed | (away_m < 2)
+        mean = np.where(sensed, recording.field, 0.6).astype(np.float16)
+        known.append(
+            KnownMap(
+                step=step, predicted=(0.8 * mean).astype(np.float16), free=mean > 0.3, mean=mean,
+                spread=np.where(sensed, 0, 0.3).astype(np.float16), seen=seen, sensed=sensed,
+                outline=reach_outline(away_m < 2, 0.5),
+            )
+        )  # fmt: skip
+    return tuple(known)
 
 
 def plan(step: int, state: np.ndarray) -> Any:

@@ -64,6 +64,8 @@ def test_an_extension_after_the_hypotheses_is_told() -> None:
         ({"supported": False}, "equivalence not shown"),
         ({"kind": "non-inferiority"}, "not inferior"),
         ({"kind": "non-inferiority", "supported": False}, "non-inferiority not shown"),
+        ({"kind": "superiority"}, "superior"),
+        ({"kind": "superiority", "supported": False}, "superiority not shown"),
         ({"kind": "difference", "direction": ""}, "significantly different"),
         ({"kind": "difference", "direction": "lower"}, "significantly lower"),
         ({"kind": "difference", "direction": "lower", "supported": False}, "not significantly lower"),
@@ -86,21 +88,25 @@ def test_a_forest_has_a_panel_a_metric_with_points_intervals_and_margins() -> No
         a_test(),
         a_test(**OTHER),
         a_test(supported=False, difference=2.0, kind="non-inferiority", direction="lower"),
+        a_test(supported=False, kind="superiority", direction="lower"),
+        a_test(supported=False, kind="superiority", direction="higher"),
     ]
     success, time = forest_figure(pd.DataFrame(rows)).axes
     assert [panel.get_xlabel() for panel in (success, time)] == ["Δ success [points]", "Δ T_total [s]"]
     points = [line for line in time.lines if line.get_marker() == "o"]
-    assert [float(point.get_xdata()[0]) for point in points] == [0.1, 2.0]
-    assert [point.get_markerfacecolor() == "white" for point in points] == [False, True]
+    assert [float(point.get_xdata()[0]) for point in points] == [0.1, 2.0, 0.1, 0.1]
+    assert [point.get_markerfacecolor() == "white" for point in points] == [False, True, True, True]
     spans = {tuple(map(float, line.get_xdata())) for line in time.lines if len(line.get_xdata()) == 2}
     assert {(-0.25, 0.45), (-0.2, 0.4)} <= spans
     bands = [band.get_paths()[0].get_extents() for band in time.collections]
     assert (bands[0].x0, bands[0].x1) == (-0.5, 0.5)
     assert bands[1].x0 == time.get_xlim()[0]  # of what is better the lower all below the margin is
     assert bands[1].x1 == 0.5
+    assert (bands[2].x0, bands[2].x1) == (time.get_xlim()[0], -0.5)
+    assert (bands[3].x0, bands[3].x1) == (0.5, time.get_xlim()[1])
     assert not success.collections
     assert [label.get_text() for label in success.get_yticklabels()] == ["2. CVaR\n− mean"]
-    assert [label.get_text().split(".")[0] for label in time.get_yticklabels()] == ["1", "3"]
+    assert [label.get_text().split(".")[0] for label in time.get_yticklabels()] == ["1", "3", "4", "5"]
 
 
 def test_a_forest_is_drawn_where_no_episode_tells_anything() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from benchnav.core.tables import to_latex, to_markdown, to_terminal
 from benchnav.eval.experiment.condition import LABELS
-from benchnav.eval.report.result_tables import comparison_table, paper_table, result_table
+from benchnav.eval.report.result_tables import comparison_table, learning_table, paper_table, result_table
 from benchnav.eval.stats.comparison import compare
 from tests.eval.report import made
 from tests.eval.stats.test_comparison import A, B, pair
@@ -368,3 +368,31 @@ def test_times_in_shares_of_unlike_budgets_say_so() -> None:
     assert row["Δ T_total [% of T]"] == "+15.0"  # shares 0.1, 1, 0.2 less 0.1, 0.5, 0.25
     assert not [heading for heading in shown.headings if "T_total [s]" in heading]
     assert "in shares of each condition's own T" in dict(shown.explained)["Δ T_total [% of T], 95 %"]
+
+
+def test_what_robots_learnt_stands_in_a_table_of_its_own() -> None:
+    learns = made.condition("astar_dwa", "mean", ground="probe:1", belief="copula")
+    told = {"seen_cells": 4096.0, "learning_ms": 3.0, "ahead_log_score": 0.5}
+    episodes = made.rows(
+        [made.row(made.condition("astar_dwa", "mean"), place) for place in range(2)],
+        made.row(learns, 0, sensed_cells=100.0, revisions=10.0, ahead_rmse=0.1, **told),
+        made.row(learns, 1, sensed_cells=301.0, revisions=21.0, ahead_rmse=0.3, **told),
+    )
+    table = learning_table(made.summary(episodes))
+    assert table is not None
+    (cells,) = table.rows
+    shown = dict(zip(table.headings, cells, strict=True))
+    assert shown["ground"] == "probe:1"
+    assert shown["belief"] == "copula"
+    means = (
+        "cells seen",
+        "cells sensed",
+        "revisions",
+        "RMSE ahead",
+        "log score ahead",
+        "belief [ms]",
+        "planning [ms]",
+    )
+    assert [shown[name] for name in means] == ["4096", "200", "16", "0.200", "0.500", "3", "1"]
+    assert [heading for heading, _ in table.explained] == list(table.headings)
+    assert learning_table(made.summary(made.rows(made.row(made.condition("mppi", "mean"))))) is None

@@ -16,7 +16,7 @@ from benchnav.core.quantiles import QuantileDistribution
 from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.run.isolation import IsolatedPlanner
-from benchnav.eval.run.knowledge import Knowledge, KnowledgeError, Learning
+from benchnav.eval.run.knowledge import Knowing, Learning
 from benchnav.eval.run.rollout import Episodes, run_episodes
 from benchnav.planning import risk
 from benchnav.planning.free_space import FreeSpace, Rules, cells_at_goal
@@ -27,7 +27,8 @@ from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.belief import Belief, Static, StaticState
 from benchnav.planning.sensing.copula import Copula
-from benchnav.planning.sensing.sensor import Contact, Moment, Probe, Sensed, Sensor
+from benchnav.planning.sensing.knowledge import KnowledgeError, Learner, Truth
+from benchnav.planning.sensing.sensor import Contact, Full, Moment, Probe, Sensed, Sensor
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.realisation import joined
 from benchnav.planning.world.simulation import Simulation
@@ -66,7 +67,19 @@ class Drives:
         return run_episodes(planner, self.problem, self.simulation, generator(), learning=learning, **options)
 
 
-def drives(seed: int = 0, **changes: Any) -> Drives:
+def learning(problem: Problem, truth: Truth, **changes: Any) -> Learning:
+    """How robots learn on ground of the law, and what they know when they set out."""
+    given: dict[str, Any] = {
+        "sensor": Full(), "ground": Probe(1.5), "belief": Copula(), "law": LAW, "measure": measure,
+        "rules": problem.task.rules, "predict": fails(),
+    }  # fmt: skip
+    learner = Learner(**given | changes)
+    return Learning(
+        learner=learner, start=learner.begin(truth, problem.start, problem.distribution), truth=truth
+    )
+
+
+def drives(seed: int = 0, replan_every_s: float = 0.5, **changes: Any) -> Drives:
     # The first draws with a feasible path.
     truth = made.mixture(40, SIZE, SIZE, seed=3)
     truth = type(truth)(truth.weights.float(), truth.means.float(), truth.stds.float())
@@ -76,14 +89,12 @@ def drives(seed: int = 0, **changes: Any) -> Drives:
     kept = joined(field >= IMMOBILE.below, LAW.grid, places).nonzero()[:BATCH, 0]
     truth, field, places = truth.select(kept), field[kept], places.select(kept)
     start, goal, terrain = places.start_m, places.goal_m, made.terrain(truth, field)
-    task = Task(robot=Unicycle(), objective=TravelTime(robot=Unicycle(), goal_radius_m=1.0), rules=RULES)
+    rules = replace(RULES, replan_every_s=replan_every_s)
+    task = Task(robot=Unicycle(), objective=TravelTime(robot=Unicycle(), goal_radius_m=1.0), rules=rules)
     simulation = Simulation(terrain, task, WORLD, places, rng.stream_key(0, "noise"), range(BATCH))
     problem = pose_problem(task, terrain.observe(), truth, measure(truth), start, goal, 24.0)
-    given: dict[str, Any] = {
-        "ground": Probe(1.5), "belief": Copula(), "law": LAW, "measure": measure, "terrain": terrain, "field": field,
-        "keys": KEYS,
-    }  # fmt: skip
-    return Drives(problem, simulation, Learning(**given | changes))
+    known = Truth(terrain=terrain, field=field, keys=KEYS)
+    return Drives(problem, simulation, learning(problem, known, **changes))
 
 
 def same(one: Episodes, other: Episodes) -> bool:
@@ -154,34 +165,35 @@ def test_what_was_not_sensed_changes_no_action(name: str) -> None:
     steps = 25
     first = given.run(
         make(name),
-        replace(given.learning, ground=Blindfolded(Probe(1.0), mask)),
+        learning(given.problem, given.learning.truth, ground=Blindfolded(Probe(1.0), mask)),
         enough=lambda step: step == steps,
     )
     # Another truth wherever no robot has looked; robots stand within what they probe.
-    field = torch.where(mask, given.learning.field, 1 - given.learning.field)
+    sensed = given.learning.truth
+    field = torch.where(mask, sensed.field, 1 - sensed.field)
     other = made.mixture(BATCH, SIZE, SIZE, seed=9)
-    truth = given.learning.terrain.truth
+    truth = sensed.terrain.truth
     truth = replace(
         truth,
         weights=torch.where(mask[:, None], truth.weights, other.weights.float()),
         means=torch.where(mask[:, None], truth.means, other.means.float()),
     )
-    terrain = replace(given.learning.terrain, truth=truth, traversability=field)
+    terrain = replace(sensed.terrain, truth=truth, traversability=field)
     simulation = Simulation(
         terrain, given.problem.task, WORLD,
         Places(start_m=given.problem.start[:, :2], goal_m=given.problem.goal_m,
                reference_time_s=torch.full((BATCH,), torch.nan)), 1, range(BATCH),
     )  # fmt: skip
-    blind = replace(given.learning, ground=Probe(1.0), terrain=terrain, field=field)
+    blind = learning(given.problem, Truth(terrain=terrain, field=field, keys=KEYS), ground=Probe(1.0))
     again = run_episodes(
         make(name), given.problem, simulation, generator(), learning=blind, enough=lambda step: step == steps
     )
     assert same(first, again)
 
 
-def told(learning: Learning, problem: Problem, steps: int) -> list[tuple[int, Problem]]:
+def told(how: Learning, problem: Problem, steps: int) -> list[tuple[int, Problem]]:
     """When robots that drive along x are told of another map, and of which."""
-    knowledge, state, found = Knowledge(learning, problem), problem.start.clone(), []
+    knowledge, state, found = Knowing(how, problem), problem.start.clone(), []
     for step in range(steps):
         revised = knowledge.learn(step, state, torch.ones(BATCH, dtype=torch.bool))
         if revised is not None:
@@ -199,7 +211,7 @@ def test_maps_are_revised_when_it_is_due_and_where_something_is_known(every: flo
     assert len(found) > 0.6 * 30 / round(every / 0.1)
     step, last = found[-1]
     # The planner's λ̂ is that of the belief, within the least change.
-    belief, seen = Copula(), given.learning
+    belief, seen = Copula(), given.learning.truth
     state = belief.init(given.problem.distribution, LAW)
     sensed: Sensed | None = None
     at = given.problem.start.clone()
@@ -228,9 +240,10 @@ def test_maps_are_revised_when_it_is_due_and_where_something_is_known(every: flo
 def test_the_goal_stays_free_whatever_is_known_of_it() -> None:
     given = drives(ground=Probe(30.0))
     column, row = (given.problem.goal_m[0] / 0.5).long().tolist()
-    field = given.learning.field.clone()
+    truth = given.learning.truth
+    field = truth.field.clone()
     field[:, row - 4 : row + 5, column - 4 : column + 5] = 0
-    (_, first), *_ = told(replace(given.learning, field=field), given.problem, 3)
+    (_, first), *_ = told(replace(given.learning, truth=replace(truth, field=field)), given.problem, 3)
     assert first.free[:, row, column].all()
     assert not first.free[:, row - 3, column - 2].any()
     at_goal = cells_at_goal(LAW.grid, given.problem.goal_m, RULES.goal_radius_m)
@@ -287,7 +300,7 @@ def test_a_sensor_that_fails_ends_its_episodes(said: Callable[..., Any], words: 
     assert (found.traceback != "") == (found.errors[0] != "")
 
 
-@pytest.mark.parametrize("call", ["init", "update", "at", "changed", "distribution"])
+@pytest.mark.parametrize("call", ["update", "at", "changed", "distribution"])
 def test_a_belief_that_fails_ends_its_episodes(call: str) -> None:
     class Broken(Copula):
         pass
@@ -345,7 +358,12 @@ def test_a_planner_in_a_process_of_its_own_learns_as_one_here() -> None:
 
 
 def test_a_measure_that_fails_on_what_is_believed_is_a_model_error() -> None:
-    given = drives(measure=fails("no tail"))
+    def on_whole_maps(distribution: TraversabilityDistribution) -> Tensor:
+        if len(distribution.shape) == 2:
+            raise ValueError("no tail")
+        return measure(distribution)
+
+    given = drives(measure=on_whole_maps)
     found = given.run(astar_dwa(), given.learning)
     assert (found.outcome == Outcome.MODEL_ERROR).all()
 
@@ -378,7 +396,8 @@ def test_a_sensor_and_a_belief_may_write_into_what_they_are_given() -> None:
     given = drives()
     options: dict[str, Any] = {"enough": lambda step: step == 40}
     wanted = given.run(astar_dwa(), given.learning, **options)
-    wrote = given.run(astar_dwa(), replace(given.learning, ground=Scribbles(), belief=Scrawls()), **options)
+    scribbled = learning(given.problem, given.learning.truth, ground=Scribbles(), belief=Scrawls())
+    wrote = given.run(astar_dwa(), scribbled, **options)
     assert same(wanted, wrote)
 
 
@@ -403,7 +422,6 @@ def test_times_that_never_come_are_refused(every: float) -> None:
 
 
 def test_the_error_keeps_how_episodes_end() -> None:
-    given = drives(belief=type("Broken", (Copula,), {"init": fails()})())
     with pytest.raises(KnowledgeError) as error:
-        Knowledge(given.learning, given.problem)
+        drives(belief=type("Broken", (Copula,), {"init": fails()})())
     assert error.value.outcome == Outcome.BELIEF_ERROR

@@ -18,14 +18,15 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder.run_folder import open_run
-from benchnav.eval.recording import Recording, drawn_plan, thinned
+from benchnav.eval.recording import NUMBERS, KnownMap, Recording, drawn_plan, thinned
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.recordings import find_recording
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.run.unit import Settings, build
+from benchnav.eval.run.unit import Settings, build, read_block
 from benchnav.planning.planners.planner import Plan
 from tests import factories
 from tests.eval.forged import forge_rows
+from tests.eval.report import made
 
 BELOW, HELD_S, SEEDS = 0.45, 0.4, (3, 4)
 SOFT = (1, 3, 4)  # classes with soft spots
@@ -228,6 +229,35 @@ def test_plans_after_the_moment_of_figures_are_thinned(stakes: Path) -> None:
         for plan, lines in zip(plans, (whole, whole, thinned(whole), thinned(whole)), strict=True):
             for before, after in zip(lines.lines["samples"], plan.lines["samples"], strict=True):
                 np.testing.assert_array_equal(after, before)
+
+
+def test_what_watched_episodes_know_is_kept_to_their_end(stakes: Path) -> None:
+    unit = find_episodes(stakes, {}, None, 0, 1)[0][0]
+    origin = Settings().origins().of(unit)
+    built = build(unit, origin)
+    recorder = Recorder(unit, built.problem, built.simulation, read_block(unit, origin).terrain, [1, 3])
+    first = made.learning_recording(5).known[0]
+
+    class Knows:
+        """Of all episodes, whether they are wanted or not."""
+
+        def maps_of(self, step: int, wanted: Any) -> dict[int, KnownMap]:
+            assert set(wanted) == {1, 3}
+            return {
+                member: replace(first, step=step, mean=first.mean.astype(np.float64) / member)
+                for member in wanted
+            }
+
+    knowing: Any = Knows()
+    for step in (0, 4, 5, 8):
+        recorder.learn(step, knowing)
+    states, actions = np.zeros((6, 3)), np.zeros((5, 2))
+    for member, wanted in ((1, [0, 4, 5]), (3, [0, 4, 5]), (0, [])):
+        known = recorder.driven(member, "stuck", states, actions, np.zeros(5)).known
+        assert [each.step for each in known] == wanted
+        for each in known:
+            np.testing.assert_allclose(each.mean, first.mean / member, atol=1e-3)
+            assert {getattr(each, name).dtype for name in NUMBERS} == {np.dtype(np.float16)}
 
 
 @pytest.mark.parametrize(

@@ -62,6 +62,18 @@ def test_what_neither_side_names_is_paired_value_by_value() -> None:
     ]
 
 
+def test_superiority_is_by_a_margin_toward_what_is_better() -> None:
+    given = {"one": CVAR, "other": MEAN, "kind": "superiority", "margin": 5}
+    (success,) = fixed(given | {"metric": "success"})["tests"]
+    assert success["claim"] == (
+        "success of mppi, cvar:0.9 is more than 5 points higher than that of mppi, mean"
+    )
+    (time,) = fixed(given | {"metric": "T_total"})["tests"]
+    assert time["claim"].endswith("is more than 5 s lower than that of mppi, mean")
+    (longer,) = fixed(given | {"metric": "T_total", "direction": "higher"})["tests"]
+    assert (success["direction"], time["direction"], longer["direction"]) == ("higher", "lower", "higher")
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -84,7 +96,10 @@ def test_the_digest_is_that_of_all_that_is_claimed(change: dict[str, Any]) -> No
             {"metric": "sucess"},
             r"Expected `metric` of hypothesis 1 as 'success' or .*Did you mean 'success'\?",
         ),
-        ({"kind": "equal"}, "`kind` of hypothesis 1 as 'difference' or 'non-inferiority' or 'equivalence'"),
+        (
+            {"kind": "equal"},
+            "`kind` of hypothesis 1 as 'difference' or 'non-inferiority' or 'superiority' or 'equivalence'",
+        ),
         ({"direction": "up"}, "`direction` of hypothesis 1 as '' or 'higher' or 'lower'"),
         ({"one": {"planner": "mpi"}}, r"`planner` of `one` of hypothesis 1 .*Did you mean 'mppi'\?"),
         ({"one": {"plannner": "mppi"}}, r"labels in `one` of hypothesis 1 .*Did you mean 'planner'\?"),
@@ -94,6 +109,7 @@ def test_the_digest_is_that_of_all_that_is_claimed(change: dict[str, Any]) -> No
         ({3: 4}, "keys of hypothesis 1 .*got '3'"),
         ({"margin": 1}, "Leave it out"),
         ({"kind": "equivalence"}, "test of equivalence, above 0 and below 100 points, got 0"),
+        ({"kind": "superiority"}, "test of superiority, above 0 and below 100 points, got 0"),
         ({"kind": "equivalence", "margin": -1}, "above 0 .*got -1"),
         ({"kind": "equivalence", "margin": 100}, "below 100 points, got 100"),
         ({"kind": "equivalence", "margin": 1, "direction": "lower"}, "no `direction`"),
@@ -138,6 +154,10 @@ def test_a_margin_is_tested_as_students_test_does() -> None:
         assert p_of(test, rows) == pytest.approx(
             ttest_1samp(gain, bound, alternative=alternative).pvalue, rel=1e-6
         )
+        better = one + 0.12 if side == "higher" else one - 0.12
+        test = hypothesis(metric="score", kind="superiority", direction=side, margin=0.06)
+        expected = ttest_1samp(better - other, -bound, alternative=alternative).pvalue
+        assert p_of(test, beside(better, other)) == pytest.approx(expected, rel=1e-6)
     both = hypothesis(metric="score", kind="equivalence", margin=0.06)
     expected = max(
         ttest_1samp(gain, -0.06, alternative="greater").pvalue,

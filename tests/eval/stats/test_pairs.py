@@ -211,7 +211,12 @@ def test_worlds_are_paired_where_the_same_λ_is_drawn() -> None:
         world("stakes for", immobile={"below": 0.1, "for_s": 5.0}),
     ]
     assert len(find_pairs(same, by="world")) == 6
-    for other in ({"correlation_m": 3.0}, {"noise": "stored"}, {"immobile": {"below": 0.2, "for_s": 2.0}}):
+    for other in (
+        {"correlation_m": 3.0},
+        {"kernel": "matern32"},
+        {"noise": "stored"},
+        {"immobile": {"below": 0.2, "for_s": 2.0}},
+    ):
         with pytest.raises(ConfigError, match="λ itself differs between their worlds"):
             find_pairs([world("stakes"), world("other", **other)], by="world")
     resampled = [

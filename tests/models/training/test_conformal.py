@@ -21,7 +21,8 @@ from benchnav.models.nets.trainable import Ensemble
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
 from benchnav.models.training.conformal import conformal_table, scored_maps, stopping_every
-from benchnav.models.training.data import MapDataset, MapSampler
+from benchnav.models.training.data import MapDataset
+from benchnav.models.training.map_order import MapSampler
 from benchnav.models.training.networks import fit_model, train_networks
 from benchnav.testing import check_model
 from tests.commands import call

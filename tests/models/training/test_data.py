@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 from benchnav.core.errors import DatasetError
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.training.data import MapData, MapKey, MapSampler, apply_jitter, apply_symmetry
+from benchnav.models.training.data import MapData, apply_jitter, apply_symmetry
+from benchnav.models.training.map_order import MapKey, MapSampler
 from tests.models.support import make_dataset
 
 
@@ -24,7 +25,13 @@ def test_symmetries_of_a_rectangle_keep_its_shape(which: int) -> None:
 def test_image_and_classes_are_turned_together(dataset: TerrainDataset) -> None:
     data = MapData(dataset, 4, seed=0)
     maps, stored = data.train, data.train.read(range(8))
-    key = MapKey(torch.arange(8), torch.arange(8), torch.ones(8, 3), torch.zeros(8, 2, dtype=torch.int64))
+    key = MapKey(
+        torch.arange(8),
+        torch.arange(8),
+        torch.ones(8, 3),
+        torch.zeros(8, 2, dtype=torch.int64),
+        torch.zeros(8, 8),
+    )
     batch = maps[key]
     for place in range(8):
         assert torch.equal(batch["rgb"][place], apply_symmetry(stored["rgb"][place], place))
@@ -35,7 +42,7 @@ def test_order_is_keyed_by_seed_and_epoch() -> None:
     def draw(seed: int, epoch: int) -> tuple[list[float], ...]:
         sampler = MapSampler(50, 50, seed, symmetries=tuple(range(8)), jitter=0.3, shuffle=True)
         sampler.set_epoch(epoch)
-        ((index, which, factors, _),) = sampler
+        ((index, which, factors, *_),) = sampler
         return index.tolist(), which.tolist(), factors.tolist()
 
     assert draw(0, 3) == draw(0, 3)
@@ -79,12 +86,12 @@ def test_an_epoch_has_every_map_once_in_batches_of_nearly_one_size() -> None:
 def test_training_maps_are_turned_and_validation_maps_are_not(dataset: TerrainDataset) -> None:
     data = MapData(dataset, 4, seed=0, jitter=0.1)
     turned, changed = set(), []
-    for _, which, factors, _ in data.train_dataloader().sampler:
+    for _, which, factors, *_ in data.train_dataloader().sampler:
         turned |= set(which.tolist())
         changed.append(bool((factors != 1).any()))
     assert len(turned) > 2
     assert all(changed)
-    for _, which, factors, _ in data.val_dataloader().sampler:
+    for _, which, factors, *_ in data.val_dataloader().sampler:
         assert not which.any()
         assert bool((factors == 1).all())
 

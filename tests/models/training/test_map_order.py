@@ -13,8 +13,8 @@ from benchnav.datagen.files import reader
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.training import map_order as module
-from benchnav.models.training.data import MapData, MapSampler
-from benchnav.models.training.map_order import WINDOW_SHARDS, map_order
+from benchnav.models.training.data import MapData
+from benchnav.models.training.map_order import WINDOW_SHARDS, MapSampler, map_order
 from tests.factories import tiny_recipe
 
 SEEDS = st.integers(0, 3), st.integers(0, 5)

@@ -4,7 +4,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchnav.core.errors import CheckpointError
+from benchnav.core.errors import CheckpointError, DatasetError
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.ground import fit_ground
 from benchnav.models.checkpoint import (
     Checkpoint,
     Part,
@@ -187,3 +189,29 @@ def test_a_part_of_an_earlier_version_has_the_defaults_of_settings_that_came_lat
     assert target.holds("classifier", ClassifierConfig(), 0)
     with pytest.raises(CheckpointError, match="got others"):
         target.holds("classifier", ClassifierConfig(encoder_depth=3), 0)
+
+
+def test_statistics_of_the_ground_come_with_the_first_part_and_not_from_logs(
+    tmp_path: Path, dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options, asked = FitOptions(), []
+    on_maps = open_target(tmp_path / "maps", FRESH, ["gp", "classifier"], "d", options, dataset)
+    monkeypatch.setattr(module, "fit_ground", lambda maps: asked.append(maps) or fit_ground(maps))
+    for name in ("gp", "classifier"):
+        on_maps.add(name, PART)
+    assert asked == [dataset]
+    assert load_checkpoint(tmp_path / "maps").ground == fit_ground(dataset)
+    on_logs = open_target(tmp_path / "logs", FRESH, ["gp"], "d", options)
+    on_logs.add("gp", PART)
+    assert load_checkpoint(tmp_path / "logs").ground is None
+
+
+def test_maps_without_observed_traversability_have_no_statistics(
+    tmp_path: Path, dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none_known(maps: TerrainDataset) -> None:
+        raise DatasetError("Expected cells of known traversability, got none.")
+
+    monkeypatch.setattr(module, "fit_ground", none_known)
+    open_target(tmp_path / "c", FRESH, ["gp"], "d", FitOptions(), dataset).add("gp", PART)
+    assert load_checkpoint(tmp_path / "c").ground is None

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -22,6 +24,27 @@ def test_static_gives_the_prediction_whatever_is_sensed() -> None:
     assert not belief.learns
     kept = belief.select(state, torch.tensor([1]))
     assert torch.equal(belief.distribution(kept).mean(), prior.mean()[1:])
+
+
+def test_static_believes_something_else_where_the_prediction_is_another() -> None:
+    prior, belief = made.mixture(2, 10, 12), Static()
+    state = belief.init(prior, LAW)
+    cells = torch.zeros(2, 10, 12, dtype=torch.bool)
+    cells[1, 3, 4:7] = True
+    other = replace(prior, means=torch.where(cells[:, None], 1 - prior.means, prior.means))
+    nothing = Sensed(traversability=torch.full((2, 10, 12), torch.nan), std=torch.ones(2, 10, 12))
+    assert torch.equal(belief.changed(state, belief.update(state, nothing, other)), cells)
+    assert not belief.changed(state, belief.update(state, nothing)).any()
+
+
+def test_episodes_take_the_places_of_others() -> None:
+    prior, other = made.mixture(3, 10, 12), made.mixture(2, 10, 12, seed=1)
+    belief = Static()
+    state = belief.init(prior, LAW)
+    whole = belief.put(state, torch.tensor([2, 0]), belief.init(other, LAW))
+    wanted = torch.stack((other.mean()[1], prior.mean()[1], other.mean()[0]))
+    assert torch.equal(belief.distribution(whole).mean(), wanted)
+    assert torch.equal(belief.distribution(state).mean(), prior.mean())
 
 
 @pytest.mark.parametrize("correlated", [True, False])

@@ -272,16 +272,23 @@ def test_probabilities_are_those_of_all_labellings(
 def test_strength_and_length_of_ones_own_go_before_those_of_the_law() -> None:
     prior, law, sensed = even(2, 12, 14), law_of(12, 14, 1.5, 0.3), LOOKS[0]
     plain = after(Classes(), prior, law, sensed)
-    strong = after(Classes(strength=1.2), prior, law, sensed)
-    assert torch.equal(strong.chance, after(Classes(), prior, law_of(12, 14, 1.5, 1.2), sensed).chance)
+    strong = after(Classes(strength=0.8), prior, law, sensed)
+    assert torch.equal(strong.chance, after(Classes(), prior, law_of(12, 14, 1.5, 0.8), sensed).chance)
     beside = (strong.chance - 0.5).abs()[:, 2, 3] - (plain.chance - 0.5).abs()[:, 2, 3]
-    assert bool((beside > 0.1).all())
+    assert bool((beside > 0.05).all())
     short = after(Classes(0.6), prior, law, sensed)
     assert torch.equal(
         short.copula.mean, after(Classes(), prior, law_of(12, 14, 0.6, 0.3), sensed).copula.mean
     )
     narrow = after(Classes(window=1), prior, law, *LOOKS)
     assert not torch.equal(narrow.copula.mean, after(Classes(), prior, law, *LOOKS).copula.mean)
+
+
+def test_a_fitted_strength_counts_up_to_the_critical_one() -> None:
+    prior, law, sensed = even(2, 12, 14), law_of(12, 14, strength=2.26), LOOKS[0]
+    found = after(Classes(), prior, law, sensed).chance
+    assert torch.equal(found, after(Classes(strength=0.88), prior, law, sensed).chance)
+    assert not torch.equal(found, after(Classes(strength=2.26), prior, law, sensed).chance)
 
 
 def test_what_is_known_is_an_episodes_own() -> None:

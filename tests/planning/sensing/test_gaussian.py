@@ -14,11 +14,12 @@ from benchnav.planning.sensing.gaussian import (
     condition,
     interval_moments,
     posterior,
+    predict,
 )
 
 INF = float("inf")
 SHAPE, LENGTH = (10, 11), 2.0
-FIELD = Field.of(SHAPE, LENGTH, "cpu")
+FIELD = Field.of(SHAPE, (LENGTH,), "cpu")
 
 
 def cells(*places: tuple[int, int]) -> Cells:
@@ -136,8 +137,30 @@ def test_many_intervals_have_the_moments_of_long_gibbs_chains(std: float) -> Non
     drawn = gibbs(where, observed, sweeps=400, chains=150)
     found = condition(FIELD.covariance(where, where), observed)
     mean, variance = found.moments(FIELD.covariance(where, where))
+    _, _, skew = predict(found, FIELD.covariance(where, where), observed, FIELD.covariance(where, where))
+    away = (drawn - drawn.mean(0)) / drawn.std(0)
+    held = (observed.upper > observed.lower)[0].numpy()
+    np.testing.assert_allclose(skew[0][held], (away**3).mean(0)[held], atol=0.25)
     np.testing.assert_allclose(mean[0], drawn.mean(0), atol=0.04)
     np.testing.assert_allclose(variance[0].sqrt(), drawn.std(0), atol=0.09)
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(-INF, -0.8), (0.2, INF), (-0.3, 0.9), (-INF, -6.5)])
+def test_beside_an_interval_a_score_is_as_skew_as_the_fields_that_match(lower: float, upper: float) -> None:
+    """In closed form: of a cell of correlation r with one that is truncated, r³ times its third moment."""
+    where = cells((4, 4))
+    observed = known((lower, upper, 0.3))
+    inner, block = FIELD.covariance(where, where), FIELD.covariance(where, ELSEWHERE)
+    found = condition(inner, observed)
+    mean, variance, skew = predict(found, inner, observed, block)
+    plain = found.moments(block)
+    torch.testing.assert_close((mean, variance), plain, atol=1e-9, rtol=0)
+    total = np.sqrt(1.09)
+    seen = stats.truncnorm(lower / total, upper / total, scale=total)
+    third = seen.stats("s") * seen.std() ** 3 / total**6
+    expected = block[0, 0].numpy() ** 3 * third / variance[0].numpy() ** 1.5
+    np.testing.assert_allclose(skew[0], np.clip(expected, -2, 2), atol=0.01)
+    assert abs(expected).max() > 0.01
 
 
 def test_a_fields_terms_do_not_depend_on_the_others_nor_on_empty_places() -> None:

@@ -6,6 +6,7 @@ import torch
 from scipy import stats
 
 from benchnav.core import rng
+from benchnav.core.copula import correlated_normal
 from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
@@ -215,6 +216,16 @@ def test_marginals_are_each_cells_own_distribution() -> None:
 
         found = stats.kstest(inside, lambda v, low=low, high=high: (share(v) - low) / (high - low))
         assert found.pvalue > 1e-3
+
+
+def test_the_kernel_of_the_gaussian_field_is_that_of_the_world() -> None:
+    terrain = ground(1, (1.0, 0.5, 0.05))
+    for kernel in ("gaussian", "matern32"):
+        world = replace(FREE, correlation_m=1.5, kernel=kernel)
+        drawn = draw_frozen(terrain, world, across(1), KEY, [3])[0][0]
+        key = rng.stream_key(KEY, 3, "field", 0)
+        normal = correlated_normal(key, np.arange(1), terrain.grid.shape, 3.0, kernel)[0]
+        np.testing.assert_allclose((drawn.double() - 0.5) / 0.05, normal, atol=1e-5)
 
 
 @pytest.mark.parametrize("correlation_m", [0.5, 1.5])

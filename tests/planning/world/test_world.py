@@ -6,7 +6,7 @@ import torch
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import of, read
 from benchnav.planning.free_space import FreeSpace, Rules
-from benchnav.planning.world.world import PRESETS, Immobile, World
+from benchnav.planning.world.world import PRESETS, Immobile, World, read_world
 
 
 def test_the_papers_world() -> None:
@@ -54,6 +54,26 @@ def test_what_the_noise_does_not_use_is_not_in_the_plain_data() -> None:
     assert World(correlation_m=2.0).to_dict() == World().to_dict()
     frozen = World(noise="frozen", correlation_m=2.0)
     assert frozen.to_dict() == {"noise": "frozen", "correlation_m": 2.0, "time_budget_s": 100.0}
+    assert World(kernel="matern32").to_dict() == World().to_dict()
+
+
+def test_a_kernel_is_in_the_plain_data_where_it_is_not_that_of_all_worlds_before() -> None:
+    rough = World(noise="frozen", kernel="matern32")
+    assert rough.to_dict()["kernel"] == "matern32"
+    assert read(World, rough.to_dict(), of("world")) == rough
+    assert (
+        read_world({"preset": "stakes", "kernel": "gaussian"})[0].to_dict()
+        == read_world("stakes")[0].to_dict()
+    )
+    made, _, label = read_world({"preset": "stakes", "kernel": "matern32"})
+    assert made.kernel == "matern32"
+    assert label == "stakes kernel=matern32"
+    with pytest.raises(
+        ConfigError, match=r"`world.kernel` with `world.noise` frozen, got it with 'resampled'"
+    ):
+        read_world({"kernel": "matern32"})
+    with pytest.raises(ConfigError, match="`kernel` 'gaussian' or 'matern32', got 'cubic'"):
+        World(kernel="cubic")
 
 
 @pytest.mark.parametrize(("budget", "dt", "steps"), [(100.0, 0.1, 1000), (0.3, 0.1, 3), (1.0, 0.3, 3)])

@@ -30,7 +30,7 @@ from benchnav.core.figures import (
     stack_panels,
     styled,
 )
-from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.experiment.hypotheses import METRICS
 from benchnav.eval.report.words import blocks, outcome_in_words, p_in_words, reading_names, with_names
 
@@ -70,7 +70,7 @@ _SPREAD = 0.32  # of a row's height, to either side
 _TEST_IN, _METRIC_IN = 0.3, 0.55
 _MARGIN = "0.88"
 
-_SETTING = ["planner", "model", "risk"]
+_SETTING = ["planner", "model", *KNOWLEDGE, "risk"]
 
 
 def lay_out(
@@ -253,8 +253,9 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame) -> None:
     names = []
     for height, row in enumerate(rows.to_dict("records")):
         if row["margin"] > 0:
-            low = -reach if row["direction"] == "lower" else -row["margin"]
-            high = reach if row["direction"] == "higher" else row["margin"]
+            inner = -row["margin"] if row["kind"] == "superiority" else row["margin"]
+            low = -reach if row["direction"] == "lower" else -inner
+            high = reach if row["direction"] == "higher" else inner
             panel.fill_between([low, high], height - 0.36, height + 0.36, color=_MARGIN, lw=0, zorder=0)
         for suffix, width in (("", 0.9), ("_90", 2.6)):
             span = [row[f"low{suffix}"], row[f"high{suffix}"]]

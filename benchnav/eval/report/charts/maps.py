@@ -29,7 +29,7 @@ from benchnav.core.figures import (
     stack_panels,
     styled,
 )
-from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.folder.steps import STEPS, read_steps
 from benchnav.eval.recording import GROUND, Ground, Recording
 from benchnav.eval.report.failures import FailedLine
@@ -104,7 +104,11 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
     tall = panel_in * min(max(tallest, 0.3), 2.0) + 0.35
     figure = Figure(figsize=(width, (layers * tall + 0.2) * lines + 0.8), layout="compressed")
     stacks = stack_panels(figure, len(recordings), across, layers)
-    several = [name for name in ("model", "world") if differ(one.about[name] for one in recordings)]
+    several = [
+        name
+        for name in ("model", *KNOWLEDGE, "world")
+        if differ(one.about.get(name, NOT_USED) for one in recordings)
+    ]
     maps = [f"{one.about['scenario']}, map {one.about['map']}" for one in recordings]
     letters = int(panel_in / _LETTER_IN)
     for place, (recording, (above, below, *last)) in enumerate(zip(recordings, stacks, strict=True)):
@@ -170,10 +174,11 @@ def _draw_terrain(panel: Axes, recording: Recording) -> LineCollection:
 
 
 def _draw_predicted(panel: Axes, recording: Recording) -> None:
-    """Draws the λ̂ that the planner was given, and the path in black, since the map has the colours of λ."""
-    show_map(panel, recording.predicted, recording.grid.extent_m, **_LAMBDA)
-    if not recording.free.all():
-        closed = np.where(recording.free, np.nan, 1.0)
+    """Draws the λ̂ that the planner had by that moment, and the path in black, since the map has the colours of λ."""
+    predicted, free = recording.given_at(recording.now)
+    show_map(panel, predicted, recording.grid.extent_m, **_LAMBDA)
+    if not free.all():
+        closed = np.where(free, np.nan, 1.0)
         show_map(panel, closed, recording.grid.extent_m, cmap=ListedColormap([CLOSED]))
         _name_ground(panel, "not free", color=CLOSED)
     blind = recording.about["model"] == NOT_USED
@@ -250,7 +255,7 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
     figure = Figure(figsize=(width, tall), layout="compressed")
     panel = figure.subplots()
     show_map(panel, _backdrop(ground), ground.grid.extent_m)
-    names = contender_names(rows[list(NAMING)].to_dict("records"))
+    names = contender_names(rows[[name for name in NAMING if name in rows]].to_dict("records"))
     colours, failed = condition_colours(list(rows["planner"])), dict[str, None]()
     for place, (row, track) in enumerate(zip(rows.to_dict("records"), tracks, strict=True)):
         # Later ones are smaller, so that paths and ends that coincide are all seen.

@@ -23,7 +23,7 @@ from benchnav.core.figures import (
     styled,
 )
 from benchnav.datagen.recipe.scenario import find_series
-from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.report.words import joined
 
 SEVERITY = "severity"
@@ -42,7 +42,7 @@ _SAME = ("data", "scenario", "world", "robot", "objective")
 Labels = Mapping[Any, Any]
 
 # What panels are named by, in order.
-_LABELS = ("scenario", "data", "world", "model", "who", "risk", "robot", "objective")
+_LABELS = ("scenario", "data", "world", "model", *KNOWLEDGE, "who", "risk", "robot", "objective")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,6 @@
-"""What the Rerun viewer shows: terrain, maps, start and goal; and where each robot is, what it planned, drove and met.
+"""What the Rerun viewer shows: terrain, maps, start and goal; and of each robot where it is, what it planned and met.
+
+Of robots that learn on their way it shows what they knew when, and how far their sensors reached.
 
 The terrain is a mesh under `world`, in metres; maps are images under `map`, in cells, their first row at the
 bottom.
@@ -11,12 +13,15 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from benchnav.core.figures import MARKS, bytes_of, hatching, outline
+from benchnav.core.figures import MARKS, bytes_of, hatching
+from benchnav.core.grid import outline
 from benchnav.eval.recording import Recording, drawing_interval, thinned
 from benchnav.eval.report.plan_layers import (
+    REACH,
     SOFT,
     STYLES,
     field_colours,
+    known_colours,
     layer_colours,
     predicted_colours,
     shades,
@@ -107,17 +112,34 @@ def log_driver(stream: Any, driver: Driver) -> None:
 
 
 def _log_predicted(stream: Any, driver: Driver) -> None:
-    """Logs the λ̂ that a planner was given, and the edge of ground that is not free."""
+    """Logs the λ̂ that a planner was given, and the edge of ground that is not free; and what it learnt on its way."""
     recording = driver.recording
-    _log_image(stream, driver.entity("map/risk"), predicted_colours(recording.predicted, recording.free))
-    flat = _on_map(recording, outline(~recording.free, recording.resolution_m))
+    if not recording.known:
+        colours = predicted_colours(recording.predicted, recording.free)
+        _log_image(stream, driver.entity("map/risk"), colours)
+        _log_closed(stream, driver, recording.free)
+    for known in recording.known:
+        stream.set_time(TIMELINE, duration=known.step * recording.dt_s)
+        for name, colours in known_colours(known).items():
+            _log_image(stream, driver.entity(f"map/{name}"), colours, static=False)
+        _log_closed(stream, driver, known.free, static=False)
+        look = driver.colour if driver.name else bytes_of(REACH)
+        _log_both(
+            stream, recording, driver.entities("reach"), _STRIPS, known.outlines, (0.05, 0.15), colors=[look]
+        )
+
+
+def _log_closed(stream: Any, driver: Driver, free: np.ndarray, static: bool = True) -> None:
+    """Logs the edge of ground that is not free."""
+    recording = driver.recording
+    flat = _on_map(recording, outline(~free, recording.resolution_m))
     edge = rr.LineStrips2D(flat, colors=[_CLOSED], radii=0.08)
-    stream.log(driver.entity("map/closed"), edge, static=True)
+    stream.log(driver.entity("map/closed"), edge, static=static)
 
 
-def _log_image(stream: Any, entity: str, image: np.ndarray) -> None:
+def _log_image(stream: Any, entity: str, image: np.ndarray, static: bool = True) -> None:
     """Logs a map, uint8 of shape [H, W, 3], as an image; images have their first row at the top."""
-    stream.log(entity, rr.Image(np.ascontiguousarray(image[::-1])), static=True)
+    stream.log(entity, rr.Image(np.ascontiguousarray(image[::-1])), static=static)
 
 
 def _log_both(
@@ -197,7 +219,9 @@ def _log_series(stream: Any, driver: Driver) -> None:
         driver.entity("series/goal", "distance"): np.linalg.norm(place - recording.goal_m, axis=1),
     }
     if not driver.name:
-        lines["series/traversability/predicted"] = recording.predicted[_cells_of(recording, place)]
+        cells = zip(*_cells_of(recording, place), strict=True)
+        predicted = [recording.given_at(step)[0][cell] for step, cell in enumerate(cells)]
+        lines["series/traversability/predicted"] = np.array(predicted)
         lines["series/traversability/threshold"] = np.full(len(place), recording.free_above)
         for name, commanded in zip(recording.action_names, recording.actions.T, strict=True):
             lines[f"series/command/{rr.escape_entity_path_part(name)}"] = commanded

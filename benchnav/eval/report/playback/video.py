@@ -1,6 +1,7 @@
 """Videos of episodes on one map, at one time base, 16:9.
 
-Of each episode the λ̂ that its planner was given is shown, with what was planned; beside these, the λ field, once for
+Of each episode the λ̂ that its planner was given is shown, with what was planned, and changes as a robot learns; beside
+these, the λ field, once for
 all episodes that drove on the same.
 """
 
@@ -15,6 +16,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.text import Text
@@ -24,6 +27,7 @@ from benchnav.core.figures import (
     MARKS,
     TRAVERSABILITY_COLOURS,
     condition_colours,
+    hatching,
     line_style,
     mark,
     mark_handle,
@@ -40,10 +44,14 @@ from benchnav.eval.report.plan_layers import (
     end_cell_handle,
     end_mark,
     field_colours,
+    known_colours,
     mark_end,
     plan_layer,
     predicted_colours,
+    reach_line,
     shades,
+    unseen_handle,
+    unseen_layer,
 )
 from benchnav.eval.report.words import NAMING, condition_name, differ, joined
 
@@ -60,6 +68,7 @@ _BAR = 210  # pixels, of the colour bar and its last number
 _TALLEST = 2.0  # of a map, over its width
 _TEXT, _HEAD, _LARGE = 12.0, 14.0, 16.0  # points
 _MARKS, _PATH, _EDGE = 1.9, 2.6, 5.0  # over those of a printed figure, and widths in points
+_MOST_IN_TWO = 12  # entries of the legend that two lines have room for
 _LENGTHS_M = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500)  # of scale bars
 _SCALE_SHARE = 0.35  # of a map's width, which a scale bar keeps under
 _ARRIVED, _FAILED = "#00684a", "#a00000"
@@ -127,16 +136,18 @@ class Frames:
         self.given, self.truths = panels[: len(recordings)], panels[len(recordings) :]
         self.drivers = []
         for place, (own, panel) in enumerate(zip(recordings, self.given, strict=True)):
-            shown, blind = predicted_colours(own.predicted, own.free), own.about["model"] == NOT_USED
-            _head(
-                panel,
-                names[place],
-                "true mean of λ; the planner uses no map" if blind else "λ̂ given to the planner",
-                colours[place],
+            blind, learns = own.about["model"] == NOT_USED, bool(own.known)
+            words = "λ̂ known by then" if learns else "λ̂ given to the planner"
+            words = "true mean of λ; the planner uses no map" if blind else words
+            _head(panel, names[place], words, colours[place])
+            shown = (
+                known_colours(own.known[-1])["risk"] if learns else predicted_colours(own.predicted, own.free)
             )
-            show_map(panel, shown, first.grid.extent_m)
+            image = show_map(panel, shown, first.grid.extent_m)
+            known = _Known(panel, own, image) if learns else None
             state = _over(panel, "", (1, 1), 5, ha="right", weight="bold")
-            self.drivers.append(_Driver(panel, shown, own, colours[place], line_style(place), state))
+            driver = _Driver(panel, shown, own, colours[place], line_style(place), state, known)
+            self.drivers.append(driver)
         for panel, places in zip(self.truths, shared, strict=True):
             own = recordings[places[0]]
             words = ", ".join(names[place] for place in places) if len(shared) > 1 else ""
@@ -220,11 +231,23 @@ class Frames:
             handles.append(Patch(color=CLOSED, label="not free"))
         if any(own.immobilising.any() for own in recordings):
             handles.append(Patch(color=IMMOBILISING, label="immobilises a robot"))
-        columns, between = -(-len(handles) // 2), 0.5 + (length - _BAR) / 2 / SIZE[0]
-        self._figure.legend(
-            handles=handles, loc="center", bbox_to_anchor=(between, 42 / SIZE[1]), ncols=columns, fontsize=_TEXT,
-            frameon=False, columnspacing=1.2, handlelength=1.4,
-        )  # fmt: skip
+        every = [known for own in recordings for known in own.known]
+        if any(not known.seen.all() for known in every):
+            handles.append(unseen_handle())
+        if any(known.outlines for known in every):
+            handles.append(reach_line(np.empty((0, 2)), _MARKS, "reach of the sensors"))
+        lines = 2 if len(handles) <= _MOST_IN_TWO else 3
+        columns, between = -(-len(handles) // lines), 0.5 + (length - _BAR) / 2 / SIZE[0]
+
+        def legend(size: float) -> Legend:
+            return self._figure.legend(
+                handles=handles, loc="center", bbox_to_anchor=(between, 42 / SIZE[1]), ncols=columns, fontsize=size,
+                frameon=False, columnspacing=1.2, handlelength=1.4,
+            )  # fmt: skip
+
+        if (shrunk := _shrunk(first := legend(_TEXT), SIZE[0] - 2 * _MARGIN - length - _BAR)) < 1:
+            first.remove()
+            legend(_TEXT * shrunk)
         shown = ScalarMappable(Normalize(0, 1), TRAVERSABILITY_COLOURS)
         bar = self._axes(SIZE[0] - _MARGIN - _BAR, 34, _BAR - 10, 14)
         self._figure.colorbar(shown, cax=bar, orientation="horizontal", ticks=[0, 0.5, 1])
@@ -266,8 +289,46 @@ def _over(panel: Axes, words: str, corner: tuple[int, int], points: float, **sty
 
 def _head(panel: Axes, heading: str, words: str = "", colour: str = "black") -> None:
     """Writes over a panel what it shows, and under that a line that is not as loud."""
-    _over(panel, heading, (0, 1), 22 if words else 5, fontsize=_HEAD, weight="bold", color=colour)
+    head = _over(panel, heading, (0, 1), 22 if words else 5, fontsize=_HEAD, weight="bold", color=colour)
+    head.set_fontsize(float(head.get_fontsize()) * _shrunk(head, panel.get_window_extent().width))
     _over(panel, words, (0, 1), 5, color="0.25")
+
+
+def _shrunk(words: Text | Legend, room: float) -> float:
+    """What the size of letters is multiplied by to fit into so many pixels, which hinting may widen them by."""
+    return min(1.0, 0.96 * room / max(words.get_window_extent().width, 1))
+
+
+class _Known:
+    """The map of a robot that learns: what was known of it by a step, and how far the sensors reached.
+
+    Args:
+        panel: which it is drawn on.
+        recording: with what was known.
+        image: of the λ̂ that was known.
+
+    Attributes:
+        moving: what is drawn anew in each frame, from the undermost to the topmost.
+    """
+
+    def __init__(self, panel: Axes, recording: Recording, image: AxesImage) -> None:
+        self._recording, self._image, self._shown = recording, image, -1
+        first = recording.known[0]
+        self._unseen = unseen_layer(first.seen, recording.resolution_m, _MARKS)
+        self._reach = reach_line(first.outline, _MARKS)
+        panel.add_collection(self._unseen)
+        panel.add_line(self._reach)
+        self.moving: list[Artist] = [image, self._unseen, self._reach, *panel.spines.values()]
+
+    def move(self, step: int) -> None:
+        """Shows what was known at a step."""
+        known = self._recording.known_at(step) or self._recording.known[0]
+        if known.step == self._shown:
+            return
+        self._shown = known.step
+        self._image.set_data(known_colours(known)["risk"])
+        self._unseen.set_segments(list(hatching(~known.seen, self._recording.resolution_m)))
+        self._reach.set_data(*known.outline.T)
 
 
 class _Driver:
@@ -280,6 +341,7 @@ class _Driver:
         colour: of its path.
         style: of its path.
         state: what says the observed λ, and at the end the outcome; without it no plan is drawn.
+        known: the map, where what is known of it changes.
 
     Attributes:
         moving: what is drawn anew in each frame, from the undermost to the topmost.
@@ -293,8 +355,9 @@ class _Driver:
         colour: str,
         style: Any,
         state: Text | None = None,
+        known: _Known | None = None,
     ) -> None:
-        self.recording, self.state = recording, state
+        self.recording, self.state, self._known = recording, state, known
         planned = STYLES if state is not None else {}
         self.layers = {name: plan_layer(look, scale=_MARKS) for name, look in planned.items()}
         for layer in self.layers.values():
@@ -313,7 +376,15 @@ class _Driver:
             panel, recording.about["outcome"], recording.track, recording.goal_m, recording.resolution_m, _MARKS, shown
         )  # fmt: skip
         said = [] if state is None else [state]
-        self.moving = [*self.layers.values(), *self.path, *places, self.robot, *self.end, *said]
+        self.moving = [
+            *(known.moving if known else ()),
+            *self.layers.values(),
+            *self.path,
+            *places,
+            self.robot,
+            *self.end,
+            *said,
+        ]
 
     def move(self, time_s: float) -> None:
         """Puts everything where it is at a time."""
@@ -321,6 +392,8 @@ class _Driver:
         steps = len(own.traversability)
         now = min(int(time_s / own.dt_s + 1e-6), steps)
         has_ended = now == steps
+        if self._known:
+            self._known.move(now)
         for line in self.path:
             line.set_data(*own.track[: now + 1].T)
         x, y, heading_rad = own.states[now, :3]

@@ -2,7 +2,8 @@
 
 A file holds the terrain as a mesh, its colours and layers, the true mean of λ, the λ field, the λ̂ that each
 planner was given, each robot with its heading at every step, the path driven so far, what the planner was thinking,
-how it ended, and time series; and a blueprint that arranges them.
+how it ended, and time series; and a blueprint that arranges them. Of a robot that learns on its way, λ̂, mean and spread
+of its belief, what it saw and sensed, and how far its sensors reached change over time.
 """
 
 from collections.abc import Sequence
@@ -19,12 +20,19 @@ from benchnav.core.store import replacing
 from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
+from benchnav.eval.report.plan_layers import MOST_SPREAD
 from benchnav.eval.report.playback.scene import TIMELINE, Driver, layer_entity, log_driver, log_ground
 from benchnav.eval.report.words import NAMING, contender_names, reading_name
 
 APPLICATION = "benchnav"
 
 _ALONE = "#00aa00"
+# Maps of a robot that learns, by what their views are called.
+_LEARNT = {
+    "mean": "Belief: mean of λ",
+    "spread": f"Belief: spread of λ, 0 to {MOST_SPREAD:g}",
+    "seen": "Seen light, λ sensed blue",
+}
 _ALL, _PLACES = "/map/overlay/**", "/map/places/**"
 
 
@@ -132,6 +140,8 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
     for driver in drivers:
         name = f"λ̂ given to {driver.name or 'the planner'}, free: {free_rule(driver.recording)}"
         views[name] = [driver.entity("/map/risk"), driver.entity("/map/overlay", "**"), _PLACES]
+    if len(drivers) == 1 and recording.known:
+        views |= {title: [f"/map/{name}", _ALL, _PLACES] for name, title in _LEARNT.items()}
     return views
 
 

@@ -23,6 +23,8 @@ from benchnav.planning.sensing.sensor import Step
 
 Local = TypeVar("Local")
 
+_ONE_DEVIATION = (0.16, 0.84)  # between these quantiles lie two standard deviations of a normal distribution
+
 
 @dataclass(frozen=True, kw_only=True)
 class GuideConfig:
@@ -30,15 +32,18 @@ class GuideConfig:
 
     Args:
         lookahead_m: how far along the path the way-point lies at most.
+        explore: optimism about ground that the robot would get to know on its way; see `optimistic`.
     """
 
     gone: ClassVar = {"by_time": "A* now minimises the path cost of the objective: give it `travel_time`."}
+    added: ClassVar = ("explore",)
 
     lookahead_m: float = 4.0
+    explore: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuses a look-ahead that looks nowhere."""
-        check_finite("A*", self, ("lookahead_m",))
+        """Refuses a look-ahead that looks nowhere, and pessimism."""
+        check_finite("A*", self, ("lookahead_m",), ("explore",))
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,7 @@ class GuidedState(Batch, Generic[Local]):
     """What a guided planner carries from step to step.
 
     Args:
-        problem: what is being solved.
+        problem: what is being solved, with the λ̂ that path costs are given.
         field: cheapest paths to the goal.
         ground: what a metre costs in each cell.
         local: the local planner's plan state.
@@ -100,7 +105,7 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
     def init(self, problem: Problem, generator: torch.Generator) -> GuidedState[Local]:
         """Searches the maps; see `Planner`."""
         local = self.local.init(_toward_waypoints(problem), generator)
-        recovery = Recovery.none(problem.start)
+        recovery, problem = Recovery.none(problem.start), optimistic(problem, self.config.explore)
         return GuidedState(problem, astar.search(problem), ground_costs(problem), local, recovery)
 
     def plan(self, step: Step, plan_state: GuidedState[Local]) -> tuple[Tensor, GuidedState[Local], Plan]:
@@ -124,12 +129,13 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
 
     def revise(self, plan_state: GuidedState[Local], problem: Problem) -> GuidedState[Local]:
         """Searches maps anew whose ground has changed, and keeps the local planner's motion; see `Planner`."""
+        local = self.local.revise(plan_state.local, _toward_waypoints(problem))
         before, field = plan_state.problem, plan_state.field
+        problem = optimistic(problem, self.config.explore)
         changed = (problem.padded_ground != before.padded_ground).flatten(1).any(1).nonzero()[:, 0]
         if len(changed):
             found = astar.search(problem.select(changed))
             field = map_tensors(field, lambda old, new: old.index_copy(0, changed, new), found)
-        local = self.local.revise(plan_state.local, _toward_waypoints(problem))
         return replace(plan_state, problem=problem, field=field, ground=ground_costs(problem), local=local)
 
     def select(self, plan_state: GuidedState[Local], members: Tensor) -> GuidedState[Local]:
@@ -137,6 +143,26 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         # The local planner alone knows which of its tensors are of episodes.
         shared: GuidedState[Any] = replace(plan_state, local=None)  # type: ignore[arg-type]
         return replace(shared.select(members), local=self.local.select(plan_state.local, members))
+
+
+def optimistic(problem: Problem, explore: float) -> Problem:
+    """The problem whose λ̂ is raised, to 1 at most, by so many times the spread of what is believed of each cell.
+
+    A path through ground that may be good is then worth a try, since the robot gets to know that ground before it is on
+    it, and can still turn away. No distance says which ground that is: what a robot senses before it commits itself has
+    hardly any spread left by then, and neither has what lies within the correlation of that, under a belief that
+    learns. Under one that does not, nothing is settled on the way, and the bonus is a mere taste for risk. Free ground
+    stays what it is.
+
+    Args:
+        problem: B problems.
+        explore: how many times; 0 gives the problem itself.
+    """
+    if explore == 0:
+        return problem
+    low, high = (problem.distribution.quantile(share) for share in _ONE_DEVIATION)
+    bonus = explore * 0.5 * (high - low).to(problem.risk_map)
+    return replace(problem, risk_map=(problem.risk_map + bonus).clamp(max=1))
 
 
 def _toward_waypoints(problem: Problem) -> Problem:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, hatching, outline, robot_marker, save_twice
+from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, hatching, robot_marker, save_twice
+from benchnav.core.grid import outline
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.charts.maps import MOST_PANELS, choose_recordings, trajectory_figure
 from benchnav.eval.report.plan_layers import field_colours
@@ -246,3 +247,14 @@ def test_whose_map_of_λ_it_is_stands_above_it() -> None:
 def test_an_episode_that_ended_at_once_can_be_drawn(tmp_path: Path) -> None:
     save_twice(trajectory_figure([made.recording(0, plans=())]), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 1000
+
+
+def test_λ_hat_of_a_robot_that_learns_is_that_known_at_the_moment() -> None:
+    taken = made.learning_recording(170)
+    known = taken.known_at(taken.now)
+    assert known is not None
+    assert 0 < known.step < 170
+    _, below, _ = shown(trajectory_figure([taken]))
+    np.testing.assert_array_equal(below.get_images()[0].get_array(), known.predicted)
+    closed = below.get_images()[1].get_array()
+    np.testing.assert_array_equal(np.isfinite(np.ma.filled(closed, np.nan)), ~known.free)

@@ -9,9 +9,9 @@ import pytest
 from matplotlib.axes import Axes
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.figures import ROBOT, bytes_of
-from benchnav.eval.recording import Recording
-from benchnav.eval.report.plan_layers import field_colours, predicted_colours, shades
+from benchnav.core.figures import ROBOT, bytes_of, hatching
+from benchnav.eval.recording import KnownMap, Recording
+from benchnav.eval.report.plan_layers import field_colours, known_colours, predicted_colours, shades
 from benchnav.eval.report.playback.video import (
     FRAMES_A_SECOND,
     HOLD_S,
@@ -201,6 +201,83 @@ def test_the_legend_names_what_is_there() -> None:
     other = replace(taken, about=taken.about | {"outcome": "success", "planner": "other"})
     assert named(taken, other)[3:5] == ["immobilised", "arrived"]
     assert "driven, in the colour of its title" in named(taken, other)
+
+
+def inside(frame: np.ndarray, panel: Axes) -> np.ndarray:
+    """The pixels of a panel."""
+    box = panel.get_window_extent()
+    return frame[SIZE[1] - int(box.y1) + 2 : SIZE[1] - int(box.y0) - 2, int(box.x0) + 2 : int(box.x1) - 2]
+
+
+def test_the_map_changes_when_more_is_known_and_only_then() -> None:
+    learning = made.learning_recording(80, plans=())
+    still = replace(learning, states=np.repeat(learning.states[:1], 81, axis=0))
+    frames = Frames([still])
+    shown = [frames.draw(time_s) for time_s in (0.0, 0.4, 0.5, 4.0)]
+    (panel,), (truth,) = frames.given, frames.truths
+    assert np.array_equal(inside(shown[0], panel), inside(shown[1], panel))
+    for before, after in ((shown[1], shown[2]), (shown[2], shown[3])):
+        assert not np.array_equal(inside(before, panel), inside(after, panel))
+        assert np.array_equal(inside(before, truth), inside(after, truth))
+    known = still.known_at(40)
+    assert known is not None
+    np.testing.assert_array_equal(panel.images[0].get_array(), known_colours(known)["risk"])
+    (hatched,) = [layer for layer in panel.collections if len(layer.get_segments())]
+    np.testing.assert_array_equal(hatched.get_segments(), hatching(~known.seen, 0.5))
+    (reach,) = [line for line in panel.lines if line.get_label() == "_reach"]
+    np.testing.assert_array_equal(np.transpose(reach.get_data()), known.outline)
+    assert "λ̂ known by then" in words_of(panel)
+    # Back in time as well.
+    assert np.array_equal(frames.draw(0.4), shown[1])
+
+
+def test_ground_that_was_not_seen_lies_under_a_veil() -> None:
+    known = made.learning_recording(10).known[-1]
+    bare = known_colours(replace(known, seen=np.ones_like(known.seen)))
+    for name, colours in known_colours(known).items():
+        assert (colours[known.seen] == bare[name][known.seen]).all(), name
+        hidden = colours[~known.seen & ~known.sensed].astype(int)
+        assert (
+            np.abs(hidden - 153) <= np.abs(bare[name][~known.seen & ~known.sensed].astype(int) - 153)
+        ).all()
+    np.testing.assert_array_equal(bare["risk"], predicted_colours(known.predicted, known.free))
+    np.testing.assert_array_equal(bare["mean"], shades(known.mean))
+    assert len(np.unique(known_colours(known)["seen"].reshape(-1, 3), axis=0)) == 3
+
+
+def test_the_legend_names_what_learning_shows() -> None:
+    learning = made.learning_recording(20)
+
+    def named(*known: KnownMap) -> list[str]:
+        (legend,) = Frames([replace(learning, known=known)])._figure.legends
+        return [text.get_text() for text in legend.get_texts()]
+
+    assert named(*learning.known)[-2:] == ["not seen", "reach of the sensors"]
+    seen = replace(learning.known[0], seen=np.ones((40, 60), bool), outline=np.empty((0, 2)))
+    for given in ((seen,), ()):
+        assert not {"not seen", "reach of the sensors"} & set(named(*given))
+
+
+def test_names_and_legend_have_room_however_long_they_are() -> None:
+    labels = {
+        "sensor": "near range_m=16",
+        "ground": "probe radius_m=2.5",
+        "belief": "copula correlation_m=1.5",
+    }
+    recordings = []
+    for place in range(3):
+        own = made.learning_recording(20)
+        about = own.about | {name: f"{label} {place}" for name, label in labels.items()}
+        recordings.append(replace(own, about=about))
+    frames = Frames(recordings)
+    for panel in frames.given:
+        heading = max(panel.texts, key=lambda text: len(text.get_text()))
+        assert "copula" in heading.get_text()
+        assert heading.get_window_extent().width <= panel.get_window_extent().width
+    (legend,) = frames._figure.legends
+    bar, colours = (axes.get_window_extent() for axes in frames._figure.axes[-2:])
+    assert bar.x1 < legend.get_window_extent().x0
+    assert legend.get_window_extent().x1 < colours.x0
 
 
 def test_an_episode_that_ended_at_once_is_shown(tmp_path: Path) -> None:

@@ -5,9 +5,10 @@ import matplotlib
 import numpy as np
 import pytest
 
-from benchnav.core.figures import bytes_of, hatching, outline
+from benchnav.core.figures import bytes_of, hatching
+from benchnav.core.grid import outline
 from benchnav.eval.recording import MOST_POINTS, DrawnPlan, Recording, thinned
-from benchnav.eval.report.plan_layers import IMMOBILISING, field_colours, layer_colours
+from benchnav.eval.report.plan_layers import IMMOBILISING, field_colours, known_colours, layer_colours
 from benchnav.eval.report.playback.viewer_file import arrange, describe, drivers_of, map_views, write_rerun
 from tests.eval.report import made
 from tests.eval.report.playback.rrd import chunks, column, image, read_path, static, verify
@@ -328,3 +329,70 @@ def test_each_layer_has_a_view_of_its_own_beside_the_colours(tmp_path: Path) -> 
     assert (np.diff(darkness.ravel()) >= -6).all()  # the higher the darker
     assert views["wind azimuth_azimuth_deg, directions"][0] in chunks(path)
     assert "/map/layers/vegetation_m" not in chunks(written(tmp_path, made.recording(10)))
+
+
+def images(path: Path, entity: str) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Images over time, as the map has them, and their times."""
+    times, buffers = column(path, entity, "buffer")
+    shown = [np.array(buffer, np.uint8).reshape(40, 60, 3)[::-1] for (buffer,) in buffers]  # type: ignore[misc]
+    return times, shown
+
+
+def test_what_was_known_is_shown_from_the_time_it_was(tmp_path: Path) -> None:
+    recording = made.learning_recording(23)
+    path = written(tmp_path, recording)
+    verify(path)
+    for name in ("risk", "mean", "spread", "seen"):
+        times, shown = images(path, f"/map/{name}")
+        np.testing.assert_allclose(times, [0, 0.5, 1.0, 1.5, 2.0], atol=1e-6)
+        for known, colours in zip(recording.known, shown, strict=True):
+            np.testing.assert_array_equal(colours, known_colours(known)[name])
+    times, strips = column(path, "/map/closed", "strips")
+    np.testing.assert_allclose(times, [0, 0.5, 1.0, 1.5, 2.0], atol=1e-6)
+    for known, lines in zip(recording.known, strips, strict=True):
+        wanted = outline(~known.free, 0.5) / 0.5 * (1, -1) + (0, 40)
+        np.testing.assert_allclose(np.array(lines), wanted, atol=1e-4)
+    for entity, scale in (("/world/reach", 1), ("/map/overlay/reach", 0.5)):
+        times, strips = column(path, entity, "strips")
+        np.testing.assert_allclose(times, [0, 0.5, 1.0, 1.5, 2.0], atol=1e-6)
+        for known, lines in zip(recording.known, strips, strict=True):
+            shown_x = np.array(lines)[..., 0] * scale
+            np.testing.assert_allclose(shown_x, np.array(known.outlines)[..., 0], atol=1e-4)
+    again = written(tmp_path, replace(recording, known=()))
+    names = ("/map/mean", "/map/spread", "/map/seen", "/world/reach")
+    assert not [entity for entity in chunks(again) if entity.startswith(names)]
+
+
+def test_λ_predicted_under_the_robot_is_that_known_by_then(tmp_path: Path) -> None:
+    recording = made.learning_recording(23)
+    _, values = column(written(tmp_path, recording), "/series/traversability/predicted", "scalars")
+    for step, value in enumerate(np.ravel(values)):
+        x, y = np.floor(recording.states[step, :2] / 0.5).astype(int)
+        assert value == pytest.approx(recording.known[step // 5].predicted[y, x])
+
+
+def test_a_robot_that_learns_has_views_of_what_it_knows() -> None:
+    learning = made.learning_recording(20)
+    views = map_views(drivers_of([learning]))
+    assert list(views.values())[-3:] == [
+        ["/map/mean", *OVERLAY], ["/map/spread", *OVERLAY], ["/map/seen", *OVERLAY]
+    ]  # fmt: skip
+    assert list(views)[:-3] == list(map_views(drivers_of([replace(learning, known=())])))
+    other = replace(learning, about=learning.about | {"ground": "contact"})
+    assert not [name for name in map_views(drivers_of([learning, other])) if name.startswith("Belief")]
+
+
+def test_conditions_that_learn_have_names_and_reaches_of_their_own(tmp_path: Path) -> None:
+    learning = made.learning_recording(12)
+    grounds = ("contact", "probe radius_m=2")
+    path = written(
+        tmp_path, *(replace(learning, about=learning.about | {"ground": ground}) for ground in grounds)
+    )
+    verify(path)
+    found = [
+        entity
+        for entity in chunks(path)
+        if entity.startswith("/map/overlay/conditions/") and "reach" in entity
+    ]
+    assert len(found) == 2
+    assert sum("contact" in entity for entity in found) == 1

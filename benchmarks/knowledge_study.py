@@ -1,0 +1,326 @@
+"""What is knowledge worth to a robot? The study of docs/studies/knowledge.md, from its maps to its tables.
+
+    python benchmarks/knowledge_study.py maps                  # makes the maps, or checks the digests of those there
+    python benchmarks/knowledge_study.py estimate primary      # ten maps a condition: how long the whole takes
+    python benchmarks/knowledge_study.py develop               # the hypotheses on maps to develop on; then their power
+    python benchmarks/knowledge_study.py run primary known     # hours; killed and begun again it goes on
+    python benchmarks/knowledge_study.py report                # tables, and the figure of success over what is known
+
+Parts are suites of docs/knowledge: `primary` holds the hypotheses; `known` (part A) and `near` (part B) extend its run;
+`sensitivity` and `kernel` (part C) and `seen` have runs of their own. Maps and runs lie in the folders `--maps_in` and
+`--out`, and `--maps` takes the first maps alone, to try it.
+"""
+
+import argparse
+import hashlib
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+import yaml
+from matplotlib.figure import Figure
+from scipy.spatial.distance import cdist
+from scipy.stats import norm
+
+from benchnav.core import rng
+from benchnav.core.figures import (
+    LINE_COLOURS,
+    MARKERS,
+    TWO_COLUMNS_IN,
+    legend_outside,
+    risk_name,
+    save,
+    styled,
+)
+from benchnav.core.grid import Grid
+from benchnav.core.tables import Table, to_markdown
+from benchnav.datagen import TerrainDataset
+from benchnav.datagen.files.hdf5 import ShardFile, pack, recipe_entry
+from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.report.write import read_report
+from benchnav.planning.world.realisation import MOST_ATTEMPTS, joined
+from benchnav.planning.world.world import PRESETS, Places
+
+ROOT = Path(__file__).parents[1]
+SUITES, PAGE, FIGURE = (
+    ROOT / "docs/knowledge",
+    ROOT / "docs/studies/knowledge.md",
+    ROOT / "docs/figures/knowledge.png",
+)
+SPLIT = "test/std"
+# The folder of each part's run.
+RUNS = {
+    "primary": "knowledge",
+    "known": "knowledge",
+    "near": "knowledge",
+    "sensitivity": "knowledge-sensitivity",
+    "kernel": "knowledge-kernel",
+    "seen": "knowledge-seen",
+}
+DEVELOPMENT, DEVELOPED = "stakes-v1-seed1", "knowledge-developed"
+MATERN, MATERN_M, MATERN_MAPS = "-matern", 1.5, 100
+ALPHA = 0.05
+# What is known, by sensor of the ground and belief, from nothing to all.
+KNOWN = {
+    ("–", "static"): "the prediction",
+    ("contact", "copula"): "λ under\nthe robot",
+    ("probe:1", "copula"): "λ within\n1 m",
+    ("probe:2", "copula"): "λ within\n2 m",
+}
+ALL_KNOWN = "all of λ"
+
+
+def command(program: str, *words: object) -> None:
+    """Runs one of our commands from the root of the repository, where the suites' parts are."""
+    subprocess.run([Path(sys.executable).with_name(program), *map(str, words)], check=True, cwd=ROOT)
+
+
+def suite_of(part: str, maps_in: Path, maps: int) -> dict[str, Any]:
+    """A part's suite, on maps that lie in a folder; of the first maps alone where a number is given."""
+    suite: dict[str, Any] = yaml.safe_load((SUITES / f"{part}.yaml").read_text())
+    return suite | {"data": str(maps_in / f"{suite['data']}.h5")} | ({"maps": maps} if maps else {})
+
+
+# --- maps -------------------------------------------------------------------------------------------
+
+
+def make_maps(maps_in: Path) -> None:
+    """Makes the maps that are not there, and refuses others than those of which the digests were fixed."""
+    known: Mapping[str, Mapping[str, Any]] = yaml.safe_load((SUITES / "data.yaml").read_text())
+    maps_in.mkdir(parents=True, exist_ok=True)
+    for name, about in known.items():
+        path = maps_in / f"{name}.h5"
+        if not path.exists():
+            command("benchnav-datagen", "create", *about["create"], "--splits", f"[{SPLIT}]", "--out", path)
+        found = TerrainDataset(path).splits[SPLIT]["digest"]
+        if found != about["digest"]:
+            sys.exit(f"Expected maps of digest {about['digest']} in {path}, got {found}.")
+        print(f"{name}: {found}")
+        target = path.with_stem(f"{path.stem}{MATERN}")
+        if (
+            yaml.safe_load((SUITES / "kernel.yaml").read_text())["data"] == target.stem
+            and not target.exists()
+        ):
+            target.write_bytes(with_matern(TerrainDataset(path)))
+            print(f"{target.stem}: {TerrainDataset(target).splits[SPLIT]['digest']}")
+
+
+def with_matern(dataset: TerrainDataset) -> bytes:
+    """The file of a dataset's first maps with λ whose normal scores have a Matérn kernel of ν = 3/2."""
+    which, grid = range(MATERN_MAPS), dataset.grid
+    maps, terrain = dataset.read(SPLIT, which), dataset.terrain(SPLIT, which)
+    places = Places(
+        **{name: torch.from_numpy(maps[name]) for name in ("start_m", "goal_m", "reference_time_s")}
+    )
+    factor = np.linalg.cholesky(matern(grid, MATERN_M))
+    immobile = PRESETS["stakes"].world.immobile
+    assert immobile is not None
+    field, pending = torch.zeros_like(terrain.traversability), torch.arange(MATERN_MAPS)
+    for attempt in range(MOST_ATTEMPTS):
+        key = rng.stream_key(0, "matern", attempt)
+        drawn = rng.normal(key, pending.numpy(), (grid.height * grid.width,)) @ factor.T
+        scores = torch.from_numpy(drawn).view(-1, *grid.shape).to(field)
+        field[pending] = terrain.truth.select(pending).from_normal(scores)
+        pending = pending[~joined(field[pending] >= immobile.below, grid, places.select(pending))]
+        if len(pending) == 0:
+            break
+    assert len(pending) == 0, "no draw has a feasible path"
+    recipe = dataset.recipe
+    splits = {SPLIT: replace(recipe.splits[SPLIT], maps=MATERN_MAPS)}
+    recipe = replace(recipe, id=f"{recipe.id}{MATERN}", splits=splits)
+    entry = recipe_entry(recipe, ShardFile(SPLIT, 0, MATERN_MAPS))
+    stored = maps["traversability"]
+    return pack(
+        recipe, SPLIT, entry, maps | {"traversability": field.numpy().astype(stored.dtype)}, dataset.fields
+    )
+
+
+def matern(grid: Grid, length_m: float) -> np.ndarray:
+    """Correlations of all cells of a map, (1 + √3 d/ℓ) exp(−√3 d/ℓ), shape [H·W, H·W]."""
+    row, column = np.divmod(np.arange(grid.height * grid.width), grid.width)
+    centres = grid.resolution_m * np.stack((row, column), axis=1)
+    far = np.sqrt(3) / length_m * cdist(centres, centres)
+    return (1 + far) * np.exp(-far) + 1e-9 * np.eye(len(far))
+
+
+# --- runs -------------------------------------------------------------------------------------------
+
+
+def drive(suite: dict[str, Any], name: str, out: Path, jobs: int, written: str = "") -> Path:
+    """Runs a suite into a folder, or what is left of it.
+
+    Args:
+        suite: what is run.
+        name: of the run's folder.
+        out: where runs lie.
+        jobs: processes.
+        written: name of the file in which the suite is kept; the run's where it is empty.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / f"{written or name}.yaml"
+    path.write_text(yaml.safe_dump(suite, sort_keys=False, allow_unicode=True))
+    command("benchnav-eval", "run", "--config", path, "--out", out / name, "--jobs", jobs)
+    return out / name
+
+
+def run(parts: list[str], out: Path, maps_in: Path, maps: int, jobs: int) -> None:
+    """Runs parts, the one with the hypotheses first: a run that was begun cannot take any later."""
+    for part in sorted(parts, key=list(RUNS).index):
+        if part in ("known", "near") and not (out / RUNS[part] / "run.json").exists():
+            sys.exit(f"Expected `primary` before {part!r}, whose run it extends.")
+        begun = time.perf_counter()
+        drive(suite_of(part, maps_in, maps), RUNS[part], out, jobs, written=f"knowledge-{part}")
+        print(f"-- {part}: {time.perf_counter() - begun:.0f} s", flush=True)
+
+
+def estimate(parts: list[str], out: Path, maps_in: Path, maps: int, jobs: int) -> None:
+    """Says how long parts take, by some maps of each condition."""
+    maps = maps or 10
+    for part in parts:
+        whole = suite_of(part, maps_in, 0)
+        some = {name: value for name, value in whole.items() if name != "hypotheses"}
+        begun = time.perf_counter()
+        drive(some | {"maps": maps, "realisations": 1}, f"estimate-{part}", out, jobs)
+        seconds = time.perf_counter() - begun
+        hours = seconds * whole["maps"] * whole.get("realisations", 1) / maps / 3600
+        print(
+            f"{part}: {seconds:.0f} s for {maps} maps; {hours:.1f} hours of {jobs} processes in all",
+            flush=True,
+        )
+
+
+def develop(out: Path, maps_in: Path, maps: int, jobs: int) -> None:
+    """Runs the conditions of the hypotheses on the maps that the study was developed on, and tells the tests' power."""
+    suite = suite_of("primary", maps_in, maps)
+    suite |= {"data": str(maps_in / f"{DEVELOPMENT}.h5"), "seed": 1, "maps": min(200, suite["maps"])}
+    drive(suite, DEVELOPED, out, jobs)
+    print(power(out))
+
+
+def power(out: Path) -> str:
+    """The power of each hypothesis, by what was found on the maps that the study was developed on.
+
+    Of a difference and of superiority where the difference is the one that was found; of equivalence and
+    non-inferiority where there is none.
+    """
+    maps, report = yaml.safe_load((SUITES / "primary.yaml").read_text())["maps"], read_report(out / DEVELOPED)
+    rows = []
+    for number, row in enumerate(report.tests.to_dict("records"), start=1):
+        # Of the mean over so many maps.
+        error = (row["high"] - row["low"]) / 2 / norm.ppf(0.975) * np.sqrt(row["n_maps"] / maps)
+        first, last = (power_of(row, error, alpha) for alpha in (ALPHA / len(report.tests), ALPHA))
+        ends = f"{row['low']:+.1f} to {row['high']:+.1f}"
+        rows.append(
+            (str(number), row["claim"], f"{row['difference']:+.2f} ({ends})", f"{first:.2f}", f"{last:.2f}")
+        )
+    headings = ("", "hypothesis", "found on other maps (95 %)", "power, first of Holm", "power, last")
+    return to_markdown(Table(headings=headings, labels=2, rows=tuple(rows)))
+
+
+def power_of(row: Mapping[Any, Any], error: float, alpha: float) -> float:
+    """Chance that a hypothesis is supported, where the estimate of its difference is normal with this error."""
+    kind, margin = row["kind"], row["margin"]
+    if error == 0:
+        return 1.0
+    if kind == "equivalence":
+        return max(0.0, 2 * norm.cdf(margin / error - norm.ppf(1 - alpha)) - 1)
+    if kind == "non-inferiority":
+        return float(norm.cdf(margin / error - norm.ppf(1 - alpha)))
+    gain = row["difference"] * (-1 if row["direction"] == "lower" else 1)
+    tails = 1 if row["direction"] else 2
+    return float(norm.cdf((gain - margin) / error - norm.ppf(1 - alpha / tails)))
+
+
+# --- what is reported -------------------------------------------------------------------------------
+
+
+def known_of(row: Mapping[Any, Any]) -> str:
+    """What is known in a condition; empty where it is none of the study's main series."""
+    if row["model"] == "clairvoyant":
+        return ALL_KNOWN
+    return KNOWN.get((row["ground"], row["belief"]), "") if row["sensor"] == "full" else ""
+
+
+@styled()
+def knowledge_figure(summary: pd.DataFrame) -> Figure:
+    """Success over what is known, a line a risk setting, a panel a planner and model; bars are 95 % intervals."""
+    rows = summary[summary["world"] == "stakes"]
+    rows = rows.assign(known=[known_of(row) for row in rows.to_dict("records")])
+    rows = rows[(rows["known"] != "") & rows["planner"].isin(["astar_dwa", "astar_mppi"])]
+    names = [*KNOWN.values(), ALL_KNOWN]
+    panels = [
+        pair
+        for pair in dict.fromkeys(zip(rows["planner"], rows["model"], strict=True))
+        if pair[1] != "clairvoyant"
+    ]
+    figure = Figure(figsize=(TWO_COLUMNS_IN, 2.3 * -(-len(panels) // 2) + 0.4), layout="constrained")
+    axes = figure.subplots(-(-len(panels) // 2), 2, sharex=True, sharey=True, squeeze=False).flat
+    risks = [risk for risk in dict.fromkeys(rows["risk"]) if risk != NOT_USED]
+    for panel, (planner, model) in zip(axes, panels, strict=False):
+        own = rows[(rows["planner"] == planner) & rows["model"].isin([model, "clairvoyant"])]
+        for place, risk in enumerate(risks):
+            # The clairvoyant has one row for all risk settings.
+            line = own[own["risk"].isin([risk, NOT_USED])].drop_duplicates("known").set_index("known")
+            line = line.reindex([name for name in names if name in line.index])
+            at = [names.index(name) + 0.1 * (place - (len(risks) - 1) / 2) for name in line.index]
+            middle, low, high = (100 * line[f"success_{end}"].to_numpy() for end in ("rate", "low", "high"))
+            panel.errorbar(
+                at, middle, yerr=[middle - low, high - middle], color=LINE_COLOURS[place], marker=MARKERS[place],
+                ms=4, lw=1.1, elinewidth=0.8, capsize=2, label=risk_name(risk),
+            )  # fmt: skip
+        panel.set_title(f"{'A*+DWA' if planner == 'astar_dwa' else 'A*+MPPI'}, model {model}")
+        panel.set_xticks(range(len(names)), names)
+        panel.grid(axis="y", color="0.93")
+        panel.set_ylabel("success [%]")
+    legend_outside(figure, columns=len(risks))
+    return figure
+
+
+def report(out: Path) -> None:
+    """Writes the figure, the tables of the page where there is one, and the power where it is known."""
+    print(f"hypotheses {hashlib.sha256((SUITES / 'primary.yaml').read_bytes()).hexdigest()}")
+    save(knowledge_figure(pd.read_csv(out / RUNS["known"] / "summary.csv")), FIGURE, "png", dpi=200)
+    print(f"wrote {FIGURE}")
+    if PAGE.exists():
+        subprocess.run([sys.executable, ROOT / "benchmarks/tables.py", PAGE, "--runs", out], check=True)
+    if (out / DEVELOPED / "episodes.parquet").exists():
+        print(power(out))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=["maps", "estimate", "develop", "power", "run", "report"])
+    parser.add_argument("parts", nargs="*", default=[], help=f"of {', '.join(RUNS)}; all if none is named")
+    parser.add_argument("--out", type=Path, default=Path("runs"), help="folder of the runs")
+    parser.add_argument("--maps_in", type=Path, default=Path("datasets"), help="folder of the maps")
+    parser.add_argument(
+        "--maps", type=int, default=0, help="of each condition, in place of what the suites say"
+    )
+    parser.add_argument("--jobs", type=int, default=2)
+    given = parser.parse_args()
+    out, maps_in, parts = given.out.resolve(), given.maps_in.resolve(), given.parts or list(RUNS)
+    if unknown := set(parts) - set(RUNS):
+        parser.error(f"Expected parts among {', '.join(RUNS)}, got {', '.join(sorted(unknown))}.")
+    if given.what == "maps":
+        make_maps(maps_in)
+    elif given.what in ("estimate", "run"):
+        {"estimate": estimate, "run": run}[given.what](parts, out, maps_in, given.maps, given.jobs)
+    elif given.what == "develop":
+        develop(out, maps_in, given.maps, given.jobs)
+    elif given.what == "power":
+        print(power(out))
+    else:
+        report(out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,182 @@
+"""Pictures of an episode from above, and the window that shows them.
+
+Letters in shapes: H×W cells of the map, N×N cells of the crop, P positions.
+"""
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from benchnav.core.errors import ConfigError
+from benchnav.core.figures import (
+    LACKING,
+    MARKS,
+    TRAVERSABILITY_COLOURS,
+    bytes_of,
+    draw_edged,
+    mark,
+    robot_marker,
+    show_map,
+)
+from benchnav.core.grid import Grid
+from benchnav.env.view import CHANNELS
+
+SIZE = (640, 480)  # width and height in pixels
+_DPI = 100
+_MAP, _CROP, _MARGIN = 424, 176, 16  # pixels, of squares and between them
+_UNSEEN = 0.35  # of the brightness of ground that was seen
+_SPREAD_COLOURS = "magma"
+_TEXT = 8.5  # points
+_MARKS = 1.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """What is drawn.
+
+    Args:
+        rgb: colours of the map, uint8, shape [3, H, W].
+        seen: which cells were seen, bool, shape [H, W].
+        crop: what the policy is given, shape [4, N, N].
+        corners_m: of the crop on the map, shape [4, 2].
+        behind: share of the crop that is behind the robot.
+        state: beginning with (x, y, θ), shape [S].
+        goal_m: (x, y), shape [2].
+        track: where the robot drove, shape [P, 2].
+        time_s: since the episode began.
+        observed: λ of the last step.
+        outcome: `running`, or how the episode ended.
+    """
+
+    rgb: np.ndarray
+    seen: np.ndarray
+    crop: np.ndarray
+    corners_m: np.ndarray
+    behind: float
+    state: np.ndarray
+    goal_m: np.ndarray
+    track: np.ndarray
+    time_s: float
+    observed: float
+    outcome: str
+
+
+class Picture:
+    """Draws scenes on maps of one grid.
+
+    Args:
+        grid: of the maps.
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        """Prepares an empty figure."""
+        self._grid = grid
+        self._figure = Figure(figsize=(SIZE[0] / _DPI, SIZE[1] / _DPI), dpi=_DPI)
+        self._canvas = FigureCanvasAgg(self._figure)
+
+    def draw(self, scene: Scene) -> np.ndarray:
+        """The image, uint8, shape [480, 640, 3]."""
+        self._figure.clear()
+        self._draw_map(scene)
+        known = scene.crop[CHANNELS.index("known")] > 0
+        for place, (channel, title, colours) in enumerate(
+            (("risk", "λ̂ ahead", TRAVERSABILITY_COLOURS), ("spread", "spread of λ", _SPREAD_COLOURS))
+        ):
+            self._draw_crop(scene, place, scene.crop[CHANNELS.index(channel)], known, title, colours)
+        self._canvas.draw()
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def _draw_map(self, scene: Scene) -> None:
+        wide, high = self._grid.extent_m
+        width, height = (_MAP * size / max(wide, high) for size in (wide, high))
+        panel = self._panel(_MARGIN + (_MAP - width) / 2, _MARGIN + (_MAP - height) / 2, width, height)
+        light = np.where(scene.seen, 1.0, _UNSEEN)[..., None]
+        show_map(panel, (scene.rgb.transpose(1, 2, 0) * light).astype(np.uint8), (wide, high))
+        for colour, line in (("black", 2.4), ("white", 1.2)):
+            panel.add_patch(Polygon(scene.corners_m, closed=True, fill=False, ec=colour, lw=line))
+        draw_edged(panel, scene.track, 1.6)
+        mark(panel, "start", scene.track[0], _MARKS)
+        mark(panel, "goal", scene.goal_m, _MARKS)
+        _draw_robot(panel, *scene.state[:3])
+        words = f"t = {scene.time_s:.1f} s    λ = {scene.observed:.2f}"
+        if scene.outcome != "running":
+            words += f"    {scene.outcome.replace('_', ' ')}"
+        panel.set_title(words, fontsize=_TEXT + 1, loc="left", pad=5)
+
+    def _draw_crop(
+        self, scene: Scene, place: int, values: np.ndarray, known: np.ndarray, title: str, colours: str
+    ) -> None:
+        left = 2 * _MARGIN + _MAP
+        bottom = SIZE[1] - 40 - _CROP - place * (_CROP + 48)
+        panel = self._panel(left, bottom, _CROP, _CROP)
+        shown = matplotlib.colormaps[colours](values)[..., :3] * np.where(known, 1.0, _UNSEEN)[..., None]
+        nothing = ~known & (scene.crop[CHANNELS.index("spread")] == 0) & (scene.crop[0] == 0)
+        shown[nothing] = np.array(bytes_of(LACKING)[:3]) / 255
+        cells = len(values)
+        # Ahead is up, and the robot's left is left.
+        panel.imshow(
+            shown.transpose(1, 0, 2)[:, ::-1],
+            origin="lower",
+            extent=(0, cells, 0, cells),
+            interpolation="none",
+        )
+        _draw_robot(panel, cells / 2, scene.behind * cells, np.pi / 2)
+        panel.set_title(title, fontsize=_TEXT, loc="left", pad=4)
+        panel.set_title("0     1", fontsize=_TEXT, loc="right", pad=4)
+        self._draw_scale(left + _CROP - 29, bottom + _CROP + 7, colours)
+
+    def _draw_scale(self, left: float, bottom: float, colours: str) -> None:
+        panel = self._panel(left, bottom, 18, 8)
+        panel.imshow(np.linspace(0, 1, 32)[None], cmap=colours, aspect="auto")
+
+    def _panel(self, left: float, bottom: float, width: float, height: float) -> Axes:
+        place = (left / SIZE[0], bottom / SIZE[1], width / SIZE[0], height / SIZE[1])
+        return self._figure.add_axes(place, xticks=[], yticks=[])
+
+
+class Window:
+    """Shows images, one after the other."""
+
+    def __init__(self) -> None:
+        """Opens the window.
+
+        Raises:
+            ConfigError: there is no display, and `MPLBACKEND` names no backend that does without.
+        """
+        # Imported here, since it looks for a display.
+        from matplotlib import pyplot
+
+        self._pyplot: Any = pyplot
+        if pyplot.get_backend().lower() == "agg" and not os.environ.get("MPLBACKEND"):
+            raise ConfigError(
+                'Expected a display for `render_mode` "human", got none that Matplotlib can use. Take "rgb_array", or '
+                "install a toolkit of Matplotlib's, such as PyQt6, where there is a display."
+            )
+        self._figure = pyplot.figure("benchnav", figsize=(SIZE[0] / _DPI, SIZE[1] / _DPI), dpi=_DPI)
+        panel = self._figure.add_axes((0, 0, 1, 1))
+        panel.set_axis_off()
+        self._image = panel.imshow(np.full((SIZE[1], SIZE[0], 3), 255, np.uint8))
+
+    def show(self, image: np.ndarray) -> None:
+        """Shows an image of the size `SIZE` in place of the last one."""
+        self._image.set_data(image)
+        if self._pyplot.get_backend().lower() != "agg":
+            self._figure.show()
+        self._figure.canvas.draw_idle()
+        self._figure.canvas.flush_events()
+
+    def close(self) -> None:
+        """Closes the window; may be called again."""
+        self._pyplot.close(self._figure)
+
+
+def _draw_robot(panel: Axes, x: float, y: float, heading_rad: float) -> None:
+    looks = MARKS["robot"]
+    panel.plot([x], [y], **looks | {"ms": _MARKS * looks["ms"], "marker": robot_marker(heading_rad)})

@@ -1,0 +1,221 @@
+"""The study of knowledge: its suites, its maps, its power and its figure."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from scipy.stats import norm
+from sklearn.gaussian_process.kernels import Matern
+
+from benchmarks import knowledge_study
+from benchmarks.knowledge_study import (
+    ALL_KNOWN,
+    KNOWN,
+    RUNS,
+    SUITES,
+    knowledge_figure,
+    known_of,
+    matern,
+    power_of,
+    suite_of,
+    with_matern,
+)
+from benchnav.core.grid import Grid
+from benchnav.core.settings import of, read
+from benchnav.core.terrain import Terrain
+from benchnav.datagen import TerrainDataset
+from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.eval.experiment.condition import Condition, check_labels, conditions_of
+from benchnav.eval.experiment.hypotheses import fix_hypotheses
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Extent
+from benchnav.planning.world.realisation import joined
+from benchnav.planning.world.world import Places
+from tests import factories
+
+RUNNABLE = [part for part in RUNS if part != "near"]  # whose models are shipped
+
+
+@pytest.fixture(autouse=True)
+def at_the_root(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(knowledge_study.ROOT)
+
+
+def suite(part: str) -> Suite:
+    made: Suite = read(Suite, suite_of(part, Path("maps"), 0), of("the suite"))
+    return made
+
+
+def conditions(part: str) -> list[Condition]:
+    return conditions_of(suite(part), lambda data: ["std"])
+
+
+@pytest.fixture(scope="module")
+def primary() -> list[Condition]:
+    return conditions_of(
+        read(Suite, suite_of("primary", Path("maps"), 0), of("the suite")), lambda data: ["std"]
+    )
+
+
+def test_the_primary_hypotheses_are_twelve_at_most_and_name_all_that_is_run(primary: list[Condition]) -> None:
+    known = {each.id: (each, Extent.product((2026,), 2, 400)) for each in primary}
+    tests = fix_hypotheses(suite("primary").hypotheses, known)["tests"]
+    assert len(tests) == len(suite("primary").hypotheses) <= 12
+    named = {test[side] for test in tests for side in ("one", "other")}
+    assert named == set(known)
+    controls = [test for test in tests if test["margin"] == 3]
+    assert Counter(test["kind"] for test in controls) == {"non-inferiority": 1, "equivalence": 2}
+
+
+def test_what_extends_a_run_has_its_labels_and_shares_conditions(primary: list[Condition]) -> None:
+    known = conditions("known")
+    check_labels([*primary, *known])
+    assert len({each.id for each in primary} & {each.id for each in known}) == 9
+    # Two planners, two models, three risk settings, four states of knowledge; and the clairvoyant.
+    assert len(known) == 2 * 2 * 3 * 4 + 2
+    assert Counter(known_of(each.labels) for each in known) == {
+        **dict.fromkeys(KNOWN.values(), 12), ALL_KNOWN: 2
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("part", [part for part in RUNNABLE if part not in ("primary", "known")])
+def test_the_parts_of_suites_are_there(part: str) -> None:
+    assert conditions(part)
+
+
+def test_maps_to_confirm_on_are_neither_those_to_develop_on_nor_the_seen_ones() -> None:
+    confirmed = {
+        suite_of(part, Path("maps"), 0)["data"] for part in ("primary", "known", "near", "sensitivity")
+    }
+    assert confirmed == {"maps/stakes-v1-400-seed2026.h5"}
+    assert suite_of("primary", Path("maps"), 7)["maps"] == 7
+    known = knowledge_study.yaml.safe_load((SUITES / "data.yaml").read_text())
+    assert len({about["digest"] for about in known.values()}) == len(known)
+
+
+def test_maps_of_another_digest_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = factories.tiny_dataset(tmp_path / "maps" / "tiny.h5")
+    folder = tmp_path / "suites"
+    folder.mkdir()
+    (folder / "kernel.yaml").write_text("data: none")
+    monkeypatch.setattr(knowledge_study, "SUITES", folder)
+    digest = TerrainDataset(place).splits["test/std"]["digest"]
+    for given in (digest, "0" * 64):
+        (folder / "data.yaml").write_text(f"tiny: {{create: [tiny-v1], digest: '{given}'}}")
+        if given == digest:
+            knowledge_study.make_maps(place.parent)
+        else:
+            with pytest.raises(SystemExit, match=f"{'0' * 64} in .*, got {digest}"):
+                knowledge_study.make_maps(place.parent)
+
+
+@pytest.mark.parametrize("length_m", [0.5, 1.5])
+def test_the_kernel_is_materns(length_m: float) -> None:
+    grid = Grid(5, 7, 0.5)
+    row, column = np.divmod(np.arange(35), 7)
+    expected = Matern(length_m, nu=1.5)(0.5 * np.stack((row, column), 1))
+    np.testing.assert_allclose(matern(grid, length_m), expected, atol=1e-8)
+
+
+def test_maps_with_materns_field_have_all_else_and_a_feasible_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = load_recipe("stakes-v1")
+    assert whole.places is not None
+    places, splits = replace(whole.places, least_distance_m=10), {"test/std": whole.splits["test/std"]}
+    splits = {name: replace(split, maps=6) for name, split in splits.items()}
+    few = replace(whole, height=28, width=48, places=places, splits=splits)
+    dataset = TerrainDataset(factories.tiny_dataset(tmp_path / "few.h5", few))
+    monkeypatch.setattr(knowledge_study, "MATERN_MAPS", 5)
+    path = tmp_path / "few-matern.h5"
+    path.write_bytes(with_matern(dataset))
+    made = TerrainDataset(path)
+    before, after = (each.terrain("test/std", range(5)) for each in (dataset, made))
+    assert made.splits["test/std"]["maps"] == 5
+    assert made.truth_of("test/std") == "generated"
+    assert torch.equal(before.rgb, after.rgb)
+    assert torch.equal(before.truth.means, after.truth.means)
+    assert not torch.equal(before.traversability, after.traversability)
+    found = made.read("test/std", None, ["start_m", "goal_m", "reference_time_s"])
+    told = Places(**{name: torch.from_numpy(values) for name, values in found.items()})
+    assert bool(joined(after.traversability >= 0.1, made.grid, told).all())
+    smooth, rough = (beside(each) for each in (before, after))
+    # A little less than the kernel says, since scores beyond λ of 0 and 1 are not told.
+    assert rough == pytest.approx(matern(Grid(3, 3, 0.5), 1.5)[0, 1], abs=0.1)
+    assert rough < smooth - 0.03
+
+
+def beside(terrain: Terrain) -> float:
+    """Correlation of the normal scores of neighbouring cells, where both are numbers."""
+    low, high = terrain.truth.to_normal(terrain.traversability)
+    inside = (high - low).abs() < 1e-3
+    both = inside[..., 1:] & inside[..., :-1]
+    return float(np.corrcoef(low[..., 1:][both], low[..., :-1][both])[0, 1])
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        {"kind": "difference", "direction": "higher", "margin": 0.0, "difference": 2.0},
+        {"kind": "difference", "direction": "lower", "margin": 0.0, "difference": -2.0},
+        {"kind": "superiority", "direction": "higher", "margin": 5.0, "difference": 8.0},
+        {"kind": "non-inferiority", "direction": "higher", "margin": 3.0, "difference": -9.0},
+        {"kind": "equivalence", "direction": "", "margin": 3.0, "difference": 1.0},
+    ],
+)
+def test_power_is_the_share_of_studies_that_support_it(row: dict[str, Any]) -> None:
+    error, alpha = 1.2, 0.05
+    z = norm.ppf(1 - alpha)
+    true = row["difference"] if row["kind"] in ("difference", "superiority") else 0.0
+    found = np.random.default_rng(0).normal(true, error, 200_000)
+    low, high, margin = found - z * error, found + z * error, row["margin"]
+    supported = {
+        "difference": high < 0 if row["direction"] == "lower" else low > 0,
+        "superiority": low > margin,
+        "non-inferiority": low > -margin,
+        "equivalence": (low > -margin) & (high < margin),
+    }[row["kind"]]
+    assert power_of(row, error, alpha) == pytest.approx(supported.mean(), abs=0.005)
+
+
+def test_the_figure_has_a_line_a_risk_setting_over_what_is_known() -> None:
+    rows = []
+    for place, (ground, belief) in enumerate(KNOWN):
+        for risk, more in (("mean", 0.0), ("cvar:0.8", 0.1)):
+            middle = 0.5 + 0.1 * place + more
+            rows.append({
+                "world": "stakes", "planner": "astar_dwa", "model": "oracle", "sensor": "full", "ground": ground,
+                "belief": belief, "risk": risk, "success_rate": middle, "success_low": middle - 0.04,
+                "success_high": middle + 0.03,
+            })  # fmt: skip
+    others = {
+        "sensor": "near:8",
+        "world": "stakes noise=resampled",
+        "ground": "elsewhere",
+        "planner": "cl_rrt",
+    }
+    rows += [{**rows[0], name: value} for name, value in others.items()]
+    rows.append(
+        {
+            **rows[0],
+            "model": "clairvoyant",
+            "ground": "–",
+            "risk": "–",
+            "success_rate": 1.0,
+            "success_high": 1.0,
+        }
+    )
+    figure = knowledge_figure(pd.DataFrame(rows))
+    panel = figure.axes[0]
+    assert [label.get_text() for label in panel.get_xticklabels()] == [*KNOWN.values(), ALL_KNOWN]
+    mean, cvar = (bars.lines[0] for bars in panel.containers)
+    np.testing.assert_allclose(mean.get_ydata(), [50, 60, 70, 80, 100])
+    np.testing.assert_allclose(cvar.get_ydata(), [60, 70, 80, 90, 100])
+    (bar,) = panel.containers[0].lines[2]
+    np.testing.assert_allclose(bar.get_segments()[1][:, 1], [56, 63])
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["mean", "CVaR₀.₈"]
