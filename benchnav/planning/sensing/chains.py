@@ -18,7 +18,7 @@ from torch import Tensor
 
 from benchnav.core import rng
 from benchnav.planning.sensing.gaussian import Cells
-from benchnav.planning.sensing.labels import CHAINS, Noise, count, joined, packed, swept, unpacked
+from benchnav.planning.sensing.labels import CHAINS, Noise, joined, packed, swept, tally, unpacked
 from benchnav.planning.sensing.sites import LEAST_CHANGE, Block, Evidence, Sites
 
 _ROUNDS, _TOLD = 6, 3  # sweeps in an update, and how many of the last of them are counted
@@ -56,14 +56,22 @@ def draw_labels(evidence: Evidence, changed: Tensor, strength: float, window: in
             seen, labels = seen + told / _TOLD, labels.view_as(block.row)
             tied = joined(labels, block.lattice, block.evidence, drawn)
             # Of cells that no ties join to evidence either label is as likely.
-            joins = joins + count(labels & tied) + 0.5 * (CHAINS - count(tied))
+            joins = joins + tally(labels & tied) + 0.5 * (CHAINS - tally(tied))
         sweeps = sweeps + 1
     found = (joins + 0.5) / (CHAINS * _TOLD + 1)
     moved = (block.free != 0) & ((found - block.chance).abs() >= LEAST_CHANGE)
     chance = evidence.chance.index_put(block.at, torch.where(moved, found, block.chance).flatten(1))
     member = block.at[0].expand_as(sites.cell)
-    places = tuple(part[sites.open] for part in (member, sites.cells.row, sites.cells.column))
-    chance = chance.index_put(places, seen[sites.open])
+    # Of a settled cell that a patch, or its chains, took to the other label, as many as hold it.
+    share = tally(labels.flatten(1).gather(1, sites.cell)) / CHAINS
+    turned = (
+        sites.loose
+        & ~sites.open
+        & ((share - block.chance.flatten(1).gather(1, sites.cell)).abs() > 1 / CHAINS)
+    )
+    told = sites.open | turned
+    places = tuple(part[told] for part in (member, sites.cells.row, sites.cells.column))
+    chance = chance.index_put(places, torch.where(turned, share, seen)[told])
     labels = evidence.labels.index_put(block.at, labels.flatten(1))
     return replace(evidence, chance=chance, labels=labels, sweeps=sweeps)
 

@@ -43,7 +43,7 @@ from benchnav.planning.sensing.belief import Belief, Law
 from benchnav.planning.sensing.chains import draw_labels
 from benchnav.planning.sensing.copula import Copula, CopulaState
 from benchnav.planning.sensing.gaussian import interval_moments
-from benchnav.planning.sensing.labels import CHAINS, Lattice, fair, noise, swept
+from benchnav.planning.sensing.labels import CHAINS, Lattice, fair, noise, swept, tally
 from benchnav.planning.sensing.score_table import quantiles_of
 from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
 from benchnav.planning.sensing.sites import Evidence
@@ -223,15 +223,16 @@ class Classes(Belief[ClassesState]):
     def sample_fields(self, state: ClassesState, count: int, keys: Sequence[int]) -> Tensor:
         """Draws a chain's labels, then scores given all observations, and λ of both.
 
-        Where the prediction's odds are not even, as many labels of the less likely class as needed become the
-        other's, the same cells' for one number that a field draws, so that patches stay whole.
+        Where the chains that hold a label are not as many as it is likely, as by the prediction's odds, labels of the
+        less likely class become the other's, the same cells' for one number that a field draws, so that patches stay
+        whole.
         """
         scores = self._copula.sample_scores(state.copula, count, keys)
         means, stds, _ = _moments(state)
         spread = stds / state.copula.std.clamp(min=_SURE)[:, None]
-        chance, wanted = state.chance.clamp(_SURE, 1 - _SURE), state.probability()
-        up = ((wanted - chance) / (1 - chance)).clamp(min=0)
-        down = ((chance - wanted) / chance).clamp(min=0)
+        held, wanted = tally(state.labels) / CHAINS, state.probability()
+        up = ((wanted - held) / (1 - held).clamp(min=_SURE)).clamp(min=0)
+        down = ((held - wanted) / held.clamp(min=_SURE)).clamp(min=0)
         streams = [rng.stream_key(key, "labels") for key in keys]
         numbers = np.stack([rng.uniform(stream, np.arange(count), (2,)) for stream in streams])
         drawn = torch.from_numpy(numbers).to(scores.device)

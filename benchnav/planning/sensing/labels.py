@@ -172,7 +172,7 @@ def joined(labels: Tensor, lattice: Lattice, evidence: Tensor, drawn: Noise) -> 
             return found
 
 
-def count(words: Tensor) -> Tensor:
+def tally(words: Tensor) -> Tensor:
     """How many bits are set, int64."""
     pairs, fours, bytes_ = _HALVES
     words = words - ((words >> 1) & pairs)

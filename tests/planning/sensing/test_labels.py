@@ -9,12 +9,12 @@ from torch import Tensor
 from benchnav.planning.sensing.labels import (
     CHAINS,
     Lattice,
-    count,
     fair,
     joined,
     noise,
     packed,
     swept,
+    tally,
     unpacked,
 )
 
@@ -26,10 +26,10 @@ def test_bits_are_packed_counted_and_unpacked() -> None:
     bits = torch.rand(50, CHAINS, generator=torch.Generator().manual_seed(1)) < 0.4
     words = packed(bits)
     assert torch.equal(unpacked(words), bits)
-    assert torch.equal(count(words), bits.sum(-1))
+    assert torch.equal(tally(words), bits.sum(-1))
     whole = torch.tensor([-1, 0])
-    assert count(whole).tolist() == [64, 0]
-    assert abs(count(fair(20, 20)).double().mean() - 32) < 1
+    assert tally(whole).tolist() == [64, 0]
+    assert abs(tally(fair(20, 20)).double().mean() - 32) < 1
 
 
 def enumerated() -> np.ndarray:
@@ -58,8 +58,8 @@ def sampled(members: Tensor, sweeps: int) -> tuple[Tensor, Tensor, Tensor]:
         labels = swept(labels, lattice, ~known, even, drawn)
         if sweep >= 10:
             tied = joined(labels, lattice, known, drawn)
-            shares = shares + count(labels).double().mean(0) / CHAINS / (sweeps - 10)
-            found = count(labels & tied) + 0.5 * (CHAINS - count(tied))
+            shares = shares + tally(labels).double().mean(0) / CHAINS / (sweeps - 10)
+            found = tally(labels & tied) + 0.5 * (CHAINS - tally(tied))
             clusters = clusters + found.mean(0) / CHAINS / (sweeps - 10)
     return shares, clusters, labels
 
