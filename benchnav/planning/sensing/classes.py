@@ -23,7 +23,7 @@ Letters in shapes: B episodes, H×W cells.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, cast
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -33,9 +33,7 @@ from benchnav.core import rng
 from benchnav.core.batch import Batch
 from benchnav.core.conditioned import ConditionedDistribution
 from benchnav.core.distribution import TraversabilityDistribution
-from benchnav.core.errors import ConfigError, expect
-from benchnav.core.ground import GroundStatistics
-from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.errors import expect
 from benchnav.core.pooled import PooledDistribution
 from benchnav.core.quantiles import QuantileDistribution
 from benchnav.planning.sensing import copula as within
@@ -44,11 +42,11 @@ from benchnav.planning.sensing.chains import draw_labels
 from benchnav.planning.sensing.copula import Copula, CopulaState
 from benchnav.planning.sensing.gaussian import interval_moments
 from benchnav.planning.sensing.labels import CHAINS, Lattice, fair, noise, swept, tally
+from benchnav.planning.sensing.pairs import split, statistics_of
 from benchnav.planning.sensing.score_table import quantiles_of
 from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
 from benchnav.planning.sensing.sites import Evidence
 
-_LEAST_MASS, _LEAST_CLASS = 0.05, 0.01  # of a cell's weight: the pair's, and each of its classes'
 _MOST_STRENGTH = 0.88  # ln(1 + √2) is critical
 _FIRST_SWEEPS = 40  # of cells of which nothing is sensed
 _SAME_SCORE = 0.05  # a change of an observed score under which its label is not drawn again
@@ -122,7 +120,7 @@ class Classes(Belief[ClassesState]):
         Raises:
             ConfigError: the prediction tells no classes, or the law does not say which look alike.
         """
-        first, second, pair, odds = _split(prior, law)
+        first, second, pair, odds = split(prior, law)
         copula = self._copula.init(first, law)
         none = torch.zeros_like(copula.mean)
         state = ClassesState(
@@ -252,7 +250,7 @@ class Classes(Belief[ClassesState]):
 
     def _strength(self, law: Law) -> float:
         return (
-            min(_statistics(law).potts_strength, _MOST_STRENGTH) if self.strength is None else self.strength
+            min(statistics_of(law).potts_strength, _MOST_STRENGTH) if self.strength is None else self.strength
         )
 
     def _swept(self, state: ClassesState, fresh: Tensor) -> ClassesState:
@@ -278,7 +276,7 @@ class Classes(Belief[ClassesState]):
         self, state: ClassesState, prior: TraversabilityDistribution
     ) -> tuple[ClassesState, Tensor]:
         """Takes the prediction of cells where it differs, bool [B, H, W], and scores the λ observed there under it."""
-        first, second, pair, odds = _split(prior, state.copula.law)
+        first, second, pair, odds = split(prior, state.copula.law)
         (one, differs), (other, also) = (
             within.with_prior(look, own) for look, own in zip(state.looks, (first, second), strict=True)
         )
@@ -303,53 +301,6 @@ class Classes(Belief[ClassesState]):
 
 def _fair(pair: Tensor) -> Tensor:
     return fair(*pair.shape[1:]).to(pair.device).expand_as(pair)
-
-
-def _statistics(law: Law) -> GroundStatistics:
-    expect(
-        law.statistics is not None,
-        "statistics of the ground, which say which classes look alike, got none. Take a model that has them, or the "
-        "belief copula.",
-    )
-    return cast(GroundStatistics, law.statistics)
-
-
-def _split(
-    prior: TraversabilityDistribution, law: Law
-) -> tuple[TraversabilityMixture, TraversabilityMixture, Tensor, Tensor]:
-    """The prediction under the first and the second class, the pair of each cell, and its log odds."""
-    names, pairs = law.class_names, _statistics(law).look_alikes
-    if not isinstance(prior, TraversabilityMixture) or prior.group is None:
-        raise ConfigError(
-            "Expected a mixture whose components belong to classes for the belief classes, got "
-            f"{type(prior).__name__}{' without `group`' if isinstance(prior, TraversabilityMixture) else ''}. "
-            "Take another model, or the belief copula."
-        )
-    strange = sorted({name for pair in pairs for name in pair} - set(names))
-    expect(not strange, f"look-alike classes among those of the prediction, got {', '.join(strange)}.")
-    pair = torch.zeros(prior.shape, dtype=torch.int64, device=prior.device)
-    odds = torch.zeros(prior.shape, dtype=torch.float64, device=prior.device)
-    if not pairs:
-        return prior, prior, pair, odds
-    weights = prior.weights.double()
-    shares = replace(prior, weights=weights / weights.sum(-3, keepdim=True)).class_probabilities(len(names))
-    group = torch.tensor(prior.group, device=prior.device).view(-1, 1, 1)
-    heaviest = torch.full_like(odds, _LEAST_MASS)
-    scales = [torch.ones_like(weights), torch.ones_like(weights)]
-    for number, names_of in enumerate(pairs, 1):
-        ids = names.index(names_of[0]), names.index(names_of[1])
-        first, second = (shares[:, own] for own in ids)
-        mass = first + second
-        own = (mass >= heaviest) & (torch.minimum(first, second) > _LEAST_CLASS)
-        heaviest, pair = torch.where(own, mass, heaviest), torch.where(own, number, pair)
-        odds = torch.where(own, (first / second).log(), odds)
-        for place, (kept, share) in enumerate(zip(ids, (first, second), strict=True)):
-            scale = torch.where(
-                group == kept, (mass / share)[:, None], torch.where(group == sum(ids) - kept, 0.0, 1.0)
-            )
-            scales[place] = torch.where(own[:, None], scale, scales[place])
-    one, other = (replace(prior, weights=(weights * scale).to(prior.dtype)) for scale in scales)
-    return one, other, pair, odds
 
 
 def _density(look: CopulaState, cells: Tensor, value: Tensor) -> Tensor:
@@ -436,7 +387,8 @@ def _moments(state: ClassesState) -> tuple[Tensor, Tensor, Tensor]:
         gain, number = left / total, upper <= lower
         found, spread = interval_moments(centre, total, lower, torch.where(number, lower + 1, upper))
         found, spread = torch.where(number, lower, found), torch.where(number, 0.0, spread)
-        new = centre + gain * (found - centre), (left - left * gain + gain.square() * spread).sqrt(), 0.0
+        std = (left - left * gain + gain.square() * spread).sqrt()
+        new = centre + gain * (found - centre), std, torch.zeros_like(std)
         held = chosen[wanted] == (part == 0)
         for whole, value in zip((means, stds, skews), new, strict=True):
             whole[:, part][wanted] = torch.where(held, whole[:, part][wanted], value)
