@@ -48,7 +48,10 @@ from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
 from benchnav.planning.sensing.sites import Evidence
 
 _MOST_STRENGTH = 0.88  # ln(1 + √2) is critical
-_FIRST_SWEEPS = 40  # of cells of which nothing is sensed
+_FIRST_SWEEPS, _MORE_SWEEPS = (
+    40,
+    10,
+)  # of cells of which nothing is sensed: of whole maps, and of what is seen later
 _SAME_SCORE = 0.05  # a change of an observed score under which its label is not drawn again
 _SAME_ODDS = 0.01  # of a prediction
 _SURE = 1e-9  # of a probability
@@ -127,7 +130,7 @@ class Classes(Belief[ClassesState]):
             copula=copula, looks=(copula, self._copula.init(second, law)), density=torch.stack((none, none), 1),
             pair=pair, odds=odds, chance=none + 0.5, labels=_fair(pair), sweeps=torch.zeros_like(pair[:, 0, 0]),
         )  # fmt: skip
-        return self._swept(state, pair > 0)
+        return self._swept(state, pair > 0, _FIRST_SWEEPS)
 
     def update(
         self, state: ClassesState, sensed: Sensed, prior: TraversabilityDistribution | None = None
@@ -253,7 +256,7 @@ class Classes(Belief[ClassesState]):
             min(statistics_of(law).potts_strength, _MOST_STRENGTH) if self.strength is None else self.strength
         )
 
-    def _swept(self, state: ClassesState, fresh: Tensor) -> ClassesState:
+    def _swept(self, state: ClassesState, fresh: Tensor, count: int) -> ClassesState:
         """Draws labels of cells, bool [B, H, W], of which nothing is observed, given those of all others."""
         members = fresh.flatten(1).any(1).nonzero()[:, 0]
         if len(members) == 0:
@@ -263,7 +266,7 @@ class Classes(Belief[ClassesState]):
         row, column = (torch.arange(size, device=fresh.device) for size in fresh.shape[1:])
         row, column = row[:, None].expand_as(fresh), column.expand_as(fresh)
         degree, free, even = lattice.degree(), -fresh.long(), -((row + column) % 2)
-        for _ in range(_FIRST_SWEEPS):
+        for _ in range(count):
             bits = noise(sweeps, row, column, degree, lattice.strength, max(fresh.shape[1:]))
             labels, sweeps = swept(labels, lattice, free, even, bits), sweeps + 1
         return replace(
@@ -296,7 +299,7 @@ class Classes(Belief[ClassesState]):
             chance=torch.where(fresh, 0.5, state.chance),
             labels=torch.where(fresh, _fair(pair), state.labels),
         )
-        return self._swept(told, fresh & (pair > 0)), renewed
+        return self._swept(told, fresh & (pair > 0), _MORE_SWEEPS), renewed
 
 
 def _fair(pair: Tensor) -> Tensor:
