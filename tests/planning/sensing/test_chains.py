@@ -13,6 +13,7 @@ from benchnav.core.copula import correlations
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning.sensing.belief import Law
 from benchnav.planning.sensing.classes import Classes
+from benchnav.planning.sensing.labels import unpacked
 from benchnav.planning.sensing.sensor import Sensed
 from tests.planning.sensing import made
 from tests.planning.sensing.made_classes import (
@@ -157,3 +158,17 @@ def test_probabilities_of_classes_are_calibrated_on_simulated_maps(count: int) -
     rank = lower + (upper - lower) * torch.from_numpy(generator.random(lower.shape))
     inner = ((rank > 0.05) & (rank < 0.95))[reach & ~seen].double().mean()
     assert float(inner) == pytest.approx(0.9, abs=0.03)
+
+
+def test_where_a_label_is_settled_all_chains_hold_it() -> None:
+    """Also where scores that fit together badly have turned a patch."""
+    law, prior = law_of(6, 8), even(40, 6, 8)
+    generator, state = torch.Generator().manual_seed(0), Classes().init(prior, law)
+    for step in range(4):
+        found = torch.full(prior.shape, torch.nan, dtype=torch.float64)
+        found[:, 2:4, 2 * step : 2 * step + 2] = torch.rand(40, 2, 2, generator=generator).double()
+        state = Classes().update(state, Sensed(traversability=found, std=torch.full_like(found, 0.1)))
+        share = unpacked(state.labels).double().mean(-1)
+        settled = state.copula.observed & ((state.chance - 0.5).abs() > 0.4999)
+        assert settled.any()
+        assert float((share - state.chance)[settled].abs().max()) < 0.1

@@ -1,5 +1,7 @@
 """The belief of look-alike classes against closed forms and the copula belief."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -222,11 +224,17 @@ def test_of_a_new_prediction_the_cells_count_that_are_others() -> None:
     assert torch.equal(state.sweeps[1], first.sweeps[1])
     assert torch.equal(state.copula.mean[1], first.copula.mean[1])
     assert torch.equal(Classes().changed(first, state) | anew, Classes().changed(first, state))
-    # Ground that was just seen has patches as ground seen from the start.
-    fresh = anew & (state.pair != first.pair)
-    bits = unpacked(state.labels)
-    alike = (bits[..., 1:, :] == bits[..., :-1, :])[fresh[..., 1:] & fresh[..., :-1]].double().mean()
-    assert float(alike) > 0.6
+
+
+def test_ground_that_is_seen_later_has_patches_of_either_class() -> None:
+    law, unseen = law_of(12, 14), prediction(torch.eye(5).double()[2].view(1, 5, 1, 1).expand(1, 5, 12, 14))
+    before = Classes().init(unseen, law)
+    # Whatever the labels were of ground that could be of no pair.
+    for labels in (before.labels, torch.full_like(before.labels, -1)):
+        state = Classes().update(replace(before, labels=labels), looked((1, 12, 14), {}), even(1, 12, 14))
+        bits = unpacked(state.labels)
+        assert 0.6 < float((bits[..., 1:, :] == bits[..., :-1, :]).double().mean()) < 0.9
+        assert float(bits.double().mean()) == pytest.approx(0.5, abs=0.1)
 
 
 def test_cells_of_no_class_are_as_under_the_copula_belief() -> None:
