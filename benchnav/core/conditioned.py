@@ -106,7 +106,7 @@ class ConditionedDistribution(TraversabilityDistribution):
         ends = (lower - mean) / std, (upper - mean) / std
         if self.score_skew is None:
             return ends
-        return _normal_of(ends[0], self.score_skew), _normal_of(ends[1], self.score_skew)
+        return unskewed(ends[0], self.score_skew), unskewed(ends[1], self.score_skew)
 
 
 def skewed(normal: Tensor, skew: Tensor) -> Tensor:
@@ -121,7 +121,7 @@ def skewed(normal: Tensor, skew: Tensor) -> Tensor:
     return torch.where(skew.abs() < _LEAST_SKEW, normal.double(), found)
 
 
-def _normal_of(value: Tensor, skew: Tensor) -> Tensor:
+def unskewed(value: Tensor, skew: Tensor) -> Tensor:
     """The number that `skewed` makes a value of; infinite beyond its range."""
     sign, root, scale, width = _log_normal(skew)
     found = sign * (root + sign * value * scale).clamp(min=0).log() / width

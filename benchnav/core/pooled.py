@@ -1,6 +1,6 @@
-"""Several distributions as one: the average of their CDFs, as of the members of an ensemble.
+"""Several distributions as one: the average of their CDFs, as of the members of an ensemble or of classes.
 
-Letters in shapes: K components, H×W cells, *B any leading dimensions.
+Letters in shapes: M members, H×W cells, *B any leading dimensions.
 """
 
 import math
@@ -19,16 +19,19 @@ _HALVINGS = 40  # of [0, 1], to 10⁻¹²
 
 @dataclass(frozen=True)
 class PooledDistribution(TraversabilityDistribution):
-    """The average of distributions, each as likely as the others; `pool` makes one.
+    """The average of distributions; `pool` makes one of distributions that are alike likely.
 
     Args:
         members: one or more, of one shape, dtype and device.
+        weights: how likely each is, summing to 1 over M, shape [*B, M, H, W]; None where each is as likely as the
+            others.
 
     Raises:
-        ConfigError: there are none, or they differ.
+        ConfigError: there are none, they differ, or the weights are of another shape.
     """
 
     members: tuple[TraversabilityDistribution, ...]
+    weights: Tensor | None = None
 
     def __post_init__(self) -> None:
         """Checks that the members fit one another."""
@@ -37,6 +40,13 @@ class PooledDistribution(TraversabilityDistribution):
         if len(kinds) > 1:
             raise ConfigError(
                 f"Expected distributions of one shape, dtype and device to pool, got {', '.join(kinds)}."
+            )
+        if self.weights is not None:
+            *batch, height, width = self.shape
+            wanted = [*batch, len(self.members), height, width]
+            expect(
+                list(self.weights.shape) == wanted,
+                f"`weights` of shape {wanted}, got {list(self.weights.shape)}.",
             )
 
     @property
@@ -76,10 +86,15 @@ class PooledDistribution(TraversabilityDistribution):
     def log_prob(self, value: Tensor) -> Tensor:
         """Log of the average density, shape [*B, H, W]; not a number where a member has none."""
         densities = torch.stack([own.log_prob(value).double() for own in self.members])
-        return (densities.logsumexp(0) - math.log(len(self.members))).to(self.dtype)
+        if self.weights is None:
+            return (densities.logsumexp(0) - math.log(len(self.members))).to(self.dtype)
+        return (densities + self.weights.double().movedim(-3, 0).log()).logsumexp(0).to(self.dtype)
 
     def _average(self, values: Sequence[Tensor]) -> Tensor:
-        return torch.stack([value.double() for value in values]).mean(0).to(self.dtype)
+        whole = torch.stack([value.double() for value in values])
+        if self.weights is None:
+            return whole.mean(0).to(self.dtype)
+        return (whole * self.weights.double().movedim(-3, 0)).sum(0).to(self.dtype)
 
 
 def pool(distributions: Sequence[TraversabilityDistribution]) -> TraversabilityDistribution:

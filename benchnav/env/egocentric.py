@@ -23,7 +23,13 @@ from benchnav.env.environment import EnvBatch, Observations, OffRoadEnv, OffRoad
 from benchnav.env.experience import Experience
 from benchnav.env.view import CHANNELS, View, bounds
 from benchnav.models.base import TraversabilityModel, predict
-from benchnav.models.predictor import Clairvoyant, class_mismatch, find_ground_statistics, load_model
+from benchnav.models.predictor import (
+    Clairvoyant,
+    class_mismatch,
+    find_ground_statistics,
+    load_model,
+    nugget_of,
+)
 from benchnav.planning.robots import steps_in
 from benchnav.planning.sensing.belief import Belief, Law
 from benchnav.planning.sensing.knowledge import Learner, Truth, sensor_keys
@@ -252,7 +258,7 @@ class EgocentricBatch(EnvBatch):
             sensor=sees,
             ground=registry.take("ground", ground),
             belief=believes,
-            law=self._law(predictor.class_names, statistics),
+            law=self._law(predictor, statistics),
             measure=risk if callable(risk) else registry.make("risk", risk),
             rules=rules,
             predict=partial(predict, predictor),
@@ -341,14 +347,15 @@ class EgocentricBatch(EnvBatch):
             )
         )
 
-    def _law(self, class_names: tuple[str, ...], statistics: GroundStatistics | None) -> Law:
+    def _law(self, model: TraversabilityModel, statistics: GroundStatistics | None) -> Law:
         """How the λ of the maps hangs together."""
         recipe, world = self._dataset.recipe, self._world
         return Law(
             grid=self._maps.grid,
             correlation_m=recipe.correlation_m if world.noise == "stored" else world.correlation_m,
+            nugget=nugget_of(model),
             statistics=statistics,
-            class_names=class_names or tuple(item.name for item in recipe.classes),
+            class_names=model.class_names or tuple(item.name for item in recipe.classes),
         )
 
     def _field(self) -> Tensor:

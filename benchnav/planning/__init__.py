@@ -24,6 +24,7 @@ __getattr__, __dir__, __all__ = face(
             "Unicycle",
         ),
         "benchnav.planning.sensing.belief": ("Belief", "Law", "Static"),
+        "benchnav.planning.sensing.classes": ("Classes",),
         "benchnav.planning.sensing.copula": ("Copula",),
         "benchnav.planning.sensing.near": ("Near",),
         "benchnav.planning.sensing.sensor": (

@@ -9,6 +9,7 @@ from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Bicycle, DifferentialDrive, Robot, Unicycle
 from benchnav.planning.sensing.belief import Belief, Law, Static
+from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.near import Near
 from benchnav.planning.sensing.sensor import Appearance, Contact, Full, Moment, Probe, Sensed, Sensor, Step
@@ -26,6 +27,7 @@ __all__ = [
     "Appearance",
     "Belief",
     "Bicycle",
+    "Classes",
     "Contact",
     "Copula",
     "DifferentialDrive",

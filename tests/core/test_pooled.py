@@ -9,6 +9,8 @@ import torch
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.pooled import PooledDistribution, pool
+from benchnav.testing.breaches import Breaches
+from benchnav.testing.distribution import check_functions
 from tests.core.distributions import Hidden, mixture, quantiles
 
 MEMBERS = mixture(3, 0.01, 0.3), mixture(3, 0.01, 0.3, seed=1), mixture(3, 0.01, 0.3, seed=2)
@@ -73,6 +75,33 @@ def test_its_quantiles_are_the_inverse_of_a_cdf_that_jumps() -> None:
     assert bool((pool([Hidden(certain[0]), certain[1]]).quantile(0.7) == 0).all())
     firm = [replace(own, means=torch.full_like(own.means, 2.0), stds=0 * own.stds) for own in MEMBERS[:2]]
     assert bool((pool([Hidden(firm[0]), firm[1]]).quantile(0.7) == 1).all())
+
+
+def test_members_count_by_their_weights_in_each_cell() -> None:
+    shares = torch.rand(2, 2, 5, 7, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    shares = torch.stack((shares[:, 0], 1 - shares[:, 0]), 1)
+    one, other = MEMBERS[:2]
+    law = PooledDistribution((one, other), shares)
+    whole = TraversabilityMixture(
+        torch.cat((one.weights * shares[:, :1], other.weights * shares[:, 1:]), 1),
+        torch.cat((one.means, other.means), 1),
+        torch.cat((one.stds, other.stds), 1),
+    )
+    for name, arguments in (
+        ("cdf", (0.3,)), ("mean", ()), ("cvar", (0.9,)), ("quantile", (0.2,)), ("expected_time", (0.05,)),
+        ("log_prob", (OBSERVED,)), ("chance", (1.0,)),
+    ):  # fmt: skip
+        found, wanted = getattr(law, name)(*arguments), getattr(whole, name)(*arguments)
+        torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-4 if name == "cvar" else 1e-6)
+    breaches = Breaches("distribution", "pooled")
+    check_functions(law, 1e-4, breaches)
+    breaches.refuse()
+    which = OBSERVED > 0
+    which[0] = False
+    assert torch.equal(law.at(which).cdf(0.4), law.cdf(0.4)[which][None])
+    assert torch.equal(law.select(torch.tensor([1])).cdf(0.4), law.cdf(0.4)[1:])
+    with pytest.raises(ConfigError, match="weights"):
+        PooledDistribution((one, other), shares[:, :1])
 
 
 def test_a_pool_is_taken_apart_with_its_members() -> None:

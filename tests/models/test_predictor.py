@@ -23,10 +23,13 @@ from benchnav.models.config import MDNConfig
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.mdn import MixtureDensityModel
 from benchnav.models.predictor import (
+    Clairvoyant,
+    Ideal,
     Oracle,
     class_mismatch,
     find_ground_statistics,
     load_model,
+    nugget_of,
     open_checkpoint,
 )
 from tests.models.support import NAMES, linear_table, make_terrain
@@ -459,3 +462,8 @@ def test_the_oracle_the_ideal_and_the_clairvoyant_know_each_their_own() -> None:
     for level in (0.0, 0.5, 0.99):
         torch.testing.assert_close(known.cvar(level), terrain.traversability, atol=1e-6, rtol=0)
     torch.testing.assert_close(known.most_likely().mean(), terrain.traversability, atol=1e-6, rtol=0)
+
+
+def test_only_true_distributions_have_no_nugget() -> None:
+    assert [nugget_of(model) for model in (Oracle(), Clairvoyant())] == [0, 0]
+    assert nugget_of(Ideal()) == nugget_of(load_model("stakes-v1")) > 0

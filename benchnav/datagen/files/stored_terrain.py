@@ -25,9 +25,10 @@ def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
     fields = {name: torch.from_numpy(maps[name]) for name in MAP_FIELDS}
     layers = [name for name in maps if name not in FIELDS | OPTIONAL]
     alike = recipe.synthesis > 1 and (len(recipe.units) < len(recipe.classes) or recipe.has_vegetation)
+    truth = latent.truth(maps["class_id"], slope, recipe.classes)
     return Terrain(
         **fields | {"class_id": fields["class_id"].long()},
-        truth=_mixture(latent.truth(maps["class_id"], slope, recipe.classes), recipe.classes),
+        truth=_mixture(truth, (0,) * len(truth[0][0])),
         grid=recipe.grid,
         look_alikes=partial(_look_alikes, recipe.classes) if alike else None,
         layers={name: torch.from_numpy(maps[name]) for name in layers},
@@ -40,12 +41,11 @@ def _look_alikes(classes: ClassTable, terrain: Terrain) -> TraversabilityMixture
     if "vegetation_m" in terrain.layers and any(item.vegetation for item in classes):
         overgrown = (terrain.layers["vegetation_m"] > 0).cpu().numpy()
     parameters = latent.look_alikes(terrain.class_id.cpu().numpy(), slope, classes, overgrown)
-    return _mixture(parameters, classes).to(terrain.class_id.device)
+    group = (number for number, item in enumerate(classes) for _ in range(2 if item.soft else 1))
+    return _mixture(parameters, tuple(group)).to(terrain.class_id.device)
 
 
-def _mixture(parameters: latent.Parameters, classes: ClassTable) -> TraversabilityMixture:
-    """In float32; the components of a class, one or with its soft spots two, stand next to one another."""
+def _mixture(parameters: latent.Parameters, group: tuple[int, ...]) -> TraversabilityMixture:
+    """In float32."""
     weights, means, stds = (torch.from_numpy(values.astype(np.float32)) for values in parameters)
-    per_class = 2 if any(item.soft for item in classes) else 1
-    group = tuple(k // per_class for k in range(weights.shape[1]))
     return TraversabilityMixture(weights, means, stds, group)

@@ -75,7 +75,7 @@ def look_alikes(
         overgrown: where vegetation hides the ground, bool, shape [B, H, W]; None for nowhere.
 
     Returns:
-        As `truth`, with a component for each of the most classes that look alike.
+        As `truth`, with the components of each class in turn, a second one where it has soft spots.
     """
     labelled = class_id != UNLABELLED
     class_id = np.where(labelled, class_id, 0)
@@ -86,23 +86,19 @@ def look_alikes(
         shares += [_covers(number, classes) for number in range(len(classes))]
         cells = [labelled & (class_id == number) for number in range(len(classes))]
         shown = np.stack([own.any(axis=(1, 2)) for own in cells], axis=1)
-    pieces = []
-    for place in range(max(map(len, shares))):
-        members = [tuple(own.items())[place % len(own)] for own in shares]
-        other = np.take([member for member, _ in members], look)
-        share = np.take(
-            [w if place < len(own) else 0.0 for own, (_, w) in zip(shares, members, strict=True)], look
-        )
+    pieces, total = [], np.zeros(class_id.shape)
+    for number, item in enumerate(classes):
+        share = np.take([own.get(number, 0.0) for own in shares], look)
         if overgrown is not None:
-            own_map = np.arange(len(look))[:, None, None]
-            share = np.where(overgrown & labelled & ~shown[own_map, other], 0.0, share)
-        weights, means, stds = truth(np.where(labelled, other, UNLABELLED), slope_deg, classes)
-        pieces.append((weights, means, stds, share))
-    weights, means, stds, share = (np.stack(parts, axis=1) for parts in zip(*pieces, strict=True))
-    if overgrown is not None:
-        share = share / share.sum(axis=1, keepdims=True)
-    flat = len(look), -1, *look.shape[1:]
-    return (weights * share[:, :, None]).reshape(flat), means.reshape(flat), stds.reshape(flat)
+            share = np.where(overgrown & labelled & ~shown[:, number, None, None], 0.0, share)
+        weights, means, stds = (
+            values[:, : 2 if item.soft else 1]
+            for values in truth(np.where(labelled, number, UNLABELLED), slope_deg, classes)
+        )
+        pieces.append((weights, means, stds, np.broadcast_to(share[:, None], weights.shape)))
+        total += share
+    weights, means, stds, share = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
+    return weights * (share if overgrown is None else share / total[:, None]), means, stds
 
 
 def _covers(number: int, classes: ClassTable) -> dict[int, float]:

@@ -35,7 +35,7 @@ from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rollout import Episodes, run_episodes
 from benchnav.eval.run.rows import episode_rows, error_rows, step_table
 from benchnav.models.base import predict
-from benchnav.models.predictor import Clairvoyant, find_ground_statistics, load_model
+from benchnav.models.predictor import Clairvoyant, find_ground_statistics, load_model, nugget_of
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem, heading_to, pose_problem
 from benchnav.planning.sensing.belief import Fields, Law
@@ -229,6 +229,7 @@ def _learner(unit: Unit, origin: Origin, device: torch.device) -> Learner:
     law = Law(
         grid=block.terrain.grid,
         correlation_m=dataset.recipe.correlation_m if world.noise == "stored" else world.correlation_m,
+        nugget=nugget_of(model),
         statistics=find_ground_statistics(part, dataset) if condition.needs_statistics else None,
         class_names=model.class_names or tuple(item.name for item in dataset.recipe.classes),
     )

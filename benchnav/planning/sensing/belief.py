@@ -34,12 +34,15 @@ class Law:
         grid: size and resolution of the maps.
         correlation_m: ℓ: normal scores at distance d have the correlation exp(−d²/2ℓ²); 0 where every cell is for
             itself.
+        nugget: share of the variance of a cell's normal score that is its own and no neighbour's, in [0, 1): 0 where
+            the prediction is each cell's true distribution. A model's errors make neighbours less alike than λ is.
         statistics: of the training maps; None where nothing needs them.
         class_names: of the prediction's classes, in the order of their ids; empty where it tells none.
     """
 
     grid: Grid
     correlation_m: float
+    nugget: float = 0.0
     statistics: GroundStatistics | None = None
     class_names: tuple[str, ...] = ()
 
@@ -49,6 +52,7 @@ class Law:
             0 <= self.correlation_m < float("inf"),
             f"`correlation_m` ≥ 0 and finite, got {self.correlation_m}.",
         )
+        expect(0 <= self.nugget < 1, f"`nugget` in [0, 1), got {self.nugget}.")
 
     @property
     def correlation_cells(self) -> float:
@@ -215,8 +219,11 @@ def draw_scores(law: Law, count: int, keys: Sequence[int]) -> Tensor:
         keys: a stream key of each episode, B of them.
     """
     numbers, shape = np.arange(count), law.grid.shape
-    drawn = [correlated_normal(key, numbers, shape, law.correlation_cells) for key in keys]
-    return torch.from_numpy(np.stack(drawn))
+    drawn = np.stack([correlated_normal(key, numbers, shape, law.correlation_cells) for key in keys])
+    if law.nugget:
+        own = [rng.normal(rng.stream_key(key, "nugget"), numbers, shape) for key in keys]
+        drawn = np.sqrt(1 - law.nugget) * drawn + np.sqrt(law.nugget) * np.stack(own)
+    return torch.from_numpy(drawn)
 
 
 def fields_of(distribution: TraversabilityDistribution, scores: Tensor) -> Tensor:

@@ -96,10 +96,12 @@ class Copula(Belief[CopulaState]):
             on, until the window is full; before, it is the median.
         window: most observations that an update or an estimate looks at, those nearest to what is new; an update looks
             at more where more is new.
+        nugget: share of the variance of a cell's score that is its own and no neighbour's; None for the law's.
     """
 
     correlation_m: float | Literal["world", "estimated"] = "world"
     window: int = 128
+    nugget: float | None = None
 
     def __post_init__(self) -> None:
         """Refuses lengths that are none, and windows without room."""
@@ -109,16 +111,19 @@ class Copula(Belief[CopulaState]):
             f"`correlation_m` ≥ 0 and finite, 'world' or 'estimated', got {given!r}.",
         )
         expect(self.window >= 1, f"`window` of at least 1, got {self.window}.")
+        expect(self.nugget is None or 0 <= self.nugget < 1, f"`nugget` in [0, 1), got {self.nugget}.")
 
     def init(self, prior: TraversabilityDistribution, law: Law) -> CopulaState:
         """Knows the prediction alone."""
         named = {"world": law.correlation_m, "estimated": _MEDIAN_M}
         length_m = named[self.correlation_m] if isinstance(self.correlation_m, str) else self.correlation_m
+        law = law if self.nugget is None else replace(law, nugget=self.nugget)
+        lengths = [length_m / law.grid.resolution_m] * prior.shape[0]
         zeros = torch.zeros(prior.shape, dtype=torch.float64, device=prior.device)
         none = torch.full_like(zeros, torch.nan)
         return CopulaState(
             prior=prior, table=ScoreTable.empty(prior), law=law,
-            field=Field.of(law.grid.shape, [length_m / law.grid.resolution_m] * len(zeros), prior.device),
+            field=Field.of(law.grid.shape, lengths, prior.device, law.nugget),
             estimated_from=zeros[:, 0, 0].long(), value=none, lower=none, upper=none, noise_std=none, precision=zeros,
             shift=zeros, mean=zeros, std=torch.ones_like(zeros), skew=zeros,
         )  # fmt: skip
@@ -133,17 +138,27 @@ class Copula(Belief[CopulaState]):
         """
         noted, other = state, torch.zeros_like(state.observed)
         if prior is not None:
-            noted, other = _with_prior(state, prior)
-        noted, news = _note(noted, sensed)
-        news |= other & noted.observed
+            noted, other = with_prior(state, prior)
+        noted, news = note(noted, sensed)
+        learnt = self.learn(noted, news | (other & noted.observed))
+        moved = other | _moved(state, learnt)
+        return replace(learnt, table=learnt.table.having(learnt.prior, moved))
+
+    def learn(self, noted: CopulaState, news: Tensor) -> CopulaState:
+        """Conditions cells near what is new.
+
+        Args:
+            noted: of which observations are noted; it is not changed.
+            news: cells of which something was noted that is not yet known, bool, shape [B, H, W].
+        """
         members = news.flatten(1).any(1).nonzero()[:, 0].tolist()
-        if members:
-            names = ("field", "estimated_from", "precision", "shift", "mean", "std", "skew")
-            noted = replace(noted, **{name: getattr(noted, name).clone() for name in names})
-            for own in members:
-                self._learn(noted, own, news[own])
-        moved = other | _moved(state, noted)
-        return replace(noted, table=noted.table.having(noted.prior, moved))
+        if not members:
+            return noted
+        names = ("field", "estimated_from", "precision", "shift", "mean", "std", "skew")
+        noted = replace(noted, **{name: getattr(noted, name).clone() for name in names})
+        for own in members:
+            self._learn(noted, own, news[own])
+        return noted
 
     def _learn(self, state: CopulaState, own: int, new: Tensor) -> None:
         """Makes of what was noted in one episode what is known; writes into the state.
@@ -154,11 +169,11 @@ class Copula(Belief[CopulaState]):
         count, before = int(observed.sum()), int(state.estimated_from[own])
         if self.correlation_m == "estimated" and max(_FEWEST, 2 * before) <= count and before < self.window:
             state.estimated_from[own] = count
-            cells = _nearest(observed, new, self.window)
+            cells = nearest(observed, new, self.window)
             kept = Cells(row=cells.row[:, : self.window], column=cells.column[:, : self.window])
             length = _estimate(state, own, kept)
             if length != float(state.field.length[own]):
-                state.field.write(own, Field.of(state.law.grid.shape, [length], new.device))
+                state.field.write(own, Field.of(state.law.grid.shape, [length], new.device, state.law.nugget))
                 state.mean[own], state.std[own], state.skew[own] = 0, 1, 0
                 new = observed
         _condition(state, own, new, self.window)
@@ -194,6 +209,10 @@ class Copula(Belief[CopulaState]):
 
     def sample_fields(self, state: CopulaState, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields given all observations, by Matheron's rule: a field of the law, moved to what was observed."""
+        return fields_of(state.prior, self.sample_scores(state, count, keys))
+
+    def sample_scores(self, state: CopulaState, count: int, keys: Sequence[int]) -> Tensor:
+        """Normal scores of the fields that `sample_fields` draws, shape [B, M, H, W]."""
         (height, width), device = state.law.grid.shape, state.mean.device
         lines = torch.arange(height, device=device)[None], torch.arange(width, device=device)[None]
         scores = []
@@ -208,7 +227,7 @@ class Copula(Belief[CopulaState]):
             cells = Cells(row=row[None], column=column[None])
             precision, shift = state.precision[own, row, column], state.shift[own, row, column]
             # As the white noise of further fields, of which the first cells are taken.
-            noise = draw_scores(replace(law, correlation_m=0.0), 2 * count, keys[own : own + 1])
+            noise = draw_scores(replace(law, correlation_m=0.0, nugget=0.0), 2 * count, keys[own : own + 1])
             noise = noise[0, count:].to(drawn)[:, row, column] / precision.sqrt()
             inner = field.covariance(cells, cells)[0] + torch.diag(1 / precision)
             away = (shift / precision - drawn[:, row, column] - noise).T
@@ -216,7 +235,7 @@ class Copula(Belief[CopulaState]):
             drawn += (field.with_block(cells, *lines)[0].T @ moved).T.view_as(drawn)
         mean, std, skew = (values[:, None] for values in (state.mean, state.std, state.skew))
         normal = (torch.stack(scores) - mean) / std.clamp(min=_NO_TERM)
-        return fields_of(state.prior, mean + std * skewed(normal, skew))
+        return mean + std * skewed(normal, skew)
 
 
 def _moved(before: CopulaState, after: CopulaState) -> Tensor:
@@ -224,13 +243,13 @@ def _moved(before: CopulaState, after: CopulaState) -> Tensor:
     return (before.mean != after.mean) | (before.std != after.std) | (before.skew != after.skew)
 
 
-def _with_prior(state: CopulaState, prior: TraversabilityDistribution) -> tuple[CopulaState, Tensor]:
+def with_prior(state: CopulaState, prior: TraversabilityDistribution) -> tuple[CopulaState, Tensor]:
     """Takes the prediction of cells where it differs, bool [B, H, W], and what the λ observed there says under it."""
     other = state.prior.differs(prior, _SAME_PREDICTION)
     if not bool(other.any()):
         return state, other
     anew = other & state.observed
-    low, high = _scores(prior, anew, state.value[anew])
+    low, high = scores_at(prior, anew, state.value[anew])
     precision, shift = _terms(low, high, state.noise_std[anew])
     # Of the other cells the prediction stays what it was, so that small changes do not add up unseen.
     prior = prior if bool(other.all()) else state.prior.replaced(other, prior)
@@ -252,7 +271,7 @@ def _terms(low: Tensor, high: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
     return precision, torch.where(high <= low, precision * low, 0.0)
 
 
-def _scores(prior: TraversabilityDistribution, cells: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+def scores_at(prior: TraversabilityDistribution, cells: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
     """Least and greatest scores of observed λ [N] in some cells, bool [B, H, W]; both the same but for an atom."""
     low, high = (end[0].double() for end in prior.at(cells).to_normal(value[None].to(prior.dtype)))
     number = high <= low
@@ -261,13 +280,13 @@ def _scores(prior: TraversabilityDistribution, cells: Tensor, value: Tensor) -> 
     return torch.where(number, middle, low), torch.where(number, middle, high)
 
 
-def _note(state: CopulaState, sensed: Sensed) -> tuple[CopulaState, Tensor]:
+def note(state: CopulaState, sensed: Sensed) -> tuple[CopulaState, Tensor]:
     """Notes what was sensed, and tells of which cells something new is known, bool of shape [B, H, W]."""
     new = sensed.mask
     if not bool(new.any()):
         return state, new
     value = sensed.traversability[new]
-    low, high = _scores(state.prior, new, value)
+    low, high = scores_at(state.prior, new, value)
     std = sensed.std[new].double().clamp(min=LEAST_STD)
     was_low, was_high, was_std = state.lower[new], state.upper[new], state.noise_std[new]
     known, number, was_number = ~was_low.isnan(), high <= low, was_high <= was_low
@@ -303,13 +322,13 @@ def _note(state: CopulaState, sensed: Sensed) -> tuple[CopulaState, Tensor]:
 def _condition(state: CopulaState, own: int, new: Tensor, window: int) -> None:
     """Updates terms of observations, and scores of cells, near what is new in one episode; writes into the state."""
     field = state.field.select(torch.tensor([own], device=new.device))
-    cells = _nearest(~state.value[own].isnan(), new, window)
+    cells = nearest(~state.value[own].isnan(), new, window)
     covariance, observed = field.covariance(cells, cells), _observed(state, own, cells)
     known = condition(covariance, observed)
     reach = math.ceil(_REACH * float(field.length))
     rows, columns = (
         slice(max(low - reach, 0), min(high + reach + 1, size))
-        for (low, high), size in zip(_bounds(new), new.shape, strict=True)
+        for (low, high), size in zip(bounds(new), new.shape, strict=True)
     )
     lines = [torch.arange(line.start, line.stop, device=new.device)[None] for line in (rows, columns)]
     mean, variance, skew = predict(known, covariance, observed, field.with_block(cells, *lines))
@@ -337,7 +356,8 @@ def _observed(state: CopulaState, own: int, cells: Cells) -> Observed:
 
 def _estimate(state: CopulaState, own: int, cells: Cells) -> float:
     """ℓ of one episode, in cells: the mode of its posterior among `_LENGTHS_M`."""
-    field = _candidates(state.law.grid.shape, state.law.grid.resolution_m, cells.row.device)
+    grid = state.law.grid
+    field = _candidates(grid.shape, grid.resolution_m, cells.row.device, state.law.nugget)
     observed = map_tensors(_observed(state, own, cells), lambda one: one.expand(len(_LENGTHS_M), -1))
     cells = map_tensors(cells, lambda one: one.expand(len(_LENGTHS_M), -1))
     covariance = field.covariance(cells, cells)
@@ -347,21 +367,21 @@ def _estimate(state: CopulaState, own: int, cells: Cells) -> float:
 
 
 @lru_cache(maxsize=8)
-def _candidates(shape: tuple[int, int], resolution_m: float, device: torch.device) -> Field:
-    return Field.of(shape, [length / resolution_m for length in _LENGTHS_M], device)
+def _candidates(shape: tuple[int, int], resolution_m: float, device: torch.device, nugget: float) -> Field:
+    return Field.of(shape, [length / resolution_m for length in _LENGTHS_M], device, nugget)
 
 
-def _bounds(new: Tensor) -> list[tuple[int, int]]:
+def bounds(new: Tensor) -> list[tuple[int, int]]:
     """First and last row, and first and last column, of some cells of a map."""
     places = (new.any(axis).nonzero()[:, 0] for axis in (1, 0))
     return [(int(place[0]), int(place[-1])) for place in places]
 
 
-def _nearest(observed: Tensor, new: Tensor, window: int) -> Cells:
+def nearest(observed: Tensor, new: Tensor, window: int) -> Cells:
     """What is new on a map and the observed cells nearest to it, as many as the window has room for."""
     away = [
         torch.maximum(low - at, at - high).clamp(min=0)
-        for (low, high), size in zip(_bounds(new), new.shape, strict=True)
+        for (low, high), size in zip(bounds(new), new.shape, strict=True)
         for at in (torch.arange(size, device=new.device),)
     ]
     distance = (away[0].square()[:, None] + away[1].square()).masked_fill(new, -1)

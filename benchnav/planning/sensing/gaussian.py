@@ -49,27 +49,36 @@ class Field(Batch):
         length: ℓ in cells, float64, shape [B].
         down: correlations by rows, float64, shape [B, H].
         across: correlations by columns, float64, shape [B, W].
+        nugget: share of a cell's variance that is its own and no neighbour's.
     """
 
     length: Tensor
     down: Tensor
     across: Tensor
+    nugget: float = 0.0
 
     @classmethod
-    def of(cls, shape: tuple[int, int], lengths: Sequence[float], device: torch.device | str) -> "Field":
-        """The fields that `benchnav.core.copula.correlated_normal` draws.
+    def of(
+        cls,
+        shape: tuple[int, int],
+        lengths: Sequence[float],
+        device: torch.device | str,
+        nugget: float = 0.0,
+    ) -> "Field":
+        """The fields that `benchnav.core.copula.correlated_normal` draws, with a nugget where there is one.
 
         Args:
             shape: (H, W).
             lengths: ℓ in cells of each field, B of them.
             device: where the correlations are.
+            nugget: of all of them.
         """
         known = {length: [correlations(size, length) for size in shape] for length in lengths}
         down, across = (
             torch.from_numpy(np.stack([known[length][axis] for length in lengths])).to(device)
             for axis in (0, 1)
         )
-        return cls(torch.tensor(lengths, dtype=torch.float64, device=device), down, across)
+        return cls(torch.tensor(lengths, dtype=torch.float64, device=device), down, across, nugget)
 
     def write(self, own: int, field: "Field") -> None:
         """Writes the one field of another into this."""
@@ -78,7 +87,11 @@ class Field(Batch):
 
     def covariance(self, one: Cells, other: Cells) -> Tensor:
         """Correlations of N cells with M others, shape [B, N, M]."""
-        return _at(self.down, one.row, other.row) * _at(self.across, one.column, other.column)
+        found = _at(self.down, one.row, other.row) * _at(self.across, one.column, other.column)
+        if not self.nugget:
+            return found
+        alike = one.row[:, :, None] == other.row[:, None]
+        return self._shared(found, alike & (one.column[:, :, None] == other.column[:, None]))
 
     def with_block(self, cells: Cells, rows: Tensor, columns: Tensor) -> Tensor:
         """Correlations of N cells with those of a block, shape [B, N, R·C].
@@ -89,7 +102,16 @@ class Field(Batch):
             columns: of the block, int64, shape [B, C].
         """
         down, across = _at(self.down, cells.row, rows), _at(self.across, cells.column, columns)
-        return (down[..., None] * across[:, :, None]).flatten(2)
+        found = down[..., None] * across[:, :, None]
+        if self.nugget:
+            alike = cells.row[:, :, None] == rows[:, None]
+            alike = alike[..., None] & (cells.column[:, :, None] == columns[:, None])[:, :, None]
+            found = self._shared(found, alike)
+        return found.flatten(2)
+
+    def _shared(self, found: Tensor, same_cell: Tensor) -> Tensor:
+        """Correlations of which a share is of the cell alone."""
+        return torch.where(same_cell, found, (1 - self.nugget) * found)
 
 
 def _at(correlations: Tensor, one: Tensor, other: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch
-from benchnav.core.conditioned import skewed
+from benchnav.core.conditioned import skewed, unskewed
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.quantiles import QuantileDistribution
 
@@ -27,6 +27,7 @@ _LEVELS: tuple[float, ...] = (
 )
 _MOST_SCORE = 9.0  # beyond which ranks are alike
 _LAST_RANK = 3.4  # at levels 0 and 1, so that the mean of the ranks beyond the next level is right
+_LEAST_STD = 1e-9
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,33 @@ class ScoreTable(Batch):
         part = ((wanted - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1)
         found = torch.lerp(values[after - 1], values[after], part)
         return QuantileDistribution(found.T[:, None], _LEVELS)
+
+    def cdf(self, cells: Tensor, mean: Tensor, std: Tensor, skew: Tensor) -> Tensor:
+        """P(λ ≤ value) at `VALUES`, of 1 P(λ < 1), of cells whose score has a posterior, float64, shape [N, K].
+
+        Args:
+            cells: as of `quantiles`, and so are the others.
+            mean: shape [N].
+            std: shape [N].
+            skew: shape [N].
+        """
+        away = self.rows.scores[self.place[cells]] - mean[:, None]
+        away = away / std[:, None].clamp(min=_LEAST_STD)
+        some = skew != 0
+        if bool(some.any()):
+            away = away.index_put((some,), unskewed(away[some], skew[some, None]))
+        return torch.special.ndtr(away)
+
+
+def quantiles_of(cdf: Tensor) -> QuantileDistribution:
+    """λ of cells as a map of one row, [1, N], by P(λ ≤ value) at `VALUES`, of 1 P(λ < 1), float64, shape [N, K]."""
+    ranks = torch.special.ndtri(torch.tensor(_LEVELS, dtype=torch.float64, device=cdf.device))
+    levels = torch.special.ndtr(ranks.clamp(-_LAST_RANK, _LAST_RANK)).expand(len(cdf), -1).contiguous()
+    after = torch.searchsorted(cdf, levels).clamp(1, len(VALUES) - 1)
+    low, high = cdf.gather(1, after - 1), cdf.gather(1, after)
+    part = ((levels - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1)
+    values = cdf.new_tensor(VALUES)
+    return QuantileDistribution(torch.lerp(values[after - 1], values[after], part).T[:, None], _LEVELS)
 
 
 def scores_of(prior: TraversabilityDistribution) -> Tensor:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from benchnav.core.errors import DatasetError
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen import schema
 from benchnav.datagen.files import manifest, reader
 from benchnav.datagen.files.find import find_dataset
@@ -84,20 +85,23 @@ def test_bad_requests_are_named(dataset_path: Path) -> None:
 
 
 def test_components_belong_to_the_class_whose_soft_spots_they_hold() -> None:
-    """The truth by class, and what looks alike by each look-alike: single-class settings choose among these."""
+    """The truth as one class, and what looks alike by its classes: single-class settings choose among these."""
     recipe = small_stakes()
     terrain = terrain_of(generate(recipe, "train", np.arange(4)), recipe)
     assert terrain.truth.group == (0, 0)
     assert terrain.look_alikes is not None
     seen = terrain.look_alikes(terrain)
-    assert seen.group == (0, 0, 1, 1)
-    look_alikes = torch.tensor([len(own) for own in classes.look_alike_classes(recipe.classes)])[
-        terrain.class_id
-    ]
-    assert set(look_alikes.unique().tolist()) == {1, 2}
-    for place, share in enumerate((1 / look_alikes, 1 - 1 / look_alikes)):
-        own = [k for k, group in enumerate(seen.group) if group == place]
-        torch.testing.assert_close(seen.weights[:, own].sum(1), share)
+    table = classes.look_alike_classes(recipe.classes)
+    shares = torch.zeros(len(table), len(table))
+    for number, own in enumerate(table):
+        shares[number, list(own)] = 1 / len(own)
+    found = seen.class_probabilities(len(table)).movedim(1, -1)
+    torch.testing.assert_close(found, shares[terrain.class_id])
+    assert {len(own) for own in table} == {1, 2}
+    # Under each class with its own λ.
+    own = torch.tensor(seen.group)[:, None, None] == terrain.class_id[:, None]
+    of_class = TraversabilityMixture(torch.where(own, seen.weights, 0.0), seen.means, seen.stds)
+    torch.testing.assert_close(of_class.mean(), terrain.truth.mean())
 
 
 class Tight:

@@ -6,7 +6,7 @@ import torch
 from scipy import stats
 
 from benchnav.core.errors import ConfigError
-from benchnav.planning.sensing.belief import Law, Static
+from benchnav.planning.sensing.belief import Law, Static, draw_scores
 from benchnav.planning.sensing.sensor import Sensed
 from tests.planning.sensing import made
 
@@ -77,3 +77,11 @@ def test_an_episodes_fields_are_its_own_keys() -> None:
 def test_a_length_that_is_none_is_refused() -> None:
     with pytest.raises(ConfigError, match="correlation_m"):
         Law(grid=LAW.grid, correlation_m=-1.0)
+
+
+def test_fields_that_are_drawn_have_the_laws_nugget() -> None:
+    law = replace(made.law(4, 6, 1.5), nugget=0.3)
+    drawn = draw_scores(law, 4000, (7,))[0].flatten(1)
+    found = np.corrcoef(drawn.numpy().T)[0, 1:3]
+    np.testing.assert_allclose(drawn.std(0), 1, atol=0.04)
+    np.testing.assert_allclose(found, 0.7 * np.exp(-np.array([1, 4]) / 18), atol=0.04)

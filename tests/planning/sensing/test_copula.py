@@ -75,6 +75,39 @@ def test_scores_that_are_observed_condition_the_field_as_linear_algebra_says() -
     assert found.base is state.prior
 
 
+@pytest.mark.parametrize("by_law", [True, False])
+def test_of_a_nugget_neighbours_know_nothing_and_a_cell_that_was_sensed_all(by_law: bool) -> None:
+    prior = made.mixture(1, HEIGHT, WIDTH)
+    places = {(4, 4): 0.55, (4, 5): 0.3}
+    told = looked(places, std=0.01)
+    belief, law = (Copula(), replace(LAW, nugget=0.4)) if by_law else (Copula(nugget=0.4), LAW)
+    state = after(belief, prior, told, law=law)
+    where = list(places)
+    mask = told.mask
+    score = prior.at(mask).to_normal(told.traversability[mask][None])[0].numpy().ravel()
+    same = np.eye(HEIGHT * WIDTH)[[EVERY.index(place) for place in where]]
+    inner = 0.6 * covariance(where, where) + (0.4 + 1e-4) * np.eye(2)
+    across = 0.6 * covariance(where, EVERY) + 0.4 * same
+    mean = (across.T @ np.linalg.solve(inner, score)).reshape(HEIGHT, WIDTH)
+    variance = 1 - (across * np.linalg.solve(inner, across)).sum(0).reshape(HEIGHT, WIDTH)
+    np.testing.assert_allclose(state.mean[0], mean, atol=6e-3)
+    np.testing.assert_allclose(state.std[0], np.sqrt(variance.clip(0)), atol=6e-3)
+    assert state.std[0, 4, 4] < 0.011 < 0.5 < state.std[0, 4, 6]
+    drawn = belief.sample_fields(state, 4000, [3])[0]
+    wanted = belief.distribution(state)
+    for level in (0.2, 0.5, 0.8):
+        below = (drawn <= wanted.quantile(level)[0] + 1e-6).double().mean(0)[4, 6:9]
+        assert ((below - level).abs() < 0.04).all()
+
+
+@pytest.mark.parametrize("nugget", [-0.1, 1.0])
+def test_nuggets_that_are_no_share_are_refused(nugget: float) -> None:
+    with pytest.raises(ConfigError, match="nugget"):
+        Copula(nugget=nugget)
+    with pytest.raises(ConfigError, match="nugget"):
+        replace(LAW, nugget=nugget)
+
+
 def test_ground_at_zero_is_an_interval_up_to_the_atoms_end() -> None:
     prior = made.mixture(1, HEIGHT, WIDTH)
     state = after(Copula(), prior, looked({(6, 6): 0.0}))

@@ -242,10 +242,10 @@ def test_sensors_are_asked_when_it_is_due_and_where_robots_are(belief: Any) -> N
     assert asked == ["Near"]
     ground = ["Contact"] if belief.learns else []
     none, two = torch.zeros(BATCH, dtype=torch.bool), torch.tensor([True, False, True])
-    felt = how.sense(known, TRUTH, START + 2, 1, none)
+    sensed = how.sense(known, TRUTH, START + 2, 1, none)
     assert asked == ["Near", *ground]
-    assert torch.equal(felt.seen, known.seen)
-    assert int(felt.ever_sensed.sum()) == BATCH * len(ground)
+    assert torch.equal(sensed.seen, known.seen)
+    assert int(sensed.ever_sensed.sum()) == BATCH * len(ground)
     looked = how.sense(known, TRUTH, START + 2, 1, two)
     assert asked == ["Near", *ground, "Near", *ground]
     more = (looked.seen & ~known.seen).flatten(1).any(1)
