@@ -460,3 +460,11 @@ def test_a_model_of_other_classes_is_said_to_be_one(dataset_path: Path) -> None:
 
     with pytest.warns(UserWarning, match="the model was trained on other classes"):
         make(dataset_path, model=Others())
+
+
+def test_the_noise_of_sensors_is_each_episodes_own(dataset_path: Path) -> None:
+    # On ground that stays what it is, nothing but the sensor's noise differs between seeds.
+    env = make(dataset_path, world={"noise": "stored", "time_budget_s": 3.0}, **SENSES["full, probe, copula"])
+    first, other, again = (env.reset(seed=seed, options={"map": 1})[0]["crop"] for seed in (0, 1, 0))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first[RISK] - other[RISK]).max() > 0.02

@@ -97,9 +97,10 @@ class Knowing:
             KnowledgeError: a sensor, the belief, the model or the risk measure raised, or gave what is none.
         """
         how = self._how
-        if how.field_at is not None:
-            self._truth = replace(self._truth, field=how.field_at(step)[self.members])
         due = self.is_due(step)
+        # To draw λ of all cells takes long, and between updates only a belief that learns is told any.
+        if how.field_at is not None and (due or how.learner.belief.learns):
+            self._truth = replace(self._truth, field=how.field_at(step)[self.members])
         looks = torch.full_like(running, due)
         self.known = how.learner.sense(self.known, self._truth, robot_state, step, looks)
         if not due:

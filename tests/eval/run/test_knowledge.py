@@ -510,3 +510,23 @@ def test_planners_are_told_nothing_of_episodes_whose_map_stays() -> None:
     # A change that is too small for a new plan comes with the next that is not.
     believed = given.learning.learner.distribution(knowing.known).mean()
     torch.testing.assert_close(after[:3], believed[:3])
+
+
+@pytest.mark.parametrize("belief", [Copula(), Static()])
+def test_λ_that_is_drawn_anew_is_what_it_is_in_each_step(belief: Belief[Any]) -> None:
+    given, drawn = drives(ground=Contact(), belief=belief), list[int]()
+
+    def field_at(step: int) -> Tensor:
+        drawn.append(step)
+        return torch.full((BATCH, SIZE, SIZE), 0.1 * (step + 1))
+
+    knowing = Knowing(replace(given.learning, field_at=field_at), given.problem)
+    knowing.keep(torch.tensor([3, 1, 0]))
+    running = torch.ones(3, dtype=torch.bool)
+    for step in range(8):
+        knowing.learn(step, given.problem.start[:3], running)
+        told = knowing.known.sensed
+        if belief.learns and step % 5:
+            assert told.mask.sum() == 3
+            assert told.traversability[told.mask].tolist() == pytest.approx([0.1 * (step + 1)] * 3)
+    assert drawn == (list(range(8)) if belief.learns else [0, 5])

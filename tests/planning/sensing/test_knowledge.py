@@ -189,6 +189,28 @@ def test_pessimism_lowers_what_unseen_ground_is_worth_and_closes_none(unseen: st
     assert (bool(lower.all()), bool(higher.all())) == (unseen == "pessimistic", unseen == "optimistic")
 
 
+def test_pessimism_closes_no_unseen_ground_either_when_more_is_known_of_it() -> None:
+    how = learner(rules=replace(RULES, unseen="pessimistic"), ground=Probe(4.0))
+    known, changed = moved(how, begin(how), START)
+    told = changed & ~known.seen
+    assert told.any()
+    assert known.free[told].all()
+    assert not known.free[known.seen].all()
+
+
+def test_a_sensor_that_looks_and_senses_at_once_does_both_in_the_same_episodes() -> None:
+    class Both(Sensor):
+        def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
+            felt = Contact().sense(terrain, field, robot_state, moment)
+            return replace(felt, appearance=SEES.sense(terrain, field, robot_state, moment).appearance)
+
+    how = learner(sensor=Both(), belief=Static())
+    two = torch.tensor([True, False, True])
+    known = how.sense(begin(how), TRUTH, START, 1, two)
+    assert known.ever_sensed.flatten(1).sum(1).tolist() == [1, 0, 1]
+    assert known.reached.flatten(1).any(1).tolist() == [True, False, True]
+
+
 def test_ground_that_turns_out_bad_is_closed_once_it_is_seen() -> None:
     how = learner(rules=replace(RULES, unseen="pessimistic"), belief=Static())
     known = begin(how)
