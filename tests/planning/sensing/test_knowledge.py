@@ -201,8 +201,8 @@ def test_pessimism_closes_no_unseen_ground_either_when_more_is_known_of_it() -> 
 def test_a_sensor_that_looks_and_senses_at_once_does_both_in_the_same_episodes() -> None:
     class Both(Sensor):
         def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
-            felt = Contact().sense(terrain, field, robot_state, moment)
-            return replace(felt, appearance=SEES.sense(terrain, field, robot_state, moment).appearance)
+            sensed = Contact().sense(terrain, field, robot_state, moment)
+            return replace(sensed, appearance=SEES.sense(terrain, field, robot_state, moment).appearance)
 
     how = learner(sensor=Both(), belief=Static())
     two = torch.tensor([True, False, True])
