@@ -130,9 +130,9 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
     Args:
         summary: from `summary.summarise`.
     """
-    learnt = summary[summary["revisions_mean"].notna()]
-    if learnt.empty:
+    if summary.empty or summary["revisions_mean"].isna().all():
         return None
+    learnt = summary[summary["revisions_mean"].notna()]
     labels = [name for name in LABELS if name in (*_ALWAYS, "ground", "belief") or differ(summary[name])]
     rows = [
         (

@@ -216,16 +216,17 @@ def _label_lines(number: str, lines: Sequence[Line], rows: pd.DataFrame) -> pd.D
 def _panels(labels: pd.DataFrame) -> list[tuple[str, list[int]]]:
     """Titles and lines of the panels: split until no panel holds more lines than a reader can distinguish.
 
-    What is blind stands in the panels of the models that it stands beside.
+    What is blind stands in the panels of the models, and of what robots know, that it stands beside.
     """
+    unused = ["model", *KNOWLEDGE]
     numbered = labels.assign(line=labels.index)
     blind = numbered["model"] == NOT_USED
     for left_out in ({"who", "risk"}, {"risk"}, set()):
         columns = [name for name in _LABELS if name not in left_out]
         panels = numbered.loc[~blind, columns].drop_duplicates()
-        shared = [name for name in columns if name != "model"]
-        beside = numbered[blind].drop(columns="model").merge(panels, "left", shared)
-        every = pd.concat([numbered[~blind], beside.fillna({"model": NOT_USED})])
+        shared = [name for name in columns if name not in unused]
+        beside = numbered[blind].drop(columns=unused).merge(panels, "left", shared)
+        every = pd.concat([numbered[~blind], beside.fillna(dict.fromkeys(unused, NOT_USED))])
         groups = every.groupby(columns, sort=False)["line"].agg(list).reset_index()
         if groups["line"].map(len).max() <= _MOST_LINES:
             break
