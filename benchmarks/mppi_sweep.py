@@ -67,10 +67,10 @@ def on_maps(options: dict[str, object], objective: str, scenario: str, seed: int
     for condition in conditions_of(suite, lambda data: [scenario]):
         unit = Unit(condition=condition, seed=seed, realisation=0, maps=tuple(range(maps)))
         settings = Settings()
-        problem, simulation = build(unit, settings.origins().of(unit))
-        episodes, _ = simulate(unit, problem, simulation, settings)
+        built = build(unit, settings.origins().of(unit))
+        episodes, _ = simulate(unit, built, settings)
         arrived = episodes.outcome == int(Outcome.SUCCESS)
-        times.append(torch.where(arrived, episodes.steps * problem.dt_s, BUDGET_S).mean())
+        times.append(torch.where(arrived, episodes.steps * built.problem.dt_s, BUDGET_S).mean())
     return float(torch.stack(times).mean())
 
 

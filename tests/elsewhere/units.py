@@ -24,7 +24,7 @@ from benchnav.eval.run import recordings
 from benchnav.eval.run import unit as units_of_run
 from benchnav.eval.run.rollout import run_episodes
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.run.unit import Settings, run_unit
+from benchnav.eval.run.unit import Built, Settings, run_unit
 from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.predictor import Oracle
 from benchnav.planning.planners.planner import Plan, Planner
@@ -103,9 +103,10 @@ def test_a_unit_is_the_same_on_another_device(
     unit = unit_of(dataset_path, **changes)
     used: set[torch.device] = set()
 
-    def simulate(unit: Unit, problem: Problem, simulation: Simulation, *given: Any, **options: Any) -> Any:
-        used.update(value.device for value in (problem.start, problem.risk_map, simulation.steps))
-        return simulate_here(unit, problem, simulation, *given, **options)
+    def simulate(unit: Unit, built: Built, *given: Any, **options: Any) -> Any:
+        problem = built.problem
+        used.update(value.device for value in (problem.start, problem.risk_map, built.simulation.steps))
+        return simulate_here(unit, built, *given, **options)
 
     simulate_here = units_of_run.simulate
     monkeypatch.setattr(units_of_run, "simulate", simulate)

@@ -99,7 +99,8 @@ def test_a_recording_holds_the_problem_of_its_own_episode(dataset: Path, tmp_pat
     assert sorted(episodes) == list(itertools.product((3,), range(2), range(3)))
     for recording, (seed, realisation, map_index) in zip(taken, episodes, strict=True):
         unit = Unit(condition=condition, seed=seed, realisation=realisation, maps=(map_index,))
-        problem, simulation = build(unit, Settings().origins().of(unit))
+        built = build(unit, Settings().origins().of(unit))
+        problem, simulation = built.problem, built.simulation
         assert simulation.field is not None
         for found, expected in (
             (recording.rgb, problem.observation.rgb),

@@ -147,7 +147,8 @@ def test_the_ground_is_that_of_each_episode_under_its_own_noise(failed: Path) ->
     for recording, row in zip(taken, mixed.to_dict("records"), strict=True):
         noise = {name: row[name] for name in ("seed", "realisation")}
         unit = Unit(condition=condition, maps=(row["map"],), **noise)
-        problem, simulation = build(unit, Settings().origins().of(unit))
+        built = build(unit, Settings().origins().of(unit))
+        problem, simulation = built.problem, built.simulation
         np.testing.assert_array_equal(recording.predicted, problem.risk_map[0].numpy())
         assert simulation.field is not None
         np.testing.assert_array_equal(recording.immobilising, (simulation.field[0] < FAILED_BELOW).numpy())
