@@ -126,10 +126,15 @@ def _option_lines(options: dict[str, Option], prefix: str = "", holder: Any = No
         if config and default is not None:
             yield from _option_lines(list_options(config), f"{prefix}{name}.", default)
         else:
-            # A type as people write it in code, classes without their modules.
-            name_of_type = re.sub(r"(\w+\.)+", "", inspect.formatannotation(option.kind))
-            kind = "" if option.kind is Any else f": {name_of_type}"
+            kind = "" if option.kind is Any else f": {_type_words(option.kind)}"
             yield f"{prefix}{name}{kind}{_default(default)}"
+
+
+def _type_words(kind: Any) -> str:
+    """A type as people write it in code, classes without their modules, words and unions by bars."""
+    words = re.sub(r"(\w+\.)+", "", inspect.formatannotation(kind))
+    words = re.sub(r"Literal\[(.*?)\]", lambda found: found[1].replace("'", ""), words)
+    return re.sub(r"^Union\[(.*)\]$", lambda found: found[1].replace(", ", " | "), words)
 
 
 def _default(value: Any) -> str:
