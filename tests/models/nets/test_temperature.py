@@ -95,6 +95,7 @@ class Held(MapDataset):
 
     def __init__(self, rgb: torch.Tensor, class_id: torch.Tensor) -> None:
         self._memory, self._maps, self.every = {"rgb": rgb, "class_id": class_id}, len(rgb), 1
+        self.given, self.masks = ("rgb", "class_id"), None
 
     def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, dict[str, torch.Tensor]]]:
         every = range(len(self))
