@@ -5,7 +5,7 @@ Cells that may be of one of two classes have neighbours, of four, that may be of
     P(labels) ∝ exp(β · number of such neighbours with one label).
 
 A cell's 64 labels are the bits of one integer, so that a few operations on integers sweep all chains (multi-spin
-coding). Heat-bath sweeps go over one colour of the checkerboard after the other. What is told of a label is estimated
+coding). Heat-bath sweeps go over one colour of the checkerboard after the other. P(class) is estimated
 from clusters (Swendsen and Wang 1987): neighbours of one label are tied with the probability 1 − exp(−β), and cells
 that no ties join to evidence are of either class by half, whatever their bit. Random numbers are keyed by cell and by
 how many sweeps an episode has had, so that an episode has the same whoever is beside it.
