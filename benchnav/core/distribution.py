@@ -172,6 +172,10 @@ class TraversabilityDistribution(Batch, ABC):
         """
         return (1 - self._exact().cdf_limits(value)[0].double()).to(self.dtype)
 
+    def spread(self) -> Tensor:
+        """Half of the interval between the 16 % and the 84 % quantile of λ, shape [*B, H, W]: of a normal one its σ."""
+        return (self.quantile(0.84) - self.quantile(0.16)) / 2
+
     def log_prob(self, value: Tensor) -> Tensor:
         """Log density on (0, 1); log probability mass at 0 and at 1; not a number, as here, where there is none.
 

@@ -19,7 +19,6 @@ from benchnav.planning.objective import distance
 CHANNELS = ("risk", "spread", "rise", "known")
 NUMBERS = ("goal_distance", "goal_cos", "goal_sin", "observed_traversability", "time_left")
 _POSE = 3  # dimensions of a state that every robot has: x, y, θ
-_LOW, _HIGH = 0.16, 0.84  # levels of the quantiles between which the spread is
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +40,7 @@ class Known(Batch):
 
 def spread_of(distribution: TraversabilityDistribution) -> Tensor:
     """Width of the interval between the 16 % and the 84 % quantile of λ, in [0, 1], shape [B, H, W]."""
-    return distribution.quantile(_HIGH) - distribution.quantile(_LOW)
+    return 2 * distribution.spread()
 
 
 @dataclass(frozen=True, kw_only=True)

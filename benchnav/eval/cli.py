@@ -239,20 +239,20 @@ def _print_replay(folder: Path) -> None:
 
 
 def _failed(folder: Path) -> int:
-    """Exit status of a finished run or shard: 1 where a planner or model failed, which one line says."""
+    """Exit status of a finished run or shard: 1 where a part failed in some episode, which one line says."""
     from benchnav.eval.folder.run_folder import EPISODES, ERRORS, read_table
     from benchnav.planning.world.outcome import ERROR_OUTCOMES
 
     if not (folder / ERRORS).exists():
         return 0
-    said = "warning: a planner or model failed in some episodes"
+    said = failed = "warning: a planner, model, sensor or belief failed in some episodes"
     if (folder / EPISODES).exists():  # which a shard does not have
         rows = read_table(folder, EPISODES)
         faults = rows[rows["outcome"].isin(ERROR_OUTCOMES)]
         counts = faults["outcome"].value_counts()
         counted = " and ".join(f"{count} {kind}" for kind, count in counts.items())
         first = faults["error"].iloc[0]
-        said = f"warning: a planner or model failed in some episodes ({counted}); the first fault: {first}"
+        said = f"{failed} ({counted}); the first fault: {first}"
     _say(f"{said}; see {folder / ERRORS}")
     return 1
 

@@ -1,10 +1,10 @@
 """Run folders, format version 5: what lies where, and how it is read.
 
-A run folder holds `run.json` (conditions, and where everything came from), `units/` (what is finished: one
-Parquet file a unit, by condition and key, with rows and, in its metadata, what else is known of it), `steps/`,
-`playback/`, and, when all is done, `episodes.parquet`, `errors.txt` where a planner or model failed, and the report.
-Every file is written under another name first. `run.json` is sealed, and holds the digests of the run's tables, so
-that an edit of either is found.
+A run folder holds `run.json` (conditions, and where everything came from), `units/` (what is finished: one Parquet file
+a unit, by condition and key, with rows and, in its metadata, what else is known of it), `steps/`, `playback/`, and,
+when all is done, `episodes.parquet`, `errors.txt` where a planner, model, sensor or belief failed, and the report.
+Every file is written under another name first. `run.json` is sealed, and holds the digests of the run's tables, so that
+an edit of either is found.
 """
 
 import json

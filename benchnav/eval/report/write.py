@@ -127,7 +127,9 @@ def read_report(folder: Path, record_driven: RecordDriven | None = None) -> Repo
     warnings = caveats(about)
     if count := summary[[f"{name}_count" for name in ERROR_OUTCOMES]].to_numpy().sum():
         episodes_in_words = "1 episode" if count == 1 else f"{count} episodes"
-        warnings.append(f"warning: a planner or model failed in {episodes_in_words}; see {folder / ERRORS}")
+        warnings.append(
+            f"warning: a planner, model, sensor or belief failed in {episodes_in_words}; see {folder / ERRORS}"
+        )
     if sheets.left_out:
         warnings.append(f"note: {sheets.left_out}")
     return Report(

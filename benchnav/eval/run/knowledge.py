@@ -173,7 +173,6 @@ class Knowing:
             cells = torch.zeros_like(known.free)
             cells[place] = True
             believed = learner.at(known, cells)
-            low, high = believed.quantile(0.16), believed.quantile(0.84)
 
             def own(values: Tensor, place: int = place) -> np.ndarray:
                 return values[place].cpu().numpy()
@@ -186,7 +185,7 @@ class Knowing:
                 predicted=own(known.risk_map),
                 free=own(known.free | self._at_goal),
                 mean=whole(believed.mean()),
-                spread=whole((high - low) / 2),
+                spread=whole(believed.spread()),
                 seen=own(known.seen),
                 sensed=own(known.ever_sensed),
                 outline=reach_outline(own(known.reached), self._problem.grid.resolution_m),

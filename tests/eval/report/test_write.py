@@ -159,7 +159,7 @@ def test_tracebacks_are_pointed_at(outcome: str, tmp_path: Path) -> None:
     rows = made.rows(made.row(made.condition(), 0), made.row(made.condition(), 1, None, outcome=outcome))
     folder = run_folder(tmp_path / "run", rows)
     warning = read_report(folder).warnings[0]
-    assert warning.startswith("warning: a planner or model failed in 1 episode; see ")
+    assert warning.startswith("warning: a planner, model, sensor or belief failed in 1 episode; see ")
     assert str(folder / "errors.txt") in warning
     write_report(folder)
     assert warning in (folder / "summary.md").read_text()

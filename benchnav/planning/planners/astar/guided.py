@@ -23,8 +23,6 @@ from benchnav.planning.sensing.sensor import Step
 
 Local = TypeVar("Local")
 
-_ONE_DEVIATION = (0.16, 0.84)  # between these quantiles lie two standard deviations of a normal distribution
-
 
 @dataclass(frozen=True, kw_only=True)
 class GuideConfig:
@@ -160,8 +158,7 @@ def optimistic(problem: Problem, explore: float) -> Problem:
     """
     if explore == 0:
         return problem
-    low, high = (problem.distribution.quantile(share) for share in _ONE_DEVIATION)
-    bonus = explore * 0.5 * (high - low).to(problem.risk_map)
+    bonus = explore * problem.distribution.spread().to(problem.risk_map)
     return replace(problem, risk_map=(problem.risk_map + bonus).clamp(max=1))
 
 
