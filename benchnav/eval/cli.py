@@ -245,14 +245,14 @@ def _failed(folder: Path) -> int:
 
     if not (folder / ERRORS).exists():
         return 0
-    said = failed = "warning: a planner, model, sensor or belief failed in some episodes"
+    said = "warning: a planner, model, sensor or belief failed in some episodes"
     if (folder / EPISODES).exists():  # which a shard does not have
         rows = read_table(folder, EPISODES)
         faults = rows[rows["outcome"].isin(ERROR_OUTCOMES)]
         counts = faults["outcome"].value_counts()
         counted = " and ".join(f"{count} {kind}" for kind, count in counts.items())
         first = faults["error"].iloc[0]
-        said = f"{failed} ({counted}); the first fault: {first}"
+        said += f" ({counted}); the first fault: {first}"
     _say(f"{said}; see {folder / ERRORS}")
     return 1
 
