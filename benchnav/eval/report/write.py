@@ -18,6 +18,7 @@ from benchnav.core.errors import BenchnavError
 from benchnav.core.figures import save_twice
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
+from benchnav.eval.experiment.condition import KNOWLEDGE
 from benchnav.eval.folder.provenance import command_lines
 from benchnav.eval.folder.run_folder import ERRORS, caveats, open_run, read_table
 from benchnav.eval.recording import MAP, Ground, Recording, read_recordings
@@ -318,6 +319,9 @@ def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
     seeds = dict.fromkeys(seed for condition in conditions for seed in condition["seeds"])
     data, models = (joined(summary[name].unique()) or NOT_USED for name in ("data", "model"))
     lines.append(f"Data: {data}. Models: {models}. Seeds: {joined(map(str, seeds))}.")
+    if summary["revisions_mean"].notna().any():
+        known = (f"{kind} {joined(summary[kind].unique())}" for kind in KNOWLEDGE)
+        lines.append(f"What robots know by: {'; '.join(known)}.")
     if len(summary[["n_episodes", "n_maps", "n_groups"]].drop_duplicates()) == 1:
         maps = maps_in_words(summary["n_maps"][0], summary["n_groups"][0])
         lines.append(f"Each condition: {summary['n_episodes'][0]} episodes on {maps}.")
