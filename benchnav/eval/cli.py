@@ -227,7 +227,7 @@ def _print_replay(folder: Path) -> None:
     shown, place = propose(folder)
     words = ["replay", str(folder)]
     for name, labels in shown.items():
-        several = name in ("planner", "scenario") or len({one[name] for one in every}) > 1
+        several = name in ("planner", "scenario") or len({one[name] for one in every} - {NOT_USED}) > 1
         if labels != [NOT_USED] and several:
             text = ",".join(labels)
             is_plain = yaml.safe_load(f"[{text}]") == labels
