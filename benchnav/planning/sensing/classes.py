@@ -35,7 +35,6 @@ from benchnav.core.conditioned import ConditionedDistribution
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.pooled import PooledDistribution
-from benchnav.core.quantiles import QuantileDistribution
 from benchnav.planning.sensing import copula as within
 from benchnav.planning.sensing.belief import Belief, Law
 from benchnav.planning.sensing.chains import draw_labels
@@ -43,7 +42,7 @@ from benchnav.planning.sensing.copula import Copula, CopulaState
 from benchnav.planning.sensing.gaussian import interval_moments
 from benchnav.planning.sensing.labels import CHAINS, Lattice, fair, noise, swept, tally
 from benchnav.planning.sensing.pairs import split, statistics_of
-from benchnav.planning.sensing.score_table import quantiles_of
+from benchnav.planning.sensing.score_table import TabulatedDistribution
 from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
 from benchnav.planning.sensing.sites import Evidence
 
@@ -180,26 +179,22 @@ class Classes(Belief[ClassesState]):
         ]
         return PooledDistribution(tuple(parts), torch.stack((first, 1 - first), 1).to(dtype))
 
-    def at(self, state: ClassesState, cells: Tensor) -> QuantileDistribution:
-        """What is believed of some cells; see `Belief`.
-
-        By quantiles from tables of scores, as `Copula.at`.
-        """
+    def at(self, state: ClassesState, cells: Tensor) -> TabulatedDistribution:
+        """What is believed of some cells, from tables of scores; see `Belief` and `Copula.at`."""
         found, among = self._copula.at(state.copula, cells), state.pair[cells] > 0
         if not bool(among.any()):
             return found
         cells = cells & (state.pair > 0)
         moments = [values.movedim(1, -1)[cells] for values in _moments(state)]
         one, other = (
-            table.having(look.prior, cells).cdf(cells, *(values[:, own] for values in moments))
+            table.having(look.prior, cells).below(cells, *(values[:, own] for values in moments))
             for own, (table, look) in enumerate(
                 zip((state.copula.table, state.looks[1].table), state.looks, strict=True)
             )
         )
-        cdf = torch.lerp(other, one, state.probability()[cells][:, None])
-        values = found.values.clone()
-        values[:, 0, among] = quantiles_of(cdf).values[:, 0].to(values.dtype)
-        return replace(found, values=values)
+        below, first = found.below.clone(), state.probability()[cells][:, None].to(one)
+        below[:, 0, among] = torch.lerp(other, one, first).T.to(below)
+        return TabulatedDistribution(below)
 
     def changed(self, before: ClassesState, after: ClassesState) -> Tensor:
         """Cells whose score, class, or prediction is another."""

@@ -1,33 +1,104 @@
-"""λ by normal score, cell by cell: a table that tells the quantiles of a conditioned cell quickly.
+"""λ by normal score, cell by cell: a table that tells the distribution of a conditioned cell quickly.
 
-A row is of one cell and has the normal scores of `VALUES` under the cell's prediction. Between them λ is taken to be
-linear in the score. Rows are made of the cells that are asked for alone, and kept for when they are asked for again.
-Letters in shapes: B episodes, H×W cells, K values of λ, R rows, N cells.
+A row is of one cell and has the normal scores of `VALUES` under the cell's prediction, which give P(λ ≤ value) where
+something is known of the score. Rows are made of the cells that are asked for alone, and kept for when they are asked
+for again.
+Letters in shapes: B episodes, H×W cells, *B any leading dimensions, K values of λ, R rows, N cells.
 """
 
+import math
+from bisect import bisect_left
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch
-from benchnav.core.conditioned import skewed, unskewed
-from benchnav.core.distribution import TraversabilityDistribution
-from benchnav.core.quantiles import QuantileDistribution
+from benchnav.core.conditioned import unskewed
+from benchnav.core.distribution import TraversabilityDistribution, check_floor, tail_of
 
 VALUES: tuple[float, ...] = (
     *(round(0.005 * step, 3) for step in range(40)),
     *(round(0.2 + 0.02 * step, 2) for step in range(41)),
 )
-"""λ between which a belief's quantiles are linear in the normal score: denser where risk is."""
-_LEVELS: tuple[float, ...] = (
-    *(round(0.0025 * step, 4) for step in range(80)),
-    *(round(0.2 + 0.02 * step, 2) for step in range(40)),
-    *(0.99, 0.995, 0.9975, 1.0),
-)
+"""λ between which a belief's CDF is linear: denser where risk is."""
 _MOST_SCORE = 9.0  # beyond which ranks are alike
-_LAST_RANK = 3.4  # at levels 0 and 1, so that the mean of the ranks beyond the next level is right
 _LEAST_STD = 1e-9
+
+
+@dataclass(frozen=True)
+class TabulatedDistribution(TraversabilityDistribution):
+    """λ by its CDF at `VALUES`, linear in between; atoms are at 0 and at 1 alone.
+
+    Args:
+        below: P(λ ≤ value), at 1 P(λ < 1), shape [*B, K, H, W].
+    """
+
+    below: Tensor
+
+    @property
+    def shape(self) -> torch.Size:
+        """[*B, H, W]."""
+        return self.below.select(-3, 0).shape
+
+    def cdf(self, value: Tensor | float) -> Tensor:
+        """P(λ ≤ value), shape [*B, H, W]; see the base."""
+        return self.cdf_limits(value)[1]
+
+    def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
+        """P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]; see the base."""
+        at = torch.as_tensor(value, dtype=self.dtype, device=self.device)
+        if isinstance(value, Tensor):
+            after = torch.searchsorted(self._values(), at.contiguous()).clamp(1, len(VALUES) - 1)
+            places = [own.expand(self.shape).unsqueeze(-3) for own in (after - 1, after)]
+            low, high = (self.below.gather(-3, own).squeeze(-3) for own in places)
+        else:
+            after = torch.tensor(min(max(bisect_left(VALUES, value), 1), len(VALUES) - 1))
+            low, high = (self.below.select(-3, int(own)) for own in (after - 1, after))
+        before, behind = self._values()[after - 1], self._values()[after]
+        inside = torch.lerp(low, high, ((at - before) / (behind - before)).clamp(0, 1))
+        return torch.where(at <= 0, 0.0, inside), torch.where(at < 0, 0.0, torch.where(at < 1, inside, 1.0))
+
+    def quantile(self, probability: Tensor | float) -> Tensor:
+        """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the base."""
+        share = torch.as_tensor(probability, dtype=self.dtype, device=self.device).expand(self.shape)
+        below, share = self.below.movedim(-3, -1).contiguous(), share.unsqueeze(-1).contiguous()
+        after = torch.searchsorted(below, share)
+        upper = after.clamp(1, len(VALUES) - 1)
+        low, high = below.gather(-1, upper - 1), below.gather(-1, upper)
+        part = ((share - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1)
+        inside = torch.lerp(self._values()[upper - 1], self._values()[upper], part)
+        return torch.where(after == len(VALUES), 1.0, torch.where(after == 0, 0.0, inside)).squeeze(-1)
+
+    def mean(self) -> Tensor:
+        """E[λ], shape [*B, H, W]."""
+        return self.cvar(0.0)
+
+    def cvar(self, level: float) -> Tensor:
+        """Mean of λ over its worst share 1 − level, 1/p ∫₀¹ max(p − F, 0), shape [*B, H, W]; see the base."""
+        tail = tail_of(level)
+        below = self.below.movedim(-3, -1)
+        left = (tail - below).clamp(min=0)
+        low, high, step = left[..., :-1], left[..., 1:], self._values().diff()
+        # Where F passes p, of the interval the part before.
+        part = low / torch.where(high > 0, 1.0, below.diff(dim=-1).clamp(min=1e-30))
+        pieces = torch.where(high > 0, (low + high) / 2, low * part / 2)
+        return (pieces @ step) / tail
+
+    def expected_time(self, floor: float) -> Tensor:
+        """E[1 / max(λ, floor)] = 1 + ∫ F / λ² from the floor to 1, shape [*B, H, W]; see the base."""
+        check_floor(floor)
+        low, high = np.array(VALUES[:-1]), np.array(VALUES[1:])
+        start, end = np.maximum(low, floor), np.maximum(high, floor)
+        times, logs = 1 / start - 1 / end, np.log(end / start)
+        weights = np.zeros(len(VALUES))
+        weights[:-1] += (high * times - logs) / (high - low)
+        weights[1:] += (logs - low * times) / (high - low)
+        return 1 + self.below.movedim(-3, -1) @ self.below.new_tensor(weights)
+
+    def _values(self) -> Tensor:
+        return self.below.new_tensor(VALUES)
 
 
 @dataclass(frozen=True)
@@ -82,8 +153,8 @@ class ScoreTable(Batch):
             place[which] = torch.arange(first, first + int(which.sum()), device=place.device)
         return ScoreTable(place, _Rows(rows))
 
-    def quantiles(self, cells: Tensor, mean: Tensor, std: Tensor, skew: Tensor) -> QuantileDistribution:
-        """λ of cells whose score has a posterior, as a map of one row, [1, N].
+    def below(self, cells: Tensor, mean: Tensor, std: Tensor, skew: Tensor) -> Tensor:
+        """P(λ ≤ value) at `VALUES`, at 1 P(λ < 1), of cells whose score has a posterior, shape [N, K].
 
         Args:
             cells: which of them, bool, shape [B, H, W]; each has a row.
@@ -92,46 +163,12 @@ class ScoreTable(Batch):
             skew: of their scores, shape [N].
         """
         scores = self.rows.scores[self.place[cells]]
-        device, dtype = scores.device, scores.dtype
-        ranks = torch.special.ndtri(torch.tensor(_LEVELS, dtype=torch.float64, device=device))
-        ranks = ranks.clamp(-_LAST_RANK, _LAST_RANK).expand(len(mean), -1)
+        mean, std = mean.to(scores), std.to(scores).clamp(min=_LEAST_STD)
+        away = (scores - mean[:, None]) / std[:, None]
         some = skew != 0
         if bool(some.any()):
-            ranks = ranks.contiguous().index_put((some,), skewed(ranks[some], skew[some, None]))
-        wanted = torch.addcmul(mean[:, None], std[:, None], ranks).to(dtype)
-        values = torch.tensor(VALUES, dtype=dtype, device=device)
-        after = torch.searchsorted(scores, wanted).clamp(1, len(VALUES) - 1)
-        low, high = scores.gather(1, after - 1), scores.gather(1, after)
-        part = ((wanted - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1)
-        found = torch.lerp(values[after - 1], values[after], part)
-        return QuantileDistribution(found.T[:, None], _LEVELS)
-
-    def cdf(self, cells: Tensor, mean: Tensor, std: Tensor, skew: Tensor) -> Tensor:
-        """P(λ ≤ value) at `VALUES`, of 1 P(λ < 1), of cells whose score has a posterior, float64, shape [N, K].
-
-        Args:
-            cells: as of `quantiles`, and so are the others.
-            mean: shape [N].
-            std: shape [N].
-            skew: shape [N].
-        """
-        away = self.rows.scores[self.place[cells]] - mean[:, None]
-        away = away / std[:, None].clamp(min=_LEAST_STD)
-        some = skew != 0
-        if bool(some.any()):
-            away = away.index_put((some,), unskewed(away[some], skew[some, None]))
-        return torch.special.ndtr(away)
-
-
-def quantiles_of(cdf: Tensor) -> QuantileDistribution:
-    """λ of cells as a map of one row, [1, N], by P(λ ≤ value) at `VALUES`, of 1 P(λ < 1), float64, shape [N, K]."""
-    ranks = torch.special.ndtri(torch.tensor(_LEVELS, dtype=torch.float64, device=cdf.device))
-    levels = torch.special.ndtr(ranks.clamp(-_LAST_RANK, _LAST_RANK)).expand(len(cdf), -1).contiguous()
-    after = torch.searchsorted(cdf, levels).clamp(1, len(VALUES) - 1)
-    low, high = cdf.gather(1, after - 1), cdf.gather(1, after)
-    part = ((levels - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1)
-    values = cdf.new_tensor(VALUES)
-    return QuantileDistribution(torch.lerp(values[after - 1], values[after], part).T[:, None], _LEVELS)
+            away = away.index_put((some,), unskewed(away[some], skew[some, None]).to(away))
+        return (1 + torch.erf(away * math.sqrt(0.5))) / 2
 
 
 def scores_of(prior: TraversabilityDistribution) -> Tensor:

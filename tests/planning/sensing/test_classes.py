@@ -35,7 +35,7 @@ def test_without_look_alikes_it_is_the_copula_belief() -> None:
         torch.testing.assert_close(state.copula.std, wanted.std, rtol=0, atol=1e-9)
         assert torch.equal(mine.changed(before, state), plain.changed(was, wanted))
     some = wanted.observed
-    assert torch.equal(mine.at(state, some).values, plain.at(wanted, some).values)
+    assert torch.equal(mine.at(state, some).below, plain.at(wanted, some).below)
     found, expected = mine.distribution(state), plain.distribution(wanted)
     torch.testing.assert_close(found.cdf(0.4), expected.cdf(0.4), rtol=0, atol=1e-9)
     torch.testing.assert_close(mine.sample_fields(state, 2, (1, 2)), plain.sample_fields(wanted, 2, (1, 2)))
@@ -250,7 +250,7 @@ def test_cells_of_no_class_are_as_under_the_copula_belief() -> None:
     assert torch.equal(state.copula.mean, plain.mean)
     found, wanted = Classes().distribution(state), Copula().distribution(plain)
     torch.testing.assert_close(found.cdf(0.6)[~chosen], wanted.cdf(0.6)[~chosen], rtol=0, atol=1e-9)
-    assert torch.equal(Classes().at(state, ~chosen).values, Copula().at(plain, ~chosen).values)
+    assert torch.equal(Classes().at(state, ~chosen).below, Copula().at(plain, ~chosen).below)
 
 
 def test_episodes_that_take_the_places_of_others_are_what_they_were_alone() -> None:

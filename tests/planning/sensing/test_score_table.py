@@ -1,0 +1,37 @@
+"""Distributions by a table of their CDF: their functions agree with each other, with integrals of it and with draws."""
+
+import pytest
+import torch
+
+from benchnav.planning.sensing.score_table import VALUES, TabulatedDistribution
+from benchnav.testing.breaches import Breaches
+from benchnav.testing.distribution import check_functions
+
+
+def table() -> TabulatedDistribution:
+    """Steep, flat, and with atoms at both ends, a cell each."""
+    values = torch.tensor(VALUES, dtype=torch.float64)
+    smooth = 0.15 + 0.7 * values**2
+    steep = (values >= 0.3).double()
+    even = values.clone()
+    sure = torch.ones_like(values)
+    never = torch.zeros_like(values)
+    return TabulatedDistribution(torch.stack((smooth, steep, even, sure, never), -1)[None, :, None])
+
+
+def test_functions_are_those_of_a_distribution_and_agree_with_integrals_of_its_cdf() -> None:
+    breaches = Breaches("distribution", "table")
+    check_functions(table(), 1e-6, breaches)
+    breaches.refuse()
+
+
+@pytest.mark.parametrize("floor", [0.03, 0.05, 0.5])
+def test_means_of_all_kinds_are_those_of_draws(floor: float) -> None:
+    law = table()
+    shares = (torch.arange(5000, dtype=torch.float64) + 0.5) / 5000
+    drawn = torch.stack([law.quantile(share)[0, 0] for share in shares])
+    assert torch.allclose(law.mean()[0, 0], drawn.mean(0), atol=2e-4, rtol=0)
+    worst = drawn[: len(drawn) // 5].mean(0)
+    assert torch.allclose(law.cvar(0.8)[0, 0], worst, atol=5e-4, rtol=0)
+    times = (1 / drawn.clamp(min=floor)).mean(0)
+    assert torch.allclose(law.expected_time(floor)[0, 0], times, rtol=2e-3, atol=0)
