@@ -1,0 +1,202 @@
+"""How often λ lies in the interval that a belief gives it, with `oracle` and a trained model.
+
+    python benchmarks/knowledge_coverage.py --maps_in datasets
+
+Robots drive by A*+DWA under `expected-time` and learn by `copula`. At four times of each episode, drawn beforehand, the
+belief is asked of all cells within 2ℓ of the robot whose λ was not sensed: does λ lie in the central 90 % of what is
+believed of it? Where λ has an atom, a rank in it is drawn (randomised PIT). Told are the share of cells with its 95 %
+interval by maps (of a ratio of sums over maps), the shares under and over the interval, and the mean log score beside
+that of the prediction alone.
+
+In the world `stakes` draws of λ without a feasible path are rejected, of which the law that is believed does not know.
+`as the law has it` has none rejected, and immobilises no robot. The first table says what rejection changes of λ: over
+40 draws of each map, the differences of E[λ] and P(λ < 0.1) between accepted draws and all, near the straight way from
+start to goal (3 m) and elsewhere. Ten minutes of a core.
+"""
+
+import argparse
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch import Tensor
+
+from benchnav.core import rng
+from benchnav.core.copula import correlated_normal
+from benchnav.eval.experiment.condition import conditions_of
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Extent, Unit, units
+from benchnav.eval.run.knowledge import Knowing
+from benchnav.eval.run.unit import Built, Settings, build, one_thread, read_block, simulate
+from benchnav.planning.world.realisation import joined
+
+TIMES, LATEST_S = 4, 40.0
+NEAR_M = 3.0  # 2ℓ
+LAW = {"preset": "stakes", "immobile": None}
+DRAWS = 40  # of each map, of the table on rejection
+NAMES = ("inside", "under", "over", "log_score", "log_score_of_prediction")
+
+
+class Coverage:
+    """What was found in the episodes of a unit: sums by map, shape [B, 6], the first of them of cells."""
+
+    def __init__(self, unit: Unit, built: Built) -> None:
+        """Draws the times."""
+        assert built.learning is not None
+        assert built.simulation.field is not None
+        self._built, self._learner, self._field = built, built.learning.learner, built.simulation.field
+        maps = np.array(unit.maps)
+        every = round(unit.condition.rules.replan_every_s / built.problem.dt_s)
+        drawn = rng.uniform(rng.stream_key(0, "coverage"), maps, (TIMES,))
+        self._steps = torch.from_numpy(every * np.ceil(drawn * LATEST_S / built.problem.dt_s / every)).long()
+        self._rank = torch.from_numpy(rng.uniform(rng.stream_key(0, "rank"), maps, built.problem.grid.shape))
+        self.sums = torch.zeros(len(maps), 1 + len(NAMES), dtype=torch.float64)
+
+    def __call__(self, step: int, knowing: Knowing) -> None:
+        """Asks what is believed where a time was drawn; of robots that are left."""
+        known, members = knowing.known, knowing.members
+        asked = (self._steps[members] == step).any(1) & known.reached.flatten(1).any(1)
+        cells = _near(known.reached, self._built.problem.grid.resolution_m) & ~known.ever_sensed
+        cells &= asked[:, None, None]
+        if not bool(cells.any()):
+            return
+        value, member = self._field[members][cells][None], members[cells.nonzero()[:, 0]]
+        believed = self._learner.distribution(known).at(cells)
+        low, high = believed.cdf_limits(value)
+        pit = torch.lerp(low.double(), high.double(), self._rank[members][cells][None])
+        predicted = self._built.problem.distribution.select(members).at(cells)
+        told = (
+            torch.ones_like(pit), (pit - 0.5).abs() <= 0.45, pit < 0.05, pit > 0.95,
+            believed.log_prob(value).clamp(min=-10), predicted.log_prob(value).clamp(min=-10),
+        )  # fmt: skip
+        self.sums.index_add_(0, member, torch.stack([part[0].double() for part in told], 1))
+
+
+def _near(reached: Tensor, resolution_m: float) -> Tensor:
+    """Cells within `NEAR_M` of the middle of those that sensors told of, bool, shape [B, H, W]."""
+    row, column = (torch.arange(size, dtype=torch.float64) for size in reached.shape[1:])
+    count = reached.flatten(1).sum(1).clamp(min=1)
+    middle = [(reached.sum(axis) * line).sum(1) / count for axis, line in ((2, row), (1, column))]
+    down = (row - middle[0][:, None])[:, :, None]
+    across = (column - middle[1][:, None])[:, None]
+    return torch.hypot(down, across) * resolution_m <= NEAR_M
+
+
+def suite_of(data: Path) -> Suite:
+    """Who learns by what, in which world."""
+    common: dict[str, Any] = {"grounds": ("contact", "probe:1"), "beliefs": ("copula",)}
+    return Suite(
+        data=str(data), planners=("astar_dwa",), risks=("expected-time",), objectives=("travel_time",),
+        scenarios=("std",), record="none",
+        conditions=(
+            {"models": ["oracle", "stakes-v1"], "world": "stakes", **common},
+            {"models": ["oracle"], "world": LAW, **common},
+        ),
+    )  # fmt: skip
+
+
+def measured(data: Path, maps: int) -> Table:
+    """Coverage of each condition."""
+    conditions = {
+        condition.id: (condition, Extent.product((0,), 1, maps))
+        for condition in conditions_of(suite_of(data), lambda data: ["std"])
+    }
+    settings, found = Settings(), dict[str, list[Tensor]]()
+    for unit in track(units(conditions), "units"):
+        with one_thread():
+            built = build(unit, settings.origins().of(unit))
+            coverage = Coverage(unit, built)
+            simulate(unit, built, settings, witness=coverage)
+        found.setdefault(unit.condition.id, []).append(coverage.sums)
+    headings = "model", "λ", "ground", "cells", "inside 90 % (95 % interval)", "under", "over"
+    table = Table(*headings, "log score", "of the prediction")
+    for key, parts in found.items():
+        labels, sums = conditions[key][0].labels, torch.cat(parts).numpy()
+        cells = sums[:, 0].sum()
+        shares = sums[:, 1:].sum(0) / cells
+        # A ratio of sums over maps: its error by the residuals of the maps.
+        left = sums[:, 1] - shares[0] * sums[:, 0]
+        error = 1.96 * np.sqrt((left**2).sum()) / cells
+        inside = f"{shares[0]:.3f} ({shares[0] - error:.3f} to {shares[0] + error:.3f})"
+        law = "as the law has it" if "immobile" in labels["world"] else "with rejection"
+        told = (
+            f"{cells:.0f}",
+            inside,
+            *(f"{share:.3f}" for share in shares[1:3]),
+            *(f"{share:.2f}" for share in shares[3:]),
+        )
+        table.add_row(labels["model"], law, labels["ground"], *told)
+    return table
+
+
+def rejection(data: Path, maps: int) -> Table:
+    """What rejection of draws changes of λ."""
+    suite = suite_of(data)
+    condition = next(iter(conditions_of(suite, lambda data: ["std"])))
+    unit = units({condition.id: (condition, Extent.product((0,), 1, maps))})[0]
+    changes, rejected, drawn = [], 0, 0
+    for first in track(range(0, maps, 50), "draws"):
+        block = read_block(
+            Unit(condition=condition, seed=0, realisation=0, maps=tuple(range(first, min(first + 50, maps)))),
+            Settings().origins().of(unit),
+        )
+        world, grid, truth = condition.world, block.terrain.grid, block.terrain.truth
+        assert world.immobile is not None
+        sums = torch.zeros(2, 3, *truth.shape, dtype=torch.float64)
+        for draw in range(DRAWS):
+            scores = correlated_normal(
+                rng.stream_key(draw, "rejection"), np.arange(first, first + truth.shape[0]), grid.shape,
+                world.correlation_m / grid.resolution_m,
+            )  # fmt: skip
+            field = truth.from_normal(torch.from_numpy(scores).float()).double()
+            kept = joined(field >= world.immobile.below, grid, block.places)
+            told = torch.stack((torch.ones_like(field), field, (field < world.immobile.below).double()))
+            sums[0] += told
+            sums[1] += told * kept[:, None, None]
+            rejected, drawn = rejected + int((~kept).sum()), drawn + len(kept)
+        # Maps of which no draw is kept tell nothing.
+        all_draws, kept_draws = (part[1:] / part[0].clamp(min=1) for part in sums)
+        some = sums[1, 0].flatten(1).amax(1) > 0
+        near = _on_the_way(block.places.start_m, block.places.goal_m, grid)
+        for own in some.nonzero()[:, 0].tolist():
+            away = (kept_draws - all_draws)[:, own]
+            changes.append([*away[:, near[own]].mean(1), *away[:, ~near[own]].mean(1)])
+    means = np.array(changes).mean(0)
+    table = Table("draws rejected", "cells", "change of E[λ]", f"of P(λ < {world.immobile.below:g})")
+    for name, (mean, chance) in zip(("near the straight way", "elsewhere"), means.reshape(2, 2), strict=True):
+        table.add_row(f"{rejected / drawn:.1%}", name, f"{mean:+.4f}", f"{chance:+.4f}")
+    return table
+
+
+def _on_the_way(start_m: Tensor, goal_m: Tensor, grid: Any) -> Tensor:
+    """Cells within `NEAR_M` of the straight line from start to goal, bool, shape [B, H, W]."""
+    row, column = (torch.arange(size) for size in grid.shape)
+    x, y = grid.centre_of(row[:, None], column[None, :])
+    x, y = torch.broadcast_tensors(x, y)
+    at = torch.stack((x, y), -1)[None].double()
+    start, way = start_m.double()[:, None, None], (goal_m - start_m).double()[:, None, None]
+    part = (((at - start) * way).sum(-1) / way.square().sum(-1)).clamp(0, 1)
+    return torch.linalg.vector_norm(at - start - part[..., None] * way, dim=-1) <= NEAR_M
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--maps_in", type=Path, default=Path("datasets"), help="folder of the study's maps")
+    parser.add_argument("--maps", type=int, default=200)
+    given = parser.parse_args()
+    data = given.maps_in / "stakes-v1-400-seed2026.h5"
+    os.chdir(Path(__file__).parents[1])  # where the shipped checkpoints are
+    console = Console(width=140)
+    console.print(rejection(data, given.maps))
+    console.print(measured(data, given.maps))
+
+
+if __name__ == "__main__":
+    main()
