@@ -212,35 +212,40 @@ def develop(out: Path, maps_in: Path, maps: int, jobs: int) -> None:
 def power(out: Path) -> str:
     """The power of each hypothesis, by what was found on the maps that the study was developed on.
 
-    Of a difference and of superiority where the difference is the one that was found; of equivalence and
-    non-inferiority where there is none.
+    For the first and the last place of Holm's correction, where the difference is the one that was found; of
+    equivalence and non-inferiority also where there is none.
     """
     maps, report = yaml.safe_load((SUITES / "primary.yaml").read_text())["maps"], read_report(out / DEVELOPED)
     rows = []
     for number, row in enumerate(report.tests.to_dict("records"), start=1):
         # Of the mean over so many maps.
         error = (row["high"] - row["low"]) / 2 / norm.ppf(0.975) * np.sqrt(row["n_maps"] / maps)
-        first, last = (power_of(row, error, alpha) for alpha in (ALPHA / len(report.tests), ALPHA))
-        ends = f"{row['low']:+.1f} to {row['high']:+.1f}"
-        rows.append(
-            (str(number), row["claim"], f"{row['difference']:+.2f} ({ends})", f"{first:.2f}", f"{last:.2f}")
+        found, none = (
+            " to ".join(
+                f"{power_of(row, error, alpha, difference):.2f}"
+                for alpha in (ALPHA / len(report.tests), ALPHA)
+            )
+            for difference in (row["difference"], 0.0)
         )
-    headings = ("", "hypothesis", "found on other maps (95 %)", "power, first of Holm", "power, last")
+        none = none if row["kind"] in ("equivalence", "non-inferiority") else "–"
+        ends = f"{row['low']:+.1f} to {row['high']:+.1f}"
+        rows.append((str(number), row["claim"], f"{row['difference']:+.2f} ({ends})", found, none))
+    headings = ("", "hypothesis", "found on other maps (95 %)", "power, if so", "power, if no difference")
     return to_markdown(Table(headings=headings, labels=2, rows=tuple(rows)))
 
 
-def power_of(row: Mapping[Any, Any], error: float, alpha: float) -> float:
-    """Chance that a hypothesis is supported, where the estimate of its difference is normal with this error."""
+def power_of(row: Mapping[Any, Any], error: float, alpha: float, difference: float) -> float:
+    """Chance that a hypothesis is supported, where the estimate of this difference is normal with this error."""
     kind, margin = row["kind"], row["margin"]
-    if error == 0:
-        return 1.0
     if kind == "equivalence":
-        return max(0.0, 2 * norm.cdf(margin / error - norm.ppf(1 - alpha)) - 1)
-    if kind == "non-inferiority":
-        return float(norm.cdf(margin / error - norm.ppf(1 - alpha)))
-    gain = row["difference"] * (-1 if row["direction"] == "lower" else 1)
+        ends = (
+            (margin + away) / max(error, 1e-9) - norm.ppf(1 - alpha) for away in (difference, -difference)
+        )
+        return max(0.0, float(sum(norm.cdf(end) for end in ends)) - 1)
+    gain = difference * (-1 if row["direction"] == "lower" else 1)
+    least = -margin if kind == "non-inferiority" else margin
     tails = 1 if row["direction"] else 2
-    return float(norm.cdf((gain - margin) / error - norm.ppf(1 - alpha / tails)))
+    return float(norm.cdf((gain - least) / max(error, 1e-9) - norm.ppf(1 - alpha / tails)))
 
 
 # --- what is reported -------------------------------------------------------------------------------
