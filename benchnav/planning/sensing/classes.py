@@ -388,7 +388,11 @@ def _moments(state: ClassesState) -> tuple[Tensor, Tensor, Tensor]:
         lower, upper, noise_std = look.lower[wanted], look.upper[wanted], look.noise_std[wanted]
         total = left + noise_std.square()
         gain, number = left / total, upper <= lower
-        found, spread = interval_moments(centre, total, lower, torch.where(number, lower + 1, upper))
+        given = centre, total, lower, torch.where(number, lower + 1, upper)
+        found, spread = (
+            torch.from_numpy(values).to(lower)
+            for values in interval_moments(*(one.cpu().numpy() for one in given))
+        )
         found, spread = torch.where(number, lower, found), torch.where(number, 0.0, spread)
         std = (left - left * gain + gain.square() * spread).sqrt()
         new = centre + gain * (found - centre), std, torch.zeros_like(std)
