@@ -389,10 +389,8 @@ def _moments(state: ClassesState) -> tuple[Tensor, Tensor, Tensor]:
         total = left + noise_std.square()
         gain, number = left / total, upper <= lower
         given = centre, total, lower, torch.where(number, lower + 1, upper)
-        found, spread = (
-            torch.from_numpy(values).to(lower)
-            for values in interval_moments(*(one.cpu().numpy() for one in given))
-        )
+        moments = interval_moments(*(one.cpu().numpy() for one in given))
+        found, spread = (torch.from_numpy(values).to(lower) for values in moments)
         found, spread = torch.where(number, lower, found), torch.where(number, 0.0, spread)
         std = (left - left * gain + gain.square() * spread).sqrt()
         new = centre + gain * (found - centre), std, torch.zeros_like(std)

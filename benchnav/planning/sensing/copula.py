@@ -181,7 +181,7 @@ class Copula(Belief[CopulaState]):
                 state.field.write(own, Field.of(state.law.grid.shape, [length], "cpu", state.law.nugget))
                 maps["mean"][:], maps["std"][:], maps["skew"][:] = 0, 1, 0
                 new = observed
-        _condition(state.field, own, maps, new, nearest(observed, new, self.window))
+        _condition(state.field, own, maps, new, self.window)
 
     def distribution(self, state: CopulaState) -> TraversabilityDistribution:
         """The prediction, given what was observed."""
@@ -324,15 +324,12 @@ def note(state: CopulaState, sensed: Sensed) -> tuple[CopulaState, Tensor]:
     return noted, changed
 
 
-def _condition(
-    field: Field, own: int, maps: dict[str, ndarray], new: ndarray, cells: tuple[ndarray, ndarray]
-) -> None:
+def _condition(field: Field, own: int, maps: dict[str, ndarray], new: ndarray, window: int) -> None:
     """Updates terms of observations, and scores of cells, near what is new in one episode; writes into its maps."""
+    cells = nearest(~np.isnan(maps["value"]), new, window)
+    observed = _observed(maps, *cells)
     row, column = (torch.from_numpy(places)[:, None] for places in cells)
-    covariance, observed = (
-        field.covariance(own, row - row.T, column - column.T).numpy(),
-        _observed(maps, *cells),
-    )
+    covariance = field.covariance(own, row - row.T, column - column.T).numpy()
     known = condition(covariance, observed)
     reach = math.ceil(_REACH * float(field.length[own]))
     rows, columns = (
@@ -342,10 +339,9 @@ def _condition(
     down, across = torch.arange(rows.start, rows.stop), torch.arange(columns.start, columns.stop)
     block = field.covariance(own, (row - down)[..., None], (column - across)[:, None])
     mean, variance, skew = predict(known, covariance, observed, block.flatten(1).numpy())
-    found = [values.reshape(block.shape[1:]) for values in (mean, np.sqrt(variance), skew)]
+    found = np.stack((mean, np.sqrt(variance), skew)).reshape(3, *block.shape[1:])
     old = [maps[name][rows, columns] for name in ("mean", "std", "skew")]
-    change = [abs(new - was) for new, was in zip(found, old, strict=True)]
-    moved = (np.maximum(change[0], change[1]) >= _LEAST_CHANGE) | (change[2] * _OF_SKEW >= _LEAST_CHANGE)
+    moved = (abs(found - old) >= _LEAST_CHANGE / np.array((1, 1, _OF_SKEW))[:, None, None]).any(0)
     for values, whole in zip(found, old, strict=True):
         np.copyto(whole, values, where=moved)
     maps["precision"][cells], maps["shift"][cells] = known.precision, known.shift
@@ -385,12 +381,13 @@ def bounds(new: ndarray) -> list[tuple[int, int]]:
 def nearest(observed: ndarray, new: ndarray, window: int) -> tuple[ndarray, ndarray]:
     """Rows and columns of what is new on a map, and of the observed cells nearest to it while the window has room."""
     row, column = observed.nonzero()
-    away = [
-        np.maximum(low - places, places - high).clip(0)
-        for (low, high), places in zip(bounds(new), (row, column), strict=True)
-    ]
+    (top, bottom), (left, right) = bounds(new)
+    down, across = (
+        np.maximum(top - row, row - bottom).clip(0),
+        np.maximum(left - column, column - right).clip(0),
+    )
     own = new[row, column]
     # Of equal distances the first cell goes first, on every machine.
-    order = np.where(own, -1, away[0] ** 2 + away[1] ** 2).argsort(kind="stable")
+    order = np.where(own, -1, down**2 + across**2).argsort(kind="stable")
     kept = order[: max(window, int(own.sum()))]
     return row[kept], column[kept]

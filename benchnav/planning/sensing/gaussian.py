@@ -86,7 +86,7 @@ class Field(Batch):
         """
         found = self.down[member, rows.abs()] * self.across[member, columns.abs()]
         if self.nugget:
-            found[(rows != 0) | (columns != 0)] *= 1 - self.nugget
+            found = torch.where((rows == 0) & (columns == 0), found, (1 - self.nugget) * found)
         return found
 
 
@@ -139,8 +139,7 @@ class Posterior:
             Mean [M], variance [M], and what the terms take from the covariances of these cells, as a matrix [N, M]
             times its own transpose.
         """
-        scaled = torch.from_numpy(self.root[:, None] * covariance)
-        taken = torch.linalg.solve_triangular(self.factor, scaled, upper=False).numpy()
+        taken = _taken(self.factor, self.root, covariance)
         return _times(self.weights, covariance), (1 - np.square(taken).sum(0)).clip(0), taken
 
 
@@ -153,9 +152,7 @@ def posterior(covariance: ndarray, precision: ndarray, shift: ndarray) -> Poster
         shift: precision times mean, shape [N].
     """
     root = np.sqrt(precision)
-    factor = torch.from_numpy(root[:, None] * covariance * root)
-    factor.diagonal().add_(1)
-    torch.linalg.cholesky(factor, out=factor)
+    factor = _factor(covariance, root)
     # (K⁻¹ + T)⁻¹ ν = K (ν − √T (I + √T K √T)⁻¹ √T K ν)
     pulled = torch.from_numpy(root * _times(covariance, shift))
     weights = shift - root * torch.cholesky_solve(pulled[:, None], factor)[:, 0].numpy()
@@ -180,9 +177,10 @@ def condition(covariance: ndarray, observed: Observed) -> Posterior:
     centre, _, taken = numbers.moments(columns)
     left = columns[held] - _times(taken.T, taken)
     terms = _Terms(observed.precision[held], observed.shift[held])
+    ends = observed.lower[held], observed.upper[held], observed.std[held]
     for _ in range(_ROUNDS):
         mean, variance = terms.moments(left, centre)
-        new = terms.towards(mean, variance, observed.lower[held], observed.upper[held], observed.std[held])
+        new = terms.towards(mean, variance, *ends)
         more = new.precision - terms.precision
         # By how much each term moves its own cell, were it alone to change.
         moved = abs(new.shift - terms.shift) + abs(more * mean)
@@ -245,9 +243,24 @@ def predict(
     total = without + np.square(observed.std[held])
     third = _third_cumulant(centre, total, observed.lower[held], observed.upper[held])
     regression = (block[held] - _times(own.T, taken)) / own_variance[:, None]
-    third = _times(third * (without / total) ** 3, regression**3)
-    skew = third / variance.clip(_LEAST_VARIANCE) ** 1.5
+    # Products and roots, which are far quicker than powers.
+    third = _times(third * (without / total) ** 3, regression * regression * regression)
+    spread = variance.clip(_LEAST_VARIANCE)
+    skew = third / (spread * np.sqrt(spread))
     return mean, variance, skew.clip(-_MOST_SKEW, _MOST_SKEW)
+
+
+def _factor(covariance: ndarray, root: ndarray) -> Tensor:
+    """Cholesky factor of I + √T K √T."""
+    inner = torch.from_numpy(root[:, None] * covariance * root)
+    inner.diagonal().add_(1)
+    return torch.linalg.cholesky(inner)
+
+
+def _taken(factor: Tensor, root: ndarray, covariance: ndarray) -> ndarray:
+    """What terms take from the covariances of M cells, [N, M], as a matrix of that shape times its own transpose."""
+    scaled = torch.from_numpy(root[:, None] * covariance)
+    return torch.linalg.solve_triangular(factor, scaled, upper=False).numpy()
 
 
 def _times(one: ndarray, other: ndarray) -> ndarray:
@@ -263,10 +276,11 @@ class _Terms(NamedTuple):
 
     def moments(self, covariance: ndarray, centre: ndarray) -> tuple[ndarray, ndarray]:
         """Mean and variance of the cells of a field of covariance [N, N] and mean [N], given the terms."""
-        found = posterior(covariance, self.precision, self.shift - self.precision * centre)
-        mean, _, taken = found.moments(covariance)
-        variance = covariance.diagonal() - np.square(taken).sum(0)
-        return centre + mean, variance.clip(_LEAST_VARIANCE)
+        root = np.sqrt(self.precision)
+        taken = _taken(_factor(covariance, root), root, covariance)
+        left = covariance - _times(taken.T, taken)
+        mean = centre + _times(left, self.shift - self.precision * centre)
+        return mean, left.diagonal().clip(_LEAST_VARIANCE)
 
     def left_out(self, mean: ndarray, variance: ndarray) -> tuple[ndarray, ndarray]:
         """Mean and variance of each cell without its own term."""
