@@ -349,10 +349,8 @@ def _condition(field: Field, own: int, maps: dict[str, ndarray], new: ndarray, w
 
 def _observed(maps: dict[str, ndarray], row: ndarray, column: ndarray) -> Observed:
     """What is known of observed cells of one episode."""
-    lower, upper, std, precision, shift = (
-        maps[name][row, column] for name in ("lower", "upper", "noise_std", "precision", "shift")
-    )
-    return Observed(lower=lower, upper=upper, std=std, precision=precision, shift=shift)
+    names = ("lower", "upper", "noise_std", "precision", "shift")
+    return Observed(*(maps[name][row, column] for name in names))
 
 
 def _estimate(state: CopulaState, maps: dict[str, ndarray], row: ndarray, column: ndarray) -> float:
@@ -386,8 +384,7 @@ def nearest(observed: ndarray, new: ndarray, window: int) -> tuple[ndarray, ndar
         np.maximum(top - row, row - bottom).clip(0),
         np.maximum(left - column, column - right).clip(0),
     )
-    own = new[row, column]
     # Of equal distances the first cell goes first, on every machine.
-    order = np.where(own, -1, down**2 + across**2).argsort(kind="stable")
-    kept = order[: max(window, int(own.sum()))]
+    order = np.where(new[row, column], -1, down**2 + across**2).argsort(kind="stable")
+    kept = order[: max(window, int(new.sum()))]
     return row[kept], column[kept]

@@ -90,7 +90,7 @@ class Field(Batch):
         return found
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Observed:
     """What is known of some scores, and the Gaussian terms that stand for it.
 
