@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from benchnav.core import rng
-from benchnav.planning.sensing.gaussian import Cells
 from benchnav.planning.sensing.labels import CHAINS, Noise, joined, packed, swept, tally, unpacked
 from benchnav.planning.sensing.sites import LEAST_CHANGE, Block, Evidence, Sites
 
@@ -70,7 +69,7 @@ def draw_labels(evidence: Evidence, changed: Tensor, strength: float, window: in
         & ((share - block.chance.flatten(1).gather(1, sites.cell)).abs() > 1 / CHAINS)
     )
     told = sites.open | turned
-    places = tuple(part[told] for part in (member, sites.cells.row, sites.cells.column))
+    places = tuple(part[told] for part in (member, sites.row, sites.column))
     chance = chance.index_put(places, torch.where(turned, share, seen)[told])
     labels = evidence.labels.index_put(block.at, labels.flatten(1))
     return replace(evidence, chance=chance, labels=labels, sweeps=sweeps)
@@ -82,7 +81,7 @@ def _filtered(labels: Tensor, sites: Sites, sweeps: Tensor, torus: int) -> tuple
     white = torch.linalg.solve_triangular(factor, scores.transpose(1, 2), upper=False)
     white, weights = white.transpose(1, 2).contiguous(), torch.zeros_like(scores[:, :, 0])
     begin = int((~fresh).int().cumprod(1).sum(1).min())
-    uniforms = _uniforms(sweeps, sites.cells, torus, begin)
+    uniforms = _uniforms(sweeps, sites, torus, begin)
     for place in range(begin, fresh.shape[1]):
         new, scale = fresh[:, place, None], factor[:, place, place, None]
         mean = (white[:, :, :place] @ factor[:, place, :place, None])[..., 0]
@@ -128,7 +127,7 @@ def _flipped(
     gain = (sites.density[:, 1:] - sites.density[:, :1]) * torch.where(first, 1.0, -1.0)
     told = torch.where(among, gain, 0.0).sum(2)
     told = told - 0.5 * (((proposed - scores) @ inverse) * (proposed + scores)).sum(2)
-    toss = _uniforms(sweeps + 1, sites.cells, block.torus, cell.shape[1] - 1)[:, 0, :, 0]
+    toss = _uniforms(sweeps + 1, sites, block.torus, cell.shape[1] - 1)[:, 0, :, 0]
     taken = ~stays & (toss.log() < told)
     return labels ^ (patch & packed(taken)[:, None, None]), torch.where(taken[..., None], proposed, scores)
 
@@ -139,7 +138,7 @@ def _visited(
     """Draws open cells given all others: labels [B, RC], scores [B, S, N], and probabilities [B, N]."""
     scores, told = scores.clone(), torch.zeros_like(sites.std)
     places = [int(place) for place in sites.open.any(0).nonzero()[:, 0].flip(0)]
-    uniforms = _uniforms(sweeps, sites.cells, torus, places[-1])
+    uniforms = _uniforms(sweeps, sites, torus, places[-1])
     for place in places:
         new, row = sites.open[:, place, None], inverse[:, place]
         share = row[:, place, None]
@@ -160,12 +159,12 @@ def _put(labels: Tensor, cell: Tensor, first: Tensor, new: Tensor) -> Tensor:
     return labels.scatter(1, cell[:, None], word)
 
 
-def _uniforms(passed: Tensor, cells: Cells, torus: int, begin: int) -> Tensor:
+def _uniforms(passed: Tensor, sites: Sites, torus: int, begin: int) -> Tensor:
     """Random numbers of cells from a place on, two a chain, float64, shape [B, N, S, 2]."""
     uses = passed[:, None] // _PASSES
     row, column = (
         (place[:, begin:] + step * uses) % torus
-        for place, step in zip((cells.row, cells.column), _STEP, strict=True)
+        for place, step in zip((sites.row, sites.column), _STEP, strict=True)
     )
     return _tosses(torus).to(row.device)[passed[:, None] % _PASSES, row * torus + column].double()
 

@@ -104,7 +104,7 @@ class Classes(Belief[ClassesState]):
     needs_statistics: ClassVar[bool] = True
 
     correlation_m: float | Literal["world", "estimated"] = "world"
-    window: int = 128
+    window: int = 256
     strength: float | None = None
     _copula: Copula = field(init=False, repr=False, compare=False)
 
@@ -383,7 +383,9 @@ def _moments(state: ClassesState) -> tuple[Tensor, Tensor, Tensor]:
         lower, upper, noise_std = look.lower[wanted], look.upper[wanted], look.noise_std[wanted]
         total = left + noise_std.square()
         gain, number = left / total, upper <= lower
-        found, spread = interval_moments(centre, total, lower, torch.where(number, lower + 1, upper))
+        given = centre, total, lower, torch.where(number, lower + 1, upper)
+        moments = interval_moments(*(one.cpu().numpy() for one in given))
+        found, spread = (torch.from_numpy(values).to(lower) for values in moments)
         found, spread = torch.where(number, lower, found), torch.where(number, 0.0, spread)
         std = (left - left * gain + gain.square() * spread).sqrt()
         new = centre + gain * (found - centre), std, torch.zeros_like(std)

@@ -18,15 +18,17 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
+import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
-from benchnav.core.batch import Batch, map_tensors
+from benchnav.core.batch import Batch
 from benchnav.core.conditioned import ConditionedDistribution, skewed
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.planning.sensing.belief import Belief, Law, draw_scores, fields_of
-from benchnav.planning.sensing.gaussian import Cells, Field, Observed, condition, evidence, predict
+from benchnav.planning.sensing.gaussian import Field, Observed, condition, evidence, predict
 from benchnav.planning.sensing.score_table import ScoreTable, TabulatedDistribution
 from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
 
@@ -40,6 +42,8 @@ _SAME_PREDICTION = 1e-3  # of its parameters; λ̂ is then the same within about
 _MEDIAN_M, _LOG_STD = 1.5, math.log(2)  # of ℓ, before anything was observed
 _LENGTHS_M = tuple(_MEDIAN_M * 2 ** (step / 4) for step in range(-8, 9))
 _FEWEST = 8  # observations that an estimate of ℓ takes
+_MAPS = ("value", "lower", "upper", "noise_std", "precision", "shift", "mean", "std", "skew")
+_LEARNT = ("field", "estimated_from", *_MAPS[4:])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,12 +98,12 @@ class Copula(Belief[CopulaState]):
             log-normal prior of median 1.5 m and standard deviation ln 2. It is estimated from 8, 16, 32, … observations
             on, until the window is full; before, it is the median.
         window: most observations that an update or an estimate looks at, those nearest to what is new; an update looks
-            at more where more is new.
+            at more where more is new. Of an observed cell that there is no room for what is known stays.
         nugget: share of the variance of a cell's score that is its own and no neighbour's; None for the law's.
     """
 
     correlation_m: float | Literal["world", "estimated"] = "world"
-    window: int = 128
+    window: int = 256
     nugget: float | None = None
 
     def __post_init__(self) -> None:
@@ -153,29 +157,30 @@ class Copula(Belief[CopulaState]):
         members = news.flatten(1).any(1).nonzero()[:, 0].tolist()
         if not members:
             return noted
-        names = ("field", "estimated_from", "precision", "shift", "mean", "std", "skew")
-        noted = replace(noted, **{name: getattr(noted, name).clone() for name in names})
-        for own in members:
-            self._learn(noted, own, news[own])
-        return noted
+        # On the host, where such small systems are solved quickest.
+        host = replace(noted, **{name: getattr(noted, name).to("cpu") for name in _MAPS})
+        host = replace(host, **{name: getattr(host, name).clone().to("cpu") for name in _LEARNT})
+        for own, new in zip(members, news[members].cpu().numpy(), strict=True):
+            self._learn(host, own, new)
+        return replace(noted, **{name: getattr(host, name).to(news.device) for name in _LEARNT})
 
-    def _learn(self, state: CopulaState, own: int, new: Tensor) -> None:
+    def _learn(self, state: CopulaState, own: int, new: ndarray) -> None:
         """Makes of what was noted in one episode what is known; writes into the state.
 
         Episodes go one by one: as many observations as each has, so that none depends on the others.
         """
-        observed = ~state.value[own].isnan()
+        maps = {name: getattr(state, name)[own].numpy() for name in _MAPS}
+        observed = ~np.isnan(maps["value"])
         count, before = int(observed.sum()), int(state.estimated_from[own])
         if self.correlation_m == "estimated" and max(_FEWEST, 2 * before) <= count and before < self.window:
             state.estimated_from[own] = count
-            cells = nearest(observed, new, self.window)
-            kept = Cells(row=cells.row[:, : self.window], column=cells.column[:, : self.window])
-            length = _estimate(state, own, kept)
+            row, column = nearest(observed, new, self.window)
+            length = _estimate(state, maps, row[: self.window], column[: self.window])
             if length != float(state.field.length[own]):
-                state.field.write(own, Field.of(state.law.grid.shape, [length], new.device, state.law.nugget))
-                state.mean[own], state.std[own], state.skew[own] = 0, 1, 0
+                state.field.write(own, Field.of(state.law.grid.shape, [length], "cpu", state.law.nugget))
+                maps["mean"][:], maps["std"][:], maps["skew"][:] = 0, 1, 0
                 new = observed
-        _condition(state, own, new, self.window)
+        _condition(state.field, own, maps, new, self.window)
 
     def distribution(self, state: CopulaState) -> TraversabilityDistribution:
         """The prediction, given what was observed."""
@@ -209,7 +214,7 @@ class Copula(Belief[CopulaState]):
     def sample_scores(self, state: CopulaState, count: int, keys: Sequence[int]) -> Tensor:
         """Normal scores of the fields that `sample_fields` draws, shape [B, M, H, W]."""
         (height, width), device = state.law.grid.shape, state.mean.device
-        lines = torch.arange(height, device=device)[None], torch.arange(width, device=device)[None]
+        lines = torch.arange(height, device=device)[:, None], torch.arange(width, device=device)
         scores = []
         for own, length in enumerate(state.field.length.tolist()):
             law = replace(state.law, correlation_m=length * state.law.grid.resolution_m)
@@ -218,16 +223,16 @@ class Copula(Belief[CopulaState]):
             row, column = (state.precision[own] > _NO_TERM).nonzero(as_tuple=True)
             if len(row) == 0:
                 continue
-            field = state.field.select(torch.tensor([own], device=device))
-            cells = Cells(row=row[None], column=column[None])
             precision, shift = state.precision[own, row, column], state.shift[own, row, column]
             # As the white noise of further fields, of which the first cells are taken.
             noise = draw_scores(replace(law, correlation_m=0.0, nugget=0.0), 2 * count, keys[own : own + 1])
             noise = noise[0, count:].to(drawn)[:, row, column] / precision.sqrt()
-            inner = field.covariance(cells, cells)[0] + torch.diag(1 / precision)
+            inner = state.field.covariance(own, row[:, None] - row, column[:, None] - column)
+            inner.diagonal().add_(1 / precision)
             away = (shift / precision - drawn[:, row, column] - noise).T
             moved = torch.cholesky_solve(away, torch.linalg.cholesky(inner))
-            drawn += (field.with_block(cells, *lines)[0].T @ moved).T.view_as(drawn)
+            apart = (places[:, None, None] - line for places, line in zip((row, column), lines, strict=True))
+            drawn += (state.field.covariance(own, *apart).flatten(1).T @ moved).T.view_as(drawn)
         mean, std, skew = (values[:, None] for values in (state.mean, state.std, state.skew))
         normal = (torch.stack(scores) - mean) / std.clamp(min=_NO_TERM)
         return mean + std * skewed(normal, skew)
@@ -314,73 +319,71 @@ def note(state: CopulaState, sensed: Sensed) -> tuple[CopulaState, Tensor]:
     return noted, changed
 
 
-def _condition(state: CopulaState, own: int, new: Tensor, window: int) -> None:
-    """Updates terms of observations, and scores of cells, near what is new in one episode; writes into the state."""
-    field = state.field.select(torch.tensor([own], device=new.device))
-    cells = nearest(~state.value[own].isnan(), new, window)
-    covariance, observed = field.covariance(cells, cells), _observed(state, own, cells)
+def _condition(field: Field, own: int, maps: dict[str, ndarray], new: ndarray, window: int) -> None:
+    """Updates terms of observations, and scores of cells, near what is new in one episode; writes into its maps."""
+    forgotten = ~np.isnan(maps["value"])
+    cells = nearest(forgotten, new, window)
+    forgotten[cells] = False
+    observed = _observed(maps, *cells)
+    row, column = (torch.from_numpy(places)[:, None] for places in cells)
+    covariance = field.covariance(own, row - row.T, column - column.T).numpy()
     known = condition(covariance, observed)
-    reach = math.ceil(_REACH * float(field.length))
+    reach = math.ceil(_REACH * float(field.length[own]))
     rows, columns = (
         slice(max(low - reach, 0), min(high + reach + 1, size))
         for (low, high), size in zip(bounds(new), new.shape, strict=True)
     )
-    lines = [torch.arange(line.start, line.stop, device=new.device)[None] for line in (rows, columns)]
-    mean, variance, skew = predict(known, covariance, observed, field.with_block(cells, *lines))
-    new_values, old_values = (mean, variance.sqrt(), skew), (state.mean, state.std, state.skew)
-    moved = torch.zeros_like(new)
-    for scale, values, whole in zip((1, 1, _OF_SKEW), new_values, old_values, strict=True):
-        old = whole[own, rows, columns]
-        moved[rows, columns] |= (values.view_as(old) - old).abs() * scale >= _LEAST_CHANGE
-    for values, whole in zip(new_values, old_values, strict=True):
-        old = whole[own, rows, columns]
-        old.copy_(torch.where(moved[rows, columns], values.view_as(old), old))
-    state.precision[own, cells.row, cells.column] = known.precision
-    state.shift[own, cells.row, cells.column] = known.shift
+    down, across = torch.arange(rows.start, rows.stop), torch.arange(columns.start, columns.stop)
+    block = field.covariance(own, (row - down)[..., None], (column - across)[:, None])
+    mean, variance, skew = predict(known, covariance, observed, block.flatten(1).numpy())
+    found = np.stack((mean, np.sqrt(variance), skew)).reshape(3, *block.shape[1:])
+    old = [maps[name][rows, columns] for name in ("mean", "std", "skew")]
+    moved = (abs(found - old) >= _LEAST_CHANGE / np.array((1, 1, _OF_SKEW))[:, None, None]).any(0)
+    # What was observed at a cell says more of it than all that the window has room for.
+    moved &= ~forgotten[rows, columns]
+    for values, whole in zip(found, old, strict=True):
+        np.copyto(whole, values, where=moved)
+    maps["precision"][cells], maps["shift"][cells] = known.precision, known.shift
 
 
-def _observed(state: CopulaState, own: int, cells: Cells) -> Observed:
+def _observed(maps: dict[str, ndarray], row: ndarray, column: ndarray) -> Observed:
     """What is known of observed cells of one episode."""
-    lower, upper, std, precision, shift = (
-        values[own, cells.row, cells.column]
-        for values in (state.lower, state.upper, state.noise_std, state.precision, state.shift)
-    )
-    there = torch.ones_like(cells.row, dtype=torch.bool)
-    return Observed(lower=lower, upper=upper, std=std, precision=precision, shift=shift, there=there)
+    names = ("lower", "upper", "noise_std", "precision", "shift")
+    return Observed(*(maps[name][row, column] for name in names))
 
 
-def _estimate(state: CopulaState, own: int, cells: Cells) -> float:
+def _estimate(state: CopulaState, maps: dict[str, ndarray], row: ndarray, column: ndarray) -> float:
     """ℓ of one episode, in cells: the mode of its posterior among `_LENGTHS_M`."""
-    grid = state.law.grid
-    field = _candidates(grid.shape, grid.resolution_m, cells.row.device, state.law.nugget)
-    observed = map_tensors(_observed(state, own, cells), lambda one: one.expand(len(_LENGTHS_M), -1))
-    cells = map_tensors(cells, lambda one: one.expand(len(_LENGTHS_M), -1))
-    covariance = field.covariance(cells, cells)
-    away = (field.length * (state.law.grid.resolution_m / _MEDIAN_M)).log() / _LOG_STD
-    likely = evidence(covariance, observed, condition(covariance, observed)) - 0.5 * away.square()
-    return float(field.length[likely.argmax()])
+    grid, observed = state.law.grid, _observed(maps, row, column)
+    field = _candidates(grid.shape, grid.resolution_m, state.law.nugget)
+    apart = [torch.from_numpy(places[:, None] - places) for places in (row, column)]
+    likely = []
+    for own, length_m in enumerate(_LENGTHS_M):
+        covariance = field.covariance(own, *apart).numpy()
+        found = evidence(covariance, observed, condition(covariance, observed))
+        likely.append(found - 0.5 * (math.log(length_m / _MEDIAN_M) / _LOG_STD) ** 2)
+    return float(field.length[int(np.argmax(likely))])
 
 
 @lru_cache(maxsize=8)
-def _candidates(shape: tuple[int, int], resolution_m: float, device: torch.device, nugget: float) -> Field:
-    return Field.of(shape, [length / resolution_m for length in _LENGTHS_M], device, nugget)
+def _candidates(shape: tuple[int, int], resolution_m: float, nugget: float) -> Field:
+    return Field.of(shape, [length / resolution_m for length in _LENGTHS_M], "cpu", nugget)
 
 
-def bounds(new: Tensor) -> list[tuple[int, int]]:
+def bounds(new: ndarray) -> list[tuple[int, int]]:
     """First and last row, and first and last column, of some cells of a map."""
-    places = (new.any(axis).nonzero()[:, 0] for axis in (1, 0))
-    return [(int(place[0]), int(place[-1])) for place in places]
+    return [(int(places.min()), int(places.max())) for places in new.nonzero()]
 
 
-def nearest(observed: Tensor, new: Tensor, window: int) -> Cells:
-    """What is new on a map and the observed cells nearest to it, as many as the window has room for."""
-    away = [
-        torch.maximum(low - at, at - high).clamp(min=0)
-        for (low, high), size in zip(bounds(new), new.shape, strict=True)
-        for at in (torch.arange(size, device=new.device),)
-    ]
-    distance = (away[0].square()[:, None] + away[1].square()).masked_fill(new, -1)
-    row, column = observed.nonzero(as_tuple=True)
+def nearest(observed: ndarray, new: ndarray, window: int) -> tuple[ndarray, ndarray]:
+    """Rows and columns of what is new on a map, and of the observed cells nearest to it while the window has room."""
+    row, column = observed.nonzero()
+    (top, bottom), (left, right) = bounds(new)
+    down, across = (
+        np.maximum(top - row, row - bottom).clip(0),
+        np.maximum(left - column, column - right).clip(0),
+    )
     # Of equal distances the first cell goes first, on every machine.
-    kept = distance[row, column].argsort(stable=True)[: max(window, int(new.sum()))]
-    return Cells(row=row[None, kept], column=column[None, kept])
+    order = np.where(new[row, column], -1, down**2 + across**2).argsort(kind="stable")
+    kept = order[: max(window, int(new.sum()))]
+    return row[kept], column[kept]

@@ -5,7 +5,9 @@ Numbers are conditioned on exactly. Intervals have no closed form: expectation p
 term whose product with the field has, cell by cell, the mean and variance that the interval gives (Minka 2001;
 equations as in Rasmussen and Williams 2006, section 3.6, with all terms updated at once and damped).
 
-All in float64. Letters in shapes: B fields, N observations (empty places have no weight), M cells, H×W map.
+One field at a time, in NumPy, whose calls cost least where there is little to do; all in float64. PyTorch multiplies
+and solves, since what NumPy makes of that depends by rounding on how many threads it has. Letters in shapes: B fields,
+N observations, M cells, H×W map.
 """
 
 import math
@@ -15,6 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy import ndarray
+from scipy.special import log_ndtr
 from torch import Tensor
 
 from benchnav.core.batch import Batch
@@ -26,19 +30,6 @@ _ENOUGH = 1e-3  # change of a mean and of a standard deviation, in normal scores
 _LEAST_SHARE = 1e-9  # of the variance that an interval leaves
 _LEAST_VARIANCE = 1e-12
 _MOST_SKEW = 2.0  # that of an exponential, which a number far out in a tail is
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cells:
-    """Cells of several maps, as many of each.
-
-    Args:
-        row: int64, shape [B, N].
-        column: int64, shape [B, N].
-    """
-
-    row: Tensor
-    column: Tensor
 
 
 @dataclass(frozen=True)
@@ -85,70 +76,42 @@ class Field(Batch):
         for name in ("length", "down", "across"):
             getattr(self, name)[own] = getattr(field, name)[0]
 
-    def covariance(self, one: Cells, other: Cells) -> Tensor:
-        """Correlations of N cells with M others, shape [B, N, M]."""
-        found = _at(self.down, one.row, other.row) * _at(self.across, one.column, other.column)
-        if not self.nugget:
-            return found
-        alike = one.row[:, :, None] == other.row[:, None]
-        return self._shared(found, alike & (one.column[:, :, None] == other.column[:, None]))
-
-    def with_block(self, cells: Cells, rows: Tensor, columns: Tensor) -> Tensor:
-        """Correlations of N cells with those of a block, shape [B, N, R·C].
+    def covariance(self, member: int | Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+        """Correlations of cells so many rows and columns apart, of the shape to which all broadcast.
 
         Args:
-            cells: N of each map.
-            rows: of the block, int64, shape [B, R].
-            columns: of the block, int64, shape [B, C].
+            member: the field, or which one each is of, int64.
+            rows: between both cells, of either sign, int64.
+            columns: as many.
         """
-        down, across = _at(self.down, cells.row, rows), _at(self.across, cells.column, columns)
-        found = down[..., None] * across[:, :, None]
+        found = self.down[member, rows.abs()] * self.across[member, columns.abs()]
         if self.nugget:
-            alike = cells.row[:, :, None] == rows[:, None]
-            alike = alike[..., None] & (cells.column[:, :, None] == columns[:, None])[:, :, None]
-            found = self._shared(found, alike)
-        return found.flatten(2)
-
-    def _shared(self, found: Tensor, same_cell: Tensor) -> Tensor:
-        """Correlations of which a share is of the cell alone."""
-        return torch.where(same_cell, found, (1 - self.nugget) * found)
+            found = torch.where((rows == 0) & (columns == 0), found, (1 - self.nugget) * found)
+        return found
 
 
-def _at(correlations: Tensor, one: Tensor, other: Tensor) -> Tensor:
-    """Correlations [B, S] at the distances of N lines from M others, shape [B, N, M]."""
-    away = (one[:, :, None] - other[:, None]).abs()
-    return correlations.expand(len(away), -1).gather(1, away.flatten(1)).view_as(away)
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Observed:
     """What is known of some scores, and the Gaussian terms that stand for it.
 
     Args:
-        lower: least score, −∞ where there is none, shape [B, N].
+        lower: least score, −∞ where there is none, shape [N].
         upper: greatest score; where it is the least, the score itself.
-        std: of the noise that was added to the score, shape [B, N].
-        precision: of the Gaussian terms; 0 where none was found yet, and in empty places, shape [B, N].
-        shift: precision times mean of the terms, shape [B, N].
-        there: which places are not empty, bool, shape [B, N].
+        std: of the noise that was added to the score, shape [N].
+        precision: of the Gaussian terms; 0 where none was found yet, shape [N].
+        shift: precision times mean of the terms, shape [N].
     """
 
-    lower: Tensor
-    upper: Tensor
-    std: Tensor
-    precision: Tensor
-    shift: Tensor
-    there: Tensor
+    lower: ndarray
+    upper: ndarray
+    std: ndarray
+    precision: ndarray
+    shift: ndarray
 
     @property
-    def interval(self) -> Tensor:
-        """Which cells are known to lie in an interval, bool, shape [B, N]."""
-        return self.there & (self.upper > self.lower)
-
-    @property
-    def most(self) -> int:
-        """The greatest number of intervals of a field."""
-        return int(self.interval.sum(1).max())
+    def interval(self) -> ndarray:
+        """Which cells are known to lie in an interval, bool, shape [N]."""
+        return self.upper > self.lower
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,125 +119,107 @@ class Posterior:
     """A field given Gaussian terms.
 
     Args:
-        root: √precision of the terms, shape [B, N].
-        factor: Cholesky factor of I + √T K √T, shape [B, N, N].
-        weights: what multiplies covariances with the observed cells to give a mean, shape [B, N].
-        precision: of the terms, shape [B, N].
-        shift: of the terms, shape [B, N].
+        root: √precision of the terms, shape [N].
+        factor: Cholesky factor of I + √T K √T, shape [N, N].
+        weights: what multiplies covariances with the observed cells to give a mean, shape [N].
+        precision: of the terms, shape [N].
+        shift: of the terms, shape [N].
     """
 
-    root: Tensor
+    root: ndarray
     factor: Tensor
-    weights: Tensor
-    precision: Tensor
-    shift: Tensor
+    weights: ndarray
+    precision: ndarray
+    shift: ndarray
 
-    def moments(self, covariance: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of M cells of unit variance, from their covariances with the observed, [B, N, M]."""
-        mean = torch.einsum("bn,bnm->bm", self.weights, covariance)
-        return mean, (1 - self.reduced(covariance).square().sum(1)).clamp(min=0)
+    def moments(self, covariance: ndarray) -> tuple[ndarray, ndarray, ndarray]:
+        """Moments of M cells of unit variance, from their covariances with the observed, [N, M].
 
-    def reduced(self, covariance: Tensor) -> Tensor:
-        """What the terms take from the covariances of M cells, as a matrix [B, N, M] times its own transpose."""
-        return torch.linalg.solve_triangular(self.factor, self.root[..., None] * covariance, upper=False)
+        Returns:
+            Mean [M], variance [M], and what the terms take from the covariances of these cells, as a matrix [N, M]
+            times its own transpose.
+        """
+        taken = _taken(self.factor, self.root, covariance)
+        return _times(self.weights, covariance), (1 - np.square(taken).sum(0)).clip(0), taken
 
 
-def posterior(covariance: Tensor, precision: Tensor, shift: Tensor) -> Posterior:
+def posterior(covariance: ndarray, precision: ndarray, shift: ndarray) -> Posterior:
     """Conditions a field on Gaussian terms.
 
     Args:
-        covariance: K of the observed cells, shape [B, N, N].
-        precision: of the terms, ≥ 0, shape [B, N].
-        shift: precision times mean, shape [B, N].
+        covariance: K of the observed cells, shape [N, N].
+        precision: of the terms, ≥ 0, shape [N].
+        shift: precision times mean, shape [N].
     """
-    root = precision.sqrt()
-    inner = root[:, :, None] * covariance * root[:, None]
-    inner.diagonal(dim1=1, dim2=2).add_(1)
-    factor = torch.linalg.cholesky(inner)
+    root = np.sqrt(precision)
+    factor = _factor(covariance, root)
     # (K⁻¹ + T)⁻¹ ν = K (ν − √T (I + √T K √T)⁻¹ √T K ν)
-    pulled = root * (covariance @ shift[..., None])[..., 0]
-    solved = torch.cholesky_solve(pulled[..., None], factor)[..., 0]
-    return Posterior(
-        root=root, factor=factor, weights=shift - root * solved, precision=precision, shift=shift
-    )
+    pulled = torch.from_numpy(root * _times(covariance, shift))
+    weights = shift - root * torch.cholesky_solve(pulled[:, None], factor)[:, 0].numpy()
+    return Posterior(root=root, factor=factor, weights=weights, precision=precision, shift=shift)
 
 
-def condition(covariance: Tensor, observed: Observed) -> Posterior:
+def condition(covariance: ndarray, observed: Observed) -> Posterior:
     """Conditions a field on numbers exactly, and then on intervals by expectation propagation.
 
-    A field's terms do not depend on the others of the batch: each goes on until its own stand still.
-
     Args:
-        covariance: K of the observed cells, shape [B, N, N].
+        covariance: K of the observed cells, shape [N, N].
         observed: what is known of them; the terms that it has are where intervals begin.
     """
-    interval, most = observed.interval, observed.most
-    known = torch.where(observed.there & ~interval, 1 / observed.std.square(), 0.0)
-    numbers = posterior(covariance, known, known * torch.where(interval, 0.0, observed.lower))
-    if most == 0:
+    held = observed.interval
+    precision = np.where(held, 0.0, 1 / np.square(observed.std))
+    shift = precision * np.where(held, 0.0, observed.lower)
+    numbers = posterior(covariance, precision, shift)
+    if not held.any():
         return numbers
     # The intervals alone, as a field of few cells that the numbers have given a mean.
-    place = _first(interval, most)
-    held, lower, upper, std, precision, shift = (
-        values.gather(1, place)
-        for values in (
-            interval, observed.lower, observed.upper, observed.std, observed.precision, observed.shift,
-        )
-    )  # fmt: skip
-    precision, shift = torch.where(held, precision, 0.0), torch.where(held, shift, 0.0)
-    columns = covariance.gather(2, place[:, None].expand(-1, covariance.shape[1], -1))
-    reduced = numbers.reduced(columns)
-    centre = torch.einsum("bn,bnm->bm", numbers.weights, columns)
-    left = columns.gather(1, place[..., None].expand(-1, -1, most)) - reduced.mT @ reduced
-    going = held.any(1).nonzero()[:, 0]
+    columns = covariance[:, held]
+    centre, _, taken = numbers.moments(columns)
+    left = columns[held] - _times(taken.T, taken)
+    terms = _Terms(observed.precision[held], observed.shift[held])
+    ends = observed.lower[held], observed.upper[held], observed.std[held]
     for _ in range(_ROUNDS):
-        if len(going) == 0:
-            break
-        own = _Terms(precision[going], shift[going])
-        mean, variance = own.moments(left[going], centre[going])
-        new = own.towards(mean, variance, lower[going], upper[going], std[going])
-        new = _Terms(*(torch.where(held[going], *both) for both in zip(new, own, strict=True)))
+        mean, variance = terms.moments(left, centre)
+        new = terms.towards(mean, variance, *ends)
+        more = new.precision - terms.precision
         # By how much each term moves its own cell, were it alone to change.
-        scale = 1 / (1 / variance + (new.precision - own.precision).clamp(min=0))
-        moved = (new.shift - own.shift).abs() + (new.precision - own.precision).abs() * mean.abs()
-        precision[going], shift[going] = new
-        going = going[(scale * moved).amax(1) > _ENOUGH]
-    found = [
-        values.scatter(1, place, torch.where(held, own, values.gather(1, place)))
-        for values, own in ((numbers.precision, precision), (numbers.shift, shift))
-    ]
-    return posterior(covariance, *found)
+        moved = abs(new.shift - terms.shift) + abs(more * mean)
+        terms = new
+        if (moved / (1 / variance + more.clip(0))).max() <= _ENOUGH:
+            break
+    precision, shift = precision.copy(), shift.copy()
+    precision[held], shift[held] = terms
+    return posterior(covariance, precision, shift)
 
 
-def evidence(covariance: Tensor, observed: Observed, found: Posterior) -> Tensor:
-    """Log likelihood of what is observed, up to what does not depend on the field, shape [B].
+def evidence(covariance: ndarray, observed: Observed, found: Posterior) -> float:
+    """Log likelihood of what is observed, up to what does not depend on the field.
 
     Numbers are exact. Intervals are by expectation propagation (Rasmussen and Williams 2006, equation 3.65).
 
     Args:
-        covariance: K of the observed cells, shape [B, N, N].
+        covariance: K of the observed cells, shape [N, N].
         observed: what is known of them.
         found: the field given that, from `condition`.
     """
-    mean, variance = found.moments(covariance)
-    terms = _Terms(found.precision, found.shift)
-    whole = 0.5 * (found.shift * mean).sum(1) - found.factor.diagonal(dim1=1, dim2=2).log().sum(1)
-    centre, without = terms.left_out(mean, variance.clamp(min=_LEAST_VARIANCE))
-    ends = (
-        torch.where(observed.interval, end, side)
-        for end, side in ((observed.lower, -1.0), (observed.upper, 1.0))
-    )
-    mass = _standard(centre, without + observed.std.square(), *ends)[2]
+    mean, variance, _ = found.moments(covariance)
+    whole = 0.5 * (found.shift * mean).sum() - np.log(found.factor.diagonal().numpy()).sum()
+    held = observed.interval
+    terms = _Terms(found.precision[held], found.shift[held])
+    centre, without = terms.left_out(mean[held], variance[held].clip(_LEAST_VARIANCE))
+    total = without + np.square(observed.std[held])
+    mass = _standard(centre, total, observed.lower[held], observed.upper[held])[2]
     # What the Gaussian term has in the place of the interval.
-    joint = (centre + without * terms.shift).square() / (1 + without * terms.precision)
-    term = (joint - centre.square()) / (2 * without) - 0.5 * torch.log1p(without * terms.precision)
-    return whole + torch.where(observed.interval, mass - term, 0.0).sum(1)
+    scaled = 1 + without * terms.precision
+    joint = np.square(centre + without * terms.shift) / scaled
+    term = (joint - np.square(centre)) / (2 * without) - 0.5 * np.log(scaled)
+    return float(whole + (mass - term).sum())
 
 
 def predict(
-    found: Posterior, covariance: Tensor, observed: Observed, block: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, variance and skewness of M cells, each of shape [B, M].
+    found: Posterior, covariance: ndarray, observed: Observed, block: ndarray
+) -> tuple[ndarray, ndarray, ndarray]:
+    """Mean, variance and skewness of M cells, each of shape [M].
 
     An interval leaves its cell skew, and by the correlation that is left its neighbours: a cell's third cumulant is the
     sum of those of the intervals' cells times the cube of the cell's regression on each, which is right for a single
@@ -283,76 +228,87 @@ def predict(
 
     Args:
         found: the field given what is observed, from `condition`.
-        covariance: K of the observed cells, shape [B, N, N].
+        covariance: K of the observed cells, shape [N, N].
         observed: what is known of them.
-        block: covariances of the observed cells with the M, shape [B, N, M].
+        block: covariances of the observed cells with the M, shape [N, M].
     """
-    taken = found.reduced(block)
-    mean = torch.einsum("bn,bnm->bm", found.weights, block)
-    variance = (1 - taken.square().sum(1)).clamp(min=0)
-    most = observed.most
-    if most == 0:
-        return mean, variance, torch.zeros_like(mean)
-    place = _first(observed.interval, most)
-    held, lower, upper, std, precision, shift = (
-        values.gather(1, place)
-        for values in (
-            observed.interval, observed.lower, observed.upper, observed.std, found.precision, found.shift,
-        )
-    )  # fmt: skip
-    columns = covariance.gather(2, place[:, None].expand(-1, covariance.shape[1], -1))
-    own = found.reduced(columns)
-    own_mean = torch.einsum("bn,bnm->bm", found.weights, columns)
-    own_variance = (1 - own.square().sum(1)).clamp(min=_LEAST_VARIANCE)
-    centre, without = _Terms(precision, shift).left_out(own_mean, own_variance)
-    ends = torch.where(held, lower, -1.0), torch.where(held, upper, 1.0)
-    total = without + std.square()
-    third = _third_cumulant(centre, total, *ends) * (without / total).pow(3)
-    shared = block.gather(1, place[..., None].expand(-1, -1, block.shape[2])) - own.mT @ taken
-    regression = shared / own_variance[..., None]
-    found_third = torch.einsum("bn,bnm->bm", torch.where(held, third, 0.0), regression.pow(3))
-    skew = found_third / variance.clamp(min=_LEAST_VARIANCE).pow(1.5)
-    return mean, variance, skew.clamp(-_MOST_SKEW, _MOST_SKEW)
+    mean, variance, taken = found.moments(block)
+    held = observed.interval
+    if not held.any():
+        return mean, variance, np.zeros_like(mean)
+    own_mean, own_variance, own = found.moments(covariance[:, held])
+    own_variance = own_variance.clip(_LEAST_VARIANCE)
+    terms = _Terms(found.precision[held], found.shift[held])
+    centre, without = terms.left_out(own_mean, own_variance)
+    total = without + np.square(observed.std[held])
+    third = _third_cumulant(centre, total, observed.lower[held], observed.upper[held])
+    regression = (block[held] - _times(own.T, taken)) / own_variance[:, None]
+    # Products and roots, which are far quicker than powers.
+    third = _times(third * (without / total) ** 3, regression * regression * regression)
+    spread = variance.clip(_LEAST_VARIANCE)
+    skew = third / (spread * np.sqrt(spread))
+    return mean, variance, skew.clip(-_MOST_SKEW, _MOST_SKEW)
 
 
-def _first(which: Tensor, most: int) -> Tensor:
-    """Places of those of each row that are meant, then of others, shape [B, most]."""
-    return (~which).int().argsort(dim=1, stable=True)[:, :most]
+def _factor(covariance: ndarray, root: ndarray) -> Tensor:
+    """Cholesky factor of I + √T K √T."""
+    inner = torch.from_numpy(root[:, None] * covariance * root)
+    inner.diagonal().add_(1)
+    return torch.linalg.cholesky(inner)
+
+
+def _taken(factor: Tensor, root: ndarray, covariance: ndarray) -> ndarray:
+    """What terms take from the covariances of M cells, [N, M], as a matrix of that shape times its own transpose."""
+    scaled = torch.from_numpy(root[:, None] * covariance)
+    return torch.linalg.solve_triangular(factor, scaled, upper=False).numpy()
+
+
+def _times(one: ndarray, other: ndarray) -> ndarray:
+    """A product of matrices or vectors."""
+    return (torch.from_numpy(one) @ torch.from_numpy(other)).numpy()
 
 
 class _Terms(NamedTuple):
-    """Gaussian terms, one a cell: exp(shift · z − precision · z² / 2), each of shape [B, N]."""
+    """Gaussian terms, one a cell: exp(shift · z − precision · z² / 2), each of shape [N]."""
 
-    precision: Tensor
-    shift: Tensor
+    precision: ndarray
+    shift: ndarray
 
-    def moments(self, covariance: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of the cells of a field of covariance [B, N, N] and mean [B, N], given the terms."""
-        found = posterior(covariance, self.precision, self.shift - self.precision * centre)
-        mean = torch.einsum("bn,bnm->bm", found.weights, covariance)
-        taken = found.reduced(covariance).square().sum(1)
-        return centre + mean, (covariance.diagonal(dim1=1, dim2=2) - taken).clamp(min=_LEAST_VARIANCE)
+    def moments(self, covariance: ndarray, centre: ndarray) -> tuple[ndarray, ndarray]:
+        """Mean and variance of the cells of a field of covariance [N, N] and mean [N], given the terms."""
+        root = np.sqrt(self.precision)
+        taken = _taken(_factor(covariance, root), root, covariance)
+        left = covariance - _times(taken.T, taken)
+        mean = centre + _times(left, self.shift - self.precision * centre)
+        return mean, left.diagonal().clip(_LEAST_VARIANCE)
 
-    def left_out(self, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+    def left_out(self, mean: ndarray, variance: ndarray) -> tuple[ndarray, ndarray]:
         """Mean and variance of each cell without its own term."""
-        without = 1 / (1 / variance - self.precision).clamp(min=_LEAST_VARIANCE)
+        without = 1 / (1 / variance - self.precision).clip(_LEAST_VARIANCE)
         return without * (mean / variance - self.shift), without
 
-    def towards(self, mean: Tensor, variance: Tensor, lower: Tensor, upper: Tensor, std: Tensor) -> "_Terms":
+    def towards(
+        self, mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray, std: ndarray
+    ) -> "_Terms":
         """Terms that give each cell more nearly the moments of its interval, all else as it is."""
         centre, without = self.left_out(mean, variance)
-        total = without + std.square()
+        total = without + np.square(std)
         noisy_mean, noisy_variance = interval_moments(centre, total, lower, upper)
-        pull = (noisy_mean - centre) / total
         shrink = (1 - noisy_variance / total) / total
-        left = (1 - without * shrink).clamp(min=_LEAST_SHARE)
+        left = (1 - without * shrink).clip(_LEAST_SHARE)
         precision = shrink / left
-        found = precision, centre * precision + pull / left
-        return _Terms(*(torch.lerp(*both, _DAMPING) for both in zip(self, found, strict=True)))
+        shift = centre * precision + (noisy_mean - centre) / total / left
+        return _Terms(
+            self.precision + _DAMPING * (precision - self.precision),
+            self.shift + _DAMPING * (shift - self.shift),
+        )
 
 
-def interval_moments(mean: Tensor, variance: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and variance of a normal number that lies in an interval, also far out in a tail.
+@np.errstate(over="ignore")
+def interval_moments(
+    mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray
+) -> tuple[ndarray, ndarray]:
+    """Mean and variance of normal numbers that lie in intervals, also far out in a tail.
 
     Args:
         mean: of the number, float64.
@@ -361,41 +317,46 @@ def interval_moments(mean: Tensor, variance: Tensor, lower: Tensor, upper: Tenso
         upper: above `lower`; ∞ for none.
     """
     low, high, log_mass, flipped = _standard(mean, variance, lower, upper)
-    at_low, at_high = (torch.where(end.isinf(), 0.0, _density(end, log_mass)) for end in (low, high))
+    at_low, at_high = _density(low, log_mass), _density(high, log_mass)
     shift = at_low - at_high
-    slope = torch.where(low.isinf(), 0.0, low) * at_low - torch.where(high.isinf(), 0.0, high) * at_high
-    share = (1 + slope - shift.square()).clamp(_LEAST_SHARE, 1)
-    shift = torch.maximum(torch.minimum(shift, high), low)
-    return mean + variance.sqrt() * torch.where(flipped, -shift, shift), variance * share
+    share = (1 + _finite(low) * at_low - _finite(high) * at_high - np.square(shift)).clip(_LEAST_SHARE, 1)
+    shift = shift.clip(low, high)
+    return mean + np.sqrt(variance) * np.where(flipped, -shift, shift), variance * share
 
 
-def _third_cumulant(mean: Tensor, variance: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Third cumulant of a normal number that lies in an interval."""
+@np.errstate(over="ignore", invalid="ignore")
+def _third_cumulant(mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray) -> ndarray:
+    """Third cumulant of normal numbers that lie in intervals."""
     low, high, log_mass, flipped = _standard(mean, variance, lower, upper)
-    at_low, at_high = (torch.where(end.isinf(), 0.0, _density(end, log_mass)) for end in (low, high))
-    low, high = (torch.where(end.isinf(), 0.0, end) for end in (low, high))
+    at_low, at_high = _density(low, log_mass), _density(high, log_mass)
+    low, high = _finite(low), _finite(high)
     first = at_low - at_high
     second = 1 + low * at_low - high * at_high
-    third = (low.square() + 2) * at_low - (high.square() + 2) * at_high
+    third = (low**2 + 2) * at_low - (high**2 + 2) * at_high
     # Far out in a tail, where rounding leaves nothing of it, the number is exponential.
-    most = 2 * (second - first.square()).clamp(min=0).pow(1.5)
-    found = torch.clamp(third - 3 * first * second + 2 * first.pow(3), -most, most)
-    return variance.pow(1.5) * torch.where(flipped, -found, found)
+    most = 2 * (second - first**2).clip(0) ** 1.5
+    found = (third - 3 * first * second + 2 * first**3).clip(-most, most)
+    return variance**1.5 * np.where(flipped, -found, found)
 
 
 def _standard(
-    mean: Tensor, variance: Tensor, lower: Tensor, upper: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray
+) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     """An interval in standard deviations, the log of its probability, and whether it was flipped to low numbers."""
-    std = variance.sqrt()
+    std = np.sqrt(variance)
     low, high = (lower - mean) / std, (upper - mean) / std
     # On the side where Φ is small, so that nothing is lost to rounding.
-    flipped = low + high > 0
-    low, high = torch.where(flipped, -high, low), torch.where(flipped, -low, high)
-    log_high = torch.special.log_ndtr(high)
-    apart = (torch.special.log_ndtr(low) - log_high).clamp(max=-1e-300)
-    return low, high, log_high + torch.log(-torch.expm1(apart)), flipped
+    flipped = low > -high
+    low, high = np.where(flipped, -high, low), np.where(flipped, -low, high)
+    log_high = log_ndtr(high)
+    apart = (log_ndtr(low) - log_high).clip(max=-1e-300)
+    return low, high, log_high + np.log(-np.expm1(apart)), flipped
 
 
-def _density(at: Tensor, log_mass: Tensor) -> Tensor:
-    return torch.exp(-0.5 * at.square() - 0.5 * math.log(2 * math.pi) - log_mass)
+def _finite(ends: ndarray) -> ndarray:
+    """Ends of intervals, 0 where there is none."""
+    return np.where(np.isinf(ends), 0.0, ends)
+
+
+def _density(at: ndarray, log_mass: ndarray) -> ndarray:
+    return np.exp(-0.5 * np.square(at) - 0.5 * math.log(2 * math.pi) - log_mass)

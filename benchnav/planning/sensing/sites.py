@@ -12,7 +12,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from benchnav.core.batch import Batch
 from benchnav.planning.sensing.copula import bounds, nearest
-from benchnav.planning.sensing.gaussian import Cells, Field
+from benchnav.planning.sensing.gaussian import Field
 from benchnav.planning.sensing.labels import Lattice, Noise, noise, unpacked
 
 _REACH = 12  # cells
@@ -84,7 +84,7 @@ class Block:
     @classmethod
     def around(cls, evidence: Evidence, changed: Tensor, strength: float) -> "Block":
         """The block that has all cells in reach of what changed, and their neighbours."""
-        ends = torch.tensor([bounds(new) for new in changed], device=changed.device)
+        ends = torch.tensor([bounds(new) for new in changed.cpu().numpy()], device=changed.device)
         lines = []
         for (low, high), size in zip(ends.permute(1, 2, 0), changed.shape[1:], strict=True):
             most = min(int((high - low).max()) + 1 + 2 * (_REACH + 1), size)
@@ -135,7 +135,8 @@ class Sites:
     """Observed cells, those that are new last, and what is known of them.
 
     Args:
-        cells: where they are, shape [B, N].
+        row: where they are, int64, shape [B, N].
+        column: int64.
         cell: place in the block, int64, shape [B, N].
         near: places of the four cells beside each, int64, shape [B, N, 4].
         tied: all bits set where they hang together with it, int64.
@@ -153,7 +154,8 @@ class Sites:
         loose: which may be given the other label together with a patch.
     """
 
-    cells: Cells
+    row: Tensor
+    column: Tensor
     cell: Tensor
     near: Tensor
     tied: Tensor
@@ -174,17 +176,18 @@ class Sites:
     def of(cls, evidence: Evidence, changed: Tensor, block: Block, window: int) -> "Sites":
         """The observed cells nearest to what is new."""
         found = [
-            nearest(~known.isnan(), new, window)
-            for known, new in zip(evidence.noise_std, changed, strict=True)
+            nearest(known, new, window)
+            for known, new in zip(
+                (~evidence.noise_std.isnan()).cpu().numpy(), changed.cpu().numpy(), strict=True
+            )
         ]
-        rows, columns, there = (
-            pad_sequence([own[0] for own in each], batch_first=True).flip(1)
-            for each in zip(*((own.row, own.column, own.row >= 0) for own in found), strict=True)
+        row, column, there = (
+            pad_sequence([torch.from_numpy(own) for own in each], batch_first=True).flip(1).to(changed.device)
+            for each in zip(*((row, column, row >= 0) for row, column in found), strict=True)
         )
-        cells = Cells(row=rows, column=columns)
-        at = block.at[0], cells.row, cells.column
+        at = block.at[0], row, column
         top, left, across = block.row[:, 0, :1], block.column[:, 0, :1], block.row.shape[2]
-        down, right = cells.row - top, cells.column - left
+        down, right = row - top, column - left
         inside = there & (down >= 0) & (down < block.row.shape[1]) & (right >= 0) & (right < across)
         cell = torch.where(inside, down * across + right, 0)
         inside &= block.own.flatten(1).gather(1, cell)
@@ -198,7 +201,8 @@ class Sites:
         fresh, interval = changed[at] & there, (upper > lower)[:, 0]
         held, precision = interval & ~fresh, evidence.precision[at].clamp(min=_LEAST_PRECISION)
         noise = torch.where(held, 1 / precision, std.square())
-        covariance = evidence.field.covariance(cells, cells)
+        apart = (place[:, :, None] - place[:, None] for place in (row, column))
+        covariance = evidence.field.covariance(block.at[0][..., None], *apart)
         covariance = torch.where(there[:, :, None] & there[:, None], covariance, 0.0)
         covariance.diagonal(dim1=1, dim2=2).copy_(torch.where(there, 1 + noise, 1.0))
         labels = unpacked(evidence.labels[at]).transpose(1, 2)
@@ -206,7 +210,7 @@ class Sites:
         scores = torch.where(held[:, None], (evidence.shift[at] / precision)[:, None], scores)
         unsettled = (evidence.chance[at] - 0.5).abs() < 0.5 - _SETTLED
         return cls(
-            cells=cells, cell=cell, near=near, tied=torch.where(inside[..., None], tied, 0),
+            row=row, column=column, cell=cell, near=near, tied=torch.where(inside[..., None], tied, 0),
             strength=block.lattice.strength, lower=lower, upper=upper, density=both(evidence.density), std=std,
             noise=noise, factor=torch.linalg.cholesky(covariance),
             scores=torch.where((there & ~fresh)[:, None], scores, 0.0), fresh=fresh, held=held,

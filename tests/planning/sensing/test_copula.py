@@ -307,12 +307,26 @@ def test_a_window_looks_at_what_is_near_and_loses_little() -> None:
     field = prior.from_normal(score)
     path = [(2 + place // 2, 2 + place) for place in range(12)]
     looks = [looked({place: float(field[0][place])}, 0.1) for place in path]
-    whole, near, one = (after(Copula(window=window), prior, *looks) for window in (128, 6, 1))
+    whole, near, one = (after(Copula(window=window), prior, *looks) for window in (256, 6, 1))
     ahead = (slice(None), slice(6, 12), slice(10, 16))
     assert (whole.mean[ahead] - near.mean[ahead]).abs().max() < 0.12
     assert (whole.mean[ahead] - one.mean[ahead]).abs().max() > (
         whole.mean[ahead] - near.mean[ahead]
     ).abs().max()
+
+
+def test_what_was_observed_at_a_cell_is_kept_where_the_window_has_no_room_for_it() -> None:
+    prior = made.mixture(1, HEIGHT, WIDTH)
+    field = prior.from_normal(made.scores(LAW, 1))
+    looks = [looked({(6, place): float(field[0, 6, place])}, 0.05) for place in range(2, 12)]
+    for window in (1, 2, 256):
+        state, last = Copula().init(prior, LAW), None
+        for look in looks:
+            state = Copula(window=window).update(state, look)
+            known = state.std[0, 6, 2:12][state.observed[0, 6, 2:12]]
+            # Of cells with a number, as with an interval what is known may widen when neighbours are told.
+            assert last is None or float((known[: len(last)] - last).max()) < 0.02
+            last = known
 
 
 def test_a_look_at_more_cells_than_the_window_tells_of_all() -> None:
