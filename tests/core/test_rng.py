@@ -42,3 +42,16 @@ def test_transforms_have_their_distributions() -> None:
 
 def test_numpys_bit_generator_has_not_changed() -> None:
     assert rng.random_bits(7, np.array([2]), 2)[0].tolist() == [260241063655440860, 14515071666965347364]
+
+
+@given(seed=st.integers(0, 2**63), count=st.integers(1, 9))
+def test_many_streams_at_once_are_the_same_streams(seed: int, count: int) -> None:
+    draw = np.random.default_rng(seed)
+    keys = [rng.stream_key(seed, place) for place in range(4)]
+    stream, indices = draw.integers(0, 4, 12), draw.integers(0, 2**40, 12)
+    found = rng.normal_of_each(keys, stream, indices, count)
+    one_by_one = [
+        rng.normal(keys[own], np.array([i]), (count,)) for own, i in zip(stream, indices, strict=True)
+    ]
+    assert np.array_equal(found, np.concatenate(one_by_one))
+    assert rng.normal_of_each(keys, stream[:0], indices[:0], count).shape == (0, count)

@@ -108,15 +108,13 @@ class Moment:
         Returns:
             Float64, in the order of `wanted.nonzero()`, shape [N, *shape].
         """
-        count, flat = wanted[0].numel(), wanted.flatten(1).cpu()
-        steps = [self.step] * len(self.keys) if isinstance(self.step, int) else self.step
-        drawn = [
-            rng.normal(rng.stream_key(key, name), step * count + row.nonzero()[:, 0].numpy(), shape)
-            for key, step, row in zip(self.keys, steps, flat, strict=True)
-            if bool(row.any())
-        ]
-        found = np.concatenate(drawn) if drawn else np.empty((0, *shape))
-        return torch.from_numpy(found).to(wanted.device)
+        member, cell = wanted.flatten(1).nonzero().cpu().numpy().T
+        steps = np.broadcast_to(np.array(self.step), len(self.keys))
+        keys = [rng.stream_key(key, name) for key in self.keys]
+        drawn = rng.normal_of_each(
+            keys, member, steps[member] * wanted[0].numel() + cell, int(np.prod(shape, dtype=int))
+        )
+        return torch.from_numpy(drawn.reshape(-1, *shape)).to(wanted.device)
 
 
 class Sensor(ABC):
