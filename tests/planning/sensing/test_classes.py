@@ -256,7 +256,7 @@ def test_cells_of_no_class_are_as_under_the_copula_belief() -> None:
 def test_episodes_that_take_the_places_of_others_are_what_they_were_alone() -> None:
     belief, law, more = Classes(), law_of(12, 14), LOOKS[2].select(torch.tensor([0, 0, 0]))
     one = after(belief, mixed(3, 12, 14), law, LOOKS[0].select(torch.tensor([0, 0, 0])))
-    two = after(belief, mixed(2, 12, 14, seed=1), law, LOOKS[1])
+    two = after(Classes(0.8), mixed(2, 12, 14, seed=1), law, LOOKS[1])
     whole, cells = belief.put(one, torch.tensor([2, 0]), two), torch.ones(3, 12, 14, dtype=torch.bool)
     for told in (
         lambda state: state,
