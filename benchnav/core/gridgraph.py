@@ -1,6 +1,6 @@
 """The 8-connected graph over a map's cells, and exact shortest paths in it for a batch of maps.
 
-A batch of maps is one block-diagonal graph, so one compiled Dijkstra search serves them all.
+Maps are searched one by one by a compiled Dijkstra search: the heap of many at once would grow with them.
 Letters in shapes: B maps, H×W cells; a cell's flat index is row·W + column.
 """
 
@@ -37,7 +37,7 @@ def cost_to_go(edge_costs: ndarray, goals: ndarray, shape: tuple[int, int]) -> t
     Args:
         edge_costs: cost > 0 of each edge of `neighbour_pairs`, infinite where it may not be taken,
             shape [B, E].
-        goals: goal cells, bool, at least one in all, shape [B, H, W].
+        goals: goal cells, bool, shape [B, H, W].
         shape: (H, W).
 
     Returns:
@@ -45,18 +45,23 @@ def cost_to_go(edge_costs: ndarray, goals: ndarray, shape: tuple[int, int]) -> t
         the next cell on a shortest path, `NO_CELL` at goals and where there is none, int64, shape
         [B, H·W].
     """
-    batch, cells = len(edge_costs), shape[0] * shape[1]
-    starts = np.flatnonzero(goals)
+    cells = shape[0] * shape[1]
     # Searching backward from the goals, so the edges are turned round: rows are their targets.
     source, target, _ = neighbour_pairs(*shape)
-    offset = cells * np.arange(batch)[:, None]
-    ends = (target + offset).ravel(), (source + offset).ravel()
-    graph = csr_array((edge_costs.ravel(), ends), shape=(batch * cells, batch * cells))
-    # The finite limit keeps infinite edges from being taken.
-    limit = np.finfo(np.float64).max
-    cost, previous, _ = dijkstra(graph, indices=starts, min_only=True, return_predecessors=True, limit=limit)
-    following = previous.reshape(batch, cells).astype(np.int64)
-    return cost.reshape(batch, *shape), np.where(following >= 0, following - offset, NO_CELL)
+    first = np.searchsorted(target, np.arange(cells + 1))
+    cost, following = np.empty((len(edge_costs), cells)), np.empty((len(edge_costs), cells), dtype=np.int64)
+    for own, (costs, starts) in enumerate(zip(edge_costs, goals.reshape(-1, cells), strict=True)):
+        graph = csr_array((costs, source, first), shape=(cells, cells))
+        # The finite limit keeps infinite edges from being taken.
+        cost[own], previous, _ = dijkstra(
+            graph,
+            indices=np.flatnonzero(starts),
+            min_only=True,
+            return_predecessors=True,
+            limit=np.finfo(np.float64).max,
+        )
+        following[own] = np.where(previous >= 0, previous, NO_CELL)
+    return cost.reshape(-1, *shape), following
 
 
 def travel_time_costs(traversability: ndarray, free: ndarray, resolution_m: float) -> ndarray:
