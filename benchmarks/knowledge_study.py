@@ -6,8 +6,8 @@
     python benchmarks/knowledge_study.py run primary known     # hours; killed and begun again it goes on
     python benchmarks/knowledge_study.py report                # tables, and the figure of success over what is known
 
-Parts are suites of docs/knowledge: `primary` holds the hypotheses; `known`, `known-mppi` (part A) and `near` (part B)
-extend its run; `sensitivity` and `kernel` (part C) and `seen` have runs of their own. Maps and runs lie in the folders
+Parts are suites of docs/knowledge, each with a run of its own: `primary` holds the hypotheses; `known` and `known-mppi`
+are part A, `near` part B, `sensitivity` and `kernel` part C; `seen` has old maps. Maps and runs lie in the folders
 `--maps_in` and `--out`, and `--maps` takes the first maps alone, to try it.
 """
 
@@ -55,16 +55,7 @@ SUITES, PAGE, FIGURE = (
     ROOT / "docs/figures/knowledge.png",
 )
 SPLIT = "test/std"
-# The folder of each part's run.
-RUNS = {
-    "primary": "knowledge",
-    "known": "knowledge",
-    "known-mppi": "knowledge",
-    "near": "knowledge",
-    "sensitivity": "knowledge-sensitivity",
-    "kernel": "knowledge-kernel",
-    "seen": "knowledge-seen",
-}
+PARTS = ("primary", "known", "known-mppi", "near", "sensitivity", "kernel", "seen")
 DEVELOPMENT, DEVELOPED = "stakes-v1-seed1", "knowledge-developed"
 MATERN, MATERN_M, MATERN_MAPS = "-matern", 1.5, 100
 ALPHA = 0.05
@@ -154,34 +145,19 @@ def matern(grid: Grid, length_m: float) -> np.ndarray:
 # --- runs -------------------------------------------------------------------------------------------
 
 
-def drive(suite: dict[str, Any], name: str, out: Path, jobs: int, written: str = "") -> Path:
-    """Runs a suite into a folder, or what is left of it.
-
-    Args:
-        suite: what is run.
-        name: of the run's folder.
-        out: where runs lie.
-        jobs: processes.
-        written: name of the file in which the suite is kept; the run's where it is empty.
-    """
+def drive(suite: dict[str, Any], name: str, out: Path, jobs: int) -> None:
+    """Runs a suite into a folder of this name, or what is left of it."""
     out.mkdir(parents=True, exist_ok=True)
-    path = out / f"{written or name}.yaml"
+    path = out / f"{name}.yaml"
     path.write_text(yaml.safe_dump(suite, sort_keys=False, allow_unicode=True))
     command("benchnav-eval", "run", "--config", path, "--out", out / name, "--jobs", jobs)
-    return out / name
 
 
 def run(parts: list[str], out: Path, maps_in: Path, maps: int, jobs: int) -> None:
-    """Runs parts, the one with the hypotheses first: a run that was begun cannot take any later."""
-    for part in sorted(parts, key=list(RUNS).index):
-        if (
-            part != "primary"
-            and RUNS[part] == RUNS["primary"]
-            and not (out / RUNS[part] / "run.json").exists()
-        ):
-            sys.exit(f"Expected `primary` before {part!r}, whose run it extends.")
+    """Runs parts, one after another."""
+    for part in parts:
         begun = time.perf_counter()
-        drive(suite_of(part, maps_in, maps), RUNS[part], out, jobs, written=f"knowledge-{part}")
+        drive(suite_of(part, maps_in, maps), f"knowledge-{part}", out, jobs)
         print(f"-- {part}: {time.perf_counter() - begun:.0f} s", flush=True)
 
 
@@ -296,7 +272,8 @@ def knowledge_figure(summary: pd.DataFrame) -> Figure:
 def report(out: Path) -> None:
     """Writes the figure, the tables of the page where there is one, and the power where it is known."""
     print(f"hypotheses {hashlib.sha256((SUITES / 'primary.yaml').read_bytes()).hexdigest()}")
-    save(knowledge_figure(pd.read_csv(out / RUNS["known"] / "summary.csv")), FIGURE, "png", dpi=200)
+    summaries = [pd.read_csv(out / f"knowledge-{part}" / "summary.csv") for part in ("known", "known-mppi")]
+    save(knowledge_figure(pd.concat(summaries)), FIGURE, "png", dpi=200)
     print(f"wrote {FIGURE}")
     if PAGE.exists():
         subprocess.run([sys.executable, ROOT / "benchmarks/tables.py", PAGE, "--runs", out], check=True)
@@ -309,7 +286,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("what", choices=["maps", "estimate", "develop", "power", "run", "report"])
-    parser.add_argument("parts", nargs="*", default=[], help=f"of {', '.join(RUNS)}; all if none is named")
+    parser.add_argument("parts", nargs="*", default=[], help=f"of {', '.join(PARTS)}; all if none is named")
     parser.add_argument("--out", type=Path, default=Path("runs"), help="folder of the runs")
     parser.add_argument("--maps_in", type=Path, default=Path("datasets"), help="folder of the maps")
     parser.add_argument(
@@ -317,9 +294,9 @@ def main() -> None:
     )
     parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args()
-    out, maps_in, parts = given.out.resolve(), given.maps_in.resolve(), given.parts or list(RUNS)
-    if unknown := set(parts) - set(RUNS):
-        parser.error(f"Expected parts among {', '.join(RUNS)}, got {', '.join(sorted(unknown))}.")
+    out, maps_in, parts = given.out.resolve(), given.maps_in.resolve(), given.parts or list(PARTS)
+    if unknown := set(parts) - set(PARTS):
+        parser.error(f"Expected parts among {', '.join(PARTS)}, got {', '.join(sorted(unknown))}.")
     if given.what == "maps":
         make_maps(maps_in)
     elif given.what in ("estimate", "run"):
