@@ -13,12 +13,15 @@ from torch import Tensor
 from benchnav.core import rng
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
+from benchnav.core.ground import GroundStatistics
 from benchnav.core.quantiles import QuantileDistribution
+from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.knowledge import Knowing, Learning
 from benchnav.eval.run.rollout import Episodes, run_episodes
+from benchnav.models.predictor import Oracle
 from benchnav.planning import risk
 from benchnav.planning.free_space import FreeSpace, Rules, cells_at_goal
 from benchnav.planning.objective import TravelTime
@@ -27,8 +30,10 @@ from benchnav.planning.planners.astar.dwa import DWAConfig
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.belief import Belief, Static, StaticState
+from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.knowledge import KnowledgeError, Learner, Truth
+from benchnav.planning.sensing.near import Near
 from benchnav.planning.sensing.sensor import Contact, Full, Moment, Probe, Sensed, Sensor
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.realisation import joined
@@ -83,7 +88,7 @@ def learning(problem: Problem, truth: Truth, **changes: Any) -> Learning:
 def drives(seed: int = 0, replan_every_s: float = 0.5, **changes: Any) -> Drives:
     # The first draws with a feasible path.
     truth = made.mixture(40, SIZE, SIZE, seed=3)
-    truth = type(truth)(truth.weights.float(), truth.means.float(), truth.stds.float())
+    truth = type(truth)(truth.weights.float(), truth.means.float(), truth.stds.float(), (0, 1))
     start, goal = (torch.tensor([place] * 40) for place in ((1.25, 1.25), (10.25, 9.75)))
     places = Places(start_m=start, goal_m=goal, reference_time_s=torch.full((40,), torch.nan))
     field = truth.from_normal(made.scores(LAW, 40, seed).float())
@@ -148,50 +153,91 @@ def test_who_probes_the_ground_is_immobilised_less_often() -> None:
     assert float(steps["probe"][both].double().mean()) < float(steps["static"][both].double().mean()) - 3
 
 
-class Blindfolded(Sensor):
-    """Senses as another does, on ground that is replaced where it is told nothing up to a step."""
+class Noting(Sensor):
+    """Senses as another does, and notes of which cells it told; the other may see all."""
 
-    def __init__(self, inner: Sensor, mask: Tensor) -> None:
-        self.inner, self.mask = inner, mask
+    def __init__(self, inner: Sensor, noted: Tensor) -> None:
+        self.inner, self.noted, self.sees_all = inner, noted, inner.sees_all  # type: ignore[misc]
 
     def sense(self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
         sensed = self.inner.sense(terrain, field, robot_state, moment)
         members = torch.tensor([KEYS.index(key) for key in moment.keys])
-        self.mask[members] |= sensed.mask
+        self.noted[members] |= sensed.mask if sensed.appearance is None else sensed.appearance.seen
         return sensed
 
 
+ALIKE = replace(
+    LAW,
+    statistics=GroundStatistics(
+        weights=(0.3, 0.7), means=(0.1, 0.75), stds=(0.1, 0.1), look_alikes=(("soft", "firm"),), potts_strength=0.5,
+        layer_means={"rgb": (10.0, 20.0, 30.0), "elevation_m": (0.5,), "slope_deg": (7.0,)},
+    ),
+    class_names=("soft", "firm"),
+)  # fmt: skip
+BELIEFS = {"static": Static(), "copula": Copula(), "classes": Classes()}
+SENSES = [
+    (sensor, ground, belief)
+    for sensor in (Full(), Near(range_m=3.0, fov_deg=200))
+    for ground in (Contact(), Probe(1.0))
+    for belief in BELIEFS
+    if (sensor.sees_all, belief) != (True, "static")  # which is told nothing
+]
+
+
 @pytest.mark.parametrize("name", SHIPPED)
-def test_what_was_not_sensed_changes_no_action(name: str) -> None:
+@pytest.mark.parametrize(("sensor", "ground", "belief"), SENSES)
+def test_what_was_not_sensed_changes_no_action(
+    name: str, sensor: Sensor, ground: Sensor, belief: str
+) -> None:
+    few, steps = torch.arange(3), 11
     given = drives()
-    mask = torch.zeros(BATCH, SIZE, SIZE, dtype=torch.bool)
-    steps = 25
-    first = given.run(
-        make(name),
-        learning(given.problem, given.learning.truth, ground=Blindfolded(Probe(1.0), mask)),
-        enough=lambda step: step == steps,
+    before, posed = given.learning.truth.terrain.select(few), given.problem.select(few)
+    posed = replace(posed, distribution=before.truth)
+    sensed = torch.zeros(2, len(few), SIZE, SIZE, dtype=torch.bool)  # what it looks like, and its λ
+    sensed[0] = sensor.sees_all
+
+    def drive(terrain: Terrain, noted: Tensor) -> Episodes:
+        truth = Truth(terrain=terrain, field=terrain.traversability, keys=KEYS[: len(few)])
+        how = learning(
+            posed, truth, sensor=Noting(sensor, noted[0]), ground=Noting(ground, noted[1]), belief=BELIEFS[belief],
+            law=ALIKE, predict=lambda terrain, seen: Oracle().predict_terrain(terrain),
+        )  # fmt: skip
+        known = how.start
+        problem = replace(
+            posed, risk_map=known.risk_map, observation=known.observation,
+            free=known.free | cells_at_goal(posed.grid, posed.goal_m, posed.goal_radius_m),
+            distribution=how.learner.distribution(known),
+        )  # fmt: skip
+        nan = torch.full((len(few),), torch.nan)
+        places = Places(start_m=problem.start[:, :2], goal_m=problem.goal_m, reference_time_s=nan)
+        simulation = Simulation(terrain, problem.task, WORLD, places, 1, range(len(few)))
+        return run_episodes(
+            make(name), problem, simulation, generator(), learning=how, enough=lambda step: step == steps
+        )
+
+    first = drive(before, sensed)
+    # Robots met the λ of the cells that they drove on.
+    row, column = before.grid.cell_of(first.states[..., 0], first.states[..., 1])
+    met = torch.zeros_like(sensed[1]).flatten(1).scatter(1, row * SIZE + column, True).view_as(sensed[1])
+    seen, felt = sensed[0], sensed[1] | met
+    assert bool((~felt).any())
+    other = made.mixture(len(few), SIZE, SIZE, seed=9)
+    # A model that sees all has the true distribution of each cell, and the noise of sensed λ is by it.
+    kept = (seen | felt)[:, None]
+    after = replace(
+        before,
+        traversability=torch.where(felt, before.traversability, 1 - before.traversability),
+        truth=replace(
+            before.truth,
+            weights=torch.where(kept, before.truth.weights, other.weights.float()),
+            means=torch.where(kept, before.truth.means, other.means.float()),
+        ),
+        rgb=torch.where(seen[:, None], before.rgb, 200),
+        # What is hidden may hide nothing else: lower ground.
+        elevation_m=torch.where(seen, before.elevation_m, before.elevation_m - 1),
+        slope_deg=torch.where(seen, before.slope_deg, 30.0),
     )
-    # Another truth wherever no robot has looked; robots stand within what they probe.
-    sensed = given.learning.truth
-    field = torch.where(mask, sensed.field, 1 - sensed.field)
-    other = made.mixture(BATCH, SIZE, SIZE, seed=9)
-    truth = sensed.terrain.truth
-    truth = replace(
-        truth,
-        weights=torch.where(mask[:, None], truth.weights, other.weights.float()),
-        means=torch.where(mask[:, None], truth.means, other.means.float()),
-    )
-    terrain = replace(sensed.terrain, truth=truth, traversability=field)
-    simulation = Simulation(
-        terrain, given.problem.task, WORLD,
-        Places(start_m=given.problem.start[:, :2], goal_m=given.problem.goal_m,
-               reference_time_s=torch.full((BATCH,), torch.nan)), 1, range(BATCH),
-    )  # fmt: skip
-    blind = learning(given.problem, Truth(terrain=terrain, field=field, keys=KEYS), ground=Probe(1.0))
-    again = run_episodes(
-        make(name), given.problem, simulation, generator(), learning=blind, enough=lambda step: step == steps
-    )
-    assert same(first, again)
+    assert same(first, drive(after, torch.zeros_like(sensed)))
 
 
 def told(how: Learning, problem: Problem, steps: int) -> list[tuple[int, Problem]]:
