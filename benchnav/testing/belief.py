@@ -49,7 +49,7 @@ def check_belief(
     `at` tells λ̂ of some cells within 0.01 of the distribution's. `sample_fields` gives λ in [0, 1] of shape
     [B, M, H, W], the same under the same keys and others under others, whose cells have what is believed up to chance.
     Arguments and global generators are left as they were; the answer is the same when asked again, after other maps
-    were begun, and for episodes alone, in another order or kept by `select`.
+    were begun, and for episodes alone, in another order, kept by `select` or put elsewhere by `put`.
 
     Args:
         belief: any belief, or the name, file or mapping of one as suites have it.
@@ -112,6 +112,7 @@ class _Trial:
         self.try_at(state)
         self.try_fields(state)
         self.try_members(looks, state)
+        self.try_put(state)
 
     def expect(self, kept: bool, breach: str) -> bool:
         """Notes a breach."""
@@ -289,6 +290,23 @@ class _Trial:
             self.expect(
                 self.alike(kept, last, self.tolerance, some),
                 "Expected of episodes that `select` keeps what they got in the batch, got another.",
+            )
+
+    def try_put(self, state: Any) -> None:
+        """Expects episodes that are put in the places of others to be there as they were."""
+        places = torch.tensor([1, _UNTOLD], device=self.prior.device)
+        some = torch.tensor([2, 0], device=self.prior.device)
+        others = self.select(state, some)
+        if others is NOTHING:
+            return
+        found = self.breaches.watch(
+            "put", lambda: self.belief.put(state, places, others), state=state, others=others
+        )
+        order = torch.tensor([0, 2, 2, 0], device=self.prior.device)
+        if found is not NOTHING and self.is_sound(found):
+            self.expect(
+                self.alike(found, state, self.tolerance, order),
+                "Expected episodes that `put` puts in the places of others to be as they were, got others.",
             )
 
     def select(self, state: Any, members: Tensor) -> Any:

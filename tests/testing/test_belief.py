@@ -172,6 +172,8 @@ BAD: dict[str, tuple[Any, str]] = {
     "fields by place": (giving("sample_fields", in_turn), "fields to be those of its own key"),
     "fields of the prediction": (giving("sample_fields", of_the_prior), "the distribution that is believed"),
     "selects others": (having(select=lambda _, s, m: s.select(m.sort().values)), "episodes that `select` keeps"),
+    "puts nothing": (having(put=lambda _, s, m, o: s), "`put` puts in the places of others"),
+    "puts elsewhere": (having(put=lambda b, s, m, o: s.put(m.flip(0), o)), "`put` puts in the places of others"),
     "selects nothing": (having(select=lambda _, s, m: s), "shape [2, 6, 8] of episodes that `select` keeps"),
 }  # fmt: skip
 
