@@ -34,11 +34,11 @@ def check_sensor(
     """Tries whether a sensor of appearance or of the ground keeps the contract, by letting it sense on four hills.
 
     The robots: one in the middle of the map, two at its borders, one off it.
-    The contract: a `Sensed` of the field's shape, dtype and device; λ in [0, 1], NaN where it is not sensed, with a
-    standard deviation of at least `LEAST_STD`; of an `Appearance` the terrain's own layers, with elevation and a doubt
-    ≥ 0 in every cell that is seen; the arguments left as they were, and with them the global generators of Python,
-    NumPy and PyTorch; the same answer when asked again, and for some episodes alone and in another order what it is in
-    the batch; noise, where there is any, that is another in each episode and in each step.
+    The contract: some cell is sensed or seen; a `Sensed` of the field's shape, dtype and device; λ in [0, 1], NaN where
+    it is not sensed, with a standard deviation of at least `LEAST_STD`; of an `Appearance` the terrain's own layers,
+    with elevation and a doubt ≥ 0 in every cell that is seen; the arguments left as they were, and with them the global
+    generators of Python, NumPy and PyTorch; the same answer when asked again, and for some episodes alone and in
+    another order what it is in the batch; noise, where there is any, that is another in each episode and in each step.
 
     It shows nothing that it should not. Nothing that it reports changes when the truth elsewhere is replaced: λ, its
     distribution and its class in all cells but those whose λ is sensed; colour, slope and layers in all cells but those
@@ -96,6 +96,11 @@ class _Trial:
         sensed = self.ask(self.truth)
         if sensed is NOTHING:
             return
+        look = sensed.appearance
+        self.breaches.expect(
+            bool(sensed.mask.any()) or (look is not None and bool(look.seen.any())),
+            "Expected a robot in the middle of a map to sense or see some cell, got none.",
+        )
         shown = _shown(sensed)
         is_same = self.breaches.expect(
             self.is_alike(self.ask(self.truth), shown, 0), "Expected the same when asked again, got another."
@@ -232,25 +237,27 @@ def _replaced(truth: _Truth, sensed: Sensed, sinks: bool) -> Iterator[tuple[str,
     """Truths that differ in what is not reported, and what that is."""
     terrain, look, mask = truth.terrain, sensed.appearance, sensed.mask
     reported = mask if look is None else mask | look.seen
+    # Others in each cell, and in all that sums them up, such as a map's mean and greatest.
     law = replace(
         terrain.truth,
         weights=terrain.truth.weights.where(mask[:, None], terrain.truth.weights.flip(1, 2)),
-        means=terrain.truth.means.where(mask[:, None], terrain.truth.means.flip(1, 2)),
+        means=terrain.truth.means.where(mask[:, None], 0.4 * (1 - terrain.truth.means)),
+        stds=terrain.truth.stds.where(mask[:, None], 0.5 * terrain.truth.stds),
     )
     other = replace(
         terrain,
         class_id=terrain.class_id.where(mask, terrain.class_id + 1),
         truth=law,
-        traversability=terrain.traversability.where(mask, 1 - terrain.traversability),
+        traversability=terrain.traversability.where(mask, 0.4 * (1 - terrain.traversability)),
     )
-    field = truth.field.where(mask, 1 - truth.field)
+    field = truth.field.where(mask, 0.4 * (1 - truth.field))
     yield (
         "λ, its distribution and its class are where λ is not sensed",
         replace(truth, terrain=other, field=field),
     )
     other = replace(
         terrain,
-        rgb=terrain.rgb.where(reported[:, None], 255 - terrain.rgb),
+        rgb=terrain.rgb.where(reported[:, None], (255 - terrain.rgb) // 2),
         slope_deg=terrain.slope_deg.where(reported, terrain.slope_deg + 5),
         layers={name: layer.where(reported, layer + 1) for name, layer in terrain.layers.items()},
     )

@@ -118,6 +118,26 @@ APPEARANCE = (
 ELEVATION = "Expected the same whatever the elevation is where nothing is sensed or seen, got another."
 ALONE = "Expected for episodes alone and in another order what they got in the batch, got another."
 BAD: dict[str, tuple[Any, str]] = {
+    "senses nothing": (probing(lambda found, *_: torch.nan * found), "to sense or see some cell, got none"),
+    **{
+        f"knows {name} of the map": (
+            telling(
+                Probe(),
+                lambda sensed, terrain, field, *_, of=of: replace(
+                    sensed, std=sensed.std * (1 + of(terrain, field)[:, None, None])
+                ),
+            ),
+            ELSEWHERE,
+        )
+        for name, of in {
+            "mean λ": lambda terrain, field: field.mean((1, 2)),
+            "greatest λ": lambda terrain, field: field.amax((1, 2)),
+            "mean of the truth": lambda terrain, field: terrain.truth.mean().mean((1, 2)),
+            "best of the truth": lambda terrain, field: terrain.truth.mean().amax((1, 2)),
+            "spread of the truth": lambda terrain, field: terrain.truth.stds.mean((1, 2, 3)),
+            "stored λ": lambda terrain, field: terrain.traversability.mean((1, 2)),
+        }.items()
+    },
     "no sensor": (3, "subclass of benchnav.planning.Sensor, got int"),
     "raises": (probing(lambda found, *_: found[99]), "Expected an answer from `sense`, got IndexError"),
     "says nothing": (telling(Probe(), lambda *_: None), "a Sensed from `sense`, got NoneType"),

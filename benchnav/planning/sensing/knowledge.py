@@ -337,7 +337,18 @@ class Learner:
             # Our own change nothing that they are given.
             if not type(sensor).__module__.startswith("benchnav."):
                 given = truth.terrain.clone(), truth.field.clone(), robot_state.clone()
-            return self._checked(sensor.sense(*given, moment), truth.field)
+            found = self._checked(sensor.sense(*given, moment), truth.field)
+            if sensor is self.sensor:
+                expect(
+                    found.appearance is not None,
+                    "`Sensed.appearance` from a sensor of appearance, got none. A sensor of λ is a `ground`.",
+                )
+            else:
+                expect(
+                    found.appearance is None or bool(found.mask.any()),
+                    "λ from a sensor of the ground, got appearance alone. A sensor of that is a `sensor`.",
+                )
+            return found
 
         return call(Outcome.SENSOR_ERROR, look)
 
