@@ -14,7 +14,6 @@ from benchnav.core import rng
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
 from benchnav.core.ground import GroundStatistics
-from benchnav.core.quantiles import QuantileDistribution
 from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
@@ -34,6 +33,7 @@ from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.knowledge import KnowledgeError, Learner, Truth
 from benchnav.planning.sensing.near import Near
+from benchnav.planning.sensing.score_table import TabulatedDistribution
 from benchnav.planning.sensing.sensor import Contact, Full, Moment, Probe, Sensed, Sensor
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.realisation import joined
@@ -349,6 +349,30 @@ def test_a_sensor_that_fails_ends_its_episodes(said: Callable[..., Any], words: 
     assert (found.traceback != "") == (found.errors[0] != "")
 
 
+def test_a_sensor_under_the_key_of_the_other_kind_is_refused() -> None:
+    given = drives()
+    truth = given.learning.truth
+    with pytest.raises(KnowledgeError, match="A sensor of λ is a `ground`"):
+        learning(given.problem, truth, sensor=Probe(1.0), law=ALIKE)
+    sees = learning(given.problem, truth, ground=Near())
+    found = given.run(astar_dwa(), sees)
+    assert all("A sensor of that is a `sensor`" in error for error in found.errors)
+    # What senses both may stand under either.
+    both = Wrong(
+        lambda field: Sensed(
+            traversability=field, std=torch.full_like(field, 0.1), appearance=looks_of(truth, field)
+        )
+    )
+    assert learning(given.problem, truth, sensor=both, law=ALIKE, predict=lambda t, o: t.truth)
+    found = given.run(astar_dwa(), learning(given.problem, truth, ground=both), enough=lambda step: step == 6)
+    assert set(found.errors) == {""}
+
+
+def looks_of(truth: Truth, field: Tensor) -> Any:
+    moment = Moment(KEYS, 0)
+    return Full().sense(truth.terrain, field, torch.zeros(len(field), 3), moment).appearance
+
+
 @pytest.mark.parametrize("call", ["update", "at", "changed"])
 def test_a_belief_that_fails_ends_its_episodes(call: str) -> None:
     class Broken(Copula):
@@ -366,7 +390,7 @@ def test_a_belief_whose_cells_are_none_is_to_blame_itself(said: str) -> None:
     class Misfit(Copula):
         def at(self, state: Any, cells: Tensor) -> Any:
             found = super().at(state, cells)
-            return self.distribution(state) if said == "shape" else _NoMean(found.values, found.levels)
+            return self.distribution(state) if said == "shape" else _NoMean(found.below)
 
     given = drives(belief=Misfit())
     found = given.run(astar_dwa(), given.learning)
@@ -375,7 +399,7 @@ def test_a_belief_whose_cells_are_none_is_to_blame_itself(said: str) -> None:
     assert all(expected in error for error in found.errors), found.errors[0]
 
 
-class _NoMean(QuantileDistribution):
+class _NoMean(TabulatedDistribution):
     """Has an expected time, by which risk is told, and no mean, by which ground is free."""
 
     def mean(self) -> Tensor:
