@@ -25,6 +25,8 @@ def test_cost_to_go_equals_networkx_on_each_map_of_a_batch(seed: int) -> None:
     shape, batch = (9, 7), 4
     costs = generator.uniform(0.1, 3, (batch, len(gridgraph.neighbour_pairs(*shape)[0])))
     costs[generator.random(costs.shape) < 0.45] = np.inf
+    # Nothing leaves one cell.
+    costs[1:, gridgraph.neighbour_pairs(*shape)[0] == 30] = np.inf
     goals = generator.random((batch, *shape)) < 0.04
     goals[0] = False
     cost, following = gridgraph.cost_to_go(costs, goals, shape)
@@ -42,6 +44,20 @@ def test_cost_to_go_equals_networkx_on_each_map_of_a_batch(seed: int) -> None:
                 assert expected[cell] == pytest.approx(edge[cell, onward] + expected[onward])
             else:
                 assert onward == gridgraph.NO_CELL
+
+
+def test_a_map_has_the_same_paths_in_any_batch_where_many_cost_the_same() -> None:
+    shape = (9, 7)
+    length = gridgraph.neighbour_pairs(*shape)[2]
+    costs = length * np.array([1.0, 2.0, 1.0])[:, None]
+    goals = np.zeros((3, *shape), bool)
+    goals[[0, 0, 1, 2, 2], [4, 8, 1, 4, 8], [3, 0, 6, 3, 0]] = True
+    cost, following = gridgraph.cost_to_go(costs, goals, shape)
+    assert np.array_equal(cost[0], cost[2])
+    for b in range(3):
+        alone = gridgraph.cost_to_go(costs[b : b + 1], goals[b : b + 1], shape)
+        assert np.array_equal(cost[b], alone[0][0])
+        assert np.array_equal(following[b], alone[1][0])
 
 
 def test_every_cell_has_its_neighbours() -> None:
