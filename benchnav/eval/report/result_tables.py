@@ -138,7 +138,7 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
         (
             *(reading_name(name, str(row[name])) for name in labels),
             *(f"{row[f'{name}_mean']:.0f}" for name in ("seen_cells", "sensed_cells", "revisions")),
-            *(f"{row[f'{name}_mean']:.3f}" for name in ("ahead_rmse", "ahead_log_score")),
+            *(_number(row[f"{name}_mean"]) for name in ("ahead_rmse", "ahead_log_score")),
             *(_times(row[name]) for name in ("learning_ms_mean", "planning_ms_median")),
         )
         for row in learnt.to_dict("records")
@@ -246,6 +246,10 @@ def _results(row: Mapping[Any, Any]) -> dict[str, str]:
         IN_BATCH: _times(row["planning_ms_median"], row["planning_ms_p95_median"]) + compiled,
         "failures": failures_in_words(row),
     }
+
+
+def _number(value: float) -> str:
+    return NOT_USED if np.isnan(value) else f"{value:.3f}"
 
 
 def _times(*values: float) -> str:

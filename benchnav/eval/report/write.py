@@ -320,7 +320,7 @@ def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
     data, models = (joined(summary[name].unique()) or NOT_USED for name in ("data", "model"))
     lines.append(f"Data: {data}. Models: {models}. Seeds: {joined(map(str, seeds))}.")
     if summary["revisions_mean"].notna().any():
-        known = (f"{kind} {joined(summary[kind].unique())}" for kind in KNOWLEDGE)
+        known = (f"{kind} {joined(summary[kind].unique()) or NOT_USED}" for kind in KNOWLEDGE)
         lines.append(f"What robots know by: {'; '.join(known)}.")
     if len(summary[["n_episodes", "n_maps", "n_groups"]].drop_duplicates()) == 1:
         maps = maps_in_words(summary["n_maps"][0], summary["n_groups"][0])

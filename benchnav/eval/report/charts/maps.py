@@ -181,8 +181,17 @@ def _draw_predicted(panel: Axes, recording: Recording) -> None:
         closed = np.where(free, np.nan, 1.0)
         show_map(panel, closed, recording.grid.extent_m, cmap=ListedColormap([CLOSED]))
         _name_ground(panel, "not free", color=CLOSED)
-    blind = recording.about["model"] == NOT_USED
-    panel.set_title("true E[λ]; the planner uses no map" if blind else "λ̂ given to the planner")
+    title = "λ̂ given to the planner"
+    if recording.about["model"] == NOT_USED:
+        title = "true E[λ]; the planner uses no map"
+    elif recording.known:
+        title = "λ̂ known by then"
+    elif (recording.about.get("sensor", "full"), recording.about.get("belief", "static")) != (
+        "full",
+        "static",
+    ):
+        title = "λ̂ at the start"  # what was learnt was not recorded
+    panel.set_title(title)
     words = "driven; above in the colour of the observed λ"
     draw_edged(panel, recording.track[: recording.now + 1], 1.4, label=words)
 

@@ -239,9 +239,11 @@ def test_the_legend_names_layers_that_are_there() -> None:
 
 def test_whose_map_of_λ_it_is_stands_above_it() -> None:
     blind = {"planner": "straight", "model": "–", "risk": "–"}
-    *_, given, none = shown(trajectory_figure([recording(), recording(**blind)]))
+    learns = recording(belief="copula", ground="probe:1")
+    *_, given, none, first = shown(trajectory_figure([recording(), recording(**blind), learns]))
     assert given.get_title() == "λ̂ given to the planner"
     assert none.get_title() == "true E[λ]; the planner uses no map"
+    assert first.get_title() == "λ̂ at the start"
 
 
 def test_an_episode_that_ended_at_once_can_be_drawn(tmp_path: Path) -> None:
