@@ -15,7 +15,6 @@ from benchnav.core import rng
 from benchnav.core.copula import correlated_normal
 from benchnav.core.terrain import Terrain
 from benchnav.planning import AStarDWA, Moment, Probe, Sensed
-from benchnav.planning.free_space import Rules
 from benchnav.planning.robots import steps_in
 
 
@@ -52,7 +51,10 @@ class Revising(AStarDWA):
     """A\\*+DWA that revises its plan as often as a robot that learns, though nothing is learnt."""
 
     def plan(self, step: Any, plan_state: Any) -> Any:
-        problem, every = plan_state.problem, steps_in(Rules().replan_every_s, plan_state.problem.dt_s)
+        problem, every = (
+            plan_state.problem,
+            steps_in(plan_state.problem.task.rules.replan_every_s, plan_state.problem.dt_s),
+        )
         if round(step.time_s / problem.dt_s) % every == 0:
             problem = replace(problem, start=step.state)
             # Maps are searched that have changed: all have, if all ground was of the other kind.

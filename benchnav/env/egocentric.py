@@ -95,11 +95,12 @@ class EgocentricEnv(OffRoadEnv):
     | 5 …   | [−1, 1] | what the robot's state has beyond (x, y, θ), such as velocities: x / (1 + \\|x\\|) |
 
     ## What is known
-    As in `benchnav-eval`: sensors look and sense at each step, from the start on. Every `replan_every_s` the model
-    predicts from what was seen, the belief is told what was sensed, and λ̂ and spread change. The noise of sensors is
-    the episode's own, so that the same seed gives the same. A belief that learns from λ, such as `"copula"`, needs a
-    world in which λ stays what it is, such as `"stakes"`. What is believed of unseen ground is what the checkpoint
-    knows of its training maps; for privileged models it is what the dataset or its recipe brings.
+    As in `benchnav-eval`: a belief that learns has λ sensed at each step. The sensor of appearance looks at the start
+    and every `replan_every_s`. Then the model predicts from what was seen, the belief is told what was sensed, and λ̂
+    and spread change. The noise of sensors is the episode's own, so that the same seed gives the same. A
+    belief that learns from λ, such as `"copula"`, needs a world in which λ stays what it is, such as `"stakes"`. What
+    is believed of unseen ground is what the checkpoint knows of its training maps; for privileged models it is what
+    the dataset or its recipe brings.
 
     ## Reward, world, start, end and info
     As of `benchnav/OffRoad-v0`, see `OffRoadEnv`.

@@ -1,6 +1,6 @@
 """What the robots of an environment know of the ground, and how they learn on their way.
 
-A shell over `benchnav.planning.sensing.knowledge`, by which robots learn in evaluations too: sensors sense at each
+A shell over `benchnav.planning.sensing.knowledge`, by which robots learn in evaluations too: λ is sensed at each
 step, and what is known is updated every `replan_every_s` of an episode. Here episodes begin at different times. Letters
 in shapes: B episodes, M of them, S state dimensions, H×W cells, N cells of all maps together.
 """
@@ -115,12 +115,8 @@ class Experience:
             return
         truth, (before, _) = replace(self._truth, field=field), self._current()
         due = which & (step % self._every == 0)
-        after = self._learner.sense(before, truth, state, step.tolist(), due)
-        # Others have sensed in this step before, or have ended.
-        sensed = map_tensors(
-            after.sensed, lambda new, old: torch.where(which[:, None, None], new, old), before.sensed
-        )
-        self._knowledge = replace(after, sensed=sensed)
+        after = self._learner.sense(before, truth, state, step.tolist(), due, which)
+        self._knowledge = after
         if bool(due.any()):
             self._update(due, truth)
 

@@ -20,7 +20,8 @@ from benchnav.planning.free_space import cells_at_goal
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import steps_in
 from benchnav.planning.sensing.belief import Fields
-from benchnav.planning.sensing.knowledge import Knowledge, Learner, Truth
+from benchnav.planning.sensing.knowledge import Knowledge, Learner, Truth, call
+from benchnav.planning.world.outcome import Outcome
 
 _LEAST_CHANGE = 0.02  # of λ̂ somewhere on a map, for which its planner is told
 _LEAST_LOG_SCORE = -10.0  # of λ that was held impossible
@@ -101,14 +102,15 @@ class Knowing:
         # To draw λ of all cells takes long, and between updates only a belief that learns is told any.
         if how.field_at is not None and (due or how.learner.belief.learns):
             self._truth = replace(self._truth, field=how.field_at(step)[self.members])
-        looks = torch.full_like(running, due)
-        self.known = how.learner.sense(self.known, self._truth, robot_state, step, looks)
+        # Who has ended senses nothing more, whenever it leaves the batch.
+        looks = running if due else torch.zeros_like(running)
+        self.known = how.learner.sense(self.known, self._truth, robot_state, step, looks, running)
+        self.seen_cells[self.members] = self.known.seen.flatten(1).sum(1)
+        self.sensed_cells[self.members] = self.known.ever_sensed.flatten(1).sum(1)
         if not due:
             return None
         known, changed = how.learner.update(self.known, self._truth)
         self.known = known
-        self.seen_cells[self.members] = known.seen.flatten(1).sum(1)
-        self.sensed_cells[self.members] = known.ever_sensed.flatten(1).sum(1)
         return self._told(robot_state, running) if bool(changed.any()) else None
 
     def _told(self, robot_state: Tensor, running: Tensor) -> Problem | None:
@@ -123,7 +125,14 @@ class Knowing:
         which, places = told[:, None, None], told.nonzero()[:, 0]
         fields = before.fields
         if isinstance(fields, Fields):
-            fields = replace(fields, state=known.believed)
+            belief, believed = self._how.learner.belief, known.believed
+            if not bool((told | ~running).all()):
+                state = fields.state
+                believed = call(
+                    Outcome.BELIEF_ERROR,
+                    lambda: belief.put(state, places, belief.select(known.believed, places)),
+                )
+            fields = replace(fields, state=believed)
         self._problem = replace(
             before,
             # Of other episodes the planner is told nothing, so that none depends on those beside it.

@@ -1,7 +1,8 @@
 """What robots know of their maps: what was seen and sensed, what is believed, and the λ̂ and free ground that follow.
 
-At each step sensors say what is learnt. Now and then the belief is updated with it, after a new prediction where more
-was seen. A `Learner` holds how that is done, a `Knowledge` what is known by now; only sensors are given the `Truth`.
+For a belief that learns λ is sensed at each step. Now and then the robot looks, and the belief is updated, after a new
+prediction where more was seen. A `Learner` holds how that is done, a `Knowledge` what is known by now; only sensors are
+given the `Truth`.
 Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of all maps together.
 """
 
@@ -153,9 +154,8 @@ class Learner:
         memory, observation = None, truth.terrain.observe()
         if not self.sensor.sees_all:
             first = self._look(self.sensor, truth, robot_state, Moment(truth.keys, 0))
-            memory = Memory.none(observation)
-            if first.appearance is not None:
-                memory = remember(memory, first.appearance)
+            assert first.appearance is not None
+            memory = remember(Memory.none(observation), first.appearance)
             observation, prediction = self._predict(memory, truth)
         assert prediction is not None
         prior = prediction
@@ -183,11 +183,18 @@ class Learner:
         return call(Outcome.BELIEF_ERROR, lambda: self.belief.init(prediction.clone(), self.law))
 
     def sense(
-        self, known: Knowledge, truth: Truth, robot_state: Tensor, step: int | Sequence[int], looks: Tensor
+        self,
+        known: Knowledge,
+        truth: Truth,
+        robot_state: Tensor,
+        step: int | Sequence[int],
+        looks: Tensor,
+        feels: Tensor,
     ) -> Knowledge:
         """Adds what is sensed in a step, and what is seen where a robot looks.
 
-        To look at each step tells hardly more than to look when what is known is updated, and takes far longer.
+        To look at each step tells hardly more than to look when what is known is updated, and takes far longer. A
+        belief that does not learn is told no λ.
 
         Args:
             known: by now; not changed.
@@ -195,14 +202,17 @@ class Learner:
             robot_state: shape [B, S].
             step: steps taken so far, in all episodes or in each, B of them.
             looks: in which episodes the sensor of appearance is asked, bool, shape [B].
+            feels: in which episodes that of the ground is asked, bool, shape [B].
+
+        Returns:
+            What is known, of B episodes.
 
         Raises:
             KnowledgeError: a sensor raised, or gave what is none.
         """
         moment = Moment(truth.keys, step)
         known = replace(known, reached=torch.zeros_like(known.reached))
-        every = torch.ones_like(looks)
-        for sensor, asked in ((self.sensor, looks), (self.ground, every if self.belief.learns else ~every)):
+        for sensor, asked in ((self.sensor, looks), (self.ground, feels & self.belief.learns)):
             if sensor.sees_all or not bool(asked.any()):
                 continue
             new, told = self._look(sensor, truth, robot_state, moment), asked[:, None, None]
@@ -338,16 +348,10 @@ class Learner:
             if not type(sensor).__module__.startswith("benchnav."):
                 given = truth.terrain.clone(), truth.field.clone(), robot_state.clone()
             found = self._checked(sensor.sense(*given, moment), truth.field)
-            if sensor is self.sensor:
-                expect(
-                    found.appearance is not None,
-                    "`Sensed.appearance` from a sensor of appearance, got none. A sensor of λ is a `ground`.",
-                )
-            else:
-                expect(
-                    found.appearance is None or bool(found.mask.any()),
-                    "λ from a sensor of the ground, got appearance alone. A sensor of that is a `sensor`.",
-                )
+            expect(
+                sensor is not self.sensor or found.appearance is not None,
+                "`Sensed.appearance` from a sensor of appearance, got none. A sensor of λ is a `ground`.",
+            )
             return found
 
         return call(Outcome.SENSOR_ERROR, look)

@@ -354,9 +354,6 @@ def test_a_sensor_under_the_key_of_the_other_kind_is_refused() -> None:
     truth = given.learning.truth
     with pytest.raises(KnowledgeError, match="A sensor of λ is a `ground`"):
         learning(given.problem, truth, sensor=Probe(1.0), law=ALIKE)
-    sees = learning(given.problem, truth, ground=Near())
-    found = given.run(astar_dwa(), sees)
-    assert all("A sensor of that is a `sensor`" in error for error in found.errors)
     # What senses both may stand under either.
     both = Wrong(
         lambda field: Sensed(
@@ -564,6 +561,18 @@ def test_what_an_episode_learns_depends_on_no_other(planner: Any) -> None:
         assert alone.ahead is not None
         assert whole.ahead is not None
         torch.testing.assert_close(alone.ahead, whole.ahead[members], atol=1e-4, rtol=0, equal_nan=True)
+
+
+def test_who_has_ended_senses_nothing_more_whenever_it_leaves_the_batch() -> None:
+    given = drives(ground=Probe(1.5))
+    whole = given.run(astar_dwa(), given.learning)
+    first = int(whole.steps.argmin())
+    part = part_of(given, [first])
+    alone = part.run(astar_dwa(), part.learning)
+    assert int(whole.steps[first]) == int(alone.steps) < int(whole.steps.max()) - 5
+    assert whole.sensed_cells is not None
+    assert alone.sensed_cells is not None
+    assert int(alone.sensed_cells) == int(whole.sensed_cells[first])
 
 
 def test_planners_are_told_nothing_of_episodes_whose_map_stays() -> None:
