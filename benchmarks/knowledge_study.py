@@ -17,19 +17,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 import yaml
 from matplotlib.figure import Figure
-from scipy.spatial.distance import cdist
 from scipy.stats import norm
 
-from benchnav.core import rng
 from benchnav.core.figures import (
     LINE_COLOURS,
     MARKERS,
@@ -39,14 +35,10 @@ from benchnav.core.figures import (
     save,
     styled,
 )
-from benchnav.core.grid import Grid
 from benchnav.core.tables import Table, to_markdown
 from benchnav.datagen import TerrainDataset
-from benchnav.datagen.files.hdf5 import ShardFile, pack, recipe_entry
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.write import read_report
-from benchnav.planning.world.realisation import MOST_ATTEMPTS, joined
-from benchnav.planning.world.world import PRESETS, Places
 
 ROOT = Path(__file__).parents[1]
 SUITES, PAGE, FIGURE = (
@@ -57,7 +49,6 @@ SUITES, PAGE, FIGURE = (
 SPLIT = "test/std"
 PARTS = ("primary", "known", "known-mppi", "near", "sensitivity", "kernel", "seen")
 DEVELOPMENT, DEVELOPED = "stakes-v1-seed1", "knowledge-developed"
-MATERN, MATERN_M, MATERN_MAPS = "-matern", 1.5, 100
 ALPHA = 0.05
 # What is known, by sensor of the ground and belief, from nothing to all.
 KNOWN = {
@@ -95,51 +86,6 @@ def make_maps(maps_in: Path) -> None:
         if found != about["digest"]:
             sys.exit(f"Expected maps of digest {about['digest']} in {path}, got {found}.")
         print(f"{name}: {found}")
-        target = path.with_stem(f"{path.stem}{MATERN}")
-        if (
-            yaml.safe_load((SUITES / "kernel.yaml").read_text())["data"] == target.stem
-            and not target.exists()
-        ):
-            target.write_bytes(with_matern(TerrainDataset(path)))
-            print(f"{target.stem}: {TerrainDataset(target).splits[SPLIT]['digest']}")
-
-
-def with_matern(dataset: TerrainDataset) -> bytes:
-    """The file of a dataset's first maps with λ whose normal scores have a Matérn kernel of ν = 3/2."""
-    which, grid = range(MATERN_MAPS), dataset.grid
-    maps, terrain = dataset.read(SPLIT, which), dataset.terrain(SPLIT, which)
-    places = Places(
-        **{name: torch.from_numpy(maps[name]) for name in ("start_m", "goal_m", "reference_time_s")}
-    )
-    factor = np.linalg.cholesky(matern(grid, MATERN_M))
-    immobile = PRESETS["stakes"].world.immobile
-    assert immobile is not None
-    field, pending = torch.zeros_like(terrain.traversability), torch.arange(MATERN_MAPS)
-    for attempt in range(MOST_ATTEMPTS):
-        key = rng.stream_key(0, "matern", attempt)
-        drawn = rng.normal(key, pending.numpy(), (grid.height * grid.width,)) @ factor.T
-        scores = torch.from_numpy(drawn).view(-1, *grid.shape).to(field)
-        field[pending] = terrain.truth.select(pending).from_normal(scores)
-        pending = pending[~joined(field[pending] >= immobile.below, grid, places.select(pending))]
-        if len(pending) == 0:
-            break
-    assert len(pending) == 0, "no draw has a feasible path"
-    recipe = dataset.recipe
-    splits = {SPLIT: replace(recipe.splits[SPLIT], maps=MATERN_MAPS)}
-    recipe = replace(recipe, id=f"{recipe.id}{MATERN}", splits=splits)
-    entry = recipe_entry(recipe, ShardFile(SPLIT, 0, MATERN_MAPS))
-    stored = maps["traversability"]
-    return pack(
-        recipe, SPLIT, entry, maps | {"traversability": field.numpy().astype(stored.dtype)}, dataset.fields
-    )
-
-
-def matern(grid: Grid, length_m: float) -> np.ndarray:
-    """Correlations of all cells of a map, (1 + √3 d/ℓ) exp(−√3 d/ℓ), shape [H·W, H·W]."""
-    row, column = np.divmod(np.arange(grid.height * grid.width), grid.width)
-    centres = grid.resolution_m * np.stack((row, column), axis=1)
-    far = np.sqrt(3) / length_m * cdist(centres, centres)
-    return (1 + far) * np.exp(-far) + 1e-9 * np.eye(len(far))
 
 
 # --- runs -------------------------------------------------------------------------------------------

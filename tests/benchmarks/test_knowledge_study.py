@@ -1,15 +1,12 @@
 """The study of knowledge: its suites, its maps, its power and its figure."""
 
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 from scipy.stats import norm
-from sklearn.gaussian_process.kernels import Matern
 
 from benchmarks import knowledge_study
 from benchmarks.knowledge_study import (
@@ -19,22 +16,15 @@ from benchmarks.knowledge_study import (
     SUITES,
     knowledge_figure,
     known_of,
-    matern,
     power_of,
     suite_of,
-    with_matern,
 )
-from benchnav.core.grid import Grid
 from benchnav.core.settings import of, read
-from benchnav.core.terrain import Terrain
 from benchnav.datagen import TerrainDataset
-from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.eval.experiment.condition import Condition, conditions_of
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent
-from benchnav.planning.world.realisation import joined
-from benchnav.planning.world.world import Places
 from tests import factories
 
 RUNNABLE = [part for part in PARTS if part != "near"]  # whose models are shipped
@@ -102,7 +92,6 @@ def test_maps_of_another_digest_are_refused(tmp_path: Path, monkeypatch: pytest.
     place = factories.tiny_dataset(tmp_path / "maps" / "tiny.h5")
     folder = tmp_path / "suites"
     folder.mkdir()
-    (folder / "kernel.yaml").write_text("data: none")
     monkeypatch.setattr(knowledge_study, "SUITES", folder)
     digest = TerrainDataset(place).splits["test/std"]["digest"]
     for given in (digest, "0" * 64):
@@ -112,50 +101,6 @@ def test_maps_of_another_digest_are_refused(tmp_path: Path, monkeypatch: pytest.
         else:
             with pytest.raises(SystemExit, match=f"{'0' * 64} in .*, got {digest}"):
                 knowledge_study.make_maps(place.parent)
-
-
-@pytest.mark.parametrize("length_m", [0.5, 1.5])
-def test_the_kernel_is_materns(length_m: float) -> None:
-    grid = Grid(5, 7, 0.5)
-    row, column = np.divmod(np.arange(35), 7)
-    expected = Matern(length_m, nu=1.5)(0.5 * np.stack((row, column), 1))
-    np.testing.assert_allclose(matern(grid, length_m), expected, atol=1e-8)
-
-
-def test_maps_with_materns_field_have_all_else_and_a_feasible_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = load_recipe("stakes-v1")
-    assert whole.places is not None
-    places, splits = replace(whole.places, least_distance_m=10), {"test/std": whole.splits["test/std"]}
-    splits = {name: replace(split, maps=6) for name, split in splits.items()}
-    few = replace(whole, height=28, width=48, places=places, splits=splits)
-    dataset = TerrainDataset(factories.tiny_dataset(tmp_path / "few.h5", few))
-    monkeypatch.setattr(knowledge_study, "MATERN_MAPS", 5)
-    path = tmp_path / "few-matern.h5"
-    path.write_bytes(with_matern(dataset))
-    made = TerrainDataset(path)
-    before, after = (each.terrain("test/std", range(5)) for each in (dataset, made))
-    assert made.splits["test/std"]["maps"] == 5
-    assert made.truth_of("test/std") == "generated"
-    assert torch.equal(before.rgb, after.rgb)
-    assert torch.equal(before.truth.means, after.truth.means)
-    assert not torch.equal(before.traversability, after.traversability)
-    found = made.read("test/std", None, ["start_m", "goal_m", "reference_time_s"])
-    told = Places(**{name: torch.from_numpy(values) for name, values in found.items()})
-    assert bool(joined(after.traversability >= 0.1, made.grid, told).all())
-    smooth, rough = (beside(each) for each in (before, after))
-    # A little less than the kernel says, since scores beyond λ of 0 and 1 are not told.
-    assert rough == pytest.approx(matern(Grid(3, 3, 0.5), 1.5)[0, 1], abs=0.1)
-    assert rough < smooth - 0.03
-
-
-def beside(terrain: Terrain) -> float:
-    """Correlation of the normal scores of neighbouring cells, where both are numbers."""
-    low, high = terrain.truth.to_normal(terrain.traversability)
-    inside = (high - low).abs() < 1e-3
-    both = inside[..., 1:] & inside[..., :-1]
-    return float(np.corrcoef(low[..., 1:][both], low[..., :-1][both])[0, 1])
 
 
 @pytest.mark.parametrize(
