@@ -46,6 +46,11 @@ class GroundStatistics:
             "as many `weights` as `means` and `stds`, got "
             f"{len(self.weights)}, {len(self.means)} and {len(self.stds)}.",
         )
+        expect(
+            min(self.weights) >= 0 and abs(sum(self.weights) - 1) < 1e-3,
+            f"`weights` ≥ 0 that sum to 1, got {self.weights}.",
+        )
+        expect(min(self.stds) >= 0, f"`stds` ≥ 0, got {self.stds}.")
 
     def mixture(self, shape: Sequence[int], like: torch.Tensor) -> TraversabilityMixture:
         """The mixture in each cell of maps.
@@ -76,7 +81,7 @@ class GroundStatistics:
             about: dict[str, Any] = json.loads(text)
             found = about.pop("format", None)
             expect(found == FORMAT, f"ground statistics of the format {FORMAT}, got {found!r}.")
-            return cls(
+            made = cls(
                 weights=tuple(about["weights"]),
                 means=tuple(about["means"]),
                 stds=tuple(about["stds"]),
@@ -84,6 +89,13 @@ class GroundStatistics:
                 look_alikes=tuple((one, other) for one, other in about["look_alikes"]),
                 potts_strength=about["potts_strength"],
             )
+            channels = {name: len(values) for name, values in made.layer_means.items()}
+            wanted = {"rgb": 3, "elevation_m": 1, "slope_deg": 1}
+            expect(
+                wanted.items() <= channels.items(),
+                f"`layer_means` of so many channels: {wanted}, got {channels}.",
+            )
+            return made
         except ConfigError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError) as error:

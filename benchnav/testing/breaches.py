@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import find_tensor_fault
 from benchnav.core.errors import BenchnavError, ConfigError
-from benchnav.planning.planners.boundary import find_tensor_fault
 
 SEED = 20240229
 NOTHING = object()  # what a call that raised has answered

@@ -143,7 +143,8 @@ def check_risk(measure: Any, device: torch.device | str = "cpu", tolerance: floa
     """Tries whether a risk measure keeps the contract, on mixtures of one component and of three, and on quantiles.
 
     The contract: λ̂ in [0, 1] of shape [B, H, W], floating-point, on the distribution's device; the same when asked
-    again, and for a map alone what it is in a batch; the distribution and the global generators left as they were. A
+    again, for a map alone what it is in a batch, and for some cells what it is on the map, since robots that learn ask
+    for those alone of which something else is believed; the distribution and the global generators left as they were. A
     measure that needs a mixture, or classes, refuses other distributions by a ConfigError that names their class.
 
     Args:
@@ -173,6 +174,16 @@ def _try_measure(
     like = torch.zeros(1, dtype=distribution.dtype, device=distribution.device)
     is_map, given = breaches.is_tensor("λ̂", like, distribution.shape), {"distribution": distribution}
     breaches.try_function("risk", partial(risk.apply, measure), given, is_map, tolerance)
+    cells = torch.zeros(distribution.shape, dtype=torch.bool, device=distribution.device)
+    cells[0, ::2], cells[2, 1] = True, True
+    try:
+        alone, whole = measure(distribution.at(cells)), measure(distribution)[cells]
+    except Exception:
+        return  # which is noted where it is tried
+    breaches.expect(
+        same(alone, whole[None], tolerance),
+        "Expected for some cells alone what λ̂ is on the map, got another.",
+    )
 
 
 def _refuses_by_name(measure: Any, distribution: TraversabilityDistribution) -> bool:

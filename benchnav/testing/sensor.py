@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from benchnav.core import registry
-from benchnav.core.batch import Batch
+from benchnav.core.batch import Batch, find_tensor_fault
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
-from benchnav.planning.planners.boundary import find_tensor_fault
 from benchnav.planning.sensing.sensor import LEAST_STD, Appearance, Moment, Sensed, Sensor
 from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
 

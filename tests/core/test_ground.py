@@ -10,7 +10,7 @@ GROUND = GroundStatistics(
     weights=(0.25, 0.75),
     means=(0.2, 0.7),
     stds=(0.1, 0.05),
-    layer_means={"rgb": (1.0, 2.0, 3.0), "slope_deg": (4.0,)},
+    layer_means={"rgb": (1.0, 2.0, 3.0), "elevation_m": (0.5,), "slope_deg": (4.0,)},
     look_alikes=(("a", "b"),),
     potts_strength=1.5,
 )
@@ -36,6 +36,9 @@ def test_the_mixture_is_the_same_in_every_cell() -> None:
         ('{"format": "other"}', "'other'"),
         ('{"format": "benchnav-ground-1"}', "'weights'"),
         (json.dumps(json.loads(GROUND.to_json()) | {"stds": [1.0]}), "2, 2 and 1"),
+        (json.dumps(json.loads(GROUND.to_json()) | {"stds": [1.0, -1.0]}), "`stds` ≥ 0"),
+        (json.dumps(json.loads(GROUND.to_json()) | {"weights": [0.3, 0.3]}), "sum to 1"),
+        (json.dumps(json.loads(GROUND.to_json()) | {"layer_means": {"rgb": [1.0]}}), "so many channels"),
     ],
 )
 def test_what_is_no_statistics_is_refused_in_one_line(text: str, named: str) -> None:

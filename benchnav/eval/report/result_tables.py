@@ -79,6 +79,11 @@ _LEARNT = {
     "belief [ms]": "time of a step for sensing and belief, of a batch divided by its episodes.",
     "planning [ms]": "time of a step for planning, likewise: median over steps.",
 }
+_TO_FULL = {
+    "Succ. to full [points]": "success less that of the same condition with the sensor `full`; "
+    "`compare --by sensor --against full` has the interval and the test.",
+    "T_total to full [s]": "mean T_total less that of the same condition with the sensor `full`.",
+}
 _MOST_ACROSS = 3
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -134,16 +139,20 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
         return None
     learnt = summary[summary["revisions_mean"].notna()]
     labels = [name for name in LABELS if name in (*_ALWAYS, "ground", "belief") or differ(summary[name])]
+    full = {_but_sensor(row): row for row in summary.to_dict("records") if row["sensor"] == "full"}
+    partly = [row for row in learnt.to_dict("records") if row["sensor"] != "full"]
+    compared = any(_but_sensor(row) in full for row in partly)
     rows = [
         (
             *(reading_name(name, str(row[name])) for name in labels),
             *(f"{row[f'{name}_mean']:.0f}" for name in ("seen_cells", "sensed_cells", "revisions")),
             *(_number(row[f"{name}_mean"]) for name in ("ahead_rmse", "ahead_log_score")),
             *(_times(row[name]) for name in ("learning_ms_mean", "planning_ms_median")),
+            *(_lost(row, full.get(_but_sensor(row))) if compared else ()),
         )
         for row in learnt.to_dict("records")
     ]
-    explained = {name: _COLUMNS[name] for name in labels} | _LEARNT
+    explained = {name: _COLUMNS[name] for name in labels} | _LEARNT | (_TO_FULL if compared else {})
     return Table(
         headings=tuple(explained),
         labels=len(labels),
@@ -151,6 +160,19 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
         explained=tuple(explained.items()),
         title="What robots learnt on their way",
     )
+
+
+def _but_sensor(row: Mapping[Any, Any]) -> tuple[str, ...]:
+    """What a condition is beside its sensor of appearance."""
+    return tuple(str(row[name]) for name in LABELS if name != "sensor")
+
+
+def _lost(row: Mapping[Any, Any], full: Mapping[Any, Any] | None) -> tuple[str, str]:
+    """Success in points and T_total in seconds, less those of a robot that sees all."""
+    if full is None or row["sensor"] == "full":
+        return NOT_USED, NOT_USED
+    success = 100 * (row["success_rate"] - full["success_rate"])
+    return f"{success:+.1f}", f"{row['total_time_mean_s'] - full['total_time_mean_s']:+.1f}"
 
 
 def paper_table(summary: pd.DataFrame, label: str) -> str:

@@ -90,6 +90,9 @@ class ClassesState(Batch):
 class Classes(Belief[ClassesState]):
     """Learns which of two look-alike classes the ground is of, and its λ within the class.
 
+    Approximate are the noise of an observation that is a number under one class and an interval under the other, which
+    is that of the first where labels are weighed, and in drawn fields the skewness under the less probable class.
+
     Args:
         correlation_m: ℓ that is believed, as of `Copula`.
         window: most observations that an update looks at, as of `Copula`.
@@ -169,7 +172,7 @@ class Classes(Belief[ClassesState]):
 
     def distribution(self, state: ClassesState) -> TraversabilityDistribution:
         """The average over the classes of a cell, each given what was observed."""
-        if not bool((state.pair > 0).any()):
+        if not statistics_of(state.copula.law).look_alikes:
             return self._copula.distribution(state.copula)
         dtype, first = state.copula.prior.dtype, state.probability()
         moments = [values.to(dtype) for values in _moments(state)]

@@ -396,3 +396,25 @@ def test_what_robots_learnt_stands_in_a_table_of_its_own() -> None:
     assert [shown[name] for name in means] == ["4096", "200", "16", "0.200", "0.500", "3", "1"]
     assert [heading for heading, _ in table.explained] == list(table.headings)
     assert learning_table(made.summary(made.rows(made.row(made.condition("mppi", "mean"))))) is None
+
+
+def test_what_is_lost_to_a_robot_that_sees_all_stands_beside_what_it_learnt() -> None:
+    def rows(sensor: str, *times_s: float | None, **labels: str) -> list[dict[str, object]]:
+        condition = made.condition("astar_dwa", "mean", sensor=sensor, **labels)
+        learnt = {} if sensor == "full" and not labels else {"revisions": 3.0, "seen_cells": 9.0}
+        return [made.row(condition, place, time_s, **learnt) for place, time_s in enumerate(times_s)]
+
+    learns = {"ground": "probe:1", "belief": "copula"}
+    episodes = made.rows(
+        rows("full", 10.0, 20.0),
+        rows("near:4", 30.0, None),
+        rows("full", 10.0, 12.0, **learns),
+        rows("near:8", 10.0, 10.0, ground="contact", belief="copula"),
+    )
+    table = learning_table(made.summary(episodes))
+    assert table is not None
+    lost = {
+        row[table.headings.index("sensor")] + row[table.headings.index("belief")]: row[-2:]
+        for row in table.rows
+    }
+    assert lost == {"near:4static": ("-50.0", "+50.0"), "fullcopula": ("–", "–"), "near:8copula": ("–", "–")}
