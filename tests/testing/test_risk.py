@@ -41,6 +41,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "no number": (changed(lambda mean, _: mean * torch.nan), "λ̂ in [0, 1]"),
     "slip": (changed(lambda mean, m: (m.stds[:, 0] > 0) / mean.new_zeros(())), "λ̂ in [0, 1]"),
     "λ̂ of the batch": (changed(lambda mean, _: mean / (1 + mean.mean())), "the same from `risk` for one alone"),
+    "λ̂ of the neighbours": (changed(lambda mean, _: (mean + mean.roll(1, -1)) / 2), "for some cells alone"),
     "another λ̂": (Forgetful(), "Expected the same from `risk` when asked again"),
     "writes into the mixture": (changed(lambda mean, m: [m.means.zero_()] and mean), "got another distribution"),
     "PyTorch's generator": (changed(lambda mean, _: mean + 0 * torch.rand(1)), "PyTorch's global generator"),
