@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core import registry
+from benchnav.core.batch import map_tensors
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
@@ -177,11 +178,12 @@ def _try_measure(
     cells = torch.zeros(distribution.shape, dtype=torch.bool, device=distribution.device)
     cells[0, ::2], cells[2, 1] = True, True
     try:
-        alone, whole = measure(distribution.at(cells)), measure(distribution)[cells]
+        given = map_tensors(distribution.at(cells), lambda values: values[None])
+        alone, whole = measure(given), measure(distribution)[cells]
     except Exception:
         return  # which is noted where it is tried
     breaches.expect(
-        same(alone, whole[None], tolerance),
+        same(alone, whole[None, None], tolerance),
         "Expected for some cells alone what λ̂ is on the map, got another.",
     )
 

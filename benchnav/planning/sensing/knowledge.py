@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core import rng
-from benchnav.core.batch import Batch, find_tensor_fault
+from benchnav.core.batch import Batch, find_tensor_fault, map_tensors
 from benchnav.core.chosen import choose
 from benchnav.core.device import GPU_FAULTS
 from benchnav.core.distribution import TraversabilityDistribution
@@ -324,7 +324,8 @@ class Learner:
     def _inferred(self, known: Knowledge, changed: Tensor) -> Knowledge:
         """Tells λ̂ and what is free of the cells of which something else is believed."""
         believed = self.at(known, changed)
-        found = call(Outcome.MODEL_ERROR, lambda: risk.apply(self.measure, believed))
+        one = map_tensors(believed, lambda values: values[None])  # a batch, as measures are given
+        found = call(Outcome.MODEL_ERROR, lambda: risk.apply(self.measure, one))[0]
         seen = None if known.memory is None else known.memory.seen[changed][None]
         free = call(Outcome.BELIEF_ERROR, lambda: self.rules.free(found, believed, seen))
         risk_map, free_map = known.risk_map.clone(), known.free.clone()

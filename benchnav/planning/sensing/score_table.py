@@ -84,7 +84,7 @@ class TabulatedDistribution(TraversabilityDistribution):
         # Where F passes p, of the interval the part before.
         part = low / torch.where(high > 0, 1.0, below.diff(dim=-1).clamp(min=1e-30))
         pieces = torch.where(high > 0, (low + high) / 2, low * part / 2)
-        return (pieces @ step) / tail
+        return ((pieces @ step) / tail).clamp(max=1)  # which rounding may pass
 
     def expected_time(self, floor: float) -> Tensor:
         """E[1 / max(λ, floor)] = 1 + ∫ F / λ² from the floor to 1, shape [*B, H, W]; see the base."""

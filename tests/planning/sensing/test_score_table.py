@@ -35,3 +35,16 @@ def test_means_of_all_kinds_are_those_of_draws(floor: float) -> None:
     assert torch.allclose(law.cvar(0.8)[0, 0], worst, atol=5e-4, rtol=0)
     times = (1 / drawn.clamp(min=floor)).mean(0)
     assert torch.allclose(law.expected_time(floor)[0, 0], times, rtol=2e-3, atol=0)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.3, 0.5, 0.8, 0.9, 0.95])
+def test_rounding_leaves_λ_between_0_and_1(level: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    shares = torch.rand(len(VALUES), 3000, generator=generator).sort(0).values
+    shares[:, :1000] = 0  # sure of 1
+    shares[:-1, 1000:2000] *= 1e-6
+    law = TabulatedDistribution(shares[None, :, None])
+    for found in (law.cvar(level), law.mean()):
+        assert found.dtype == torch.float32
+        assert float(found.min()) >= 0
+        assert float(found.max()) <= 1
