@@ -93,7 +93,7 @@ def test_parts_of_planners() -> None:
     problem = factories.problem(torch.rand(2, 16, 16))
     maps = maps_of(problem)
     same_after(lambda: astar.search(problem), *maps)
-    costs, goals = astar.edge_costs(problem), np.zeros((2, 16, 16), dtype=bool)
+    costs, goals = astar.edge_costs(problem).numpy(), np.zeros((2, 16, 16), dtype=bool)
     same_after(lambda: gridgraph.cost_to_go(costs, goals, (16, 16)), costs, goals)
     mean, noise, target = torch.rand(2, 12, 2), torch.randn(12, 2, 5), problem.goal_m
     same_after(lambda: rollout_cost(problem, problem.start, mean, noise, target), mean, noise, *maps)
