@@ -142,7 +142,7 @@ class Experience:
         """Knowledge and spread after an update."""
         knowledge, changed = self._learner.update(knowledge, truth)
         if bool(changed.any()):
-            spread = spread.index_put((changed,), self._measure.spread[0].to(spread.dtype))
+            spread = spread.index_put((changed,), self._measure.spread.flatten().to(spread.dtype))
         return knowledge, spread
 
     def _begun_on(self, maps: Sequence[int], truth: Truth, state: Tensor) -> tuple[Knowledge, Tensor]:
