@@ -75,7 +75,7 @@ def test_what_needs_a_mixture_says_so_by_name_or_fails_on_quantiles() -> None:
             return risk.mean(given)
         raise ConfigError("Expected something else.")
 
-    assert "Expected something else. (test_risk.py, line 75) [quantiles]" in refusal(check_risk, nameless)
+    assert "Expected something else. (test_risk.py, line 76) [quantiles]" in refusal(check_risk, nameless)
 
 
 @pytest.mark.parametrize("name", registry.names("risk"))

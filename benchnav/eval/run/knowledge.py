@@ -53,8 +53,8 @@ class Knowing:
 
     Attributes:
         revisions: how often each episode's map was changed, int64, shape [B].
-        seen_cells: how many cells each robot saw, int64, shape [B].
-        sensed_cells: of how many cells each sensed λ, int64, shape [B].
+        seen_cells: how many cells each robot saw by its last update, int64, shape [B].
+        sensed_cells: of how many cells each sensed λ by then, int64, shape [B].
         ahead: by step, RMSE of E[λ] and mean log score of the belief over the cells ahead of each robot of which λ was
             not sensed, shape [B, 2]; NaN where there are none.
         known: what is known, of the episodes that are left.
@@ -105,10 +105,11 @@ class Knowing:
         # Who has ended senses nothing more, whenever it leaves the batch.
         looks = running if due else torch.zeros_like(running)
         self.known = how.learner.sense(self.known, self._truth, robot_state, step, looks, running)
-        self.seen_cells[self.members] = self.known.seen.flatten(1).sum(1)
-        self.sensed_cells[self.members] = self.known.ever_sensed.flatten(1).sum(1)
         if not due:
             return None
+        on = self.members[running]
+        self.seen_cells[on] = self.known.seen[running].flatten(1).sum(1)
+        self.sensed_cells[on] = self.known.ever_sensed[running].flatten(1).sum(1)
         known, changed = how.learner.update(self.known, self._truth)
         self.known = known
         return self._told(robot_state, running) if bool(changed.any()) else None

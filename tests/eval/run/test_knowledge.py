@@ -219,14 +219,14 @@ def test_what_was_not_sensed_changes_no_action(
     # Robots met the λ of the cells that they drove on.
     row, column = before.grid.cell_of(first.states[..., 0], first.states[..., 1])
     met = torch.zeros_like(sensed[1]).flatten(1).scatter(1, row * SIZE + column, True).view_as(sensed[1])
-    seen, felt = sensed[0], sensed[1] | met
-    assert bool((~felt).any())
+    seen, known = sensed[0], sensed[1] | met
+    assert bool((~known).any())
     other = made.mixture(len(few), SIZE, SIZE, seed=9)
     # A model that sees all has the true distribution of each cell, and the noise of sensed λ is by it.
-    kept = (seen | felt)[:, None]
+    kept = (seen | known)[:, None]
     after = replace(
         before,
-        traversability=torch.where(felt, before.traversability, 1 - before.traversability),
+        traversability=torch.where(known, before.traversability, 1 - before.traversability),
         truth=replace(
             before.truth,
             weights=torch.where(kept, before.truth.weights, other.weights.float()),
@@ -429,7 +429,7 @@ def test_a_planner_in_a_process_of_its_own_learns_as_one_here() -> None:
 
 def test_a_measure_that_fails_on_what_is_believed_is_a_model_error() -> None:
     def on_whole_maps(distribution: TraversabilityDistribution) -> Tensor:
-        if len(distribution.shape) == 2:
+        if distribution.shape[1] == 1:
             raise ValueError("no tail")
         return measure(distribution)
 

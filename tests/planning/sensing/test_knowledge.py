@@ -78,7 +78,7 @@ def begin(how: Learner) -> Knowledge:
 
 def moved(how: Learner, known: Knowledge, robot_state: Tensor, step: int = 5) -> tuple[Knowledge, Tensor]:
     looks = torch.ones(BATCH, dtype=torch.bool)
-    return how.update(how.sense(known, TRUTH, robot_state, step, looks), TRUTH)
+    return how.update(how.sense(known, TRUTH, robot_state, step, looks, torch.ones_like(looks)), TRUTH)
 
 
 def near(robot_state: Tensor = START) -> Tensor:
@@ -206,7 +206,7 @@ def test_a_sensor_that_looks_and_senses_at_once_does_both_in_the_same_episodes()
 
     how = learner(sensor=Both(), belief=Static())
     two = torch.tensor([True, False, True])
-    known = how.sense(begin(how), TRUTH, START, 1, two)
+    known = how.sense(begin(how), TRUTH, START, 1, two, torch.ones_like(two))
     assert known.ever_sensed.flatten(1).sum(1).tolist() == [1, 0, 1]
     assert known.reached.flatten(1).any(1).tolist() == [True, False, True]
 
@@ -242,11 +242,11 @@ def test_sensors_are_asked_when_it_is_due_and_where_robots_are(belief: Any) -> N
     assert asked == ["Near"]
     ground = ["Contact"] if belief.learns else []
     none, two = torch.zeros(BATCH, dtype=torch.bool), torch.tensor([True, False, True])
-    sensed = how.sense(known, TRUTH, START + 2, 1, none)
+    sensed = how.sense(known, TRUTH, START + 2, 1, none, torch.ones_like(none))
     assert asked == ["Near", *ground]
     assert torch.equal(sensed.seen, known.seen)
     assert int(sensed.ever_sensed.sum()) == BATCH * len(ground)
-    looked = how.sense(known, TRUTH, START + 2, 1, two)
+    looked = how.sense(known, TRUTH, START + 2, 1, two, torch.ones_like(two))
     assert asked == ["Near", *ground, "Near", *ground]
     more = (looked.seen & ~known.seen).flatten(1).any(1)
     assert more.tolist() == two.tolist() == looked.news.tolist()
@@ -262,8 +262,8 @@ def test_all_looks_between_two_updates_count_and_of_one_cell_the_later() -> None
     how = learner(sensor=Full(), ground=Probe(0.8, 0.3))
     known = how.begin(TRUTH, START, TRUTH.terrain.truth)
     every = torch.ones(BATCH, dtype=torch.bool)
-    one = how.sense(known, TRUTH, START, 1, every)
-    both = how.sense(one, TRUTH, START + 0.5, 2, every)
+    one = how.sense(known, TRUTH, START, 1, every, torch.ones_like(every))
+    both = how.sense(one, TRUTH, START + 0.5, 2, every, torch.ones_like(every))
     first = Probe(0.8, 0.3).sense(TRUTH.terrain, TRUTH.field, START, Moment(KEYS, 1))
     second = Probe(0.8, 0.3).sense(TRUTH.terrain, TRUTH.field, START + 0.5, Moment(KEYS, 2))
     assert torch.equal(both.ever_sensed, first.mask | second.mask)
