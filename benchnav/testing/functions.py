@@ -178,8 +178,8 @@ def _try_measure(
     cells = torch.zeros(distribution.shape, dtype=torch.bool, device=distribution.device)
     cells[0, ::2], cells[2, 1] = True, True
     try:
-        given = map_tensors(distribution.at(cells), lambda values: values[None])
-        alone, whole = measure(given), measure(distribution)[cells]
+        some = map_tensors(distribution.at(cells), lambda values: values[None])
+        alone, whole = measure(some), measure(distribution)[cells]
     except Exception:
         return  # which is noted where it is tried
     breaches.expect(
