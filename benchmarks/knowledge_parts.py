@@ -51,10 +51,8 @@ class Revising(AStarDWA):
     """A\\*+DWA that revises its plan as often as a robot that learns, though nothing is learnt."""
 
     def plan(self, step: Any, plan_state: Any) -> Any:
-        problem, every = (
-            plan_state.problem,
-            steps_in(plan_state.problem.task.rules.replan_every_s, plan_state.problem.dt_s),
-        )
+        problem = plan_state.problem
+        every = steps_in(problem.task.rules.replan_every_s, problem.dt_s)
         if round(step.time_s / problem.dt_s) % every == 0:
             problem = replace(problem, start=step.state)
             # Maps are searched that have changed: all have, if all ground was of the other kind.

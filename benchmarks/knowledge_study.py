@@ -62,7 +62,10 @@ ALL_KNOWN = "all of λ"
 
 def command(program: str, *words: object) -> None:
     """Runs one of our commands from the root of the repository, where the suites' parts are."""
-    subprocess.run([Path(sys.executable).with_name(program), *map(str, words)], check=True, cwd=ROOT)
+    if code := subprocess.run(
+        [Path(sys.executable).with_name(program), *map(str, words)], cwd=ROOT
+    ).returncode:
+        sys.exit(code)  # it has said why
 
 
 def suite_of(part: str, maps_in: Path, maps: int) -> dict[str, Any]:
@@ -218,9 +221,12 @@ def knowledge_figure(summary: pd.DataFrame) -> Figure:
 def report(out: Path) -> None:
     """Writes the figure, the tables of the page where there is one, and the power where it is known."""
     print(f"hypotheses {hashlib.sha256((SUITES / 'primary.yaml').read_bytes()).hexdigest()}")
-    summaries = [pd.read_csv(out / f"knowledge-{part}" / "summary.csv") for part in ("known", "known-mppi")]
-    save(knowledge_figure(pd.concat(summaries)), FIGURE, "png", dpi=200)
-    print(f"wrote {FIGURE}")
+    summaries = [out / f"knowledge-{part}" / "summary.csv" for part in ("known", "known-mppi")]
+    if all(path.exists() for path in summaries):
+        save(knowledge_figure(pd.concat(map(pd.read_csv, summaries))), FIGURE, "png", dpi=200)
+        print(f"wrote {FIGURE}")
+    else:
+        print("no figure: it needs the runs of `known` and `known-mppi`")
     if PAGE.exists():
         subprocess.run([sys.executable, ROOT / "benchmarks/tables.py", PAGE, "--runs", out], check=True)
     if (out / DEVELOPED / "episodes.parquet").exists():

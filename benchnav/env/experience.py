@@ -115,8 +115,7 @@ class Experience:
             return
         truth, (before, _) = replace(self._truth, field=field), self._current()
         due = which & (step % self._every == 0)
-        after = self._learner.sense(before, truth, state, step.tolist(), due, which)
-        self._knowledge = after
+        self._knowledge = self._learner.sense(before, truth, state, step.tolist(), due, which)
         if bool(due.any()):
             self._update(due, truth)
 

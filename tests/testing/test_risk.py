@@ -42,6 +42,10 @@ BAD: dict[str, tuple[Any, str]] = {
     "slip": (changed(lambda mean, m: (m.stds[:, 0] > 0) / mean.new_zeros(())), "λ̂ in [0, 1]"),
     "λ̂ of the batch": (changed(lambda mean, _: mean / (1 + mean.mean())), "the same from `risk` for one alone"),
     "λ̂ of the neighbours": (changed(lambda mean, _: (mean + mean.roll(1, -1)) / 2), "for some cells alone"),
+    "cannot take some cells": (
+        changed(lambda mean, _: mean if mean.shape[-2] > 1 else mean[99]),
+        "Expected an answer from `risk`, got IndexError",
+    ),
     "another λ̂": (Forgetful(), "Expected the same from `risk` when asked again"),
     "writes into the mixture": (changed(lambda mean, m: [m.means.zero_()] and mean), "got another distribution"),
     "PyTorch's generator": (changed(lambda mean, _: mean + 0 * torch.rand(1)), "PyTorch's global generator"),
@@ -75,7 +79,10 @@ def test_what_needs_a_mixture_says_so_by_name_or_fails_on_quantiles() -> None:
             return risk.mean(given)
         raise ConfigError("Expected something else.")
 
-    assert "Expected something else. (test_risk.py, line 76) [quantiles]" in refusal(check_risk, nameless)
+    raised = nameless.__code__.co_firstlineno + 3
+    assert f"Expected something else. (test_risk.py, line {raised}) [quantiles]" in refusal(
+        check_risk, nameless
+    )
 
 
 @pytest.mark.parametrize("name", registry.names("risk"))

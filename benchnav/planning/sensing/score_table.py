@@ -7,7 +7,6 @@ Letters in shapes: B episodes, H×W cells, *B any leading dimensions, K values o
 """
 
 import math
-from bisect import bisect_left
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,13 +48,9 @@ class TabulatedDistribution(TraversabilityDistribution):
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]; see the base."""
         at = torch.as_tensor(value, dtype=self.dtype, device=self.device)
-        if isinstance(value, Tensor):
-            after = torch.searchsorted(self._values(), at.contiguous()).clamp(1, len(VALUES) - 1)
-            places = [own.expand(self.shape).unsqueeze(-3) for own in (after - 1, after)]
-            low, high = (self.below.gather(-3, own).squeeze(-3) for own in places)
-        else:
-            after = torch.tensor(min(max(bisect_left(VALUES, value), 1), len(VALUES) - 1))
-            low, high = (self.below.select(-3, int(own)) for own in (after - 1, after))
+        after = torch.searchsorted(self._values(), at.contiguous()).clamp(1, len(VALUES) - 1)
+        places = [own.expand(self.shape).unsqueeze(-3) for own in (after - 1, after)]
+        low, high = (self.below.gather(-3, own).squeeze(-3) for own in places)
         before, behind = self._values()[after - 1], self._values()[after]
         inside = torch.lerp(low, high, ((at - before) / (behind - before)).clamp(0, 1))
         return torch.where(at <= 0, 0.0, inside), torch.where(at < 0, 0.0, torch.where(at < 1, inside, 1.0))
