@@ -263,6 +263,7 @@ class EgocentricBatch(EnvBatch):
             measure=risk if callable(risk) else registry.make("risk", risk),
             rules=rules,
             predict=partial(predict, predictor),
+            keeps_spread=True,
         )
         every = steps_in(replan_every_s, self._task.robot.dt_s)
         self._experience = Experience(learner, every, alike=not clairvoyant)

@@ -14,40 +14,19 @@ from torch import Tensor
 
 from benchnav.core.batch import Batch, map_tensors
 from benchnav.core.distribution import TraversabilityDistribution
-from benchnav.env.view import Known, spread_of
-from benchnav.planning.risk import RiskMeasure
+from benchnav.env.view import Known
 from benchnav.planning.sensing.knowledge import Knowledge, Learner, Truth
 from benchnav.planning.sensing.sensor import Sensed
 
 _MOST_KEPT = 256  # maps, of up to a megabyte each
 
 
-class _Measure:
-    """Gives λ̂, and keeps the spread of what it was given: to ask what is believed once more takes as long as all else.
-
-    Args:
-        measure: the risk measure.
-
-    Attributes:
-        spread: of the last distribution.
-    """
-
-    def __init__(self, measure: RiskMeasure) -> None:
-        self._measure = measure
-        self.spread = torch.empty(0)
-
-    def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
-        self.spread = spread_of(distribution)
-        return self._measure(distribution)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _First(Batch):
-    """What is known of whole maps before a robot set out: prediction, all but the belief, and spread."""
+    """What is known of whole maps before a robot set out: the prediction, and all but the belief."""
 
     prior: TraversabilityDistribution
     knowledge: Knowledge
-    spread: Tensor
 
 
 class Experience:
@@ -61,22 +40,21 @@ class Experience:
 
     def __init__(self, learner: Learner, every: int, alike: bool) -> None:
         """Knows nothing of any episode."""
-        self._measure = _Measure(learner.measure)
-        self._learner, self._every = replace(learner, measure=self._measure), every
+        self._learner, self._every = learner, every
         self._senses = learner.belief.learns or not learner.sensor.sees_all
         self._alike = alike and learner.sensor.sees_all
         self._kept: OrderedDict[int, _First] = OrderedDict()
         self._knowledge: Knowledge | None = None
-        self._spread: Tensor | None = None
         self._truth: Truth | None = None
 
     @property
     def known(self) -> Known:
         """What all robots know now, as policies are told it."""
-        knowledge, spread = self._current()
+        knowledge = self._current()
+        assert knowledge.spread is not None
         return Known(
             risk_map=knowledge.risk_map,
-            spread=spread,
+            spread=knowledge.spread,
             elevation_m=knowledge.observation.elevation_m,
             seen=knowledge.seen,
         )
@@ -90,15 +68,11 @@ class Experience:
             truth: of these episodes.
             state: where the robots are, shape [M, S].
         """
-        if self._alike:
-            knowledge, spread = self._begun_on(maps, truth, state)
-        else:
-            knowledge, spread = self._begun(truth, state)
-        if self._knowledge is None or self._spread is None or len(members) == len(self._spread):
-            self._knowledge, self._spread, self._truth = knowledge, spread, truth
+        knowledge = self._begun_on(maps, truth, state) if self._alike else self._begun(truth, state)
+        if self._knowledge is None or len(members) == len(self._knowledge.free):
+            self._knowledge, self._truth = knowledge, truth
             return
         self._knowledge = self._learner.put(self._knowledge, members, knowledge)
-        self._spread = self._spread.index_copy(0, members, spread)
         if self._senses and self._truth is not None:
             self._truth = self._truth.put(members, truth)
 
@@ -113,70 +87,58 @@ class Experience:
         """
         if not self._senses or self._truth is None:
             return
-        truth, (before, _) = replace(self._truth, field=field), self._current()
+        truth = replace(self._truth, field=field)
         due = which & (step % self._every == 0)
-        self._knowledge = self._learner.sense(before, truth, state, step.tolist(), due, which)
+        self._knowledge = self._learner.sense(self._current(), truth, state, step.tolist(), due, which)
         if bool(due.any()):
             self._update(due, truth)
 
     def _update(self, due: Tensor, truth: Truth) -> None:
         """Updates what is known in some episodes, bool [B]."""
-        learner, (now, spread) = self._learner, self._current()
+        learner, now = self._learner, self._current()
         news = now.news & due
         if bool(news.any()):
             # Taken apart, since a prediction costs more than that.
             members = news.nonzero()[:, 0]
-            part = self._updated(learner.select(now, members), spread[members], truth.select(members))
-            now, spread = learner.put(now, members, part[0]), spread.index_copy(0, members, part[1])
+            part, _ = learner.update(learner.select(now, members), truth.select(members))
+            now = learner.put(now, members, part)
         told = (due & ~news)[:, None, None]
         sensed, news = now.sensed, now.news
         if bool((sensed.mask & told).any()):
             # As a whole, since to take it apart costs more than the update.
             now = replace(now, sensed=_only(sensed, told), news=torch.zeros_like(news))
-            now, spread = self._updated(now, spread, truth)
+            now, _ = learner.update(now, truth)
             now = replace(now, sensed=_only(sensed, ~told), news=news)
-        self._knowledge, self._spread = now, spread
+        self._knowledge = now
 
-    def _updated(self, knowledge: Knowledge, spread: Tensor, truth: Truth) -> tuple[Knowledge, Tensor]:
-        """Knowledge and spread after an update."""
-        knowledge, changed = self._learner.update(knowledge, truth)
-        if bool(changed.any()):
-            spread = spread.index_put((changed,), self._measure.spread.flatten().to(spread.dtype))
-        return knowledge, spread
-
-    def _begun_on(self, maps: Sequence[int], truth: Truth, state: Tensor) -> tuple[Knowledge, Tensor]:
-        """Knowledge and spread at the start on maps that are seen as a whole; kept, since no episode changes them."""
+    def _begun_on(self, maps: Sequence[int], truth: Truth, state: Tensor) -> Knowledge:
+        """What is known at the start of maps that are seen as a whole; kept, since no episode changes it."""
         every = []
         for place, number in enumerate(maps):
             if number not in self._kept:
                 own = torch.tensor([place])
-                knowledge, spread = self._begun(truth.select(own), state[own])
+                knowledge = self._begun(truth.select(own), state[own])
                 prior = self._learner.distribution(knowledge)
-                knowledge = replace(knowledge, believed=None)
-                self._kept[number] = _First(prior=prior, knowledge=knowledge, spread=spread)
+                self._kept[number] = _First(prior=prior, knowledge=replace(knowledge, believed=None))
             self._kept.move_to_end(number)
             every.append(self._kept[number])
         while len(self._kept) > _MOST_KEPT:
             self._kept.popitem(last=False)
         first, *rest = every
         joined = map_tensors(first, lambda *values: torch.cat(values), *rest)
-        believed = self._learner.believe(joined.prior)
-        return replace(joined.knowledge, believed=believed), joined.spread
+        return replace(joined.knowledge, believed=self._learner.believe(joined.prior))
 
-    def _begun(self, truth: Truth, state: Tensor) -> tuple[Knowledge, Tensor]:
-        """Knowledge and spread at the start."""
-        learner = self._learner
-        prediction = None
+    def _begun(self, truth: Truth, state: Tensor) -> Knowledge:
+        """What is known at the start."""
+        learner, prediction = self._learner, None
         if learner.sensor.sees_all:
             terrain = replace(truth.terrain, traversability=truth.field)
             prediction = learner.predict(terrain, terrain.observe())
-        knowledge = learner.begin(truth, state, prediction)
-        return knowledge, self._measure.spread
+        return learner.begin(truth, state, prediction)
 
-    def _current(self) -> tuple[Knowledge, Tensor]:
+    def _current(self) -> Knowledge:
         assert self._knowledge is not None, "no episode has begun"
-        assert self._spread is not None
-        return self._knowledge, self._spread
+        return self._knowledge
 
 
 def _only(sensed: Sensed, which: Tensor) -> Sensed:

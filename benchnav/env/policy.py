@@ -10,7 +10,7 @@ from torch import Tensor
 from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
 from benchnav.core.ground import SEEN
-from benchnav.env.view import Known, View, spread_of
+from benchnav.env.view import Known, View
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.sensing.sensor import Step
@@ -110,7 +110,7 @@ def _known_of(problem: Problem) -> Known:
     seen = problem.observation.layers.get(SEEN)
     return Known(
         risk_map=problem.risk_map,
-        spread=spread_of(problem.distribution),
+        spread=problem.distribution.spread(),
         elevation_m=problem.elevation_m,
         seen=torch.ones_like(problem.free) if seen is None else seen > 0,
     )

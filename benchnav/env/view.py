@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch
-from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.planning.objective import distance
@@ -27,7 +26,7 @@ class Known(Batch):
 
     Args:
         risk_map: λ̂ as the risk setting gives it, in [0, 1], shape [B, H, W].
-        spread: `spread_of` the distribution of λ, in [0, 1], shape [B, H, W].
+        spread: half of the range from the 16 % to the 84 % quantile of λ, in [0, 0.5], shape [B, H, W].
         elevation_m: of what was seen; of other cells it is not used, shape [B, H, W].
         seen: which cells were seen, bool, shape [B, H, W].
     """
@@ -36,11 +35,6 @@ class Known(Batch):
     spread: Tensor
     elevation_m: Tensor
     seen: Tensor
-
-
-def spread_of(distribution: TraversabilityDistribution) -> Tensor:
-    """Width of the interval between the 16 % and the 84 % quantile of λ, in [0, 1], shape [B, H, W]."""
-    return 2 * distribution.spread()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +93,7 @@ class View:
         seen = inside & (read(known.seen) > 0)
         channels = [
             torch.where(inside, read(known.risk_map), 0.0),
-            torch.where(inside, read(known.spread), 0.0),
+            torch.where(inside, 2 * read(known.spread), 0.0),
             torch.where(seen, rise.clamp(-1, 1), 0.0),
             seen.float(),
         ]

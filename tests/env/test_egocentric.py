@@ -157,12 +157,12 @@ def test_the_crop_shows_what_is_believed(dataset_path: Path, senses: dict[str, A
     seen = drive(env, 12)[-1]
     batch = batch_of(env)
     _, now = batch._current()
-    knowledge, learner = batch._experience._current()[0], batch._experience._learner
+    knowledge, learner = batch._experience._current(), batch._experience._learner
     believed = learner.distribution(knowledge)
     known = replace(
         batch._experience.known,
         risk_map=believed.cvar(0.8).float(),
-        spread=(believed.quantile(0.84) - believed.quantile(0.16)).float(),
+        spread=(believed.quantile(0.84) - believed.quantile(0.16)).float() / 2,
     )
     wanted = View(cells=12, behind=0.5).crop(batch._maps.grid, known, now.state)[0]
     # A belief may tell some cells in a quicker way, within 0.01.
@@ -287,7 +287,7 @@ def test_what_was_not_sensed_changes_no_observation(dataset_path: Path, ground: 
     env = make(dataset_path, **settings)
     wanted = drive(env, 16, turning)
     batch = batch_of(env)
-    own, knowledge = batch._map[0], batch._experience._current()[0]
+    own, knowledge = batch._map[0], batch._experience._current()
     seen, sensed = knowledge.seen, knowledge.ever_sensed
     assert 0.05 < seen.float().mean() < 0.9
     # λ is given by the truth of its own cell, and the robot drove where it looked.

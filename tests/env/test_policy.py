@@ -32,7 +32,7 @@ def toward(seen: dict[str, np.ndarray]) -> np.ndarray:
 def problem_of(batch: EgocentricBatch) -> Problem:
     """The problem that an evaluation would pose of what an environment's robots know now."""
     simulation, now = batch._current()
-    knowledge, learner = batch._experience._current()[0], batch._experience._learner
+    knowledge, learner = batch._experience._current(), batch._experience._learner
     chosen = torch.from_numpy(batch._map)
     posed = pose_problem(
         batch._task, knowledge.observation, learner.distribution(knowledge), knowledge.risk_map,

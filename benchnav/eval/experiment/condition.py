@@ -286,6 +286,9 @@ def _parts(kind: str, given: Any) -> list[Part]:
         cell = torch.full((1, 1, 1, 1), 0.5)
         for one in made:
             registry.make("risk", one)(TraversabilityMixture(torch.ones_like(cell), cell, cell, (0,)))
+    if kind in KNOWLEDGE:
+        for one in made:
+            registry.make(kind, one)
     return made
 
 

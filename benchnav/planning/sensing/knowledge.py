@@ -84,6 +84,7 @@ class Knowledge(Batch):
         observation: what the model was given.
         believed: the state of the belief.
         risk_map: λ̂, shape [B, H, W].
+        spread: of what is believed (`TraversabilityDistribution.spread`), shape [B, H, W]; None where it is not kept.
         free: free ground, without that at the goal, bool, shape [B, H, W].
     """
 
@@ -95,6 +96,7 @@ class Knowledge(Batch):
     observation: Observation
     believed: Any
     risk_map: Tensor
+    spread: Tensor | None
     free: Tensor
 
     @property
@@ -115,6 +117,7 @@ class Learner:
         measure: the risk measure that gives λ̂.
         rules: free space, and what is believed of unseen ground.
         predict: the model; not needed where the sensor sees all.
+        keeps_spread: keeps the spread of what is believed beside λ̂, for policies.
     """
 
     sensor: Sensor
@@ -124,6 +127,7 @@ class Learner:
     measure: risk.RiskMeasure
     rules: Rules
     predict: Predict
+    keeps_spread: bool = False
 
     @property
     def statistics(self) -> GroundStatistics:
@@ -160,7 +164,7 @@ class Learner:
         assert prediction is not None
         prior = prediction
         believed = self.believe(prior)
-        risk_map = call(Outcome.MODEL_ERROR, lambda: risk.apply(self.measure, prior))
+        risk_map, spread = self._measured(prior)
         seen = None if memory is None else memory.seen
         return Knowledge(
             memory=memory,
@@ -171,6 +175,7 @@ class Learner:
             observation=observation,
             believed=believed,
             risk_map=risk_map,
+            spread=spread,
             free=self.rules.free(risk_map, prior, seen),
         )
 
@@ -325,13 +330,27 @@ class Learner:
         """Tells λ̂ and what is free of the cells of which something else is believed."""
         believed = self.at(known, changed)
         one = map_tensors(believed, lambda values: values[None])  # a batch, as measures are given
-        found = call(Outcome.MODEL_ERROR, lambda: risk.apply(self.measure, one))[0]
+        found, spread = self._measured(one)
         seen = None if known.memory is None else known.memory.seen[changed][None]
-        free = call(Outcome.BELIEF_ERROR, lambda: self.rules.free(found, believed, seen))
-        risk_map, free_map = known.risk_map.clone(), known.free.clone()
-        risk_map[changed] = found[0].to(risk_map.dtype)
-        free_map[changed] = free[0]
-        return replace(known, risk_map=risk_map, free=free_map)
+        free = call(Outcome.BELIEF_ERROR, lambda: self.rules.free(found[0], believed, seen))
+        told = replace(
+            known,
+            risk_map=known.risk_map.index_put((changed,), found.flatten().to(known.risk_map.dtype)),
+            free=known.free.index_put((changed,), free[0]),
+        )
+        if known.spread is None or spread is None:
+            return told
+        return replace(
+            told, spread=known.spread.index_put((changed,), spread.flatten().to(known.spread.dtype))
+        )
+
+    def _measured(self, believed: TraversabilityDistribution) -> tuple[Tensor, Tensor | None]:
+        """λ̂ and, where it is kept, the spread, of a batch of maps."""
+
+        def measure() -> tuple[Tensor, Tensor | None]:
+            return risk.apply(self.measure, believed), believed.spread() if self.keeps_spread else None
+
+        return call(Outcome.MODEL_ERROR, measure)
 
     def _predict(self, memory: Memory, truth: Truth) -> tuple[Observation, TraversabilityDistribution]:
         """What a model is given of what was seen, and what it makes of it; elsewhere what `rules.unseen` says."""

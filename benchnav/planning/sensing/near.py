@@ -51,11 +51,11 @@ class Near(Sensor):
         """Refuses cameras that are none."""
         for name in ("range_m", "height_m"):
             value = getattr(self, name)
-            expect(0 < value < math.inf, f"`{name}` > 0 and finite, got {value}.")
-        expect(0 < self.fov_deg <= 360, f"`fov_deg` in (0, 360], got {self.fov_deg}.")
+            expect(0 < value < math.inf, f"`{name}` of the sensor near > 0 and finite, got {value}.")
+        expect(0 < self.fov_deg <= 360, f"`fov_deg` of the sensor near in (0, 360], got {self.fov_deg}.")
         for name in ("colour_noise", "elevation_noise"):
             value = getattr(self, name)
-            expect(0 <= value < math.inf, f"`{name}` ≥ 0 and finite, got {value}.")
+            expect(0 <= value < math.inf, f"`{name}` of the sensor near ≥ 0 and finite, got {value}.")
 
     def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
         """Looks around once; robots off the map see nothing."""

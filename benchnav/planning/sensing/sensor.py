@@ -188,10 +188,13 @@ class Probe(Sensor):
 
     def __post_init__(self) -> None:
         """Refuses what senses nothing, or too well to be conditioned on."""
-        expect(0 < self.radius_m < float("inf"), f"`radius_m` > 0 and finite, got {self.radius_m}.")
+        expect(
+            0 < self.radius_m < float("inf"),
+            f"`radius_m` of the ground probe > 0 and finite, got {self.radius_m}.",
+        )
         expect(
             LEAST_STD <= self.noise_std < float("inf"),
-            f"`noise_std` of at least {LEAST_STD:g} and finite, got {self.noise_std}.",
+            f"`noise_std` of the ground probe of at least {LEAST_STD:g} and finite, got {self.noise_std}.",
         )
 
     def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:

@@ -368,7 +368,8 @@ def test_an_own_part_that_fails_ends_its_episodes_with_its_name(
     ("words", "told"),
     [
         (("--risks", "[single-class]", "--beliefs", "[copula]"), "Expected a belief that does not learn"),
-        (("--grounds", "['probe:-1']", "--beliefs", "[copula]"), "`radius_m` > 0"),
+        (("--grounds", "['probe:-1']", "--beliefs", "[copula]"), "`radius_m` of the ground probe > 0"),
+        (("--grounds", "['probe:-1']"), "`radius_m`"),  # which `static` does not ask
         (("--grounds", "[{part: probe, options: {noise_std: 0}}]", "--beliefs", "[copula]"), "`noise_std`"),
         (("--sensors", "[{part: near, options: {fov_deg: 0}}]"), "`fov_deg`"),
         (("--beliefs", "[{part: copula, options: {window: 0}}]"), "`window`"),
