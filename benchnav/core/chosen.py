@@ -58,6 +58,10 @@ class ChosenDistribution(TraversabilityDistribution):
         """E[1 / max(λ, floor)], shape [*B, H, W]; see the base."""
         return self._pick(self.first.expected_time(floor), self.second.expected_time(floor))
 
+    def time_cvar(self, level: float, floor: float) -> Tensor:
+        """CVaR of the time 1 / max(λ, floor), shape [*B, H, W]; see the base."""
+        return self._pick(self.first.time_cvar(level, floor), self.second.time_cvar(level, floor))
+
     def log_prob(self, value: Tensor) -> Tensor:
         """Log density on (0, 1), log mass at 0 and at 1, shape [*B, H, W]; see the base."""
         return self._pick(self.first.log_prob(value), self.second.log_prob(value))

@@ -7,6 +7,8 @@ an integral of F:
     E[λ] = 1 − ∫₀¹ F,    CVaR_α = v − 1/p ∫₀^v F at p = 1 − α and v = Q(p),
     E[1 / max(λ, ε)] = 1 + ∫₁^{1/ε} F(1/t) dt,    CRPS = ∫₀^y F² + ∫_y¹ (1 − F)² at an observed y.
 
+The worst share p of λ has the CDF min(F / p, 1), which gives the CVaR of the time 1 / max(λ, ε).
+
 Each integrand is monotone, so that a trapezium over an interval is off by at most half of its length times the change
 over it, whatever atoms and gaps are inside. The intervals of the largest doubt are halved again and again, in each cell
 on its own and a fixed number of times, and a parabola takes the place of the chord where the function is smooth. Cells
@@ -154,13 +156,31 @@ class TraversabilityDistribution(Batch, ABC):
         Returns:
             In [1, 1 / floor], shape [*B, H, W].
         """
+        return self.time_cvar(0.0, floor)
+
+    def time_cvar(self, level: float, floor: float) -> Tensor:
+        """CVaR of the time 1 / max(λ, floor): its mean over the worst share 1 − level of λ, which is the slowest.
+
+        Args:
+            level: α in [0, 1); at 0 the result is the expected time.
+            floor: ε in (0, 1], least speed.
+
+        Returns:
+            In [1, 1 / floor], shape [*B, H, W].
+        """
+        tail = tail_of(level)
         check_floor(floor)
 
         def work(own: Self) -> Tensor:
+            def share(values: Tensor) -> Tensor:
+                return (values / tail).clamp(max=1)
+
             shares = torch.linspace(0, 1, _FIRST + 1, dtype=torch.float64, device=own.device)
             edges = (floor**-shares).view(-1, 1, 1, 1).expand(-1, *own.shape)
-            ends = own.cdf_limits(1.0)[0], own.cdf(floor)
-            return 1 + _integral(own, lambda cdf, times: cdf(1 / times), edges, *ends, rounds=_ROUNDS_OF_TIME)
+            ends = share(own.cdf_limits(1.0)[0]), share(own.cdf(floor))
+            return 1 + _integral(
+                own, lambda cdf, times: share(cdf(1 / times)), edges, *ends, rounds=_ROUNDS_OF_TIME
+            )
 
         return self._in_pieces(work)
 
@@ -242,8 +262,10 @@ class TraversabilityDistribution(Batch, ABC):
         Args:
             cells: which of them, bool, shape [*B, H, W].
         """
-        which = cells.reshape(-1, *cells.shape[-2:])
-        return map_tensors(self._in_members(), lambda values: values.movedim(0, -3)[..., which].unsqueeze(-2))
+        member, row, column = cells.reshape(-1, *cells.shape[-2:]).nonzero(as_tuple=True)
+        return map_tensors(
+            self._in_members(), lambda values: values.movedim(0, -3)[..., member, row, column].unsqueeze(-2)
+        )
 
     def differs(self, other: "TraversabilityDistribution", tolerance: float = 0.0) -> Tensor:
         """Tells of which cells something else is predicted, bool, shape [*B, H, W].

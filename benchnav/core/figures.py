@@ -104,6 +104,7 @@ _RISKS = {
     "cvar": ("CVaR", "CVaR{lowered}"),
     "var": ("VaR", "VaR{lowered}"),
     "expected-time": ("expected time", "expected time (floor {})"),
+    "time-cvar": ("time CVaR", "time CVaR{lowered}"),
     "chance": ("P(λ ≥ bound)", "P(λ ≥ {})"),
     "single-class": ("single class", "single-class CVaR{lowered}"),
 }

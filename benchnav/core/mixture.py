@@ -156,7 +156,21 @@ class TraversabilityMixture(TraversabilityDistribution):
             At least 1, shape [*B, H, W], to within 1e-6.
         """
         check_floor(floor)
-        return self._in_cells(lambda cells: _expected_time(cells, floor))
+        return self._in_cells(lambda cells: _expected_time(cells.float(), floor, 1.0))
+
+    def time_cvar(self, level: float, floor: float) -> Tensor:
+        """CVaR of the time 1 / max(λ, floor), shape [*B, H, W], to within 1e-6; see the base."""
+        tail = tail_of(level)
+        check_floor(floor)
+        if tail == 1:
+            return self.expected_time(floor)
+
+        def work(cells: Cells, share: Tensor) -> Tensor:
+            slowest = value_at_risk(cells, share).clamp(floor, 1)
+            within = _expected_time(cells, floor, slowest) - 1 / slowest
+            return 1 / slowest + within.clamp(min=0) / tail
+
+        return self._in_tail(work, tail)
 
     def crps(self, observed: Tensor) -> Tensor:
         """Continuous ranked probability score: ∫₀¹ (F(x) − 1[observed ≤ x])² dx.
@@ -361,19 +375,18 @@ def component_log_prob(means: Tensor, stds: Tensor, value: Tensor) -> Tensor:
     return torch.where((value <= 0) | (value >= 1), mass, density)
 
 
-def _expected_time(cells: Cells, floor: float) -> Tensor:
-    """`expected_time` of N cells, in float32: to within 1e-6."""
-    short = cells.float()
+def _expected_time(cells: Cells, floor: float, most: Tensor | float) -> Tensor:
+    """1 / most + ∫ F / x² from the floor to the most λ, of N cells: in float32 to within 1e-6."""
     # Beyond [low, high] the CDF of a component is 0 or 1, and the integral of 1 / x² is known.
-    reach = _REACH * math.sqrt(0.5) / short.scales
-    low, high = (short.means - reach).clamp(floor, 1), (short.means + reach).clamp(floor, 1)
+    reach = _REACH * math.sqrt(0.5) / cells.scales
+    low, high = ((cells.means + way).clamp(min=floor).clamp(max=most) for way in (-reach, reach))
     start, span = low.log(), high.log() - low.log()
-    time = 1 + (1 / high - 1)
+    time = 1 / most + (1 / high - 1 / most)
     for node, share in _LEGENDRE:
         log_x = start + span * node
-        below = torch.erf((log_x.exp() - short.means).mul_(short.scales)).add_(1)
+        below = torch.erf((log_x.exp() - cells.means).mul_(cells.scales)).add_(1)
         time = torch.addcmul(time, span * (0.5 * share), below.mul_(torch.exp(-log_x)))
-    return added(short.weights * time).clamp(min=1)
+    return added(cells.weights * time).clamp(min=1)
 
 
 def _probability(z: Tensor) -> Tensor:

@@ -114,8 +114,15 @@ class QuantileDistribution(TraversabilityDistribution):
 
     def expected_time(self, floor: float) -> Tensor:
         """E[1 / max(λ, floor)], shape [*B, H, W]; see the base."""
+        return self.time_cvar(0.0, floor)
+
+    def time_cvar(self, level: float, floor: float) -> Tensor:
+        """CVaR of the time 1 / max(λ, floor), shape [*B, H, W]; see the base."""
+        tail = tail_of(level)
         check_floor(floor)
         low, high, width = self._intervals()
+        part = ((tail - self._levels()[:-1]) / width).clamp(0, 1)  # of each interval, that is in the tail
+        high, width = torch.lerp(low, high, part), width * part / tail
         slow, fast = low.clamp(min=floor), high.clamp(min=floor)
         # Of an interval this share is under the floor, and 1 / λ has the mean log(b / a) / (b − a) over the rest.
         under = ((floor - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1)

@@ -4,7 +4,7 @@ A measure is a function of a `TraversabilityDistribution` of shape [B, H, W] tha
 further keyword parameters are its options. A setting is written `name` or `name:level`: `cvar:0.9`, `var:0.95`,
 `expected-time:0.05`, `mean`. Risk means the lower tail of λ; a higher level of CVaR or VaR is more cautious. The
 integrals are the distribution's own, the names are given in `pyproject.toml`, and the registry reads what is written.
-Source: paper II and III-B; `expected_time` and `chance` go beyond it.
+Source: paper II and III-B; `expected_time`, `time_cvar` and `chance` go beyond it.
 """
 
 from collections.abc import Callable
@@ -53,6 +53,19 @@ def expected_time(distribution: TraversabilityDistribution, floor: float = 0.05)
         floor: least speed, as a share of the commanded one, in (0, 1].
     """
     return (1 / distribution.expected_time(floor)).clamp(floor, 1)
+
+
+def time_cvar(distribution: TraversabilityDistribution, level: float = 0.9, floor: float = 0.05) -> Tensor:
+    """1 / CVaR of the time 1 / max(λ, floor), by which a path's length gives the time it takes on the worst ground.
+
+    As CVaR looks at the mean of λ over its worst share, this looks at the mean of the time over it.
+
+    Args:
+        distribution: of λ in each cell.
+        level: α in [0, 1); at 0 it is `expected_time`.
+        floor: least speed, as a share of the commanded one, in (0, 1].
+    """
+    return (1 / distribution.time_cvar(level, floor)).clamp(floor, 1)
 
 
 def chance(distribution: TraversabilityDistribution, bound: float = 0.1) -> Tensor:

@@ -70,7 +70,12 @@ def _check_integrals(
 ) -> None:
     """Tells where what a class gives in place of the base's integrals is something else."""
     base = TraversabilityDistribution
-    for name, arguments in (("mean", ()), ("cvar", (_LEVEL,)), ("expected_time", (_FLOOR,))):
+    for name, arguments in (
+        ("mean", ()),
+        ("cvar", (_LEVEL,)),
+        ("expected_time", (_FLOOR,)),
+        ("time_cvar", (_LEVEL, _FLOOR)),
+    ):
         found = ask(name, *arguments)
         if found is NOTHING or getattr(type(own), name) is getattr(base, name):
             continue

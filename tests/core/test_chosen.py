@@ -25,6 +25,7 @@ ASKED: dict[str, Callable[[TraversabilityDistribution], Tensor]] = {
     "var": lambda own: own.var(0.9),
     "cvar": lambda own: own.cvar(0.8),
     "expected time": lambda own: own.expected_time(0.05),
+    "time CVaR": lambda own: own.time_cvar(0.8, 0.05),
     "chance": lambda own: own.chance(0.1),
     "log density": lambda own: own.log_prob(VALUES),
     "log mass": lambda own: own.log_prob(torch.zeros_like(VALUES)),

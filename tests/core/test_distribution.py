@@ -16,6 +16,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.pooled import PooledDistribution
 from benchnav.core.quantiles import QuantileDistribution
+from tests import factories
 from tests.core.distributions import Hidden, mixture, quantiles
 
 LAWS = {
@@ -52,6 +53,17 @@ def test_the_expected_time_of_a_cdf_is_that_of_the_exact_form(
     law: TraversabilityDistribution, floor: float
 ) -> None:
     close(Hidden(law).expected_time(floor), law.expected_time(floor), relative=1e-4)
+
+
+@EACH
+@pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 0.99])
+@pytest.mark.parametrize("floor", [0.01, 0.3])
+def test_the_tail_of_the_time_of_a_cdf_is_that_of_the_exact_form(
+    law: TraversabilityDistribution, level: float, floor: float
+) -> None:
+    close(Hidden(law).time_cvar(level, floor), law.time_cvar(level, floor), relative=1e-4)
+    if level == 0:
+        close(law.time_cvar(level, floor), law.expected_time(floor), relative=1e-6)
 
 
 @EACH
@@ -125,6 +137,13 @@ def test_the_interval_of_normal_numbers_is_that_of_an_atom() -> None:
     below, above = Hidden(law).to_normal(-0.1), Hidden(law).to_normal(1.1)
     assert bool((below[1] == -math.inf).all())
     assert bool((above[0] == math.inf).all())
+
+
+def test_the_spread_of_a_normal_law_is_its_standard_deviation() -> None:
+    mean = torch.full((1, 3, 3), 0.5)
+    spread = factories.normal(mean, torch.full_like(mean, 0.1)).spread()
+    torch.testing.assert_close(spread, torch.full_like(mean, 0.99446 * 0.1), rtol=0, atol=5e-5)
+    assert factories.certain(mean).spread().abs().max() == 0
 
 
 def test_what_a_cdf_alone_cannot_tell_is_not_a_number_or_refused_by_name() -> None:

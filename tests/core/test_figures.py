@@ -168,6 +168,7 @@ def test_a_layer_of_directions_ends_in_the_colour_that_it_begins_with() -> None:
     [
         ("mean", "mean"), ("cvar", "CVaR"), ("cvar:0.95", "CVaR₀.₉₅"), ("var:0.9", "VaR₀.₉"),
         ("expected-time", "expected time"), ("expected-time:0.05", "expected time (floor 0.05)"),
+        ("time-cvar", "time CVaR"), ("time-cvar:0.8", "time CVaR₀.₈"),
         ("chance:0.1", "P(λ ≥ 0.1)"), ("single-class", "single class"), ("single-class:0", "single-class CVaR₀"),
         ("entropic:5", "entropic:5"), ("cautious", "cautious"), ("cvar:x", "cvar:x"), ("–", "–"),
     ],

@@ -321,6 +321,32 @@ def test_the_expected_time_is_that_of_an_adaptive_integrator(floor: float) -> No
             assert single(mean, std).expected_time(floor).item() == pytest.approx(time, rel=1e-6)
 
 
+@pytest.mark.parametrize("floor", [0.02, 0.3, 1.0])
+@pytest.mark.parametrize("level", [0.3, 0.8, 0.99])
+def test_the_tail_of_the_time_is_that_of_an_adaptive_integrator_over_ranks(
+    level: float, floor: float
+) -> None:
+    from scipy.integrate import quad
+
+    tail = 1 - level
+    for mean in (-0.3, 0.06, 0.5, 1.3):
+        for std in (0.01, 0.05, 0.2, 1.0):
+            law = stats.norm(mean, std)
+            edges = [rank for rank in map(law.cdf, (0, floor, 1)) if 0 < rank < tail]
+
+            def time(rank: float, law=law) -> float:  # type: ignore[no-untyped-def]
+                return 1 / min(max(float(law.ppf(rank)), floor), 1)
+
+            wanted = quad(time, 0, tail, points=edges or None, limit=500)[0] / tail
+            assert single(mean, std).time_cvar(level, floor).item() == pytest.approx(wanted, rel=2e-6)
+
+
+def test_the_tail_of_the_time_of_a_mixture_is_that_of_its_slowest_draws() -> None:
+    draws = monte_carlo()[:, 1, 0, 3].clamp(0, 1).sort().values
+    found = random_mixture().time_cvar(0.8, 0.05)[1, 0, 3].item()
+    assert found == pytest.approx((1 / draws[: len(draws) // 5].clamp(min=0.05)).mean().item(), rel=5e-3)
+
+
 def test_the_expected_time_of_a_mixture_is_that_of_its_components_in_the_mean() -> None:
     mixture = random_mixture()
     times = sum(
@@ -342,6 +368,8 @@ def test_the_expected_time_of_a_mixture_is_that_of_its_components_in_the_mean() 
 def test_a_least_speed_out_of_range_is_refused(floor: float) -> None:
     with pytest.raises(ConfigError, match="least speed"):
         random_mixture().expected_time(floor)
+    with pytest.raises(ConfigError, match="least speed"):
+        random_mixture().time_cvar(0.5, floor)
 
 
 @pytest.mark.parametrize("bound", [0.0, 0.1, 0.5, 0.9, 1.0])

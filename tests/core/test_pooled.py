@@ -52,6 +52,7 @@ def test_any_others_average_their_cdfs(hide: bool) -> None:
         wanted = getattr(Hidden(exact) if name == "crps" else exact, name)(*arguments)
         torch.testing.assert_close(getattr(law, name)(*arguments), wanted, rtol=0, atol=1e-4)
     torch.testing.assert_close(law.expected_time(0.05), exact.expected_time(0.05), rtol=1e-4, atol=0)
+    torch.testing.assert_close(law.time_cvar(0.8, 0.05), exact.time_cvar(0.8, 0.05), rtol=1e-4, atol=0)
     density = law.log_prob(OBSERVED)
     if hide:
         assert bool(density.isnan().all())

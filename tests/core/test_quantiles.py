@@ -96,6 +96,16 @@ def test_the_cvar_is_the_mean_of_the_lowest_quantiles(level: float) -> None:
         assert bool((LAW.var(level) == 1).all())
 
 
+@pytest.mark.parametrize("floor", [0.05, 0.3])
+@pytest.mark.parametrize("level", [0.0, 0.5, 0.83])
+def test_the_tail_of_the_time_is_that_of_the_slowest_ranks(level: float, floor: float) -> None:
+    nodes = (np.arange(20_000) + 0.5) / 20_000 * (1 - level)
+    knots = LAW.values.movedim(1, -1).reshape(-1, 72).numpy()
+    times = [(1 / np.interp(nodes, EDGES, own).clip(floor)).mean() for own in knots]
+    found = LAW.time_cvar(level, floor).flatten()
+    torch.testing.assert_close(found, torch.tensor(times, dtype=torch.float64), rtol=1e-4, atol=0)
+
+
 @pytest.mark.parametrize("floor", [0.01, 0.05, 0.3, 1.0])
 def test_the_expected_time_is_that_of_the_quantiles(floor: float) -> None:
     wanted = weighted(1 / sampled(LAW).clamp(min=floor))

@@ -22,6 +22,12 @@ def test_measures_by_name_are_those_of_the_mixture() -> None:
         ("mean", mixture.mean()),
         ("expected-time", (1 / mixture.expected_time(0.05)).clamp(0.05, 1)),
         ("expected-time:0.2", (1 / mixture.expected_time(0.2)).clamp(0.2, 1)),
+        ("time-cvar", (1 / mixture.time_cvar(0.9, 0.05)).clamp(0.05, 1)),
+        ("time-cvar:0.6", (1 / mixture.time_cvar(0.6, 0.05)).clamp(0.05, 1)),
+        (
+            {"part": "time-cvar", "options": {"level": 0.6, "floor": 0.2}},
+            (1 / mixture.time_cvar(0.6, 0.2)).clamp(0.2, 1),
+        ),
         ("chance", mixture.chance(0.1)),
         ("chance:0.4", mixture.chance(0.4)),
         ("single-class", mixture.most_likely().cvar(0.9)),
@@ -89,7 +95,9 @@ def test_a_measure_changes_nothing_that_it_is_given(name: str) -> None:
     assert all(torch.equal(*pair) for pair in zip(before, after, strict=True))
 
 
-@pytest.mark.parametrize(("text", "word"), [("chance:1.5", "bound"), ("expected-time:0", "least speed")])
+@pytest.mark.parametrize(
+    ("text", "word"), [("chance:1.5", "bound"), ("expected-time:0", "least speed"), ("time-cvar:1", "level")]
+)
 def test_options_of_other_measures_out_of_range_are_refused(text: str, word: str) -> None:
     with pytest.raises(ConfigError, match=word):
         risk.apply(registry.make("risk", text), random_mixture())
@@ -105,7 +113,7 @@ def test_measures_are_those_of_any_distribution_and_single_class_refuses_by_name
     law = quantiles()
     for text, expected in (
         ("mean", law.mean()), ("cvar:0.7", law.cvar(0.7)), ("var:0.7", law.var(0.7)), ("chance:0.2", law.chance(0.2)),
-        ("expected-time:0.1", 1 / law.expected_time(0.1)),
+        ("expected-time:0.1", 1 / law.expected_time(0.1)), ("time-cvar:0.7", 1 / law.time_cvar(0.7, 0.05)),
     ):  # fmt: skip
         assert torch.equal(risk.apply(registry.make("risk", text), law), expected), text
     with pytest.raises(ConfigError, match="single-class option, got QuantileDistribution"):

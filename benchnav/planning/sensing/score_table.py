@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav.core.batch import Batch
+from benchnav.core.batch import Batch, map_tensors
 from benchnav.core.conditioned import unskewed
 from benchnav.core.distribution import TraversabilityDistribution, check_floor, tail_of
 
@@ -24,6 +24,7 @@ VALUES: tuple[float, ...] = (
 """λ between which a belief's CDF is linear: denser where risk is."""
 _MOST_SCORE = 9.0  # beyond which ranks are alike
 _LEAST_STD = 1e-9
+_AT_ONCE = 512  # cells, so that what is worked on stays in the cache
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,20 @@ class TabulatedDistribution(TraversabilityDistribution):
         weights[:-1] += (high * times - logs) / (high - low)
         weights[1:] += (logs - low * times) / (high - low)
         return 1 + self.below.movedim(-3, -1) @ self.below.new_tensor(weights)
+
+    def time_cvar(self, level: float, floor: float) -> Tensor:
+        """CVaR of the time 1 / max(λ, floor), shape [*B, H, W]; see the base."""
+        tail = tail_of(level)
+        check_floor(floor)
+        below, values = self.below.movedim(-3, -1), self._values()
+        low, high = values[:-1], values[1:].clamp(min=floor)
+        slope = below.diff(dim=-1) / values.diff()
+        # Where F passes p, the CDF of the tail is linear up to there, and 1 from there on.
+        whole = low + (tail - below[..., :-1]).clamp(min=0) / slope.clamp(min=1e-30)
+        split = torch.minimum(whole.clamp(min=floor), high)
+        start = low.clamp(min=floor)
+        linear = (below[..., :-1] - slope * low) * (1 / start - 1 / split) + slope * (split / start).log()
+        return 1 + (linear / tail + (1 / split - 1 / high)).sum(-1)
 
     def _values(self) -> Tensor:
         return self.below.new_tensor(VALUES)
@@ -171,5 +186,17 @@ def scores_of(prior: TraversabilityDistribution) -> Tensor:
 
     Of an atom at 0 and at 1 it is the end that is nearer to the other values.
     """
-    ends = [prior.to_normal(value)[value < 1] for value in VALUES]
-    return torch.cat([end.float().clamp(-_MOST_SCORE, _MOST_SCORE) for end in ends]).T.contiguous()
+    count = prior.shape[-1]
+    parts = [_scores_of(prior, start, start + _AT_ONCE) for start in range(0, max(count, 1), _AT_ONCE)]
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+
+def _scores_of(prior: TraversabilityDistribution, start: int, end: int) -> Tensor:
+    """Those of some cells, all values at once."""
+    cells = map_tensors(prior, lambda of: of[..., start:end].repeat_interleave(len(VALUES), dim=-1))
+    value = torch.tensor(VALUES, dtype=torch.float64, device=prior.device).repeat(
+        cells.shape[-1] // len(VALUES)
+    )
+    low, high = cells.to_normal(value[None])
+    ends = torch.where(value < 1, high, low)[0]
+    return ends.float().clamp(-_MOST_SCORE, _MOST_SCORE).view(-1, len(VALUES))

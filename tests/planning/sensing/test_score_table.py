@@ -3,9 +3,12 @@
 import pytest
 import torch
 
-from benchnav.planning.sensing.score_table import VALUES, TabulatedDistribution
+from benchnav.core.distribution import TraversabilityDistribution
+from benchnav.planning.sensing import score_table
+from benchnav.planning.sensing.score_table import VALUES, TabulatedDistribution, scores_of
 from benchnav.testing.breaches import Breaches
 from benchnav.testing.distribution import check_functions
+from tests.core.distributions import Hidden, mixture, quantiles
 
 
 def table() -> TabulatedDistribution:
@@ -35,6 +38,10 @@ def test_means_of_all_kinds_are_those_of_draws(floor: float) -> None:
     assert torch.allclose(law.cvar(0.8)[0, 0], worst, atol=5e-4, rtol=0)
     times = (1 / drawn.clamp(min=floor)).mean(0)
     assert torch.allclose(law.expected_time(floor)[0, 0], times, rtol=2e-3, atol=0)
+    for level in (0.5, 0.8):
+        slowest = drawn[: round(len(drawn) * (1 - level))].clamp(min=floor)
+        assert torch.allclose(law.time_cvar(level, floor)[0, 0], (1 / slowest).mean(0), rtol=2e-3, atol=0)
+    assert torch.allclose(law.time_cvar(0.0, floor), law.expected_time(floor), rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.3, 0.5, 0.8, 0.9, 0.95])
@@ -48,3 +55,26 @@ def test_rounding_leaves_λ_between_0_and_1(level: float) -> None:
         assert found.dtype == torch.float32
         assert float(found.min()) >= 0
         assert float(found.max()) <= 1
+
+
+@pytest.mark.parametrize("cells", [1, 12, 512])
+@pytest.mark.parametrize(
+    "prior",
+    [
+        mixture(3, 0.05, 0.3),
+        mixture(1, 0.001, 0.2),
+        quantiles(dtype=torch.float32),
+        Hidden(mixture(2, 0.1, 0.2)),
+    ],
+)
+def test_a_row_has_the_scores_of_its_own_cell(
+    prior: TraversabilityDistribution, cells: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(score_table, "_AT_ONCE", cells)
+    row = prior.at(torch.ones(prior.shape, dtype=torch.bool))
+    found = scores_of(row)
+    for place, value in enumerate(VALUES):
+        low, high = row.to_normal(value)
+        wanted = (high if value < 1 else low)[0].float().clamp(-9, 9)
+        torch.testing.assert_close(found[:, place], wanted, rtol=0, atol=1e-5)
+    assert scores_of(prior.at(torch.zeros(prior.shape, dtype=torch.bool))).shape == (0, len(VALUES))
