@@ -12,6 +12,7 @@ Source: Salmon et al. (2011), "Parallel random numbers: as easy as 1, 2, 3" (Phi
 import hashlib
 import json
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,6 +32,7 @@ _ROUNDS = 10
 _HALF, _LOW = np.uint64(32), np.uint64(2**32 - 1)
 
 
+@lru_cache(maxsize=2**14)
 def stream_key(seed: int, *names: Name) -> int:
     """Hashes a root seed and names to a 128-bit key; distinct names give independent streams."""
     text = json.dumps([int(seed), *names], separators=(",", ":"))

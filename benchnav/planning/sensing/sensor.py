@@ -204,9 +204,11 @@ class Probe(Sensor):
         truth, value = terrain.truth.at(near), field[wanted]
         lower, upper = (ends[0].double() for ends in truth.to_normal(value[None]))
         # In an atom all ranks are alike: one of them, at random.
-        low, high = (torch.special.ndtr(end.clamp(-_MOST_SCORE, _MOST_SCORE)) for end in (lower, upper))
-        rank = torch.special.ndtr(moment.normal("rank", near))
-        score = torch.where(upper > lower, torch.special.ndtri(low + (high - low) * rank), lower)
+        atom = upper > lower
+        ends = (end[atom].clamp(-_MOST_SCORE, _MOST_SCORE) for end in (lower, upper))
+        low, high = (torch.special.ndtr(end) for end in ends)
+        rank = torch.special.ndtr(moment.normal("rank", near.index_put(wanted, atom)))
+        score = lower.index_put((atom,), torch.special.ndtri(low + (high - low) * rank))
         score = score + self.noise_std * moment.normal("noise", near)
         found = torch.full_like(field, torch.nan)
         found[wanted] = truth.from_normal(score[None].to(value.dtype))[0].to(field.dtype)
@@ -217,5 +219,9 @@ class Probe(Sensor):
         grid = terrain.grid
         row, column = (torch.arange(size, device=robot_state.device) for size in grid.shape)
         x, y = grid.centre_of(row[:, None], column[None, :])
-        away = torch.hypot(x - robot_state[:, 0, None, None], y - robot_state[:, 1, None, None])
-        return away <= self.radius_m
+        right, up = x - robot_state[:, 0, None, None], y - robot_state[:, 1, None, None]
+        near = (right.abs() <= self.radius_m) & (up.abs() <= self.radius_m)
+        # Roots of the few cells alone that may be near: those of all take as long as the rest of a look.
+        member, row, column = near.nonzero(as_tuple=True)
+        away = torch.hypot(right[member, 0, column], up[member, row, 0])
+        return near.index_put((member, row, column), away <= self.radius_m)
