@@ -15,7 +15,10 @@ class Batch:
 
     def select(self, members: Tensor) -> Self:
         """Keeps some members, by index, int64, shape [M]; one may be taken more than once."""
-        return map_tensors(self, lambda values: values[members])
+        given: Any = self
+        return replace(
+            given, **{each.name: _selected(getattr(self, each.name), members) for each in fields(given)}
+        )
 
     def put(self, members: Tensor, others: Self) -> Self:
         """Puts M members in the places of others, by index, int64, shape [M]; this one is not changed."""
@@ -54,6 +57,19 @@ def _changed(first: Any, change: Callable[..., Tensor], rest: list[Any]) -> Any:
     if isinstance(first, Mapping):
         return {key: _changed(inner, change, [other[key] for other in rest]) for key, inner in first.items()}
     return first
+
+
+def _selected(value: Any, members: Tensor) -> Any:
+    """A value of a batch for some members; a batch in it keeps them as it does by itself."""
+    if isinstance(value, Tensor):
+        return value[members]
+    if isinstance(value, Batch):
+        return value.select(members)
+    if isinstance(value, tuple) and value and isinstance(value[0], Batch):
+        return tuple(own.select(members) for own in value)
+    if isinstance(value, Mapping):
+        return {key: _selected(inner, members) for key, inner in value.items()}
+    return value
 
 
 def put_if_alike(value: Value, members: Tensor, others: Value) -> Value:

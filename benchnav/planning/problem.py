@@ -19,6 +19,7 @@ from benchnav.core.terrain import Observation
 from benchnav.planning.free_space import PENALTY, Rules, cells_at_goal
 from benchnav.planning.objective import Objective
 from benchnav.planning.robots import Robot
+from benchnav.planning.world.world import Immobile
 
 # Stands for a λ̂ of 0 in maps for lookups, where the sign tells whether ground is free and 0 is off the map.
 _ZERO = 1e-30
@@ -63,6 +64,7 @@ class Problem(Batch):
         goal_m: (x, y) of the goals, shape [B, 2].
         time_budget_s: T of each episode, shape [B].
         fields: draws whole fields of λ, whose cells hang together; see `sample_fields`.
+        immobile: what the world holds robots by, which planners may plan for; None for nothing.
     """
 
     task: Task
@@ -74,6 +76,7 @@ class Problem(Batch):
     goal_m: Tensor
     time_budget_s: Tensor
     fields: FieldSource | None = None
+    immobile: Immobile | None = None
 
     def __post_init__(self) -> None:
         """Checks that the batch is one batch."""
@@ -162,8 +165,7 @@ class Problem(Batch):
         One lookup a step serves motion, J and the penalty of ground that is not free; see `motion_traversability`,
         `stage_cost` and `free_at`.
         """
-        magnitude = self.risk_map.clamp(min=_ZERO)
-        return self.grid.pad(torch.where(self.free, magnitude, -magnitude), outside=-0.0)
+        return ground_map(self.grid, self.risk_map, self.free)
 
     @cached_property
     def action_bounds(self) -> tuple[Tensor, Tensor]:
@@ -202,6 +204,12 @@ class Problem(Batch):
     def terminal_cost(self, state: Tensor, target: Tensor) -> Tensor:
         """J of the last state, and the penalty of ground that is not free; shapes as for `stage_cost`."""
         return terminal_cost(self.objective, state, self.ground_at(state), target)
+
+
+def ground_map(grid: Grid, traversability: Tensor, free: Tensor) -> Tensor:
+    """`Problem.padded_ground` of any λ and free space, shape [*B, H, W] of both."""
+    magnitude = traversability.clamp(min=_ZERO)
+    return grid.pad(torch.where(free, magnitude, -magnitude), outside=-0.0)
 
 
 def motion_traversability(ground: Tensor, min_traversability: float) -> Tensor:
@@ -243,6 +251,7 @@ def pose_problem(
     time_budget_s: Tensor | float,
     seen: Tensor | None = None,
     fields: FieldSource | None = None,
+    immobile: Immobile | None = None,
 ) -> Problem:
     """Poses the problem of driving from start to goal, heading at the goal.
 
@@ -256,6 +265,7 @@ def pose_problem(
         time_budget_s: T, of all or of each, shape [B].
         seen: which cells were seen, bool, shape [B, H, W]; None for all.
         fields: draws whole fields of λ; None where nobody asks for them.
+        immobile: what the world holds robots by; None for nothing.
     """
     rules = task.rules
     at_goal = cells_at_goal(observation.grid, goal_m, rules.goal_radius_m)
@@ -271,6 +281,7 @@ def pose_problem(
         .expand(len(goal_m))
         .clone(),
         fields=fields,
+        immobile=immobile,
     )
 
 

@@ -207,6 +207,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
             simulation.time_budget_s,
             known.seen,
             Fields(learner.belief, known.believed, tuple(unit.maps)),
+            condition.world.immobile,
         )
     except GPU_FAULTS as error:
         raise gpu_failed(error) from error

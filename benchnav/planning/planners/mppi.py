@@ -12,6 +12,9 @@ noise as drawn: u ← clip(u + Σwε). Were clipped samples averaged, the mean w
 bounds wherever costs are flat, since samples beyond a bound are drawn back onto it. The mean is clipped too, so
 that it cannot wind up beyond the bounds, where no sample would reach back.
 
+Risk is that of λ in each cell, as the risk map has it, or that of the cost (`risk_on: cost`): each sequence is rolled
+out on M fields of λ, and its cost is the CVaR over them; see `benchnav.planning.planners.cost_risk`.
+
 What differs: noise and temperature are relative by default, so that one setting serves robots and objectives of
 any unit. The control cost is off by default. The mean is not smoothed. Noise is read anew from one bank, a pure
 function of seed and step (`NoiseBank`); the episodes of a batch share it, so an episode has the same noise alone as
@@ -21,7 +24,7 @@ in any batch.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -33,6 +36,7 @@ from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
+from benchnav.planning.planners.cost_risk import advance_held, framed_fields, tail_cost
 from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
 from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
 from benchnav.planning.robots import Robot, component_wise, steps_in
@@ -42,8 +46,10 @@ from benchnav.planning.sensing.sensor import Step
 _CHUNK_STEPS = 10
 _WORTH_COMPILING = 2000  # samples
 OF_EPISODES = (0, 1, 2, 6, 7)  # arguments of what is compiled: states, cost, mean, padded_ground, target
+HELD_OF_EPISODES = (0, 1, 2, 3, 7, 8, 9)  # states, cost, held, mean, padded_ground, target, steps_left
 _DRAWN_SAMPLES = 40
 _RUNS = 4  # length N of a part of the noise bank, in runs of K numbers
+_LEAST_TAIL = 10  # fields in the tail of which a cost is the mean
 _LEAST_SPREAD = 1e-30  # where all samples cost alike, all weigh alike
 
 
@@ -62,6 +68,11 @@ class MPPIConfig:
         temperature: the same in the units of J, in place of `temperature_share`; λ in the source.
         control_cost: weight γ of the information-theoretic control cost γ·uᵀΣ⁻¹ε; 0 takes the current mean
             itself as the base distribution (α = 1 in the source), the value of `temperature` takes 0 (α = 0).
+        risk_on: `map`, rollouts are on λ̂; `cost`, on fields of λ, and λ̂ tells free ground alone.
+        level: α of the CVaR of the cost, in [0, 1); at 0 its mean.
+        fields: M, on which each sequence is rolled out; at least 10 in the tail, M ≥ 10 / (1 − α), where α > 0.
+        once: draws fields once for a map as it is known, not anew at each step.
+        entrapment: rollouts stop for good on ground on which the world holds robots.
     """
 
     gone: ClassVar = {"horizon": "It is now `horizon_s`, in seconds."}
@@ -73,13 +84,29 @@ class MPPIConfig:
     temperature_share: float = 0.1
     temperature: float | None = None
     control_cost: float = 0.0
+    risk_on: Literal["map", "cost"] = "map"
+    level: float = 0.0
+    fields: int = 64
+    once: bool = False
+    entrapment: bool = False
 
     def __post_init__(self) -> None:
         """Refuses settings that sample nothing."""
-        above = "horizon_s", "samples", "noise_share", "temperature_share", "temperature"
+        above = "horizon_s", "samples", "noise_share", "temperature_share", "temperature", "fields"
         check_finite("MPPI", self, above, ("control_cost",))
         fits = self.noise is None or (self.noise and all(0 < scale < math.inf for scale in self.noise))
         expect(fits, f"`noise` > 0 for each action of MPPI, got {self.noise}.")
+        expect(self.risk_on in ("map", "cost"), f"`risk_on` 'map' or 'cost' for MPPI, got {self.risk_on!r}.")
+        expect(0 <= self.level < 1, f"`level` in [0, 1) for MPPI, got {self.level}.")
+        expect(
+            self.risk_on == "cost" or (self.level == 0 and not self.once),
+            "`risk_on: cost` for `level` and `once` of MPPI, got 'map', whose risk is that of the risk setting.",
+        )
+        least = math.ceil(_LEAST_TAIL / (1 - self.level) - 1e-9)
+        expect(
+            self.level == 0 or self.fields >= least,
+            f"`fields` of at least {_LEAST_TAIL} / (1 − `level`) = {least} for MPPI, got {self.fields}.",
+        )
 
 
 @dataclass(frozen=True)
@@ -127,13 +154,19 @@ class MPPIState(Batch):
     Args:
         problem: what is being solved.
         mean: mean action sequence, shape [B, T, A].
+        held: steps in a row, up to now, on ground that holds the robot, shape [B].
+        ground: fields of λ that were drawn once, as of `framed_fields`, shape [B, M, N]; None where there are none.
         noise: of all steps, the same for each episode.
+        key: of the fields' streams.
         step: steps planned so far.
     """
 
     problem: Problem
     mean: Tensor
+    held: Tensor
+    ground: Tensor | None
     noise: NoiseBank
+    key: int
     step: int
 
 
@@ -149,14 +182,23 @@ class MPPI(LocalPlanner[MPPIState]):
     def __init__(self, config: MPPIConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or MPPIConfig()
-        samples = self.config.samples
-        self._advance = Fused(advance_chunk, samples, _WORTH_COMPILING, batched=OF_EPISODES)
-        self._weigh = Fused(weigh, samples, _WORTH_COMPILING, batched=OF_EPISODES)
+        samples, fields = self.config.samples, self._fields
+        rollouts = samples * fields
+        self._advance = Fused(advance_chunk, rollouts, _WORTH_COMPILING, batched=OF_EPISODES)
+        self._advance_held = Fused(advance_held, rollouts, _WORTH_COMPILING, batched=HELD_OF_EPISODES)
+        self._weigh = Fused(weigh, rollouts, _WORTH_COMPILING, batched=OF_EPISODES)
+
+    @property
+    def _fields(self) -> int:
+        return self.config.fields if self.config.risk_on == "cost" else 1
 
     @property
     def compiled(self) -> bool | None:
         """Whether it runs compiled; None before the first step."""
-        verdicts = (self._advance.compiled, self._weigh.compiled)
+        rolled = (
+            self._advance.compiled if self._advance_held.compiled is None else self._advance_held.compiled
+        )
+        verdicts = (rolled, self._weigh.compiled)
         return None if None in verdicts else all(verdicts)
 
     def init(self, problem: Problem, generator: torch.Generator) -> MPPIState:
@@ -175,26 +217,63 @@ class MPPI(LocalPlanner[MPPIState]):
         horizon = steps_in(config.horizon_s, problem.dt_s)
         mean = problem.start.new_zeros(len(problem), horizon, len(names))
         scale = config.noise_share * (high - low) if config.noise is None else low.new_tensor(config.noise)
-        return MPPIState(problem, mean, draw_bank(seed, horizon, config.samples, scale), 0)
+        bank = draw_bank(seed, horizon, config.samples, scale)
+        key = rng.stream_key(seed, "fields")
+        held, ground = problem.start.new_zeros(len(problem)), self._drawn_once(problem, key)
+        return MPPIState(problem, mean, held, ground, bank, key, 0)
+
+    def revise(self, plan_state: MPPIState, problem: Problem) -> MPPIState:
+        """Keeps the mean; see `Planner`."""
+        ground = self._drawn_once(problem, plan_state.key)
+        return replace(plan_state, problem=problem, ground=ground)
+
+    def _drawn_once(self, problem: Problem, key: int) -> Tensor | None:
+        if self.config.risk_on == "map" or not self.config.once:
+            return None
+        ground = framed_fields(problem, problem.sample_fields(self._fields, key))
+        return ground.unflatten(0, (len(problem), -1))
 
     def plan_toward(
         self, step: Step, plan_state: MPPIState, target_m: Tensor
     ) -> tuple[Tensor, MPPIState, Plan]:
         """Solves one step; see `LocalPlanner`."""
         problem, config, mean = plan_state.problem, self.config, plan_state.mean
-        noise = plan_state.noise.at(plan_state.step)
-        states, cost = roll_out(problem, step.state, mean, noise, target_m, self._advance)
+        noise, ground = plan_state.noise.at(plan_state.step), self._ground(plan_state)
+        held = self._held(plan_state, step)
+        advance = self._advance if held is None else self._advance_held
+        states, cost, going = roll_out(
+            problem, step.state, mean, noise, target_m, advance, ground, held, step.time_s
+        )
         if config.control_cost:
-            cost = cost + config.control_cost * control_cost(mean, noise, plan_state.noise.scale)
+            own = control_cost(mean, noise, plan_state.noise.scale)
+            cost = cost + config.control_cost * own.repeat_interleave(self._fields, 0)
+        target = target_m[:, None].repeat_interleave(self._fields, 0).contiguous()
         weights, updated = self._weigh(
-            states, cost, mean, noise, *problem.action_bounds, problem.padded_ground,
-            target_m[:, None].contiguous(), problem.grid, problem.objective,
-            config.temperature, config.temperature_share,
+            states, cost, mean, noise, *problem.action_bounds, ground, target, problem.grid, problem.objective,
+            config.temperature, config.temperature_share, self._fields, config.level, going,
         )  # fmt: skip
         shifted = torch.cat((updated[:, 1:], updated[:, -1:]), dim=1)
         layers = _drawn(problem, step.state, updated, mean, noise, weights) if step.draw else {}
         plan = Plan.empty(len(problem), step.state.device, **layers)
-        return updated[:, 0], replace(plan_state, mean=shifted, step=plan_state.step + 1), plan
+        after = replace(plan_state, mean=shifted, step=plan_state.step + 1)
+        return updated[:, 0], after if held is None else replace(after, held=held), plan
+
+    def _ground(self, plan_state: MPPIState) -> Tensor:
+        """What rollouts are on in this step, shape [B·M, N]."""
+        problem = plan_state.problem
+        if self.config.risk_on == "map":
+            return problem.padded_ground
+        if plan_state.ground is not None:
+            return plan_state.ground.flatten(0, 1)
+        key = rng.stream_key(plan_state.key, plan_state.step)
+        return framed_fields(problem, problem.sample_fields(self._fields, key))
+
+    def _held(self, plan_state: MPPIState, step: Step) -> Tensor | None:
+        """Steps in a row on ground that holds the robots; None where rollouts are not held, shape [B]."""
+        immobile = plan_state.problem.immobile
+        if not self.config.entrapment or immobile is None:
+            return None
+        return torch.where(step.traversability < immobile.below, plan_state.held + 1, 0)
 
 
 def draw_bank(seed: int, horizon: int, samples: int, scale: Tensor) -> NoiseBank:
@@ -235,8 +314,11 @@ def roll_out(
     mean: Tensor,
     noise: Tensor,
     target_m: Tensor,
-    advance: Callable[..., tuple[Tensor, Tensor]],
-) -> tuple[Tensor, Tensor]:
+    advance: Callable[..., Any],
+    ground: Tensor | None = None,
+    held: Tensor | None = None,
+    time_s: float = 0.0,
+) -> tuple[Tensor, Tensor, Tensor | None]:
     """Rolls sampled action sequences out, summing J and the penalty of ground that is not free.
 
     Args:
@@ -245,22 +327,41 @@ def roll_out(
         mean: mean action sequences, shape [B, T, A].
         noise: added to every mean and clipped to the action bounds, shape [T, A, K].
         target_m: (x, y) to be reached, shape [B, 2].
-        advance: `advance_chunk` or the same compiled.
+        advance: `advance_chunk`, with `held` `advance_held`, or the same compiled.
+        ground: M maps of an episode after another, as of `framed_fields`, shape [B·M, N]; None for λ̂.
+        held: steps in a row, up to now, on ground that holds the robots, shape [B]; None where none does.
+        time_s: since the start, of which `held` has use.
 
     Returns:
-        The last states, shape [B, K, S], and the cost but for theirs, shape [B, K].
+        The last states, shape [B·M, K, S], the cost but for theirs, shape [B·M, K], and, with `held`, which have not
+        stopped, bool of that shape.
     """
+    ground = problem.padded_ground if ground is None else ground
+    count = len(ground) // len(problem)
+    state, mean, target_m = (each.repeat_interleave(count, 0) for each in (state, mean, target_m))
     states = component_wise(state[:, None].expand(-1, noise.shape[2], -1))
     target = target_m[:, None].contiguous()  # as all that is passed on: another layout is compiled for anew
     cost = state.new_zeros(states.shape[:2])
-    for first in range(0, mean.shape[1], _CHUNK_STEPS):
-        chunk = slice(first, first + _CHUNK_STEPS)
-        states, cost = advance(
-            states, cost, mean[:, chunk].contiguous(), noise[chunk], *problem.action_bounds,
-            problem.padded_ground, target, problem.grid, problem.robot, problem.objective,
-            problem.task.rules.min_traversability,
-        )  # fmt: skip
-    return states, cost
+    parts = problem.grid, problem.robot, problem.objective, problem.task.rules.min_traversability
+    if held is None or problem.immobile is None:
+        for chunk in _chunks(mean.shape[1]):
+            given = mean[:, chunk].contiguous(), noise[chunk], *problem.action_bounds, ground, target
+            states, cost = advance(states, cost, *given, *parts)
+        return states, cost, None
+    most = steps_in(problem.immobile.for_s, problem.dt_s)
+    rows = held.repeat_interleave(count, 0)[:, None].expand_as(cost).clamp(max=most - 1).contiguous()
+    left = ((problem.time_budget_s - time_s) / problem.dt_s).round().to(state)
+    left = left.repeat_interleave(count, 0)[:, None]
+    for chunk in _chunks(mean.shape[1]):
+        given = mean[:, chunk].contiguous(), noise[chunk], *problem.action_bounds, ground, target
+        states, cost, rows = advance(
+            states, cost, rows, *given, left - chunk.start, *parts, problem.immobile.below, most
+        )
+    return states, cost, rows < most
+
+
+def _chunks(horizon: int) -> list[slice]:
+    return [slice(first, min(first + _CHUNK_STEPS, horizon)) for first in range(0, horizon, _CHUNK_STEPS)]
 
 
 def advance_chunk(
@@ -279,15 +380,21 @@ def advance_chunk(
 def weigh(
     states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
     padded_ground: Tensor, target: Tensor, grid: Grid, objective: Objective,
-    temperature: float | None, temperature_share: float,
+    temperature: float | None, temperature_share: float, fields: int = 1, level: float = 0.0,
+    going: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Adds the cost of the last states, weighs the samples by exp(−cost / temperature) and moves the mean.
+
+    Of rollouts on M fields the cost is the CVaR over them; those that have stopped have paid all that there is to pay.
 
     Returns:
         Weights of the samples, shape [B, K], and the mean action sequences, shape [B, T, A].
     """
     ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
-    cost = cost + terminal_cost(objective, states, ground, target)
+    last = terminal_cost(objective, states, ground, target)
+    cost = cost + (last if going is None else torch.where(going, last, 0))
+    if fields > 1:
+        cost = tail_cost(cost.unflatten(0, (-1, fields)), level)
     scale = temperature_share * cost_spread(cost) if temperature is None else temperature
     weights = torch.softmax((cost.amin(dim=1, keepdim=True) - cost) / scale, dim=1)
     return weights, average(mean, noise, weights, low, high)

@@ -84,7 +84,7 @@ def on_cuda(*tensors: Tensor) -> bool:
 
 def rollout_cost(problem: Problem, state: Tensor, mean: Tensor, noise: Tensor, target_m: Tensor) -> Tensor:
     """J and the penalty of ground that is not free along MPPI's sampled action sequences, shape [B, K]."""
-    states, cost = roll_out(problem, state, mean, noise, target_m, advance_chunk)
+    states, cost, _ = roll_out(problem, state, mean, noise, target_m, advance_chunk)
     return cost + problem.terminal_cost(states, target_m[:, None])
 
 

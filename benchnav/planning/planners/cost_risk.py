@@ -1,0 +1,104 @@
+"""Risk of the cost: action sequences are rolled out on whole fields of λ, and judged by the tail of what they cost.
+
+A risk map tells each cell's risk on its own. What a way costs adds up over cells that hang together, and its tail is
+that of the sum: CVaR over M fields of the cost of a sequence of actions on each. On fields and on a risk map alike,
+ground of little λ may hold a robot for good (`advance_held`), of which the motion model alone does not know. Source:
+Cai et al. (2024), "EVORA: Deep evidential traversability learning for risk-aware off-road autonomy", CVaR-Cost.
+
+Letters in shapes: B episodes, M fields, K samples, T steps, S state and A action dimensions, H×W cells, N cells framed
+for lookups.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from benchnav.core.grid import Grid
+from benchnav.planning.objective import Objective
+from benchnav.planning.problem import (
+    Problem,
+    ground_map,
+    motion_traversability,
+    predicted_traversability,
+    stage_cost,
+)
+from benchnav.planning.robots import Robot, component_wise
+
+
+def framed_fields(problem: Problem, fields: Tensor) -> Tensor:
+    """Fields of λ with the problem's free space, as `Problem.padded_ground` has λ̂, an episode's one after another.
+
+    Args:
+        problem: B problems.
+        fields: λ, shape [B, M, H, W].
+
+    Returns:
+        Shape [B·M, N].
+    """
+    free = problem.free[:, None].expand_as(fields)
+    return ground_map(problem.grid, fields, free).flatten(0, 1)
+
+
+def tail_cost(cost: Tensor, level: float) -> Tensor:
+    """CVaR of the cost over equally likely fields: the mean of the worst share 1 − level of them.
+
+    Args:
+        cost: shape [B, M, K].
+        level: α in [0, 1); at 0 the mean.
+
+    Returns:
+        Shape [B, K]. Of a field that is in that share by a part alone the part counts.
+    """
+    if level == 0:
+        return cost.mean(1)
+    worst = (1 - level) * cost.shape[1]
+    count = math.ceil(worst - 1e-9)
+    most = cost.topk(count, dim=1).values
+    return (most[:, :-1].sum(1) + (worst - count + 1) * most[:, -1]) / worst
+
+
+def advance_held(
+    states: Tensor, cost: Tensor, held: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
+    padded_ground: Tensor, target: Tensor, steps_left: Tensor, grid: Grid, robot: Robot, objective: Objective,
+    min_traversability: float, below: float, most: int,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Rolls samples out as `mppi.advance_chunk` does, where ground of little λ holds a robot for good.
+
+    One that was on such ground for so many steps stops there, and pays J of standing there until its time is over.
+
+    Args:
+        states: shape [B, K, S].
+        cost: so far, shape [B, K].
+        held: steps in a row on ground that holds, shape [B, K]; `most` of one that has stopped.
+        mean: of the actions, shape [B, T, A].
+        noise: added to it, shape [T, A, K].
+        low: least actions, shape [A].
+        high: greatest actions, shape [A].
+        padded_ground: as of `Problem`, shape [B, N].
+        target: (x, y) to be reached, shape [B, 1, 2].
+        steps_left: from the first of these steps until the time is over, shape [B, 1].
+        grid: of the maps.
+        robot: F.
+        objective: J.
+        min_traversability: least λ of motion.
+        below: λ under which ground holds.
+        most: steps in a row for which it has to.
+
+    Returns:
+        States, cost and `held` after these steps.
+    """
+    for step in range(mean.shape[1]):
+        action = torch.clamp(mean[:, step, :, None] + noise[step], low[:, None], high[:, None]).movedim(1, 2)
+        ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
+        traversability, going = predicted_traversability(ground), held < most
+        longer = torch.where(traversability < below, held + 1, 0)
+        stops = going & (longer >= most)
+        paid = stage_cost(objective, states, action, ground, target)
+        standing = objective.stage(states, torch.zeros_like(action), traversability, target)
+        rest = (steps_left - (step + 1)).clamp(min=0) * standing
+        cost = cost + torch.where(going, paid + torch.where(stops, rest, 0), 0)
+        moved = robot(states, action, motion_traversability(ground, min_traversability))
+        states = torch.where((going & ~stops)[..., None], moved, states)
+        held = torch.where(going, longer, held)
+    return component_wise(states), cost, held

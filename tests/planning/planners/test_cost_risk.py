@@ -1,0 +1,278 @@
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from benchnav.core.errors import ConfigError
+from benchnav.planning.objective import GoalDistance, Objective, TravelTime
+from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConfig
+from benchnav.planning.planners.cost_risk import advance_held, tail_cost
+from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, roll_out
+from benchnav.planning.problem import Problem
+from benchnav.planning.robots import Unicycle
+from benchnav.planning.sensing.belief import Fields, Law, Static
+from benchnav.planning.world.world import Immobile
+from tests import factories
+from tests.planning.planners.driving import first, generator, rollout_cost
+
+SMALL = MPPIConfig(samples=64, horizon_s=1.5)
+
+
+@dataclass(frozen=True)
+class Given:
+    """Fields that are given, as many as are asked for of [B, M, H, W]; notes the keys that they are asked by."""
+
+    fields: Tensor
+    keys: list[int]
+
+    def sample(self, count: int, key: int) -> Tensor:
+        self.keys.append(key)
+        return self.fields[:, :count]
+
+    def select(self, members: Tensor) -> "Given":
+        return Given(self.fields[members], self.keys)
+
+
+def varied(batch: int = 2, **changes: Any) -> Problem:
+    maps = 0.31 + 0.6 * torch.rand(batch, 16, 16, generator=generator())
+    return factories.problem(maps, **changes)
+
+
+def fields(problem: Problem, count: int) -> Tensor:
+    return torch.rand(len(problem), count, 16, 16, generator=generator(5))
+
+
+def drives(planner: Any, problem: Problem, steps: int = 3) -> tuple[list[Tensor], Any]:
+    """Actions of some steps, and the last plan state."""
+    plan_state, state, found = planner.init(problem, generator()), problem.start, []
+    for _ in range(steps):
+        action, plan_state, _ = planner.plan(replace(first(problem), state=state), plan_state)
+        found.append(action)
+        state = problem.robot(state, action, problem.traversability_at(state))
+    return found, plan_state
+
+
+@settings(max_examples=60, deadline=None)
+@given(count=st.integers(1, 40), level=st.floats(0, 0.99), seed=st.integers(0, 99))
+def test_the_tail_of_a_cost_is_the_mean_over_its_worst_fields_and_a_part_of_one(
+    count: int, level: float, seed: int
+) -> None:
+    cost = torch.rand(2, count, 3, generator=generator(seed), dtype=torch.float64)
+    found = tail_cost(cost, level)
+    left, total = (1 - level) * count, torch.zeros(2, 3, dtype=torch.float64)
+    for values in cost.sort(1, descending=True).values.unbind(1):
+        total += min(1.0, left) * values
+        left = max(left - 1, 0)
+    torch.testing.assert_close(found, total / ((1 - level) * count))
+    if level == 0:
+        torch.testing.assert_close(found, cost.mean(1))
+
+
+def test_one_field_that_is_sure_is_the_map_bit_for_bit() -> None:
+    problem = varied(3)
+    sure = replace(problem, fields=Given(problem.risk_map[:, None], []))
+    for planner in (MPPI, lambda config: AStarMPPI(AStarMPPIConfig(mppi=config))):
+        wanted, _ = drives(planner(SMALL), problem)
+        found, _ = drives(planner(replace(SMALL, risk_on="cost", fields=1)), sure)
+        assert all(torch.equal(*pair) for pair in zip(found, wanted, strict=True))
+
+
+@pytest.mark.parametrize("level", [0.0, 0.4])
+def test_what_a_sequence_costs_is_the_tail_over_all_fields(level: float) -> None:
+    """Each field is a problem of its own, whose costs are enumerated."""
+    count = 20
+    problem = varied()
+    drawn = fields(problem, count)
+    posed = replace(problem, fields=Given(drawn, []))
+    planner = MPPI(replace(SMALL, risk_on="cost", fields=count, level=level, temperature=0.7))
+    plan_state = planner.init(posed, generator())
+    action, _, _ = planner.plan(first(posed), plan_state)
+    noise = plan_state.noise.at(0)
+    costs = torch.stack([
+        rollout_cost(
+            replace(problem, risk_map=field), problem.start, plan_state.mean, noise, problem.goal_m
+        )
+        for field in drawn.unbind(1)
+    ], dim=1)  # fmt: skip
+    worst = costs.sort(1, descending=True).values[:, : round((1 - level) * count)].mean(1).double()
+    weights = torch.softmax((worst.amin(1, keepdim=True) - worst) / 0.7, dim=1)
+    moved = (noise[0].double() * weights[:, None]).sum(-1)
+    wanted = moved.clamp(*(bound.double() for bound in problem.action_bounds))
+    torch.testing.assert_close(action.double(), wanted, atol=2e-4, rtol=1e-3)
+
+
+def test_fields_are_drawn_anew_at_each_step_and_once_if_that_is_asked_for() -> None:
+    for once, asked in ((False, 3), (True, 1)):
+        problem = varied()
+        source = Given(fields(problem, 4), [])
+        planner = MPPI(replace(SMALL, risk_on="cost", fields=4, once=once))
+        _, plan_state = drives(planner, replace(problem, fields=source))
+        assert len(set(source.keys)) == len(source.keys) == asked
+        again = Given(source.fields, [])
+        drives(planner, replace(problem, fields=again))
+        assert again.keys == source.keys
+        # What is known of the map has changed.
+        other = Given(1 - source.fields, [])
+        revised = planner.revise(plan_state, replace(problem, fields=other))
+        assert len(other.keys) == once
+        assert torch.equal(planner._ground(revised).abs().max(), other.fields.max()) or not once
+
+
+def test_fields_of_a_seed_are_others_than_those_of_another() -> None:
+    problem, keys = varied(), []
+    for seed in (0, 1):
+        source = Given(fields(problem, 4), [])
+        planner = MPPI(replace(SMALL, risk_on="cost", fields=4))
+        planner.plan(first(problem), planner.init(replace(problem, fields=source), generator(seed)))
+        keys.append(source.keys[0])
+    assert keys[0] != keys[1]
+
+
+@pytest.mark.parametrize("once", [False, True])
+def test_an_episode_alone_does_as_it_does_in_a_batch(once: bool) -> None:
+    problem = varied(3)
+    belief = Static()
+    law = Law(grid=problem.grid, correlation_m=1.0)
+    doubtful = factories.normal(problem.risk_map, torch.full_like(problem.risk_map, 0.2))
+    source = Fields(belief, belief.init(doubtful, law), (7, 3, 5))
+    problem = replace(problem, distribution=doubtful, fields=source)
+    planner = MPPI(replace(SMALL, risk_on="cost", fields=20, level=0.5, once=once))
+    whole, state = drives(planner, problem, steps=1)
+    member = torch.tensor([1])
+    alone, _ = drives(planner, problem.select(member), steps=1)
+    torch.testing.assert_close(whole[0][1:2], alone[0], atol=1e-5, rtol=1e-4)
+    # An ended episode leaves, and the fields of the others are theirs as before.
+    step = replace(first(problem), state=problem.start + 0.1)
+    kept = planner.select(state, member)
+    wanted = planner.plan(step, state)[0][member]
+    found = planner.plan(
+        replace(step, state=step.state[member], traversability=step.traversability[member]), kept
+    )
+    torch.testing.assert_close(found[0], wanted, atol=1e-5, rtol=1e-4)
+
+
+def held_cost(
+    problem: Problem, ground: Tensor, actions: Tensor, held: int, time_s: float, immobile: Immobile
+) -> float:
+    """What one sequence [T, 2] costs on a map by a plain loop, the last state included."""
+    state, cost, most = problem.start[0].double(), 0.0, round(immobile.for_s / 0.1)
+    left = round((float(problem.time_budget_s[0]) - time_s) / 0.1)
+    target = problem.goal_m[0].double()
+    for place, action in enumerate(actions.double()):
+        row, column = int(state[1] // 0.5), int(state[0] // 0.5)
+        value = ground[row, column].double()
+        cost += float(problem.objective.stage(state, action, value, target))
+        held = held + 1 if value < immobile.below else 0
+        if held >= most:
+            standing = problem.objective.stage(state, torch.zeros(2), value, target)
+            return cost + float(standing) * (left - place - 1)
+        clamped = value.clamp(min=problem.task.rules.min_traversability)
+        state = problem.robot(state, action, clamped)
+    row, column = int(state[1] // 0.5), int(state[0] // 0.5)
+    return cost + float(problem.objective.terminal(state, ground[row, column].double(), target))
+
+
+@pytest.mark.parametrize("held", [0, 3])
+@pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(robot=Unicycle(), goal_radius_m=1.0)])
+def test_a_rollout_that_is_held_pays_what_is_left_of_the_time(objective: Objective, held: int) -> None:
+    ground = torch.full((1, 16, 16), 0.9)
+    ground[:, 4:, 5:8] = 0.05
+    immobile = Immobile(below=0.1, for_s=0.5)
+    rules = replace(factories.task().rules, min_traversability=0.2)
+    problem = factories.problem(
+        ground, start=(2.2, 2.25), goal=(6.75, 2.25), objective=objective, rules=rules, time_budget_s=9.0
+    )
+    problem = replace(problem, immobile=immobile, free=torch.ones_like(problem.free))
+    mean = torch.zeros(1, 25, 2)
+    noise = torch.rand(25, 2, 6, generator=generator(3))
+    noise[:, 1] -= 0.5
+    states, cost, going = roll_out(
+        problem,
+        problem.start,
+        mean,
+        noise,
+        problem.goal_m,
+        advance_held,
+        None,
+        torch.tensor([float(held)]),
+        2.0,
+    )
+    assert going is not None
+    last = problem.terminal_cost(states, problem.goal_m[:, None])
+    found = cost + torch.where(going, last, 0)
+    actions = noise.movedim(2, 0).clamp(torch.tensor([0.0, -1.0]), torch.tensor([1.0, 1.0]))
+    wanted = [held_cost(problem, ground[0], one, held, 2.0, immobile) for one in actions.movedim(1, 1)]
+    assert found[0].tolist() == pytest.approx(wanted, rel=1e-4)
+    assert bool((~going).any())
+    if isinstance(objective, TravelTime):
+        assert found[0][~going[0]].tolist() == pytest.approx([7.0] * int((~going).sum()), rel=1e-4)
+
+
+def trap() -> Problem:
+    """Soft ground straight ahead, and firm ground around it; the map says that it is only slow."""
+    ground = torch.full((1, 24, 24), 0.9)
+    ground[:, 8:15, 8:12] = 0.08
+    rules = replace(factories.task().rules, min_traversability=0.05)
+    objective = TravelTime(robot=Unicycle(), goal_radius_m=0.5)
+    problem = factories.problem(ground, (3.6, 5.75), (7.75, 5.75), objective=objective, rules=rules)
+    return replace(problem, immobile=Immobile(below=0.1, for_s=1.0), free=torch.ones_like(problem.free))
+
+
+@pytest.mark.parametrize("cost", [False, True])
+def test_with_entrapment_it_keeps_off_ground_that_holds(cost: bool) -> None:
+    problem = trap()
+    if cost:
+        problem = replace(problem, fields=Given(problem.risk_map[:, None], []))
+    speeds = []
+    for entrapment in (False, True):
+        config = replace(SMALL, samples=512, horizon_s=3.0, entrapment=entrapment)
+        config = replace(config, risk_on="cost", fields=1) if cost else config
+        planner = MPPI(config)
+        _, plan_state = drives(planner, problem, steps=6)
+        states = [problem.start]
+        for action in plan_state.mean.unbind(1):
+            states.append(problem.robot(states[-1], action, problem.traversability_at(states[-1])))
+        value = problem.traversability_at(torch.stack(states, 1))
+        speeds.append(int((value < 0.1).sum()))
+    assert speeds[1] < 10 <= speeds[0]
+
+
+def test_a_robot_remembers_for_how_long_it_was_held() -> None:
+    problem = trap()
+    planner = MPPI(replace(SMALL, entrapment=True))
+    plan_state: MPPIState = planner.init(problem, generator())
+    for observed, wanted in ((math.nan, 0), (0.05, 1), (0.02, 2), (0.3, 0), (0.05, 1)):
+        step = replace(first(problem), traversability=torch.tensor([observed]))
+        _, plan_state, _ = planner.plan(step, plan_state)
+        assert plan_state.held.tolist() == [wanted]
+    # In a world that holds nobody there is nothing to plan for.
+    free = replace(problem, immobile=None)
+    wanted, _ = drives(MPPI(SMALL), free)
+    found, _ = drives(planner, free)
+    assert all(torch.equal(*pair) for pair in zip(found, wanted, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"risk_on": "field"}, "`risk_on` 'map' or 'cost'"),
+        ({"risk_on": "cost", "level": 1.0}, "`level` in"),
+        ({"level": 0.5}, "`risk_on: cost` for `level`"),
+        ({"once": True}, "`risk_on: cost` for `level`"),
+        ({"risk_on": "cost", "level": 0.8, "fields": 49}, "= 50 for MPPI, got 49"),
+        ({"risk_on": "cost", "fields": 0}, "`fields` > 0"),
+    ],
+)
+def test_risk_that_cannot_be_told_is_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        replace(SMALL, **changes)
+
+
+def test_as_few_fields_as_the_tail_needs_are_taken() -> None:
+    assert replace(SMALL, risk_on="cost", level=0.8, fields=50).fields == 50
+    assert replace(SMALL, risk_on="cost", level=0.0, fields=1).fields == 1
