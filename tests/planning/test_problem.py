@@ -83,7 +83,7 @@ def test_headings_look_at_the_goal() -> None:
 def test_no_truth_is_in_it() -> None:
     assert {field.name for field in fields(Problem)} == {
         "task", "observation", "distribution", "risk_map", "free", "start", "goal_m", "time_budget_s",
-        "fields",
+        "fields", "immobile",
     }  # fmt: skip
     assert not any("class_id" in name or "truth" in name for name in tensors(varied()))
 
