@@ -249,7 +249,7 @@ def pose_problem(
     start_m: Tensor,
     goal_m: Tensor,
     time_budget_s: Tensor | float,
-    seen: Tensor | None = None,
+    free: Tensor | None = None,
     fields: FieldSource | None = None,
     immobile: Immobile | None = None,
 ) -> Problem:
@@ -263,18 +263,19 @@ def pose_problem(
         start_m: (x, y), shape [B, 2].
         goal_m: (x, y), shape [B, 2].
         time_budget_s: T, of all or of each, shape [B].
-        seen: which cells were seen, bool, shape [B, H, W]; None for all.
+        free: free ground, but for that at the goal, bool, shape [B, H, W]; None for what the rules make of λ̂.
         fields: draws whole fields of λ; None where nobody asks for them.
         immobile: what the world holds robots by; None for nothing.
     """
     rules = task.rules
+    free = rules.free(risk_map, distribution) if free is None else free
     at_goal = cells_at_goal(observation.grid, goal_m, rules.goal_radius_m)
     return Problem(
         task=task,
         observation=observation,
         distribution=distribution,
         risk_map=risk_map,
-        free=rules.free(risk_map, distribution, seen) | at_goal,
+        free=free | at_goal,
         start=task.robot.initial_state(heading_to(start_m, goal_m)),
         goal_m=goal_m,
         time_budget_s=torch.as_tensor(time_budget_s, dtype=torch.float64, device=goal_m.device)

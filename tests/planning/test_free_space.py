@@ -223,7 +223,7 @@ def test_ground_that_was_not_seen_is_closed_by_no_pessimism(unseen: str) -> None
     task = replace(factories.task(rules=rules))
     posed = factories.problem(ground)
     places = posed.start[:, :2], torch.tensor([[50.0, 50.0]])
-    problem = pose_problem(task, posed.observation, certain, ground, *places, 9.0, seen)
+    problem = pose_problem(task, posed.observation, certain, ground, *places, 9.0, wanted)
     assert torch.equal(problem.free, wanted)
 
 

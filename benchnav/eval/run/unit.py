@@ -205,7 +205,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
             block.places.start_m,
             block.places.goal_m,
             simulation.time_budget_s,
-            known.seen,
+            known.free,
             Fields(learner.belief, known.believed, tuple(unit.maps)),
             condition.world.immobile,
         )
