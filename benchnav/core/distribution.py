@@ -159,7 +159,7 @@ class TraversabilityDistribution(Batch, ABC):
         return self.time_cvar(0.0, floor)
 
     def time_cvar(self, level: float, floor: float) -> Tensor:
-        """CVaR of the time 1 / max(λ, floor): its mean over the worst share 1 − level of λ, which is the slowest.
+        """CVaR of the time 1 / max(λ, floor): its mean over the worst share 1 − level of λ, where it is least.
 
         Args:
             level: α in [0, 1); at 0 the result is the expected time.

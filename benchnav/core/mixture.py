@@ -166,9 +166,9 @@ class TraversabilityMixture(TraversabilityDistribution):
             return self.expected_time(floor)
 
         def work(cells: Cells, share: Tensor) -> Tensor:
-            slowest = value_at_risk(cells, share).clamp(floor, 1)
-            within = _expected_time(cells, floor, slowest) - 1 / slowest
-            return 1 / slowest + within.clamp(min=0) / tail
+            least = value_at_risk(cells, share).clamp(floor, 1)
+            within = _expected_time(cells, floor, least) - 1 / least
+            return 1 / least + within.clamp(min=0) / tail
 
         return self._in_tail(work, tail)
 

@@ -1,4 +1,4 @@
-"""Ground that is not free: one rule for every planner.
+"""Ground that is not free, one rule for every planner; and what immobilises a robot.
 
 S_free is where a map exceeds a threshold, and around the goal. A planner may cross other ground at a high
 finite penalty, so that all planners face the same question and there is a way where no free way is
@@ -101,6 +101,24 @@ class Rules:
         """As plain data for JSON; what came with later versions is left out where it stands at its default."""
         later = {name: value for name, value in _LATER.items() if getattr(self, name) == value}
         return {name: value for name, value in asdict(self).items() if name not in later}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Immobile:
+    """What immobilises a robot.
+
+    Args:
+        below: observed λ under this immobilises a robot.
+        for_s: an episode ends when it was held for so long without a break, whatever was commanded.
+    """
+
+    below: float = 0.1
+    for_s: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Refuses rules that hold always or never."""
+        expect(0 < self.below <= 1, f"`immobile.below` in (0, 1], got {self.below}.")
+        expect(0 < self.for_s < float("inf"), f"`immobile.for_s` > 0 and finite, got {self.for_s}.")
 
 
 def cells_at_goal(grid: Grid, goal_m: Tensor, radius_m: float) -> Tensor:

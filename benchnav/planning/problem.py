@@ -16,10 +16,9 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.core.terrain import Observation
-from benchnav.planning.free_space import PENALTY, Rules, cells_at_goal
+from benchnav.planning.free_space import PENALTY, Immobile, Rules, cells_at_goal
 from benchnav.planning.objective import Objective
 from benchnav.planning.robots import Robot
-from benchnav.planning.world.world import Immobile
 
 # Stands for a λ̂ of 0 in maps for lookups, where the sign tells whether ground is free and 0 is off the map.
 _ZERO = 1e-30

@@ -341,7 +341,7 @@ def test_the_tail_of_the_time_is_that_of_an_adaptive_integrator_over_ranks(
             assert single(mean, std).time_cvar(level, floor).item() == pytest.approx(wanted, rel=2e-6)
 
 
-def test_the_tail_of_the_time_of_a_mixture_is_that_of_its_slowest_draws() -> None:
+def test_the_tail_of_the_time_of_a_mixture_is_that_of_its_worst_draws() -> None:
     draws = monte_carlo()[:, 1, 0, 3].clamp(0, 1).sort().values
     found = random_mixture().time_cvar(0.8, 0.05)[1, 0, 3].item()
     assert found == pytest.approx((1 / draws[: len(draws) // 5].clamp(min=0.05)).mean().item(), rel=5e-3)

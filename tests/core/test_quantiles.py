@@ -98,7 +98,7 @@ def test_the_cvar_is_the_mean_of_the_lowest_quantiles(level: float) -> None:
 
 @pytest.mark.parametrize("floor", [0.05, 0.3])
 @pytest.mark.parametrize("level", [0.0, 0.5, 0.83])
-def test_the_tail_of_the_time_is_that_of_the_slowest_ranks(level: float, floor: float) -> None:
+def test_the_tail_of_the_time_is_that_of_the_least_ranks(level: float, floor: float) -> None:
     nodes = (np.arange(20_000) + 0.5) / 20_000 * (1 - level)
     knots = LAW.values.movedim(1, -1).reshape(-1, 72).numpy()
     times = [(1 / np.interp(nodes, EDGES, own).clip(floor)).mean() for own in knots]

@@ -14,7 +14,7 @@ from benchnav.core.batch import Batch
 from benchnav.core.copula import KERNELS
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.settings import check_known, plain, read
-from benchnav.planning.free_space import FreeSpace, Rules
+from benchnav.planning.free_space import FreeSpace, Immobile, Rules
 
 NOISES = ("resampled", "stored", "frozen")
 
@@ -34,24 +34,6 @@ class Places(Batch):
     start_m: Tensor
     goal_m: Tensor
     reference_time_s: Tensor
-
-
-@dataclass(frozen=True, kw_only=True)
-class Immobile:
-    """What immobilises a robot.
-
-    Args:
-        below: observed λ under this immobilises a robot.
-        for_s: an episode ends when it was held for so long without a break, whatever was commanded.
-    """
-
-    below: float = 0.1
-    for_s: float = 2.0
-
-    def __post_init__(self) -> None:
-        """Refuses rules that hold always or never."""
-        expect(0 < self.below <= 1, f"`immobile.below` in (0, 1], got {self.below}.")
-        expect(0 < self.for_s < float("inf"), f"`immobile.for_s` > 0 and finite, got {self.for_s}.")
 
 
 @dataclass(frozen=True, kw_only=True)

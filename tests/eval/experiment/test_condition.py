@@ -18,8 +18,8 @@ from benchnav.eval.experiment.condition import (
     later_labels,
 )
 from benchnav.eval.experiment.suite import Suite
-from benchnav.planning.free_space import FreeSpace, Rules
-from benchnav.planning.world.world import PRESETS, Immobile, World
+from benchnav.planning.free_space import FreeSpace, Immobile, Rules
+from benchnav.planning.world.world import PRESETS, World
 
 FAN = "tests.eval.parts:Faulty"
 

@@ -22,7 +22,7 @@ from benchnav.eval.run.knowledge import Knowing, Learning
 from benchnav.eval.run.rollout import Episodes, run_episodes
 from benchnav.models.predictor import Oracle
 from benchnav.planning import risk
-from benchnav.planning.free_space import FreeSpace, Rules, cells_at_goal
+from benchnav.planning.free_space import FreeSpace, Immobile, Rules, cells_at_goal
 from benchnav.planning.objective import TravelTime
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig
 from benchnav.planning.planners.astar.dwa import DWAConfig
@@ -38,7 +38,7 @@ from benchnav.planning.sensing.sensor import Contact, Full, Moment, Probe, Sense
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.realisation import joined
 from benchnav.planning.world.simulation import Simulation
-from benchnav.planning.world.world import Immobile, Places, World
+from benchnav.planning.world.world import Places, World
 from tests.planning.planners.driving import generator
 from tests.planning.planners.test_planners import NAMES, make
 from tests.planning.sensing import made

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from benchnav.core.errors import ConfigError
+from benchnav.planning.free_space import Immobile
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConfig
 from benchnav.planning.planners.cost_risk import advance_held, tail_cost
@@ -16,7 +17,6 @@ from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, roll_ou
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.belief import Fields, Law, Static
-from benchnav.planning.world.world import Immobile
 from tests import factories
 from tests.planning.planners.driving import first, generator, rollout_cost
 

@@ -11,8 +11,9 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
+from benchnav.planning.free_space import Immobile
 from benchnav.planning.world.realisation import Realisation, draw_frozen, joined
-from benchnav.planning.world.world import Immobile, Places, World
+from benchnav.planning.world.world import Places, World
 from tests import factories
 
 KEY = rng.stream_key(0, "noise")

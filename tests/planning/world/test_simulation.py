@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from benchnav.core import rng
-from benchnav.planning.free_space import Rules
+from benchnav.planning.free_space import Immobile, Rules
 from benchnav.planning.robots import DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import FAILURES, Outcome
 from benchnav.planning.world.realisation import Realisation
 from benchnav.planning.world.simulation import Simulation, SimulationState, end
-from benchnav.planning.world.world import Immobile, World
+from benchnav.planning.world.world import World
 from tests import factories
 
 KEY = rng.stream_key(0, "noise")

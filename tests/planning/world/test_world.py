@@ -5,8 +5,8 @@ import torch
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import of, read
-from benchnav.planning.free_space import FreeSpace, Rules
-from benchnav.planning.world.world import PRESETS, Immobile, World, read_world
+from benchnav.planning.free_space import FreeSpace, Immobile, Rules
+from benchnav.planning.world.world import PRESETS, World, read_world
 
 
 def test_the_papers_world() -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.eval.run.rollout import run_episodes
+from benchnav.planning.free_space import Immobile
 from benchnav.planning.objective import TravelTime, distance
 from benchnav.planning.planners.cl_rrt import cl_rrt
 from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT, CLRRTConfig, CLRRTState
@@ -24,7 +25,7 @@ from benchnav.planning.robots import Bicycle, DifferentialDrive, Robot, Unicycle
 from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
-from benchnav.planning.world.world import Immobile, World
+from benchnav.planning.world.world import World
 from tests import factories
 from tests.planning.planners.cl_rrt.maps import GRID, known, make_problem, open_map, walled_map
 from tests.planning.planners.driving import drive as closed_loop
