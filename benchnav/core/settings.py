@@ -11,7 +11,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from enum import Enum
 from functools import cache, partial
 from pathlib import Path, PurePath
@@ -311,13 +311,15 @@ def _parser(kind: Any) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Gives a value as plain data for JSON.
+    """Gives a value as plain data for JSON; fields that a dataclass lists as `added` are left out at their default.
 
     Raises:
         ConfigError: it is something else.
     """
     if is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
+        added, every = getattr(value, "added", ()), {each.name: each for each in fields(value)}
+        given = {name: getattr(value, name) for name in every}
+        value = {n: own for n, own in given.items() if n not in added or own != every[n].default}
     if isinstance(value, Mapping):
         return {str(name): plain(item) for name, item in value.items()}
     if isinstance(value, tuple | list):

@@ -65,7 +65,8 @@ def advance_held(
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Rolls samples out as `mppi.advance_chunk` does, where ground of little λ holds a robot for good.
 
-    One that was on such ground for so many steps stops there, and pays J of standing there until its time is over.
+    One that was on such ground for so many steps stops there, and pays J of standing there until its time is over. Its
+    states go on, and cost nothing more.
 
     Args:
         states: shape [B, K, S].
@@ -98,7 +99,6 @@ def advance_held(
         standing = objective.stage(states, torch.zeros_like(action), traversability, target)
         rest = (steps_left - (step + 1)).clamp(min=0) * standing
         cost = cost + torch.where(going, paid + torch.where(stops, rest, 0), 0)
-        moved = robot(states, action, motion_traversability(ground, min_traversability))
-        states = torch.where((going & ~stops)[..., None], moved, states)
+        states = robot(states, action, motion_traversability(ground, min_traversability))
         held = torch.where(going, longer, held)
     return component_wise(states), cost, held

@@ -76,6 +76,7 @@ class MPPIConfig:
     """
 
     gone: ClassVar = {"horizon": "It is now `horizon_s`, in seconds."}
+    added: ClassVar = ("risk_on", "level", "fields", "once", "entrapment")
 
     horizon_s: float = 5.0
     samples: int = 5000

@@ -8,12 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from benchnav.core import registry
 from benchnav.core.errors import ConfigError
+from benchnav.core.store import text_digest
 from benchnav.planning.free_space import Immobile
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConfig
-from benchnav.planning.planners.cost_risk import advance_held, tail_cost
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, roll_out
+from benchnav.planning.planners.cost_risk import advance_held, framed_fields, tail_cost
+from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, roll_out, weigh
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.belief import Fields, Law, Static
@@ -80,6 +82,15 @@ def test_one_field_that_is_sure_is_the_map_bit_for_bit() -> None:
         wanted, _ = drives(planner(SMALL), problem)
         found, _ = drives(planner(replace(SMALL, risk_on="cost", fields=1)), sure)
         assert all(torch.equal(*pair) for pair in zip(found, wanted, strict=True))
+
+
+def test_ground_that_is_not_free_has_its_penalty_on_every_field() -> None:
+    problem = varied()
+    problem = replace(
+        problem, free=problem.free & (torch.rand(problem.free.shape, generator=generator(1)) > 0.5)
+    )
+    ground = framed_fields(problem, fields(problem, 3)).unflatten(0, (2, 3))
+    assert torch.equal(ground > 0, (problem.padded_ground > 0)[:, None].expand_as(ground))
 
 
 @pytest.mark.parametrize("level", [0.0, 0.4])
@@ -213,6 +224,30 @@ def test_a_rollout_that_is_held_pays_what_is_left_of_the_time(objective: Objecti
         assert found[0][~going[0]].tolist() == pytest.approx([7.0] * int((~going).sum()), rel=1e-4)
 
 
+def test_rollouts_that_have_stopped_have_no_last_cost() -> None:
+    problem = varied(1)
+    states = problem.start[:, None].expand(-1, 4, -1).clone()
+    cost, going = torch.tensor([[3.0, 3.0, 3.0, 4.0]]), torch.tensor([[True, False, True, False]])
+    given = problem.padded_ground, problem.goal_m[:, None], problem.grid, problem.objective
+    weights, _ = weigh(
+        states,
+        cost,
+        torch.zeros(1, 1, 2),
+        torch.zeros(1, 2, 4),
+        *problem.action_bounds,
+        *given,
+        1.0,
+        0.1,
+        1,
+        0.0,
+        going,
+    )
+    last = problem.terminal_cost(states, problem.goal_m[:, None])
+    assert float(last.min()) > 1
+    wanted = torch.softmax(-(cost + torch.where(going, last, 0)), dim=1)
+    torch.testing.assert_close(weights, wanted)
+
+
 def trap() -> Problem:
     """Soft ground straight ahead, and firm ground around it; the map says that it is only slow."""
     ground = torch.full((1, 24, 24), 0.9)
@@ -271,6 +306,22 @@ def test_a_robot_remembers_for_how_long_it_was_held() -> None:
 def test_risk_that_cannot_be_told_is_refused(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         replace(SMALL, **changes)
+
+
+def test_its_defaults_move_no_id_and_others_do() -> None:
+    for part, path in (("mppi", ()), ("astar_mppi", ("mppi",))):
+        ids = set()
+        for options in ({}, {"risk_on": "map"}, {"risk_on": "cost"}, {"entrapment": True}):
+            given: dict[str, Any] = options
+            for name in path:
+                given = {name: given}
+            done = registry.complete(
+                "planner", registry.read_part("planner", {"part": part, "options": given})
+            )
+            ids.add(text_digest(dict(done.options)))
+            recorded = done.options["mppi"] if path else done.options
+            assert set(recorded).isdisjoint(MPPIConfig.added) is (options in ({}, {"risk_on": "map"}))
+        assert len(ids) == 3
 
 
 def test_as_few_fields_as_the_tail_needs_are_taken() -> None:
