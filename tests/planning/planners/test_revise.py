@@ -169,3 +169,17 @@ def test_a_planner_that_cannot_revise_begins_anew_where_the_robots_are() -> None
     assert torch.equal(planner.start, posed.start + 1)
     assert torch.equal(moved.start, posed.start + 1), "it wrote into what is not its own"
     assert torch.equal(again.risk_map, wall())
+
+
+def test_of_a_batch_the_map_that_has_changed_is_searched_anew_and_no_other() -> None:
+    maps = 0.4 + 0.5 * torch.rand(3, 16, 16, generator=generator())
+    before = factories.problem(maps)
+    changed = maps.clone()
+    changed[1, 4:9, 4:9] = 0.1
+    after = factories.problem(changed)
+    planner = make("astar_dwa")
+    found = planner.revise(planner.init(before, generator()), after)
+    wanted = planner.init(after, generator())
+    assert torch.equal(found.field.cost, wanted.field.cost)
+    assert torch.equal(found.field.following, wanted.field.following)
+    assert not torch.equal(found.field.cost, planner.init(before, generator()).field.cost)
