@@ -1,6 +1,6 @@
 """Batches: frozen dataclasses of tensors whose first dimension is that of the members, episodes or maps."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any, Self, TypeVar, cast
 
@@ -15,10 +15,8 @@ class Batch:
 
     def select(self, members: Tensor) -> Self:
         """Keeps some members, by index, int64, shape [M]; one may be taken more than once."""
-        given: Any = self
-        return replace(
-            given, **{each.name: _selected(getattr(self, each.name), members) for each in fields(given)}
-        )
+        # A batch in it keeps them as it does by itself.
+        return _mapped(self, lambda values: values[members], lambda inner: inner.select(members), ())
 
     def put(self, members: Tensor, others: Self) -> Self:
         """Puts M members in the places of others, by index, int64, shape [M]; this one is not changed."""
@@ -41,35 +39,35 @@ def map_tensors(value: Value, change: Callable[..., Tensor], *others: Value) -> 
         change: is given a tensor, and those that have its place in the others.
         others: more of the same kind.
     """
-    names = [each.name for each in fields(value)]
-    return replace(
-        value, **{n: _changed(getattr(value, n), change, [getattr(one, n) for one in others]) for n in names}
-    )
+    return _mapped(value, change, lambda first, *rest: map_tensors(first, change, *rest), others)
 
 
-def _changed(first: Any, change: Callable[..., Tensor], rest: list[Any]) -> Any:
+def _mapped(
+    value: Value, change: Callable[..., Tensor], inner: Callable[..., Any], others: Sequence[Any]
+) -> Value:
+    """Changes each tensor by `change` and each batch by `inner`."""
+    given: Any = value
+    names = [each.name for each in fields(given)]
+    found = {
+        n: _changed(getattr(given, n), change, inner, [getattr(one, n) for one in others]) for n in names
+    }
+    return cast(Value, replace(given, **found))
+
+
+def _changed(
+    first: Any, change: Callable[..., Tensor], inner: Callable[..., Any], rest: Sequence[Any]
+) -> Any:
     if isinstance(first, Tensor):
         return change(first, *rest)
     if isinstance(first, Batch):
-        return map_tensors(first, change, *rest)
+        return inner(first, *rest)
     if isinstance(first, tuple) and first and isinstance(first[0], Batch):
-        return tuple(map_tensors(own, change, *same) for own, *same in zip(first, *rest, strict=True))
+        return tuple(inner(own, *same) for own, *same in zip(first, *rest, strict=True))
     if isinstance(first, Mapping):
-        return {key: _changed(inner, change, [other[key] for other in rest]) for key, inner in first.items()}
+        return {
+            key: _changed(own, change, inner, [other[key] for other in rest]) for key, own in first.items()
+        }
     return first
-
-
-def _selected(value: Any, members: Tensor) -> Any:
-    """A value of a batch for some members; a batch in it keeps them as it does by itself."""
-    if isinstance(value, Tensor):
-        return value[members]
-    if isinstance(value, Batch):
-        return value.select(members)
-    if isinstance(value, tuple) and value and isinstance(value[0], Batch):
-        return tuple(own.select(members) for own in value)
-    if isinstance(value, Mapping):
-        return {key: _selected(inner, members) for key, inner in value.items()}
-    return value
 
 
 def put_if_alike(value: Value, members: Tensor, others: Value) -> Value:
