@@ -15,14 +15,18 @@ from tests.models.nets.test_mdn import draw_two_grounds, layers
 from tests.models.zoo.support import EXACT, ZOO, killed_in, make, to_train
 
 # Largest error of the CDF in the mean over a ground: evidential knows no atoms, and its tails are heavy.
-LIMITS = {"evidential": 0.15, "mc_dropout": 0.13, "quantile": 0.13}
+LIMITS = {"evidential": 0.15, "mc_dropout": 0.11, "quantile": 0.13}
+# Hidden channels, and steps. Dropout widens what a narrow network predicts: with 32 it erred by 0.15 in the mean of
+# six seeds, with 128 by 0.05, and by 0.086 at most.
+SIZES = {"mc_dropout": (128, 120)}
 
 
 @pytest.mark.parametrize("name", ZOO)
 def test_it_recovers_a_known_distribution(name: str) -> None:
-    generator, steps = torch.Generator().manual_seed(0), 60
+    hidden, steps = SIZES.get(name, (32, 60))
+    generator = torch.Generator().manual_seed(0)
     torch.manual_seed(0)
-    network = make(name, hidden=32, **({"dropout": 0.05} if name == "mc_dropout" else {})).train()
+    network = make(name, hidden=hidden, **({"dropout": 0.05} if name == "mc_dropout" else {})).train()
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-2, total_steps=steps)
     for _ in range(steps):
@@ -42,12 +46,6 @@ def test_it_recovers_a_known_distribution(name: str) -> None:
         for value in (0.0, 0.2, 0.5, 0.9, 1 - 1e-6)  # with both atoms, which are up to 0.31
     ]
     rmse = float((found.mean() - truth.mean()).square().mean().sqrt())
-    print(
-        name,
-        max(errors),
-        rmse,
-        (found.crps(terrain.traversability).mean() / truth.crps(terrain.traversability).mean()),
-    )
     assert max(errors) < LIMITS.get(name, 0.08)
     assert rmse < 0.05
     assert float(found.crps(terrain.traversability).mean()) < 1.08 * float(
