@@ -42,6 +42,11 @@ class ChosenDistribution(TraversabilityDistribution):
         (low, high), (other_low, other_high) = self.first.cdf_limits(value), self.second.cdf_limits(value)
         return self._pick(low, other_low), self._pick(high, other_high)
 
+    @property
+    def searched(self) -> bool:
+        """See the base."""
+        return self.first.searched and self.second.searched
+
     def quantile(self, probability: Tensor | float) -> Tensor:
         """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the base."""
         return self._pick(self.first.quantile(probability), self.second.quantile(probability))

@@ -89,6 +89,11 @@ class TraversabilityDistribution(Batch, ABC):
             λ in [0, 1], shape [*B, H, W].
         """
 
+    @property
+    def searched(self) -> bool:
+        """Whether quantiles are searched for, which takes long; only where no atom lies within (0, 1)."""
+        return False
+
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """P(λ < value) and P(λ ≤ value), which differ by the mass of an atom at the value.
 

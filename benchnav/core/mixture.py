@@ -99,6 +99,11 @@ class TraversabilityMixture(TraversabilityDistribution):
         lower = torch.where(value <= 0, 0.0, torch.where(value > 1, 1.0, inside))
         return lower, torch.where(value < 0, 0.0, torch.where(value >= 1, 1.0, inside))
 
+    @property
+    def searched(self) -> bool:
+        """See the base."""
+        return bool((self.stds > 0).all())
+
     def quantile(self, probability: Tensor | float) -> Tensor:
         """Least λ that is not exceeded with this probability, exact at 0 and 1, shape [*B, H, W]; see the base."""
         share = torch.as_tensor(probability, dtype=torch.float64, device=self.weights.device)

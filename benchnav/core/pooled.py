@@ -63,6 +63,11 @@ class PooledDistribution(TraversabilityDistribution):
         lower, upper = zip(*(own.cdf_limits(value) for own in self.members), strict=True)
         return self._average(lower), self._average(upper)
 
+    @property
+    def searched(self) -> bool:
+        """See the base."""
+        return all(own.searched for own in self.members)
+
     def quantile(self, probability: Tensor | float) -> Tensor:
         """Least λ that is not exceeded with this probability, within 10⁻¹²; exact at 0 and 1, shape [*B, H, W]."""
         exact = self._exact()

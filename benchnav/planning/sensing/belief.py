@@ -5,22 +5,24 @@ of λ in each cell. It is pure: what it knows is in a state that it is given and
 Letters in shapes: B episodes, H×W cells, M drawn fields.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any, ClassVar, Generic, TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from benchnav.core import rng
 from benchnav.core.batch import Batch
-from benchnav.core.copula import correlated_normal
+from benchnav.core.copula import correlations
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.core.ground import GroundStatistics
+from benchnav.planning.sensing.score_table import scores_of, value_at
 from benchnav.planning.sensing.sensor import Sensed
 
 State = TypeVar("State", bound=Batch)
@@ -162,8 +164,8 @@ class Fields:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StaticState(Batch):
-    """What the static belief knows.
+class Predicted(Batch):
+    """What is known before anything was sensed; all that the static belief knows.
 
     Args:
         prior: the model's prediction, shape [B, H, W].
@@ -173,9 +175,28 @@ class StaticState(Batch):
     prior: TraversabilityDistribution
     law: Law
 
+    def fields(self, scores: Tensor) -> Tensor:
+        """λ of the ranks that normal scores have in the prediction, shape [B, M, H, W] of both.
+
+        Where quantiles take long λ is linear in the score between the values of `score_table`, which are exact.
+        """
+        if self._rows is None:
+            return fields_of(self.prior, scores)
+        wanted = scores.to(self._rows).movedim(1, -1)
+        found = [value_at(rows, own) for rows, own in zip(self._rows, wanted, strict=True)]
+        return torch.stack(found).movedim(-1, 1).to(self.prior.dtype)
+
+    @cached_property
+    def _rows(self) -> Tensor | None:
+        """Scores of the values of each cell, float32, shape [B, H, W, K]; None where they are not needed."""
+        if not self.prior.searched:
+            return None
+        every = torch.ones(self.prior.shape, dtype=torch.bool, device=self.prior.device)
+        return scores_of(self.prior.at(every)).view(*self.prior.shape, -1)
+
 
 @dataclass(frozen=True)
-class Static(Belief[StaticState]):
+class Static(Belief[Predicted]):
     """The model's prediction; what is sensed on the way is ignored.
 
     Args:
@@ -186,44 +207,65 @@ class Static(Belief[StaticState]):
 
     correlated: bool = True
 
-    def init(self, prior: TraversabilityDistribution, law: Law) -> StaticState:
+    def init(self, prior: TraversabilityDistribution, law: Law) -> Predicted:
         """Keeps the prediction."""
-        return StaticState(prior=prior, law=law)
+        return Predicted(prior=prior, law=law)
 
     def update(
-        self, state: StaticState, sensed: Sensed, prior: TraversabilityDistribution | None = None
-    ) -> StaticState:
+        self, state: Predicted, sensed: Sensed, prior: TraversabilityDistribution | None = None
+    ) -> Predicted:
         """Takes a new prediction where there is one."""
-        return state if prior is None else StaticState(prior=prior, law=state.law)
+        return state if prior is None else Predicted(prior=prior, law=state.law)
 
-    def distribution(self, state: StaticState) -> TraversabilityDistribution:
+    def distribution(self, state: Predicted) -> TraversabilityDistribution:
         """The prediction."""
         return state.prior
 
-    def changed(self, before: StaticState, after: StaticState) -> Tensor:
+    def changed(self, before: Predicted, after: Predicted) -> Tensor:
         """Cells whose prediction is another."""
         return before.prior.differs(after.prior)
 
-    def sample_fields(self, state: StaticState, count: int, keys: Sequence[int]) -> Tensor:
+    def sample_fields(self, state: Predicted, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields with the prediction's marginals."""
         law = state.law if self.correlated else replace(state.law, correlation_m=0.0)
-        return fields_of(state.prior, draw_scores(law, count, keys))
+        return state.fields(draw_scores(law, count, keys))
 
 
 def draw_scores(law: Law, count: int, keys: Sequence[int]) -> Tensor:
-    """Draws normal scores as the world does, float64, shape [B, M, H, W].
+    """Draws normal scores that hang together as those of the world do, float32, shape [B, M, H, W].
+
+    As two cells are correlated by the product over both axes, white noise passes a root of either axis' correlations.
 
     Args:
         law: how they hang together.
-        count: M.
+        count: M; the first of more fields are those of fewer.
         keys: a stream key of each episode, B of them.
     """
-    numbers, shape = np.arange(count), law.grid.shape
-    drawn = np.stack([correlated_normal(key, numbers, shape, law.correlation_cells) for key in keys])
+    drawn = torch.stack([_white(key, count, law.grid.shape) for key in keys])
+    if law.correlation_m:
+        down, across = (_root(size, law.correlation_cells) for size in law.grid.shape)
+        drawn = down @ drawn @ across
     if law.nugget:
-        own = [rng.normal(rng.stream_key(key, "nugget"), numbers, shape) for key in keys]
-        drawn = np.sqrt(1 - law.nugget) * drawn + np.sqrt(law.nugget) * np.stack(own)
-    return torch.from_numpy(drawn)
+        own = [_white(rng.stream_key(key, "nugget"), count, law.grid.shape) for key in keys]
+        drawn = math.sqrt(1 - law.nugget) * drawn + math.sqrt(law.nugget) * torch.stack(own)
+    return drawn
+
+
+def _white(key: int, count: int, shape: tuple[int, int]) -> Tensor:
+    """Standard normals, float32, shape [M, H, W]."""
+    numbers = count * math.prod(shape)
+    # PyTorch draws sixteen at a time, and what is left over otherwise.
+    whole = -(-numbers // 16) * 16
+    return torch.randn(whole, generator=rng.generator(key))[:numbers].view(count, *shape)
+
+
+@lru_cache(maxsize=64)
+def _root(size: int, correlation_cells: float) -> Tensor:
+    """The symmetric root of the correlations along one axis, float32, shape [size, size]."""
+    along = torch.from_numpy(correlations(size, correlation_cells))
+    place = torch.arange(size)
+    values, vectors = torch.linalg.eigh(along[(place[:, None] - place).abs()])
+    return ((vectors * values.clamp(min=0).sqrt()) @ vectors.T).float()
 
 
 def fields_of(distribution: TraversabilityDistribution, scores: Tensor) -> Tensor:

@@ -245,7 +245,7 @@ class Classes(Belief[ClassesState]):
             parts = []
             for part, look in enumerate(state.looks):
                 score = means[:, part] + spread[:, part] * (own - state.copula.mean)
-                parts.append(look.prior.from_normal(score.to(look.prior.dtype)))
+                parts.append(look.fields(score[:, None])[:, 0])
             fields.append(torch.where(first, parts[0], parts[1]))
         return torch.stack(fields, 1)
 

@@ -23,11 +23,11 @@ import torch
 from numpy import ndarray
 from torch import Tensor
 
-from benchnav.core.batch import Batch
+from benchnav.core import rng
 from benchnav.core.conditioned import ConditionedDistribution, skewed
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
-from benchnav.planning.sensing.belief import Belief, Law, draw_scores, fields_of
+from benchnav.planning.sensing.belief import Belief, Law, Predicted, draw_scores
 from benchnav.planning.sensing.gaussian import Field, Observed, condition, evidence, predict
 from benchnav.planning.sensing.score_table import ScoreTable, TabulatedDistribution
 from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
@@ -47,13 +47,11 @@ _LEARNT = ("field", "estimated_from", *_MAPS[4:])
 
 
 @dataclass(frozen=True, kw_only=True)
-class CopulaState(Batch):
+class CopulaState(Predicted):
     """What the copula belief knows; of observations NaN where there is none.
 
     Args:
-        prior: the model's prediction, shape [B, H, W].
         table: scores of λ under the prediction, of the cells of which something else is believed.
-        law: how λ hangs together.
         field: how the scores hang together, B of them.
         estimated_from: from how many observations ℓ was estimated; 0 where it was not, int64, shape [B].
         value: observed λ, of several looks the average, float64, shape [B, H, W].
@@ -67,9 +65,7 @@ class CopulaState(Batch):
         skew: of the score given all observations, its skewness, shape [B, H, W].
     """
 
-    prior: TraversabilityDistribution
     table: ScoreTable
-    law: Law
     field: Field
     estimated_from: Tensor
     value: Tensor
@@ -209,7 +205,7 @@ class Copula(Belief[CopulaState]):
 
     def sample_fields(self, state: CopulaState, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields given all observations, by Matheron's rule: a field of the law, moved to what was observed."""
-        return fields_of(state.prior, self.sample_scores(state, count, keys))
+        return state.fields(self.sample_scores(state, count, keys))
 
     def sample_scores(self, state: CopulaState, count: int, keys: Sequence[int]) -> Tensor:
         """Normal scores of the fields that `sample_fields` draws, shape [B, M, H, W]."""
@@ -218,15 +214,15 @@ class Copula(Belief[CopulaState]):
         scores = []
         for own, length in enumerate(state.field.length.tolist()):
             law = replace(state.law, correlation_m=length * state.law.grid.resolution_m)
-            drawn = draw_scores(law, count, keys[own : own + 1])[0].to(device)
+            drawn = draw_scores(law, count, keys[own : own + 1])[0].to(device).double()
             scores.append(drawn)
             row, column = (state.precision[own] > _NO_TERM).nonzero(as_tuple=True)
             if len(row) == 0:
                 continue
             precision, shift = state.precision[own, row, column], state.shift[own, row, column]
-            # As the white noise of further fields, of which the first cells are taken.
-            noise = draw_scores(replace(law, correlation_m=0.0, nugget=0.0), 2 * count, keys[own : own + 1])
-            noise = noise[0, count:].to(drawn)[:, row, column] / precision.sqrt()
+            noise_keys = [rng.stream_key(keys[own], "observations")]
+            noise = draw_scores(replace(law, correlation_m=0.0, nugget=0.0), count, noise_keys)
+            noise = noise[0].to(drawn)[:, row, column] / precision.sqrt()
             inner = state.field.covariance(own, row[:, None] - row, column[:, None] - column)
             inner.diagonal().add_(1 / precision)
             away = (shift / precision - drawn[:, row, column] - noise).T

@@ -59,13 +59,7 @@ class TabulatedDistribution(TraversabilityDistribution):
     def quantile(self, probability: Tensor | float) -> Tensor:
         """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the base."""
         share = torch.as_tensor(probability, dtype=self.dtype, device=self.device).expand(self.shape)
-        below, share = self.below.movedim(-3, -1).contiguous(), share.unsqueeze(-1).contiguous()
-        after = torch.searchsorted(below, share)
-        upper = after.clamp(1, len(VALUES) - 1)
-        low, high = below.gather(-1, upper - 1), below.gather(-1, upper)
-        part = ((share - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1)
-        inside = torch.lerp(self._values()[upper - 1], self._values()[upper], part)
-        return torch.where(after == len(VALUES), 1.0, torch.where(after == 0, 0.0, inside)).squeeze(-1)
+        return value_at(self.below.movedim(-3, -1).contiguous(), share.unsqueeze(-1)).squeeze(-1)
 
     def mean(self) -> Tensor:
         """E[λ], shape [*B, H, W]."""
@@ -109,6 +103,25 @@ class TabulatedDistribution(TraversabilityDistribution):
 
     def _values(self) -> Tensor:
         return self.below.new_tensor(VALUES)
+
+
+def value_at(rows: Tensor, wanted: Tensor) -> Tensor:
+    """λ at which numbers that rise with λ reach others: 0 and 1 beyond their ends.
+
+    Args:
+        rows: of each cell at `VALUES`, shape [*B, K].
+        wanted: shape [*B, N].
+
+    Returns:
+        Shape [*B, N].
+    """
+    after = torch.searchsorted(rows, wanted.contiguous())
+    upper = after.clamp(1, len(VALUES) - 1)
+    low, high = rows.gather(-1, upper - 1), rows.gather(-1, upper)
+    part = ((wanted - low) / torch.where(high > low, high - low, 1.0)).clamp(0, 1)
+    values = rows.new_tensor(VALUES)
+    inside = torch.lerp(values[upper - 1], values[upper], part)
+    return torch.where(after == len(VALUES), 1.0, torch.where(after == 0, 0.0, inside))
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig
 from benchnav.planning.planners.astar.dwa import DWAConfig
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing.belief import Belief, Static, StaticState
+from benchnav.planning.sensing.belief import Belief, Predicted, Static
 from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.knowledge import KnowledgeError, Learner, Truth
@@ -116,7 +116,7 @@ class Deaf(Static):
 
     learns = True
 
-    def changed(self, before: StaticState, after: StaticState) -> Tensor:
+    def changed(self, before: Predicted, after: Predicted) -> Tensor:
         return torch.zeros(after.prior.shape, dtype=torch.bool)
 
 

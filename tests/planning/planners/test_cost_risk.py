@@ -84,6 +84,16 @@ def test_one_field_that_is_sure_is_the_map_bit_for_bit() -> None:
         assert all(torch.equal(*pair) for pair in zip(found, wanted, strict=True))
 
 
+def test_fields_of_ground_that_is_known_for_sure_are_the_map_bit_for_bit() -> None:
+    problem, belief = varied(3), Static()
+    sure = factories.normal(problem.risk_map, torch.zeros_like(problem.risk_map))
+    source = Fields(belief, belief.init(sure, Law(grid=problem.grid, correlation_m=1.0)), (7, 3, 5))
+    posed = replace(problem, distribution=sure, fields=source)
+    wanted, _ = drives(MPPI(SMALL), problem)
+    found, _ = drives(MPPI(replace(SMALL, risk_on="cost", fields=1)), posed)
+    assert all(torch.equal(*pair) for pair in zip(found, wanted, strict=True))
+
+
 def test_ground_that_is_not_free_has_its_penalty_on_every_field() -> None:
     problem = varied()
     problem = replace(

@@ -5,8 +5,11 @@ import pytest
 import torch
 from scipy import stats
 
+from benchnav.core.chosen import choose
+from benchnav.core.copula import correlations
 from benchnav.core.errors import ConfigError
-from benchnav.planning.sensing.belief import Law, Static, draw_scores
+from benchnav.core.pooled import pool
+from benchnav.planning.sensing.belief import Law, Predicted, Static, draw_scores, fields_of
 from benchnav.planning.sensing.sensor import Sensed
 from tests.planning.sensing import made
 
@@ -85,3 +88,43 @@ def test_fields_that_are_drawn_have_the_laws_nugget() -> None:
     found = np.corrcoef(drawn.numpy().T)[0, 1:3]
     np.testing.assert_allclose(drawn.std(0), 1, atol=0.04)
     np.testing.assert_allclose(found, 0.7 * np.exp(-np.array([1, 4]) / 18), atol=0.04)
+
+
+@pytest.mark.parametrize("correlation_m", [0.4, 1.5])
+def test_scores_are_correlated_as_those_of_the_world_along_both_axes(correlation_m: float) -> None:
+    law = made.law(5, 7, correlation_m)
+    drawn = draw_scores(law, 20000, (7,))[0].flatten(1).double()
+    down, across = (correlations(size, law.correlation_cells) for size in law.grid.shape)
+    row, column = np.divmod(np.arange(35), 7)
+    wanted = down[abs(row[:, None] - row)] * across[abs(column[:, None] - column)]
+    np.testing.assert_allclose(drawn.T @ drawn / 20000, wanted, atol=0.035)
+    assert float(drawn.mean(0).abs().max()) < 0.035
+
+
+def test_fields_that_are_told_from_a_table_have_the_ranks_of_their_scores() -> None:
+    prior, law = made.mixture(3, 10, 12), made.law(10, 12)
+    scores = draw_scores(law, 200, (1, 2, 3)).double()
+    assert prior.searched
+    found, wanted = Predicted(prior=prior, law=law).fields(scores), fields_of(prior, scores)
+    assert float((found - wanted).abs().max()) < 0.01
+    assert float((found - wanted).abs().mean()) < 0.0005
+    for end in (0.0, 1.0):  # atoms are whole
+        assert torch.equal(found == end, wanted == end)
+        assert float((wanted == end).double().mean()) > 0.02
+    known = Predicted(prior=prior, law=law).select(torch.tensor([2, 0])).fields(scores[[2, 0]])
+    assert torch.equal(known, found[[2, 0]])
+
+
+def test_of_ground_that_is_known_for_sure_fields_are_exact() -> None:
+    mixed, law = made.mixture(1, 10, 12), made.law(10, 12)
+    sure = replace(mixed, stds=torch.zeros_like(mixed.stds))
+    scores = draw_scores(law, 20, (1,)).double()
+    both = torch.rand(mixed.shape, generator=torch.Generator().manual_seed(0)) < 0.5
+    for prior in (sure, choose(both, mixed, sure), pool([mixed, sure])):
+        assert not prior.searched
+        found = Predicted(prior=prior, law=law).fields(scores)
+        assert torch.equal(found, fields_of(prior, scores))
+    away = fields_of(sure, scores)[:, :, None] - mixed.means[:, None]
+    assert float(away.abs().amin(2).max()) < 1e-6
+    for prior in (choose(both, mixed, mixed), pool([mixed, mixed])):
+        assert prior.searched
