@@ -190,6 +190,11 @@ def inclination_deg(along_x: ndarray, along_y: ndarray) -> ndarray:
     return np.arctan(np.sqrt(along_x * along_x + along_y * along_y)) * (180 / np.pi)
 
 
+def slopes_deg(elevation_m: ndarray, resolution_m: float) -> ndarray:
+    """Slopes of maps of which nothing beyond is known, float64, shape [B, H, W] of both."""
+    return inclination_deg(*horn_gradient(framed(elevation_m.astype(np.float64)), resolution_m))
+
+
 def framed(elevation_m: ndarray) -> ndarray:
     """Frames maps [B, H, W] with one cell of ground that is not known, NaN, shape [B, H + 2, W + 2]."""
     return np.pad(elevation_m, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)

@@ -10,14 +10,13 @@ Letters in shapes: b maps in a batch, H×W cells.
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from benchnav.core import rng
 from benchnav.core.ground import SEEN
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.datagen.synth import elevation
+from benchnav.datagen.synth.elevation import slopes_deg
 from benchnav.models.config import Masking
 
 
@@ -65,18 +64,14 @@ class RandomMasks:
                 noisy = layer + self.law.elevation_noise * noise[:, 3]
                 found[name] = torch.where(seen, noisy, self.means[name][0])
                 if "slope_deg" in maps:
-                    slopes = torch.where(masked, self._slopes(noisy), maps["slope_deg"])
+                    steep = torch.from_numpy(slopes_deg(noisy.numpy(), self.resolution_m)).to(noisy)
+                    slopes = torch.where(masked, steep, maps["slope_deg"])
                     unsure = torch.nn.functional.max_pool2d((~seen).float(), 3, stride=1, padding=1) > 0
                     found["slope_deg"] = torch.where(unsure, self.means["slope_deg"][0], slopes)
             elif name not in ("slope_deg", SEEN):
                 unknown = UNLABELLED if name == "class_id" else torch.nan
                 found[name] = torch.where(seen, layer, unknown).to(layer.dtype)
         return found
-
-    def _slopes(self, elevation_m: Tensor) -> Tensor:
-        framed = elevation.framed(elevation_m.numpy().astype(np.float64))
-        slopes = elevation.inclination_deg(*elevation.horn_gradient(framed, self.resolution_m))
-        return torch.from_numpy(slopes).to(elevation_m)
 
 
 def path_distances(path: Tensor, shape: tuple[int, int], resolution_m: float) -> Tensor:

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +15,7 @@ from benchnav.core.grid import Grid
 from benchnav.core.ground import SEEN
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.schema import quantise
-from benchnav.datagen.synth import elevation
+from benchnav.datagen.synth.elevation import slopes_deg
 from benchnav.planning.sensing.sensor import Appearance
 
 
@@ -101,20 +100,14 @@ def masked(memory: Memory, layer_means: Mapping[str, tuple[float, ...]]) -> Obse
     elevation_m = torch.where(seen, memory.elevation_m, height)
     # A cell is dark where it or a neighbour was not seen; what lies beyond the map is not asked for.
     unseen = torch.nn.functional.max_pool2d((~seen).float(), 3, stride=1, padding=1) > 0
+    slopes = quantise(slopes_deg(elevation_m.cpu().numpy(), memory.grid.resolution_m), 10)
     return Observation(
         rgb=torch.where(seen[:, None], memory.rgb, colour[:, None, None]),
         elevation_m=elevation_m,
-        slope_deg=torch.where(unseen, slope, _slopes(elevation_m, memory.grid)),
+        slope_deg=torch.where(unseen, slope, torch.from_numpy(slopes).to(elevation_m)),
         grid=memory.grid,
         layers={
             **{name: torch.where(seen, layer, torch.nan) for name, layer in memory.layers.items()},
             SEEN: seen.to(torch.float32),
         },
     )
-
-
-def _slopes(elevation_m: Tensor, grid: Grid) -> Tensor:
-    """Slopes as `benchnav.datagen.synth.generate` makes them, shape [B, H, W]."""
-    ground = elevation.framed(elevation_m.cpu().numpy().astype(np.float64))
-    slopes = quantise(elevation.inclination_deg(*elevation.horn_gradient(ground, grid.resolution_m)), 10)
-    return torch.from_numpy(slopes).to(elevation_m)
