@@ -1,0 +1,1 @@
+"""The optimal planner: value iteration over where a unicycle stands and looks."""

@@ -1,0 +1,227 @@
+"""The optimal planner: drives by the least cost to go of every pose on a map, found once by value iteration.
+
+`Optimal` takes λ̂ for λ: its time is the least under that map, "certainty-equivalent", and no bound on what can be done
+on the ground. `OptimalBound` is given λ itself, by the model `clairvoyant`, and knows for how long the world lets a
+robot stand on ground that holds it: what is left of a failure then is not for want of knowledge, nor of planning. Both
+plan for the paper's unicycle alone, which they drive forward, and once: a map that changes is refused.
+Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L levels of time held.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchnav.core.errors import ConfigError, expect
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.planning.free_space import PENALTY
+from benchnav.planning.planners.optimal.value import UNREACHED, Costs, Moves, value_iteration
+from benchnav.planning.planners.optimal.ways import OptimalState, path_of, ways_from
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
+from benchnav.planning.problem import Problem, Task
+from benchnav.planning.robots import SPEED, TURN_RATE, Unicycle
+from benchnav.planning.sensing.sensor import Step
+
+_LEAST_KNOWN = 1e-3  # λ that the bound drives on
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimalConfig:
+    """Settings of the optimal planner.
+
+    Args:
+        headings: Q, in which a circle is divided.
+        refine: cells of value iteration along each side of a cell of the map.
+        hazard: plans for the expected time under each cell's own distribution, of which a robot that is held pays the
+            whole limit, in place of the time under λ̂.
+    """
+
+    headings: int = 32
+    refine: int = 1
+    hazard: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuses grids that are none."""
+        _check_grid("optimal", self.headings, self.refine)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimalBoundConfig:
+    """Settings of the bound.
+
+    Args:
+        headings: Q, in which a circle is divided.
+        refine: cells of value iteration along each side of a cell of the map.
+        levels: L, of the time for which a robot was held; 0 takes it for lost where it enters ground that holds.
+    """
+
+    headings: int = 32
+    refine: int = 1
+    levels: int = 5
+
+    def __post_init__(self) -> None:
+        """Refuses grids that are none."""
+        _check_grid("optimal-bound", self.headings, self.refine)
+        expect(0 <= self.levels <= 5, f"`levels` from 0 to 5 for optimal-bound, got {self.levels}.")
+
+
+def _check_grid(name: str, headings: int, refine: int) -> None:
+    expect(8 <= headings <= 256, f"`headings` from 8 to 256 for {name}, got {headings}.")
+    expect(1 <= refine <= 4, f"`refine` from 1 to 4 for {name}, got {refine}.")
+
+
+class Optimal(Planner[OptimalState]):
+    """Drives by the least time to go under λ̂, with the penalty of ground that is not free.
+
+    Args:
+        config: settings.
+    """
+
+    steers = ((SPEED, TURN_RATE),)
+    name = "optimal"
+
+    def __init__(self, config: OptimalConfig | None = None) -> None:
+        """Keeps the settings; all else is in the plan state."""
+        self.config: Any = config or OptimalConfig()
+
+    def follows(self, task: Task) -> str:
+        """What it minimises; see `Planner`."""
+        return "expected time, a loss as the time limit" if self.config.hazard else "time under λ̂"
+
+    def init(self, problem: Problem, generator: torch.Generator) -> OptimalState:
+        """Finds the cost to go; draws nothing. See `Planner`.
+
+        Raises:
+            ConfigError: the robot is another, or what is asked for is not known.
+        """
+        robot, times = problem.robot, self.config.refine
+        low, high = (robot.action_low[-1], robot.action_high[-1])
+        if type(robot) is not Unicycle or low != -high:
+            raise ConfigError(
+                f"Expected robot 'unicycle', with the same turn rate to both sides, for planner {self.name!r}, got "
+                f"{type(robot).__name__}."
+            )
+        grid = problem.grid
+        grid = Grid(grid.height * times, grid.width * times, grid.resolution_m / times)
+        costs = self.costs_of(problem, grid)
+        moves = Moves.of(robot, grid.resolution_m, self.config.headings)
+        value = value_iteration(costs, moves, grid, self.config.headings)
+        held = problem.start.new_zeros(len(problem))
+        return OptimalState(problem=problem, grid=grid, costs=costs, value=value, held=held)
+
+    def plan(self, step: Step, plan_state: OptimalState) -> tuple[Tensor, OptimalState, Plan]:
+        """Begins the way that leads to the least cost; see `Planner`."""
+        problem, held = plan_state.problem, plan_state.held
+        if problem.immobile is not None:
+            holds = step.traversability < problem.immobile.below
+            held = torch.where(holds, held + problem.dt_s, 0.0)
+        pose, own = step.state[:, :3], torch.arange(len(held), device=held.device)
+        ways = ways_from(pose, held, plan_state)
+        cost, best = ways.cost.min(1)
+        # What a turn takes to be over after this step.
+        rate = ways.turn[own, best] / (problem.traversability_at(pose).clamp(min=_LEAST_KNOWN) * problem.dt_s)
+        low, high = problem.action_bounds
+        drives = ways.rolls[own, best] | (rate.abs() <= high[1])
+        action = torch.stack((torch.where(drives, high[0], 0.0), rate.clamp(low[1], high[1])), 1)
+        status = PlanStatus.FAILED * (cost >= UNREACHED / 2).long()
+        drawn = {"path": path_of(plan_state, pose, held)} if step.draw else {}
+        plan = replace(Plan.empty(len(held), held.device, **drawn), status=status)
+        return action, replace(plan_state, held=held), plan
+
+    def select(self, plan_state: OptimalState, members: Tensor) -> OptimalState:
+        """Keeps some episodes; see `Planner`."""
+        return plan_state.select(members)
+
+    def revise(self, plan_state: OptimalState, problem: Problem) -> OptimalState:
+        """Refuses: it plans once.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError(
+            f"Expected a map that stays what it is for planner {self.name!r}, which plans once, got one that changes. "
+            "Take belief 'static' and sensor 'full'."
+        )
+
+    def costs_of(self, problem: Problem, grid: Grid) -> Costs:
+        """What driving costs, on the cells of value iteration."""
+        if not self.config.hazard:
+            rate = 1 / problem.traversability + PENALTY * problem.robot.top_speed_mps * ~problem.free
+            return _on_grid(problem, grid, rate, problem.free)
+        immobile = problem.immobile
+        if immobile is None:
+            raise ConfigError(
+                f"Expected a world that immobilises robots for `hazard` of {self.name!r}, got none."
+            )
+        lost = problem.distribution.cdf_limits(immobile.below)[0].clamp(max=1 - 1e-6)
+        # Of ground that does not hold the robot.
+        whole = problem.distribution.expected_time(immobile.below)
+        rate = ((whole - lost / immobile.below) / (1 - lost)).clamp(min=1)
+        hazard = -torch.log1p(-lost) / problem.grid.resolution_m
+        return _on_grid(problem, grid, rate, torch.ones_like(problem.free), hazard=hazard)
+
+
+class OptimalBound(Optimal):
+    """Drives by the least time to go on λ itself, in a world that holds robots for good: a bound for all planners.
+
+    Args:
+        config: settings.
+    """
+
+    name = "optimal-bound"
+
+    def __init__(self, config: OptimalBoundConfig | None = None) -> None:
+        """Keeps the settings; all else is in the plan state."""
+        self.config = config or OptimalBoundConfig()
+
+    def follows(self, task: Task) -> str:
+        """What it minimises; see `Planner`."""
+        return "time on λ itself"
+
+    def costs_of(self, problem: Problem, grid: Grid) -> Costs:
+        """What driving costs; see `Optimal`."""
+        known, immobile = problem.distribution, problem.immobile
+        if not (isinstance(known, TraversabilityMixture) and bool((known.stds == 0).all())):
+            raise ConfigError(
+                f"Expected model 'clairvoyant' for planner {self.name!r}, which is told λ itself, got a prediction "
+                "that is not certain."
+            )
+        field = known.mean()
+        rate = 1 / field.clamp(min=_LEAST_KNOWN)
+        holds = torch.zeros_like(problem.free) if immobile is None else field < immobile.below
+        if immobile is None or self.config.levels == 0:
+            return _on_grid(problem, grid, torch.where(holds, UNREACHED, rate), ~holds)
+        costs = _on_grid(problem, grid, rate, ~holds, holds_s=torch.where(holds, rate, 0.0))
+        return replace(costs, held_s=immobile.for_s, levels=self.config.levels)
+
+
+def _on_grid(
+    problem: Problem,
+    grid: Grid,
+    rate: Tensor,
+    open_: Tensor,
+    hazard: Tensor | None = None,
+    holds_s: Tensor | None = None,
+) -> Costs:
+    """Costs on a grid that divides the map's cells, from maps of `Costs`, each of shape [B, H, W]."""
+    times = grid.height // problem.grid.height
+
+    def fine(values: Tensor) -> Tensor:
+        return values.repeat_interleave(times, 1).repeat_interleave(times, 2)
+
+    dtype = problem.start.dtype
+    rate = fine(rate).to(dtype)
+    row, column = (torch.arange(size, device=rate.device) for size in grid.shape)
+    x, y = grid.centre_of(row[:, None], column)
+    goal_x, goal_y = problem.goal_m.T[:, :, None, None]
+    away = torch.hypot(x - goal_x, y - goal_y) - problem.goal_radius_m
+    return Costs(
+        rate=rate,
+        open=fine(open_) | (away < 0),
+        final=torch.where(away < 0, away / problem.robot.top_speed_mps * rate, torch.nan).to(dtype),
+        loss=problem.time_budget_s.to(dtype),
+        hazard=None if hazard is None else fine(hazard).to(dtype),
+        holds_s=None if holds_s is None else fine(holds_s).to(dtype),
+    )

@@ -1,0 +1,320 @@
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.planning.free_space import PENALTY, FreeSpace, Immobile, Rules
+from benchnav.planning.planners.optimal.optimal import (
+    Optimal,
+    OptimalBound,
+    OptimalBoundConfig,
+    OptimalConfig,
+)
+from benchnav.planning.planners.optimal.value import UNREACHED, Moves, headings_of
+from benchnav.planning.planners.optimal.ways import path_of, ways_from
+from benchnav.planning.planners.planner import PlanStatus
+from benchnav.planning.problem import Problem
+from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
+from benchnav.planning.world.outcome import Outcome
+from tests import factories
+from tests.planning.planners.driving import drive, first, generator, with_start
+
+RULES = Rules(min_traversability=0.01, free_space=FreeSpace(above=0.0))
+
+
+def problem(ground: Tensor, start: tuple[float, float], goal: tuple[float, float], **changes: Any) -> Problem:
+    return factories.problem(ground, start, goal, rules=RULES, **changes)
+
+
+def time_to_go(planner: Any, posed: Problem) -> Tensor:
+    state = planner.init(posed, generator())
+    return ways_from(posed.start, state.held, state).cost.min(1).values
+
+
+def curve(x: float, y: float, heading: float, radius_m: float = 1.0) -> float:
+    """Least time to a disc around 0 along a circle of radius 1 and straight on; infinite within that circle."""
+    found = math.inf
+    for side in (1, -1):
+        centre_x, centre_y = x - side * math.sin(heading), y + side * math.cos(heading)
+        away = math.hypot(centre_x, centre_y)
+        if away < 1:
+            continue
+        # From the centre: where the robot is, and where the straight begins, which ends at 0.
+        begin = math.atan2(y - centre_y, x - centre_x)
+        ends = math.atan2(-centre_y, -centre_x) - side * math.acos(1 / away)
+        arc = (side * (ends - begin)) % (2 * math.pi)
+        found = min(found, arc * (arc < 2 * math.pi - 1e-6) + math.sqrt(away**2 - 1) - radius_m)
+    return found
+
+
+def least_time(x: float, y: float, heading: float) -> float:
+    """The same, where the robot may turn on the spot first."""
+    away = (math.atan2(-y, -x) - heading + math.pi) % (2 * math.pi) - math.pi
+    turns = (away * share / 200 for share in range(201))
+    straight = abs(away) + math.hypot(x, y) - 1
+    return min(straight, *(abs(turn) + curve(x, y, heading + turn) for turn in turns))
+
+
+def test_on_free_ground_the_cost_to_go_is_the_least_time() -> None:
+    goal = (20.25, 12.0)
+    posed = problem(torch.ones(1, 64, 64), (4.0, 4.0), goal)
+    value = Optimal().init(posed, generator()).value[0, 0]
+    drawn, far, near = torch.Generator().manual_seed(0), [], []
+    while len(far) < 200 or len(near) < 40:
+        heading, row, column = (int(torch.randint(most, (), generator=drawn)) for most in (32, 64, 64))
+        x, y = (column + 0.5) / 2 - goal[0], (row + 0.5) / 2 - goal[1]
+        if math.hypot(x, y) < 2:
+            continue
+        wanted = least_time(x, y, heading * math.pi / 16)
+        more = float(value[heading, row, column]) - wanted
+        far, near = ([*far, more / wanted], near) if wanted > 10 else (far, [*near, more])
+    # It is never less than what can be done.
+    assert min(*far, *near) > -0.001
+    assert max(far) < 0.02
+    assert max(near) < 0.2
+
+
+@pytest.mark.parametrize("turned", [0.0, 1.5, -2.2, 3.1])
+def test_on_free_ground_it_drives_in_the_least_time(turned: float) -> None:
+    posed = problem(torch.ones(1, 64, 64), (4.1, 4.3), (27.0, 20.0))
+    posed = replace(posed, start=posed.start + torch.tensor([0.0, 0.0, turned]))
+    done = drive(Optimal(), posed)
+    assert done.outcome.tolist() == [Outcome.SUCCESS]
+    x, y, heading = posed.start[0].tolist()
+    wanted = least_time(x - 27, y - 20, heading)
+    assert 0.1 * int(done.steps[0]) == pytest.approx(wanted, rel=0.03)
+    assert float(time_to_go(Optimal(), posed)) == pytest.approx(wanted, rel=0.02)
+
+
+def test_through_strips_the_time_adds_up_and_slow_ground_is_gone_around_where_that_is_quicker() -> None:
+    ground = torch.full((2, 40, 40), 0.8)
+    ground[0, :, 15:25] = 0.2
+    ground[1, 15:25, 15:25] = 0.1
+    posed = problem(ground, (2.25, 10.25), (17.25, 10.25))
+    found = time_to_go(Optimal(), posed)
+    through = 9.0 / 0.8 + 5 / 0.2
+    assert float(found[0]) == pytest.approx(through, rel=0.03)
+    # By two corners, of which it keeps half a cell at most.
+    around = 2 * math.hypot(5.25, 2.75) + 5 - 1
+    assert 0.98 * around / 0.8 < float(found[1]) < 1.06 * around / 0.8
+    done = drive(Optimal(), posed)
+    assert done.outcome.tolist() == [Outcome.SUCCESS] * 2
+    assert (0.1 * done.steps).tolist() == pytest.approx(found.tolist(), rel=0.03)
+
+
+def test_half_the_traversability_takes_twice_the_time() -> None:
+    drawn = 0.3 + 0.7 * torch.rand(1, 24, 24, generator=generator())
+    both = torch.cat((drawn, drawn / 2))
+    whole, half = time_to_go(Optimal(), problem(both, (2.25, 2.25), (9.25, 8.25))).tolist()
+    assert half == pytest.approx(2 * whole, rel=1e-4)
+
+
+def test_finer_grids_tell_about_the_same_time() -> None:
+    drawn = torch.rand(3, 1, 36, 36, generator=generator(2))
+    ground = 0.15 + 0.85 * torch.nn.functional.avg_pool2d(drawn, 5, 1)[:, 0]
+    posed = problem(ground, (2.25, 2.25), (13.25, 12.25))
+    coarse = time_to_go(Optimal(), posed)
+    fine = time_to_go(Optimal(OptimalConfig(refine=2, headings=64)), posed)
+    torch.testing.assert_close(coarse, fine, rtol=0.02, atol=0)
+    assert not torch.equal(coarse, fine)
+    headings = time_to_go(Optimal(OptimalConfig(headings=16)), posed)
+    torch.testing.assert_close(headings, fine, rtol=0.05, atol=0)
+    assert not torch.equal(coarse, headings)
+
+
+def test_ground_that_is_not_free_is_gone_around_and_crossed_where_there_is_no_other_way() -> None:
+    ground = torch.full((2, 24, 24), 0.9)
+    wall = torch.zeros(24, 24, dtype=torch.bool)
+    wall[:, 11] = True
+    posed = problem(ground, (2.25, 6.25), (9.25, 6.25))
+    free = torch.ones(2, 24, 24, dtype=torch.bool)
+    free[:, wall] = False
+    free[0, 21, 11] = True  # a gap of one cell
+    posed = replace(posed, free=free)
+    found = time_to_go(Optimal(), posed)
+    around = math.hypot(3.5, 4.5) * 2 - 1
+    turn = 2 * math.atan(4.5 / 3.5)
+    assert around / 0.9 < float(found[0]) < 1.01 * (around + turn) / 0.9
+    assert float(found[1]) == pytest.approx(PENALTY * 0.5, rel=0.3)
+    done = drive(Optimal(), posed)
+    assert done.outcome.tolist() == [Outcome.SUCCESS] * 2
+    column = (done.states[0, :, 0] / 0.5).long()
+    assert set((done.states[0, column == 11, 1] / 0.5).long().tolist()) == {21}
+
+
+def test_moves_end_where_the_robot_does() -> None:
+    moves = Moves.of(Unicycle(), 0.5, 32)
+    angles = headings_of(32)
+    offsets = moves.offsets(angles, torch.ones(1, dtype=torch.float64))[:, :, 0]
+    for place, (action, seconds) in enumerate(zip(moves.actions, moves.seconds.tolist(), strict=True)):
+        state = torch.cat((torch.zeros(32, 2, dtype=torch.float64), angles[:, None]), 1)
+        robot = Unicycle(dt_s=seconds / 2000)
+        for _ in range(2000):
+            state = robot(state, action.expand(32, 2), torch.ones(32, dtype=torch.float64))
+        torch.testing.assert_close(offsets[:, place], state[:, :2], atol=1e-3, rtol=0)
+        turned = (state[:, 2] - angles) / (math.pi / 16)
+        torch.testing.assert_close(turned, torch.full_like(turned, moves.turns[place]), atol=1e-6, rtol=0)
+        assert float(offsets[:, place].norm(dim=1).max()) <= 0.5 + 1e-9
+
+
+def held_ground(below: float, for_s: float) -> Problem:
+    """A bar of ground that holds right across the way, around which it is far."""
+    ground = torch.full((1, 40, 24), 0.9)
+    ground[:, :36, 11] = below
+    posed = problem(ground, (2.25, 2.25), (9.25, 2.25))
+    return replace(posed, immobile=Immobile(below=0.1, for_s=for_s), distribution=factories.certain(ground))
+
+
+def test_the_bound_crosses_what_does_not_hold_for_long_enough() -> None:
+    across = 6 - 0.5
+    crossed = across / 0.9 + 0.5 / 0.08  # 6.3 s on ground that holds
+    bound, entry = OptimalBound(), OptimalBound(OptimalBoundConfig(levels=0))
+    for for_s, crosses in ((4.0, False), (9.0, True)):
+        posed = held_ground(0.08, for_s)
+        found, lost = float(time_to_go(bound, posed)), float(time_to_go(entry, posed))
+        assert lost > 30
+        if crosses:
+            assert found == pytest.approx(crossed, rel=0.05)
+        else:
+            assert found == pytest.approx(lost, rel=0.02)
+        done = drive(bound, posed)
+        assert done.outcome.tolist() == [Outcome.SUCCESS]
+        ends = int(done.steps[0])
+        met = posed.traversability_at(done.states[0, None, : ends + 1])[0]
+        longest = run = 0
+        for value in met.tolist():
+            run = run + 1 if value < 0.1 else 0
+            longest = max(longest, run)
+        assert (longest > 40) is crosses
+        assert 0.1 * longest < for_s
+
+
+def test_a_robot_that_was_held_has_less_time_left() -> None:
+    posed = held_ground(0.08, 7.0)
+    state = OptimalBound().init(with_start(posed, 5.3, 2.25, 0.0), generator())
+    pose = torch.tensor([[5.6, 2.25, 0.0]])
+    some, more = (float(ways_from(pose, torch.tensor([held]), state).cost.min()) for held in (0.0, 6.5))
+    assert some == pytest.approx(0.4 / 0.08 + 2.25 / 0.9, rel=0.1)
+    assert more > 3 * some or more >= UNREACHED / 2
+
+
+def test_levels_of_a_world_that_holds_at_once_are_entry_as_loss() -> None:
+    drawn = torch.rand(2, 1, 36, 36, generator=generator(4))
+    ground = torch.nn.functional.avg_pool2d(drawn, 5, 1)[:, 0].sub(0.35).mul(3).clamp(0.02, 1)
+    assert 0.02 < float((ground < 0.1).float().mean()) < 0.3
+    posed = replace(
+        problem(ground, (2.25, 2.25), (13.25, 12.25)),
+        immobile=Immobile(below=0.1, for_s=0.2),
+        distribution=factories.certain(ground),
+    )
+    levels = time_to_go(OptimalBound(), posed)
+    entry = time_to_go(OptimalBound(OptimalBoundConfig(levels=0)), posed)
+    assert float(levels.max()) < 200
+    torch.testing.assert_close(levels, entry, rtol=0.02, atol=0)
+
+
+def test_the_hazard_of_a_metre_is_that_of_its_cells() -> None:
+    """Along a corridor of the same hazard V = (T + 1/h) (1 − exp(−h x)), which solves V' = 1 + h (T − V)."""
+    lost, budget_s = 0.03, 50.0
+    ground = torch.ones(1, 64, 64)
+    posed = problem(ground, (3.25, 16.0), (28.25, 16.0), time_budget_s=budget_s)
+    weights = torch.tensor([lost, 1 - lost])[None, :, None, None].expand(1, 2, 64, 64)
+    means = torch.tensor([0.05, 1.0])[None, :, None, None].expand_as(weights)
+    posed = replace(
+        posed,
+        immobile=Immobile(below=0.1, for_s=2.0),
+        distribution=TraversabilityMixture(weights, means, torch.zeros_like(means)),
+    )
+    found = float(time_to_go(Optimal(OptimalConfig(hazard=True)), posed))
+    hazard = -math.log(1 - lost) / 0.5
+    assert found == pytest.approx((budget_s + 1 / hazard) * (1 - math.exp(-hazard * 24)), rel=0.02)
+    sure = float(time_to_go(Optimal(), posed))
+    assert sure == pytest.approx(24, rel=0.02)
+
+
+def test_with_hazard_it_goes_around_ground_that_is_quick_and_may_hold() -> None:
+    ground = torch.full((1, 40, 40), 0.7)
+    ground[:, 15:25, 10:30] = 1.0
+    posed = problem(ground, (2.25, 10.25), (17.25, 10.25), time_budget_s=90.0)
+    chance = torch.where(ground == 1, 0.1, 1e-9)
+    weights = torch.stack((chance, 1 - chance), 1)
+    means = torch.stack((torch.full_like(ground, 0.02), ground), 1)
+    posed = replace(
+        posed,
+        immobile=Immobile(below=0.1, for_s=2.0),
+        distribution=TraversabilityMixture(weights, means, torch.zeros_like(means)),
+    )
+    for hazard in (False, True):
+        planner = Optimal(OptimalConfig(hazard=hazard))
+        path = path_of(planner.init(posed, generator()), posed.start, torch.zeros(1))[0]
+        path = path[~path.isnan().any(1)]
+        assert float((path[-1] - posed.goal_m[0]).norm()) < 1.0
+        row, column = posed.grid.cell_of(path[:, 0], path[:, 1])
+        assert bool((chance[0, row, column] > 0.05).any()) is not hazard
+
+
+def test_an_episode_alone_does_as_it_does_in_a_batch() -> None:
+    ground = 0.2 + 0.8 * torch.rand(11, 20, 20, generator=generator(3))
+    posed = problem(ground, (1.25, 1.25), (8.25, 7.75))
+    planner, member = Optimal(), torch.tensor([9])
+    whole = planner.init(posed, generator())
+    alone = planner.init(posed.select(member), generator(1))
+    torch.testing.assert_close(planner.select(whole, member).value, alone.value)
+    step = first(posed)
+    action, _, plan = planner.plan(step, whole)
+    found = planner.plan(first(posed.select(member)), planner.select(whole, member))[0]
+    assert torch.equal(found, action[9:10])
+    assert plan.status.tolist() == [PlanStatus.OK] * 11
+
+
+def test_where_there_is_no_way_it_gives_up() -> None:
+    ground = torch.full((2, 24, 24), 0.9)
+    ground[0, :, 10:13] = 0.02
+    posed = replace(
+        problem(ground, (2.25, 6.25), (9.25, 6.25)),
+        immobile=Immobile(),
+        distribution=factories.certain(ground),
+    )
+    planner = OptimalBound()
+    _, _, plan = planner.plan(first(posed), planner.init(posed, generator()))
+    assert plan.status.tolist() == [PlanStatus.FAILED, PlanStatus.OK]
+
+
+@pytest.mark.parametrize("kind", [Optimal, OptimalBound])
+def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> None:
+    ground = torch.full((1, 16, 16), 0.9)
+    for robot in (Bicycle(), DifferentialDrive(), Unicycle(turn_rate_radps=(-1.0, 0.5))):
+        with pytest.raises(ConfigError, match=f"'unicycle'.* for planner '{kind.name}'"):
+            kind().init(factories.problem(ground, robot=robot), generator())
+    posed = factories.problem(ground)
+    with pytest.raises(ConfigError, match="which plans once"):
+        kind().revise(kind().init(posed, generator()), posed)
+
+
+def test_what_cannot_be_known_is_refused() -> None:
+    ground = torch.full((1, 16, 16), 0.9)
+    posed = factories.problem(ground)
+    unsure = replace(posed, distribution=factories.normal(ground, torch.full_like(ground, 0.1)))
+    with pytest.raises(ConfigError, match="model 'clairvoyant' for planner 'optimal-bound'"):
+        OptimalBound().init(unsure, generator())
+    with pytest.raises(ConfigError, match="immobilises robots for `hazard`"):
+        Optimal(OptimalConfig(hazard=True)).init(posed, generator())
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "words"),
+    [
+        (OptimalConfig, {"headings": 4}, "`headings` from 8 to 256 for optimal"),
+        (OptimalConfig, {"refine": 0}, "`refine` from 1 to 4 for optimal"),
+        (OptimalBoundConfig, {"levels": 6}, "`levels` from 0 to 5 for optimal-bound"),
+        (OptimalBoundConfig, {"headings": 300}, "`headings` from 8 to 256 for optimal-bound"),
+    ],
+)
+def test_settings_that_are_none_are_refused(kind: Any, changes: dict[str, int], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        kind(**changes)
