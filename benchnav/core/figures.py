@@ -95,6 +95,8 @@ _PLANNERS = {
     "astar_mppi": ("A*+MPPI", PINK),
     "cl_rrt": ("CL-RRT", ORANGE),
     "mppi": ("MPPI", GREEN),
+    "optimal": ("optimal", AMBER),
+    "optimal_bound": ("optimal, bound", SKY),
     "straight": ("straight", BLIND),
 }
 

@@ -35,7 +35,7 @@ def test_a_planner_has_one_colour_in_whatever_company() -> None:
     assert alone["mppi"] == others["mppi"]
     assert len(set(others.values())) == 4
     assert others["straight"] == BLIND
-    shipped = planner_colours(["astar_dwa", "astar_mppi", "cl_rrt", "mppi", "straight"])
+    shipped = planner_colours(list(names("planner")))
     assert len(set(shipped.values())) == len(shipped)
 
 

@@ -137,8 +137,10 @@ def build_each(conditions: Iterable[Condition], seed: int, maps: int) -> list[st
     for condition in conditions:
         dataset, task, world = _open(condition), condition.make_task(), condition.world
         place = condition.data, condition.split
-        if is_new("planner", condition.planner, condition.robot, condition.objective):
+        if is_new("planner", condition.planner, condition.robot, condition.objective, world.immobile):
             _check_planner(condition, task)
+        if not condition.blind:
+            _check_told(condition)
         if is_new("ground", *place, world.noise):
             _check_known_ground(condition, dataset, maps)
         if is_new("world", *place, world, condition.rules, condition.robot):
@@ -188,6 +190,20 @@ def _steered(conditions: list[Condition]) -> tuple[list[Condition], list[dict[st
     return left, dropped
 
 
+def _check_told(condition: Condition) -> None:
+    """Refuses what a planner cannot be told."""
+    planner, name = condition.make_planner(), condition.planner.label
+    if planner.plans_once and condition.learns:
+        raise ConfigError(
+            f"Expected belief 'static' and sensor 'full' for planner {name!r}, which plans once, got "
+            f"{condition.belief.label!r} and {condition.sensor.label!r}."
+        )
+    if planner.given_truth and condition.model.part != "clairvoyant":
+        raise ConfigError(
+            f"Expected model 'clairvoyant' for planner {name!r}, which is told λ itself, got {condition.model.label!r}."
+        )
+
+
 def _check_planner(condition: Condition, task: Task) -> None:
     """Lets a shipped planner refuse what only its preparation can tell, such as its bounds."""
     if not registry.find("planner", condition.planner.part).shipped:
@@ -199,7 +215,7 @@ def _check_planner(condition: Condition, task: Task) -> None:
     places = torch.tensor([[0.5, 0.5]]), torch.tensor([[3.5, 3.5]])
 
     def prepare() -> None:
-        problem = pose_problem(task, seen, mixture, ground, *places, 1.0)
+        problem = pose_problem(task, seen, mixture, ground, *places, 1.0, immobile=condition.world.immobile)
         condition.make_planner().init(problem, torch.Generator())
 
     labels = condition.labels

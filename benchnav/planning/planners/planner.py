@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import expect
+from benchnav.core.errors import ConfigError, expect
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import Robot
 from benchnav.planning.sensing.sensor import Step
@@ -79,8 +79,17 @@ class Planner(ABC, Generic[State]):
     steers: tuple[tuple[str, ...], ...] | None = None
     """Action names of the robots that it steers; a robot of other actions is refused. None: any robot."""
 
+    robots: tuple[type[Robot], ...] | None = None
+    """Kinds of robots that it plans for, of those that it steers; None: all."""
+
     blind: bool = False
     """On the class: it uses no map, so that one run stands for every model and risk setting."""
+
+    plans_once: bool = False
+    """It plans at the start alone; a robot that learns on its way is refused."""
+
+    given_truth: bool = False
+    """It is given λ itself; another model than `clairvoyant` is refused."""
 
     @property
     def compiled(self) -> bool | None:
@@ -203,8 +212,11 @@ def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:
         name: of the planner, for the message.
 
     Raises:
-        ConfigError: the names of the robot's actions are none that the planner knows.
+        ConfigError: the names of the robot's actions are none that the planner knows, or it is of another kind.
     """
+    if planner.robots is not None and type(robot) not in planner.robots:
+        kinds = " or ".join(kind.__name__ for kind in planner.robots)
+        raise ConfigError(f"Expected robot {kinds} for planner {name!r}, got {type(robot).__name__}.")
     names = tuple(robot.action_names)
     known = (names,) if planner.steers is None else planner.steers
     actions = " or ".join(f"({', '.join(each)})" for each in known)

@@ -19,7 +19,7 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.optimal.value import UNREACHED, Costs, Moves, value_iteration
 from benchnav.planning.planners.optimal.ways import OptimalState, path_of, ways_from
-from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, check_steers
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, TURN_RATE, Unicycle
 from benchnav.planning.sensing.sensor import Step
@@ -80,6 +80,8 @@ class Optimal(Planner[OptimalState]):
     """
 
     steers = ((SPEED, TURN_RATE),)
+    robots = (Unicycle,)
+    plans_once = True
     name = "optimal"
 
     def __init__(self, config: OptimalConfig | None = None) -> None:
@@ -97,12 +99,13 @@ class Optimal(Planner[OptimalState]):
             ConfigError: the robot is another, or what is asked for is not known.
         """
         robot, times = problem.robot, self.config.refine
-        low, high = (robot.action_low[-1], robot.action_high[-1])
-        if type(robot) is not Unicycle or low != -high:
-            raise ConfigError(
-                f"Expected robot 'unicycle', with the same turn rate to both sides, for planner {self.name!r}, got "
-                f"{type(robot).__name__}."
-            )
+        check_steers(self, robot, self.name)
+        low, high = robot.action_low[1], robot.action_high[1]
+        expect(
+            low == -high,
+            f"`turn_rate_radps` alike to both sides for planner {self.name!r}, got {low:g} to {high:g}.",
+        )
+        assert isinstance(robot, Unicycle)
         grid = problem.grid
         grid = Grid(grid.height * times, grid.width * times, grid.resolution_m / times)
         costs = self.costs_of(problem, grid)
@@ -170,6 +173,7 @@ class OptimalBound(Optimal):
         config: settings.
     """
 
+    given_truth = True
     name = "optimal-bound"
 
     def __init__(self, config: OptimalBoundConfig | None = None) -> None:

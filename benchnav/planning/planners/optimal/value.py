@@ -205,6 +205,7 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> Tensor:
         after.append(None if costs.holds_s is None else _held_after(costs, arc))
     final = costs.final[:, None, None]
     value = torch.where(final.isnan(), UNREACHED, final).expand(-1, levels, headings, -1, -1).clone()
+    settled = torch.zeros_like(final, dtype=torch.bool)[..., :1, :1]
     for sweep in range(1, _MOST_SWEEPS * max(grid.shape)):
         before = value
         for number, arc in enumerate(arcs):
@@ -221,8 +222,12 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> Tensor:
             keep = kept[number]
             found = (ended if keep is None else ended * keep[:, None]) + spent[number][:, None]
             value = torch.where(final.isnan(), torch.minimum(value, found), final)
-        if sweep % _CHECK_EVERY == 0 and float((before - value).max()) < _SETTLED:
-            break
+        # A map that has settled stays, so that none depends on those beside it.
+        value = torch.where(settled, before, value)
+        if sweep % _CHECK_EVERY == 0:
+            settled = (before - value).flatten(1).amax(1)[:, None, None, None, None] < _SETTLED
+            if bool(settled.all()):
+                break
     return value
 
 
