@@ -288,9 +288,14 @@ def test_where_there_is_no_way_it_gives_up() -> None:
 @pytest.mark.parametrize("kind", [Optimal, OptimalBound])
 def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> None:
     ground = torch.full((1, 16, 16), 0.9)
-    for robot in (Bicycle(), DifferentialDrive(), Unicycle(turn_rate_radps=(-1.0, 0.5))):
-        with pytest.raises(ConfigError, match=f"'unicycle'.* for planner '{kind.name}'"):
+    for robot in (Bicycle(), DifferentialDrive()):
+        with pytest.raises(
+            ConfigError, match=f"Unicycle for planner '{kind.name}', got {type(robot).__name__}"
+        ):
             kind().init(factories.problem(ground, robot=robot), generator())
+    uneven = Unicycle(turn_rate_radps=(-1.0, 0.5))
+    with pytest.raises(ConfigError, match=f"alike to both sides for planner '{kind.name}'"):
+        kind().init(factories.problem(ground, robot=uneven), generator())
     posed = factories.problem(ground)
     with pytest.raises(ConfigError, match="which plans once"):
         kind().revise(kind().init(posed, generator()), posed)
@@ -300,7 +305,7 @@ def test_what_cannot_be_known_is_refused() -> None:
     ground = torch.full((1, 16, 16), 0.9)
     posed = factories.problem(ground)
     unsure = replace(posed, distribution=factories.normal(ground, torch.full_like(ground, 0.1)))
-    with pytest.raises(ConfigError, match="model 'clairvoyant' for planner 'optimal-bound'"):
+    with pytest.raises(ConfigError, match="model 'clairvoyant' for planner 'optimal_bound'"):
         OptimalBound().init(unsure, generator())
     with pytest.raises(ConfigError, match="immobilises robots for `hazard`"):
         Optimal(OptimalConfig(hazard=True)).init(posed, generator())
@@ -311,8 +316,8 @@ def test_what_cannot_be_known_is_refused() -> None:
     [
         (OptimalConfig, {"headings": 4}, "`headings` from 8 to 256 for optimal"),
         (OptimalConfig, {"refine": 0}, "`refine` from 1 to 4 for optimal"),
-        (OptimalBoundConfig, {"levels": 6}, "`levels` from 0 to 5 for optimal-bound"),
-        (OptimalBoundConfig, {"headings": 300}, "`headings` from 8 to 256 for optimal-bound"),
+        (OptimalBoundConfig, {"levels": 6}, "`levels` from 0 to 5 for optimal_bound"),
+        (OptimalBoundConfig, {"headings": 300}, "`headings` from 8 to 256 for optimal_bound"),
     ],
 )
 def test_settings_that_are_none_are_refused(kind: Any, changes: dict[str, int], words: str) -> None:

@@ -63,8 +63,8 @@ class OptimalBoundConfig:
 
     def __post_init__(self) -> None:
         """Refuses grids that are none."""
-        _check_grid("optimal-bound", self.headings, self.refine)
-        expect(0 <= self.levels <= 5, f"`levels` from 0 to 5 for optimal-bound, got {self.levels}.")
+        _check_grid("optimal_bound", self.headings, self.refine)
+        expect(0 <= self.levels <= 5, f"`levels` from 0 to 5 for optimal_bound, got {self.levels}.")
 
 
 def _check_grid(name: str, headings: int, refine: int) -> None:
@@ -174,7 +174,7 @@ class OptimalBound(Optimal):
     """
 
     given_truth = True
-    name = "optimal-bound"
+    name = "optimal_bound"
 
     def __init__(self, config: OptimalBoundConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
