@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from benchnav.core.errors import ConfigError
@@ -94,3 +95,46 @@ def test_a_merged_run_says_what_its_shards_said(dataset_path: Path, tmp_path: Pa
     assert about["dropped"] == open_run(parts[0]).about["dropped"]
     assert about["warnings"] == open_run(parts[1]).about["warnings"]
     assert json.dumps(about["history"]).count(str(dataset_path)) == len(about["history"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"planner": "optimal", "beliefs": ("copula",)}, "'optimal', which plans once, got 'copula' and 'full'"),
+        ({"planner": "optimal", "sensors": ("near:4",)}, "'optimal', which plans once, got 'static' and 'near:4'"),
+        ({"planner": "optimal_bound"}, "planner 'optimal_bound', which is told λ itself, got 'oracle'"),
+        ({"planner": "optimal", "robots": ("bicycle",)}, "Expected robot Unicycle for planner 'optimal', got Bicycle"),
+        (
+            {"planner": {"part": "optimal", "options": {"hazard": True}}, "world": "paper"},
+            "immobilises robots for `hazard`",
+        ),
+    ],
+)  # fmt: skip
+def test_what_a_planner_cannot_be_told_is_refused_before_anything_is_run(
+    dataset_path: Path, tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
+    planner = changes.pop("planner")
+    suite = {"planners": (planner,), "robots": ("unicycle",), "risks": ("mean",), "world": "stakes"} | changes
+    with pytest.raises(ConfigError, match=words):
+        list(run_suite(suite_on(dataset_path, **suite), tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_optimal_planners_are_run_by_their_names(dataset_path: Path, tmp_path: Path) -> None:
+    conditions = [
+        {"planners": ["optimal", {"part": "optimal", "label": "careful", "options": {"hazard": True}}]},
+        {"planners": ["optimal", "optimal_bound"], "models": ["clairvoyant"]},
+    ]
+    suite = suite_on(
+        dataset_path, conditions=conditions, robots=("unicycle",), risks=("mean",), world="stakes"
+    )
+    folder = tmp_path / "run"
+    list(run_suite(suite, folder))
+    rows = pd.read_parquet(folder / "episodes.parquet")
+    assert len(rows) == 4 * 2
+    known = rows[rows["model"] == "clairvoyant"]
+    assert (known["outcome"] == "success").all()
+    bound, plain = (
+        known[known["planner"] == name]["end_time_s"].to_numpy() for name in ("optimal_bound", "optimal")
+    )
+    assert (bound <= plain + 0.5).all()
