@@ -72,6 +72,8 @@ def check_planner(
         robot = registry.take("robot", given)
         if made.steers is not None and tuple(robot.action_names) not in made.steers:
             continue
+        if made.robots is not None and type(robot) not in made.robots:
+            continue
         steered += 1
         name = given if isinstance(given, str) else type(robot).__name__
         goal = objective or GoalDistance()
@@ -79,7 +81,8 @@ def check_planner(
         for height, width in shapes:
             breaches.place = f"{name} on {height}×{width}"
             task = Task(robot=robot, objective=goal, rules=rules)
-            _Trial(made, _make_problem(task, height, width, torch.device(device)), tolerance, breaches).run()
+            posed = _make_problem(task, height, width, torch.device(device), made.given_truth)
+            _Trial(made, posed, tolerance, breaches).run()
     breaches.expect(steered > 0, "Expected a robot among those tried that it steers, got none.")
     breaches.refuse()
 
@@ -243,8 +246,11 @@ def _step(problem: Problem, step: Step, ended: Tensor, number: int) -> Step:
     return replace(step, state=state, time_s=number * problem.dt_s, draw=number % 2 == 1)
 
 
-def _make_problem(task: Task, height: int, width: int, device: torch.device) -> Problem:
-    """Poses four problems: free ground, a closed wall, a start on ground predicted 0, a wall with a gap."""
+def _make_problem(task: Task, height: int, width: int, device: torch.device, known: bool) -> Problem:
+    """Poses four problems: free ground, a closed wall, a start on ground predicted 0, a wall with a gap.
+
+    Where λ is known the prediction is certain.
+    """
     rows, columns = torch.arange(height, device=device)[:, None], torch.arange(width, device=device)
     # Waves, so that no two cells are quite alike.
     ground = (0.8 + 0.1 * torch.sin(0.7 * rows + 1.3 * columns)).repeat(4, 1, 1)
@@ -254,8 +260,9 @@ def _make_problem(task: Task, height: int, width: int, device: torch.device) -> 
     ground[3, wall, : width - 7] = ground[3, wall, width - 3 :] = 0
     elevation = (0.2 * torch.sin(0.4 * rows) * torch.cos(0.3 * columns)).repeat(4, 1, 1)
     rgb = (255 * ground).to(torch.uint8)[:, None].repeat(1, 3, 1, 1)
-    means = torch.stack((ground - 0.05, ground + 0.05), dim=1)
-    mixture = TraversabilityMixture(torch.full_like(means, 0.5), means, torch.full_like(means, 0.1))
+    doubt = 0.0 if known else 1.0
+    means = torch.stack((ground - 0.05 * doubt, ground + 0.05 * doubt), dim=1)
+    mixture = TraversabilityMixture(torch.full_like(means, 0.5), means, torch.full_like(means, 0.1 * doubt))
     grid = Grid(height, width, _RESOLUTION_M)
     seen = Observation(rgb, elevation, 10 * elevation.abs(), grid)
     start = ground.new_tensor([1.2, 1.3]).repeat(4, 1)
