@@ -73,7 +73,7 @@ def _check_grid(name: str, headings: int, refine: int) -> None:
 
 
 class Optimal(Planner[OptimalState]):
-    """Drives by the least time to go under λ̂, with the penalty of ground that is not free.
+    """Drives by the least time to go under the risk map, with the penalty of ground that is not free.
 
     Args:
         config: settings.
