@@ -194,6 +194,18 @@ def test_the_bound_crosses_what_does_not_hold_for_long_enough() -> None:
         assert 0.1 * longest < for_s
 
 
+def test_between_two_bars_the_time_held_is_over() -> None:
+    ground = torch.full((1, 40, 24), 0.9)
+    ground[:, :36, 8] = ground[:, :36, 14] = 0.08
+    posed = replace(
+        problem(ground, (2.25, 2.25), (10.25, 2.25)),
+        immobile=Immobile(below=0.1, for_s=9.0),
+        distribution=factories.certain(ground),
+    )
+    wanted = (7 - 1.0) / 0.9 + 2 * 0.5 / 0.08
+    assert float(time_to_go(OptimalBound(), posed)) == pytest.approx(wanted, rel=0.05)
+
+
 def test_a_robot_that_was_held_has_less_time_left() -> None:
     posed = held_ground(0.08, 7.0)
     state = OptimalBound().init(with_start(posed, 5.3, 2.25, 0.0), generator())
@@ -261,6 +273,8 @@ def test_with_hazard_it_goes_around_ground_that_is_quick_and_may_hold() -> None:
 def test_an_episode_alone_does_as_it_does_in_a_batch() -> None:
     ground = 0.2 + 0.8 * torch.rand(11, 20, 20, generator=generator(3))
     posed = problem(ground, (1.25, 1.25), (8.25, 7.75))
+    # One beside it has a far longer way, for which more sweeps are made.
+    posed.free[8, 4:16:6, :16] = posed.free[8, 7:16:6, 4:] = False
     planner, member = Optimal(), torch.tensor([9])
     whole = planner.init(posed, generator())
     alone = planner.init(posed.select(member), generator(1))
