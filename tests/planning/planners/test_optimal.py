@@ -199,7 +199,7 @@ def test_between_two_bars_the_time_held_is_over() -> None:
     ground[:, :36, 8] = ground[:, :36, 14] = 0.08
     posed = replace(
         problem(ground, (2.25, 2.25), (10.25, 2.25)),
-        immobile=Immobile(below=0.1, for_s=9.0),
+        immobile=Immobile(below=0.1, for_s=7.0),
         distribution=factories.certain(ground),
     )
     wanted = (7 - 1.0) / 0.9 + 2 * 0.5 / 0.08
@@ -232,7 +232,7 @@ def test_levels_of_a_world_that_holds_at_once_are_entry_as_loss() -> None:
 
 def test_the_hazard_of_a_metre_is_that_of_its_cells() -> None:
     """Along a corridor of the same hazard V = (T + 1/h) (1 − exp(−h x)), which solves V' = 1 + h (T − V)."""
-    lost, budget_s = 0.03, 50.0
+    lost, budget_s = 0.01, 200.0
     ground = torch.ones(1, 64, 64)
     posed = problem(ground, (3.25, 16.0), (28.25, 16.0), time_budget_s=budget_s)
     weights = torch.tensor([lost, 1 - lost])[None, :, None, None].expand(1, 2, 64, 64)
