@@ -119,12 +119,33 @@ def test_finer_grids_tell_about_the_same_time() -> None:
     ground = 0.15 + 0.85 * torch.nn.functional.avg_pool2d(drawn, 5, 1)[:, 0]
     posed = problem(ground, (2.25, 2.25), (13.25, 12.25))
     coarse = time_to_go(Optimal(), posed)
+    finer = Optimal(OptimalConfig(refine=3)).init(posed, generator())
+    assert finer.value.shape == (3, 1, 32, 96, 96)
     fine = time_to_go(Optimal(OptimalConfig(refine=2, headings=64)), posed)
     torch.testing.assert_close(coarse, fine, rtol=0.02, atol=0)
     assert not torch.equal(coarse, fine)
     headings = time_to_go(Optimal(OptimalConfig(headings=16)), posed)
     torch.testing.assert_close(headings, fine, rtol=0.05, atol=0)
     assert not torch.equal(coarse, headings)
+
+
+def test_what_the_ground_is_like_where_it_has_arrived_costs_nothing() -> None:
+    ground = torch.ones(2, 24, 24)
+    ground[1, 12, 18] = 0.05  # where the goal is
+    found = time_to_go(Optimal(), problem(ground, (2.25, 6.25), (9.25, 6.25)))
+    assert found.tolist() == pytest.approx([6.0, 6.0], rel=0.03)
+    narrow = replace(RULES, goal_radius_m=0.1)
+    posed = factories.problem(ground[:1], (2.25, 6.25), (9.4, 6.3), rules=narrow)
+    assert float(time_to_go(Optimal(), posed)) == pytest.approx(7.05, rel=0.03)
+
+
+def test_the_time_held_is_counted_while_it_drives() -> None:
+    posed, planner = held_ground(0.08, 4.0), OptimalBound()
+    state = planner.init(posed, generator())
+    for met, wanted in ((0.05, 0.1), (0.02, 0.2), (0.5, 0.0)):
+        step = replace(first(posed), traversability=torch.tensor([met]))
+        state = planner.plan(step, state)[1]
+        assert state.held.tolist() == pytest.approx([wanted])
 
 
 def test_ground_that_is_not_free_is_gone_around_and_crossed_where_there_is_no_other_way() -> None:

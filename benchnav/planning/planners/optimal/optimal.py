@@ -220,11 +220,16 @@ def _on_grid(
     row, column = (torch.arange(size, device=rate.device) for size in grid.shape)
     x, y = grid.centre_of(row[:, None], column)
     goal_x, goal_y = problem.goal_m.T[:, :, None, None]
-    away = torch.hypot(x - goal_x, y - goal_y) - problem.goal_radius_m
+    away = torch.hypot(x - goal_x, y - goal_y)
+    # At least the goal's own cell. One rate in all of them, as what a way costs within the disc is taken off again.
+    ends = away < (away.flatten(1).amin(1)[:, None, None] + 1e-6).clamp(min=problem.goal_radius_m)
+    within = torch.where(ends, rate, UNREACHED).amin((1, 2), keepdim=True)
+    rate = torch.where(ends, within, rate)
+    left = (away - problem.goal_radius_m) / problem.robot.top_speed_mps * rate
     return Costs(
         rate=rate,
-        open=fine(open_) | (away < 0),
-        final=torch.where(away < 0, away / problem.robot.top_speed_mps * rate, torch.nan).to(dtype),
+        open=fine(open_) | ends,
+        final=torch.where(ends, left, torch.nan).to(dtype),
         loss=problem.time_budget_s.to(dtype),
         hazard=None if hazard is None else fine(hazard).to(dtype),
         holds_s=None if holds_s is None else fine(holds_s).to(dtype),

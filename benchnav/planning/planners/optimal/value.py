@@ -89,7 +89,7 @@ class Costs(Batch):
     Args:
         rate: cost of a second of driving with λ = 1, shape [B, H, W].
         open: cells between which values are interpolated, bool, shape [B, H, W].
-        final: cost to go where the robot has arrived, at most 0, since it arrived before; NaN elsewhere, [B, H, W].
+        final: cost to go where ways end, under 0 where the robot has arrived before; NaN elsewhere, shape [B, H, W].
         hazard: chance of being lost on a metre, as −ln of that of not being lost, shape [B, H, W]; None for none.
         loss: cost of being lost, shape [B].
         holds_s: seconds on ground that holds robots for each second of driving with λ = 1, 0 where none does, shape
