@@ -5,11 +5,12 @@ import pytest
 import torch
 from scipy import stats
 
-from benchnav.core.chosen import choose
+from benchnav.core.chosen import ChosenDistribution, choose
 from benchnav.core.copula import correlations
 from benchnav.core.errors import ConfigError
 from benchnav.core.pooled import pool
 from benchnav.planning.sensing.belief import Law, Predicted, Static, draw_scores, fields_of
+from benchnav.planning.sensing.score_table import VALUES, value_at
 from benchnav.planning.sensing.sensor import Sensed
 from tests.planning.sensing import made
 
@@ -126,5 +127,13 @@ def test_of_ground_that_is_known_for_sure_fields_are_exact() -> None:
         assert torch.equal(found, fields_of(prior, scores))
     away = fields_of(sure, scores)[:, :, None] - mixed.means[:, None]
     assert float(away.abs().amin(2).max()) < 1e-6
-    for prior in (choose(both, mixed, mixed), pool([mixed, mixed])):
-        assert prior.searched
+    assert pool([mixed, mixed]).searched
+    assert ChosenDistribution(mixed, mixed, both).searched
+    for parts in ((mixed, sure), (sure, mixed)):
+        assert not ChosenDistribution(*parts, both).searched
+
+
+def test_beyond_the_ends_of_a_row_values_are_0_and_1() -> None:
+    rows = torch.linspace(-1, 1, len(VALUES))[None].clone()
+    rows[:, -3:], rows[:, :3] = 1.0, -1.0
+    assert value_at(rows, torch.tensor([[-1.2, 1.2]])).tolist() == [[0.0, 1.0]]
