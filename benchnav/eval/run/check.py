@@ -200,7 +200,8 @@ def _check_told(condition: Condition) -> None:
         )
     if planner.given_truth and condition.model.part != "clairvoyant":
         raise ConfigError(
-            f"Expected model 'clairvoyant' for planner {name!r}, which is told λ itself, got {condition.model.label!r}."
+            f"Expected model 'clairvoyant' for planner {name!r}, which is given λ itself, got "
+            f"{condition.model.label!r}."
         )
 
 

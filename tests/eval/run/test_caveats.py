@@ -102,7 +102,7 @@ def test_a_merged_run_says_what_its_shards_said(dataset_path: Path, tmp_path: Pa
     [
         ({"planner": "optimal", "beliefs": ("copula",)}, "'optimal', which plans once, got 'copula' and 'full'"),
         ({"planner": "optimal", "sensors": ("near:4",)}, "'optimal', which plans once, got 'static' and 'near:4'"),
-        ({"planner": "optimal_bound"}, "planner 'optimal_bound', which is told λ itself, got 'oracle'"),
+        ({"planner": "optimal_bound"}, "planner 'optimal_bound', which is given λ itself, got 'oracle'"),
         ({"planner": "optimal", "robots": ("bicycle",)}, "Expected robot Unicycle for planner 'optimal', got Bicycle"),
         (
             {"planner": {"part": "optimal", "options": {"hazard": True}}, "world": "paper"},

@@ -189,7 +189,7 @@ class OptimalBound(Optimal):
         known, immobile = problem.distribution, problem.immobile
         if not (isinstance(known, TraversabilityMixture) and bool((known.stds == 0).all())):
             raise ConfigError(
-                f"Expected model 'clairvoyant' for planner {self.name!r}, which is told λ itself, got a prediction "
+                f"Expected model 'clairvoyant' for planner {self.name!r}, which is given λ itself, got a prediction "
                 "that is not certain."
             )
         field = known.mean()

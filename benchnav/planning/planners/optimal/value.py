@@ -22,7 +22,7 @@ from benchnav.core.batch import Batch
 from benchnav.core.grid import Grid
 from benchnav.planning.robots import Unicycle
 
-POINTS = 8  # N
+_POINTS = 8  # N
 UNREACHED = 1e6  # cost to go before a way is found, and where there is none
 _BARRED = 1e-9  # weight of a cell that is not free beside one that is
 _SETTLED = 1e-3  # least change that counts
@@ -156,7 +156,8 @@ class _Arc:
 
 
 def _arcs(moves: Moves, grid: Grid, headings: int, like: Tensor) -> list[_Arc]:
-    shares = torch.cat((points_along(), torch.ones(1, dtype=torch.float64)))
+    # Where along an arc ground is looked at, and its end.
+    shares = torch.cat(((torch.arange(_POINTS) + 0.5) / _POINTS, torch.ones(1))).double()
     offsets = moves.offsets(headings_of(headings), shares) / grid.resolution_m  # [Q, A, N + 1, 2]
     reach = max(1, math.ceil(float(offsets.abs().max()) - 1e-9))
     found = []
@@ -166,7 +167,7 @@ def _arcs(moves: Moves, grid: Grid, headings: int, like: Tensor) -> list[_Arc]:
         cells = (own[:, :-1] + 0.5).floor().long()
         for heading in range(headings):
             for row, column in cells[heading].tolist():
-                passed[heading, row, column] += 1 / POINTS
+                passed[heading, row, column] += 1 / _POINTS
             end = own[heading, -1].tolist()
             row, column = (min(math.floor(part + 1e-9), 2 * reach - 1) for part in end)
             for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
@@ -174,15 +175,10 @@ def _arcs(moves: Moves, grid: Grid, headings: int, like: Tensor) -> list[_Arc]:
                 ends[heading, row + down, column + across] += beside[0] * beside[1]
         metres = float(moves.actions[place, 0].abs()) * seconds
         points = tuple(
-            (cells[:, number, 0].tolist(), cells[:, number, 1].tolist()) for number in range(POINTS)
+            (cells[:, number, 0].tolist(), cells[:, number, 1].tolist()) for number in range(_POINTS)
         )
         found.append(_Arc(seconds, metres, turn, passed[:, None].to(like), ends[:, None].to(like), points))
     return found
-
-
-def points_along() -> Tensor:
-    """Where along an arc ground is looked at, as shares of it, float64, shape [N]."""
-    return (torch.arange(POINTS, dtype=torch.float64) + 0.5) / POINTS
 
 
 def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> Tensor:
@@ -235,7 +231,7 @@ def _held_after(costs: Costs, arc: _Arc) -> Tensor:
     """Levels of time held after an arc, by that before it, L where the robot is lost, int64, shape [B, L, Q, H, W]."""
     assert costs.holds_s is not None
     (size, height, width), reach = costs.holds_s.shape, arc.reach
-    headings, step = len(arc.ends), arc.seconds / POINTS
+    headings, step = len(arc.ends), arc.seconds / _POINTS
     around = pad(costs.holds_s[:, None], (reach,) * 4)[:, 0]
     start = torch.arange(costs.levels, device=around.device) * (costs.held_s / costs.levels)
     held = start[None, :, None, None, None].to(around).expand(size, -1, headings, height, width).clone()
