@@ -3,6 +3,7 @@
     python -m benchmarks.cai                                       # all of it
     python -m benchmarks.cai --density 0.4 1.0 --out trials.csv    # some of it
     python -m benchmarks.cai --setup.risk_map histogram            # with a choice of theirs
+    python -m benchmarks.cai --risk cost cost-cvar:0.6 --density 0.4 1.0 --setup.mppi.fields 128     # risk on the cost
 
 What is theirs, what is ours and what differs is said in `docs/studies/validation.md`.
 """
@@ -15,7 +16,7 @@ from jsonargparse import ArgumentParser
 
 from benchmarks.cai.run import SETTINGS, run_trials
 from benchmarks.cai.tables import CAUTIOUS, NEUTRAL, tabulate_pairs, tabulate_success
-from benchmarks.cai.task import Setup
+from benchmarks.cai.task import Setup, planner_config
 from benchnav.core.command import show_progress
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import replacing
@@ -52,8 +53,9 @@ def main() -> int:
         given = parser.instantiate(words)
         units = run_trials(given.density, given.risk, given.maps, given.realisations, given.seed, given.setup)
         rows: list[pd.DataFrame] = []
-        total = given.maps * given.realisations
-        show_progress(((len(rows), total) for unit in units if rows.append(unit) is None), "trials a setting")
+        planners = {planner_config(setting, given.setup) for setting in given.risk}
+        total = given.maps * given.realisations * len(planners)
+        show_progress(((len(rows), total) for unit in units if rows.append(unit) is None), "trials a planner")
     except ConfigError as error:
         print(f"{parser.prog}: error: {error}", file=sys.stderr)
         return 2

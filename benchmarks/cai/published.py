@@ -40,6 +40,14 @@ PUBLISHED = {
     (1.0, "cvar:0.4"): Published(45, 11.75),
     (1.0, "cvar:0.6"): Published(197, 10.64),
     (1.0, "cvar:0.8"): Published(198, 10.71),
+    (0.1, "cost"): Published(200, 7.06),
+    (0.1, "cost-cvar:0.6"): Published(200, 7.27),
+    (0.4, "cost"): Published(188, 7.95),
+    (0.4, "cost-cvar:0.6"): Published(186, 8.15),
+    (0.7, "cost"): Published(146, 9.22),
+    (0.7, "cost-cvar:0.6"): Published(157, 9.48),
+    (1.0, "cost"): Published(108, 10.61),
+    (1.0, "cost-cvar:0.6"): Published(200, 10.39),
 }
 
 # Of each density the trials in which `cvar:0.8` alone arrived, and those in which `mean` alone did.

@@ -7,10 +7,11 @@ import pandas as pd
 import torch
 
 from benchmarks.cai.drive import ManyTrialsMPPI, drive
-from benchmarks.cai.task import Setup, pose
+from benchmarks.cai.task import Setup, planner_config, pose
 from benchmarks.cai.world import draw_traction, draw_vegetation
 from benchnav.core import rng
 from benchnav.core.errors import ConfigError
+from benchnav.planning.planners.mppi import MPPIConfig
 
 SETTINGS = ("mean", "cvar:0.4", "cvar:0.6", "cvar:0.8")
 
@@ -32,8 +33,8 @@ def run_trials(
         setup: how it is planned.
 
     Yields:
-        Rows of one map and realisation: `density`, `setting`, `map`, `realisation`, `success`, `time_s`
-        (not a number where there was no arrival).
+        Rows of one map, realisation and planner, which settings of λ̂ share: `density`, `setting`, `map`, `realisation`,
+        `success`, `time_s` (not a number where there was no arrival).
 
     Raises:
         ConfigError: there is nothing to run, or a density or setting that does not exist.
@@ -42,22 +43,25 @@ def run_trials(
         raise ConfigError(f"Expected densities in [0, 1], got {list(densities)}.")
     if maps < 1 or realisations < 1:
         raise ConfigError(f"Expected `maps` and `realisations` ≥ 1, got {maps} and {realisations}.")
-    planner = ManyTrialsMPPI(setup.mppi)
-    labels = pd.MultiIndex.from_product((densities, settings), names=("density", "setting")).to_frame(
-        index=False
-    )
+    alike: dict[MPPIConfig, list[str]] = {}
+    for setting in settings:
+        alike.setdefault(planner_config(setting, setup), []).append(setting)
+    planners = {config: ManyTrialsMPPI(config) for config in alike}
+    names = [round(1e6 * density) for density in densities]
     for member in range(maps):
         which = np.array([member])
         vegetation = np.concatenate([draw_vegetation(seed, which, density) for density in densities])
-        problem = pose(vegetation, settings, setup)
+        problems = {config: pose(vegetation, own, setup, names) for config, own in alike.items()}
         for realisation in range(realisations):
-            traction = draw_traction(seed, which.repeat(len(densities)), realisation, vegetation)
-            traction = torch.from_numpy(traction.repeat(len(settings), axis=0)).float()
-            generator = rng.generator(rng.stream_key(seed, "cai", "planner", member, realisation))
-            arrival_s = drive(planner, problem, traction, generator).double().numpy()
-            yield labels.assign(
-                map=member,
-                realisation=realisation,
-                success=np.isfinite(arrival_s),
-                time_s=np.where(np.isfinite(arrival_s), arrival_s.round(1), np.nan),
-            )
+            drawn = draw_traction(seed, which.repeat(len(densities)), realisation, vegetation)
+            for config, own in alike.items():
+                traction = torch.from_numpy(drawn.repeat(len(own), axis=0)).float()
+                generator = rng.generator(rng.stream_key(seed, "cai", "planner", member, realisation))
+                arrival_s = drive(planners[config], problems[config], traction, generator).double().numpy()
+                labels = pd.MultiIndex.from_product((densities, own), names=("density", "setting"))
+                yield labels.to_frame(index=False).assign(
+                    map=member,
+                    realisation=realisation,
+                    success=np.isfinite(arrival_s),
+                    time_s=np.where(np.isfinite(arrival_s), arrival_s.round(1), np.nan),
+                )

@@ -4,7 +4,7 @@ Letters in shapes: B trials, K components, *B any leading dimensions.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from benchmarks.cai.ground import DIRT, SLICES, VEGETATION
 from benchmarks.cai.world import GRID
-from benchnav.core import registry
+from benchnav.core import registry, rng
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
@@ -30,6 +30,7 @@ GOAL_RADIUS_M = 0.5
 STEPS = 150
 THEIR_MPPI = MPPIConfig(horizon_s=10.0, samples=1024, noise=(2.0, 2.0), temperature=1.0, control_cost=1.0)
 _LAST_SPEED_MPS = 0.01 + 1e-6
+_COST = "cost"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +73,31 @@ class TimeAndDistance(Objective):
         return ROVER.dt_s + away**self.power + away / _LAST_SPEED_MPS * (away > GOAL_RADIUS_M)
 
 
+@dataclass(frozen=True)
+class CellFields:
+    """Draws fields of which every cell is independent, by the point masses that are predicted: a `FieldSource`.
+
+    Args:
+        atoms: as of `predict`, shape [B, 100, 9, 9].
+        names: of the trials, by which their fields are drawn; trials of one name have the same.
+    """
+
+    atoms: Tensor
+    names: tuple[int, ...]
+
+    def sample(self, count: int, key: int) -> Tensor:
+        """See `Problem.sample_fields`."""
+        drawn = []
+        for atoms, name in zip(self.atoms, self.names, strict=True):
+            generator = rng.generator(rng.stream_key(key, "cai", "fields", name))
+            drawn.append(atoms.gather(0, torch.randint(SLICES, (count, *GRID.shape), generator=generator)))
+        return torch.stack(drawn)
+
+    def select(self, members: Tensor) -> "CellFields":
+        """Keeps some trials, by index, int64."""
+        return CellFields(self.atoms[members], tuple(self.names[place] for place in members.tolist()))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Setup:
     """How it is planned; the defaults are theirs.
@@ -105,20 +131,35 @@ def predict(vegetation: np.ndarray) -> TraversabilityMixture:
     return TraversabilityMixture(torch.full_like(atoms, 1 / SLICES), atoms, torch.zeros_like(atoms))
 
 
-def pose(vegetation: np.ndarray, settings: Sequence[str], setup: Setup) -> Problem:
+def planner_config(setting: str, setup: Setup) -> MPPIConfig:
+    """Settings of the planner under a risk setting: the setup's own, with risk on the cost where that is asked for."""
+    if not setting.startswith(_COST):
+        return setup.mppi
+    return replace(setup.mppi, risk_on="cost", level=round(1 - tail_share(setting), 9))
+
+
+def pose(
+    vegetation: np.ndarray, settings: Sequence[str], setup: Setup, names: Sequence[int] | None = None
+) -> Problem:
     """Poses the trials of some maps under some risk settings.
+
+    Fields of λ are drawn cell by cell; one λ serves both motions, as on the map.
 
     Args:
         vegetation: where it grows on D maps, bool, shape [D, 9, 9].
         settings: S of them, such as `mean` or `cvar:0.8`.
         setup: how it is planned.
+        names: of the D maps, by which fields of λ are drawn; their places if they are not given.
 
     Returns:
         D·S trials, all settings of the first map first.
     """
     mixture = predict(vegetation)
     risk_maps = [infer_risk(setting, vegetation, mixture, setup) for setting in settings]
-    trials = len(vegetation) * len(settings)
+    each = torch.arange(len(vegetation)).repeat_interleave(len(settings))
+    trials, mixture = len(each), mixture.select(each)
+    names = range(len(vegetation)) if names is None else names
+    fields = CellFields(mixture.means, tuple(names[place] for place in each.tolist()))
     flat = torch.zeros(trials, *GRID.shape)
     rules = Rules(
         free_space=FreeSpace(by="mean", above=0.0),
@@ -128,16 +169,18 @@ def pose(vegetation: np.ndarray, settings: Sequence[str], setup: Setup) -> Probl
     return pose_problem(
         Task(robot=ROVER, objective=choose_objective(setup), rules=rules),
         Observation(flat[:, None].expand(-1, 3, -1, -1).to(torch.uint8), flat, flat, GRID),
-        mixture.select(torch.arange(len(vegetation)).repeat_interleave(len(settings))),
+        mixture,
         torch.stack(risk_maps, dim=1).flatten(0, 1),
         torch.tensor(START_M).expand(trials, 2),
         torch.tensor(GOAL_M).expand(trials, 2),
         STEPS * ROVER.dt_s,
+        fields=fields,
     )
 
 
 def infer_risk(setting: str, vegetation: np.ndarray, mixture: TraversabilityMixture, setup: Setup) -> Tensor:
-    """λ̂ of one risk setting, shape [D, 9, 9]."""
+    """λ̂ of one risk setting, shape [D, 9, 9]; the mean where the risk is that of the cost."""
+    setting = "mean" if setting.startswith(_COST) else setting
     if setup.risk_map == "exact":
         return risk.apply(registry.make("risk", setting), mixture)
     share = tail_share(setting)
@@ -146,13 +189,16 @@ def infer_risk(setting: str, vegetation: np.ndarray, mixture: TraversabilityMixt
 
 
 def tail_share(setting: str) -> float:
-    """Their α, the share of the tail: 1 for `mean`, 1 − level for `cvar:level`."""
+    """Their α, the share of the tail: 1 for `mean` and `cost`, 1 − level for `cvar:level` and `cost-cvar:level`."""
     name, _, level = setting.partition(":")
-    if name == "mean":
+    if setting in ("mean", _COST):
         return 1.0
-    if name == "cvar" and level:
+    if name in ("cvar", f"{_COST}-cvar") and level:
         return round(1 - float(level), 9)
-    raise ConfigError(f"Expected `mean` or `cvar:LEVEL`, the risk settings that they have, got {setting!r}.")
+    raise ConfigError(
+        "Expected `mean`, `cvar:LEVEL`, `cost` or `cost-cvar:LEVEL`, the risk settings that they have, got "
+        f"{setting!r}."
+    )
 
 
 def choose_objective(setup: Setup) -> Objective:

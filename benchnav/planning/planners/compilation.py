@@ -88,7 +88,9 @@ class Fused(Generic[R]):
                 pass  # what it was compiled for has changed in what the signature does not tell
         with _compiling(checked=not all(_is_ours(arg) for arg in args)):
             for place in self._batched:
-                if len(args[place]) > 1:  # the number of episodes may be any, but one
+                if (
+                    args[place] is not None and len(args[place]) > 1
+                ):  # the number of episodes may be any, but one
                     torch._dynamo.maybe_mark_dynamic(args[place], 0)
             return self._fused(*args)
 

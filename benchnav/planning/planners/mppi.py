@@ -13,7 +13,8 @@ bounds wherever costs are flat, since samples beyond a bound are drawn back onto
 that it cannot wind up beyond the bounds, where no sample would reach back.
 
 Risk is that of λ in each cell, as the risk map has it, or that of the cost (`risk_on: cost`): each sequence is rolled
-out on M fields of λ, and its cost is the CVaR over them; see `benchnav.planning.planners.cost_risk`.
+out on M fields of λ, and its cost is the CVaR over them; see `benchnav.planning.planners.cost_risk`. What is beyond the
+horizon J takes for a straight line over good ground; `cost_to_go` looks at the map's cheapest paths instead.
 
 What differs: noise and temperature are relative by default, so that one setting serves robots and objectives of
 any unit. The control cost is off by default. The mean is not smoothed. Noise is read anew from one bank, a pure
@@ -33,10 +34,13 @@ from benchnav.core import rng
 from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
+from benchnav.planning import risk
 from benchnav.planning.free_space import PENALTY
-from benchnav.planning.objective import Objective
+from benchnav.planning.objective import Objective, has_path_cost
+from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.cost_risk import advance_held, framed_fields, tail_cost
+from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank
 from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
 from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
 from benchnav.planning.robots import Robot, component_wise, steps_in
@@ -48,7 +52,6 @@ _WORTH_COMPILING = 2000  # samples
 OF_EPISODES = (0, 1, 2, 6, 7)  # arguments of what is compiled: states, cost, mean, padded_ground, target
 HELD_OF_EPISODES = (0, 1, 2, 3, 7, 8, 9)  # states, cost, held, mean, padded_ground, target, steps_left
 _DRAWN_SAMPLES = 40
-_RUNS = 4  # length N of a part of the noise bank, in runs of K numbers
 _LEAST_TAIL = 10  # fields in the tail of which a cost is the mean
 _LEAST_SPREAD = 1e-30  # where all samples cost alike, all weigh alike
 
@@ -73,10 +76,13 @@ class MPPIConfig:
         fields: M, on which each sequence is rolled out; at least 10 in the tail, M ≥ 10 / (1 − α), where α > 0.
         once: draws fields once for a map as it is known, not anew at each step.
         entrapment: rollouts stop for good on ground on which the world holds robots.
+        cost_to_go: what the last state of a rollout pays: `objective`, as J has it; `map`, what A*'s cheapest path
+            from there to the goal costs under λ̂; `expected-time`, the same under the λ̂ of that risk setting, whatever
+            the problem's own.
     """
 
     gone: ClassVar = {"horizon": "It is now `horizon_s`, in seconds."}
-    added: ClassVar = ("risk_on", "level", "fields", "once", "entrapment")
+    added: ClassVar = ("risk_on", "level", "fields", "once", "entrapment", "cost_to_go")
 
     horizon_s: float = 5.0
     samples: int = 5000
@@ -90,6 +96,7 @@ class MPPIConfig:
     fields: int = 64
     once: bool = False
     entrapment: bool = False
+    cost_to_go: Literal["objective", "map", "expected-time"] = "objective"
 
     def __post_init__(self) -> None:
         """Refuses settings that sample nothing."""
@@ -103,49 +110,16 @@ class MPPIConfig:
             self.risk_on == "cost" or (self.level == 0 and not self.once),
             "`risk_on: cost` for `level` and `once` of MPPI, got 'map', whose risk is that of the risk setting.",
         )
+        known = "objective", "map", "expected-time"
+        expect(
+            self.cost_to_go in known,
+            f"`cost_to_go` among {', '.join(known)} for MPPI, got {self.cost_to_go!r}.",
+        )
         least = math.ceil(_LEAST_TAIL / (1 - self.level) - 1e-9)
         expect(
             self.level == 0 or self.fields >= least,
             f"`fields` of at least {_LEAST_TAIL} / (1 − `level`) = {least} for MPPI, got {self.fields}.",
         )
-
-
-@dataclass(frozen=True)
-class NoiseBank:
-    """Normal numbers, and where each step reads them.
-
-    Drawing normals costs more than rolling out what they perturb. So a bank of them is drawn when a planner begins, a
-    few times as many as a step needs, and each step reads it from other places: the bank has a part for each time step
-    of the horizon, and of it every action gets a run that begins at a place of its own. From step to step the parts
-    change hands and the places move, by strides that are drawn too. Within a step all numbers are independent, as no
-    two of them lie at one place of the bank; from step to step numbers occur again, in other company. All is a pure
-    function of seed and step, on any device. A part has N numbers.
-
-    Args:
-        scale: standard deviation of each action's noise, shape [A].
-        values: so scaled, shape [A, T, N].
-        place: where the runs of step 0 begin in their parts, int64, shape [T, A].
-        stride: how far they move on from step to step, int64, shape [T, A].
-        samples: K, the length of a run.
-    """
-
-    scale: Tensor
-    values: Tensor
-    place: Tensor
-    stride: Tensor
-    samples: int
-
-    def at(self, step: int) -> Tensor:
-        """The noise of a step, shape [T, A, K]."""
-        actions, horizon, numbers = self.values.shape
-        within = (self.place + step * self.stride) % (numbers - self.samples + 1)
-        # Parts move backward: forward, with the plan, a moment of it would meet the same part at every step.
-        part = (torch.arange(horizon, device=within.device) - step) % horizon
-        action = torch.arange(actions, device=within.device)
-        begin = (action * horizon + part[:, None]) * numbers + within
-        # Row i of the windows is the run that begins at number i; nothing is copied before the selection.
-        windows = self.values.as_strided((self.values.numel() - self.samples + 1, self.samples), (1, 1))
-        return windows.index_select(0, begin.flatten()).view(horizon, actions, self.samples)
 
 
 @dataclass(frozen=True)
@@ -157,6 +131,7 @@ class MPPIState(Batch):
         mean: mean action sequence, shape [B, T, A].
         held: steps in a row, up to now, on ground that holds the robot, shape [B].
         ground: fields of λ that were drawn once, as of `framed_fields`, shape [B, M, N]; None where there are none.
+        to_go: of the cheapest paths, as of `astar.framed`, shape [B, 2, N]; None where J tells the last cost.
         noise: of all steps, the same for each episode.
         key: of the fields' streams.
         step: steps planned so far.
@@ -166,6 +141,7 @@ class MPPIState(Batch):
     mean: Tensor
     held: Tensor
     ground: Tensor | None
+    to_go: Tensor | None
     noise: NoiseBank
     key: int
     step: int
@@ -187,7 +163,7 @@ class MPPI(LocalPlanner[MPPIState]):
         rollouts = samples * fields
         self._advance = Fused(advance_chunk, rollouts, _WORTH_COMPILING, batched=OF_EPISODES)
         self._advance_held = Fused(advance_held, rollouts, _WORTH_COMPILING, batched=HELD_OF_EPISODES)
-        self._weigh = Fused(weigh, rollouts, _WORTH_COMPILING, batched=OF_EPISODES)
+        self._weigh = Fused(weigh, rollouts, _WORTH_COMPILING, batched=(*OF_EPISODES, 15))
 
     @property
     def _fields(self) -> int:
@@ -206,7 +182,8 @@ class MPPI(LocalPlanner[MPPIState]):
         """Starts from a standing robot; see `Planner`.
 
         Raises:
-            ConfigError: the robot has another number of actions than there are noise scales.
+            ConfigError: the robot has another number of actions than there are noise scales; there is to be a cost to
+                go, and the objective does not say what a path costs.
         """
         names, config = problem.robot.action_names, self.config
         expect(
@@ -221,12 +198,26 @@ class MPPI(LocalPlanner[MPPIState]):
         bank = draw_bank(seed, horizon, config.samples, scale)
         key = rng.stream_key(seed, "fields")
         held, ground = problem.start.new_zeros(len(problem)), self._drawn_once(problem, key)
-        return MPPIState(problem, mean, held, ground, bank, key, 0)
+        return MPPIState(problem, mean, held, ground, self._to_go(problem), bank, key, 0)
 
     def revise(self, plan_state: MPPIState, problem: Problem) -> MPPIState:
         """Keeps the mean; see `Planner`."""
         ground = self._drawn_once(problem, plan_state.key)
-        return replace(plan_state, problem=problem, ground=ground)
+        return replace(plan_state, problem=problem, ground=ground, to_go=self._to_go(problem))
+
+    def _to_go(self, problem: Problem) -> Tensor | None:
+        wanted = self.config.cost_to_go
+        if wanted == "objective":
+            return None
+        name = type(problem.objective).__name__
+        expect(
+            has_path_cost(problem.objective),
+            f"an objective with `path_cost` for option `cost_to_go` of MPPI, got {name}.",
+        )
+        if wanted == "expected-time":
+            risk_map = risk.expected_time(problem.distribution).to(problem.risk_map)
+            problem = replace(problem, risk_map=risk_map)
+        return astar.framed(problem, astar.search(problem))
 
     def _drawn_once(self, problem: Problem, key: int) -> Tensor | None:
         if self.config.risk_on == "map" or not self.config.once:
@@ -252,6 +243,7 @@ class MPPI(LocalPlanner[MPPIState]):
         weights, updated = self._weigh(
             states, cost, mean, noise, *problem.action_bounds, ground, target, problem.grid, problem.objective,
             config.temperature, config.temperature_share, self._fields, config.level, going,
+            plan_state.to_go,
         )  # fmt: skip
         shifted = torch.cat((updated[:, 1:], updated[:, -1:]), dim=1)
         layers = _drawn(problem, step.state, updated, mean, noise, weights) if step.draw else {}
@@ -275,24 +267,6 @@ class MPPI(LocalPlanner[MPPIState]):
         if not self.config.entrapment or immobile is None:
             return None
         return torch.where(step.traversability < immobile.below, plan_state.held + 1, 0)
-
-
-def draw_bank(seed: int, horizon: int, samples: int, scale: Tensor) -> NoiseBank:
-    """Draws a bank on the CPU, the same for every device.
-
-    Args:
-        seed: root of the noise.
-        horizon: T.
-        samples: K.
-        scale: standard deviation of each action's noise, shape [A].
-    """
-    # PyTorch's generator looks at 32 bits of a seed alone: the key is a hash of all of them.
-    generator = rng.generator(rng.stream_key(seed, "noise"))
-    actions, numbers = len(scale), _RUNS * samples
-    values = torch.randn((actions, horizon, numbers), generator=generator, dtype=scale.dtype).to(scale.device)
-    places, shape = numbers - samples + 1, (horizon, actions)
-    place, stride = (torch.randint(places, shape, generator=generator).to(scale.device) for _ in range(2))
-    return NoiseBank(scale, values * scale[:, None, None], place, stride, samples)
 
 
 def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
@@ -382,7 +356,7 @@ def weigh(
     states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
     padded_ground: Tensor, target: Tensor, grid: Grid, objective: Objective,
     temperature: float | None, temperature_share: float, fields: int = 1, level: float = 0.0,
-    going: Tensor | None = None,
+    going: Tensor | None = None, to_go: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Adds the cost of the last states, weighs the samples by exp(−cost / temperature) and moves the mean.
 
@@ -392,7 +366,14 @@ def weigh(
         Weights of the samples, shape [B, K], and the mean action sequences, shape [B, T, A].
     """
     ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
-    last = terminal_cost(objective, states, ground, target)
+    if to_go is None:
+        last = terminal_cost(objective, states, ground, target)
+    else:
+        together = states.unflatten(0, (-1, fields)).flatten(
+            1, 2
+        )  # all fields of an episode have one map of costs
+        paths = astar.cost_at(grid, to_go, together[..., 0], together[..., 1])
+        last = paths.view_as(cost) + PENALTY * (ground <= 0)
     cost = cost + (last if going is None else torch.where(going, last, 0))
     if fields > 1:
         cost = tail_cost(cost.unflatten(0, (-1, fields)), level)

@@ -1,11 +1,12 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from benchmarks.cai.ground import DIRT, VEGETATION
-from benchmarks.cai.task import ROVER, Setup, pose, predict, tail_share
+from benchmarks.cai.task import ROVER, Setup, planner_config, pose, predict, tail_share
 from benchmarks.cai.world import draw_vegetation
 from benchnav.core.errors import ConfigError
 from tests.planning.planners.driving import rollout_cost
@@ -98,7 +99,7 @@ def test_histograms_give_their_risk_maps() -> None:
 
 def test_shares_of_the_tail() -> None:
     assert [tail_share(setting) for setting in ("mean", "cvar:0.4", "cvar:0.8")] == [1.0, 0.6, 0.2]
-    with pytest.raises(ConfigError, match="Expected `mean` or `cvar:LEVEL`"):
+    with pytest.raises(ConfigError, match="Expected `mean`, `cvar:LEVEL`, `cost` or `cost-cvar:LEVEL`"):
         tail_share("var:0.9")
 
 
@@ -107,3 +108,22 @@ def test_objectives_of_ours_are_found_by_name() -> None:
     state = torch.tensor([[[0.5, 0.5, 0.0]]] * 2)
     cost = problem.objective.stage(state, torch.zeros(2, 1, 2), torch.ones(2, 1), problem.goal_m[:, None])
     assert cost[0].item() == pytest.approx(math.hypot(8, 8))
+
+
+def test_their_alpha_is_the_share_of_the_worst_costs() -> None:
+    cost, tail = (planner_config(setting, Setup()) for setting in ("cost", "cost-cvar:0.6"))
+    assert (cost.risk_on, cost.level, cost.fields) == ("cost", 0.0, 64)
+    assert (tail.risk_on, tail.level) == ("cost", 0.6)
+    assert replace(tail, risk_on="map", level=0.0) == planner_config("cvar:0.8", Setup()) == Setup().mppi
+
+
+def test_fields_have_the_distribution_of_each_cell_and_cells_are_independent() -> None:
+    problem = pose(VEGETATED[:1], ["cost", "cost-cvar:0.6"], Setup(), [7])
+    drawn = problem.sample_fields(4000, 3)
+    assert torch.equal(drawn[0], drawn[1])
+    mean = problem.distribution.mean()[0]
+    assert float((drawn[0].mean(0) - mean).abs().max()) < 0.03
+    cells = drawn[0].flatten(1)[:, :6]
+    assert float((torch.corrcoef(cells.T) - torch.eye(6)).abs().max()) < 0.06
+    assert torch.equal(drawn, pose(VEGETATED, ["cost"], Setup(), [7, 8]).sample_fields(4000, 3)[[0, 0]])
+    assert not torch.equal(drawn, pose(VEGETATED[:1], ["cost"], Setup(), [8]).sample_fields(4000, 3)[[0, 0]])

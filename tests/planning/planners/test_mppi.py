@@ -8,7 +8,8 @@ from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance, Objective
 from benchnav.planning.planners import mppi
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, NoiseBank, draw_bank
+from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
+from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
@@ -362,7 +363,9 @@ def test_no_tensor_is_made_on_another_device(robot, monkeypatch: pytest.MonkeyPa
         values = mean.new_zeros(2, 20, 4 * 256)
         places = torch.zeros(20, 2, dtype=torch.int64, device=mean.device)
         bank = NoiseBank(scale=scale, values=values, place=places, stride=places, samples=256)
-        state = MPPIState(problem, mean, held=mean[:, 0, 0], ground=None, noise=bank, key=0, step=0)
+        state = MPPIState(
+            problem, mean, held=mean[:, 0, 0], ground=None, to_go=None, noise=bank, key=0, step=0
+        )
         planner = MPPI(replace(SMALL, control_cost=0.1))
         action, state, plan = planner.plan(first(problem, draw=True), state)
         assert on_cuda(action, state.mean, plan.path, plan.samples, plan.status)

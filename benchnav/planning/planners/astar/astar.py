@@ -22,6 +22,8 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import distance
 from benchnav.planning.problem import Problem
 
+_OUTSIDE = 100 * PENALTY  # cost to go off the map, where robots do not move
+
 
 @dataclass(frozen=True)
 class CostToGo(Batch):
@@ -102,6 +104,52 @@ def search(problem: Problem) -> CostToGo:
     following = np.where(following == gridgraph.NO_CELL, np.arange(following.shape[1]), following)
     start = problem.start
     return CostToGo(torch.from_numpy(cost).to(start), torch.from_numpy(following).to(start.device))
+
+
+def framed(problem: Problem, field: CostToGo) -> Tensor:
+    """Cost to go, and what a level metre costs in each cell, framed for `cost_at`.
+
+    Args:
+        problem: B problems.
+        field: their cheapest paths.
+
+    Returns:
+        Shape [B, 2, N], N = (H + 2)·(W + 2).
+    """
+    traversability = problem.traversability
+    per_m = problem.objective.path_cost(traversability, torch.zeros_like(traversability))
+    per_m = per_m + PENALTY * ~problem.free
+    return problem.grid.pad(torch.stack((field.cost, per_m.to(field.cost)), dim=1), outside=_OUTSIDE)
+
+
+def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
+    """Cost to go from anywhere: by the centre, of the cell itself or of one next to it, that makes it least.
+
+    The straight line to that centre costs what the two cells' metres cost, half and half, as an edge does. So at a
+    centre the cost is that of its cell (where grades cost nothing), and between them it leaves no steps as large as a
+    cell. In cells where paths end it is 0.
+
+    Args:
+        grid: of the maps.
+        costs: from `framed`, shape [B, 2, N].
+        x_m: positions, shape [B, J].
+        y_m: positions, shape [B, J].
+
+    Returns:
+        Shape [B, J].
+    """
+    size = grid.resolution_m
+    to_go, per_m = costs.unbind(1)
+    column, row = (x_m / size).floor(), (y_m / size).floor()
+    own, ended = grid.lookup(per_m, x_m, y_m), grid.lookup(to_go, x_m, y_m) == 0
+    best = torch.full_like(x_m, torch.inf)
+    for above in (-0.5, 0.5, 1.5):
+        for right in (-0.5, 0.5, 1.5):
+            centre_x, centre_y = (column + right) * size, (row + above) * size
+            length = torch.sqrt((x_m - centre_x) ** 2 + (y_m - centre_y) ** 2)
+            line = 0.5 * length * (own + grid.lookup(per_m, centre_x, centre_y))
+            best = torch.minimum(best, grid.lookup(to_go, centre_x, centre_y) + line)
+    return torch.where(ended, 0, best)
 
 
 def cell_at(grid: Grid, state: Tensor) -> Tensor:

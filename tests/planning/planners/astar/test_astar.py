@@ -180,3 +180,59 @@ def test_points_begin_at_the_robot_and_end_at_the_goal() -> None:
     torch.testing.assert_close(points[1, :3], torch.tensor(expected))
     torch.testing.assert_close(points[1, -1], torch.tensor([8.1, 3.3]))
     assert (points[0].diff(dim=0)[:, 0] >= 0).all()
+
+
+def everywhere(problem: Problem, count: int, seed: int = 3) -> torch.Tensor:
+    """Positions (x, y) on the maps, shape [B, count, 2]."""
+    extent = torch.tensor(problem.grid.extent_m)
+    return extent * torch.rand(len(problem), count, 2, generator=torch.Generator().manual_seed(seed))
+
+
+def test_the_cost_at_a_centre_is_that_of_its_cell() -> None:
+    problem = random_problem(1, Unicycle(), by_time=True)
+    assert not problem.free.all()
+    field = astar.search(problem)
+    centres = astar.cell_centres(problem.grid, torch.arange(16 * 12)).expand(3, -1, -1)
+    found = astar.cost_at(problem.grid, astar.framed(problem, field), centres[..., 0], centres[..., 1])
+    torch.testing.assert_close(found, field.cost.flatten(1), rtol=1e-5, atol=1e-4)
+
+
+def test_the_cost_between_centres_is_the_least_of_lines_to_those_near() -> None:
+    problem = random_problem(2, Unicycle(), by_time=True)
+    field, points = astar.search(problem), everywhere(problem, 60)
+    found = astar.cost_at(problem.grid, astar.framed(problem, field), points[..., 0], points[..., 1])
+    per_m = 1 / problem.risk_map.clamp(min=0.3) + PENALTY * ~problem.free
+    for b, each in enumerate(points):
+        for (x, y), value in zip(each.tolist(), found[b].tolist(), strict=True):
+            row, column = int(y // 0.5), int(x // 0.5)
+            if field.cost[b, row, column] == 0:
+                assert value == 0
+                continue
+            wanted = min(
+                field.cost[b, i, j].item()
+                + np.hypot(x - 0.5 * j - 0.25, y - 0.5 * i - 0.25)
+                * 0.5
+                * (per_m[b, row, column] + per_m[b, i, j]).item()
+                for i in range(max(row - 1, 0), min(row + 2, 16))
+                for j in range(max(column - 1, 0), min(column + 2, 12))
+            )
+            assert value == pytest.approx(wanted, rel=1e-4)
+
+
+def test_off_the_map_the_cost_is_above_all_on_it() -> None:
+    problem = random_problem(2, Unicycle(), by_time=True)
+    costs = astar.framed(problem, astar.search(problem))
+    outside = torch.tensor([-3.0, 20.0]).expand(3, 2)
+    on_map = costs[:, 0].unflatten(1, (18, 14))[:, 1:-1, 1:-1]
+    assert float(astar.cost_at(problem.grid, costs, outside, outside).min()) > float(on_map.max())
+
+
+def test_a_robot_of_twice_the_speed_has_half_the_time_to_go() -> None:
+    found = []
+    for speed in (1.0, 2.0):
+        problem = random_problem(1, Unicycle(speed_mps=(0, speed)), by_time=True)
+        problem = replace(problem, free=torch.ones_like(problem.free))
+        points = everywhere(problem, 40)
+        costs = astar.framed(problem, astar.search(problem))
+        found.append(astar.cost_at(problem.grid, costs, points[..., 0], points[..., 1]))
+    torch.testing.assert_close(found[0], 2 * found[1])
