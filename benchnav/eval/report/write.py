@@ -37,6 +37,7 @@ from benchnav.eval.report.charts.maps import (
     read_driven,
     trajectory_figure,
 )
+from benchnav.eval.report.charts.regret import MOST_CHAINS, regret_figure
 from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_name
 from benchnav.eval.report.failures import RecordDriven, Sheets, collect_sheets, failures_table
 from benchnav.eval.report.findings import findings
@@ -45,6 +46,7 @@ from benchnav.eval.report.result_tables import LATENCIES, learning_table, paper_
 from benchnav.eval.report.words import NOT_USED, joined, maps_in_words, unit_of_statistics
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
+from benchnav.eval.stats.regret import split_regret
 from benchnav.eval.stats.summary import summarise
 from benchnav.planning.world.outcome import ERROR_OUTCOMES
 
@@ -66,6 +68,7 @@ class Report:
         warnings: lines on what went wrong, or could not be shown.
         summary: the numbers behind the table.
         tests: a row a hypothesis, from `hypotheses.test_hypotheses`; none where the suite held none.
+        regret: from `regret.split_regret`; none where the run has no chain.
         episodes: the rows behind the summary.
         failures: a row a failed episode.
         sheets: failures on their ground.
@@ -79,6 +82,7 @@ class Report:
     warnings: tuple[str, ...]
     summary: pd.DataFrame
     tests: pd.DataFrame
+    regret: pd.DataFrame
     episodes: pd.DataFrame
     failures: pd.DataFrame
     sheets: Sheets
@@ -141,6 +145,7 @@ def read_report(folder: Path, record_driven: RecordDriven | None = None) -> Repo
         warnings=tuple(warnings),
         summary=summary,
         tests=tests,
+        regret=split_regret(about["conditions"], episodes, worlds),
         episodes=episodes,
         failures=failures,
         sheets=sheets,
@@ -171,6 +176,8 @@ def write_report(folder: Path, record_driven: RecordDriven | None = None, out: P
         write_text(
             out / "hypotheses.tex", to_latex([report.hypotheses], caption, f"{report.name}-hypotheses")
         )
+    if not report.regret.empty:
+        write_text(out / "regret.csv", report.regret.to_csv(index=False, float_format="%.6g"))
     figures = {}
     for name, caption, figure in _figures(folder, report, record_driven):
         path = out / "figures" / f"{name}.png"
@@ -213,6 +220,16 @@ def _figures(
         "all are open where nothing is significantly worse. Grey planners are blind.",
         success_figure(summary),
     )
+    if not report.regret.empty:
+        chains = report.regret["chain"].nunique()
+        shown = f" The first {MOST_CHAINS} of {chains} chains are shown." if chains > MOST_CHAINS else ""
+        yield (
+            "regret",
+            "From a planner to the bound, step by step, on the episodes that all have in common: paired differences "
+            "with 95 % intervals. A step may be negative, and in another order steps would be others, so that none is "
+            f"a share of the causes.{shown}",
+            regret_figure(report.regret),
+        )
     driven = read_driven(folder, report.episodes)
     if driven is not None:
         yield _driven(*driven)

@@ -57,17 +57,19 @@ def rows(*episodes: dict[str, Any] | Iterable[dict[str, Any]]) -> pd.DataFrame:
 def conditions(episodes: pd.DataFrame, **notes: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """What `run.json` says of the conditions; `follows` and `remarks` by planner."""
     return {
-        name: {"value": PAPER | _model(group), "labels": {label: group[label].iloc[0] for label in LABELS}}
+        name: {"value": PAPER | _parts(group), "labels": {label: group[label].iloc[0] for label in LABELS}}
         | {"follows": "", "remarks": [], "changed": [], "seeds": sorted(set(group["seed"].tolist()))}
         | notes.get(group["planner"].iloc[0], {})
         for name, group in episodes.groupby("condition", sort=False)
     }
 
 
-def _model(rows: pd.DataFrame) -> dict[str, Any]:
-    """The model by its label; of planners that look at nothing, the stand-in."""
-    label = rows["model"].iloc[0]
-    return {"model": {"part": "oracle" if label == "–" else label, "options": {}}}
+def _parts(rows: pd.DataFrame) -> dict[str, Any]:
+    """Model, planner and risk by their labels; of planners that look at nothing, the stand-in."""
+    labels = rows[["model", "planner", "risk"]].iloc[0].to_dict()
+    if labels["model"] == "–":
+        labels["model"] = "oracle"
+    return {kind: {"part": label, "options": {}} for kind, label in labels.items()}
 
 
 def bold_cells(table: Table) -> set[tuple[int, int]]:

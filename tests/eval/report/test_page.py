@@ -62,7 +62,7 @@ def page(tmp_path: Path) -> Page:
     nothing = pd.DataFrame()
     report = Report(
         name=EVIL, header=(EVIL,), warnings=(EVIL,), findings={EVIL: [EVIL]},
-        table=table, about=about, summary=nothing, tests=nothing, episodes=nothing, failures=nothing,
+        table=table, about=about, summary=nothing, tests=nothing, regret=nothing, episodes=nothing, failures=nothing,
         sheets=Sheets(shown=(), predicted={}, left_out=""),
     )  # fmt: skip
     return Page(render("report.html", report, {picture: EVIL}))

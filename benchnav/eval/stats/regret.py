@@ -1,0 +1,130 @@
+"""Regret, split along a chain of conditions that ends at the best that any planner could do.
+
+From a planner with a model's prediction to the optimal planner with the same prediction, with that of ideal eyes
+(`ideal`), with the true distribution (`oracle`), and to the bound, which is given λ itself. Each step is a paired
+difference of its own. They add up to the whole by construction, which does not make them causes: a step may be
+negative, and another order of steps would give others.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import pandas as pd
+
+from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.unit import DRAW
+from benchnav.eval.stats.best import BLOCK, PRIVILEGED
+from benchnav.eval.stats.comparison import gain_by_map, time_difference
+from benchnav.eval.stats.paired_difference import success_interval
+from benchnav.eval.stats.pairs import side_by_side
+from benchnav.eval.stats.summary import time_budgets
+
+OPTIMAL, BOUND = "optimal", "optimal_bound"
+_MODELS = ("ideal", "oracle")
+
+
+def find_chains(conditions: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
+    """Finds chains of which all five conditions are there.
+
+    Robots that learn on their way are in none: the optimal planners plan once.
+
+    Args:
+        conditions: by id what `run.json` knows of them.
+
+    Returns:
+        Of each chain its conditions, by id: a planner with a model, the optimal planner with it, with `ideal` and with
+        `oracle`, and the bound.
+    """
+    values = {condition: about["value"] for condition, about in conditions.items()}
+
+    def like(value: Mapping[str, Any], but: Sequence[str], **parts: str) -> list[str]:
+        """Conditions that are as one is but for some keys, with these parts."""
+        kept = {key: own for key, own in value.items() if key not in but}
+        return [
+            other
+            for other, own in values.items()
+            if {key: one for key, one in own.items() if key not in but} == kept
+            and all(own[kind]["part"] == part for kind, part in parts.items())
+        ]
+
+    chains = []
+    for condition, value in values.items():
+        planner, model = value["planner"]["part"], value["model"]["part"]
+        blind = conditions[condition]["labels"]["model"] == NOT_USED
+        if planner in (OPTIMAL, BOUND) or model in PRIVILEGED or blind:
+            continue
+        bounds = like(value, ("planner", "model", "risk"), planner=BOUND, model="clairvoyant")
+        for optimal in like(value, ("planner",), planner=OPTIMAL):
+            told = [like(values[optimal], ("model",), model=one) for one in _MODELS]
+            if all(told) and bounds:
+                chains.append([condition, optimal, *(found[0] for found in told), bounds[0]])
+    return chains
+
+
+def split_regret(
+    conditions: Mapping[str, Mapping[str, Any]],
+    episodes: pd.DataFrame,
+    worlds: Mapping[str, Mapping[str, Any]],
+) -> pd.DataFrame:
+    """Paired differences along each chain, on the episodes that all five of its conditions have in common.
+
+    Args:
+        conditions: by id what `run.json` knows of them.
+        episodes: all rows of the run.
+        worlds: by condition what λ did.
+
+    Returns:
+        A row a step of a chain: `chain`, its number; labels of what it begins with; ids, planners and models of the
+        two conditions, `one`, `one_planner`, `one_model` and `other…`; `n_maps`, of which a group counts as one, and
+        `n_episodes`; of `success` and of `time`, T_total in seconds, a failure counted as T: the means `_one` and
+        `_other`, and the `_difference` of one less other with its 95 % interval `_low`, `_high`.
+    """
+    rows = dict(list(episodes.groupby("condition", sort=False)))
+    made: list[dict[str, Any]] = []
+    for number, chain in enumerate(find_chains(conditions), start=1):
+        met = [set(rows[condition][DRAW].itertuples(index=False, name=None)) for condition in chain]
+        common = pd.DataFrame(sorted(set.intersection(*met)), columns=DRAW)
+        if common.empty:
+            continue
+        own = {
+            condition: common.merge(rows[condition], on=DRAW).assign(
+                time_budget_s=lambda found, world=worlds[condition]: time_budgets(found, world)
+            )
+            for condition in chain
+        }
+        labels = conditions[chain[0]]["labels"]
+        about = {name: labels[name] for name in (*BLOCK, "planner", "model", "risk")}
+        for one, other in pairwise(chain):
+            both = side_by_side(own[one], own[other], ["success", "total_time_s", "time_budget_s"])
+            made.append(
+                {
+                    "chain": number,
+                    **about,
+                    "one": one,
+                    "other": other,
+                    **{
+                        f"{end}_{kind}": conditions[condition]["labels"][kind]
+                        for end, condition in (("one", one), ("other", other))
+                        for kind in ("planner", "model")
+                    },
+                    **_differences(both),
+                }
+            )
+    return pd.DataFrame(made)
+
+
+def _differences(both: pd.DataFrame) -> dict[str, Any]:
+    gain, draws = gain_by_map(both)
+    found: dict[str, Any] = {"n_maps": len(gain), "n_episodes": len(both)}
+    nothing = (gain.sum() / len(both), float("nan"), float("nan"))
+    for name, column, interval in (
+        ("success", "success", success_interval(gain, draws) if len(gain) > 1 else nothing),
+        ("time", "total_time_s", time_difference(both) if len(gain) > 1 else nothing),
+    ):
+        found |= {f"{name}_one": both[column].mean(), f"{name}_other": both[f"{column}_other"].mean()}
+        found |= {
+            f"{name}_{end}": float(value)
+            for end, value in zip(("difference", "low", "high"), interval, strict=True)
+        }
+    return found
