@@ -1,6 +1,6 @@
 """Controls of the study of knowledge: a robot that learns what is not so, and one that plans anew for nothing.
 
-benchmarks/knowledge_study.py runs them: docs/knowledge/primary.yaml names them as `benchmarks/knowledge_parts.py:NAME`.
+benchmarks/study.py runs them: docs/knowledge/primary.yaml names them as `benchmarks/knowledge_parts.py:NAME`.
 """
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The study of knowledge: its suites, its maps, its power and its figure."""
+"""The studies: their suites, their maps, their power and their figures."""
 
 from collections import Counter
 from pathlib import Path
@@ -8,12 +8,14 @@ import pandas as pd
 import pytest
 from scipy.stats import norm
 
-from benchmarks import knowledge_study
-from benchmarks.knowledge_study import (
+from benchmarks import study
+from benchmarks.study import (
     ALL_KNOWN,
     KNOWN,
-    PARTS,
-    SUITES,
+    STUDIES,
+    Study,
+    arm_of,
+    frontier_figure,
     knowledge_figure,
     known_of,
     power_of,
@@ -27,27 +29,28 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent
 from tests import factories
 
-RUNNABLE = [part for part in PARTS if part != "near"]  # whose models are shipped
+KNOWLEDGE = STUDIES["knowledge"]
+RUNNABLE = [part for part in KNOWLEDGE.parts if part != "near"]  # whose models are shipped
 
 
 @pytest.fixture(autouse=True)
 def at_the_root(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(knowledge_study.ROOT)
+    monkeypatch.chdir(study.ROOT)
 
 
-def suite(part: str) -> Suite:
-    made: Suite = read(Suite, suite_of(part, Path("maps"), 0), of("the suite"))
+def suite(part: str, of_study: Study = KNOWLEDGE) -> Suite:
+    made: Suite = read(Suite, suite_of(of_study, part, Path("maps"), 0), of("the suite"))
     return made
 
 
-def conditions(part: str) -> list[Condition]:
-    return conditions_of(suite(part), lambda data: ["std"])
+def conditions(part: str, of_study: Study = KNOWLEDGE) -> list[Condition]:
+    return conditions_of(suite(part, of_study), lambda data: ["std"])
 
 
 @pytest.fixture(scope="module")
 def primary() -> list[Condition]:
     return conditions_of(
-        read(Suite, suite_of("primary", Path("maps"), 0), of("the suite")), lambda data: ["std"]
+        read(Suite, suite_of(KNOWLEDGE, "primary", Path("maps"), 0), of("the suite")), lambda data: ["std"]
     )
 
 
@@ -80,27 +83,27 @@ def test_the_parts_of_suites_are_there(part: str) -> None:
 
 def test_maps_to_confirm_on_are_neither_those_to_develop_on_nor_the_seen_ones() -> None:
     confirmed = {
-        suite_of(part, Path("maps"), 0)["data"] for part in ("primary", "known", "near", "sensitivity")
+        suite_of(KNOWLEDGE, part, Path("maps"), 0)["data"]
+        for part in ("primary", "known", "near", "sensitivity")
     }
     assert confirmed == {"maps/stakes-v1-400-seed2026.h5"}
-    assert suite_of("primary", Path("maps"), 7)["maps"] == 7
-    known = knowledge_study.yaml.safe_load((SUITES / "data.yaml").read_text())
+    assert suite_of(KNOWLEDGE, "primary", Path("maps"), 7)["maps"] == 7
+    known = study.yaml.safe_load((KNOWLEDGE.suites / "data.yaml").read_text())
     assert len({about["digest"] for about in known.values()}) == len(known)
 
 
 def test_maps_of_another_digest_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place = factories.tiny_dataset(tmp_path / "maps" / "tiny.h5")
-    folder = tmp_path / "suites"
-    folder.mkdir()
-    monkeypatch.setattr(knowledge_study, "SUITES", folder)
+    monkeypatch.setattr(study, "ROOT", tmp_path)
+    KNOWLEDGE.suites.mkdir(parents=True)
     digest = TerrainDataset(place).splits["test/std"]["digest"]
     for given in (digest, "0" * 64):
-        (folder / "data.yaml").write_text(f"tiny: {{create: [tiny-v1], digest: '{given}'}}")
+        (KNOWLEDGE.suites / "data.yaml").write_text(f"tiny: {{create: [tiny-v1], digest: '{given}'}}")
         if given == digest:
-            knowledge_study.make_maps(place.parent)
+            study.make_maps(KNOWLEDGE, place.parent)
         else:
             with pytest.raises(SystemExit, match=f"{'0' * 64} in .*, got {digest}"):
-                knowledge_study.make_maps(place.parent)
+                study.make_maps(KNOWLEDGE, place.parent)
 
 
 @pytest.mark.parametrize(
@@ -190,8 +193,52 @@ def test_power_is_of_the_maps_that_the_study_confirms_on(
             assert folder == tmp_path / "knowledge-developed"
             self.tests = tests
 
-    monkeypatch.setattr(knowledge_study, "read_report", Read)
+    monkeypatch.setattr(study, "read_report", Read)
     # A standard error of 3 over 100 maps is one of 1.5 over 400.
     first, last = (norm.cdf(3 / 1.5 - norm.ppf(1 - alpha)) for alpha in (0.05 / 4, 0.05))
-    told = knowledge_study.power(tmp_path)
+    told = study.power(KNOWLEDGE, tmp_path)
     assert f"| 1 | it pays | +3.00 (-2.9 to +8.9) | {first:.2f} to {last:.2f} | – |" in told
+
+
+COST = STUDIES["cost"]
+
+
+def test_arms_of_risk_on_the_cost_differ_in_what_they_are_called_for_alone() -> None:
+    found = conditions("levels", COST)
+    told = Counter()
+    for each in found:
+        family, arm, level = arm_of(each.labels)
+        options = dict(each.planner.options)
+        own = options["mppi"] if each.planner.part == "astar_mppi" else options
+        assert (own["samples"], own["cost_to_go"]) == (1024, "expected-time")
+        assert own.get("entrapment", False) is ("held" in arm or "held" in each.labels["planner"])
+        if "cost" in arm:
+            assert (own["risk_on"], own.get("level", 0), own.get("fields", 64)) == ("cost", level, 64)
+            assert each.labels["risk"] == "expected-time"
+        else:
+            assert own.get("risk_on", "map") == "map"
+        told[family, arm] += 1
+    assert told.pop(("", "")) == 1  # the clairvoyant
+    arms = [f"CVaR of {what}{held}" for what in ("λ", "time", "the cost") for held in ("", ", held")]
+    assert told == {(family, arm): 3 for family in ("MPPI", "A*+MPPI") for arm in arms}
+
+
+def test_the_frontiers_have_a_line_an_arm_through_its_levels() -> None:
+    rows = []
+    for place, each in enumerate(conditions("levels", COST)):
+        middle = 0.5 + 0.01 * place
+        rows.append({
+            **each.labels, "success_rate": middle, "success_low": middle - 0.1, "success_high": middle + 0.1,
+            "total_time_mean_s": 60.0 - place,
+        })  # fmt: skip
+    figure = frontier_figure(pd.DataFrame(rows))
+    assert [panel.get_title() for panel in figure.axes] == ["MPPI", "A*+MPPI"]
+    panel = figure.axes[0]
+    assert len(panel.containers) == 6
+    assert [text.get_text() for text in panel.texts] == 6 * ["0", "0.5", "0.8"]
+    own = next(row for row in rows if row["planner"] == "mppi cost 0.8 held")
+    (line,) = (bars.lines[0] for bars in panel.containers if bars.get_label() == "CVaR of the cost, held")
+    assert (line.get_xdata()[-1], line.get_ydata()[-1]) == (
+        own["total_time_mean_s"],
+        100 * own["success_rate"],
+    )

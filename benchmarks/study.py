@@ -1,14 +1,16 @@
-"""What is knowledge worth to a robot? The study of docs/studies/knowledge.md, from its maps to its tables.
+"""The studies whose hypotheses are fixed before their run, from their maps to their tables.
 
-    python benchmarks/knowledge_study.py maps                  # makes the maps, or checks the digests of those there
-    python benchmarks/knowledge_study.py estimate primary      # ten maps a condition: how long the whole takes
-    python benchmarks/knowledge_study.py develop               # the hypotheses on maps to develop on; then their power
-    python benchmarks/knowledge_study.py run primary known     # hours; killed and begun again it goes on
-    python benchmarks/knowledge_study.py report                # tables, and the figure of success over what is known
+    python benchmarks/study.py knowledge maps                  # makes the maps, or checks the digests of those there
+    python benchmarks/study.py knowledge estimate primary      # ten maps a condition: how long the whole takes
+    python benchmarks/study.py knowledge develop               # the hypotheses on maps to develop on; then their power
+    python benchmarks/study.py knowledge run primary known     # hours; killed and begun again it goes on
+    python benchmarks/study.py knowledge report                # tables, and the figure
 
-Parts are suites of docs/knowledge, each with a run of its own: `primary` holds the hypotheses; `known` and `known-mppi`
-are part A, `near` part B, `sensitivity` and `kernel` part C; `seen` has old maps. Maps and runs lie in the folders
-`--maps_in` and `--out`, and `--maps` takes the first maps alone, to try it.
+`knowledge` is docs/studies/knowledge.md: `primary` holds the hypotheses; `known` and `known-mppi` are part A, `near`
+part B, `sensitivity` and `kernel` part C, `seen` has old maps, `nugget` maps to develop on. `cost` is the risk of the
+cost in docs/studies/risk.md: levels are chosen by `levels` on maps to develop on, `primary` confirms, and `own` gives
+each planner the cost to go of its own risk map. Parts are suites of docs/knowledge and docs/cost, each with a run of
+its own. Maps and runs lie in the folders `--maps_in` and `--out`, and `--maps` takes the first maps alone, to try it.
 """
 
 import argparse
@@ -16,7 +18,8 @@ import hashlib
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +34,7 @@ from benchnav.core.figures import (
     MARKERS,
     TWO_COLUMNS_IN,
     legend_outside,
+    line_style,
     risk_name,
     save,
     styled,
@@ -41,14 +45,46 @@ from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.write import read_report
 
 ROOT = Path(__file__).parents[1]
-SUITES, PAGE, FIGURE = (
-    ROOT / "docs/knowledge",
-    ROOT / "docs/studies/knowledge.md",
-    ROOT / "docs/figures/knowledge.png",
-)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """A study.
+
+    Args:
+        name: of the study, which its runs' names begin with, and of its folder in docs.
+        page: which tells of it, in docs/studies.
+        parts: its suites.
+        development: maps on which its hypotheses were developed.
+        seed: of the episodes there.
+    """
+
+    name: str
+    page: str
+    parts: tuple[str, ...]
+    development: str = "stakes-v1-seed1"
+    seed: int = 1
+
+    @property
+    def suites(self) -> Path:
+        """Folder of its suites and of the digests of its maps."""
+        return ROOT / "docs" / self.name
+
+    @property
+    def developed(self) -> str:
+        """Name of the run by which the power of its hypotheses is known."""
+        return f"{self.name}-developed"
+
+
+STUDIES = {
+    "knowledge": Study(
+        name="knowledge",
+        page="knowledge.md",
+        parts=("primary", "known", "known-mppi", "near", "sensitivity", "kernel", "seen", "nugget"),
+    ),
+    "cost": Study(name="cost", page="risk.md", parts=("levels", "primary", "own")),
+}
 SPLIT = "test/std"
-PARTS = ("primary", "known", "known-mppi", "near", "sensitivity", "kernel", "seen")
-DEVELOPMENT, DEVELOPED = "stakes-v1-seed1", "knowledge-developed"
 ALPHA = 0.05
 # What is known, by sensor of the ground and belief, from nothing to all.
 KNOWN = {
@@ -68,18 +104,18 @@ def command(program: str, *words: object) -> None:
         sys.exit(code)  # it has said why
 
 
-def suite_of(part: str, maps_in: Path, maps: int) -> dict[str, Any]:
+def suite_of(study: Study, part: str, maps_in: Path, maps: int) -> dict[str, Any]:
     """A part's suite, on maps that lie in a folder; of the first maps alone where a number is given."""
-    suite: dict[str, Any] = yaml.safe_load((SUITES / f"{part}.yaml").read_text())
+    suite: dict[str, Any] = yaml.safe_load((study.suites / f"{part}.yaml").read_text())
     return suite | {"data": str(maps_in / f"{suite['data']}.h5")} | ({"maps": maps} if maps else {})
 
 
 # --- maps -------------------------------------------------------------------------------------------
 
 
-def make_maps(maps_in: Path) -> None:
+def make_maps(study: Study, maps_in: Path) -> None:
     """Makes the maps that are not there, and refuses others than those of which the digests were fixed."""
-    known: Mapping[str, Mapping[str, Any]] = yaml.safe_load((SUITES / "data.yaml").read_text())
+    known: Mapping[str, Mapping[str, Any]] = yaml.safe_load((study.suites / "data.yaml").read_text())
     maps_in.mkdir(parents=True, exist_ok=True)
     for name, about in known.items():
         path = maps_in / f"{name}.h5"
@@ -102,22 +138,22 @@ def drive(suite: dict[str, Any], name: str, out: Path, jobs: int) -> None:
     command("benchnav-eval", "run", "--config", path, "--out", out / name, "--jobs", jobs)
 
 
-def run(parts: list[str], out: Path, maps_in: Path, maps: int, jobs: int) -> None:
+def run(study: Study, parts: list[str], out: Path, maps_in: Path, maps: int, jobs: int) -> None:
     """Runs parts, one after another."""
     for part in parts:
         begun = time.perf_counter()
-        drive(suite_of(part, maps_in, maps), f"knowledge-{part}", out, jobs)
+        drive(suite_of(study, part, maps_in, maps), f"{study.name}-{part}", out, jobs)
         print(f"-- {part}: {time.perf_counter() - begun:.0f} s", flush=True)
 
 
-def estimate(parts: list[str], out: Path, maps_in: Path, maps: int, jobs: int) -> None:
+def estimate(study: Study, parts: list[str], out: Path, maps_in: Path, maps: int, jobs: int) -> None:
     """Says how long parts take, by some maps of each condition."""
     maps = maps or 10
     for part in parts:
-        whole = suite_of(part, maps_in, 0)
+        whole = suite_of(study, part, maps_in, 0)
         some = {name: value for name, value in whole.items() if name != "hypotheses"}
         begun = time.perf_counter()
-        drive(some | {"maps": maps, "realisations": 1}, f"estimate-{part}", out, jobs)
+        drive(some | {"maps": maps, "realisations": 1}, f"estimate-{study.name}-{part}", out, jobs)
         seconds = time.perf_counter() - begun
         hours = seconds * whole["maps"] * whole.get("realisations", 1) / maps / 3600
         print(
@@ -126,22 +162,26 @@ def estimate(parts: list[str], out: Path, maps_in: Path, maps: int, jobs: int) -
         )
 
 
-def develop(out: Path, maps_in: Path, maps: int, jobs: int) -> None:
+def develop(study: Study, out: Path, maps_in: Path, maps: int, jobs: int) -> None:
     """Runs the conditions of the hypotheses on the maps that the study was developed on, and tells the tests' power."""
-    suite = suite_of("primary", maps_in, maps)
-    suite |= {"data": str(maps_in / f"{DEVELOPMENT}.h5"), "seed": 1, "maps": min(200, suite["maps"])}
-    drive(suite, DEVELOPED, out, jobs)
-    print(power(out))
+    suite = suite_of(study, "primary", maps_in, maps)
+    suite |= {
+        "data": str(maps_in / f"{study.development}.h5"),
+        "seed": study.seed,
+        "maps": min(200, suite["maps"]),
+    }
+    drive(suite, study.developed, out, jobs)
+    print(power(study, out))
 
 
-def power(out: Path) -> str:
+def power(study: Study, out: Path) -> str:
     """The power of each hypothesis, by what was found on the maps that the study was developed on.
 
     For the first and the last place of Holm's correction, where the difference is the one that was found; of
     equivalence and non-inferiority also where there is none.
     """
-    maps, report = yaml.safe_load((SUITES / "primary.yaml").read_text())["maps"], read_report(out / DEVELOPED)
-    rows = []
+    maps = yaml.safe_load((study.suites / "primary.yaml").read_text())["maps"]
+    report, rows = read_report(out / study.developed), []
     for number, row in enumerate(report.tests.to_dict("records"), start=1):
         # Of the mean over so many maps.
         error = (row["high"] - row["low"]) / 2 / norm.ppf(0.975) * np.sqrt(row["n_maps"] / maps)
@@ -218,27 +258,102 @@ def knowledge_figure(summary: pd.DataFrame) -> Figure:
     return figure
 
 
-def report(out: Path) -> None:
-    """Writes the figure, the tables of the page where there is one, and the power where it is known."""
-    print(f"hypotheses {hashlib.sha256((SUITES / 'primary.yaml').read_bytes()).hexdigest()}")
+@styled()
+def frontier_figure(summary: pd.DataFrame) -> Figure:
+    """Success over T_total, a line an arm through its levels, a panel a planner; bars are 95 % intervals of success."""
+    rows = summary.assign(
+        **{
+            name: [own[place] for own in map(arm_of, summary.to_dict("records"))]
+            for place, name in enumerate(("family", "arm", "level"))
+        }
+    )
+    rows = rows[rows["arm"] != ""]
+    panels = list(dict.fromkeys(rows["family"]))
+    figure = Figure(figsize=(TWO_COLUMNS_IN, 3.2), layout="constrained")
+    axes = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+    arms = list(dict.fromkeys(rows["arm"]))
+    for panel, family in zip(axes, panels, strict=True):
+        for place, arm in enumerate(arms):
+            own = rows[(rows["family"] == family) & (rows["arm"] == arm)].sort_values("level")
+            middle, low, high = (100 * own[f"success_{end}"].to_numpy() for end in ("rate", "low", "high"))
+            panel.errorbar(
+                own["total_time_mean_s"], middle, yerr=[middle - low, high - middle],
+                color=LINE_COLOURS[place // 2], marker=MARKERS[place // 2], ls=line_style(place % 2),
+                mfc="white" if place % 2 else LINE_COLOURS[place // 2], ms=4, lw=1.1, elinewidth=0.6, capsize=1.5,
+                label=arm,
+            )  # fmt: skip
+            for (time_s, value), level in zip(
+                own[["total_time_mean_s", "success_rate"]].to_numpy(), own["level"], strict=True
+            ):
+                panel.annotate(
+                    f"{level:g}", (time_s, 100 * value), (3, 3), textcoords="offset points", size=6
+                )
+        panel.set(title=family, xlabel="T_total [s]")
+        panel.grid(color="0.93")
+    axes[0].set_ylabel("success [%]")
+    legend_outside(figure, columns=3)
+    return figure
+
+
+# Of each planner of the study its name in the figure.
+FAMILIES = {"mppi": "MPPI", "astar_mppi": "A*+MPPI"}
+
+
+def arm_of(row: Mapping[Any, Any]) -> tuple[str, str, float]:
+    """Planner, arm and level of a condition; all empty where it is none of the study's."""
+    planner, _, kind = row["planner"].partition(" ")
+    name, _, level = row["risk"].partition(":")
+    held = ", held" if "held" in kind else ""
+    if planner not in FAMILIES or row["model"] == "clairvoyant":
+        return "", "", 0.0
+    if "cost" in kind:
+        return FAMILIES[planner], f"CVaR of the cost{held}", float(kind.split()[1])
+    arms = {
+        "cvar": "CVaR of λ",
+        "time-cvar": "CVaR of time",
+        "expected-time": "CVaR of time",
+        "mean": "CVaR of λ",
+    }
+    return FAMILIES[planner], f"{arms[name]}{held}", float(level or 0)
+
+
+def knowledge_report(out: Path) -> None:
+    """Draws success over what is known."""
     summaries = [out / f"knowledge-{part}" / "summary.csv" for part in ("known", "known-mppi")]
+    _draw(summaries, knowledge_figure, "knowledge.png")
+
+
+def cost_report(out: Path) -> None:
+    """Draws the frontiers."""
+    _draw([out / "cost-primary" / "summary.csv"], frontier_figure, "risk-cost.png")
+
+
+def _draw(summaries: list[Path], figure: Callable[[pd.DataFrame], Figure], name: str) -> None:
     if all(path.exists() for path in summaries):
-        save(knowledge_figure(pd.concat(map(pd.read_csv, summaries))), FIGURE, "png", dpi=200)
-        print(f"wrote {FIGURE}")
+        path = ROOT / "docs/figures" / name
+        save(figure(pd.concat(map(pd.read_csv, summaries))), path, "png", dpi=200)
+        print(f"wrote {path}")
     else:
-        print("no figure: it needs the runs of `known` and `known-mppi`")
-    if PAGE.exists():
-        subprocess.run([sys.executable, ROOT / "benchmarks/tables.py", PAGE, "--runs", out], check=True)
-    if (out / DEVELOPED / "episodes.parquet").exists():
-        print(power(out))
+        print(f"no figure: it needs {' and '.join(str(path.parent) for path in summaries)}")
+
+
+def report(study: Study, out: Path) -> None:
+    """Writes the figure, the tables of the page where there is one, and the power where it is known."""
+    print(f"hypotheses {hashlib.sha256((study.suites / 'primary.yaml').read_bytes()).hexdigest()}")
+    {"knowledge": knowledge_report, "cost": cost_report}[study.name](out)
+    page = ROOT / "docs/studies" / study.page
+    subprocess.run([sys.executable, ROOT / "benchmarks/tables.py", page, "--runs", out], check=True)
+    if (out / study.developed / "episodes.parquet").exists():
+        print(power(study, out))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("study", choices=list(STUDIES))
     parser.add_argument("what", choices=["maps", "estimate", "develop", "power", "run", "report"])
-    parser.add_argument("parts", nargs="*", default=[], help=f"of {', '.join(PARTS)}; all if none is named")
+    parser.add_argument("parts", nargs="*", default=[], help="of the study; all if none is named")
     parser.add_argument("--out", type=Path, default=Path("runs"), help="folder of the runs")
     parser.add_argument("--maps_in", type=Path, default=Path("datasets"), help="folder of the maps")
     parser.add_argument(
@@ -246,19 +361,20 @@ def main() -> None:
     )
     parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args()
-    out, maps_in, parts = given.out.resolve(), given.maps_in.resolve(), given.parts or list(PARTS)
-    if unknown := set(parts) - set(PARTS):
-        parser.error(f"Expected parts among {', '.join(PARTS)}, got {', '.join(sorted(unknown))}.")
+    study, out, maps_in = STUDIES[given.study], given.out.resolve(), given.maps_in.resolve()
+    parts = given.parts or list(study.parts)
+    if unknown := set(parts) - set(study.parts):
+        parser.error(f"Expected parts among {', '.join(study.parts)}, got {', '.join(sorted(unknown))}.")
     if given.what == "maps":
-        make_maps(maps_in)
+        make_maps(study, maps_in)
     elif given.what in ("estimate", "run"):
-        {"estimate": estimate, "run": run}[given.what](parts, out, maps_in, given.maps, given.jobs)
+        {"estimate": estimate, "run": run}[given.what](study, parts, out, maps_in, given.maps, given.jobs)
     elif given.what == "develop":
-        develop(out, maps_in, given.maps, given.jobs)
+        develop(study, out, maps_in, given.maps, given.jobs)
     elif given.what == "power":
-        print(power(out))
+        print(power(study, out))
     else:
-        report(out)
+        report(study, out)
 
 
 if __name__ == "__main__":
