@@ -369,9 +369,8 @@ def weigh(
     if to_go is None:
         last = terminal_cost(objective, states, ground, target)
     else:
-        together = states.unflatten(0, (-1, fields)).flatten(
-            1, 2
-        )  # all fields of an episode have one map of costs
+        # All fields of an episode have one map of costs.
+        together = states.unflatten(0, (-1, fields)).flatten(1, 2)
         paths = astar.cost_at(grid, to_go, together[..., 0], together[..., 1])
         last = paths.view_as(cost) + PENALTY * (ground <= 0)
     cost = cost + (last if going is None else torch.where(going, last, 0))

@@ -67,6 +67,17 @@ def test_without_one_of_its_conditions_there_is_no_chain(missing: tuple[str, str
     assert split(rows).empty
 
 
+@pytest.mark.parametrize("model", ["ideal", "oracle", "clairvoyant"])
+def test_another_planner_with_a_privileged_model_neither_begins_a_chain_nor_stands_in_one(model: str) -> None:
+    rows = episodes()
+    labels = made.condition("astar_dwa", "cvar", model=model)
+    added = [made.row(labels, place, 30.0, condition=name_of("astar_dwa", model)) for place in range(10)]
+    more = pd.concat([rows, pd.DataFrame(added)])
+    assert find_chains(conditions(more)) == find_chains(conditions(rows))
+    fewer = more[more["planner"].eq("astar_dwa") | more["model"].ne(model)]
+    assert find_chains(conditions(fewer)) == []
+
+
 def test_risk_settings_have_chains_of_their_own_and_share_the_bound() -> None:
     rows = pd.concat([episodes(), episodes(risk="mean")]).drop_duplicates(["condition", "map"])
     chains = find_chains(conditions(rows))
