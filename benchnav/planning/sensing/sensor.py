@@ -21,7 +21,6 @@ from benchnav.core.errors import expect
 from benchnav.core.terrain import Observation, Terrain
 
 LEAST_STD = 1e-3  # of noise, in normal scores: keeps the equations of a belief solvable
-_MOST_SCORE = 8.0  # standard deviations; beyond it a rank within an atom is not told from its end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,7 +175,8 @@ class Probe(Sensor):
     """The λ of all cells whose centres are near the robot, with noise in normal scores.
 
     A cell's rank among the values that its distribution allows is a standard normal number; the noise is added to that,
-    so that what is sensed is in [0, 1] and an atom at 0 or 1 can be mistaken for ground beside it.
+    so that what is sensed is in [0, 1], and ground beside an atom at 0 or 1 can be mistaken for it. An atom is read as
+    it is: its λ does not tell where in it the rank lies, and a rank drawn for it would tell neighbours what is not so.
 
     Args:
         radius_m: how near.
@@ -203,15 +203,12 @@ class Probe(Sensor):
         wanted = near.nonzero(as_tuple=True)
         truth, value = terrain.truth.at(near), field[wanted]
         lower, upper = (ends[0].double() for ends in truth.to_normal(value[None]))
-        # In an atom all ranks are alike: one of them, at random.
+        # An atom has no score that noise could move.
         atom = upper > lower
-        ends = (end[atom].clamp(-_MOST_SCORE, _MOST_SCORE) for end in (lower, upper))
-        low, high = (torch.special.ndtr(end) for end in ends)
-        rank = torch.special.ndtr(moment.normal("rank", near.index_put(wanted, atom)))
-        score = lower.index_put((atom,), torch.special.ndtri(low + (high - low) * rank))
-        score = score + self.noise_std * moment.normal("noise", near)
+        score = lower.masked_fill(atom, 0.0) + self.noise_std * moment.normal("noise", near)
+        read = truth.from_normal(score[None].to(value.dtype))[0].to(field.dtype)
         found = torch.full_like(field, torch.nan)
-        found[wanted] = truth.from_normal(score[None].to(value.dtype))[0].to(field.dtype)
+        found[wanted] = torch.where(atom, value, read)
         return Sensed(traversability=found, std=torch.full_like(field, self.noise_std))
 
     def _near(self, terrain: Terrain, robot_state: Tensor) -> Tensor:

@@ -6,7 +6,9 @@ import torch
 from scipy import stats
 
 from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
+from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.sensor import LEAST_STD, Contact, Moment, Probe, Sensed
 from tests.planning.sensing import made
 
@@ -67,23 +69,48 @@ def test_the_noise_of_a_probe_is_normal_in_scores() -> None:
     assert stats.kstest(noise / 0.3, "norm").pvalue > 1e-3
 
 
-def test_within_an_atom_a_probe_takes_any_rank() -> None:
+def test_an_atom_is_read_as_it_is_and_ground_beside_it_may_be_mistaken_for_it() -> None:
     truth = made.mixture(BATCH, HEIGHT, WIDTH)
-    field = torch.zeros(BATCH, HEIGHT, WIDTH, dtype=torch.float64)
-    terrain = made.terrain(truth, field)
-    told = [
-        sensed.traversability[sensed.mask]
-        for step in range(80)
-        for sensed in (Probe(2.0, 0.1).sense(terrain, field, STATES, Moment(KEYS, step)),)
-    ]
-    _, upper = truth.to_normal(field)
-    # A rank under the atom's end that noise lifts over it is no longer 0: P(z + 0.1 ε > b | z < b).
-    rng, ends = np.random.default_rng(0), upper[Probe(2.0)._near(terrain, STATES)].numpy()
-    drawn = stats.truncnorm.rvs(-np.inf, ends, size=(2000, len(ends)), random_state=rng)
-    expected = (drawn + 0.1 * rng.standard_normal(drawn.shape) > ends).mean()
-    share = float((torch.cat(told) > 0).double().mean())
-    assert 0.02 < share < 0.95
-    assert share == pytest.approx(expected, abs=0.015)
+    _, upper = truth.to_normal(torch.zeros(BATCH, HEIGHT, WIDTH, dtype=torch.float64))
+    for value in (0.0, 1.0):
+        field = torch.full((BATCH, HEIGHT, WIDTH), value, dtype=torch.float64)
+        sensed = Probe(2.0, 0.5).sense(made.terrain(truth, field), field, STATES, Moment(KEYS, 0))
+        assert bool((sensed.traversability[sensed.mask] == value).all())
+    field = truth.from_normal(upper + 0.1)
+    told = []
+    for step in range(80):
+        sensed = Probe(2.0, 0.1).sense(made.terrain(truth, field), field, STATES, Moment(KEYS, step))
+        told.append(sensed.traversability[sensed.mask] == 0)
+    assert float(torch.cat(told).double().mean()) == pytest.approx(stats.norm.cdf(-1), abs=0.015)
+
+
+def test_what_many_looks_of_a_probe_say_of_the_cells_around_holds_as_often_as_it_should() -> None:
+    """Of λ in the belief's central 90 %, where atoms are looked at again and again."""
+    batch, size = 300, 13
+    law, ground = made.law(size, size), made.mixture(batch, size, size)
+    share = torch.full_like(ground.weights[:, :1], 0.3)
+    low, high = ground.means.split(1, 1)
+    truth = TraversabilityMixture(
+        torch.cat((share, 1 - share), 1), torch.cat((low - 0.1, high), 1), ground.stds
+    )
+    field = truth.from_normal(made.scores(law, batch))
+    assert 0.1 < float((field == 0).double().mean()) < 0.2
+    terrain, belief = made.terrain(truth, field), Copula()
+    states = torch.tensor([[3.25, 3.25, 0.0]] * batch, dtype=torch.float64)
+    known = belief.init(truth, law)
+    for step in range(30):
+        sensed = Probe(1.0, 0.1).sense(terrain, field, states, Moment(range(batch), step))
+        known = belief.update(known, sensed)
+    row, column = (torch.arange(size) - 6 for _ in range(2))
+    near = torch.hypot(row[:, None].double(), column[None].double()) <= 4
+    cells = near & ~sensed.mask
+    low, high = belief.at(known, cells).cdf_limits(field[cells][None])
+    rank = torch.rand(low.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    inside = (torch.lerp(low.double(), high.double(), rank)[0] - 0.5).abs() <= 0.45
+    by_map = inside.double().view(batch, -1).mean(1)
+    error = 3 * float(by_map.std()) / batch**0.5
+    assert error < 0.02
+    assert float(by_map.mean()) == pytest.approx(0.9, abs=error)
 
 
 def test_noise_is_of_the_episode_the_cell_and_the_step_alone(ground: tuple[Terrain, torch.Tensor]) -> None:
