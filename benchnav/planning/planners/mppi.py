@@ -96,7 +96,7 @@ class MPPIConfig:
     fields: int = 64
     once: bool = False
     entrapment: bool = False
-    cost_to_go: Literal["objective", "map", "expected-time"] = "objective"
+    cost_to_go: str = "objective"
 
     def __post_init__(self) -> None:
         """Refuses settings that sample nothing."""
