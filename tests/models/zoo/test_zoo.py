@@ -18,17 +18,18 @@ from tests.models.zoo.support import EXACT, ZOO, killed_in, make, to_train
 LIMITS = {"evidential": 0.15, "mc_dropout": 0.11, "quantile": 0.13}
 # Hidden channels, and steps. Dropout widens what a narrow network predicts: with 32 it erred by 0.15 in the mean of
 # six seeds, with 128 by 0.05, and by 0.086 at most.
-SIZES = {"mc_dropout": (128, 120)}
+# Hidden units, steps and learning rate: the noise of dropout leaves high rates nowhere to settle.
+TRAINING = {"mc_dropout": (64, 300, 5e-3)}
 
 
 @pytest.mark.parametrize("name", ZOO)
 def test_it_recovers_a_known_distribution(name: str) -> None:
-    hidden, steps = SIZES.get(name, (32, 60))
+    hidden, steps, rate = TRAINING.get(name, (32, 60, 2e-2))
     generator = torch.Generator().manual_seed(0)
     torch.manual_seed(0)
     network = make(name, hidden=hidden, **({"dropout": 0.05} if name == "mc_dropout" else {})).train()
-    optimizer = torch.optim.AdamW(network.parameters(), lr=2e-2)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-2, total_steps=steps)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=rate)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
     for _ in range(steps):
         terrain, _ = draw_two_grounds(generator)
         optimizer.zero_grad()
