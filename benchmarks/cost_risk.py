@@ -6,8 +6,7 @@ MPPI with risk on the cost chooses actions that cost little on the M fields that
 and on others it costs more (the optimism of a chosen minimum). Robots begin on maps of `stakes-v1 --seed 1` under the
 prediction of `stakes-v1`, with the time to go of `expected-time`, and drive on the mean of the prediction. After 0, 2
 and 4 seconds the chosen actions are rolled out on 4 096 fresh fields. Told are the mean of fresh less own over maps and
-moments with its 95 % interval by maps, in seconds, and how long a solve takes for one robot of a batch. Ten minutes of
-a core.
+moments with its 95 % interval by maps, in seconds, and how long a solve takes for one robot of a batch.
 """
 
 import argparse

@@ -242,3 +242,15 @@ def test_the_frontiers_have_a_line_an_arm_through_its_levels() -> None:
         own["total_time_mean_s"],
         100 * own["success_rate"],
     )
+
+
+@pytest.mark.parametrize("what", ["develop", "power"])
+def test_a_study_without_hypotheses_has_no_power(
+    what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["study.py", "cost", what])
+    with pytest.raises(SystemExit, match="2"):
+        study.main()
+    assert "Expected a study with hypotheses, got cost" in capsys.readouterr().err
+    for name, own in STUDIES.items():
+        assert {path.stem for path in own.suites.glob("*.yaml")} == {*own.parts, "data"}, name

@@ -54,7 +54,11 @@ def find_chains(conditions: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
         blind = conditions[condition]["labels"]["model"] == NOT_USED
         if planner in (OPTIMAL, BOUND) or model in PRIVILEGED or blind:
             continue
-        bounds = like(value, ("planner", "model", "risk"), planner=BOUND, model="clairvoyant")
+        bounds = [
+            other
+            for other in like(value, ("planner", "model", "risk"), planner=BOUND, model="clairvoyant")
+            if values[other]["planner"]["options"].get("levels") != 0  # where entry is loss it is no bound
+        ]
         for optimal in like(value, ("planner",), planner=OPTIMAL):
             told = [like(values[optimal], ("model",), model=one) for one in _MODELS]
             if all(told) and bounds:

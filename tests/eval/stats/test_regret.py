@@ -78,6 +78,16 @@ def test_another_planner_with_a_privileged_model_neither_begins_a_chain_nor_stan
     assert find_chains(conditions(fewer)) == []
 
 
+def test_where_entry_counts_as_loss_it_is_no_bound() -> None:
+    known = conditions(episodes())
+    bound = name_of("optimal_bound", "clairvoyant", "–")
+    cheaper = {"planner": {"part": "optimal_bound", "options": {"levels": 0}}}
+    cheap = {**known[bound], "value": {**known[bound]["value"], **cheaper}}
+    ((*_, last),) = find_chains({"cheap": cheap, **known})
+    assert last == bound
+    assert find_chains({**known, bound: cheap}) == []
+
+
 def test_risk_settings_have_chains_of_their_own_and_share_the_bound() -> None:
     rows = pd.concat([episodes(), episodes(risk="mean")]).drop_duplicates(["condition", "map"])
     chains = find_chains(conditions(rows))
