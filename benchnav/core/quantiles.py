@@ -112,10 +112,6 @@ class QuantileDistribution(TraversabilityDistribution):
         """Mean of λ over its worst share 1 − level, shape [*B, H, W]; see the base."""
         return self._mean_under(tail_of(level))
 
-    def expected_time(self, floor: float) -> Tensor:
-        """E[1 / max(λ, floor)], shape [*B, H, W]; see the base."""
-        return self.time_cvar(0.0, floor)
-
     def time_cvar(self, level: float, floor: float) -> Tensor:
         """CVaR of the time 1 / max(λ, floor), shape [*B, H, W]; see the base."""
         tail = tail_of(level)

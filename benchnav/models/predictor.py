@@ -69,10 +69,8 @@ class Clairvoyant(PrivilegedModel):
 
 
 Source = str | Path | Mapping[str, Any] | registry.Part
-# `Law.nugget` under a model that learnt. On 40 maps of stakes-v1 under seed 1, with the model stakes-v1, log scores
-# ahead of robots that sense λ under them are −1.82, 0.13, 0.14 and 0.10 with nuggets of 0, 0.1, 0.3 and 0.6; with a
-# probe of 1 m −0.14, 0.23, 0.18 and 0.14. Without one, scores of neighbours that the model has wrong contradict one
-# another.
+# `Law.nugget` under a model that learnt; docs/reference/sensing.md has the figures it was chosen by. Without a nugget,
+# scores of neighbouring cells that the model predicts wrongly contradict each other.
 MODEL_NUGGET = 0.1
 IN_REPOSITORY_ALONE = "paper-v1"  # a checkpoint that `setup.py` leaves out of wheels
 

@@ -61,6 +61,7 @@ _SHOWN = {
 }
 _MOMENTS = 4
 _SENSED = "white"
+_THIN = 0.6  # of the width that lines have where a map is alone
 
 _BIN_S = 2.0
 _MOST_LINES, _MOST_ACROSS = 7, 4
@@ -139,7 +140,7 @@ def knowledge_figure(recording: Recording) -> Figure:
     if any(not known.seen.all() for known in every):
         handles.append(unseen_handle())
     if any(known.outlines for known in every):
-        handles.append(reach_line(np.empty((0, 2)), label="reach of the sensors"))
+        handles.append(reach_line(np.empty((0, 2)), _THIN, "reach of the sensors"))
     legend_outside(figure, handles, 5)
     return figure
 
@@ -153,7 +154,7 @@ def _draw_known(panel: Axes, known: KnownMap, resolution_m: float) -> None:
     panel.add_collection(unseen_layer(known.seen, resolution_m))
     sensed = list(outline(known.sensed, resolution_m))
     panel.add_collection(LineCollection(sensed, colors=_SENSED, linewidths=0.5))
-    panel.add_line(reach_line(known.outline))
+    panel.add_line(reach_line(known.outline, _THIN))
 
 
 def _draw_robot(panel: Axes, recording: Recording, step: int) -> None:
