@@ -73,7 +73,7 @@ def grid_table(problem: Problem) -> tuple[Table, list[tuple[np.ndarray, np.ndarr
     )
     for name, posed, options in rows:
         coarse, took = cost_from_start(posed, name, **options)
-        fine, longer = cost_from_start(posed, name, refine=2, **options)
+        fine, longer = cost_from_start(posed, name, refine=2, headings=64, **options)
         both = np.isfinite(coarse) & np.isfinite(fine)
         share = (coarse[both] - fine[both]) / fine[both]
         agrees = np.mean(np.isfinite(coarse) == np.isfinite(fine))

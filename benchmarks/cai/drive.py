@@ -7,26 +7,15 @@ import torch
 from torch import Tensor
 
 from benchmarks.cai.task import GOAL_M, GOAL_RADIUS_M, STEPS
-from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.mppi import MPPI, OF_EPISODES, MPPIConfig, advance_chunk, weigh
+from benchnav.planning.planners.mppi import MPPI
 from benchnav.planning.problem import Problem
 from benchnav.planning.sensing.sensor import Step
 
-_ALWAYS = 0  # is compiled, however few samples
-
 
 class ManyTrialsMPPI(MPPI):
-    """MPPI that is compiled even at few samples: hundreds of trials of one shape share the compiling.
+    """MPPI that is compiled even at few samples: hundreds of trials of one shape share the compiling."""
 
-    Args:
-        config: settings.
-    """
-
-    def __init__(self, config: MPPIConfig) -> None:
-        """Keeps the settings."""
-        super().__init__(config)
-        self._advance = Fused(advance_chunk, config.samples, _ALWAYS, batched=OF_EPISODES)
-        self._weigh = Fused(weigh, config.samples, _ALWAYS, batched=OF_EPISODES)
+    worth_compiling = 0
 
 
 def drive(planner: MPPI, problem: Problem, traction: Tensor, generator: torch.Generator) -> Tensor:

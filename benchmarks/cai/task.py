@@ -85,7 +85,7 @@ class CellFields:
     atoms: Tensor
     names: tuple[int, ...]
 
-    def sample(self, count: int, key: int) -> Tensor:
+    def sample(self, count: int, key: int, cells: Tensor | None = None) -> Tensor:
         """See `Problem.sample_fields`."""
         drawn = []
         for atoms, name in zip(self.atoms, self.names, strict=True):

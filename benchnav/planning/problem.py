@@ -27,7 +27,7 @@ _ZERO = 1e-30
 class FieldSource(Protocol):
     """Draws fields of λ for B episodes: `benchnav.planning.sensing.belief.Fields`."""
 
-    def sample(self, count: int, key: int) -> Tensor:
+    def sample(self, count: int, key: int, cells: Tensor | None = None) -> Tensor:
         """See `Problem.sample_fields`."""
 
     def select(self, members: Tensor) -> Self:
@@ -125,12 +125,13 @@ class Problem(Batch):
         """Time step of the robot."""
         return self.robot.dt_s
 
-    def sample_fields(self, count: int, key: int) -> Tensor:
+    def sample_fields(self, count: int, key: int, cells: Tensor | None = None) -> Tensor:
         """Draws fields of λ as what is believed has them, each whole: its cells hang together.
 
         Args:
             count: M.
             key: a stream key, see `benchnav.core.rng`; another key draws other fields.
+            cells: which are asked for, bool, shape [B, H, W], which may save time; what others hold means nothing then.
 
         Returns:
             λ in [0, 1], shape [B, M, H, W]; those of an episode do not depend on the others.
@@ -142,7 +143,7 @@ class Problem(Batch):
             raise ConfigError(
                 "Expected a problem with `fields` to draw from, got None. Pass them to `pose_problem`."
             )
-        return self.fields.sample(count, key).to(self.risk_map)
+        return self.fields.sample(count, key, cells).to(self.risk_map)
 
     def select(self, members: Tensor) -> "Problem":
         """Keeps some episodes, by index, int64."""

@@ -20,6 +20,7 @@ from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.boundary import NOT_FINITE, find_fault, find_layer_faults
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem, Task, pose_problem
+from benchnav.planning.sensing.belief import Fields, Law, Static
 from benchnav.planning.sensing.sensor import Step
 from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
 
@@ -267,4 +268,6 @@ def _make_problem(task: Task, height: int, width: int, device: torch.device, kno
     seen = Observation(rgb, elevation, 10 * elevation.abs(), grid)
     start = ground.new_tensor([1.2, 1.3]).repeat(4, 1)
     goal = (ground.new_tensor(grid.extent_m) - ground.new_tensor([1.7, 1.4])).repeat(4, 1)
-    return pose_problem(task, seen, mixture, ground, start, goal, 60.0)
+    believed = Static().init(mixture, Law(grid=grid, correlation_m=1.0))
+    fields = Fields(Static(), believed, tuple(range(len(ground))))
+    return pose_problem(task, seen, mixture, ground, start, goal, 60.0, fields=fields)

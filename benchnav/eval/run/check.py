@@ -28,6 +28,7 @@ from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.predictor import class_mismatch, find_checkpoint, find_ground_statistics, load_model
 from benchnav.planning.planners.planner import check_steers
 from benchnav.planning.problem import Task, pose_problem
+from benchnav.planning.sensing.belief import Fields, Law, Static
 from benchnav.planning.world.realisation import check_known
 from benchnav.planning.world.simulation import Simulation
 
@@ -137,8 +138,9 @@ def build_each(conditions: Iterable[Condition], seed: int, maps: int) -> list[st
     for condition in conditions:
         dataset, task, world = _open(condition), condition.make_task(), condition.world
         place = condition.data, condition.split
-        if is_new("planner", condition.planner, condition.robot, condition.objective, world.immobile):
-            _check_planner(condition, task)
+        posed = condition.robot, condition.objective, condition.rules, world.immobile
+        if is_new("planner", condition.planner, condition.data, *posed):
+            _check_planner(condition, task, dataset.grid.resolution_m)
         if not condition.blind:
             _check_told(condition)
         if is_new("ground", *place, world.noise):
@@ -205,18 +207,23 @@ def _check_told(condition: Condition) -> None:
         )
 
 
-def _check_planner(condition: Condition, task: Task) -> None:
+def _check_planner(condition: Condition, task: Task, resolution_m: float) -> None:
     """Lets a shipped planner refuse what only its preparation can tell, such as its bounds."""
     if not registry.find("planner", condition.planner.part).shipped:
         return
     ground = torch.full((1, 4, 4), 0.9)
-    seen = Observation(torch.zeros(1, 3, 4, 4, dtype=torch.uint8), 0 * ground, 0 * ground, Grid(4, 4, 1.0))
+    grid = Grid(4, 4, resolution_m)
+    seen = Observation(torch.zeros(1, 3, 4, 4, dtype=torch.uint8), 0 * ground, 0 * ground, grid)
     ones = torch.ones_like(ground).unsqueeze(1)
     mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
-    places = torch.tensor([[0.5, 0.5]]), torch.tensor([[3.5, 3.5]])
+    places = [torch.full((1, 2), cells * resolution_m) for cells in (0.5, 3.5)]
 
     def prepare() -> None:
-        problem = pose_problem(task, seen, mixture, ground, *places, 1.0, immobile=condition.world.immobile)
+        fields = Fields(Static(), Static().init(mixture, Law(grid=grid, correlation_m=0.0)), (0,))
+        world = condition.world
+        problem = pose_problem(
+            task, seen, mixture, ground, *places, 1.0, immobile=world.immobile, fields=fields
+        )
         condition.make_planner().init(problem, torch.Generator())
 
     labels = condition.labels

@@ -121,12 +121,15 @@ def split_regret(
 def _differences(both: pd.DataFrame) -> dict[str, Any]:
     gain, draws = gain_by_map(both)
     found: dict[str, Any] = {"n_maps": len(gain), "n_episodes": len(both)}
-    nothing = (gain.sum() / len(both), float("nan"), float("nan"))
-    for name, column, interval in (
-        ("success", "success", success_interval(gain, draws) if len(gain) > 1 else nothing),
-        ("time", "total_time_s", time_difference(both) if len(gain) > 1 else nothing),
-    ):
-        found |= {f"{name}_one": both[column].mean(), f"{name}_other": both[f"{column}_other"].mean()}
+    for name, column in (("success", "success"), ("time", "total_time_s")):
+        one, other = (float(both[end].mean()) for end in (column, f"{column}_other"))
+        found |= {f"{name}_one": one, f"{name}_other": other}
+        if len(gain) == 1:
+            interval = one - other, float("nan"), float("nan")
+        elif name == "success":
+            interval = success_interval(gain, draws)
+        else:
+            interval = time_difference(both)
         found |= {
             f"{name}_{end}": float(value)
             for end, value in zip(("difference", "low", "high"), interval, strict=True)

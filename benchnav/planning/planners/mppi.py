@@ -39,8 +39,8 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import Objective, has_path_cost
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.cost_risk import advance_held, framed_fields, tail_cost
-from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank
+from benchnav.planning.planners.cost_risk import advance_held, framed_fields, tail_cost, within_reach
+from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank, perturb
 from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
 from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
 from benchnav.planning.robots import Robot, component_wise, steps_in
@@ -48,9 +48,9 @@ from benchnav.planning.sensing.sensor import Step
 
 # A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
 _CHUNK_STEPS = 10
-_WORTH_COMPILING = 2000  # samples
 OF_EPISODES = (0, 1, 2, 6, 7)  # arguments of what is compiled: states, cost, mean, padded_ground, target
-HELD_OF_EPISODES = (0, 1, 2, 3, 7, 8, 9)  # states, cost, held, mean, padded_ground, target, steps_left
+# states, cost, held, mean, padded_ground, target, goal, steps_left
+HELD_OF_EPISODES = (0, 1, 2, 3, 7, 8, 9, 10)
 _DRAWN_SAMPLES = 40
 _LEAST_TAIL = 10  # fields in the tail of which a cost is the mean
 _LEAST_SPREAD = 1e-30  # where all samples cost alike, all weigh alike
@@ -155,15 +155,16 @@ class MPPI(LocalPlanner[MPPIState]):
     """
 
     name = "MPPI"
+    worth_compiling: ClassVar[int] = 2000
+    """Rollouts of an episode and step from which on they run compiled."""
 
     def __init__(self, config: MPPIConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or MPPIConfig()
-        samples, fields = self.config.samples, self._fields
-        rollouts = samples * fields
-        self._advance = Fused(advance_chunk, rollouts, _WORTH_COMPILING, batched=OF_EPISODES)
-        self._advance_held = Fused(advance_held, rollouts, _WORTH_COMPILING, batched=HELD_OF_EPISODES)
-        self._weigh = Fused(weigh, rollouts, _WORTH_COMPILING, batched=(*OF_EPISODES, 15))
+        rollouts, least = self.config.samples * self._fields, self.worth_compiling
+        self._advance = Fused(advance_chunk, rollouts, least, batched=OF_EPISODES)
+        self._advance_held = Fused(advance_held, rollouts, least, batched=HELD_OF_EPISODES)
+        self._weigh = Fused(weigh, rollouts, least, batched=(*OF_EPISODES, 14, 15))  # going, to_go
 
     @property
     def _fields(self) -> int:
@@ -230,7 +231,7 @@ class MPPI(LocalPlanner[MPPIState]):
     ) -> tuple[Tensor, MPPIState, Plan]:
         """Solves one step; see `LocalPlanner`."""
         problem, config, mean = plan_state.problem, self.config, plan_state.mean
-        noise, ground = plan_state.noise.at(plan_state.step), self._ground(plan_state)
+        noise, ground = plan_state.noise.at(plan_state.step), self._ground(plan_state, step.state)
         held = self._held(plan_state, step)
         advance = self._advance if held is None else self._advance_held
         states, cost, going = roll_out(
@@ -251,15 +252,16 @@ class MPPI(LocalPlanner[MPPIState]):
         after = replace(plan_state, mean=shifted, step=plan_state.step + 1)
         return updated[:, 0], after if held is None else replace(after, held=held), plan
 
-    def _ground(self, plan_state: MPPIState) -> Tensor:
-        """What rollouts are on in this step, shape [B·M, N]."""
+    def _ground(self, plan_state: MPPIState, state: Tensor) -> Tensor:
+        """What rollouts from these states are on in this step, shape [B·M, N]."""
         problem = plan_state.problem
         if self.config.risk_on == "map":
             return problem.padded_ground
         if plan_state.ground is not None:
             return plan_state.ground.flatten(0, 1)
         key = rng.stream_key(plan_state.key, plan_state.step)
-        return framed_fields(problem, problem.sample_fields(self._fields, key))
+        cells = within_reach(problem, state, plan_state.mean.shape[1] * problem.dt_s)
+        return framed_fields(problem, problem.sample_fields(self._fields, key, cells))
 
     def _held(self, plan_state: MPPIState, step: Step) -> Tensor | None:
         """Steps in a row on ground that holds the robots; None where rollouts are not held, shape [B]."""
@@ -315,7 +317,8 @@ def roll_out(
     count = len(ground) // len(problem)
     state, mean, target_m = (each.repeat_interleave(count, 0) for each in (state, mean, target_m))
     states = component_wise(state[:, None].expand(-1, noise.shape[2], -1))
-    target = target_m[:, None].contiguous()  # as all that is passed on: another layout is compiled for anew
+    # Contiguous, as all that is passed on: another layout is compiled for anew.
+    target = target_m[:, None].contiguous()
     cost = state.new_zeros(states.shape[:2])
     parts = problem.grid, problem.robot, problem.objective, problem.task.rules.min_traversability
     if held is None or problem.immobile is None:
@@ -327,11 +330,11 @@ def roll_out(
     rows = held.repeat_interleave(count, 0)[:, None].expand_as(cost).clamp(max=most - 1).contiguous()
     left = ((problem.time_budget_s - time_s) / problem.dt_s).round().to(state)
     left = left.repeat_interleave(count, 0)[:, None]
+    goal = problem.goal_m.repeat_interleave(count, 0)[:, None].contiguous()
+    held_by = problem.goal_radius_m, problem.immobile.below, most
     for chunk in _chunks(mean.shape[1]):
         given = mean[:, chunk].contiguous(), noise[chunk], *problem.action_bounds, ground, target
-        states, cost, rows = advance(
-            states, cost, rows, *given, left - chunk.start, *parts, problem.immobile.below, most
-        )
+        states, cost, rows = advance(states, cost, rows, *given, goal, left - chunk.start, *parts, *held_by)
     return states, cost, rows < most
 
 
@@ -345,7 +348,7 @@ def advance_chunk(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Rolls samples out over a chunk of the horizon, adding up their costs; takes a problem in its parts."""
     for step in range(mean.shape[1]):
-        action = _perturb(mean[:, step, :, None], noise[step], low, high).movedim(1, 2)
+        action = perturb(mean[:, step, :, None], noise[step], low, high).movedim(1, 2)
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
         cost = cost + stage_cost(objective, states, action, ground, target)
         states = robot(states, action, motion_traversability(ground, min_traversability))
@@ -376,26 +379,37 @@ def weigh(
     cost = cost + (last if going is None else torch.where(going, last, 0))
     if fields > 1:
         cost = tail_cost(cost.unflatten(0, (-1, fields)), level)
-    scale = temperature_share * cost_spread(cost) if temperature is None else temperature
+    if temperature is None:
+        stopped = None if going is None else (~going).unflatten(0, (-1, fields)).sum(1)
+        # What a step of one field adds to the cost, where it counts.
+        penalty = PENALTY / max(1.0, (1 - level) * fields)
+        scale = temperature_share * cost_spread(cost, penalty, stopped)
+    else:
+        scale = temperature
     weights = torch.softmax((cost.amin(dim=1, keepdim=True) - cost) / scale, dim=1)
     return weights, average(mean, noise, weights, low, high)
 
 
-def cost_spread(cost: Tensor) -> Tensor:
+def cost_spread(cost: Tensor, penalty: float = PENALTY, stopped: Tensor | None = None) -> Tensor:
     """How far the costs of samples lie above the least, on average: the unit of the relative temperature.
 
     Samples that pay the penalty of ground that is not free for more steps than the best does are left out: else the
     temperature near such ground would be that of the penalty, and all ways over free ground would count alike. They
     are told by an excess of half the penalty, so J itself should spread less, as the penalty of such ground asks too.
+    Left out for the same reason are samples that stop for good on more fields than the best does.
 
     Args:
         cost: shape [B, K].
+        penalty: what a step on ground that is not free adds to the cost.
+        stopped: on how many fields a sample stops, shape [B, K]; None where none does.
 
     Returns:
         More than 0, shape [B, 1].
     """
     excess = cost - cost.amin(dim=1, keepdim=True)
-    counted = excess < 0.5 * PENALTY
+    counted = excess < 0.5 * penalty
+    if stopped is not None:
+        counted = counted & (stopped <= stopped.gather(1, cost.argmin(1, keepdim=True)))
     spread = torch.where(counted, excess, 0).sum(dim=1, keepdim=True) / counted.sum(dim=1, keepdim=True)
     return spread.clamp(min=_LEAST_SPREAD)
 
@@ -405,16 +419,11 @@ def average(mean: Tensor, noise: Tensor, weights: Tensor, low: Tensor, high: Ten
     return torch.clamp(mean + (noise * weights[:, None, None]).sum(-1), low, high)
 
 
-def _perturb(mean: Tensor, noise: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Samples actions: clip(u + ε), within bounds [A], the action dimension next to last."""
-    return torch.clamp(mean + noise, low[:, None], high[:, None])
-
-
 def _drawn(
     problem: Problem, state: Tensor, updated: Tensor, mean: Tensor, noise: Tensor, weights: Tensor
 ) -> dict[str, Tensor]:
     """The path of the updated mean, and those of the best samples about the mean before."""
     best = weights.topk(min(_DRAWN_SAMPLES, weights.shape[1]), dim=1).indices
-    samples = _perturb(mean[..., None], noise[..., best].movedim(2, 0), *problem.action_bounds)
+    samples = perturb(mean[..., None], noise[..., best].movedim(2, 0), *problem.action_bounds)
     paths = rollout_path(problem, state, torch.cat((updated[..., None], samples), dim=3))
     return {"path": paths[:, 0], "samples": paths[:, 1:]}

@@ -51,6 +51,11 @@ class NoiseBank:
         return windows.index_select(0, begin.flatten()).view(horizon, actions, self.samples)
 
 
+def perturb(mean: Tensor, noise: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Samples actions: clip(u + ε), within bounds [A], the action dimension next to last."""
+    return torch.clamp(mean + noise, low[:, None], high[:, None])
+
+
 def draw_bank(seed: int, horizon: int, samples: int, scale: Tensor) -> NoiseBank:
     """Draws a bank on the CPU, the same for every device.
 

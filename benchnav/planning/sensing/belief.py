@@ -123,6 +123,17 @@ class Belief(ABC, Generic[State]):
             λ in [0, 1], shape [B, M, H, W].
         """
 
+    def sample_cells(self, state: State, count: int, keys: Sequence[int], cells: Tensor) -> Tensor:
+        """Draws the fields of `sample_fields` where some cells alone are asked for; what others hold means nothing.
+
+        Args:
+            state: what is known.
+            count: M.
+            keys: a stream key of each episode.
+            cells: which are asked for, bool, shape [B, H, W].
+        """
+        return self.sample_fields(state, count, keys)
+
     def select(self, state: State, members: Tensor) -> State:
         """Keeps some episodes, by index, int64."""
         return state.select(members)
@@ -152,10 +163,12 @@ class Fields:
     state: Any
     names: tuple[int, ...]
 
-    def sample(self, count: int, key: int) -> Tensor:
-        """Draws `count` fields of each episode, shape [B, M, H, W], by a root key."""
+    def sample(self, count: int, key: int, cells: Tensor | None = None) -> Tensor:
+        """Draws `count` fields of each episode, shape [B, M, H, W], by a root key; see `Problem.sample_fields`."""
         keys = [rng.stream_key(key, "fields", name) for name in self.names]
-        return self.belief.sample_fields(self.state, count, keys)
+        if cells is None:
+            return self.belief.sample_fields(self.state, count, keys)
+        return self.belief.sample_cells(self.state, count, keys, cells)
 
     def select(self, members: Tensor) -> "Fields":
         """Keeps some episodes, by index, int64."""
@@ -175,16 +188,21 @@ class Predicted(Batch):
     prior: TraversabilityDistribution
     law: Law
 
-    def fields(self, scores: Tensor) -> Tensor:
+    def fields(self, scores: Tensor, cells: Tensor | None = None) -> Tensor:
         """λ of the ranks that normal scores have in the prediction, shape [B, M, H, W] of both.
 
-        Where quantiles take long λ is linear in the score between the values of `score_table`, which are exact.
+        Where quantiles take long λ is linear in the score between the values of `score_table`, which are exact, and
+        looked up in some cells alone, bool [B, H, W], where they are given.
         """
         if self._rows is None:
             return fields_of(self.prior, scores)
-        wanted = scores.to(self._rows).movedim(1, -1)
-        found = [value_at(rows, own) for rows, own in zip(self._rows, wanted, strict=True)]
-        return torch.stack(found).movedim(-1, 1).to(self.prior.dtype)
+        scores = scores.to(self._rows)
+        found = torch.zeros_like(scores)
+        for place, rows in enumerate(self._rows):
+            asked: Any = ... if cells is None else cells[place]
+            wanted = scores[place][:, asked].movedim(0, -1)
+            found[place][:, asked] = value_at(rows[asked], wanted).movedim(-1, 0)
+        return found.to(self.prior.dtype)
 
     @cached_property
     def _rows(self) -> Tensor | None:
@@ -227,8 +245,15 @@ class Static(Belief[Predicted]):
 
     def sample_fields(self, state: Predicted, count: int, keys: Sequence[int]) -> Tensor:
         """Draws fields with the prediction's marginals."""
+        return state.fields(self._scores(state, count, keys))
+
+    def sample_cells(self, state: Predicted, count: int, keys: Sequence[int], cells: Tensor) -> Tensor:
+        """Draws them, of some cells alone."""
+        return state.fields(self._scores(state, count, keys), cells)
+
+    def _scores(self, state: Predicted, count: int, keys: Sequence[int]) -> Tensor:
         law = state.law if self.correlated else replace(state.law, correlation_m=0.0)
-        return state.fields(draw_scores(law, count, keys))
+        return draw_scores(law, count, keys)
 
 
 def draw_scores(law: Law, count: int, keys: Sequence[int]) -> Tensor:
@@ -241,13 +266,19 @@ def draw_scores(law: Law, count: int, keys: Sequence[int]) -> Tensor:
         count: M; the first of more fields are those of fewer.
         keys: a stream key of each episode, B of them.
     """
-    drawn = torch.stack([_white(key, count, law.grid.shape) for key in keys])
+    # An episode at a time: the last bits of a product depend on how many are in it.
+    return torch.stack([_scores(law, count, key) for key in keys])
+
+
+def _scores(law: Law, count: int, key: int) -> Tensor:
+    """Those of an episode, shape [M, H, W]."""
+    drawn = _white(key, count, law.grid.shape)
     if law.correlation_m:
         down, across = (_root(size, law.correlation_cells) for size in law.grid.shape)
         drawn = down @ drawn @ across
     if law.nugget:
-        own = [_white(rng.stream_key(key, "nugget"), count, law.grid.shape) for key in keys]
-        drawn = math.sqrt(1 - law.nugget) * drawn + math.sqrt(law.nugget) * torch.stack(own)
+        own = _white(rng.stream_key(key, "nugget"), count, law.grid.shape)
+        drawn = math.sqrt(1 - law.nugget) * drawn + math.sqrt(law.nugget) * own
     return drawn
 
 

@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.colors import to_rgba
 
-from benchnav.eval.report.charts.regret import regret_figure
+from benchnav.core.figures import BLUE, ORANGE
+from benchnav.eval.report.charts.regret import _ENDS, regret_figure
 from benchnav.eval.report.write import write_report
 from benchnav.eval.stats.regret import find_chains, split_regret
 from tests.eval.forged import forge_run
@@ -129,7 +131,7 @@ def test_differences_are_paired_and_add_up_to_the_whole() -> None:
         assert row["time_one"] == pytest.approx(time[place].mean())
         assert row["success_other"] == pytest.approx(arrived[place + 1].mean())
         assert row["time_low"] < row["time_difference"] < row["time_high"]
-        assert row["success_low"] < row["success_high"]
+        assert row["success_low"] <= row["success_difference"] <= row["success_high"]
     assert table["time_difference"].sum() == pytest.approx(time[0].mean() - time[-1].mean())
     # Against all that vary by map, what is paired is known well.
     last = table.iloc[2]
@@ -164,9 +166,30 @@ def test_the_waterfall_says_each_step_with_sign_and_interval() -> None:
     assert any(text.startswith(points) for text in texts)
 
 
-def test_few_maps_have_no_interval() -> None:
-    texts = texts_of(split(episodes([own[:1] for own in TIMES])))
-    assert not any("nan" in text for text in texts)
+def test_bars_are_orange_where_the_next_is_better_and_lines_are_their_intervals() -> None:
+    """Less time is better, and more success."""
+    table = split(episodes())
+    figure = regret_figure(table)
+    for panel, (measure, factor) in zip(figure.axes, (("success", 100.0), ("time", 1.0)), strict=False):
+        bars = [bar for bar in panel.patches if bar.get_facecolor()[:3] != to_rgba(_ENDS)[:3]]
+        lines = [line for line in panel.lines if line.get_color() == "black"]
+        assert len(bars) == len(lines) == 4
+        for row, bar, line in zip(table.to_dict("records"), bars, lines, strict=True):
+            one, gain = factor * row[f"{measure}_one"], -factor * row[f"{measure}_difference"]
+            low, high = (factor * row[f"{measure}_{end}"] for end in ("low", "high"))
+            assert (bar.get_x(), bar.get_width()) == pytest.approx((one, gain))
+            assert line.get_xdata() == pytest.approx([one - high, one - low])
+            better = gain > 0 if measure == "success" else gain < 0
+            colour = ORANGE if better else BLUE
+            assert gain == 0 or bar.get_facecolor() == pytest.approx(to_rgba(colour))
+
+
+def test_one_map_has_no_interval() -> None:
+    table = split(episodes([own[:1] for own in TIMES]))
+    assert table["time_difference"].tolist() == pytest.approx([4.0, 0.0, 3.0, 4.0])
+    assert table["success_difference"].tolist() == [0.0] * 4
+    assert table[["time_low", "time_high", "success_low", "success_high"]].isna().all(axis=None)
+    assert not any("nan" in text for text in texts_of(table))
 
 
 @pytest.mark.usefixtures("whole_fonts")

@@ -1,9 +1,11 @@
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
+import torch._dynamo.config
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -11,11 +13,12 @@ from torch import Tensor
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import text_digest
-from benchnav.planning.free_space import Immobile
+from benchnav.planning.free_space import PENALTY, Immobile
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
+from benchnav.planning.planners import compilation
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConfig
-from benchnav.planning.planners.cost_risk import advance_held, framed_fields, tail_cost
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, roll_out, weigh
+from benchnav.planning.planners.cost_risk import advance_held, framed_fields, tail_cost, within_reach
+from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, cost_spread, roll_out, weigh
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.belief import Fields, Law, Static
@@ -32,7 +35,7 @@ class Given:
     fields: Tensor
     keys: list[int]
 
-    def sample(self, count: int, key: int) -> Tensor:
+    def sample(self, count: int, key: int, cells: Tensor | None = None) -> Tensor:
         self.keys.append(key)
         return self.fields[:, :count]
 
@@ -141,7 +144,9 @@ def test_fields_are_drawn_anew_at_each_step_and_once_if_that_is_asked_for() -> N
         other = Given(1 - source.fields, [])
         revised = planner.revise(plan_state, replace(problem, fields=other))
         assert len(other.keys) == once
-        assert torch.equal(planner._ground(revised).abs().max(), other.fields.max()) or not once
+        assert (
+            torch.equal(planner._ground(revised, problem.start).abs().max(), other.fields.max()) or not once
+        )
 
 
 def test_fields_of_a_seed_are_others_than_those_of_another() -> None:
@@ -177,38 +182,118 @@ def test_an_episode_alone_does_as_it_does_in_a_batch(once: bool) -> None:
     torch.testing.assert_close(found[0], wanted, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+def test_each_episode_has_its_own_start_goal_fields_and_time_held(
+    compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Alone and in a batch that shrinks; what is compiled for one number of episodes serves all."""
+    traced: list[bool] = []
+    real = compilation._compiling
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    monkeypatch.setattr(compilation, "worth_compiling", lambda *_: compiled)
+    monkeypatch.setattr(compilation, "_compiling", lambda checked: traced.append(checked) or real(checked))
+    problem = varied(3)
+    doubtful = factories.normal(problem.risk_map, torch.full_like(problem.risk_map, 0.3))
+    start = torch.tensor([[1.25, 1.25, 0.4], [5.25, 2.25, 2.0], [3.0, 6.0, -1.0]])
+    goal = torch.tensor([[6.75, 6.75], [1.75, 5.25], [6.25, 1.25]])
+    source = Fields(Static(), Static().init(doubtful, Law(grid=problem.grid, correlation_m=1.0)), (7, 3, 5))
+    problem = replace(
+        problem, distribution=doubtful, fields=source, start=start, goal_m=goal,
+        immobile=Immobile(below=0.4, for_s=0.5),
+        time_budget_s=torch.tensor([20.0, 30.0, 40.0], dtype=torch.float64),
+    )  # fmt: skip
+    planner = MPPI(
+        replace(
+            SMALL, samples=40, risk_on="cost", fields=20, level=0.5, control_cost=0.1, entrapment=True,
+            cost_to_go="expected-time",
+        )
+    )  # fmt: skip
+    objective = TravelTime(robot=Unicycle(), goal_radius_m=1.0)
+    problem = replace(problem, task=replace(problem.task, objective=objective))
+    observed = torch.tensor([0.2, 0.9, 0.3])  # of which two are held
+    with torch._dynamo.config.patch(disable=False):
+        found = {}
+        for members in ([0, 1, 2], [2, 0], [1], [0], [2]):
+            posed, own = problem.select(torch.tensor(members)), observed[members]
+            plan_state = planner.init(posed, generator())
+            action, plan_state, _ = planner.plan(replace(first(posed), traversability=own), plan_state)
+            step = replace(first(posed), state=posed.start + 0.1, traversability=own, time_s=0.1)
+            action, plan_state, _ = planner.plan(step, plan_state)
+            found |= {(len(members), member): action[place] for place, member in enumerate(members)}
+    for (_, member), action in found.items():
+        torch.testing.assert_close(action, found[3, member], atol=1e-5, rtol=1e-4)
+    assert planner.compiled is compiled
+    # Two chunks of the horizon, whose fields are many even of one episode, and what weighs them, of several and of one.
+    assert len(traced) == (4 if compiled else 0)
+
+
+def test_cells_that_rollouts_cannot_reach_are_not_looked_up_and_change_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = varied(2, start=(1.25, 2.25), goal=(6.75, 5.25))
+    doubtful = factories.normal(problem.risk_map, torch.full_like(problem.risk_map, 0.3))
+    source = Fields(Static(), Static().init(doubtful, Law(grid=problem.grid, correlation_m=1.0)), (7, 3))
+    problem = replace(problem, distribution=doubtful, fields=source)
+    planner = MPPI(replace(SMALL, risk_on="cost", fields=4))
+    plan_state = planner.init(problem, generator())
+    found, _, _ = planner.plan(first(problem), plan_state)
+    ground = planner._ground(plan_state, problem.start)
+    assert 0.5 < float((ground.abs() < 1e-20).double().mean()) < 0.9  # in 1.5 s of 8 m × 8 m
+    monkeypatch.setattr(Static, "sample_cells", lambda self, *given: self.sample_fields(*given[:3]))
+    wanted, _, _ = planner.plan(first(problem), plan_state)
+    assert torch.equal(found, wanted)
+    assert float((planner._ground(plan_state, problem.start) > 0).double().mean()) > 0.7
+
+
+def test_what_is_within_reach_is_what_top_speed_reaches() -> None:
+    problem = varied(2)
+    state = torch.tensor([[2.25, 2.25, 0.0], [7.9, 4.25, 1.0]])
+    found = within_reach(problem, state, 1.5)
+    assert found[0].sum() == 49  # points of a grid within 4 of one of them
+    for member in range(2):
+        for row in range(16):
+            for column in range(16):
+                away = math.dist((0.5 * column + 0.25, 0.5 * row + 0.25), state[member, :2])
+                assert bool(found[member, row, column]) is (away <= 2.0)
+
+
 def held_cost(
     problem: Problem, ground: Tensor, actions: Tensor, held: int, time_s: float, immobile: Immobile
 ) -> float:
     """What one sequence [T, 2] costs on a map by a plain loop, the last state included."""
     state, cost, most = problem.start[0].double(), 0.0, round(immobile.for_s / 0.1)
     left = round((float(problem.time_budget_s[0]) - time_s) / 0.1)
-    target = problem.goal_m[0].double()
+    target, arrived = problem.goal_m[0].double(), False
     for place, action in enumerate(actions.double()):
         row, column = int(state[1] // 0.5), int(state[0] // 0.5)
-        value = ground[row, column].double()
-        cost += float(problem.objective.stage(state, action, value, target))
-        held = held + 1 if value < immobile.below else 0
+        value, off = ground[row, column].double(), PENALTY * (not problem.free[0, row, column])
+        cost += float(problem.objective.stage(state, action, value, target)) + off
+        arrived = arrived or math.dist(state[:2], target) < problem.goal_radius_m
+        held = held + 1 if value < immobile.below and not arrived else 0
         if held >= most:
             standing = problem.objective.stage(state, torch.zeros(2), value, target)
-            return cost + float(standing) * (left - place - 1)
+            return cost + (float(standing) + off) * (left - place - 1)
         clamped = value.clamp(min=problem.task.rules.min_traversability)
         state = problem.robot(state, action, clamped)
     row, column = int(state[1] // 0.5), int(state[0] // 0.5)
-    return cost + float(problem.objective.terminal(state, ground[row, column].double(), target))
+    off = PENALTY * (not problem.free[0, row, column])
+    return cost + float(problem.objective.terminal(state, ground[row, column].double(), target)) + off
 
 
-@pytest.mark.parametrize("held", [0, 3])
+@pytest.mark.parametrize("case", ["", "held by now", "closed", "behind the goal"])
 @pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(robot=Unicycle(), goal_radius_m=1.0)])
-def test_a_rollout_that_is_held_pays_what_is_left_of_the_time(objective: Objective, held: int) -> None:
+def test_a_rollout_that_is_held_pays_what_is_left_of_the_time(objective: Objective, case: str) -> None:
     ground = torch.full((1, 16, 16), 0.9)
     ground[:, 4:, 5:8] = 0.05
     immobile = Immobile(below=0.1, for_s=0.5)
-    rules = replace(factories.task().rules, min_traversability=0.2)
+    rules = replace(factories.task().rules, min_traversability=0.2, goal_radius_m=0.3)
+    goal, held = (2.7 if case == "behind the goal" else 6.75, 2.25), 3 * (case == "held by now")
     problem = factories.problem(
-        ground, start=(2.2, 2.25), goal=(6.75, 2.25), objective=objective, rules=rules, time_budget_s=9.0
+        ground, start=(2.2, 2.25), goal=goal, objective=objective, rules=rules, time_budget_s=9.0
     )
-    problem = replace(problem, immobile=immobile, free=torch.ones_like(problem.free))
+    free = torch.ones_like(problem.free)
+    free[:, 4:, 5:8] = case != "closed"
+    problem = replace(problem, immobile=immobile, free=free)
     mean = torch.zeros(1, 25, 2)
     noise = torch.rand(25, 2, 6, generator=generator(3))
     noise[:, 1] -= 0.5
@@ -227,10 +312,15 @@ def test_a_rollout_that_is_held_pays_what_is_left_of_the_time(objective: Objecti
     last = problem.terminal_cost(states, problem.goal_m[:, None])
     found = cost + torch.where(going, last, 0)
     actions = noise.movedim(2, 0).clamp(torch.tensor([0.0, -1.0]), torch.tensor([1.0, 1.0]))
-    wanted = [held_cost(problem, ground[0], one, held, 2.0, immobile) for one in actions.movedim(1, 1)]
+    wanted = [held_cost(problem, ground[0], one, held, 2.0, immobile) for one in actions]
     assert found[0].tolist() == pytest.approx(wanted, rel=1e-4)
+    if case == "behind the goal":  # which few stay away from
+        away = replace(problem, goal_m=problem.goal_m + 4)
+        elsewhere = [held_cost(away, ground[0], one, held, 2.0, immobile) for one in actions]
+        assert elsewhere != pytest.approx(wanted, rel=1e-3)
+        return
     assert bool((~going).any())
-    if isinstance(objective, TravelTime):
+    if isinstance(objective, TravelTime) and case != "closed":
         assert found[0][~going[0]].tolist() == pytest.approx([7.0] * int((~going).sum()), rel=1e-4)
 
 
@@ -256,6 +346,40 @@ def test_rollouts_that_have_stopped_have_no_last_cost() -> None:
     assert float(last.min()) > 1
     wanted = torch.softmax(-(cost + torch.where(going, last, 0)), dim=1)
     torch.testing.assert_close(weights, wanted)
+
+
+def test_a_step_off_free_ground_on_one_field_does_not_set_the_temperature() -> None:
+    """The spread is that of the samples that have no such step, however little it adds to the cost of M fields."""
+    cost = torch.tensor([[3.0, 1.0, 2.0]])[:, None].repeat(1, 20, 1)
+    cost[:, 4, 2] += PENALTY
+    for level, wanted in ((0.0, 1.0), (0.5, 1.0)):
+        tail = tail_cost(cost, level)
+        assert float(tail[0, 2]) == pytest.approx(2.0 + PENALTY / (20 * (1 - level)))
+        problem = varied(1)
+        states = problem.goal_m[:, None].repeat(20, 3, 1)
+        states = torch.cat((states, torch.zeros(20, 3, 1)), 2)
+        ground = framed_fields(problem, fields(problem, 20))
+        weights, _ = weigh(
+            states, cost[0], torch.zeros(1, 1, 2), torch.zeros(1, 2, 3), *problem.action_bounds, ground,
+            problem.goal_m[:, None].repeat(20, 1, 1), problem.grid, GoalDistance(), None, 1.0, 20, level,
+        )  # fmt: skip
+        assert float(weights[0, 0] / weights[0, 1]) == pytest.approx(math.exp(-2 / wanted), rel=1e-4)
+
+
+def test_samples_that_are_held_on_more_fields_than_the_best_do_not_set_the_temperature() -> None:
+    cost = torch.tensor([[3.0, 1.0, 80.0, 2.0]])
+    assert float(cost_spread(cost, PENALTY, torch.tensor([[1, 1, 3, 0]]))) == pytest.approx(1.0)
+    assert float(cost_spread(cost, PENALTY)) == pytest.approx((2 + 0 + 79 + 1) / 4)
+    problem = varied(1)
+    states = torch.cat((problem.goal_m[:, None].repeat(2, 4, 1), torch.zeros(2, 4, 1)), 2)
+    going = torch.ones(2, 4, dtype=torch.bool)
+    going[1, 2] = False
+    ground = framed_fields(problem, fields(problem, 2))
+    weights, _ = weigh(
+        states, cost.repeat(2, 1), torch.zeros(1, 1, 2), torch.zeros(1, 2, 4), *problem.action_bounds, ground,
+        problem.goal_m[:, None].repeat(2, 1, 1), problem.grid, GoalDistance(), None, 1.0, 2, 0.0, going,
+    )  # fmt: skip
+    assert float(weights[0, 0] / weights[0, 1]) == pytest.approx(math.exp(-2), rel=1e-4)
 
 
 def trap() -> Problem:

@@ -134,9 +134,10 @@ def test_what_the_ground_is_like_where_it_has_arrived_costs_nothing() -> None:
     ground[1, 12, 18] = 0.05  # where the goal is
     found = time_to_go(Optimal(), problem(ground, (2.25, 6.25), (9.25, 6.25)))
     assert found.tolist() == pytest.approx([6.0, 6.0], rel=0.03)
-    narrow = replace(RULES, goal_radius_m=0.1)
+    narrow = replace(RULES, goal_radius_m=0.36)
     posed = factories.problem(ground[:1], (2.25, 6.25), (9.4, 6.3), rules=narrow)
-    assert float(time_to_go(Optimal(), posed)) == pytest.approx(7.05, rel=0.03)
+    assert float(time_to_go(Optimal(), posed)) == pytest.approx(6.79, rel=0.03)
+    assert drive(Optimal(), posed).outcome.tolist() == [Outcome.SUCCESS]
 
 
 def test_the_time_held_is_counted_while_it_drives() -> None:
@@ -270,6 +271,21 @@ def test_the_hazard_of_a_metre_is_that_of_its_cells() -> None:
     assert sure == pytest.approx(24, rel=0.02)
 
 
+@pytest.mark.parametrize("hazard", [True, False])
+def test_where_it_has_arrived_nothing_holds_it(hazard: bool) -> None:
+    """Two maps that differ within the goal's disc alone."""
+    ground = torch.full((2, 16, 24), 0.9)
+    posed = problem(ground, (2.25, 4.25), (9.25, 4.25), time_budget_s=60.0)
+    row, column = torch.meshgrid(torch.arange(16), torch.arange(24), indexing="ij")
+    away = torch.hypot(0.5 * column + 0.25 - 9.25, 0.5 * row + 0.25 - 4.25)
+    ground[1, away < 1.0] = 0.05
+    posed = replace(posed, immobile=Immobile(below=0.1, for_s=0.3))
+    predicted = factories.normal(ground, torch.full_like(ground, 0.2 if hazard else 0.0))
+    planner = Optimal(OptimalConfig(hazard=True)) if hazard else OptimalBound()
+    found = time_to_go(planner, replace(posed, distribution=predicted, risk_map=ground))
+    assert float(found[1]) == pytest.approx(float(found[0]), rel=0.03)
+
+
 def test_with_hazard_it_goes_around_ground_that_is_quick_and_may_hold() -> None:
     ground = torch.full((1, 40, 40), 0.7)
     ground[:, 15:25, 10:30] = 1.0
@@ -331,6 +347,12 @@ def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> N
     uneven = Unicycle(turn_rate_radps=(-1.0, 0.5))
     with pytest.raises(ConfigError, match=f"alike to both sides for planner '{kind.name}'"):
         kind().init(factories.problem(ground, robot=uneven), generator())
+    backward = Unicycle(speed_mps=(-1.0, 1.0))
+    with pytest.raises(ConfigError, match=f"`speed_mps` from 0 on for planner '{kind.name}', got from -1 on"):
+        kind().init(factories.problem(ground, robot=backward), generator())
+    posed = factories.problem(ground, rules=replace(RULES, goal_radius_m=0.35))
+    with pytest.raises(ConfigError, match=r"`goal_radius_m` of at least 0\.35, half of a cell's diagonal"):
+        kind().init(posed, generator())
     posed = factories.problem(ground)
     with pytest.raises(ConfigError, match="which plans once"):
         kind().revise(kind().init(posed, generator()), posed)

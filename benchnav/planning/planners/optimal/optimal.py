@@ -2,11 +2,13 @@
 
 `Optimal` takes λ̂ for λ: its time is the least under that map, "certainty-equivalent", and no bound on what can be done
 on the ground. `OptimalBound` is given λ itself, by the model `clairvoyant`, and knows for how long the world lets a
-robot stand on ground that holds it: what is left of a failure then is not for want of knowledge, nor of planning. Both
-plan for the paper's unicycle alone, which they drive forward, and once: a map that changes is refused.
+robot stand on ground that holds it: what is left of a failure then is not for want of knowledge, nor of planning. Its
+time is the least up to what the grid costs. Both plan for the paper's unicycle alone, which drives forward, and once: a
+map that changes is refused.
 Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L levels of time held.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -105,9 +107,17 @@ class Optimal(Planner[OptimalState]):
             low == -high,
             f"`turn_rate_radps` alike to both sides for planner {self.name!r}, got {low:g} to {high:g}.",
         )
+        slowest = robot.action_low[0]
+        expect(slowest == 0, f"`speed_mps` from 0 on for planner {self.name!r}, got from {slowest:g} on.")
         assert isinstance(robot, Unicycle)
         grid = problem.grid
         grid = Grid(grid.height * times, grid.width * times, grid.resolution_m / times)
+        least, radius = grid.resolution_m / math.sqrt(2), problem.goal_radius_m
+        expect(
+            radius >= least,
+            f"`goal_radius_m` of at least {least:.2f}, half of a cell's diagonal, for planner {self.name!r}, got "
+            f"{radius:g}.",
+        )
         costs = self.costs_of(problem, grid)
         moves = Moves.of(robot, grid.resolution_m, self.config.headings)
         value = value_iteration(costs, moves, grid, self.config.headings)
@@ -167,7 +177,7 @@ class Optimal(Planner[OptimalState]):
 
 
 class OptimalBound(Optimal):
-    """Drives by the least time to go on λ itself, in a world that holds robots for good: a bound for all planners.
+    """Drives by the least time to go on λ itself, in a world that holds robots for good: a bound, up to its grid.
 
     Args:
         config: settings.
@@ -221,8 +231,8 @@ def _on_grid(
     x, y = grid.centre_of(row[:, None], column)
     goal_x, goal_y = problem.goal_m.T[:, :, None, None]
     away = torch.hypot(x - goal_x, y - goal_y)
-    # At least the goal's own cell. One rate in all of them, as what a way costs within the disc is taken off again.
-    ends = away < (away.flatten(1).amin(1)[:, None, None] + 1e-6).clamp(min=problem.goal_radius_m)
+    # One rate in all of them, as what a way costs within the disc is taken off again; there nothing holds a robot.
+    ends = away <= problem.goal_radius_m
     within = torch.where(ends, rate, UNREACHED).amin((1, 2), keepdim=True)
     rate = torch.where(ends, within, rate)
     left = (away - problem.goal_radius_m) / problem.robot.top_speed_mps * rate
@@ -231,6 +241,6 @@ def _on_grid(
         open=fine(open_) | ends,
         final=torch.where(ends, left, torch.nan).to(dtype),
         loss=problem.time_budget_s.to(dtype),
-        hazard=None if hazard is None else fine(hazard).to(dtype),
-        holds_s=None if holds_s is None else fine(holds_s).to(dtype),
+        hazard=None if hazard is None else fine(hazard).to(dtype).masked_fill(ends, 0),
+        holds_s=None if holds_s is None else fine(holds_s).to(dtype).masked_fill(ends, 0),
     )
