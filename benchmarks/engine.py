@@ -3,8 +3,9 @@
     python benchmarks/engine.py [FILE.json]
 
 One thread. Each figure is the median of the repeats, on maps of `paper-v1-test`; ratios are to the peer's median.
-Peers: for MPPI the same rollouts as ten plain lines of PyTorch, with as many normals drawn a step; for A*+DWA the same
-planner uncompiled; for risk maps thirty halvings of every cell; for the environment its step in which none begins anew.
+Peers: for MPPI the same rollouts as ten plain lines of PyTorch, with as many normals drawn a step; with risk on the
+cost as many rollouts on the risk map; for A*+DWA the same planner uncompiled; for the optimal planner A*'s search of
+the map; for risk maps thirty halvings of every cell; for the environment its step in which none begins anew.
 """
 
 import json
@@ -31,9 +32,11 @@ from benchnav.models.base import predict
 from benchnav.models.predictor import load_model
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
-from benchnav.planning.planners.mppi import MPPI
+from benchnav.planning.planners.mppi import MPPI, MPPIConfig
+from benchnav.planning.planners.optimal.optimal import Optimal
 from benchnav.planning.problem import Problem, Rules, Task, pose_problem
 from benchnav.planning.robots import Unicycle
+from benchnav.planning.sensing.belief import Fields, Law, Static
 from benchnav.planning.sensing.sensor import Step
 
 REPEATS = 31
@@ -65,7 +68,11 @@ def problem_of(episodes: int) -> Problem:
     places = dataset.read("test/std", range(episodes), ["start_m", "goal_m"])
     start_m, goal_m = (torch.from_numpy(places[name]) for name in ("start_m", "goal_m"))
     task = Task(robot=Unicycle(), objective=GoalDistance(), rules=Rules())
-    return pose_problem(task, terrain.observe(), terrain.truth, terrain.truth.mean(), start_m, goal_m, 100.0)
+    believed = Static().init(terrain.truth, Law(grid=terrain.grid, correlation_m=1.5))
+    return pose_problem(
+        task, terrain.observe(), terrain.truth, terrain.truth.mean(), start_m, goal_m, 100.0,
+        fields=Fields(Static(), believed, tuple(range(episodes))),
+    )  # fmt: skip
 
 
 def plan_ms(planner: Any, problem: Problem) -> float:
@@ -126,6 +133,18 @@ def planners() -> list[dict[str, Any]]:
         name = "MPPI 5 000 × 50, one episode" if episodes == 1 else f"the same, an episode of {episodes}"
         own = plan_ms(MPPI(), problem_of(episodes))
         rows.append({"work": name, "ms": own, "peer": "plain PyTorch", "peer_ms": peer})
+    on_cost = MPPIConfig(samples=1024, risk_on="cost", level=0.8, fields=64)
+    for episodes in (1, 20):
+        problem = problem_of(episodes)
+        name = "MPPI 1 024 × 50 on 64 fields" if episodes == 1 else f"the same, an episode of {episodes}"
+        own, peer = (plan_ms(MPPI(config), problem) for config in (on_cost, MPPIConfig(samples=1024 * 64)))
+        rows.append({"work": name, "ms": own, "peer": "as many on the map", "peer_ms": peer})
+    several = problem_of(10)
+    own, peer = (
+        milliseconds(lambda planner=planner: planner.init(several, torch.Generator()), 3) / 10
+        for planner in (Optimal(), AStarDWA())
+    )
+    rows.append({"work": "optimal, a map of 10", "ms": own, "peer": "A*", "peer_ms": peer})
     for episodes in (1, 20):
         problem = problem_of(episodes)
         name = "A*+DWA step, one episode" if episodes == 1 else f"the same, an episode of {episodes}"
