@@ -14,43 +14,26 @@ import pytest
 
 from benchnav.datagen import TerrainDataset
 from benchnav.testing import check_objective, check_planner, check_risk, check_robot
+from tests.commands import call
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
-def run(folder: Path, command: str, *arguments: object) -> str:
-    """Runs a command in a folder and returns what it printed."""
-    program = Path(sys.executable).with_name(command)
-    done = subprocess.run(
-        [program, *map(str, arguments)], cwd=folder, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 def test_a_model_of_ones_own_is_trained_calibrated_measured_and_driven_with(
-    dataset_path: Path, tmp_path: Path
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     os.symlink(EXAMPLES / "own_model.py", tmp_path / "own_model.py")
-    run(tmp_path, "benchnav-datagen", "create", "tiny-v1", "--out", "tiny.h5")
-    quick = (
-        "--settings.batch_size",
-        "2",
-        "--settings.learning_rate",
-        "0.02",
-        "--trainer.precision",
-        "32-true",
-    )
-    said = run(
-        tmp_path, "benchnav-train", "fit", "own_model.py:CellModel", "--data", "tiny.h5", "--out", "mine",
-        "--members", "2", *quick,
-    )  # fmt: skip
-    assert "pool of 2 networks" in said
+    assert call("datagen", "create", "tiny-v1", "--out", "tiny.h5") == 0
+    quick = ("--settings.batch_size", 2, "--settings.learning_rate", 0.02, "--trainer.precision", "32-true")
+    fit = ("fit", "own_model.py:CellModel", "--data", "tiny.h5", "--out", "mine", "--members", 2, *quick)
+    assert call("train", *fit) == 0
+    assert "pool of 2 networks" in capfd.readouterr().out
     assert len((tmp_path / "own_model.py").read_text().splitlines()) < 60
     model = "own_model.py:CellModel@mine"
     measured = {}
     for name in (model, "oracle"):
-        run(tmp_path, "benchnav-train", "evaluate", name, "--data", "tiny.h5", "--json", "q.json")
+        assert call("train", "evaluate", name, "--data", "tiny.h5", "--json", "q.json") == 0
         measured[name] = json.loads((tmp_path / "q.json").read_text())["splits"]
     dataset = TerrainDataset(tmp_path / "tiny.h5")
     observed = dataset.read("train", fields=["traversability"])["traversability"]
@@ -68,10 +51,14 @@ def test_a_model_of_ones_own_is_trained_calibrated_measured_and_driven_with(
 @pytest.mark.slow
 def test_a_site_of_ones_own_goes_from_drives_to_a_suite(tmp_path: Path) -> None:
     pytest.importorskip("rasterio")
-    said = run("own_site.py", tmp_path)
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / "own_site.py", tmp_path], capture_output=True, text=True, timeout=900
+    )
+    said = done.stdout
+    assert done.returncode == 0, done.stderr
     assert "rows of drives.csv.gz were used" in said
     assert "against measured λ" in said
-    table = re.search(r"^site +A\* \+ DWA +CVaR₀.₈ +\d+", said, re.MULTILINE)
+    table = re.search(r"^site +A\*\+DWA +CVaR₀.₈ +\d+", said, re.MULTILINE)
     assert table, said
 
 
@@ -218,7 +205,7 @@ def test_the_command_in_an_examples_docstring_names_what_is_there(name: str) -> 
 
 def test_a_sweep_finds_the_best_of_its_trials(tmp_path: Path) -> None:
     pytest.importorskip("optuna", reason="Optuna, which the example alone needs, is not installed")
-    run(tmp_path, "benchnav-datagen", "create", "tiny-v1", "--out", "tiny.h5")
+    assert call("datagen", "create", "tiny-v1", "--out", tmp_path / "tiny.h5") == 0
     done = subprocess.run(
         [sys.executable, EXAMPLES / "sweep.py", "tiny.h5", "trials", "3"],
         cwd=tmp_path, capture_output=True, text=True, timeout=300,

@@ -18,7 +18,8 @@ from huggingface_hub import constants
 
 from benchnav.core import hub
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models import find_checkpoint, load_model
+from benchnav.models.checkpoint import digests_of, load_checkpoint
 from benchnav.models.training.data import training_digest
 from tests.commands import call
 
@@ -154,50 +155,36 @@ def test_what_a_hub_lacks_is_one_line(server: tuple[str, type[Hub]], tmp_path: P
 
 
 def test_a_checkpoint_is_downloaded_and_what_is_here_goes_first(
-    server: tuple[str, type[Hub]], tmp_path: Path
+    server: tuple[str, type[Hub]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address, handler = server
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(constants, "ENDPOINT", address)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hf"))
     shipped = Path(__file__).parents[2] / "checkpoints" / "stakes-v1"
     handler.repos["models/me/stakes"] = shipped
-    code = (
-        "from benchnav.models import find_checkpoint, load_model; from benchnav.models.checkpoint import digests_of\n"
-        "folder = find_checkpoint('me/stakes@main'); load_model('me/stakes@main')\n"
-        f"assert digests_of(folder) == digests_of(__import__('pathlib').Path({str(shipped)!r}))\n"
-        "print(folder)"
-    )
-    settings = {
-        **os.environ,
-        "HF_HOME": str(tmp_path / "hf"),
-        "HF_ENDPOINT": address,
-        "HF_HUB_DISABLE_XET": "1",
-    }
 
-    def call() -> str:
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            cwd=tmp_path,
-            env=settings,
-            capture_output=True,
-            text=True,
-            timeout=300,
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout.strip()
+    def find(address: str) -> str:
+        """Where the checkpoint is found by a process that has found none before."""
+        hub.download.cache_clear()
+        folder = find_checkpoint(address)
+        load_model(address)
+        assert digests_of(folder) == digests_of(shipped)
+        return str(folder)
 
-    folder = Path(call())
+    folder = Path(find("me/stakes@main"))
     assert folder.name == COMMIT
     assert (folder / "ground.json").read_bytes() == (shipped / "ground.json").read_bytes()
-    code = code.replace("@main", f"@{COMMIT}")
     (folder / "gp.safetensors").unlink()  # as a download leaves it that was cut short
     shutil.rmtree(folder.parents[1] / "trees")  # of what there is, which not every version keeps
-    assert call() == str(folder)
+    assert find(f"me/stakes@{COMMIT}") == str(folder)
     assert (folder / "gp.safetensors").is_file()
     handler.asked.clear()
-    assert (call(), handler.asked) == (str(folder), [])
-    code = code.replace(f"@{COMMIT}", "@main")
+    assert (find(f"me/stakes@{COMMIT}"), handler.asked) == (str(folder), [])
     (tmp_path / "me").mkdir()
     shutil.copytree(shipped, tmp_path / "me" / "stakes@main")
-    assert call() == "me/stakes@main"
+    assert find("me/stakes@main") == "me/stakes@main"
+    hub.download.cache_clear()
 
 
 def test_addresses_go_through_training_measures_and_suites(
