@@ -18,8 +18,8 @@ from huggingface_hub import constants
 
 from benchnav.core import hub
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models import find_checkpoint, load_model
-from benchnav.models.checkpoint import digests_of, load_checkpoint
+from benchnav.models import find_checkpoint
+from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.training.data import training_digest
 from tests.commands import call
 
@@ -154,37 +154,56 @@ def test_what_a_hub_lacks_is_one_line(server: tuple[str, type[Hub]], tmp_path: P
     assert "Try again with a connection, or name a local folder." in offline.stderr
 
 
+FIND = """
+import shutil, sys
+from benchnav.core import hub
+from benchnav.models import find_checkpoint, load_model
+from benchnav.models.checkpoint import digests_of
+
+def find(address):
+    hub.download.cache_clear()  # as a process does that has found none before
+    folder = find_checkpoint(address)
+    load_model(address)
+    assert digests_of(folder) == digests_of(find_checkpoint(sys.argv[1]))
+    return folder
+
+folder = find(sys.argv[2])
+print(folder)
+if len(sys.argv) > 3:
+    (folder / "gp.safetensors").unlink()  # as a download leaves it that was cut short
+    shutil.rmtree(folder.parents[1] / "trees")  # of what there is, which not every version keeps
+    print(find(sys.argv[3]))
+"""
+
+
 def test_a_checkpoint_is_downloaded_and_what_is_here_goes_first(
     server: tuple[str, type[Hub]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address, handler = server
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(constants, "ENDPOINT", address)
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hf"))
     shipped = Path(__file__).parents[2] / "checkpoints" / "stakes-v1"
     handler.repos["models/me/stakes"] = shipped
+    settings = {"HF_HOME": str(tmp_path / "hf"), "HF_ENDPOINT": address, "HF_HUB_DISABLE_XET": "1"}
 
-    def find(address: str) -> str:
-        """Where the checkpoint is found by a process that has found none before."""
-        hub.download.cache_clear()
-        folder = find_checkpoint(address)
-        load_model(address)
-        assert digests_of(folder) == digests_of(shipped)
-        return str(folder)
+    def find(*addresses: str) -> list[str]:
+        words = [sys.executable, "-c", FIND, str(shipped), *addresses]
+        done = subprocess.run(
+            words, cwd=tmp_path, env={**os.environ, **settings}, capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout.split()
 
-    folder = Path(find("me/stakes@main"))
-    assert folder.name == COMMIT
-    assert (folder / "ground.json").read_bytes() == (shipped / "ground.json").read_bytes()
-    (folder / "gp.safetensors").unlink()  # as a download leaves it that was cut short
-    shutil.rmtree(folder.parents[1] / "trees")  # of what there is, which not every version keeps
-    assert find(f"me/stakes@{COMMIT}") == str(folder)
-    assert (folder / "gp.safetensors").is_file()
+    moves, stays = "me/stakes@main", f"me/stakes@{COMMIT}"
+    folder, again = find(moves, stays)
+    assert again == folder
+    assert Path(folder).name == COMMIT
+    for name in ("ground.json", "gp.safetensors"):
+        assert Path(folder, name).read_bytes() == (shipped / name).read_bytes()
     handler.asked.clear()
-    assert (find(f"me/stakes@{COMMIT}"), handler.asked) == (str(folder), [])
-    (tmp_path / "me").mkdir()
-    shutil.copytree(shipped, tmp_path / "me" / "stakes@main")
-    assert find("me/stakes@main") == "me/stakes@main"
-    hub.download.cache_clear()
+    assert (find(stays), handler.asked) == ([folder], [])
+    monkeypatch.chdir(tmp_path)
+    Path("me").mkdir()
+    shutil.copytree(shipped, Path("me", "stakes@main"))
+    assert str(find_checkpoint(moves)) == moves
 
 
 def test_addresses_go_through_training_measures_and_suites(

@@ -107,8 +107,10 @@ class Optimal(Planner[OptimalState]):
             low == -high,
             f"`turn_rate_radps` alike to both sides for planner {self.name!r}, got {low:g} to {high:g}.",
         )
-        slowest = robot.action_low[0]
-        expect(slowest == 0, f"`speed_mps` from 0 on for planner {self.name!r}, got from {slowest:g} on.")
+        least_speed = robot.action_low[0]
+        expect(
+            least_speed == 0, f"`speed_mps` from 0 on for planner {self.name!r}, got from {least_speed:g} on."
+        )
         assert isinstance(robot, Unicycle)
         grid = problem.grid
         grid = Grid(grid.height * times, grid.width * times, grid.resolution_m / times)
