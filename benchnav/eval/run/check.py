@@ -216,13 +216,13 @@ def _check_planner(condition: Condition, task: Task, resolution_m: float) -> Non
     seen = Observation(torch.zeros(1, 3, 4, 4, dtype=torch.uint8), 0 * ground, 0 * ground, grid)
     ones = torch.ones_like(ground).unsqueeze(1)
     mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
-    places = [torch.full((1, 2), cells * resolution_m) for cells in (0.5, 3.5)]
+    start, goal = (torch.full((1, 2), cells * resolution_m) for cells in (0.5, 3.5))
 
     def prepare() -> None:
         fields = Fields(Static(), Static().init(mixture, Law(grid=grid, correlation_m=0.0)), (0,))
         world = condition.world
         problem = pose_problem(
-            task, seen, mixture, ground, *places, 1.0, immobile=world.immobile, fields=fields
+            task, seen, mixture, ground, start, goal, 1.0, immobile=world.immobile, fields=fields
         )
         condition.make_planner().init(problem, torch.Generator())
 

@@ -124,12 +124,9 @@ def _differences(both: pd.DataFrame) -> dict[str, Any]:
     for name, column in (("success", "success"), ("time", "total_time_s")):
         one, other = (float(both[end].mean()) for end in (column, f"{column}_other"))
         found |= {f"{name}_one": one, f"{name}_other": other}
-        if len(gain) == 1:
-            interval = one - other, float("nan"), float("nan")
-        elif name == "success":
-            interval = success_interval(gain, draws)
-        else:
-            interval = time_difference(both)
+        interval: tuple[Any, Any, Any] = one - other, float("nan"), float("nan")
+        if len(gain) > 1:
+            interval = success_interval(gain, draws) if name == "success" else time_difference(both)
         found |= {
             f"{name}_{end}": float(value)
             for end, value in zip(("difference", "low", "high"), interval, strict=True)

@@ -379,13 +379,12 @@ def weigh(
     cost = cost + (last if going is None else torch.where(going, last, 0))
     if fields > 1:
         cost = tail_cost(cost.unflatten(0, (-1, fields)), level)
-    if temperature is None:
+    scale: Tensor | float | None = temperature
+    if scale is None:
         stopped = None if going is None else (~going).unflatten(0, (-1, fields)).sum(1)
-        # What a step of one field adds to the cost, where it counts.
+        # What a step on one field adds to the cost, where it counts.
         penalty = PENALTY / max(1.0, (1 - level) * fields)
         scale = temperature_share * cost_spread(cost, penalty, stopped)
-    else:
-        scale = temperature
     weights = torch.softmax((cost.amin(dim=1, keepdim=True) - cost) / scale, dim=1)
     return weights, average(mean, noise, weights, low, high)
 
