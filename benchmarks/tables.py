@@ -23,10 +23,11 @@ from pathlib import Path
 from textwrap import indent
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from scipy.stats import fisher_exact, t, ttest_ind_from_stats
-from statsmodels.stats.multitest import multipletests
 
+from benchnav.core.resampling import holm
 from benchnav.core.tables import Table, to_markdown
 from benchnav.eval.compare import read_conditions
 from benchnav.eval.experiment.condition import NOT_USED
@@ -115,7 +116,7 @@ def paper(run: Path) -> str:
     summary = pd.read_csv(run / "summary.csv")
     ours = summary[(summary["planner"] == "mppi") & (summary["risk"] == "cvar")]
     found = [(row["scenario"], *_beside(row)) for row in ours.to_dict("records") if row["scenario"] in PAPER]
-    success, time = (multipletests([row[place] for row in found], method="holm")[1] for place in (2, 3))
+    success, time = (holm(np.array([row[place] for row in found], float)) for place in (2, 3))
     headings = ["scenario", "Succ. [%], paper", "ours", "p", "T_total [s], paper", "ours", "p"]
     rows = [
         [scenario, *cells[:2], f"{success[place]:.2g}", *cells[2:], f"{time[place]:.2g}"]

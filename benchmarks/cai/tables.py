@@ -9,11 +9,12 @@ McNemar test, ours with theirs by Fisher's exact test.
 import sys
 from collections.abc import Mapping
 
+import numpy as np
 import pandas as pd
 from scipy.stats import binomtest, fisher_exact
-from statsmodels.stats.multitest import multipletests
 
 from benchmarks.cai.published import PUBLISHED, PUBLISHED_PAIRS, TRIALS
+from benchnav.core.resampling import holm
 from benchnav.eval.stats.summary import wilson_interval
 
 CAUTIOUS, NEUTRAL = "cvar:0.8", "mean"
@@ -42,7 +43,7 @@ def tabulate_success(rows: pd.DataFrame) -> str:
         table = [[arrived, trials - arrived], [theirs.successes, TRIALS - theirs.successes]]
         compared[len(lines)] = fisher_exact(table).pvalue
         lines.append([*cells, show_share(theirs.successes, TRIALS), show_time(theirs.time_s)])
-    corrected = multipletests(list(compared.values()), method="holm")[1] if compared else []
+    corrected = holm(np.array(list(compared.values())))
     for place, p in zip(compared, corrected, strict=True):
         lines[place].append(show_p(p))
     return markdown(
@@ -94,7 +95,7 @@ def tabulate_runs(runs: Mapping[str, pd.DataFrame]) -> str:
     for name in others:
         changes = [(won[name][line], won[first][line]) for line in settings]
         counts = [(int((one & ~other).sum()), int((other & ~one).sum())) for one, other in changes]
-        corrected = multipletests([mcnemar_p(*pair) for pair in counts], method="holm")[1]
+        corrected = holm(np.array([mcnemar_p(*pair) for pair in counts]))
         lines = [
             [f"{100 * line[0]:.0f} %", f"`{line[1]}`", f"{100 * (gained - lost) / len(one):+.1f}", f"{gained}, {lost}",
              show_p(p)]

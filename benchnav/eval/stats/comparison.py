@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from statsmodels.stats.multitest import multipletests
 
+from benchnav.core.resampling import holm
 from benchnav.eval.stats.paired_difference import (
     by_map,
     maps_needed,
@@ -55,7 +55,7 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
     table = table.join(_columns("arrival_time", "s", [mean_interval(values) for values in arrived]))
     table["arrival_time_n_maps"] = [len(values) for values in arrived]
     for name in ("success_p", "time_p"):
-        table[f"{name}_holm"] = multipletests(table[name], ALPHA, method="holm")[1]
+        table[f"{name}_holm"] = holm(table[name].to_numpy())
     return table
 
 

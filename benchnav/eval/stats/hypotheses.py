@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from scipy.optimize import brentq
-from statsmodels.stats.multitest import multipletests
 
-from benchnav.core.resampling import sign_flips
+from benchnav.core.resampling import holm, sign_flips
 from benchnav.eval.experiment.hypotheses import METRICS, Hypothesis
 from benchnav.eval.stats.comparison import ALPHA, gain_by_map, mean_differences, time_difference
 from benchnav.eval.stats.paired_difference import mean_interval, sign_flip_p, success_interval
@@ -60,7 +59,7 @@ def test_hypotheses(
             both = both[both["success"] & both["success_other"]]
         made.append({**plain, **_test(test, both.dropna(subset=[column, f"{column}_other"]))})
     table = pd.DataFrame(made)
-    table["p_holm"] = multipletests(table["p"], ALPHA, method="holm")[1]
+    table["p_holm"] = holm(table["p"].to_numpy())
     return table.assign(supported=table["p_holm"] < ALPHA)
 
 

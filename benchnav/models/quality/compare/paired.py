@@ -17,7 +17,7 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 
-from benchnav.core.resampling import LEAST_MAPS, bootstrap_counts, sign_flips
+from benchnav.core.resampling import LEAST_MAPS, bootstrap_counts, holm, sign_flips
 from benchnav.models.quality.map_sums import Sums, added, measures_of
 
 ALPHA = 0.05
@@ -82,16 +82,6 @@ def compare_pairs(split: str, sums: Mapping[str, Sums], competing: Sequence[str]
     for _, rows in table[rivals].groupby("measure"):
         table.loc[rows.index, "p_holm"] = holm(rows["p"].to_numpy())
     return table
-
-
-def holm(p: np.ndarray) -> np.ndarray:
-    """Corrects p-values for their number, shape [N]. Source: Holm (1979).
-
-    statsmodels' `multipletests` gives the same, but collects garbage at each call, which takes longer than the tests.
-    """
-    order = np.argsort(p)
-    stepped = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)).clip(max=1)
-    return stepped[np.argsort(order)]
 
 
 def _pair(one: Sums, other: Sums, flips: np.ndarray, counts: np.ndarray) -> dict[str, dict[str, float]]:

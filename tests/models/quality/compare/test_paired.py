@@ -8,14 +8,13 @@ from hypothesis import strategies as st
 from scipy.stats import bootstrap, permutation_test
 from statsmodels.stats.multitest import multipletests
 
-from benchnav.core.resampling import bootstrap_counts
+from benchnav.core.resampling import bootstrap_counts, holm
 from benchnav.models.quality.compare.paired import (
     HIGHER,
     LOWER,
     MEASURES,
     against_best,
     compare_pairs,
-    holm,
     summarise,
 )
 from benchnav.models.quality.map_sums import added, measures_of
