@@ -328,6 +328,13 @@ def test_every_registered_planner_keeps_the_contract(planner: str, robot: str) -
     check_planner(made, robots=[robot])
 
 
+def test_a_planner_that_draws_fields_keeps_the_contract() -> None:
+    check_planner(
+        {"part": "mppi", "options": {"samples": 16, "risk_on": "cost", "fields": 3, "horizon_s": 1.0}},
+        robots=["unicycle"],
+    )
+
+
 @pytest.mark.parametrize("order", ["kept", "sorted"])
 def test_what_select_keeps_has_to_be_those_that_were_asked_for(order: str) -> None:
     class Leaving(Good):

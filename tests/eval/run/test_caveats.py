@@ -120,6 +120,16 @@ def test_what_a_planner_cannot_be_told_is_refused_before_anything_is_run(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("once", [False, True])
+def test_risk_on_the_cost_is_run_by_its_options(dataset_path: Path, tmp_path: Path, once: bool) -> None:
+    options = {"samples": 32, "horizon_s": 1.0, "risk_on": "cost", "fields": 20, "level": 0.5, "once": once}
+    planners = ({"part": "mppi", "options": options},)
+    suite = suite_on(dataset_path, planners=planners, robots=("unicycle",), risks=("mean",), world="stakes")
+    list(run_suite(suite, tmp_path / "run"))
+    rows = pd.read_parquet(tmp_path / "run" / "episodes.parquet")
+    assert not rows["outcome"].isin(["planner_error", "model_error"]).any()
+
+
 def test_optimal_planners_are_run_by_their_names(dataset_path: Path, tmp_path: Path) -> None:
     conditions = [
         {"planners": ["optimal", {"part": "optimal", "label": "careful", "options": {"hazard": True}}]},
