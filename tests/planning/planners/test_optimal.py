@@ -275,7 +275,7 @@ def test_the_hazard_of_a_metre_is_that_of_its_cells() -> None:
 def test_where_it_has_arrived_nothing_holds_it(hazard: bool) -> None:
     """Two maps that differ within the goal's disc alone."""
     ground = torch.full((2, 16, 24), 0.9)
-    posed = problem(ground, (2.25, 4.25), (9.25, 4.25), time_budget_s=60.0)
+    posed = problem(ground, (7.75, 4.25), (9.25, 4.25), time_budget_s=60.0)
     row, column = torch.meshgrid(torch.arange(16), torch.arange(24), indexing="ij")
     away = torch.hypot(0.5 * column + 0.25 - 9.25, 0.5 * row + 0.25 - 4.25)
     ground[1, away < 1.0] = 0.05
