@@ -278,7 +278,7 @@ def test_where_it_has_arrived_nothing_holds_it(hazard: bool) -> None:
     posed = problem(ground, (7.75, 4.25), (9.25, 4.25), time_budget_s=60.0)
     row, column = torch.meshgrid(torch.arange(16), torch.arange(24), indexing="ij")
     away = torch.hypot(0.5 * column + 0.25 - 9.25, 0.5 * row + 0.25 - 4.25)
-    ground[1, away < 1.0] = 0.05
+    ground[1, (away > 0.1) & (away <= 1.0)] = 0.05
     posed = replace(posed, immobile=Immobile(below=0.1, for_s=0.3))
     predicted = factories.normal(ground, torch.full_like(ground, 0.2 if hazard else 0.0))
     planner = Optimal(OptimalConfig(hazard=True)) if hazard else OptimalBound()
