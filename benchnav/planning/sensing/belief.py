@@ -267,10 +267,10 @@ def draw_scores(law: Law, count: int, keys: Sequence[int]) -> Tensor:
         keys: a stream key of each episode, B of them.
     """
     # An episode at a time: the last bits of a product depend on how many are in it.
-    return torch.stack([_scores(law, count, key) for key in keys])
+    return torch.stack([_scores_of_one(law, count, key) for key in keys])
 
 
-def _scores(law: Law, count: int, key: int) -> Tensor:
+def _scores_of_one(law: Law, count: int, key: int) -> Tensor:
     """Those of an episode, shape [M, H, W]."""
     drawn = _white(key, count, law.grid.shape)
     if law.correlation_m:
