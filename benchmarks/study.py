@@ -8,9 +8,10 @@
 
 `knowledge` is docs/studies/knowledge.md: `primary` holds the hypotheses; `known` and `known-mppi` are part A, `near`
 part B, `sensitivity` and `kernel` part C, `seen` has old maps, `nugget` maps to develop on. `cost` is risk on the
-cost, of which `levels` drives each arm at each level on maps to develop on; hypotheses are not fixed yet. Parts are
-suites of docs/knowledge and docs/cost, each with a run of its own. Maps and runs lie in the folders `--maps_in` and
-`--out`, and `--maps` takes the first maps alone, to try it.
+cost: `levels` drives each arm at each level on maps to develop on, `primary` holds the hypotheses, `frontier` the levels
+that these leave out, `own` another time to go, and `best` the optimal planners. Parts are suites of docs/knowledge and
+docs/cost, each with a run of its own. Maps and runs lie in the folders `--maps_in` and `--out`, and `--maps` takes the
+first maps alone, to try it.
 """
 
 import argparse
@@ -71,11 +72,6 @@ class Study:
         return ROOT / "docs" / self.name
 
     @property
-    def confirms(self) -> bool:
-        """Whether its hypotheses are fixed."""
-        return "primary" in self.parts
-
-    @property
     def developed(self) -> str:
         """Name of the run by which the power of its hypotheses is known."""
         return f"{self.name}-developed"
@@ -87,7 +83,7 @@ STUDIES = {
         page="knowledge.md",
         parts=("primary", "known", "known-mppi", "near", "sensitivity", "kernel", "seen", "nugget"),
     ),
-    "cost": Study(name="cost", page="risk.md", parts=("levels",)),
+    "cost": Study(name="cost", page="risk.md", parts=("levels", "primary", "frontier", "own", "best")),
 }
 SPLIT = "test/std"
 ALPHA = 0.05
@@ -330,7 +326,8 @@ def knowledge_report(out: Path) -> None:
 
 def cost_report(out: Path) -> None:
     """Draws the frontiers."""
-    _draw([out / "cost-levels" / "summary.csv"], frontier_figure, "risk-cost.png")
+    summaries = [out / f"cost-{part}" / "summary.csv" for part in ("primary", "frontier")]
+    _draw(summaries, frontier_figure, "risk-cost.png")
 
 
 def _draw(summaries: list[Path], figure: Callable[[pd.DataFrame], Figure], name: str) -> None:
@@ -344,8 +341,7 @@ def _draw(summaries: list[Path], figure: Callable[[pd.DataFrame], Figure], name:
 
 def report(study: Study, out: Path) -> None:
     """Writes the figure, the tables of the page where there is one, and the power where it is known."""
-    if study.confirms:
-        print(f"hypotheses {hashlib.sha256((study.suites / 'primary.yaml').read_bytes()).hexdigest()}")
+    print(f"hypotheses {hashlib.sha256((study.suites / 'primary.yaml').read_bytes()).hexdigest()}")
     {"knowledge": knowledge_report, "cost": cost_report}[study.name](out)
     page = ROOT / "docs/studies" / study.page
     subprocess.run([sys.executable, ROOT / "benchmarks/tables.py", page, "--runs", out], check=True)
@@ -371,8 +367,6 @@ def main() -> None:
     parts = given.parts or list(study.parts)
     if unknown := set(parts) - set(study.parts):
         parser.error(f"Expected parts among {', '.join(study.parts)}, got {', '.join(sorted(unknown))}.")
-    if given.what in ("develop", "power") and not study.confirms:
-        parser.error(f"Expected a study with hypotheses, got {study.name}, of which none are fixed yet.")
     if given.what == "maps":
         make_maps(study, maps_in)
     elif given.what in ("estimate", "run"):

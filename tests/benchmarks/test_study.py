@@ -27,6 +27,7 @@ from benchnav.eval.experiment.condition import Condition, conditions_of
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent
+from benchnav.eval.stats.regret import find_chains
 from tests import factories
 
 KNOWLEDGE = STUDIES["knowledge"]
@@ -244,13 +245,48 @@ def test_the_frontiers_have_a_line_an_arm_through_its_levels() -> None:
     )
 
 
-@pytest.mark.parametrize("what", ["develop", "power"])
-def test_a_study_without_hypotheses_has_no_power(
-    what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("sys.argv", ["study.py", "cost", what])
-    with pytest.raises(SystemExit, match="2"):
-        study.main()
-    assert "Expected a study with hypotheses, got cost" in capsys.readouterr().err
+def test_on_new_maps_the_arms_are_those_of_the_maps_to_develop_on() -> None:
+    """But for `mean` with rollouts that are held, which drives as `mean` does."""
+
+    def named(part: str) -> list[tuple[str, str, str]]:
+        return [
+            tuple(each.labels[name] for name in ("planner", "model", "risk")) for each in conditions(part, COST)
+        ]
+
+    left_out = {(f"{planner} map held", "stakes-v1", "mean") for planner in ("mppi", "astar_mppi")}
+    new = [*named("primary"), *named("frontier")]
+    assert len(new) == len({*new})
+    assert {*new} == {*named("levels")} - left_out
+    for part in ("primary", "frontier"):
+        options = {each.labels["planner"]: each.planner for each in conditions("levels", COST)}
+        assert all(each.planner == options[each.labels["planner"]] for each in conditions(part, COST))
+
+
+def test_the_hypotheses_of_risk_on_the_cost_are_eight() -> None:
+    own = suite("primary", COST)
+    known = {each.id: (each, Extent.product((3027,), 1, 200)) for each in conditions("primary", COST)}
+    tests = fix_hypotheses(own.hypotheses, known)["tests"]
+    assert len(tests) == 8
+    assert own.maps == 200
+
+
+def test_own_time_to_go_is_all_that_differs() -> None:
+    primary = {each.labels["planner"]: each.planner.options for each in conditions("primary", COST)}
+    for each in conditions("own", COST):
+        same = primary[each.labels["planner"].removesuffix(" own")]
+        own, other = (dict(options).get("mppi", options) for options in (each.planner.options, same))
+        assert {**own, "cost_to_go": "expected-time"} == {**other}
+        assert own["cost_to_go"] == "map"
+
+
+def test_the_way_to_the_best_has_a_chain_of_each_planner() -> None:
+    about = {each.id: {"value": each.value, "labels": each.labels} for each in conditions("best", COST)}
+    chains = find_chains(about)
+    assert {about[chain[0]]["labels"]["planner"] for chain in chains} == {
+        "astar_dwa", "cl_rrt", "mppi", "astar_mppi",
+    }  # fmt: skip
+
+
+def test_each_part_has_its_suite() -> None:
     for name, own in STUDIES.items():
         assert {path.stem for path in own.suites.glob("*.yaml")} == {*own.parts, "data"}, name
