@@ -8,10 +8,10 @@
 
 `knowledge` is docs/studies/knowledge.md: `primary` holds the hypotheses; `known` and `known-mppi` are part A, `near`
 part B, `sensitivity` and `kernel` part C, `seen` has old maps, `nugget` maps to develop on. `cost` is risk on the
-cost: `levels` drives each arm at each level on maps to develop on, `primary` holds the hypotheses, `frontier` the levels
-that these leave out, `own` another time to go, and `best` the optimal planners. Parts are suites of docs/knowledge and
-docs/cost, each with a run of its own. Maps and runs lie in the folders `--maps_in` and `--out`, and `--maps` takes the
-first maps alone, to try it.
+cost: `levels` drives each arm at each level on maps to develop on, `primary` holds the hypotheses, `frontier` the
+levels that these leave out, `own` another time to go, and `best` the optimal planners. Parts are suites of
+docs/knowledge and docs/cost, each with a run of its own. Maps and runs lie in the folders `--maps_in` and `--out`, and
+`--maps` takes the first maps alone, to try it.
 """
 
 import argparse
