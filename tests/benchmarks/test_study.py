@@ -250,7 +250,8 @@ def test_on_new_maps_the_arms_are_those_of_the_maps_to_develop_on() -> None:
 
     def named(part: str) -> list[tuple[str, str, str]]:
         return [
-            tuple(each.labels[name] for name in ("planner", "model", "risk")) for each in conditions(part, COST)
+            tuple(each.labels[name] for name in ("planner", "model", "risk"))
+            for each in conditions(part, COST)
         ]
 
     left_out = {(f"{planner} map held", "stakes-v1", "mean") for planner in ("mppi", "astar_mppi")}
