@@ -21,6 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,6 @@ from benchnav.core.figures import (
     MARKERS,
     TWO_COLUMNS_IN,
     legend_outside,
-    line_style,
     risk_name,
     save,
     styled,
@@ -261,61 +261,60 @@ def knowledge_figure(summary: pd.DataFrame) -> Figure:
 
 @styled()
 def frontier_figure(summary: pd.DataFrame) -> Figure:
-    """Success over T_total, a line an arm through its levels, a panel a planner; bars are 95 % intervals of success."""
+    """Success over the time to the goal, a line an arm through its levels, with 95 % intervals of success.
+
+    A panel a planner; in the row below rollouts are held.
+    """
+    arms = [arm_of(row) for row in summary.to_dict("records")]
     rows = summary.assign(
-        **{
-            name: [own[place] for own in map(arm_of, summary.to_dict("records"))]
-            for place, name in enumerate(("family", "arm", "level"))
-        }
+        **{name: [arm[name] for arm in arms] for name in ("planner", "arm", "held", "level")}
     )
     rows = rows[rows["arm"] != ""]
-    panels = list(dict.fromkeys(rows["family"]))
-    figure = Figure(figsize=(TWO_COLUMNS_IN, 3.2), layout="constrained")
-    axes = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
-    arms = list(dict.fromkeys(rows["arm"]))
-    for panel, family in zip(axes, panels, strict=True):
-        for place, arm in enumerate(arms):
-            own = rows[(rows["family"] == family) & (rows["arm"] == arm)].sort_values("level")
+    panels = list(dict.fromkeys(rows["planner"]))
+    figure = Figure(figsize=(TWO_COLUMNS_IN, 4.6), layout="constrained")
+    axes = figure.subplots(2, len(panels), sharex="row", sharey=True, squeeze=False)
+    for (held, planner), panel in zip(product((False, True), panels), axes.flat, strict=True):
+        for place, (arm, away) in enumerate(ARMS.items()):
+            own = rows[(rows["planner"] == planner) & (rows["arm"] == arm) & (rows["held"] == held)]
+            own = own.sort_values("level")
             middle, low, high = (100 * own[f"success_{end}"].to_numpy() for end in ("rate", "low", "high"))
+            time_s = own["success_time_mean_s"].to_numpy()
             panel.errorbar(
-                own["total_time_mean_s"], middle, yerr=[middle - low, high - middle],
-                color=LINE_COLOURS[place // 2], marker=MARKERS[place // 2], ls=line_style(place % 2),
-                mfc="white" if place % 2 else LINE_COLOURS[place // 2], ms=4, lw=1.1, elinewidth=0.6, capsize=1.5,
-                label=arm,
+                time_s, middle, yerr=[middle - low, high - middle], color=LINE_COLOURS[place], marker=MARKERS[place],
+                ms=4, lw=1.1, elinewidth=0.6, capsize=1.5, label=arm,
             )  # fmt: skip
-            for (time_s, value), level in zip(
-                own[["total_time_mean_s", "success_rate"]].to_numpy(), own["level"], strict=True
-            ):
+            for *at, level in zip(time_s, middle, own["level"], strict=True):
                 panel.annotate(
-                    f"{level:g}", (time_s, 100 * value), (3, 3), textcoords="offset points", size=6
-                )
-        panel.set(title=family, xlabel="T_total [s]")
+                    f"{level:g}", at, away, textcoords="offset points", size=6, color=LINE_COLOURS[place],
+                    ha="center", va="center",
+                )  # fmt: skip
+        panel.set_title(f"{planner}, rollouts that are held" if held else planner)
         panel.grid(color="0.93")
-    axes[0].set_ylabel("success [%]")
-    legend_outside(figure, columns=3)
+    for panel in axes[-1]:
+        panel.set_xlabel("time to the goal [s]")
+    for panel in axes[:, 0]:
+        panel.set_ylabel("success [%]")
+    legend_outside(figure, columns=len(ARMS))
     return figure
 
 
+# Of each arm where the number of its level stands, in points from its mark.
+ARMS = {"CVaR of λ": (-6, 4), "CVaR of time": (6, -5), "CVaR of the cost": (6, 5)}
 # Of each planner of the study its name in the figure.
 FAMILIES = {"mppi": "MPPI", "astar_mppi": "A*+MPPI"}
 
 
-def arm_of(row: Mapping[Any, Any]) -> tuple[str, str, float]:
-    """Planner, arm and level of a condition; all empty where it is none of the study's."""
-    planner, _, kind = row["planner"].partition(" ")
+def arm_of(row: Mapping[Any, Any]) -> dict[str, Any]:
+    """Planner, arm and level of a condition, and whether its rollouts are held; other conditions have no arm."""
+    part, _, kind = row["planner"].partition(" ")
     name, _, level = row["risk"].partition(":")
-    held = ", held" if "held" in kind else ""
-    if planner not in FAMILIES or row["model"] == "clairvoyant":
-        return "", "", 0.0
+    found = {"planner": FAMILIES.get(part, ""), "held": "held" in kind, "arm": "", "level": 0.0}
+    if part not in FAMILIES or row["model"] == "clairvoyant":
+        return found
     if "cost" in kind:
-        return FAMILIES[planner], f"CVaR of the cost{held}", float(kind.split()[1])
-    arms = {
-        "cvar": "CVaR of λ",
-        "time-cvar": "CVaR of time",
-        "expected-time": "CVaR of time",
-        "mean": "CVaR of λ",
-    }
-    return FAMILIES[planner], f"{arms[name]}{held}", float(level or 0)
+        return found | {"arm": "CVaR of the cost", "level": float(kind.split()[1])}
+    arm = "CVaR of λ" if name in ("cvar", "mean") else "CVaR of time"
+    return found | {"arm": arm, "level": float(level or 0)}
 
 
 def knowledge_report(out: Path) -> None:
