@@ -15,7 +15,7 @@ import pandas as pd
 from jsonargparse import ArgumentParser
 
 from benchmarks.cai.run import SETTINGS, run_trials
-from benchmarks.cai.tables import CAUTIOUS, NEUTRAL, tabulate_pairs, tabulate_success
+from benchmarks.cai.tables import PAIRS, tabulate_pairs, tabulate_success
 from benchmarks.cai.task import Setup, planner_config
 from benchnav.core.command import show_progress
 from benchnav.core.errors import ConfigError
@@ -64,8 +64,9 @@ def main() -> int:
         with replacing(given.out) as partial:
             trials.to_csv(partial, index=False)
     print(tabulate_success(trials))
-    if {CAUTIOUS, NEUTRAL} <= set(given.risk):
-        print(f"\n{tabulate_pairs(trials)}")
+    for pair in PAIRS:
+        if {*pair} <= set(given.risk):
+            print(f"\n{tabulate_pairs(trials, *pair)}")
     return 0
 
 

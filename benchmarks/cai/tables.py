@@ -17,7 +17,8 @@ from benchmarks.cai.published import PUBLISHED, PUBLISHED_PAIRS, TRIALS
 from benchnav.core.resampling import holm
 from benchnav.eval.stats.summary import wilson_interval
 
-CAUTIOUS, NEUTRAL = "cvar:0.8", "mean"
+# What is compared on the same trials; of the first the log of theirs is counted too.
+PAIRS = (("cvar:0.8", "mean"), ("cost-cvar:0.6", "cost"), ("cost-cvar:0.6", "cvar:0.6"))
 _NONE = "–"
 
 
@@ -52,22 +53,26 @@ def tabulate_success(rows: pd.DataFrame) -> str:
     )
 
 
-def tabulate_pairs(rows: pd.DataFrame) -> str:
-    """What caution gains over the mean on the same trials, ours and theirs.
+def tabulate_pairs(rows: pd.DataFrame, one: str, other: str) -> str:
+    """What a setting gains over another on the same trials, and of the first of `PAIRS` what it gained in theirs.
 
     Args:
         rows: trials, from `run_trials`; both settings are among them.
+        one: a setting.
+        other: the other.
     """
-    lines = []
+    ours, lines = ["points", f"`{one}` alone, `{other}` alone", "p"], []
+    counted = PUBLISHED_PAIRS if (one, other) == PAIRS[0] else {}
     for density, group in rows.groupby("density", sort=False):
         trials = group.pivot(index=["map", "realisation"], columns="setting", values="success").astype(bool)
-        gained = int((trials[CAUTIOUS] & ~trials[NEUTRAL]).sum())
-        lost = int((trials[NEUTRAL] & ~trials[CAUTIOUS]).sum())
-        theirs = PUBLISHED_PAIRS.get(density)
-        shown = [_NONE] * 3 if theirs is None else show_pair(*theirs, TRIALS)
-        lines.append([f"{100 * density:.0f} %", *show_pair(gained, lost, len(trials)), *shown])
-    ours = ["points", f"`{CAUTIOUS}` alone, `{NEUTRAL}` alone", "p"]
-    return markdown(["vegetation", *ours, *(f"theirs: {name}" for name in ours)], lines)
+        gained = int((trials[one] & ~trials[other]).sum())
+        lost = int((trials[other] & ~trials[one]).sum())
+        line = [f"{100 * density:.0f} %", *show_pair(gained, lost, len(trials))]
+        if counted:
+            theirs = counted.get(density)
+            line += [_NONE] * 3 if theirs is None else show_pair(*theirs, TRIALS)
+        lines.append(line)
+    return markdown(["vegetation", *ours, *(f"theirs: {name}" for name in ours if counted)], lines)
 
 
 def tabulate_runs(runs: Mapping[str, pd.DataFrame]) -> str:

@@ -75,8 +75,11 @@ def test_p_is_corrected_over_all_lines_that_are_compared() -> None:
 def test_pairs_are_those_of_one_trial() -> None:
     mean, cautious = [True, False, False, False], [False, True, True, False]
     shuffled = rows(1.0, mean=mean, cvar_8=cautious).sample(frac=1, random_state=0)
-    line = tabulate_pairs(shuffled).splitlines()[-1]
+    line = tabulate_pairs(shuffled, "cvar:0.8", "mean").splitlines()[-1]
     assert line == "| 100 % | +25.0 | 2, 1 | 1.00 | +79.0 | 159, 1 | 2e-46 |"
+    head, _, line = tabulate_pairs(shuffled, "mean", "cvar:0.8").splitlines()
+    assert head == "| vegetation | points | `mean` alone, `cvar:0.8` alone | p |"
+    assert line == "| 100 % | -25.0 | 1, 2 | 1.00 |"
 
 
 def test_no_arrival_has_no_time() -> None:
