@@ -24,6 +24,7 @@ from benchmarks.study import (
     power_of,
     suite_of,
 )
+from benchmarks.tables import BESIDE, arm_label
 from benchnav.core.settings import of, read
 from benchnav.datagen import TerrainDataset
 from benchnav.eval.experiment.condition import Condition, conditions_of
@@ -274,6 +275,14 @@ def test_the_hypotheses_of_risk_on_the_cost_are_eight() -> None:
     tests = fix_hypotheses(own.hypotheses, known)["tests"]
     assert len(tests) == 8
     assert own.maps == 200
+
+
+def test_the_table_of_arms_has_a_row_of_each_and_sets_it_beside_one_of_its_planner() -> None:
+    arms = [arm_label(each.labels) for each in conditions("primary", COST)]
+    assert len({*arms}) == len(arms) == 17
+    assert {(planner, *BESIDE) for planner, *_ in arms} <= {*arms}
+    assert ("astar_mppi", "fields, held", "CVaR of the cost, 0") in arms
+    assert ("mppi", "map, held", "cvar:0.8") in arms
 
 
 def test_own_time_to_go_is_all_that_differs() -> None:
