@@ -1,0 +1,84 @@
+"""Smooth MPPI and iCEM, which are compared with MPPI: they keep to the contract, and sample as their sources say."""
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.mppi_parts import ICEM, ICEMConfig, SmoothConfig, SmoothMPPI, coloured_noise
+from benchnav.core import rng
+from benchnav.planning import MPPI, MPPIConfig, Planner, Problem
+from benchnav.planning.sensing.sensor import Step
+from benchnav.testing import check_planner
+from tests import factories
+
+
+def open_ground() -> Problem:
+    return factories.problem(torch.full((2, 16, 16), 0.8))
+
+
+def first_step(problem: Problem) -> Step:
+    return Step(state=problem.start, traversability=torch.full((len(problem),), torch.nan), time_s=0.0)
+
+
+@pytest.mark.parametrize(
+    "planner",
+    [
+        SmoothMPPI(SmoothConfig(samples=64, horizon_s=1.0)),
+        ICEM(ICEMConfig(samples=64, horizon_s=1.0)),
+        ICEM(ICEMConfig(samples=64, horizon_s=1.0, cost_to_go="map")),
+    ],
+    ids=["smooth", "icem", "icem to go"],
+)
+def test_they_keep_to_the_contract(planner: Planner) -> None:
+    check_planner(planner, ["unicycle"])
+
+
+def test_samples_of_smooth_mppi_are_sums_of_changes() -> None:
+    problem, options = open_ground(), {"samples": 200, "horizon_s": 1.0, "noise_share": 0.02}
+    plain, smooth = (
+        planner.init(problem, rng.generator(0)).noise.at(3)
+        for planner in (MPPI(MPPIConfig(**options)), SmoothMPPI(SmoothConfig(**options)))
+    )
+    torch.testing.assert_close(smooth, plain.cumsum(0))
+
+
+def test_smoothness_costs_what_actions_change() -> None:
+    """With nothing but smoothness to pay for, the mean moves toward the samples that change least."""
+    problem = open_ground()
+    changes = []
+    for smoothness in (0.0, 1e6):
+        planner = SmoothMPPI(SmoothConfig(samples=500, horizon_s=1.0, smoothness=smoothness))
+        state = planner.init(problem, rng.generator(0))
+        step = first_step(problem)
+        _, after, _ = planner.plan_toward(step, state, problem.goal_m)
+        low, high = problem.action_bounds
+        changes.append(float((after.mean.diff(dim=1) / (high - low)).square().sum()))
+    assert changes[1] < 0.5 * changes[0]
+
+
+@pytest.mark.parametrize("colour", [0.0, 1.0, 2.0])
+def test_the_spectrum_of_coloured_noise_falls_as_it_is_told(colour: float) -> None:
+    noise = coloured_noise(64, (2, 4000), colour, torch.Generator().manual_seed(0))
+    assert noise.shape == (64, 2, 4000)
+    np.testing.assert_allclose(noise.square().mean((0, 2)), 1, atol=0.01)
+    power = torch.fft.rfft(noise[:, 0], dim=0).abs().square().mean(1)[2:32]
+    slope = np.polyfit(np.log(np.arange(2, 32)), np.log(power), 1)[0]
+    assert slope == pytest.approx(-colour, abs=0.05)
+
+
+def test_icem_drives_the_best_of_its_elites_and_tries_them_again() -> None:
+    problem = open_ground()
+    planner = ICEM(ICEMConfig(samples=64, horizon_s=1.0, elites=8, kept=0.5))
+    state = planner.init(problem, rng.generator(0))
+    action, after, _ = planner.plan_toward(first_step(problem), state, problem.goal_m)
+    assert after.elites.shape == (*state.mean.shape, 4)
+    # Shifted by a step, the last action twice.
+    torch.testing.assert_close(after.elites[:, -1], after.elites[:, -2])
+    more = ICEM(ICEMConfig(samples=64, horizon_s=1.0, elites=8, kept=0.5, iterations=6))
+    costs = []
+    for each in (planner, more):
+        first, then, _ = each.plan_toward(first_step(problem), state, problem.goal_m)
+        sequence = torch.cat((first[:, None], then.elites[:, :-1, :, 0]), 1)[..., None]
+        costs.append(float(each._cost(problem, problem.start, sequence, problem.goal_m, None).mean()))
+    assert costs[1] <= costs[0]
+    assert action.shape == (len(problem), 2)
