@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core import rng
+from benchnav.core.errors import expect
 from benchnav.planning import MPPI, MPPIConfig
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.astar import astar
@@ -44,11 +45,19 @@ class _Summed(NoiseBank):
         return super().at(step).cumsum(0)
 
 
+def refuse_others(config: MPPIConfig, own: type[MPPIConfig], unused: tuple[str, ...]) -> None:
+    """Refuses options of MPPI that a planner has no use for, where they are not at their default."""
+    for name in ("risk_on", "entrapment", "control_cost", *unused):
+        given = getattr(config, name)
+        expect(given == getattr(own(), name), f"no `{name}` for {own.__name__}, got {given!r}.")
+
+
 class SmoothMPPI(MPPI):
     """MPPI that samples the changes of actions, and takes large ones for costly."""
 
     def __init__(self, config: SmoothConfig | None = None) -> None:
         super().__init__(config or SmoothConfig())
+        refuse_others(self.config, SmoothConfig, ())
 
     def init(self, problem: Problem, generator: torch.Generator) -> MPPIState:
         state = super().init(problem, generator)
@@ -122,6 +131,7 @@ class ICEM(MPPI):
 
     def __init__(self, config: ICEMConfig | None = None) -> None:
         super().__init__(config or ICEMConfig())
+        refuse_others(self.config, ICEMConfig, ("noise", "temperature", "temperature_share"))
         self._roll = Fused(_advance, self.config.samples, self.worth_compiling, batched=(0, 1, 2, 3, 4))
 
     @property

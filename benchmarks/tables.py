@@ -20,7 +20,7 @@ missing stays as it is. Kinds:
 
 import argparse
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from textwrap import indent
 from typing import Any
@@ -36,15 +36,13 @@ from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.run_folder import EPISODES, open_run
 from benchnav.eval.report.write import read_report
 from benchnav.eval.stats.comparison import compare
-from benchnav.eval.stats.pairs import Compared, Pair, find_pairs, side_by_side
+from benchnav.eval.stats.pairs import Pair, find_pairs, side_by_side
 from benchnav.eval.stats.summary import wilson_interval
 
 # MPPI under CVaR at 0.9; Endo, Honda and Ishigami (2024), Table I: success, mean and standard deviation of T_total.
 PAPER_EPISODES = 20
 PAPER = {"std": (0.90, 52.7, 22.5), "hg": (0.80, 60.2, 26.1), "hs": (0.85, 58.6, 25.7)}
 
-# Of the arms of the study of risk on the cost the one that the others of its planner stand beside.
-BESIDE = ("map", "time-cvar:0.5")
 _MEASURES = ("success", "total_time_s", "time_budget_s")
 
 _BLOCK = re.compile(r"^( *)<!-- (\w+) ([\w-]+) -->\n.*?<!-- end -->", re.DOTALL | re.MULTILINE)
@@ -118,16 +116,18 @@ def _best_and_worst(compared: pd.DataFrame) -> tuple[dict[str, float], str, str]
 
 
 def arms(run: Path) -> str:
-    """Success, times and computing of each arm, and what it gains on CVaR of time on the map."""
-    summary = pd.read_csv(run / "summary.csv")
-    known = {arm_label(each.labels): each for each in read_conditions([open_run(run)])}
-    pairs = {
-        arm: _beside_time(each, known[arm[0], *BESIDE]) for arm, each in known.items() if arm[1:] != BESIDE
-    }
-    compared = compare(list(pairs.values())).assign(arm=list(pairs)).set_index("arm").to_dict("index")
+    """Success, time and computing of each arm, and what it gains on CVaR of time on the map with its planner."""
+    known = {(each.labels["planner"], each.labels["risk"]): each for each in read_conditions([open_run(run)])}
+    pairs = {}
+    for (planner, risk), one in known.items():
+        other = known[f"{planner.split()[0]} map", "time-cvar:0.5"]
+        if one is not other:  # two that may differ in planner and risk setting alike
+            both = side_by_side(one.episodes, other.episodes, _MEASURES)
+            pairs[planner, risk] = Pair(one=planner, other=other.labels["planner"], shared={}, episodes=both)
+    compared = dict(zip(pairs, compare(list(pairs.values())).to_dict("records"), strict=True))
     rows = []
-    for row in summary.to_dict("records"):
-        arm, differs = arm_label(row), ["", "", ""]
+    for row in pd.read_csv(run / "summary.csv").to_dict("records"):
+        arm, differs = (row["planner"], row["risk"]), ["", "", ""]
         if found := compared.get(arm):
             points = [100 * found[f"success_{end}"] for end in ("difference", "low", "high")]
             seconds = [found[f"arrival_time_{end}_s"] for end in ("difference", "low", "high")]
@@ -137,26 +137,11 @@ def arms(run: Path) -> str:
             ]  # fmt: skip
         rows.append([
             *arm, f"{100 * row['success_rate']:.1f} ({100 * row['success_low']:.0f}–{100 * row['success_high']:.0f})",
-            f"{row['total_time_mean_s']:.1f}", f"{row['planning_ms_median']:.1f}",
-            *differs,
+            f"{row['total_time_mean_s']:.1f}", f"{row['planning_ms_median']:.1f}", *differs,
         ])  # fmt: skip
     measures = ["success [%] (95 %)", "T_total [s]", "ms a step"]
     differences = ["Δ success [points] (95 %)", "p", "Δ time where both arrive [s] (95 %)"]
-    return table(["planner", "rollouts", "risk", *measures, *differences], rows)
-
-
-def arm_label(labels: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Planner, what rollouts are on, and the risk of a condition."""
-    planner, ground, *words = labels["planner"].split()
-    risk = f"CVaR of the cost, {words[0]}" if ground == "cost" else labels["risk"]
-    held = ", held" if words[-1:] == ["held"] else ""
-    return planner, ("fields" if ground == "cost" else "map") + held, risk
-
-
-def _beside_time(one: Compared, other: Compared) -> Pair:
-    """Two conditions that may differ in planner and risk setting alike."""
-    episodes = side_by_side(one.episodes, other.episodes, _MEASURES)
-    return Pair(one=one.labels["planner"], other=other.labels["planner"], shared={}, episodes=episodes)
+    return table(["planner", "risk", *measures, *differences], rows)
 
 
 def paper(run: Path) -> str:

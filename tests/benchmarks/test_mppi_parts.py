@@ -1,12 +1,15 @@
 """Smooth MPPI and iCEM, which are compared with MPPI: they keep to the contract, and sample as their sources say."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 from benchmarks.mppi_parts import ICEM, ICEMConfig, SmoothConfig, SmoothMPPI, coloured_noise
 from benchnav.core import rng
-from benchnav.planning import MPPI, MPPIConfig, Planner, Problem
+from benchnav.core.errors import ConfigError
+from benchnav.planning import MPPI, MPPIConfig, Planner, Problem, TravelTime, Unicycle
 from benchnav.planning.sensing.sensor import Step
 from benchnav.testing import check_planner
 from tests import factories
@@ -82,3 +85,48 @@ def test_icem_drives_the_best_of_its_elites_and_tries_them_again() -> None:
         costs.append(float(each._cost(problem, problem.start, sequence, problem.goal_m, None).mean()))
     assert costs[1] <= costs[0]
     assert action.shape == (len(problem), 2)
+
+
+SETTINGS = {
+    SmoothConfig: {
+        "samples": 80, "horizon_s": 2.0, "noise_share": 0.3, "noise": (0.2, 0.9), "temperature_share": 1.0,
+        "temperature": 5.0, "smoothness": 100.0, "cost_to_go": "map",
+    },
+    ICEMConfig: {
+        "samples": 80, "horizon_s": 2.0, "noise_share": 0.2, "iterations": 2, "elites": 4, "kept": 0.1, "decay": 3.0,
+        "momentum": 0.8, "colour": 0.0, "cost_to_go": "map",
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, own in SETTINGS.items() for name in own])
+def test_each_setting_changes_what_is_planned(kind: type[MPPIConfig], name: str) -> None:
+    ground = torch.full((1, 16, 16), 0.8)
+    ground[:, 4:9, 5] = 0.1
+    problem = factories.problem(ground, objective=TravelTime(robot=Unicycle(), goal_radius_m=1.0))
+    planned = []
+    for options in ({}, {name: SETTINGS[kind][name]}):
+        planner = (SmoothMPPI if kind is SmoothConfig else ICEM)(
+            kind(**{"samples": 40, "horizon_s": 1.0} | options)
+        )
+        state = planner.init(problem, rng.generator(0))
+        for _ in range(2):
+            _, state, _ = planner.plan_toward(first_step(problem), state, problem.goal_m)
+        planned.append(state.mean[:, :5])
+    assert not torch.equal(*planned)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        (SmoothConfig, {"risk_on": "cost"}),
+        (SmoothConfig, {"control_cost": 0.1}),
+        (ICEMConfig, {"entrapment": True}),
+        (ICEMConfig, {"temperature": 1.0}),
+    ],
+)
+def test_options_that_they_have_no_use_for_are_refused(
+    kind: type[MPPIConfig], options: dict[str, Any]
+) -> None:
+    with pytest.raises(ConfigError, match=f"no `{next(iter(options))}` for {kind.__name__}"):
+        (SmoothMPPI if kind is SmoothConfig else ICEM)(kind(**options))

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from scipy.stats import norm
 
-from benchmarks import study
+from benchmarks import study, tables
 from benchmarks.study import (
     ALL_KNOWN,
     ARMS,
@@ -24,13 +24,13 @@ from benchmarks.study import (
     power_of,
     suite_of,
 )
-from benchmarks.tables import BESIDE, arm_label
 from benchnav.core.settings import of, read
 from benchnav.datagen import TerrainDataset
 from benchnav.eval.experiment.condition import Condition, conditions_of
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent
+from benchnav.eval.stats.pairs import Compared
 from benchnav.eval.stats.regret import find_chains
 from tests import factories
 
@@ -277,12 +277,41 @@ def test_the_hypotheses_of_risk_on_the_cost_are_eight() -> None:
     assert own.maps == 200
 
 
-def test_the_table_of_arms_has_a_row_of_each_and_sets_it_beside_one_of_its_planner() -> None:
-    arms = [arm_label(each.labels) for each in conditions("primary", COST)]
-    assert len({*arms}) == len(arms) == 17
-    assert {(planner, *BESIDE) for planner, *_ in arms} <= {*arms}
-    assert ("astar_mppi", "fields, held", "CVaR of the cost, 0") in arms
-    assert ("mppi", "map, held", "cvar:0.8") in arms
+def test_the_table_of_arms_sets_each_beside_cvar_of_time_with_its_planner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 40 maps that of MPPI arrives on 20, that of A*+MPPI on 30, all others on 35, and 2 s later."""
+    arrived = {("mppi map", "time-cvar:0.5"): 20, ("astar_mppi map", "time-cvar:0.5"): 30}
+    compared, summary = [], []
+    for each in conditions("primary", COST):
+        arm = (each.labels["planner"], each.labels["risk"])
+        success = np.arange(40) < arrived.get(arm, 35)
+        took = np.where(success, 30.0 + 2 * (arm not in arrived), 90.0)
+        episodes = pd.DataFrame({
+            "seed": 3027, "realisation": 0, "map": range(40), "group": range(40), "success": success,
+            "total_time_s": took, "time_budget_s": 90.0,
+        })  # fmt: skip
+        compared.append(Compared(labels=each.labels, value={}, maps=(), episodes=episodes))
+        summary.append({
+            **each.labels, "success_rate": success.mean(), "success_low": 0.2, "success_high": 0.9,
+            "total_time_mean_s": took.mean(), "planning_ms_median": 1.5,
+        })  # fmt: skip
+    pd.DataFrame(summary).to_csv(tmp_path / "summary.csv")
+    monkeypatch.setattr(tables, "open_run", lambda run: run)
+    monkeypatch.setattr(tables, "read_conditions", lambda runs: compared)
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in tables.arms(tmp_path).splitlines()[2:]
+    ]
+    found = {(row[0], row[1]): row[2:] for row in rows}
+    assert len(rows) == len(found) == 17
+    assert found["mppi map", "time-cvar:0.5"][:3] == ["50.0 (20–90)", "60.0", "1.5"]
+    assert (
+        found["mppi map", "time-cvar:0.5"][3:] == found["astar_mppi map", "time-cvar:0.5"][3:] == ["", "", ""]
+    )
+    for planner, points in (("mppi", "+37.5"), ("astar_mppi", "+12.5")):
+        gain, _, later = found[f"{planner} cost 0.8", "expected-time"][3:]
+        assert gain.startswith(points)
+        assert later.startswith("+2.0")
 
 
 def test_own_time_to_go_is_all_that_differs() -> None:
