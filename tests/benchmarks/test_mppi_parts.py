@@ -1,5 +1,6 @@
 """Smooth MPPI and iCEM, which are compared with MPPI: they keep to the contract, and sample as their sources say."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from benchmarks.mppi_parts import ICEM, ICEMConfig, SmoothConfig, SmoothMPPI, co
 from benchnav.core import rng
 from benchnav.core.errors import ConfigError
 from benchnav.planning import MPPI, MPPIConfig, Planner, Problem, TravelTime, Unicycle
+from benchnav.planning.free_space import PENALTY
 from benchnav.planning.sensing.sensor import Step
 from benchnav.testing import check_planner
 from tests import factories
@@ -59,6 +61,27 @@ def test_smoothness_costs_what_actions_change() -> None:
     assert changes[1] < 0.5 * changes[0]
 
 
+def test_changes_are_shares_of_an_actions_range() -> None:
+    problem = open_ground()
+    low, high = problem.action_bounds
+    assert high[0] - low[0] != high[1] - low[1]
+    costs = []
+    for smoothness in (0.0, 3.0):
+        planner = SmoothMPPI(SmoothConfig(samples=50, horizon_s=1.0, smoothness=smoothness))
+        state = planner.init(problem, rng.generator(0))
+        weigh = planner._weigh
+        planner._weigh = lambda states, cost, *rest, weigh=weigh: (
+            costs.append(cost),
+            weigh(states, cost, *rest),
+        )[1]  # type: ignore[assignment]
+        planner.plan_toward(first_step(problem), state, problem.goal_m)
+    actions = (state.mean[..., None] + state.noise.at(0)).clamp(low[:, None], high[:, None])
+    shares = (actions - low[:, None]) / (high - low)[:, None]
+    torch.testing.assert_close(
+        costs[1] - costs[0], 3 * (shares[:, 1:] - shares[:, :-1]).square().sum((1, 2)), rtol=1e-3, atol=1e-3
+    )
+
+
 @pytest.mark.parametrize("colour", [0.0, 1.0, 2.0])
 def test_the_spectrum_of_coloured_noise_falls_as_it_is_told(colour: float) -> None:
     noise = coloured_noise(64, (2, 4000), colour, torch.Generator().manual_seed(0))
@@ -85,6 +108,66 @@ def test_icem_drives_the_best_of_its_elites_and_tries_them_again() -> None:
         costs.append(float(each._cost(problem, problem.start, sequence, problem.goal_m, None).mean()))
     assert costs[1] <= costs[0]
     assert action.shape == (len(problem), 2)
+
+
+def test_icem_fits_its_distribution_to_its_elites_as_its_algorithm_says() -> None:
+    """Two iterations, written out: fewer samples in the second, which tries the elites and the mean again."""
+    problem = open_ground()
+    config = ICEMConfig(samples=40, horizon_s=0.5, iterations=2, elites=10, kept=0.2, decay=2.0, momentum=0.2)
+    planner = ICEM(config)
+    state = planner.init(problem, rng.generator(0))
+    state = replace(state, step=3, mean=state.mean + 0.1, elites=state.elites + 0.2)
+    low, high = (bound[:, None] for bound in problem.action_bounds)
+    mean, spread, tried = (
+        state.mean,
+        config.noise_share * (high - low)[:, 0].expand_as(state.mean),
+        state.elites,
+    )
+    for iteration, count in enumerate((40, 20)):
+        noise = state.coloured.take(rng.stream_key(state.key, 3, iteration), count)
+        sampled = (mean[..., None] + spread[..., None] * noise).clamp(low, high)
+        sequences = torch.cat((sampled, tried, *([mean[..., None]] if iteration else [])), 3)
+        order = planner._cost(problem, problem.start, sequences, problem.goal_m, None).argsort(1)[:, :10]
+        best = torch.stack([sequences[episode][..., order[episode]] for episode in range(len(problem))])
+        mean, spread = 0.2 * mean + 0.8 * best.mean(3), 0.2 * spread + 0.8 * best.std(3)
+        tried = best[..., :2]
+    action, after, _ = planner.plan_toward(first_step(problem), state, problem.goal_m)
+    torch.testing.assert_close(action, best[:, 0, :, 0])
+    torch.testing.assert_close(after.mean[:, :-1], mean[:, 1:])
+    torch.testing.assert_close(after.elites[:, :-1], tried[:, 1:])
+
+
+def test_the_last_mean_of_icem_is_tried() -> None:
+    """Straight to the goal at full speed, which no noise makes better."""
+    problem = open_ground()
+    planner = ICEM(ICEMConfig(samples=20, horizon_s=0.5, iterations=1, elites=2, momentum=1.0))
+    state = planner.init(problem, rng.generator(0))
+    ahead = torch.tensor([problem.action_bounds[1][0], 0.0])
+    state = replace(state, mean=ahead.expand_as(state.mean))
+    away = problem.goal_m - problem.start[:, :2]
+    facing = torch.cat((problem.start[:, :2], torch.atan2(away[:, 1:], away[:, :1])), 1)
+    action, _, _ = planner.plan_toward(replace(first_step(problem), state=facing), state, problem.goal_m)
+    torch.testing.assert_close(action, ahead.expand_as(action))
+
+
+def test_icem_pays_for_a_last_state_on_ground_that_is_not_free() -> None:
+    ground = torch.full((1, 16, 16), 0.8)
+    ground[:, :, 8:] = 0.0
+    problem = factories.problem(ground)
+    planner = ICEM(ICEMConfig(samples=8, horizon_s=0.2, cost_to_go="map"))
+    to_go = planner.init(problem, rng.generator(0)).to_go
+    assert to_go is not None
+    edge = 8 * problem.grid.resolution_m
+    costs = [
+        float(
+            planner._cost(
+                problem, torch.tensor([[edge - before, 4.0, 0.0]]), torch.tensor([[[[1.0], [0.0]]]]),
+                problem.goal_m, torch.zeros_like(to_go),
+            )
+        )
+        for before in (0.01, 0.3)
+    ]  # fmt: skip
+    assert costs[0] - costs[1] == pytest.approx(PENALTY, rel=0.01)
 
 
 SETTINGS = {

@@ -308,9 +308,11 @@ def test_the_table_of_arms_sets_each_beside_cvar_of_time_with_its_planner(
     assert (
         found["mppi map", "time-cvar:0.5"][3:] == found["astar_mppi map", "time-cvar:0.5"][3:] == ["", "", ""]
     )
-    for planner, points in (("mppi", "+37.5"), ("astar_mppi", "+12.5")):
-        gain, _, later = found[f"{planner} cost 0.8", "expected-time"][3:]
+    # All 5 maps that differ speak for an arm of A*+MPPI: 2 / 2⁵; after 8 smaller p of 15, Holm's factor is 7.
+    for planner, points, least, most in (("mppi", "+37.5", 0, 0.01), ("astar_mppi", "+12.5", 0.42, 0.46)):
+        gain, p, later = found[f"{planner} cost 0.8", "expected-time"][3:]
         assert gain.startswith(points)
+        assert least <= float(p) <= most
         assert later.startswith("+2.0")
 
 
