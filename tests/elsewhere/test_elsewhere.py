@@ -9,9 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 
-@pytest.mark.parametrize("cases", ["units", "models"])
+@pytest.mark.parametrize("cases", ["units", "models", *(["gpu"] if torch.cuda.is_available() else [])])
 def test_cases_on_another_device(cases: str) -> None:
     here = Path(__file__).parent
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", str(here / f"{cases}.py")]

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is 
 @pytest.mark.parametrize(
     "changes",
     [
-        *({"planners": (name,)} for name in names("planner") if name not in ("optimal_bound", "sb3")),
+        *({"planners": (name,)} for name in names("planner") if name != "optimal_bound"),
         {"planners": ("optimal_bound",), "model": "clairvoyant", "world": HOLDS},
         {"planners": ({"part": "optimal", "options": {"hazard": True}},), "world": HOLDS},
         {"planners": ({"part": "mppi", "options": ON_COST},), "world": HOLDS},
