@@ -12,7 +12,7 @@ missing stays as it is. Kinds:
   after Holm's correction over all pairs of settings of the row. Best and worst are chosen by what was seen, so
   that the gain leans upward;
 - `arms`: of the study of risk on the cost each arm, and its difference from CVaR of time on the map with the same
-  planner; p after Holm's correction over all rows that have one;
+  planner, or from the same arm with the shared time to go; p after Holm's correction over all rows that have one;
 - `paper`: the paper's Table I beside a run's. Theirs: Wilson's interval of 20 episodes, and Student's of a mean of
   20 by its standard deviation. p: Fisher's exact test of success, Welch's of T_total, Holm's correction over the
   scenarios, each of the two apart.
@@ -36,7 +36,7 @@ from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.run_folder import EPISODES, open_run
 from benchnav.eval.report.write import read_report
 from benchnav.eval.stats.comparison import compare
-from benchnav.eval.stats.pairs import Pair, find_pairs, side_by_side
+from benchnav.eval.stats.pairs import Compared, Pair, find_pairs, side_by_side
 from benchnav.eval.stats.summary import wilson_interval
 
 # MPPI under CVaR at 0.9; Endo, Honda and Ishigami (2024), Table I: success, mean and standard deviation of T_total.
@@ -116,11 +116,15 @@ def _best_and_worst(compared: pd.DataFrame) -> tuple[dict[str, float], str, str]
 
 
 def arms(run: Path) -> str:
-    """Success, time and computing of each arm, and what it gains on CVaR of time on the map with its planner."""
-    known = {(each.labels["planner"], each.labels["risk"]): each for each in read_conditions([open_run(run)])}
-    pairs = {}
-    for (planner, risk), one in known.items():
-        other = known[f"{planner.split()[0]} map", "time-cvar:0.5"]
+    """Success, time and computing of each arm, and what it gains on another, which may be in the run `cost-primary`."""
+    own = {_arm(each): each for each in read_conditions([open_run(run)])}
+    known, pairs = own, {}
+    if any(_compared_with(*arm) not in own for arm in own):
+        known = own | {
+            _arm(each): each for each in read_conditions([open_run(run.with_name("cost-primary"))])
+        }
+    for (planner, risk), one in own.items():
+        other = known[_compared_with(planner, risk)]
         if one is not other:  # two that may differ in planner and risk setting alike
             both = side_by_side(one.episodes, other.episodes, _MEASURES)
             pairs[planner, risk] = Pair(one=planner, other=other.labels["planner"], shared={}, episodes=both)
@@ -142,6 +146,17 @@ def arms(run: Path) -> str:
     measures = ["success [%] (95 %)", "T_total [s]", "ms a step"]
     differences = ["Δ success [points] (95 %)", "p", "Δ time where both arrive [s] (95 %)"]
     return table(["planner", "risk", *measures, *differences], rows)
+
+
+def _arm(condition: Compared) -> tuple[str, str]:
+    return condition.labels["planner"], condition.labels["risk"]
+
+
+def _compared_with(planner: str, risk: str) -> tuple[str, str]:
+    """CVaR of time on the map with the same planner; of an arm with its own time to go that with the shared one."""
+    if planner.endswith(" own"):
+        return planner.removesuffix(" own"), "expected-time" if "cost" in planner else risk
+    return f"{planner.split()[0]} map", "time-cvar:0.5"
 
 
 def paper(run: Path) -> str:

@@ -277,43 +277,81 @@ def test_the_hypotheses_of_risk_on_the_cost_are_eight() -> None:
     assert own.maps == 200
 
 
+def table_of_arms(
+    part: str, arrived: dict[tuple[str, str], int], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> dict[tuple[str, str], list[str]]:
+    """Rows of a part where arms arrive on so many of 40 maps, in 30 s, and all others on 35, 2 s later."""
+
+    def conditions_in(name: str) -> list[Compared]:
+        found = []
+        for each in conditions(name, COST):
+            arm = (each.labels["planner"], each.labels["risk"])
+            success = np.arange(40) < arrived.get(arm, 35)
+            episodes = pd.DataFrame({
+                "seed": 3027, "realisation": 0, "map": range(40), "group": range(40), "success": success,
+                "total_time_s": np.where(success, 30.0 + 2 * (arm not in arrived), 90.0), "time_budget_s": 90.0,
+            })  # fmt: skip
+            found.append(Compared(labels=each.labels, value={}, maps=(), episodes=episodes))
+        return found
+
+    summary = [
+        {
+            **each.labels, "success_rate": each.episodes["success"].mean(), "success_low": 0.2, "success_high": 0.9,
+            "total_time_mean_s": each.episodes["total_time_s"].mean(), "planning_ms_median": 1.5,
+        }
+        for each in conditions_in(part)
+    ]  # fmt: skip
+    run = folder / f"cost-{part}"
+    run.mkdir()
+    pd.DataFrame(summary).to_csv(run / "summary.csv")
+    monkeypatch.setattr(tables, "open_run", lambda run: run)
+    monkeypatch.setattr(
+        tables, "read_conditions", lambda runs: conditions_in(runs[0].name.removeprefix("cost-"))
+    )
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tables.arms(run).splitlines()[2:]]
+    found = {(row[0], row[1]): row[2:] for row in rows}
+    assert len(rows) == len(found) == len(summary)
+    return found
+
+
 def test_the_table_of_arms_sets_each_beside_cvar_of_time_with_its_planner(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of 40 maps that of MPPI arrives on 20, that of A*+MPPI on 30, all others on 35, and 2 s later."""
-    arrived = {("mppi map", "time-cvar:0.5"): 20, ("astar_mppi map", "time-cvar:0.5"): 30}
-    compared, summary = [], []
-    for each in conditions("primary", COST):
-        arm = (each.labels["planner"], each.labels["risk"])
-        success = np.arange(40) < arrived.get(arm, 35)
-        took = np.where(success, 30.0 + 2 * (arm not in arrived), 90.0)
-        episodes = pd.DataFrame({
-            "seed": 3027, "realisation": 0, "map": range(40), "group": range(40), "success": success,
-            "total_time_s": took, "time_budget_s": 90.0,
-        })  # fmt: skip
-        compared.append(Compared(labels=each.labels, value={}, maps=(), episodes=episodes))
-        summary.append({
-            **each.labels, "success_rate": success.mean(), "success_low": 0.2, "success_high": 0.9,
-            "total_time_mean_s": took.mean(), "planning_ms_median": 1.5,
-        })  # fmt: skip
-    pd.DataFrame(summary).to_csv(tmp_path / "summary.csv")
-    monkeypatch.setattr(tables, "open_run", lambda run: run)
-    monkeypatch.setattr(tables, "read_conditions", lambda runs: compared)
-    rows = [
-        [cell.strip() for cell in line.split("|")[1:-1]] for line in tables.arms(tmp_path).splitlines()[2:]
-    ]
-    found = {(row[0], row[1]): row[2:] for row in rows}
-    assert len(rows) == len(found) == 17
+    base = {("mppi map", "time-cvar:0.5"): 20, ("astar_mppi map", "time-cvar:0.5"): 30}
+    found = table_of_arms("primary", base, tmp_path, monkeypatch)
     assert found["mppi map", "time-cvar:0.5"][:3] == ["50.0 (20–90)", "60.0", "1.5"]
-    assert (
-        found["mppi map", "time-cvar:0.5"][3:] == found["astar_mppi map", "time-cvar:0.5"][3:] == ["", "", ""]
-    )
+    assert all(found[arm][3:] == ["", "", ""] for arm in base)
     # All 5 maps that differ speak for an arm of A*+MPPI: 2 / 2⁵; after 8 smaller p of 15, Holm's factor is 7.
     for planner, points, least, most in (("mppi", "+37.5", 0, 0.01), ("astar_mppi", "+12.5", 0.42, 0.46)):
         gain, p, later = found[f"{planner} cost 0.8", "expected-time"][3:]
         assert gain.startswith(points)
         assert least <= float(p) <= most
         assert later.startswith("+2.0")
+
+
+def test_the_table_of_other_levels_compares_with_the_primary_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = {("mppi map", "time-cvar:0.5"): 20, ("astar_mppi map", "time-cvar:0.5"): 30}
+    found = table_of_arms("frontier", base, tmp_path, monkeypatch)
+    for (planner, _), row in found.items():
+        assert row[3].startswith("+12.5" if planner.startswith("astar") else "+37.5")
+
+
+def test_an_arm_with_its_own_time_to_go_stands_beside_itself_with_the_shared_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shared = {
+        ("mppi map", "cvar:0.8"): 20, ("mppi map", "time-cvar:0.5"): 25, ("astar_mppi map", "cvar:0.8"): 30,
+        ("astar_mppi map", "time-cvar:0.5"): 32, ("mppi cost 0.8", "expected-time"): 33,
+    }  # fmt: skip
+    found = table_of_arms("own", shared, tmp_path, monkeypatch)
+    gains = {arm: row[3].split()[0] for arm, row in found.items()}
+    assert gains == {
+        ("mppi map own", "cvar:0.8"): "+37.5", ("mppi map own", "time-cvar:0.5"): "+25.0",
+        ("astar_mppi map own", "cvar:0.8"): "+12.5", ("astar_mppi map own", "time-cvar:0.5"): "+7.5",
+        ("mppi cost 0.8 own", "time-cvar:0.5"): "+5.0",
+    }  # fmt: skip
 
 
 def test_own_time_to_go_is_all_that_differs() -> None:
