@@ -223,7 +223,7 @@ def test_a_solve_is_the_same_compiled_and_eager_alone_and_in_a_batch_on_one_thre
     maps = 0.35 + 0.6 * torch.rand(3, 24, 20, generator=generator())
     problem = factories.problem(maps, start=(1.25, 1.25), goal=(8.25, 9.25))
     monkeypatch.setattr(compilation, "worth_compiling", lambda *_: compiled)
-    few, short = MPPIConfig(samples=300, horizon_s=1), AStarDWAConfig(dwa=DWAConfig(horizon_s=1))
+    few, short = MPPIConfig(samples=300, horizon_s=0.4), AStarDWAConfig(dwa=DWAConfig(horizon_s=0.4))
     found: dict[tuple[bool, int, int], torch.Tensor] = {}
     threads = torch.get_num_threads()
     for compiled in (False, True):
