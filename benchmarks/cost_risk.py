@@ -110,7 +110,7 @@ def main() -> None:
     data = (given.maps_in / "stakes-v1-seed1.h5").resolve()
     os.chdir(Path(__file__).parents[1])  # where the shipped checkpoints are
     table = Table(
-        "level", "fields", "fresh less own [s] (95 % interval)", "of the actions before", "ms a solve"
+        "level", "fields", "fresh less own, s (95 % interval)", "of the actions before", "ms a solve"
     )
     with one_thread():
         problem = problem_of(data, given.maps)
