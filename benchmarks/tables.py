@@ -36,7 +36,7 @@ from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.run_folder import EPISODES, open_run
 from benchnav.eval.report.write import read_report
 from benchnav.eval.stats.comparison import compare
-from benchnav.eval.stats.pairs import Compared, Pair, find_pairs, side_by_side
+from benchnav.eval.stats.pairs import Compared, Pair, check_maps, find_pairs, side_by_side
 from benchnav.eval.stats.summary import wilson_interval
 
 # MPPI under CVaR at 0.9; Endo, Honda and Ishigami (2024), Table I: success, mean and standard deviation of T_total.
@@ -126,6 +126,7 @@ def arms(run: Path) -> str:
     for (planner, risk), one in own.items():
         other = known[_compared_with(planner, risk)]
         if one is not other:  # two that may differ in planner and risk setting alike
+            check_maps(one, other, f"{planner} and {other.labels['planner']}")
             both = side_by_side(one.episodes, other.episodes, _MEASURES)
             pairs[planner, risk] = Pair(one=planner, other=other.labels["planner"], shared={}, episodes=both)
     compared = dict(zip(pairs, compare(list(pairs.values())).to_dict("records"), strict=True))

@@ -412,14 +412,14 @@ def test_with_entrapment_it_keeps_off_ground_that_holds(cost: bool) -> None:
     problem = trap()
     if cost:
         problem = replace(problem, fields=Given(problem.risk_map[:, None], []))
-    held = []
-    for entrapment in (False, True):
-        config = replace(SMALL, samples=512, horizon_s=3.0, entrapment=entrapment)
-        planner = MPPI(replace(config, risk_on="cost", fields=1) if cost else config)
-        held.append(sum(longest_held(planner, problem, seed) for seed in range(2)))
-    # Samples are few, so that a robot may cut the corner of the soft ground, for up to 18 steps of 53 in trials.
-    assert held[1] < held[0] / 2
-    assert held[0] > 80
+    for seed in range(2):
+        held = []
+        for entrapment in (False, True):
+            # With 3 s a robot cuts the corner of the soft ground under some seeds.
+            config = replace(SMALL, samples=512, horizon_s=4.0, entrapment=entrapment)
+            planner = MPPI(replace(config, risk_on="cost", fields=1) if cost else config)
+            held.append(longest_held(planner, problem, seed))
+        assert held[1] < 10 <= held[0]
 
 
 def test_a_robot_remembers_for_how_long_it_was_held() -> None:
