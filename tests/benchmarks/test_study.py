@@ -24,6 +24,7 @@ from benchmarks.study import (
     power_of,
     suite_of,
 )
+from benchnav.core.errors import ConfigError
 from benchnav.core.settings import of, read
 from benchnav.datagen import TerrainDataset
 from benchnav.eval.experiment.condition import Condition, conditions_of
@@ -278,9 +279,16 @@ def test_the_hypotheses_of_risk_on_the_cost_are_eight() -> None:
 
 
 def table_of_arms(
-    part: str, arrived: dict[tuple[str, str], int], folder: Path, monkeypatch: pytest.MonkeyPatch
+    part: str,
+    arrived: dict[tuple[str, str], int],
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    other_maps: str = "",
 ) -> dict[tuple[str, str], list[str]]:
-    """Rows of a part where arms arrive on so many of 40 maps, in 30 s, and all others on 35, 2 s later."""
+    """Rows of a part where arms arrive on so many of 40 maps, in 30 s, and all others on 35, 2 s later.
+
+    Planners of `other_maps` drove on maps with other digests.
+    """
 
     def conditions_in(name: str) -> list[Compared]:
         found = []
@@ -291,7 +299,9 @@ def table_of_arms(
                 "seed": 3027, "realisation": 0, "map": range(40), "group": range(40), "success": success,
                 "total_time_s": np.where(success, 30.0 + 2 * (arm not in arrived), 90.0), "time_budget_s": 90.0,
             })  # fmt: skip
-            found.append(Compared(labels=each.labels, value={}, maps=(), episodes=episodes))
+            digest = "b" if each.labels["planner"] == other_maps else "a"
+            maps = tuple(f"{digest}{place}" for place in range(40))
+            found.append(Compared(labels=each.labels, value={}, maps=maps, episodes=episodes))
         return found
 
     summary = [
@@ -327,6 +337,13 @@ def test_the_table_of_arms_sets_each_beside_cvar_of_time_with_its_planner(
         assert gain.startswith(points)
         assert least <= float(p) <= most
         assert later.startswith("+2.0")
+
+
+def test_the_table_of_arms_refuses_an_arm_on_other_maps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ConfigError, match=r"same maps, got mppi cost 0\.8 and mppi map,"):
+        table_of_arms("primary", {}, tmp_path, monkeypatch, other_maps="mppi cost 0.8")
 
 
 def test_the_table_of_other_levels_compares_with_the_primary_run(
