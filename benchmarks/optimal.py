@@ -27,7 +27,6 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent, Unit, units
 from benchnav.eval.run.unit import Built, Settings, build, one_thread, simulate
 from benchnav.planning.free_space import Immobile
-from benchnav.planning.planners.optimal.value import UNREACHED
 from benchnav.planning.planners.optimal.ways import ways_from
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
@@ -56,7 +55,7 @@ def cost_from_start(problem: Problem, planner: str, **options: Any) -> tuple[np.
     state = made.init(problem, rng.generator(0))
     took = time.perf_counter() - begun
     cost = ways_from(problem.start, state.held, state).cost.min(1).values.double().numpy()
-    return np.where(cost < UNREACHED / 2, cost, np.inf), took / len(problem)
+    return np.where(cost < made.no_way(state.costs).double().numpy(), cost, np.inf), took / len(problem)
 
 
 def grid_table(problem: Problem) -> tuple[Table, list[tuple[np.ndarray, np.ndarray]]]:

@@ -61,8 +61,8 @@ def find_chains(conditions: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
         ]
         for optimal in like(value, ("planner",), planner=OPTIMAL):
             told = [like(values[optimal], ("model",), model=one) for one in _MODELS]
-            if all(told) and bounds:
-                chains.append([condition, optimal, *(found[0] for found in told), bounds[0]])
+            if all(told):
+                chains += [[condition, optimal, *(found[0] for found in told), bound] for bound in bounds]
     return chains
 
 

@@ -42,7 +42,13 @@ from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.cost_risk import advance_held, framed_fields, tail_cost, within_reach
 from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank, perturb
 from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
-from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
+from benchnav.planning.problem import (
+    Problem,
+    Task,
+    motion_traversability,
+    stage_cost,
+    terminal_cost,
+)
 from benchnav.planning.robots import Robot, component_wise, steps_in
 from benchnav.planning.sensing.sensor import Step
 
@@ -71,7 +77,8 @@ class MPPIConfig:
         temperature: the same in the units of J, in place of `temperature_share`; λ in the source.
         control_cost: weight γ of the information-theoretic control cost γ·uᵀΣ⁻¹ε; 0 takes the current mean
             itself as the base distribution (α = 1 in the source), the value of `temperature` takes 0 (α = 0).
-        risk_on: `map`, rollouts are on λ̂; `cost`, on fields of λ, and λ̂ tells free ground alone.
+        risk_on: `map`, rollouts are on λ̂; `cost`, on fields of λ, and λ̂ tells which ground is free where the rules
+            ask it.
         level: α of the CVaR of the cost, in [0, 1); at 0 its mean.
         fields: M, on which each sequence is rolled out; at least 10 in the tail, M ≥ 10 / (1 − α), where α > 0.
         once: draws fields once for a map as it is known, not anew at each step.
@@ -106,9 +113,10 @@ class MPPIConfig:
         expect(fits, f"`noise` > 0 for each action of MPPI, got {self.noise}.")
         expect(self.risk_on in ("map", "cost"), f"`risk_on` 'map' or 'cost' for MPPI, got {self.risk_on!r}.")
         expect(0 <= self.level < 1, f"`level` in [0, 1) for MPPI, got {self.level}.")
+        alone = self.level == 0 and not self.once and self.fields == MPPIConfig.fields
         expect(
-            self.risk_on == "cost" or (self.level == 0 and not self.once),
-            "`risk_on: cost` for `level` and `once` of MPPI, got 'map', whose risk is that of the risk setting.",
+            self.risk_on == "cost" or alone,
+            "`risk_on: cost` for `level`, `fields` and `once` of MPPI, got 'map', whose risk is the risk setting's.",
         )
         known = "objective", "map", "expected-time"
         expect(
@@ -178,6 +186,19 @@ class MPPI(LocalPlanner[MPPIState]):
         )
         verdicts = (rolled, self._weigh.compiled)
         return None if None in verdicts else all(verdicts)
+
+    def follows(self, task: Task) -> str:
+        """What it minimises where that is not J alone; see `Planner`."""
+        config, found = self.config, []
+        if config.risk_on == "cost":
+            tail = f"CVaR {config.level:g} of J" if config.level else "mean of J"
+            found.append(f"{tail} over {config.fields} fields of λ")
+        if config.entrapment:
+            found.append("immobilised rollouts pay the rest of the time")
+        if config.cost_to_go != "objective":
+            known = "λ̂" if config.cost_to_go == "map" else "expected-time"
+            found.append(f"the last state pays A*'s cost to go under {known}")
+        return ", ".join(found if config.risk_on == "cost" or not found else ["J", *found])
 
     def init(self, problem: Problem, generator: torch.Generator) -> MPPIState:
         """Starts from a standing robot; see `Planner`.
@@ -377,38 +398,39 @@ def weigh(
         paths = astar.cost_at(grid, to_go, together[..., 0], together[..., 1])
         last = paths.view_as(cost) + PENALTY * (ground <= 0)
     cost = cost + (last if going is None else torch.where(going, last, 0))
-    if fields > 1:
-        cost = tail_cost(cost.unflatten(0, (-1, fields)), level)
+    each = cost.unflatten(0, (-1, fields))
+    cost = tail_cost(each, level) if fields > 1 else cost
     scale: Tensor | float | None = temperature
     if scale is None:
         stopped = None if going is None else (~going).unflatten(0, (-1, fields)).sum(1)
-        # What a step on one field adds to the cost, where it counts.
-        penalty = PENALTY / max(1.0, (1 - level) * fields)
-        scale = temperature_share * cost_spread(cost, penalty, stopped)
+        scale = temperature_share * cost_spread(cost, each, stopped)
     weights = torch.softmax((cost.amin(dim=1, keepdim=True) - cost) / scale, dim=1)
     return weights, average(mean, noise, weights, low, high)
 
 
-def cost_spread(cost: Tensor, penalty: float = PENALTY, stopped: Tensor | None = None) -> Tensor:
+def cost_spread(cost: Tensor, each: Tensor | None = None, stopped: Tensor | None = None) -> Tensor:
     """How far the costs of samples lie above the least, on average: the unit of the relative temperature.
 
-    Samples that pay the penalty of ground that is not free for more steps than the best does are left out: else the
-    temperature near such ground would be that of the penalty, and all ways over free ground would count alike. They
-    are told by an excess of half the penalty, so J itself should spread less, as the penalty of such ground asks too.
-    Left out for the same reason are samples that stop for good on more fields than the best does.
+    Samples that pay the penalty of ground that is not free for more steps than the best does, of all fields together,
+    are left out: else the temperature near such ground would be that of the penalty, and all ways over free ground
+    would count alike. Steps are told by the cost on each field, in penalties, so J itself should spread by less than
+    half of one, as the penalty of such ground asks too. Left out for the same reason are samples that stop for good on
+    more fields than the best does.
 
     Args:
         cost: shape [B, K].
-        penalty: what a step on ground that is not free adds to the cost.
+        each: on each field, shape [B, M, K]; None where that is the cost itself.
         stopped: on how many fields a sample stops, shape [B, K]; None where none does.
 
     Returns:
         More than 0, shape [B, 1].
     """
-    excess = cost - cost.amin(dim=1, keepdim=True)
-    counted = excess < 0.5 * penalty
+    each, best = cost[:, None] if each is None else each, cost.argmin(dim=1, keepdim=True)
+    more = each - each.gather(2, best[:, None].expand(-1, each.shape[1], -1))
+    counted = (more / PENALTY + 0.5).floor().sum(1) <= 0
     if stopped is not None:
-        counted = counted & (stopped <= stopped.gather(1, cost.argmin(1, keepdim=True)))
+        counted = counted & (stopped <= stopped.gather(1, best))
+    excess = cost - cost.amin(dim=1, keepdim=True)
     spread = torch.where(counted, excess, 0).sum(dim=1, keepdim=True) / counted.sum(dim=1, keepdim=True)
     return spread.clamp(min=_LEAST_SPREAD)
 

@@ -90,6 +90,16 @@ def test_where_entry_counts_as_loss_it_is_no_bound() -> None:
     assert find_chains({**known, bound: cheap}) == []
 
 
+def test_each_of_two_bounds_ends_a_chain() -> None:
+    known = conditions(episodes())
+    bound = name_of("optimal_bound", "clairvoyant", "–")
+    finer = {"planner": {"part": "optimal_bound", "options": {"refine": 2}}}
+    fine = {**known[bound], "value": {**known[bound]["value"], **finer}}
+    one, other = find_chains({**known, "fine": fine})
+    assert one[:-1] == other[:-1]
+    assert (one[-1], other[-1]) == (bound, "fine")
+
+
 def test_risk_settings_have_chains_of_their_own_and_share_the_bound() -> None:
     rows = pd.concat([episodes(), episodes(risk="mean")]).drop_duplicates(["condition", "map"])
     chains = find_chains(conditions(rows))

@@ -10,6 +10,7 @@ import torch
 import torch._dynamo.config
 import torch._inductor.config
 
+from benchnav.planning.free_space import Immobile
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners import compilation
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig
@@ -17,6 +18,7 @@ from benchnav.planning.planners.astar.dwa import DWAConfig
 from benchnav.planning.planners.compilation import Fused, worth_compiling
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig
 from benchnav.planning.robots import Unicycle
+from benchnav.planning.sensing.belief import Fields, Law, Static
 from tests import factories
 from tests.planning.planners.driving import first, generator
 
@@ -193,6 +195,30 @@ def test_compiled_and_eager_planners_agree(monkeypatch: pytest.MonkeyPatch) -> N
     action, state, _ = other.plan(first(problem), other.init(problem, generator()))
     assert other.compiled is True
     assert torch.equal(action, actions[1][:, :2])
+
+
+def test_compiled_and_eager_rollouts_on_fields_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With risk on the cost, rollouts that stop for good, and A*'s cost to go."""
+    maps = 0.02 + 0.9 * torch.rand(2, 16, 20, generator=generator())
+    known = factories.normal(maps, torch.full_like(maps, 0.05))
+    belief = Static()
+    source = Fields(
+        belief, belief.init(known, Law(grid=factories.problem(maps).grid, correlation_m=1.0)), (7, 3)
+    )
+    problem = replace(
+        factories.problem(maps), distribution=known, fields=source, immobile=Immobile(below=0.3, for_s=0.2)
+    )
+    config = MPPIConfig(
+        samples=64, horizon_s=0.4, risk_on="cost", level=0.5, fields=20, entrapment=True, cost_to_go="map"
+    )
+    actions = []
+    for worth in (False, True):
+        monkeypatch.setattr(compilation, "worth_compiling", lambda *_, worth=worth: worth)
+        planner = MPPI(config)
+        action, state, _ = planner.plan(first(problem), planner.init(problem, generator()))
+        actions.append(torch.cat((action, state.mean.flatten(1)), dim=1))
+        assert planner.compiled is worth
+    torch.testing.assert_close(actions[0], actions[1], atol=1e-4, rtol=1e-4)
 
 
 def test_a_unit_of_three_episodes_and_one_of_twenty_agree_on_compiling() -> None:

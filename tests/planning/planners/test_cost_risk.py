@@ -1,6 +1,7 @@
 import math
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise, product
 from typing import Any
 
 import pytest
@@ -12,13 +13,22 @@ from torch import Tensor
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.store import text_digest
 from benchnav.planning.free_space import PENALTY, Immobile
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners import compilation
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConfig
 from benchnav.planning.planners.cost_risk import advance_held, framed_fields, tail_cost, within_reach
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, cost_spread, roll_out, weigh
+from benchnav.planning.planners.mppi import (
+    MPPI,
+    MPPIConfig,
+    MPPIState,
+    advance_chunk,
+    cost_spread,
+    roll_out,
+    weigh,
+)
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.belief import Fields, Law, Static
@@ -128,6 +138,44 @@ def test_what_a_sequence_costs_is_the_tail_over_all_fields(level: float) -> None
     moved = (noise[0].double() * weights[:, None]).sum(-1)
     wanted = moved.clamp(*(bound.double() for bound in problem.action_bounds))
     torch.testing.assert_close(action.double(), wanted, atol=2e-4, rtol=1e-3)
+
+
+def test_the_tail_over_drawn_fields_is_that_over_all_that_there_are() -> None:
+    """Three cells on the way have one of two λ each: eight fields, whose costs and chances are enumerated."""
+    count, chance = 200, torch.tensor([0.3, 0.5, 0.2])
+    posed = factories.problem(torch.ones(1, 4, 10), start=(0.75, 1.25), goal=(4.25, 1.25))
+    weights, means = torch.zeros(1, 2, 4, 10), torch.ones(1, 2, 4, 10)
+    weights[:, 1] = 1.0
+    weights[0, :, :, 2:5] = torch.stack((chance, 1 - chance))[:, None]
+    means[0, 0, :, 2:5] = 0.3
+    known = TraversabilityMixture(weights, means, torch.zeros_like(means))
+    belief = Static(correlated=False)
+    source = Fields(belief, belief.init(known, Law(grid=posed.grid, correlation_m=1.0)), (7,))
+    posed = replace(posed, distribution=known, fields=source)
+    plan_state = MPPI(replace(SMALL, samples=16)).init(posed, generator())
+    noise = plan_state.noise.at(0)
+
+    def costs_on(fields: Tensor) -> Tensor:
+        ground = framed_fields(posed, fields[None])
+        return roll_out(posed, posed.start, plan_state.mean, noise, posed.goal_m, advance_chunk, ground)[
+            1
+        ].double()
+
+    slow = torch.tensor(list(product((True, False), repeat=3)))
+    all_fields = torch.ones(8, 4, 10)
+    all_fields[:, :, 2:5] = torch.where(slow, 0.3, 1.0)[:, None]
+    cost, chances = costs_on(all_fields), torch.where(slow, chance, 1 - chance).prod(1).double()
+    order = cost.argsort(0, descending=True)
+    share = chances[:, None].expand_as(cost).gather(0, order)
+    drawn = costs_on(posed.sample_fields(count, 5)[0])
+    tails = []
+    for level in (0.0, 0.5, 0.8):
+        counted = (1 - level - (share.cumsum(0) - share)).clamp(min=0).minimum(share)
+        wanted = (counted * cost.gather(0, order)).sum(0) / (1 - level)
+        error = drawn.std(0) / math.sqrt((1 - level) * count)
+        assert bool(((tail_cost(drawn[None], level)[0] - wanted).abs() <= 4 * error + 1e-4).all())
+        tails.append(wanted)
+    assert all(float((more - less).max()) > 0.1 for less, more in pairwise(tails))
 
 
 def test_fields_are_drawn_anew_at_each_step_and_once_if_that_is_asked_for() -> None:
@@ -352,9 +400,9 @@ def test_rollouts_that_have_stopped_have_no_last_cost() -> None:
 
 def test_a_step_off_free_ground_on_one_field_does_not_set_the_temperature() -> None:
     """The spread is that of the samples that have no such step, however little it adds to the cost of M fields."""
-    cost = torch.tensor([[3.0, 1.0, 2.0, 101.0]])[:, None].repeat(1, 20, 1)
+    cost = torch.tensor([[3.0, 1.0, 2.0, 901.0]])[:, None].repeat(1, 20, 1)
     cost[:, 4, 2] += PENALTY
-    wanted = (2.0 + 0.0 + 100.0) / 3  # what is not a penalty counts, however much it is
+    wanted = (2.0 + 0.0 + 900.0) / 3  # what is not a penalty counts, however much it is
     for level in (0.0, 0.5):
         tail = tail_cost(cost, level)
         assert float(tail[0, 2]) == pytest.approx(2.0 + PENALTY / (20 * (1 - level)))
@@ -371,8 +419,8 @@ def test_a_step_off_free_ground_on_one_field_does_not_set_the_temperature() -> N
 
 def test_samples_that_are_held_on_more_fields_than_the_best_do_not_set_the_temperature() -> None:
     cost = torch.tensor([[3.0, 1.0, 80.0, 2.0]])
-    assert float(cost_spread(cost, PENALTY, torch.tensor([[1, 1, 3, 0]]))) == pytest.approx(1.0)
-    assert float(cost_spread(cost, PENALTY)) == pytest.approx((2 + 0 + 79 + 1) / 4)
+    assert float(cost_spread(cost, stopped=torch.tensor([[1, 1, 3, 0]]))) == pytest.approx(1.0)
+    assert float(cost_spread(cost)) == pytest.approx((2 + 0 + 79 + 1) / 4)
     problem = varied(1)
     states = torch.cat((problem.goal_m[:, None].repeat(2, 4, 1), torch.zeros(2, 4, 1)), 2)
     going = torch.ones(2, 4, dtype=torch.bool)
@@ -444,6 +492,7 @@ def test_a_robot_remembers_for_how_long_it_was_held() -> None:
         ({"risk_on": "cost", "level": 1.0}, "`level` in"),
         ({"level": 0.5}, "`risk_on: cost` for `level`"),
         ({"once": True}, "`risk_on: cost` for `level`"),
+        ({"fields": 128}, "`risk_on: cost` for `level`, `fields`"),
         ({"risk_on": "cost", "level": 0.8, "fields": 49}, "= 50 for MPPI, got 49"),
         ({"risk_on": "cost", "fields": 0}, "`fields` > 0"),
     ],
@@ -451,6 +500,28 @@ def test_a_robot_remembers_for_how_long_it_was_held() -> None:
 def test_risk_that_cannot_be_told_is_refused(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         replace(SMALL, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, ""),
+        ({"risk_on": "cost", "level": 0.8, "fields": 128}, "CVaR 0.8 of J over 128 fields of λ"),
+        ({"risk_on": "cost"}, "mean of J over 64 fields of λ"),
+        ({"entrapment": True}, "J, immobilised rollouts pay the rest of the time"),
+        ({"cost_to_go": "map"}, "J, the last state pays A*'s cost to go under λ̂"),
+        (
+            {"risk_on": "cost", "cost_to_go": "expected-time"},
+            "mean of J over 64 fields of λ, the last state pays A*'s cost to go under expected-time",
+        ),
+    ],
+)
+def test_it_says_what_it_minimises_in_place_of_the_objective(changes: dict[str, Any], words: str) -> None:
+    config, task = replace(SMALL, **changes), factories.task(objective=TravelTime(Unicycle(), 1.0))
+    assert MPPI(config).follows(task) == words
+    guided = AStarMPPI(AStarMPPIConfig(mppi=config))
+    assert guided.follows(task) == (words and f"J (A*), {words} (MPPI)")
+    assert guided.follows(factories.task()) == f"3D path length (A*), {words or 'J'} (MPPI)"
 
 
 def test_its_defaults_move_no_id_and_others_do() -> None:

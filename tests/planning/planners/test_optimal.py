@@ -15,7 +15,13 @@ from benchnav.planning.planners.optimal.optimal import (
     OptimalBoundConfig,
     OptimalConfig,
 )
-from benchnav.planning.planners.optimal.value import UNREACHED, Moves, headings_of
+from benchnav.planning.planners.optimal.value import (
+    UNREACHED,
+    Moves,
+    _arcs,
+    _held_after,
+    headings_of,
+)
 from benchnav.planning.planners.optimal.ways import path_of, ways_from
 from benchnav.planning.planners.planner import PlanStatus
 from benchnav.planning.problem import Problem
@@ -226,6 +232,49 @@ def test_between_two_bars_the_time_held_is_over() -> None:
     )
     wanted = (7 - 1.0) / 0.9 + 2 * 0.5 / 0.08
     assert float(time_to_go(OptimalBound(), posed)) == pytest.approx(wanted, rel=0.05)
+
+
+def wide_bar(for_s: float) -> Problem:
+    """A closed bar of three cells, on each of which a robot is 5.26 s."""
+    ground = torch.full((1, 24, 40), 0.9)
+    ground[:, :, 12:15] = 0.095
+    posed = problem(ground, (2.25, 6.25), (17.25, 6.25), time_budget_s=90.0)
+    return replace(posed, immobile=Immobile(below=0.1, for_s=for_s), distribution=factories.certain(ground))
+
+
+@pytest.mark.parametrize(("for_s", "crosses"), [(12.0, False), (14.0, False), (18.0, True), (20.0, True)])
+def test_over_several_cells_the_time_held_adds_up(for_s: float, crosses: bool) -> None:
+    posed, planner = wide_bar(for_s), OptimalBound()
+    state = planner.init(posed, generator())
+    found = float(ways_from(posed.start, state.held, state).cost.min())
+    _, _, plan = planner.plan(first(posed), state)
+    assert plan.status.tolist() == [PlanStatus.OK if crosses else PlanStatus.FAILED]
+    if crosses:
+        assert found == pytest.approx((14 - 1.5) / 0.9 + 1.5 / 0.095, rel=0.02)
+    else:
+        assert found > 90
+
+
+def test_a_turn_on_ground_that_holds_adds_a_level_however_short() -> None:
+    """On a map of such ground alone a robot is lost after as many turns as there are levels."""
+    posed = wide_bar(20.0)
+    costs = OptimalBound().init(posed, generator()).costs
+    moves = Moves.of(Unicycle(), 0.5, 32)
+    everywhere = replace(costs, holds_s=torch.full_like(costs.rate, 1 / 0.095), final=costs.final * torch.nan)
+    turn = next(arc for arc in _arcs(moves, posed.grid, 32, costs.rate) if not arc.metres)
+    after = _held_after(everywhere, turn)[0, :, 0, 0, 0]
+    assert turn.seconds / 0.095 < 20 / 5
+    assert after.tolist() == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("levels", [1, 2, 3, 4, 5])
+def test_there_are_as_many_levels_as_are_asked_for(levels: int) -> None:
+    planner = OptimalBound(OptimalBoundConfig(levels=levels))
+    assert planner.init(wide_bar(4.0), generator()).value.shape[1] == levels
+    with pytest.raises(
+        ConfigError, match=rf"at most {5 * levels:g} s for {levels} `levels` of planner 'optimal_bound'"
+    ):
+        planner.init(wide_bar(5 * levels + 0.1), generator())
 
 
 def test_a_robot_that_was_held_has_less_time_left() -> None:

@@ -81,10 +81,11 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         return self.local.compiled
 
     def follows(self, task: Task) -> str:
-        """What A* minimises where that is the length of the path and not J; see `Planner`."""
+        """What A* and the local planner minimise where that is not J alone; see `Planner`."""
+        own = self.local.follows(task)
         if isinstance(task.objective, GoalDistance) or not has_path_cost(task.objective):
-            return f"3D path length (A*), J ({self.local.name})"
-        return ""
+            return f"3D path length (A*), {own or 'J'} ({self.local.name})"
+        return own and f"J (A*), {own} ({self.local.name})"
 
     def remarks(self, task: Task) -> tuple[str, ...]:
         """Says what a path costs where J does not, and where no risk setting moves the path; see `Planner`."""

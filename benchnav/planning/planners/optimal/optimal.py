@@ -140,7 +140,7 @@ class Optimal(Planner[OptimalState]):
         low, high = problem.action_bounds
         drives = ways.rolls[own, best] | (rate.abs() <= high[1])
         action = torch.stack((torch.where(drives, high[0], 0.0), rate.clamp(low[1], high[1])), 1)
-        status = PlanStatus.FAILED * (cost >= UNREACHED / 2).long()
+        status = PlanStatus.FAILED * (cost >= self.no_way(plan_state.costs)).long()
         drawn = {"path": path_of(plan_state, pose, held)} if step.draw else {}
         plan = replace(Plan.empty(len(held), held.device, **drawn), status=status)
         return action, replace(plan_state, held=held), plan
@@ -159,6 +159,10 @@ class Optimal(Planner[OptimalState]):
             f"Expected a map that stays what it is for planner {self.name!r}, which plans once, got one that changes. "
             "Take belief 'static' and sensor 'full'."
         )
+
+    def no_way(self, costs: Costs) -> Tensor:
+        """Cost from which on there is no way, shape [B]."""
+        return torch.full_like(costs.loss, UNREACHED / 2)
 
     def costs_of(self, problem: Problem, grid: Grid) -> Costs:
         """What driving costs, on the cells of value iteration."""
@@ -196,6 +200,10 @@ class OptimalBound(Optimal):
         """What it minimises; see `Planner`."""
         return "time on λ itself"
 
+    def no_way(self, costs: Costs) -> Tensor:
+        """The time limit, as the value of where there is no way reaches into cells beside it; see `Optimal`."""
+        return costs.loss
+
     def costs_of(self, problem: Problem, grid: Grid) -> Costs:
         """What driving costs; see `Optimal`."""
         known, immobile = problem.distribution, problem.immobile
@@ -209,6 +217,12 @@ class OptimalBound(Optimal):
         holds = torch.zeros_like(problem.free) if immobile is None else field < immobile.below
         if immobile is None or self.config.levels == 0:
             return _on_grid(problem, grid, torch.where(holds, UNREACHED, rate), ~holds)
+        most_s = self.config.levels * grid.resolution_m / (problem.robot.top_speed_mps * immobile.below)
+        expect(
+            immobile.for_s <= most_s,
+            f"`immobile.for_s` of at most {most_s:g} s for {self.config.levels} `levels` of planner {self.name!r}, "
+            f"each no longer than a cell of λ = {immobile.below:g} takes, got {immobile.for_s:g}.",
+        )
         costs = _on_grid(problem, grid, rate, ~holds, holds_s=torch.where(holds, rate, 0.0))
         return replace(costs, held_s=immobile.for_s, levels=self.config.levels)
 

@@ -108,8 +108,9 @@ class Costs(Batch):
     levels: int = 1
 
     def level(self, held: Tensor) -> Tensor:
-        """Level of a time held, int64, of the same shape."""
-        return (held / self.held_s * self.levels + 1e-6).floor().long().clamp(0, self.levels - 1)
+        """Nearest level of a time held, at least 1 where there is any, int64, of the same shape; L is lost."""
+        nearest = (held / self.held_s * self.levels + 0.5).floor().long()
+        return torch.where(held > 0, nearest.clamp(1, self.levels), 0)
 
 
 def value_iteration(costs: Costs, moves: Moves, grid: Grid, headings: int) -> Tensor:
@@ -233,9 +234,10 @@ def _held_after(costs: Costs, arc: _Arc) -> Tensor:
     (size, height, width), reach = costs.holds_s.shape, arc.reach
     headings, step = len(arc.ends), arc.seconds / _POINTS
     around = pad(costs.holds_s[:, None], (reach,) * 4)[:, 0]
-    start = torch.arange(costs.levels, device=around.device) * (costs.held_s / costs.levels)
-    held = start[None, :, None, None, None].to(around).expand(size, -1, headings, height, width).clone()
-    lost = torch.zeros_like(held, dtype=torch.bool)
+    before = torch.arange(costs.levels, device=around.device)[None, :, None, None, None]
+    start = before.to(around) * (costs.held_s / costs.levels)
+    held = start.expand(size, -1, headings, height, width).clone()
+    lost, whole = (torch.full_like(held, value, dtype=torch.bool) for value in (False, True))
     for rows, columns in arc.points:
         seconds = step * torch.stack(
             [
@@ -246,4 +248,7 @@ def _held_after(costs: Costs, arc: _Arc) -> Tensor:
         )
         held = torch.where(seconds[:, None] > 0, held + seconds[:, None], 0.0)
         lost |= held >= costs.held_s
-    return torch.where(lost, costs.levels, costs.level(held))
+        whole &= seconds[:, None] > 0
+    # A move that is all on such ground adds a level: else the time of short ones would never add up.
+    level = torch.maximum(costs.level(held), torch.where(whole, before + 1, 0))
+    return torch.where(lost, costs.levels, level)

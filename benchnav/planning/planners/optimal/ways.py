@@ -187,6 +187,7 @@ def _cost(
             now = torch.where(seconds > 0, now + seconds, 0.0)
             lost = lost | (now >= costs.held_s)
         level = costs.level(now)
+        lost, level = lost | (level == costs.levels), level.clamp(max=costs.levels - 1)
     to_go = _value_at(plan_state.value, level, heading, cells)
     if costs.hazard is not None:
         _, along = read(costs.hazard, 0.0)
