@@ -9,9 +9,9 @@
 `knowledge` is docs/studies/knowledge.md: `primary` holds the hypotheses; `known` and `known-mppi` are part A, `near`
 part B, `sensitivity` and `kernel` part C, `seen` has old maps, `nugget` maps to develop on. `cost` is risk on the
 cost: `levels` drives each arm at each level on maps to develop on, `primary` holds the hypotheses, `frontier` the
-levels that these leave out, `own` another time to go, and `best` the optimal planners. Parts are suites of
-docs/knowledge and docs/cost, each with a run of its own. Maps and runs lie in the folders `--maps_in` and `--out`, and
-`--maps` takes the first maps alone, to try it.
+levels that these leave out and `own` another time to go, both and `primary` once more with `--maps 50 --out
+runs/first50`, and `best` the optimal planners. Parts are suites of docs/knowledge and docs/cost, each with a run of its
+own. Maps and runs lie in the folders `--maps_in` and `--out`, and `--maps` takes the first maps alone, to try it.
 """
 
 import argparse
@@ -29,6 +29,7 @@ import numpy as np
 import pandas as pd
 import yaml
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from scipy.stats import norm
 
 from benchnav.core.figures import (
@@ -263,7 +264,7 @@ def knowledge_figure(summary: pd.DataFrame) -> Figure:
 def frontier_figure(summary: pd.DataFrame) -> Figure:
     """Success over the time to the goal, a line an arm through its levels, with 95 % intervals of success.
 
-    A panel a planner; in the row below rollouts are held.
+    A panel a planner; in the row below with entrapment. Marks grow with the level.
     """
     arms = [arm_of(row) for row in summary.to_dict("records")]
     rows = summary.assign(
@@ -273,33 +274,31 @@ def frontier_figure(summary: pd.DataFrame) -> Figure:
     panels = list(dict.fromkeys(rows["planner"]))
     figure = Figure(figsize=(TWO_COLUMNS_IN, 4.6), layout="constrained")
     axes = figure.subplots(2, len(panels), sharex="row", sharey=True, squeeze=False)
+    handles: dict[str, Line2D] = {}
     for (held, planner), panel in zip(product((False, True), panels), axes.flat, strict=True):
-        for place, (arm, away) in enumerate(ARMS.items()):
+        for place, arm in enumerate(ARMS):
             own = rows[(rows["planner"] == planner) & (rows["arm"] == arm) & (rows["held"] == held)]
             own = own.sort_values("level")
             middle, low, high = (100 * own[f"success_{end}"].to_numpy() for end in ("rate", "low", "high"))
             time_s = own["success_time_mean_s"].to_numpy()
+            looks = {"color": LINE_COLOURS[place], "marker": MARKERS[place]}
             panel.errorbar(
-                time_s, middle, yerr=[middle - low, high - middle], color=LINE_COLOURS[place], marker=MARKERS[place],
-                ms=4, lw=1.1, elinewidth=0.6, capsize=1.5, label=arm,
+                time_s, middle, yerr=[middle - low, high - middle], color=LINE_COLOURS[place], lw=1.1, elinewidth=0.6,
+                capsize=1.5,
             )  # fmt: skip
-            for *at, level in zip(time_s, middle, own["level"], strict=True):
-                panel.annotate(
-                    f"{level:g}", at, away, textcoords="offset points", size=6, color=LINE_COLOURS[place],
-                    ha="center", va="center",
-                )  # fmt: skip
-        panel.set_title(f"{planner}, rollouts that are held" if held else planner)
+            panel.scatter(time_s, middle, s=(3 + 5 * own["level"]) ** 2, zorder=3, lw=0, **looks)
+            handles[arm] = Line2D([], [], ms=5, lw=1.1, label=arm, **looks)
+        panel.set_title(f"{planner}, entrapment" if held else planner)
         panel.grid(color="0.93")
     for panel in axes[-1]:
-        panel.set_xlabel("time to the goal [s]")
+        panel.set_xlabel("mean time of those that arrive [s]")
     for panel in axes[:, 0]:
         panel.set_ylabel("success [%]")
-    legend_outside(figure, columns=len(ARMS))
+    legend_outside(figure, list(handles.values()), len(ARMS))
     return figure
 
 
-# Of each arm where the number of its level stands, in points from its mark.
-ARMS = {"CVaR of λ": (-6, 4), "CVaR of time": (6, -5), "CVaR of the cost": (6, 5)}
+ARMS = ("CVaR of λ", "CVaR of time", "CVaR of the cost")
 # Of each planner of the study its name in the figure.
 FAMILIES = {"mppi": "MPPI", "astar_mppi": "A*+MPPI"}
 
@@ -324,8 +323,8 @@ def knowledge_report(out: Path) -> None:
 
 
 def cost_report(out: Path) -> None:
-    """Draws the frontiers."""
-    summaries = [out / f"cost-{part}" / "summary.csv" for part in ("primary", "frontier")]
+    """Draws the frontiers, of the runs that are on the first 50 maps alike."""
+    summaries = [out / "first50" / f"cost-{part}" / "summary.csv" for part in ("primary", "frontier")]
     _draw(summaries, frontier_figure, "risk-cost.png")
 
 

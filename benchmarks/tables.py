@@ -45,7 +45,7 @@ PAPER = {"std": (0.90, 52.7, 22.5), "hg": (0.80, 60.2, 26.1), "hs": (0.85, 58.6,
 
 _MEASURES = ("success", "total_time_s", "time_budget_s")
 
-_BLOCK = re.compile(r"^( *)<!-- (\w+) ([\w-]+) -->\n.*?<!-- end -->", re.DOTALL | re.MULTILINE)
+_BLOCK = re.compile(r"^( *)<!-- (\w+) ([\w/-]+) -->\n.*?<!-- end -->", re.DOTALL | re.MULTILINE)
 _BESIDE_RISK = ("data", "scenario", "world", "robot", "model", "sensor", "ground", "belief", "planner")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.collections import PathCollection
 from scipy.stats import norm
 
 from benchmarks import study, tables
@@ -238,11 +239,14 @@ def test_the_frontiers_have_a_line_an_arm_through_its_levels() -> None:
         })  # fmt: skip
     figure = frontier_figure(pd.DataFrame(rows))
     planners = ["MPPI", "A*+MPPI"]
-    titles = [*planners, *(f"{planner}, rollouts that are held" for planner in planners)]
+    titles = [*planners, *(f"{planner}, entrapment" for planner in planners)]
     assert [panel.get_title() for panel in figure.axes] == titles
     for panel in figure.axes:
-        assert [bars.get_label() for bars in panel.containers] == [*ARMS]
-        assert [text.get_text() for text in panel.texts] == 3 * ["0", "0.5", "0.8"]
+        assert len(panel.containers) == len(ARMS)
+        marks = [found for found in panel.collections if isinstance(found, PathCollection)]
+        assert [list(own.get_sizes()) for own in marks] == len(ARMS) * [[9.0, 30.25, 49.0]]
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == [*ARMS]
     for name, panel in (("mppi cost 0.8", figure.axes[0]), ("mppi cost 0.8 held", figure.axes[2])):
         own = next(row for row in rows if row["planner"] == name)
         line = panel.containers[-1].lines[0]
