@@ -59,7 +59,7 @@ def regret_figure(table: pd.DataFrame) -> Figure:
     handles = [
         Patch(color=ORANGE, label="the next is better"),
         Patch(color=BLUE, label="the next is worse"),
-        Patch(color=_ENDS, label="mean"),
+        Patch(color=_ENDS, label="of the first, of the bound"),
     ]
     legend_outside(figure, handles, 3)
     return figure
@@ -90,7 +90,8 @@ def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
         start, end = means[place - 1], means[place]
         better = difference > 0 if more_is_worse else difference < 0
         panel.barh(place, end - start, left=start, color=ORANGE if better else BLUE, **looks)
-        panel.plot([start - high, start - low], [place, place], color="black", lw=0.9)
+        ends = np.clip([start - high, start - low], 0, None if more_is_worse else factor)
+        panel.plot(ends, [place, place], color="black", lw=0.9)
         words = _signed(-difference)
         if low == low:  # of few maps there is no interval
             words += f" ({_signed(-high)} to {_signed(-low)})"
