@@ -56,6 +56,7 @@ def regret_figure(table: pd.DataFrame) -> Figure:
         line[0].set_title(f"{title}, {about['n_maps']} maps", loc="left")
     for panel, (label, *_) in zip(axes[-1], _MEASURES.values(), strict=True):
         panel.set_xlabel(label)
+        panel.set_xlim(left=0)
     handles = [
         Patch(color=ORANGE, label="the next is better"),
         Patch(color=BLUE, label="the next is worse"),
@@ -100,6 +101,7 @@ def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
         panel.plot([value, value], [place - 0.35, place + 1.35], color="0.5", lw=0.5)
     panel.grid(axis="x", color="0.93")
     panel.set_axisbelow(True)
+    panel.use_sticky_edges = False
     panel.tick_params(axis="y", length=0)
 
 
