@@ -4,7 +4,7 @@
 
 On λ fields of maps of `stakes-v1 --seed 1`, as the law draws them, which are given to the planners as they are
 (`clairvoyant`). The first table compares the time from start to goal with that at twice the resolution, and tells
-whether both find a way; then how much more the bound promises where ground that holds a robot counts as lost at once
+whether both find a way; then how much more the bound promises where immobilising ground counts as loss at once
 (`levels: 0`). The second drives the other planners on the same fields, which hold nobody: a planner is quicker where it
 takes less than the optimal planner by more than the difference to twice the resolution on that map.
 """

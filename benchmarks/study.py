@@ -304,7 +304,7 @@ FAMILIES = {"mppi": "MPPI", "astar_mppi": "A*+MPPI"}
 
 
 def arm_of(row: Mapping[Any, Any]) -> dict[str, Any]:
-    """Planner, arm and level of a condition, and whether its rollouts are held; other conditions have no arm."""
+    """Planner, arm and level of a condition, and whether it has entrapment; other conditions have no arm."""
     part, _, kind = row["planner"].partition(" ")
     name, _, level = row["risk"].partition(":")
     found = {"planner": FAMILIES.get(part, ""), "held": "held" in kind, "arm": "", "level": 0.0}

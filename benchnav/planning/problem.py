@@ -63,7 +63,7 @@ class Problem(Batch):
         goal_m: (x, y) of the goals, shape [B, 2].
         time_budget_s: T of each episode, shape [B].
         fields: draws whole fields of λ, whose cells hang together; see `sample_fields`.
-        immobile: what the world holds robots by, which planners may plan for; None for nothing.
+        immobile: what immobilises robots in the world, which planners may plan for; None for nothing.
     """
 
     task: Task
@@ -265,7 +265,7 @@ def pose_problem(
         time_budget_s: T, of all or of each, shape [B].
         free: free ground, but for that at the goal, bool, shape [B, H, W]; None for what the rules make of λ̂.
         fields: draws whole fields of λ; None where nobody asks for them.
-        immobile: what the world holds robots by; None for nothing.
+        immobile: what immobilises robots in the world; None for nothing.
     """
     rules = task.rules
     free = rules.free(risk_map, distribution) if free is None else free

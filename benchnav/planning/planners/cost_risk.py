@@ -2,7 +2,7 @@
 
 A risk map tells each cell's risk on its own. What a way costs adds up over cells that hang together, and its tail is
 that of the sum: CVaR over M fields of the cost of a sequence of actions on each. On fields and on a risk map alike,
-ground of little λ may hold a robot for good (`advance_held`), of which the motion model alone does not know. Source:
+ground of little λ may immobilise a robot (`advance_entrapped`), of which the motion model alone does not know. Source:
 Cai et al. (2024), "EVORA: Deep evidential traversability learning for risk-aware off-road autonomy", CVaR-Cost.
 
 Letters in shapes: B episodes, M fields, K samples, T steps, S state and A action dimensions, H×W cells, N cells framed
@@ -74,12 +74,12 @@ def tail_cost(cost: Tensor, level: float) -> Tensor:
     return (most[:, :-1].sum(1) + (worst - count + 1) * most[:, -1]) / worst
 
 
-def advance_held(
+def advance_entrapped(
     states: Tensor, cost: Tensor, held: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
     padded_ground: Tensor, target: Tensor, goal: Tensor, steps_left: Tensor, grid: Grid, robot: Robot,
     objective: Objective, min_traversability: float, goal_radius_m: float, below: float, most: int,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Rolls samples out as `mppi.advance_chunk` does, where ground of little λ holds a robot for good.
+    """Rolls samples out as `mppi.advance_chunk` does, where ground of little λ immobilises a robot.
 
     One that was on such ground for so many steps stops there, and pays J of standing there, with the penalty of ground
     that is not free, until its time is over. Its states go on, and cost nothing more. Whoever has been at the goal has
@@ -88,7 +88,7 @@ def advance_held(
     Args:
         states: shape [B, K, S].
         cost: so far, shape [B, K].
-        held: steps in a row on ground that holds, shape [B, K]; `most` of one that has stopped, −1 of one that has
+        held: steps in a row on immobilising ground, shape [B, K]; `most` of one that has stopped, −1 of one that has
             arrived.
         mean: of the actions, shape [B, T, A].
         noise: added to it, shape [T, A, K].

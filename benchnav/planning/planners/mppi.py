@@ -39,7 +39,7 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import Objective, has_path_cost
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.cost_risk import advance_held, framed_fields, tail_cost, within_reach
+from benchnav.planning.planners.cost_risk import advance_entrapped, framed_fields, tail_cost, within_reach
 from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank, perturb
 from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
 from benchnav.planning.problem import (
@@ -56,7 +56,7 @@ from benchnav.planning.sensing.sensor import Step
 _CHUNK_STEPS = 10
 OF_EPISODES = (0, 1, 2, 6, 7)  # arguments of what is compiled: states, cost, mean, padded_ground, target
 # states, cost, held, mean, padded_ground, target, goal, steps_left
-HELD_OF_EPISODES = (0, 1, 2, 3, 7, 8, 9, 10)
+ENTRAPPED_OF_EPISODES = (0, 1, 2, 3, 7, 8, 9, 10)
 _DRAWN_SAMPLES = 40
 _LEAST_TAIL = 10  # fields in the tail of which a cost is the mean
 _LEAST_SPREAD = 1e-30  # where all samples cost alike, all weigh alike
@@ -82,7 +82,7 @@ class MPPIConfig:
         level: α of the CVaR of the cost, in [0, 1); at 0 its mean.
         fields: M, on which each sequence is rolled out; at least 10 in the tail, M ≥ 10 / (1 − α), where α > 0.
         once: draws fields once for a map as it is known, not anew at each step.
-        entrapment: rollouts stop for good on ground on which the world holds robots.
+        entrapment: rollouts stop for good on ground that immobilises robots in the world.
         cost_to_go: what the last state of a rollout pays: `objective`, as J has it; `map`, what A*'s cheapest path
             from there to the goal costs under λ̂; `expected-time`, the same under the λ̂ of that risk setting, whatever
             the problem's own.
@@ -137,7 +137,7 @@ class MPPIState(Batch):
     Args:
         problem: what is being solved.
         mean: mean action sequence, shape [B, T, A].
-        held: steps in a row, up to now, on ground that holds the robot, shape [B].
+        held: steps in a row, up to now, on immobilising ground, shape [B].
         ground: fields of λ that were drawn once, as of `framed_fields`, shape [B, M, N]; None where there are none.
         to_go: of the cheapest paths, as of `astar.framed`, shape [B, 2, N]; None where J tells the last cost.
         noise: of all steps, the same for each episode.
@@ -171,7 +171,7 @@ class MPPI(LocalPlanner[MPPIState]):
         self.config = config or MPPIConfig()
         rollouts, least = self.config.samples * self._fields, self.worth_compiling
         self._advance = Fused(advance_chunk, rollouts, least, batched=OF_EPISODES)
-        self._advance_held = Fused(advance_held, rollouts, least, batched=HELD_OF_EPISODES)
+        self._advance_entrapped = Fused(advance_entrapped, rollouts, least, batched=ENTRAPPED_OF_EPISODES)
         self._weigh = Fused(weigh, rollouts, least, batched=(*OF_EPISODES, 14, 15))  # going, to_go
 
     @property
@@ -182,7 +182,9 @@ class MPPI(LocalPlanner[MPPIState]):
     def compiled(self) -> bool | None:
         """Whether it runs compiled; None before the first step."""
         rolled = (
-            self._advance.compiled if self._advance_held.compiled is None else self._advance_held.compiled
+            self._advance.compiled
+            if self._advance_entrapped.compiled is None
+            else self._advance_entrapped.compiled
         )
         verdicts = (rolled, self._weigh.compiled)
         return None if None in verdicts else all(verdicts)
@@ -254,7 +256,7 @@ class MPPI(LocalPlanner[MPPIState]):
         problem, config, mean = plan_state.problem, self.config, plan_state.mean
         noise, ground = plan_state.noise.at(plan_state.step), self._ground(plan_state, step.state)
         held = self._held(plan_state, step)
-        advance = self._advance if held is None else self._advance_held
+        advance = self._advance if held is None else self._advance_entrapped
         states, cost, going = roll_out(
             problem, step.state, mean, noise, target_m, advance, ground, held, step.time_s
         )
@@ -285,7 +287,7 @@ class MPPI(LocalPlanner[MPPIState]):
         return framed_fields(problem, problem.sample_fields(self._fields, key, cells))
 
     def _held(self, plan_state: MPPIState, step: Step) -> Tensor | None:
-        """Steps in a row on ground that holds the robots; None where rollouts are not held, shape [B]."""
+        """Steps in a row on immobilising ground, shape [B]; None without entrapment."""
         immobile = plan_state.problem.immobile
         if not self.config.entrapment or immobile is None:
             return None
@@ -325,9 +327,9 @@ def roll_out(
         mean: mean action sequences, shape [B, T, A].
         noise: added to every mean and clipped to the action bounds, shape [T, A, K].
         target_m: (x, y) to be reached, shape [B, 2].
-        advance: `advance_chunk`, with `held` `advance_held`, or the same compiled.
+        advance: `advance_chunk`, with `held` `advance_entrapped`, or the same compiled.
         ground: M maps of an episode after another, as of `framed_fields`, shape [B·M, N]; None for λ̂.
-        held: steps in a row, up to now, on ground that holds the robots, shape [B]; None where none does.
+        held: steps in a row, up to now, on immobilising ground, shape [B]; None without entrapment.
         time_s: since the start, of which `held` has use.
 
     Returns:

@@ -19,7 +19,7 @@ from benchnav.planning.free_space import PENALTY, Immobile
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners import compilation
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConfig
-from benchnav.planning.planners.cost_risk import advance_held, framed_fields, tail_cost, within_reach
+from benchnav.planning.planners.cost_risk import advance_entrapped, framed_fields, tail_cost, within_reach
 from benchnav.planning.planners.mppi import (
     MPPI,
     MPPIConfig,
@@ -354,7 +354,7 @@ def test_a_rollout_that_is_held_pays_what_is_left_of_the_time(objective: Objecti
         mean,
         noise,
         problem.goal_m,
-        advance_held,
+        advance_entrapped,
         None,
         torch.tensor([float(held)]),
         2.0,

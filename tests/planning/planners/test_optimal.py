@@ -260,7 +260,9 @@ def test_a_turn_on_ground_that_holds_adds_a_level_however_short() -> None:
     posed = wide_bar(20.0)
     costs = OptimalBound().init(posed, generator()).costs
     moves = Moves.of(Unicycle(), 0.5, 32)
-    everywhere = replace(costs, holds_s=torch.full_like(costs.rate, 1 / 0.095), final=costs.final * torch.nan)
+    everywhere = replace(
+        costs, immobile_s=torch.full_like(costs.rate, 1 / 0.095), final=costs.final * torch.nan
+    )
     turn = next(arc for arc in _arcs(moves, posed.grid, 32, costs.rate) if not arc.metres)
     after = _held_after(everywhere, turn)[0, :, 0, 0, 0]
     assert turn.seconds / 0.095 < 20 / 5

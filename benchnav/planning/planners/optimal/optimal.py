@@ -2,7 +2,7 @@
 
 `Optimal` takes λ̂ for λ: its time is the least under that map, "certainty-equivalent", and no bound on what can be done
 on the ground. `OptimalBound` is given λ itself, by the model `clairvoyant`, and knows for how long the world lets a
-robot stand on ground that holds it: what is left of a failure then is not for want of knowledge, nor of planning. Its
+robot stand on immobilising ground: what is left of a failure then is not for want of knowledge, nor of planning. Its
 time is the least up to what the grid costs. Both plan for the paper's unicycle alone, which drives forward, and once: a
 map that changes is refused.
 Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L levels of time held.
@@ -36,8 +36,8 @@ class OptimalConfig:
     Args:
         headings: Q, in which a circle is divided.
         refine: cells of value iteration along each side of a cell of the map.
-        hazard: plans for the expected time under each cell's own distribution, of which a robot that is held pays the
-            whole limit, in place of the time under λ̂.
+        hazard: plans for the expected time under each cell's own distribution, of which an immobilised robot pays
+            the whole limit, in place of the time under λ̂.
     """
 
     headings: int = 32
@@ -56,7 +56,7 @@ class OptimalBoundConfig:
     Args:
         headings: Q, in which a circle is divided.
         refine: cells of value iteration along each side of a cell of the map.
-        levels: L, of the time for which a robot was held; 0 takes it for lost where it enters ground that holds.
+        levels: L, of the time on immobilising ground; 0 takes a robot for lost where it enters such ground.
     """
 
     headings: int = 32
@@ -183,7 +183,7 @@ class Optimal(Planner[OptimalState]):
 
 
 class OptimalBound(Optimal):
-    """Drives by the least time to go on λ itself, in a world that holds robots for good: a bound, up to its grid.
+    """Drives by the least time to go on λ itself, in a world that immobilises robots: a bound, up to its grid.
 
     Args:
         config: settings.
@@ -223,8 +223,8 @@ class OptimalBound(Optimal):
             f"`immobile.for_s` of at most {most_s:g} s for {self.config.levels} `levels` of planner {self.name!r}, "
             f"each no longer than a cell of λ = {immobile.below:g} takes, got {immobile.for_s:g}.",
         )
-        costs = _on_grid(problem, grid, rate, ~holds, holds_s=torch.where(holds, rate, 0.0))
-        return replace(costs, held_s=immobile.for_s, levels=self.config.levels)
+        costs = _on_grid(problem, grid, rate, ~holds, immobile_s=torch.where(holds, rate, 0.0))
+        return replace(costs, lost_after_s=immobile.for_s, levels=self.config.levels)
 
 
 def _on_grid(
@@ -233,7 +233,7 @@ def _on_grid(
     rate: Tensor,
     open_: Tensor,
     hazard: Tensor | None = None,
-    holds_s: Tensor | None = None,
+    immobile_s: Tensor | None = None,
 ) -> Costs:
     """Costs on a grid that divides the map's cells, from maps of `Costs`, each of shape [B, H, W]."""
     times = grid.height // problem.grid.height
@@ -247,7 +247,7 @@ def _on_grid(
     x, y = grid.centre_of(row[:, None], column)
     goal_x, goal_y = problem.goal_m.T[:, :, None, None]
     away = torch.hypot(x - goal_x, y - goal_y)
-    # One rate in all of them, as what a way costs within the disc is taken off again; there nothing holds a robot.
+    # One rate in all of them: what a way costs within the disc is taken off again; nothing immobilises a robot there.
     ends = away <= problem.goal_radius_m
     within = torch.where(ends, rate, UNREACHED).amin((1, 2), keepdim=True)
     rate = torch.where(ends, within, rate)
@@ -258,5 +258,5 @@ def _on_grid(
         final=torch.where(ends, left, torch.nan).to(dtype),
         loss=problem.time_budget_s.to(dtype),
         hazard=None if hazard is None else fine(hazard).to(dtype).masked_fill(ends, 0),
-        holds_s=None if holds_s is None else fine(holds_s).to(dtype).masked_fill(ends, 0),
+        immobile_s=None if immobile_s is None else fine(immobile_s).to(dtype).masked_fill(ends, 0),
     )

@@ -92,9 +92,9 @@ class Costs(Batch):
         final: cost to go where ways end, under 0 where the robot has arrived before; NaN elsewhere, shape [B, H, W].
         hazard: chance of being lost on a metre, as −ln of that of not being lost, shape [B, H, W]; None for none.
         loss: cost of being lost, shape [B].
-        holds_s: seconds on ground that holds robots for each second of driving with λ = 1, 0 where none does, shape
+        immobile_s: seconds on immobilising ground for each second of driving with λ = 1, 0 where none does, shape
             [B, H, W]; None where nothing holds.
-        held_s: time after which a robot that was held without a break is lost.
+        lost_after_s: time on such ground, without a break, after which a robot is lost.
         levels: L, of time held.
     """
 
@@ -103,13 +103,13 @@ class Costs(Batch):
     final: Tensor
     loss: Tensor
     hazard: Tensor | None = None
-    holds_s: Tensor | None = None
-    held_s: float = 1.0
+    immobile_s: Tensor | None = None
+    lost_after_s: float = 1.0
     levels: int = 1
 
     def level(self, held: Tensor) -> Tensor:
         """Nearest level of a time held, at least 1 where there is any, int64, of the same shape; L is lost."""
-        nearest = (held / self.held_s * self.levels + 0.5).floor().long()
+        nearest = (held / self.lost_after_s * self.levels + 0.5).floor().long()
         return torch.where(held > 0, nearest.clamp(1, self.levels), 0)
 
 
@@ -123,7 +123,7 @@ def value_iteration(costs: Costs, moves: Moves, grid: Grid, headings: int) -> Te
         headings: Q.
 
     Returns:
-        `UNREACHED` where there is no way; a robot of the level l was held for l / L of the time after which it is lost.
+        `UNREACHED` where there is no way; at the level l a robot has had l / L of the time after which it is lost.
     """
     arcs = _arcs(moves, grid, headings, costs.rate)
     maps = torch.arange(len(costs.rate), device=costs.rate.device).split(_MAPS_AT_ONCE)
@@ -199,7 +199,7 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> Tensor:
             cost = cost + (1 - keep) * costs.loss[:, None, None, None]
         spent.append(cost)
         kept.append(keep)
-        after.append(None if costs.holds_s is None else _held_after(costs, arc))
+        after.append(None if costs.immobile_s is None else _held_after(costs, arc))
     final = costs.final[:, None, None]
     value = torch.where(final.isnan(), UNREACHED, final).expand(-1, levels, headings, -1, -1).clone()
     settled = torch.zeros_like(final, dtype=torch.bool)[..., :1, :1]
@@ -230,12 +230,12 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> Tensor:
 
 def _held_after(costs: Costs, arc: _Arc) -> Tensor:
     """Levels of time held after an arc, by that before it, L where the robot is lost, int64, shape [B, L, Q, H, W]."""
-    assert costs.holds_s is not None
-    (size, height, width), reach = costs.holds_s.shape, arc.reach
+    assert costs.immobile_s is not None
+    (size, height, width), reach = costs.immobile_s.shape, arc.reach
     headings, step = len(arc.ends), arc.seconds / _POINTS
-    around = pad(costs.holds_s[:, None], (reach,) * 4)[:, 0]
+    around = pad(costs.immobile_s[:, None], (reach,) * 4)[:, 0]
     before = torch.arange(costs.levels, device=around.device)[None, :, None, None, None]
-    start = before.to(around) * (costs.held_s / costs.levels)
+    start = before.to(around) * (costs.lost_after_s / costs.levels)
     held = start.expand(size, -1, headings, height, width).clone()
     lost, whole = (torch.full_like(held, value, dtype=torch.bool) for value in (False, True))
     for rows, columns in arc.points:
@@ -247,7 +247,7 @@ def _held_after(costs: Costs, arc: _Arc) -> Tensor:
             1,
         )
         held = torch.where(seconds[:, None] > 0, held + seconds[:, None], 0.0)
-        lost |= held >= costs.held_s
+        lost |= held >= costs.lost_after_s
         whole &= seconds[:, None] > 0
     # A move that is all on such ground adds a level: else the time of short ones would never add up.
     level = torch.maximum(costs.level(held), torch.where(whole, before + 1, 0))

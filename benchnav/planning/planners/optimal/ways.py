@@ -33,7 +33,7 @@ class OptimalState(Batch):
         grid: cells of value iteration, H×W.
         costs: of driving on them.
         value: cost to go, shape [B, L, Q, H, W].
-        held: time for which the robots have been held, in seconds, shape [B].
+        held: time that the robots have been on immobilising ground, in seconds, shape [B].
     """
 
     problem: Problem
@@ -67,7 +67,7 @@ def ways_from(pose: Tensor, held: Tensor, plan_state: OptimalState) -> Ways:
 
     Args:
         pose: (x, y, θ), shape [B, 3].
-        held: time for which the robots have been held, shape [B].
+        held: time that the robots have been on immobilising ground, shape [B].
         plan_state: costs and values.
     """
     grid, robot = plan_state.grid, plan_state.problem.robot
@@ -160,7 +160,7 @@ def _cost(
 
     Args:
         pose: (x, y, θ), shape [B, 3].
-        held: time for which the robots have been held, shape [B].
+        held: time that the robots have been on immobilising ground, shape [B].
         points: (x, y) along the ways, shape [B, K, N, 2].
         spot_s: for how long they turn on the spot, with λ = 1, shape [B, K].
         drive_s: for how long they drive, with λ = 1, shape [B, K].
@@ -179,13 +179,13 @@ def _cost(
     here, along = read(costs.rate, UNREACHED)
     cost = spot_s * here + drive_s * along.mean(2)
     level, lost = torch.zeros_like(cells[0]), torch.zeros_like(cost, dtype=torch.bool)
-    if costs.holds_s is not None:
-        here, along = read(costs.holds_s, 0.0)
+    if costs.immobile_s is not None:
+        here, along = read(costs.immobile_s, 0.0)
         now = held[:, None] + spot_s * here
-        lost = now >= costs.held_s
+        lost = now >= costs.lost_after_s
         for seconds in (along * drive_s[..., None] / _POINTS).unbind(2):
             now = torch.where(seconds > 0, now + seconds, 0.0)
-            lost = lost | (now >= costs.held_s)
+            lost = lost | (now >= costs.lost_after_s)
         level = costs.level(now)
         lost, level = lost | (level == costs.levels), level.clamp(max=costs.levels - 1)
     to_go = _value_at(plan_state.value, level, heading, cells)
