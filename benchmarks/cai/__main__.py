@@ -3,7 +3,7 @@
     python -m benchmarks.cai                                       # all of it
     python -m benchmarks.cai --density 0.4 1.0 --out trials.csv    # some of it
     python -m benchmarks.cai --setup.risk_map histogram            # with a choice of theirs
-    python -m benchmarks.cai --risk cost cost-cvar:0.6 --density 0.4 1.0 --setup.mppi.fields 128     # risk on the cost
+    python -m benchmarks.cai --risk cost cost-cvar:0.6 --density 0.4 1.0 --setup.fields 128     # risk on the cost
 
 What is theirs, what is ours and what differs is said in `docs/studies/validation.md`.
 """

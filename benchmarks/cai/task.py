@@ -108,6 +108,7 @@ class Setup:
         objective: `theirs`, or one of ours by name.
         distance_power: of the distance in a step's cost.
         min_traversability: least λ̂ that motion is given.
+        fields: on which sequences are rolled out where the risk is that of the cost.
     """
 
     mppi: MPPIConfig = THEIR_MPPI
@@ -115,6 +116,7 @@ class Setup:
     objective: str = "theirs"
     distance_power: int = 1
     min_traversability: float = 0.01
+    fields: int = 64
 
 
 def predict(vegetation: np.ndarray) -> TraversabilityMixture:
@@ -135,7 +137,7 @@ def planner_config(setting: str, setup: Setup) -> MPPIConfig:
     """Settings of the planner under a risk setting: the setup's own, with risk on the cost where that is asked for."""
     if not setting.startswith(_COST):
         return setup.mppi
-    return replace(setup.mppi, risk_on="cost", level=round(1 - tail_share(setting), 9))
+    return replace(setup.mppi, risk_on="cost", level=round(1 - tail_share(setting), 9), fields=setup.fields)
 
 
 def pose(

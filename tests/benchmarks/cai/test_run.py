@@ -101,12 +101,12 @@ def test_what_cannot_be_run_is_refused(given: tuple, expected: str) -> None:
 
 
 def test_risk_on_the_cost_has_a_planner_of_its_own_and_leaves_the_other_rows(rows: pd.DataFrame) -> None:
-    setup = Setup(mppi=replace(QUICK.mppi, fields=26))
+    setup = replace(QUICK, fields=26)
     found = trials(DENSITIES, ["mean", "cost", "cost-cvar:0.6"], setup=setup)
     assert times(found, setting="mean") == times(rows, setting="mean", realisation=0)
     assert len({tuple(times(found, setting=name)) for name in ("mean", "cost", "cost-cvar:0.6")}) == 3
     # Neither the other densities nor the other settings change its fields.
     alone = trials([0.4], ["cost-cvar:0.6"], setup=setup)
     assert times(alone) == times(found, setting="cost-cvar:0.6", density=0.4)
-    fewer = trials(DENSITIES, ["cost"], setup=Setup(mppi=replace(QUICK.mppi, fields=1)))
+    fewer = trials(DENSITIES, ["cost"], setup=replace(QUICK, fields=1))
     assert times(fewer) != times(found, setting="cost")
