@@ -269,6 +269,16 @@ def test_a_turn_on_immobilising_ground_adds_a_level_however_short() -> None:
     assert after.tolist() == [1, 2, 3, 4, 5]
 
 
+@pytest.mark.parametrize(("held", "crosses"), [(3.0, True), (13.0, False)])
+def test_who_has_no_time_left_to_leave_such_ground_is_lost_by_every_way(held: float, crosses: bool) -> None:
+    """It takes 3.7 s to the last cell of the bar, and 2.6 s to leave that."""
+    posed = with_start(wide_bar(18.0), 6.9, 6.25, 0.0)
+    state = OptimalBound().init(posed, generator())
+    found = float(ways_from(posed.start, torch.tensor([held]), state).cost.min())
+    assert (found < 90) is crosses
+    assert crosses or found >= UNREACHED / 2
+
+
 @pytest.mark.parametrize("levels", [1, 2, 3, 4, 5])
 def test_there_are_as_many_levels_as_are_asked_for(levels: int) -> None:
     planner = OptimalBound(OptimalBoundConfig(levels=levels))
