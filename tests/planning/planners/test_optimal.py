@@ -255,6 +255,14 @@ def test_over_several_cells_the_time_held_adds_up(for_s: float, crosses: bool) -
         assert found > 90
 
 
+def test_a_way_that_takes_little_more_than_the_time_limit_is_tried() -> None:
+    posed = replace(wide_bar(18.0), time_budget_s=torch.tensor([29.0]))
+    planner = OptimalBound()
+    state = planner.init(posed, generator())
+    assert 29.0 < float(ways_from(posed.start, state.held, state).cost.min()) < 31.0
+    assert planner.plan(first(posed), state)[2].status.tolist() == [PlanStatus.OK]
+
+
 def test_a_turn_on_immobilising_ground_adds_a_level_however_short() -> None:
     """On a map of such ground alone a robot is lost after as many turns as there are levels."""
     posed = wide_bar(25.0)

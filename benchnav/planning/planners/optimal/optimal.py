@@ -201,8 +201,11 @@ class OptimalBound(Optimal):
         return "time on λ itself"
 
     def no_way(self, costs: Costs) -> Tensor:
-        """The time limit, as the value of where there is no way reaches into cells beside it; see `Optimal`."""
-        return costs.loss
+        """Twice T, as the value of where there is no way reaches into cells beside it; see `Optimal`.
+
+        Not T itself: the grid makes times a little too long, and a failed plan ends an episode that may arrive.
+        """
+        return 2 * costs.loss
 
     def costs_of(self, problem: Problem, grid: Grid) -> Costs:
         """What driving costs; see `Optimal`."""
