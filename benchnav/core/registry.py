@@ -21,6 +21,7 @@ so that what was recorded before they came is still the same part.
 """
 
 import importlib
+import importlib.util
 import inspect
 import os
 import re
@@ -32,6 +33,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
+from benchnav.core import touched
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import NO_DEFAULT as NO_DEFAULT
 from benchnav.core.settings import Option as Option
@@ -286,6 +288,7 @@ def find(kind: str, source: str) -> Found:
     """
     if (_checked(kind), source) in _REGISTERED:
         target = _REGISTERED[kind, source]
+        touched.watch()
         digest = partial(digest_of_target, target)
         return Found(target=target, origin="this process", source_digest=digest, everywhere=False)
     points = [point for point in _points(kind) if point.name == source]
@@ -377,6 +380,8 @@ def _unknown(kind: str, source: str, remedy: str, reason: str = "") -> ConfigErr
 
 
 def _found_in_module(kind: str, place: str, name: str) -> Found:
+    if place.partition(".")[0] != "benchnav":
+        touched.watch(_installed_folder(place))
     try:
         module = importlib.import_module(place)
     except (Exception, SystemExit) as error:
@@ -404,6 +409,16 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
     )
 
 
+def _installed_folder(place: str) -> Path | None:
+    """The folder of a package, whose code is a part's although it may lie among installed packages."""
+    try:
+        spec = importlib.util.find_spec(place.partition(".")[0])
+    except (ImportError, ValueError):
+        return None
+    folders = list(spec.submodule_search_locations or ()) if spec else []
+    return Path(folders[0]) if folders else None
+
+
 def _found_in_file(kind: str, path: Path, name: str) -> Found:
     path = path.expanduser()
     try:
@@ -413,6 +428,7 @@ def _found_in_file(kind: str, path: Path, name: str) -> Found:
         raise ConfigError(
             f"Expected {_a(kind)} in a file, got {str(path)!r}, which cannot be read: {error.strerror}.{near}"
         ) from error
+    touched.watch()
     target = attribute(load_file(path.resolve(), content), str(path), name)
     source = partial(digest_of_file_part, path.resolve(), content)
     return Found(target=target, origin=f"file {path}", source_digest=source)

@@ -221,7 +221,7 @@ def _module(path: Path) -> tuple[str, tuple[str, ...]]:
             continue
         if ast.get_docstring(node, clean=False) is not None:
             node.body = node.body[1:]
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12], _imports(content, "")
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12], imported_names(content, "")
 
 
 def _digest_of_sources(found: Mapping[str, bytes]) -> str:
@@ -246,14 +246,14 @@ def imported_sources(near: Path, package: str, content: bytes) -> dict[str, byte
     todo = [(package, content)]
     while todo:
         package, content = todo.pop()
-        for name in _imports(content, package):
+        for name in imported_names(content, package):
             if name in found or name.partition(".")[0] in (*sys.stdlib_module_names, "benchnav"):
                 continue
             spec = _spec(name, near)
             if spec is None or not spec.has_location or not spec.origin:
                 continue
             path = Path(spec.origin)
-            if not path.is_file() or any(map(path.is_relative_to, _installed_folders())):
+            if not path.is_file() or any(map(path.is_relative_to, installed_folders())):
                 continue
             found[name] = _read_source(path)
             if path.suffix == ".py":
@@ -262,7 +262,7 @@ def imported_sources(near: Path, package: str, content: bytes) -> dict[str, byte
 
 
 @cache
-def _imports(content: bytes, package: str) -> tuple[str, ...]:
+def imported_names(content: bytes, package: str) -> tuple[str, ...]:
     """Modules that a source may import, with the packages around them; of `from a import b` both a and a.b."""
     named = []
     try:
@@ -299,7 +299,7 @@ def _spec(name: str, near: Path) -> ModuleSpec | None:
 
 
 @cache
-def _installed_folders() -> frozenset[str]:
+def installed_folders() -> frozenset[str]:
     """Folders of the standard library and of installed distributions, wherever on the path they were put."""
     known = sysconfig.get_paths()
     return frozenset(

@@ -23,11 +23,11 @@ from joblib.externals.loky import get_reusable_executor
 from joblib.externals.loky.backend.utils import kill_process_tree
 
 from benchnav.core.errors import BenchnavError, ConfigError, quiet
+from benchnav.core.touched import THREADS
 
 _LOOK_S = 0.5
 _REACH_S = 5
 _WORKERS_S = 10
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 Result = TypeVar("Result")
 
@@ -74,7 +74,7 @@ def end_with(parent: int) -> None:
 
 def _run_in_processes(calls: Sequence[Callable[[], Result]], jobs: int) -> Iterator[Result]:
     # Processes that share the processors should not each take all of them.
-    threads = {name: os.environ.get(name, "1") for name in _THREADS}
+    threads = {name: os.environ.get(name, "1") for name in THREADS}
     executor = get_reusable_executor(
         jobs, timeout=300, initializer=end_with, initargs=(os.getpid(),), env=threads
     )

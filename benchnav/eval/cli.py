@@ -28,6 +28,7 @@ def run_command(
     scheduler: str = "",
     device: Device = "auto",
     reuse_code: bool = False,
+    check_determinism: bool = False,
 ) -> int:
     """Run a suite into a folder; resume or extend the run that is there.
 
@@ -43,6 +44,8 @@ def run_command(
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
         device: Where maps are predicted and episodes run; auto takes CUDA where there is a GPU.
         reuse_code: Use finished units of other code too, and mark their rows.
+        check_determinism: First run a unit of each condition twice, in fresh processes and another order; if rows
+            differ, name them and end with status 1.
     """
     from benchnav.eval.run.runner import run_suite
 
@@ -51,6 +54,8 @@ def run_command(
     if planner_limit_s < 0:
         raise ConfigError(f"Expected `planner_limit_s` ≥ 0, got {planner_limit_s}.")
     folder = _own_folder(out)
+    if check_determinism and not _repeats(suite, planner_limit_s, device):
+        return 1
     steps = run_suite(
         suite, folder, jobs, overwrite, planner_limit_s, _say, own, scheduler, device, reuse_code
     )
@@ -103,6 +108,28 @@ def rerun(
     same, lines = rerun.compare(original, repeated)
     print("\n".join(lines))
     return 0 if same else 1
+
+
+def verify(folder: str) -> int:
+    """Check all files of a run against the digests that were written with them.
+
+    Args:
+        folder: Run folder, finished or not.
+    """
+    from benchnav.eval.folder.verify import verify_run
+
+    damage, notes = verify_run(_own_folder(folder))
+    for line in notes:
+        print(f"note: {line}")
+    for line in damage:
+        print(f"damaged: {line}")
+    if damage:
+        print(
+            "Give the run's command again: damaged units are run again, and tables, figures and playback written."
+        )
+    else:
+        print(f"{folder}: no file is damaged")
+    return 1 if damage else 0
 
 
 def list_command(kinds: list[str]) -> None:
@@ -191,6 +218,21 @@ def _finish(folder: Path) -> int:
     return _failed(folder)
 
 
+def _repeats(suite: Suite, planner_limit_s: float, device: str) -> bool:
+    """Check that the conditions of a suite repeat, and say which do not."""
+    from benchnav.eval.run.determinism import check_determinism
+
+    count, lines = check_determinism(suite, _say, planner_limit_s, device)
+    for line in lines:
+        _say(f"not deterministic: {line}")
+    _say(
+        f"{len(lines)} of {count} conditions differ; nothing was run"
+        if lines
+        else f"all {count} conditions repeat"
+    )
+    return not lines
+
+
 def _say(line: str) -> None:
     tell(f"benchnav-eval: {line}")
 
@@ -265,6 +307,7 @@ COMMANDS = {
     "replay": Command(replay, ("folder",)),
     "merge": Command(merge, ("out", "parts")),
     "rerun": Command(rerun, ("folder",)),
+    "verify": Command(verify, ("folder",)),
 }
 
 

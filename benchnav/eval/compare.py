@@ -170,9 +170,10 @@ def _unlike_code(conditions: Iterable[Compared], parts_alone: bool = False) -> l
     codes: dict[str, dict[str, dict[str, Any]]] = {}
     for condition in conditions:
         for run, code in condition.code.items():
-            held = codes.setdefault(run, {group: {} for group in code})
+            groups = codes.setdefault(run, {})
             for group, known in code.items():
-                held[group] |= {} if parts_alone and group == "environment" else known
+                is_left_out = parts_alone and group == "environment"
+                groups[group] = groups.get(group, {}) | ({} if is_left_out else known)
     return [
         f"{second} differs from {first} in {', '.join(names)}"
         for first, second in combinations(sorted(codes), 2)

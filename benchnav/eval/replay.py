@@ -119,6 +119,7 @@ def _recordings(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> "li
 
 def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> Path:
     """The viewer's file of the episodes, which is made in a folder where it is not there."""
+    from benchnav.eval.folder.checksums import is_as_noted, note_checksums
     from benchnav.eval.report.playback.viewer_file import write_rerun
 
     unit, member = found[0]
@@ -128,6 +129,7 @@ def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> Pa
         digest = hashlib.sha256(conditions.encode()).hexdigest()[:8]
         words = (unit.condition.scenario, digest, unit.seed, unit.realisation, f"{unit.maps[member]:05d}")
         path = path.with_name(f"together-{'-'.join(map(str, words))}.rrd")
-    if len(found) > 1 or not path.exists():
+    if len(found) > 1 or not path.exists() or not is_as_noted(out, path):
         write_rerun(_recordings(folder, found, out), path)
+        note_checksums(out, [path])
     return path

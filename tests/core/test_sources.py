@@ -121,11 +121,11 @@ def test_what_was_installed_into_a_folder_of_its_own_is_left_out_too(
     (target / "other-1.0.dist-info").mkdir(parents=True)
     (target / "other_aid.py").write_text("x = 1\n")
     monkeypatch.syspath_prepend(target)
-    sources._installed_folders.cache_clear()
+    sources.installed_folders.cache_clear()
     try:
         assert imported_sources(tmp_path, "", b"import other_aid") == {}
     finally:
-        sources._installed_folders.cache_clear()
+        sources.installed_folders.cache_clear()
 
 
 def test_the_same_files_elsewhere_have_the_same_digest(part: Path, tmp_path: Path) -> None:

@@ -17,7 +17,8 @@ from benchnav.core.store import Shard
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval import cli
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.run_folder import EPISODES, metadata, open_run, read_table, write_run
+from benchnav.eval.folder.run_folder import EPISODES, open_run, read_table, write_run
+from benchnav.eval.folder.sealed import metadata
 from benchnav.eval.run import unit as units_of_run
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.rerun import compare, rerun

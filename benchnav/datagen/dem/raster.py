@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchnav.core.errors import ConfigError, DatasetError, expect
+from benchnav.core.touched import note_file
 from benchnav.datagen.dem.layer import LayerRaster, read_layer
 
 _MOST_STRETCH = 0.02  # of a projection against the ground; within a UTM zone it is at most 0.001
@@ -189,6 +190,7 @@ def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Ra
     """
     # Rasterio warns of a missing place, which is an error below.
     with warnings.catch_warnings(action="ignore"), _naming(argument, name):
+        note_file(name)
         file = load_rasterio().open(name)
     with file:
         if file.crs is None:

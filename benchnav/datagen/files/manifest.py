@@ -7,6 +7,7 @@ import h5py
 
 from benchnav.core.errors import DatasetError
 from benchnav.core.store import unseal
+from benchnav.core.touched import note_file
 from benchnav.datagen import schema
 
 # What HDF5 and h5py raise where a file is damaged, by where the damage lies.
@@ -27,6 +28,7 @@ def open_file(path: Path) -> h5py.File:
         DatasetError: it is not there, is no HDF5 file, or its structure is damaged.
     """
     try:
+        note_file(path)
         return h5py.File(path, "r")
     except FileNotFoundError as error:
         raise DatasetError(

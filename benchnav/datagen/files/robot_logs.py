@@ -14,6 +14,7 @@ from pandas.api.types import is_numeric_dtype
 
 from benchnav.core.errors import DatasetError
 from benchnav.core.settings import hint
+from benchnav.core.touched import note_file
 
 ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
 _MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
@@ -42,6 +43,7 @@ def read_log(path: Path) -> pd.DataFrame:
     """
     try:
         if path.suffix == ".parquet":
+            note_file(path)
             return pd.read_parquet(path).reset_index(drop=True)
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)

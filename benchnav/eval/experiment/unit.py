@@ -98,7 +98,7 @@ class Unit:
     @property
     def steps_path(self) -> Path:
         """The file of the unit's steps in a run folder, one partition a condition."""
-        return Path("steps", f"condition={self.condition.id}", f"{self.name}.parquet")
+        return steps_path(self.condition.id, self.name)
 
     def recording_path(self, member: int, suffix: str = ".npz") -> Path:
         """The file of one episode's recording in a run folder; `.rrd` for the viewer's, which is made of it.
@@ -125,6 +125,11 @@ class Unit:
             "all": list(range(len(self.maps))),
         }
         return chosen.get(self.record, [])
+
+
+def steps_path(condition_id: str, name: str) -> Path:
+    """Return the file of a unit's steps in a run folder, from its condition and its name."""
+    return Path("steps", f"condition={condition_id}", f"{name}.parquet")
 
 
 def units(conditions: Conditions, record: Record = "none") -> list[Unit]:

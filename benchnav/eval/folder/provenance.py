@@ -28,6 +28,7 @@ from benchnav.core.device import gpu_name
 from benchnav.core.shipped_files import PACKAGE
 from benchnav.core.sources import digest_of, package_modules
 from benchnav.core.store import text_digest
+from benchnav.core.touched import Touches, touches_of, unlike
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.condition import PART_KINDS, Condition, is_checkpoint
@@ -43,6 +44,7 @@ _UNIT = "benchnav.eval.run.unit"
 _MOST_NAMED = 3
 
 Code = dict[str, dict[str, Any]]
+TOUCHED = "touched"  # beside the groups of code: what parts touched, which is known only when they have run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,6 +136,22 @@ def describe_parts(condition: Condition) -> Code:
     return {"modules": package_modules(modules), "parts": parts}
 
 
+def touches(condition: Condition) -> Touches:
+    """Return what the user's own parts of a condition have touched in this process; see `benchnav.core.touched`."""
+    targets = []
+    for kind in PART_KINDS:
+        part = getattr(condition, kind)
+        if not is_checkpoint(kind, part.part):
+            found = registry.find(kind, part.part)
+        elif own := split_own(part.part):
+            found = registry.find(kind, own[0])
+        else:
+            found = find_family(read_config(find_checkpoint(part.part))["model"])
+        if not found.shipped:
+            targets.append(found.target)
+    return touches_of(targets)
+
+
 def describe_datasets(conditions: Conditions) -> dict[str, Any]:
     """The maps used: by dataset its id and, by split, a digest of each map and one of what they mean."""
     described: dict[str, Any] = {}
@@ -155,19 +173,20 @@ def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
     """Names what two codes both have and what is not the same, with the values where they are short.
 
     Args:
-        earlier: as `Origin.code`.
+        earlier: as `Origin.code`, perhaps with what parts touched as `TOUCHED`.
         now: as well.
     """
-    unlike = {
+    differing = {
         group: [name for name, value in earlier[group].items() if now[group].get(name, value) != value]
         for group in ("modules", "environment", "parts")
     }
-    modules = unlike["modules"]
+    modules = differing["modules"]
     more = f" and {len(modules) - _MOST_NAMED} more of its modules" if len(modules) > _MOST_NAMED else ""
     return [
         *([f"{', '.join(modules[:_MOST_NAMED])}{more}"] if modules else []),
-        *(f"{n} ({earlier['environment'][n]} to {now['environment'][n]})" for n in unlike["environment"]),
-        *unlike["parts"],
+        *(f"{n} ({earlier['environment'][n]} to {now['environment'][n]})" for n in differing["environment"]),
+        *differing["parts"],
+        *unlike(earlier.get(TOUCHED, {}), now.get(TOUCHED, {})),
     ]
 
 

@@ -25,19 +25,14 @@ from benchnav.core.sources import digest_of_path
 from benchnav.core.store import Shard, replacing, seal, unseal, write_text
 from benchnav.eval.experiment.condition import KNOWLEDGE, Condition, condition_from, later_labels
 from benchnav.eval.experiment.suite import RECORDS
-from benchnav.eval.experiment.unit import DRAW, Extent, Unit
-from benchnav.eval.folder.provenance import Origin, code_digest
+from benchnav.eval.experiment.unit import DRAW, Extent, Unit, steps_path
+from benchnav.eval.folder.provenance import TOUCHED, Origin, code_digest, touches
+from benchnav.eval.folder.sealed import CONTENT, DamageError, metadata, read_sealed, with_metadata
 
 FORMAT, FORMAT_VERSION = "benchnav-run", 5
 _LAST_OF_0_7 = 3
 RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
 KEYS = ["condition", *DRAW]  # of a row
-
-METADATA = b"benchnav"  # key of ours in a Parquet file's metadata
-
-
-class DamageError(ValueError):
-    """A file of a run does not hold what it has to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,18 +157,51 @@ class Finished:
     Args:
         path: its file.
         about: the metadata of the file: `unit` (what was run), `key`, `code`, `digests` of the maps, `record`, `made`
-            (a token of this one making of it, which copies keep), `traceback` and `errors`.
+            (a token of this one making of it, which copies keep), `traceback`, `errors`, `touched` by the user's own
+            parts, and the digests `content` of its rows, `steps` of its steps and `recordings` of its recordings by
+            their path.
     """
 
     path: Path
     about: Mapping[str, Any]
 
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+        return self.path.parents[2]
+
     def has(self, unit: Unit) -> bool:
         """Whether it was recorded as a unit is now to be, and what was recorded is still of its making."""
         if RECORDS.index(self.about["record"]) < RECORDS.index(unit.record):
             return False
-        steps = self.path.parents[2] / unit.steps_path
+        steps = self.folder / unit.steps_path
         return self.about["record"] == "none" or metadata(steps).get("key") == self.about["key"]
+
+    def damage(self) -> list[str]:
+        """Return what of the unit is not as it was written, a line each that begins with the file.
+
+        Steps and recordings count if they are of this making of the unit; a file that is missing is no damage.
+        """
+        lines = []
+        try:
+            read_sealed(self.path)
+        except DamageError as error:
+            lines.append(f"{self.path.relative_to(self.folder)}: {error}")
+        steps = steps_path(self.about["unit"][0], self.path.name.rpartition("-")[0])
+        about = metadata(self.folder / steps)
+        if about and about.get("key") != self.about["key"]:
+            return lines
+        if self.about.get("steps") and (self.folder / steps).exists():
+            try:
+                read_sealed(self.folder / steps)
+                if about.get(CONTENT) != self.about["steps"]:
+                    raise DamageError("it holds the steps of another run")
+            except DamageError as error:
+                lines.append(f"{steps}: {error}")
+        for name, digest in self.about.get("recordings", {}).items():
+            if digest_of_path(self.folder / name) not in ("", digest):
+                lines.append(f"{name}: it was changed after benchnav wrote it")
+        return lines
 
 
 def find_units(folder: Path, unit: Unit) -> list[Finished]:
@@ -187,25 +215,13 @@ def find_units(folder: Path, unit: Unit) -> list[Finished]:
     return [finished for finished in found if finished.about.get("unit") == _identity(unit)]
 
 
+def unit_path(unit: Unit, key: str) -> Path:
+    """Return where a unit that is made under a key lies in a run folder."""
+    return Path("units", unit.condition.id, f"{unit.name}-{key}.parquet")
+
+
 def _identity(unit: Unit) -> list[Any]:
     return [unit.condition.id, unit.seed, unit.realisation, *unit.maps]
-
-
-def metadata(path: Path) -> dict[str, Any]:
-    """What a Parquet file of a run says of itself; nothing where it is not there or damaged."""
-    try:
-        known = pq.read_schema(path).metadata or {}
-        about: dict[str, Any] = json.loads(known.get(METADATA, b"{}"))
-    except (OSError, ValueError):
-        return {}
-    return about
-
-
-def with_metadata(table: pa.Table, about: Mapping[str, Any]) -> pa.Table:
-    """A table that says something of itself; see `metadata`."""
-    return table.replace_schema_metadata(
-        {**(table.schema.metadata or {}), METADATA: json.dumps(about).encode()}
-    )
 
 
 def write_unit(
@@ -222,6 +238,7 @@ def write_unit(
         traceback: of the first of them.
     """
     key = origin.key(unit)
+    recordings = [unit.recording_path(member) for member in range(len(unit.maps))]
     about = {
         "unit": _identity(unit),
         "key": key,
@@ -231,9 +248,14 @@ def write_unit(
         "made": secrets.token_hex(8),
         "traceback": traceback,
         "errors": list(errors),
+        TOUCHED: touches(unit.condition),
+        "steps": metadata(folder / unit.steps_path).get(CONTENT, ""),
+        "recordings": {
+            path.as_posix(): digest for path in recordings if (digest := digest_of_path(folder / path))
+        },
     }
     table = pa.Table.from_pandas(rows.assign(code=code_digest(origin.code)), preserve_index=False)
-    with replacing(folder / "units" / unit.condition.id / f"{unit.name}-{key}.parquet") as partial:
+    with replacing(folder / unit_path(unit, key)) as partial:
         pq.write_table(with_metadata(table, about), partial)
 
 
@@ -259,7 +281,10 @@ def finish_run(folder: Path, finished: Sequence[tuple[Unit, Finished]], reused: 
     table = pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata(None)
     with replacing(folder / EPISODES) as partial:
         pq.write_table(table, partial)
-    codes = {code_digest(one.about["code"]): one.about["code"] for _, one in finished}
+    codes: dict[str, Any] = {}
+    for _, one in finished:
+        code = codes.setdefault(code_digest(one.about["code"]), {**one.about["code"], TOUCHED: {}})
+        code[TOUCHED] |= one.about.get(TOUCHED, {})
     known = {"codes": codes, "reused": reused, "tables": {EPISODES: digest_of_path(folder / EPISODES)}}
     if {name: about.get(name) for name in known} != known:
         write_run(folder, {**about, **known})
@@ -275,8 +300,13 @@ def write_errors(folder: Path, finished: Iterable[tuple[Unit, Finished]]) -> Non
 
 
 def unit_rows(finished: Finished) -> pd.DataFrame:
-    """Reads the rows of a finished unit."""
-    return _with_all_labels(pq.read_table(finished.path, partitioning=None).to_pandas())
+    """Read the rows of a finished unit.
+
+    Raises:
+        ConfigError: If its file is damaged.
+    """
+    with damaged(finished.path, "Give the run's command again, which runs the unit again."):
+        return _with_all_labels(read_sealed(finished.path).to_pandas())
 
 
 def _with_all_labels(rows: pd.DataFrame) -> pd.DataFrame:

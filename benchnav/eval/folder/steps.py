@@ -21,7 +21,8 @@ from benchnav.core.settings import check_known
 from benchnav.core.store import replacing
 from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.folder.run_folder import DamageError, damaged, metadata, open_run, with_metadata
+from benchnav.eval.folder.run_folder import damaged, open_run
+from benchnav.eval.folder.sealed import DamageError, metadata, read_sealed, with_metadata
 
 STEPS = "steps"
 
@@ -68,7 +69,7 @@ def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
         for path, names in held.items():
             if names == [*every, LAST_COLUMN]:
                 continue
-            table = pq.read_table(path, partitioning=None)
+            table = read_sealed(path)
             none = pa.array(np.full(len(table), np.nan, np.float32))
             full = {name: table[name] if name in names else none for name in [*every, LAST_COLUMN]}
             _write(path, pa.table(full), metadata(path))
@@ -105,12 +106,22 @@ def rows_of(
     Raises:
         ConfigError: a file of them is damaged.
     """
+    # Whole files, since their digests are of all that they hold.
+    tables = []
     with damaged(folder / STEPS, _REMEDY):
         for field in source.schema:
             fits = pa.types.is_integer if field.name in _KEYS else pa.types.is_floating
             if field.name in (*_KEYS, *_VALUES) and not fits(field.type):
                 raise DamageError(f"{field.name} holds {field.type}")
-        return source.to_table(columns=columns and list(columns), filter=chosen).to_pandas()
+        for fragment in source.get_fragments(filter=chosen):
+            table = read_sealed(Path(fragment.path))
+            condition = ds.get_partition_keys(fragment.partition_expression)["condition"]
+            table = table.append_column("condition", pa.array([condition] * len(table), pa.string()))
+            table = table.filter(chosen)
+            tables.append(table.select(columns) if columns else table)
+        if not tables:
+            return source.schema.empty_table().select(columns or source.schema.names).to_pandas()
+        return pa.concat_tables(tables, promote_options="default").to_pandas()
 
 
 def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:

@@ -19,6 +19,7 @@ from benchnav.core.figures import save_twice
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
 from benchnav.eval.experiment.condition import KNOWLEDGE
+from benchnav.eval.folder.checksums import note_checksums
 from benchnav.eval.folder.provenance import command_lines
 from benchnav.eval.folder.run_folder import ERRORS, caveats, open_run, read_table
 from benchnav.eval.recording import MAP, Ground, Recording, read_recordings
@@ -52,6 +53,8 @@ from benchnav.planning.world.outcome import ERROR_OUTCOMES
 
 PAGE = "report.html"
 
+_FILES = (PAGE, *(f"summary.{suffix}" for suffix in ("csv", "md", "tex")), "failures.csv", "hypotheses.csv")
+_FILES += ("hypotheses.tex", "regret.csv")
 _MOST_PATHS = 8
 _EPISODE = ("condition", "seed", "realisation", "map")
 
@@ -186,6 +189,8 @@ def write_report(folder: Path, record_driven: RecordDriven | None = None, out: P
         figures[path] = caption
     for file in ("summary.md", PAGE):
         write_text(out / file, render(file, report, figures))
+    drawn = [path.with_suffix(suffix) for path in figures for suffix in (".png", ".pdf")]
+    note_checksums(out, [*drawn, *(path for name in _FILES if (path := out / name).is_file())])
     return report
 
 

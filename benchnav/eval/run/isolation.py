@@ -7,6 +7,7 @@ the planner's, robot's and objective's parts by name first, so that what they ar
 import multiprocessing
 import pickle
 import traceback
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -14,6 +15,7 @@ import torch
 
 from benchnav.core.device import GPU_FAULTS, gpu_failed
 from benchnav.core.errors import BenchnavError
+from benchnav.core.touched import merge, snapshot
 from benchnav.eval.experiment.condition import Condition
 from benchnav.planning.planners import boundary
 from benchnav.planning.planners.planner import Plan, Planner
@@ -22,6 +24,7 @@ from benchnav.planning.sensing.sensor import Step
 
 # Starting a process, importing PyTorch and compiling are not the planner's time.
 _START_S = 120.0
+_CLOSE_S = 5.0
 
 
 class PlannerProcessError(BenchnavError):
@@ -53,7 +56,10 @@ class IsolatedPlanner(Planner[int]):
             raise
 
     def close(self) -> None:
-        """Ends the child."""
+        """End the child, and take over what it saw its planner touch."""
+        if self._child.is_alive():
+            with suppress(PlannerProcessError):
+                merge(self._ask(_CLOSE_S, "touched"))
         self._child.kill()
         self._child.join()
         self._here.close()
@@ -110,7 +116,10 @@ def _serve(connection: Connection, condition: Condition) -> None:
             return
         try:
             call, *arguments = pickle.loads(message)
-            if call == "start":
+            answer: Any
+            if call == "touched":
+                answer = snapshot()
+            elif call == "start":
                 condition.make_task()
                 condition.make("belief")  # whose state a problem holds
                 planner, answer = condition.make_planner(), None

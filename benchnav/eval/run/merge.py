@@ -13,10 +13,14 @@ from typing import Any
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard, new_folder, replacing, sole_writer, take_place
+from benchnav.core.touched import unlike
 from benchnav.eval.experiment.condition import label_words
 from benchnav.eval.experiment.unit import Unit, in_table_order, units
 from benchnav.eval.folder import provenance
+from benchnav.eval.folder.checksums import note_checksums
+from benchnav.eval.folder.provenance import TOUCHED
 from benchnav.eval.folder.run_folder import (
+    ERRORS,
     RUN,
     Finished,
     Run,
@@ -62,6 +66,15 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
                     f"Expected shards made by one code, got {earlier.path} and {now.path}, which differ in "
                     f"{'; '.join(changed)}. Give the commands of the shards again with one code."
                 )
+        touched: dict[str, str] = {}
+        for _, one in found:
+            if changed := unlike(touched, one.about.get(TOUCHED, {})):
+                raise ConfigError(
+                    f"Expected shards whose parts read the same, got {one.path}, which differs from units before it in "
+                    f"{'; '.join(changed)}. Give the commands of the shards again with the same files, packages and "
+                    "variables."
+                )
+            touched |= one.about.get(TOUCHED, {})
         target = folder.resolve()
         partial = new_folder(target)
         write_run(partial, _about(runs))
@@ -80,6 +93,7 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
                 )
         align_steps(partial, every)
         finish_run(partial, copied)
+        note_checksums(partial, [partial / ERRORS])
         keep_ground(partial)
         take_place(partial, target, last=RUN)
 
@@ -139,6 +153,11 @@ def _unlike(first: Run, other: Run) -> list[str]:
 def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
     """A finished unit of some runs, the newest of each; refuses one that came out differently in two."""
     found = [makings[0] for run in runs if (makings := find_units(run.folder, unit))]
+    for making in found:
+        if damage := making.damage():
+            raise ConfigError(
+                f"{making.folder} is damaged: {damage[0]}. Give the shard's command again, which runs the unit again."
+            )
     for other in found[1:]:
         if len(differences(unit_rows(found[0]), unit_rows(other))[0]):
             raise ConfigError(

@@ -13,6 +13,7 @@ from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.unit import Unit
+from benchnav.eval.folder.checksums import note_checksums
 from benchnav.eval.folder.run_folder import EPISODES, Run, open_run, read_table
 from benchnav.eval.folder.steps import LAST_COLUMN, open_steps, read_steps
 from benchnav.eval.recording import GROUND, MAP, Ground, Recording
@@ -190,3 +191,4 @@ def keep_ground(folder: Path) -> None:
         immobilising=simulation.immobilising[0].cpu().numpy(),
         goal_m=block.places.goal_m[0].cpu().numpy(),
     ).save(folder / GROUND)
+    note_checksums(folder, [folder / GROUND])

@@ -16,11 +16,21 @@ from benchnav.core.device import find_device, gpu_name
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import plain
 from benchnav.core.store import Shard, sole_writer
+from benchnav.core.touched import changes_since, unlike
 from benchnav.core.workers import connected, run_calls
-from benchnav.eval.experiment.suite import RECORDS, Suite
+from benchnav.eval.experiment.suite import RECORDS, Record, Suite
 from benchnav.eval.experiment.unit import Unit, in_table_order, units
-from benchnav.eval.folder.provenance import Origin, Origins, code_differences
-from benchnav.eval.folder.run_folder import Finished, caveats, find_units, finish_run, write_errors
+from benchnav.eval.folder.checksums import note_checksums
+from benchnav.eval.folder.provenance import TOUCHED, Origin, Origins, code_differences
+from benchnav.eval.folder.run_folder import (
+    ERRORS,
+    Finished,
+    caveats,
+    find_units,
+    finish_run,
+    unit_path,
+    write_errors,
+)
 from benchnav.eval.folder.steps import align_steps
 from benchnav.eval.run.begin import Work, begin, drop
 from benchnav.eval.run.check import Say, check_suite
@@ -92,7 +102,7 @@ def run_work(
     every = units(conditions, work.record)
     own = [unit for unit in every if work.shard is None or unit.shard(work.shard.of) == work.shard]
     origins = work.settings.origins()
-    missing = _missing(own, origins, folder, work.reuse_code, say)
+    missing = _missing(own, origins, folder, work.reuse_code, say, is_here=not scheduler)
     done = len(own) - len(missing)
     if own:
         yield done, len(own)
@@ -110,11 +120,15 @@ def run_work(
         say("measuring the planning time of one robot alone")
     measure_latencies(folder, {unit.condition.id for unit in own}, work.settings)
     finished, reused = _finished(in_table_order(own, conditions), origins, folder, work.reuse_code)
+    if not work.reuse_code:
+        _check_steady([one for _, one in finished], is_here=not scheduler)
     if work.shard is not None:
         write_errors(folder, finished)
+        note_checksums(folder, [folder / ERRORS])
         return
     align_steps(folder, every)
     finish_run(folder, finished, reused)
+    note_checksums(folder, [folder / ERRORS])
     keep_ground(folder)
 
 
@@ -124,34 +138,69 @@ def _run_in(here: Path, folder: Path, unit: Unit, origin: Origin, settings: Sett
 
 
 def _missing(
-    own: list[Unit], origins: Origins, folder: Path, reuse_code: bool, say: Say
+    own: list[Unit], origins: Origins, folder: Path, reuse_code: bool, say: Say, is_here: bool
 ) -> list[tuple[Unit, Origin]]:
-    """What is to be run: units that are not finished, or not recorded as they are now to be."""
-    missing, again, unused = [], 0, 0
+    """What is to be run: units that are not finished, damaged, or not recorded as they are now to be.
+
+    Args:
+        own: units of this run.
+        origins: what they come from now.
+        folder: the run folder.
+        reuse_code: take units of other code.
+        say: is told how many units are run again, and why.
+        is_here: units are run on this machine, so that what parts read can be compared with what is here.
+    """
+    missing, again, unused, stale = [], 0, 0, 0
     other: dict[str, None] = {}
+    changed: dict[str, None] = {}
+    damage: list[str] = []
     for unit in own:
         origin, known = origins.of(unit), find_units(folder, unit)
         counts = _counting(known, unit, origin, reuse_code)
-        if counts is None:
+        if lines := _damage(folder, unit, origin, counts):
+            missing.append((replace(unit, record=_richest(unit, counts)), origin))
+            damage.append(lines[0])
+        elif counts is None:
             missing.append((unit, origin))
             if known:
                 unused += 1
                 other |= dict.fromkeys(_differences(known[0], origin))
+        elif is_here and not reuse_code and (lines := changes_since(counts.about.get(TOUCHED, {}))):
+            missing.append((replace(unit, record=_richest(unit, counts)), origin))
+            stale += 1
+            changed |= dict.fromkeys(lines)
         elif not counts.has(unit):
             again += 1
-            # With what it has kept, so that a run is never the poorer for being asked for more.
-            record = max(unit.record, counts.about["record"], key=RECORDS.index)
-            missing.append((replace(unit, record=record), origin))
+            missing.append((replace(unit, record=_richest(unit, counts)), origin))
     if done := len(own) - len(missing):
         say(f"{done} of {len(own)} units were there already")
     if again:
         say(f"{again} of {len(own)} units are run again for recordings or steps that they lack")
+    if damage:
+        say(f"{len(damage)} of {len(own)} units are damaged and are run again; the first: {damage[0]}")
+    if stale:
+        say(
+            f"{stale} of {len(own)} units are run again, since what their parts read changed: {'; '.join(changed)}"
+        )
     if unused:
         say(
             f"{unused} of {len(own)} units were finished by other code or maps ({'; '.join(other)}) and are run again; "
             "--reuse-code takes units of other code"
         )
     return missing
+
+
+def _damage(folder: Path, unit: Unit, origin: Origin, counts: Finished | None) -> list[str]:
+    """Lines on what of the making of a unit that counts is damaged; of one that cannot be recognised, on its file."""
+    if counts is not None:
+        return counts.damage()
+    path = unit_path(unit, origin.key(unit))
+    return [f"{path}: it cannot be read"] if (folder / path).exists() else []
+
+
+def _richest(unit: Unit, counts: Finished | None) -> Record:
+    """What is recorded of a unit that is run again: no less than it has kept, however little is asked for."""
+    return max(unit.record, counts.about["record"] if counts else unit.record, key=RECORDS.index)
 
 
 def _counting(known: list[Finished], unit: Unit, origin: Origin, reuse_code: bool) -> Finished | None:
@@ -169,6 +218,26 @@ def _differences(finished: Finished, origin: Origin) -> list[str]:
     """What differs between the origin of a finished unit and another, in words."""
     maps = ["maps"] if finished.about["digests"] != list(origin.maps) else []
     return [*code_differences(finished.about["code"], origin.code), *maps]
+
+
+def _check_steady(finished: list[Finished], is_here: bool) -> None:
+    """Refuse units whose parts read different contents of one file, package or variable.
+
+    Raises:
+        ConfigError: If there are such, or if what they read is not here any more.
+    """
+    seen: dict[str, str] = {}
+    changed: dict[str, None] = {}
+    for one in finished:
+        touched = one.about.get(TOUCHED, {})
+        changed |= dict.fromkeys(unlike(seen, touched))
+        seen |= touched
+    changed |= dict.fromkeys(changes_since(seen)) if is_here else {}
+    if changed:
+        raise ConfigError(
+            f"Expected what parts read to stay the same during the run, got changes: {'; '.join(changed)}. "
+            "Give the run's command again; it runs the units again that read something else."
+        )
 
 
 def _finished(
@@ -190,8 +259,9 @@ def _finished(
                 "Give its `benchnav-eval run` command again."
             )
         found.append((unit, counts))
-        if counts.about["key"] != origin.key(unit):
+        changed = changes_since(counts.about.get(TOUCHED, {})) if reuse_code else []
+        if changed or counts.about["key"] != origin.key(unit):
             reused += 1
-            other |= dict.fromkeys(_differences(counts, origin))
+            other |= dict.fromkeys([*_differences(counts, origin), *changed])
     line = f"{reused} of {len(own)} units were made by other code ({'; '.join(other)}); column `code` tells which rows"
     return found, line if reused else ""

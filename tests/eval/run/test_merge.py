@@ -18,7 +18,8 @@ import pytest
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.run_folder import caveats, metadata, open_run, read_table, with_metadata, write_run
+from benchnav.eval.folder.run_folder import caveats, open_run, read_table, write_run
+from benchnav.eval.folder.sealed import metadata, with_metadata
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.run import merge
 from benchnav.eval.run.merge import merge_shards

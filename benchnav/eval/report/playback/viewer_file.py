@@ -19,6 +19,7 @@ from benchnav.core.grid import is_azimuth
 from benchnav.core.store import replacing
 from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.folder.checksums import is_as_noted, note_checksums
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.plan_layers import MOST_SPREAD
 from benchnav.eval.report.playback.scene import TIMELINE, Driver, layer_entity, log_driver, log_ground
@@ -37,14 +38,16 @@ _ALL, _PLACES = "/map/overlay/**", "/map/places/**"
 
 
 def write_viewer_files(folder: Path) -> None:
-    """Writes the viewer's file of each recording in a run folder that has none.
+    """Write the viewer's file of each recording in a run folder that has none, or a damaged one.
 
     Args:
         folder: the run folder.
     """
-    for path in sorted((folder / "playback").glob("*.npz")):
-        if not path.with_suffix(".rrd").exists():
-            write_rerun([Recording.load(path)], path.with_suffix(".rrd"))
+    files = [path.with_suffix(".rrd") for path in sorted((folder / "playback").glob("*.npz"))]
+    for file in files:
+        if not file.exists() or not is_as_noted(folder, file):
+            write_rerun([Recording.load(file.with_suffix(".npz"))], file)
+    note_checksums(folder, files)
 
 
 def write_rerun(recordings: Sequence[Recording], path: Path) -> None:

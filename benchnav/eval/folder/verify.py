@@ -1,0 +1,72 @@
+"""Checking all files of a run folder against the digests that they, and the run, hold."""
+
+from pathlib import Path
+
+from benchnav.core.errors import BenchnavError
+from benchnav.core.sources import digest_of_path
+from benchnav.eval.experiment.unit import units
+from benchnav.eval.folder.checksums import SUMS, read_checksums
+from benchnav.eval.folder.run_folder import EPISODES, RUN, Finished, find_units, open_run, read_table
+from benchnav.eval.folder.sealed import CONTENT, DamageError, metadata, read_sealed
+from benchnav.eval.folder.steps import STEPS
+
+
+def verify_run(folder: Path) -> tuple[list[str], list[str]]:
+    """Compare all files of a run folder with their digests.
+
+    Args:
+        folder: a run folder, finished or not; nothing is written.
+
+    Returns:
+        Lines on what is damaged, each beginning with the file, and lines on what is not damaged but should be known.
+
+    Raises:
+        ConfigError: If the folder has no `run.json`.
+    """
+    damage, notes = [], []
+    try:
+        run = open_run(folder)
+    except BenchnavError as error:
+        if not (folder / RUN).is_file():
+            raise
+        return [str(error)], []
+    files = sorted((folder / "units").glob("*/*.parquet"))
+    undigested = 0
+    for path in files:
+        finished = Finished(path=path, about=metadata(path))
+        if "key" not in finished.about:
+            damage.append(f"{path.relative_to(folder)}: it cannot be read")
+            continue
+        undigested += CONTENT not in finished.about
+        damage += finished.damage()
+    for path in sorted((folder / STEPS).glob("*/*.parquet")):
+        try:
+            read_sealed(path)
+        except DamageError as error:
+            damage.append(f"{path.relative_to(folder)}: {error}")
+    if (folder / EPISODES).exists():
+        try:
+            read_table(folder, EPISODES)
+        except BenchnavError as error:
+            damage.append(f"{EPISODES}: {error}")
+    checksums = read_checksums(folder)
+    removed = []
+    for name, digest in checksums.items():
+        if not digest:
+            damage.append(f"{SUMS}: {name[:60]!r} is not a checksum and a path")
+        elif not (folder / name).is_file():
+            removed.append(name)
+        elif digest_of_path(folder / name) != digest:
+            damage.append(f"{name}: it was changed after benchnav wrote it")
+    every = units(run.conditions)
+    own = [unit for unit in every if run.shard is None or unit.shard(run.shard.of) == run.shard]
+    missing = sum(not find_units(folder, unit) for unit in own)
+    if missing:
+        notes.append(f"{missing} of {len(own)} units are not finished")
+    if removed:
+        notes.append(
+            f"{len(removed)} of {len(checksums)} files in {SUMS} are missing, the first {removed[0]}"
+        )
+    if undigested:
+        notes.append(f"{undigested} of {len(files)} units hold no digest, as version 1.0 wrote them")
+    return list(dict.fromkeys(damage)), notes
