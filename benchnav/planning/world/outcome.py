@@ -31,7 +31,7 @@ class Outcome(IntEnum):
     BELIEF_ERROR = 11  # the belief raised, or gave what is none
 
 
-# Which a fault of some code is to blame for.
+# Outcomes caused by an exception in user code.
 ERROR_OUTCOMES = ("planner_error", "model_error", "sensor_error", "belief_error")
 FAILURES = tuple(o for o in Outcome if o not in (Outcome.RUNNING, Outcome.SUCCESS))
 
