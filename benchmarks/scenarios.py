@@ -170,7 +170,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def by_scenario(pairs: Mapping[str, Maps], columns: Columns) -> str:
     """A table with a row a scenario."""
-    rows = [[name, *(column(severity) for column in columns.values())] for name, severity in pairs.items()]
+    rows = [[name, *(column(maps) for column in columns.values())] for name, maps in pairs.items()]
     return table(["scenario", *columns], rows)
 
 
@@ -299,9 +299,9 @@ def draw_distributions(series: Mapping[str, Maps], steepest: float) -> Figure:
     """Slope, λ and brightness of all cells in std, hg and hs."""
     figure, panels = _three_panels(2.5)
     for name, dashes in (("std", "-"), ("hg-100", "-"), ("hs-100", (0, (4, 1.5)))):
-        severity: Maps = series[name]
+        maps: Maps = series[name]
         look: dict[str, Any] = {"color": COLOURS[name.split("-")[0]], "ls": dashes, "lw": 1.3, "label": name}
-        counts = [severity["slope"], severity["lambda"], histogram(severity["brightness"], SHARE_EDGES)]
+        counts = [maps["slope"], maps["lambda"], histogram(maps["brightness"], SHARE_EDGES)]
         slope, traversability, light = (np.r_[0, c.sum(0).cumsum()] / c.sum() for c in counts)
         panels[0].plot(SLOPE_EDGES[slope < 1], 1 - slope[slope < 1], **look)
         panels[1].plot(SHARE_EDGES, traversability, **look)

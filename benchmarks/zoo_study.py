@@ -1,4 +1,4 @@
-"""Does a better calibrated model get the robot to its goal more often? Quality varied on purpose, and what it is worth.
+"""Does a model with a lower loss get the robot to its goal more often? Quality varied on purpose, and what it is worth.
 
     python benchmarks/zoo_study.py runs/zoo                 # hours; killed and begun again it goes on
     python benchmarks/zoo_study.py runs/zoo --parts inputs  # one part alone

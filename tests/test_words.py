@@ -8,7 +8,8 @@ OLD = re.compile(r"luck|yardstick|told[ _]apart|\brungs?\b|ladder|\btwins?\b|slo
 # Unmistakable parts of sentences that no reader understood.
 RIDDLES = re.compile(
     r"so many maps show|told apart from it|does not tell from it|is told the truth|of the draws of λ [\d{]|joined "
-    r"start and goal by no ground|shows from|has a way over ground|since which these|may leave 0 out",
+    r"start and goal by no ground|shows from|has a way over ground|since which these|may leave 0 out|"
+    r"randomization conditions|independent conditions|none for example|\(a (\w+), a \1\)|noise of λ, and what",
     re.IGNORECASE,
 )
 # The table of renames, its test, and this.

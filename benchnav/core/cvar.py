@@ -143,7 +143,7 @@ def conditional_value_at_risk(cells: Cells, tail: Tensor) -> Tensor:
 
 
 def _may_wait(values: Tensor) -> bool:
-    """Tells whether numbers may be looked at while all is computed."""
+    """Return whether reading values is free, as on a CPU."""
     return values.device.type == "cpu"
 
 
@@ -191,7 +191,7 @@ def _root(cells: Cells, tail: Tensor, value: Tensor, is_var: bool = False) -> Te
         near = excess.abs() < _SHARE_ERROR * tail
         if is_var:
             near &= off.abs() < _VAR_ERROR
-        # Cells that are not known, whose parameters are not numbers, have no root.
+        # Cells with NaN parameters have no root.
         ended = near | _at_an_end(value, excess) | (high - low < _LEAST_GAP) | excess.isnan()
         value = torch.where(ended, value, moved)
         if not _may_wait(value):

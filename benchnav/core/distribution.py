@@ -335,7 +335,7 @@ class TraversabilityDistribution(Batch, ABC):
         return map_tensors(self, lambda values: values.reshape(-1, *values.shape[count:]))
 
     def _in_pieces(self, work: Callable[..., Tensor], *layers: Tensor) -> Tensor:
-        """Does some work on so many cells at a time that memory does not grow with the maps.
+        """Apply a function in chunks of cells, so that memory does not grow with the maps.
 
         Args:
             work: from a distribution of shape [b, h, w] in float64 and layers of that shape to numbers of that shape,

@@ -1,7 +1,7 @@
 """Named random streams: from a root seed and names to random numbers, with no global state.
 
 A stream is named by a root seed and any strings or integers, for example
-`(seed, "test/hs", "elevation")`. Element `i` of a stream (a map, a map) owns a block of its
+`(seed, "test/hs", "elevation")`. Element `i` of a stream (a map) owns a block of its
 own in the counter of a Philox generator, so its numbers are the same whatever batch, order or
 worker asks for them. The transforms from raw bits are ours: libraries change theirs between
 versions, while a bit generator's raw output is specified.

@@ -135,7 +135,7 @@ def _run_on_cluster(calls: Sequence[Callable[[], Result]], scheduler: str) -> It
             ) from error
         except KilledWorker as error:
             raise BenchnavError(
-                f"Some work was given up, since several workers died over it, the last at {error.last_worker.address}: "
+                f"A task was dropped; it killed several workers, the last at {error.last_worker.address}: "
                 "see their logs, perhaps for lack of memory. Finished work is kept."
             ) from error
 

@@ -95,13 +95,13 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
 
     ## Info
 
-    | key              | type  | meaning                                                    |
-    |------------------|-------|------------------------------------------------------------|
-    | `map`       | int   | number of the map in its split                             |
+    | key              | type  | meaning                                                           |
+    |------------------|-------|-------------------------------------------------------------------|
+    | `map`            | int   | number of the map in its split                                    |
     | `outcome`        | str   | `running`, `success`, `timeout`, `immobilised` or `out_of_bounds` |
-    | `is_success`     | bool  | the goal was reached                                       |
-    | `traversability` | float | observed λ in the step; 1 after a reset                         |
-    | `distance_m`     | float | to the goal                                                |
+    | `is_success`     | bool  | the goal was reached                                              |
+    | `traversability` | float | observed λ in the step; 1 after a reset                           |
+    | `distance_m`     | float | to the goal                                                       |
 
     ## Version history
     * v0 of benchnav 0.9: layers of the dataset.
@@ -405,5 +405,5 @@ class EnvBatch:
 
 
 def _lost(outcome: Tensor) -> Tensor:
-    """Off the map, or held by the ground for good: no later step could mend it."""
+    """Off the map, or immobilised for good: no later step could mend it."""
     return (outcome == Outcome.OUT_OF_BOUNDS) | (outcome == Outcome.IMMOBILISED)

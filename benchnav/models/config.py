@@ -26,7 +26,7 @@ class TrainOptions:
         symmetries: Turn and mirror training maps at random; false for photos, whose light comes from one direction.
         crop: Train on squares of so many cells a side, drawn anew each epoch; 0 takes whole maps.
         resume: Go on with an interrupted training from its finished parts and epochs.
-        overwrite: Replace these parts, or a checkpoint of another model or other classes, where `out` holds one.
+        overwrite: Replace an existing checkpoint in `out`, or these parts of it.
         conformal: Recalibrate the model on every second map of valid, which early stopping and temperature then leave
             out. Its lower quantiles then hold on new maps of the same kind.
     """

@@ -3,8 +3,8 @@
 S_free is where a map exceeds a threshold, and around the goal. A planner may cross other ground at a high
 finite penalty, so that all planners face the same question and there is a way where no free way is
 predicted. A planner that looks no farther than a horizon, as MPPI does, may still wait before such ground.
-The λ̂ that motion and path costs are given is at least `min_traversability`, so that a robot on ground predicted to hold
-it can plan its way out. Beyond the paper, whose equation 2e forbids such ground.
+The λ̂ that motion and path costs are given is at least `min_traversability`, so that a robot on ground predicted to
+immobilise it can plan its way out. Beyond the paper, whose equation 2e forbids such ground.
 """
 
 from dataclasses import asdict, dataclass
@@ -109,14 +109,14 @@ class Immobile:
 
     Args:
         below: observed λ under this immobilises a robot.
-        for_s: an episode ends when it was held for so long without a break, whatever was commanded.
+        for_s: an episode ends after so many seconds in a row on such ground, whatever was commanded.
     """
 
     below: float = 0.1
     for_s: float = 2.0
 
     def __post_init__(self) -> None:
-        """Refuses rules that hold always or never."""
+        """Refuses rules that always or never immobilise."""
         expect(0 < self.below <= 1, f"`immobile.below` in (0, 1], got {self.below}.")
         expect(0 < self.for_s < float("inf"), f"`immobile.for_s` > 0 and finite, got {self.for_s}.")
 

@@ -135,7 +135,7 @@ def check_objective(objective: Any, robot: Any = None, device: torch.device | st
             cost = breaches.try_function(method, getattr(made, method), given, is_cost)
         breaches.expect(
             cost is NOTHING or bool((cost > 0).all()),
-            "Expected costs above 0 from `path_cost`, got others. Let no metre of a path be free.",
+            "Expected costs above 0 from `path_cost`, got others. Return a cost > 0 per metre.",
         )
     breaches.refuse()
 

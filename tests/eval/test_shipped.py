@@ -110,7 +110,7 @@ IN_STAKES = [
 ]  # fmt: skip
 
 
-def test_golden_rows_of_the_blind_straight_line_where_soft_ground_ends_a_episode(tmp_path: Path) -> None:
+def test_golden_rows_of_the_blind_straight_line_where_soft_ground_ends_an_episode(tmp_path: Path) -> None:
     suite = Suite(
         data="stakes-v1", world="stakes", model="oracle", planners=("straight",), scenarios=("std",),
         maps=8, record="steps",

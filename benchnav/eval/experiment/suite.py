@@ -35,8 +35,8 @@ class Suite:
         objectives: Objectives J.
         sensors: What a robot sees of its map: `full`, all of it before it sets out, or `near`, the ground around it.
         grounds: Which λ it senses on its way: `contact`, under it, or `probe`, around it.
-        beliefs: What it makes of sensed λ: `static`, nothing; `copula`, what λ is like nearby; `classes`, also which of
-            two look-alike classes ground is of.
+        beliefs: How measured λ updates the prediction: `static`, not; `copula`, λ of nearby cells; `classes`, also
+            which of two look-alike classes cells are of.
         world: What λ does: a preset by name, paper or stakes, or {preset: NAME, noise: resampled | stored |
             frozen, correlation_m: 1.5, kernel: gaussian | matern32, immobile: {below: 0.1, for_s: 2},
             time_budget_s: T or time_budget_ratio: T over the map's reference time}; or a list of several.

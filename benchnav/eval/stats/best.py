@@ -108,7 +108,7 @@ def best_set_p(values: np.ndarray, flips: np.ndarray) -> tuple[np.ndarray, float
 
 
 def against_best(
-    episodes: pd.DataFrame, summary: pd.DataFrame, told: Mapping[str, str] | None = None
+    episodes: pd.DataFrame, summary: pd.DataFrame, privileged: Mapping[str, str] | None = None
 ) -> pd.DataFrame:
     """Compares the conditions of each block that compete, map by map, and tells which are worse than the best.
 
@@ -118,7 +118,7 @@ def against_best(
     Args:
         episodes: rows of episodes.
         summary: of them, from `summary.summarise`.
-        told: from `privileged_models`; none where not given.
+        privileged: from `privileged_models`; none where not given.
 
     Returns:
         A row a condition, in the order of the summary: `condition`; `privileged`, of `PRIVILEGED`, empty
@@ -131,7 +131,7 @@ def against_best(
         itself.
     """
     groups = dict(list(episodes.groupby("condition", sort=False)))
-    summary = summary.assign(privileged=summary["condition"].map(told or {}).fillna(""))
+    summary = summary.assign(privileged=summary["condition"].map(privileged or {}).fillna(""))
     found: list[dict[str, Any]] = []
     for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False):
         about, compared = _compare(

@@ -37,7 +37,7 @@ def wilson_interval(rate: float, n: float) -> tuple[float, float]:
 
     Args:
         rate: share of successes, in [0, 1].
-        n: number of independent conditions, > 0; an effective number need not be whole.
+        n: number of independent trials, > 0; an effective number need not be whole.
 
     Returns:
         Lower and upper end, in [0, 1].
@@ -54,8 +54,8 @@ def design_effect(success: np.ndarray, maps: np.ndarray) -> float:
     all, or there is but one map, ρ cannot be seen; it is then 1, so that a map counts as one episode. Since ρ
     is an estimate, a 95 % interval made with it holds 93 % of the time on 20 maps and 95 % on 60 (simulated,
     five episodes a map).
-    Source: Donner and Klar (2000), "Design and Analysis of Cluster Randomization Conditions", 1.2 and 6.2.1;
-    Ridout, Demétrio and Firth (1999) for the estimator on binary data.
+    Source: Donner and Klar (2000), "Design and Analysis of Cluster Randomization Trials in Health Research", 1.2 and
+    6.2.1; Ridout, Demétrio and Firth (1999) for the estimator on binary data.
 
     Args:
         success: bool, shape [N].

@@ -29,7 +29,7 @@ from benchnav.models.nets.inputs import Maps
 from benchnav.models.nets.trainable import Loss, TrainableNetwork
 
 _DETAIL_CHANNELS = 32
-_CONDITION_SIDE = 64
+_CHECK_SIDE = 64  # cells of the side of the map that checks a network
 _LEAST_DOUBT = 1e-6
 
 
@@ -273,9 +273,9 @@ def _drop_unused_stages(network: Any, channels: int) -> None:
     Raises:
         ValueError: at this depth the network's answer is not of the image's size.
     """
-    answer = network.eval()(torch.zeros(1, channels, _CONDITION_SIDE, _CONDITION_SIDE))
-    if answer.shape[-1] != _CONDITION_SIDE:
-        raise ValueError(f"it answers {_CONDITION_SIDE} cells with {answer.shape[-1]}.")
+    answer = network.eval()(torch.zeros(1, channels, _CHECK_SIDE, _CHECK_SIDE))
+    if answer.shape[-1] != _CHECK_SIDE:
+        raise ValueError(f"it answers {_CHECK_SIDE} cells with {answer.shape[-1]}.")
     answer.sum().backward()
     for part in list(network.encoder.modules()):
         for name, inner in list(part.named_children()):

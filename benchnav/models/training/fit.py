@@ -186,7 +186,7 @@ def fit(
             if state is None or trainer.global_step:
                 raise
             raise CheckpointError(
-                f"{state} is damaged: {type(error).__name__} {error}. Pass --overwrite to begin anew."
+                f"{state} is damaged: {type(error).__name__} {error}. Pass --overwrite to restart."
             ) from error
         return measured(trainer)
 
@@ -242,7 +242,7 @@ def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | 
         if others := differing(settings, json.loads((folder / SETTINGS).read_text())):
             raise CheckpointError(
                 f"Expected the settings of the interrupted training in {folder} to resume it, got {others}. "
-                "Repeat its settings, or pass --overwrite to begin anew."
+                "Repeat its settings, or pass --overwrite to restart."
             )
         return state
     if is_first_process():

@@ -81,9 +81,9 @@ def advance_entrapped(
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Rolls samples out as `mppi.advance_chunk` does, where ground of little λ immobilises a robot.
 
-    One that was on such ground for so many steps stops there, and pays J of standing there, with the penalty of ground
-    that is not free, until its time is over. Its states go on, and cost nothing more. Whoever has been at the goal has
-    arrived, and is not held on ground behind it.
+    One that was on such ground for `most` steps in a row stops there, and pays J of standing there, with the penalty
+    of ground that is not free, until its time is over. Its states go on, and cost nothing more. One that has been at
+    the goal has arrived, and is not immobilised on ground behind it.
 
     Args:
         states: shape [B, K, S].
@@ -103,8 +103,8 @@ def advance_entrapped(
         objective: J.
         min_traversability: least λ of motion.
         goal_radius_m: how near the goal a robot has arrived.
-        below: λ under which ground holds.
-        most: steps in a row for which it has to.
+        below: λ under which ground immobilises a robot.
+        most: steps in a row on such ground after which a robot is immobilised.
 
     Returns:
         States, cost and `held` after these steps.

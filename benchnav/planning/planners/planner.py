@@ -133,7 +133,7 @@ class Planner(ABC, Generic[State]):
         return NotImplemented
 
     def revise(self, plan_state: State, problem: Problem) -> State:
-        """Goes on under another λ̂, as where more is known of the ground than before.
+        """Replan for an updated λ̂ map.
 
         Args:
             plan_state: from the last call; not changed.

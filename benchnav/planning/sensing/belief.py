@@ -30,7 +30,7 @@ State = TypeVar("State", bound=Batch)
 
 @dataclass(frozen=True, kw_only=True)
 class Law:
-    """How the λ of a map's cells hangs together.
+    """Covariance model of the λ field.
 
     Args:
         grid: size and resolution of the maps.
@@ -75,11 +75,11 @@ class Belief(ABC, Generic[State]):
 
     @abstractmethod
     def init(self, prior: TraversabilityDistribution, law: Law) -> State:
-        """What is known before anything was sensed.
+        """Return the initial belief state.
 
         Args:
             prior: the model's prediction, shape [B, H, W].
-            law: how λ hangs together.
+            law: the covariance model.
         """
 
     @abstractmethod
@@ -106,7 +106,7 @@ class Belief(ABC, Generic[State]):
         return self.distribution(state).at(cells)
 
     def changed(self, before: State, after: State) -> Tensor:
-        """Cells of which something else is believed than before, bool, shape [B, H, W]; all, where none can tell."""
+        """Return a mask of cells whose belief changed, bool, shape [B, H, W]; all of them if that is not known."""
         found = self.distribution(after)
         return torch.ones(found.shape, dtype=torch.bool, device=found.device)
 

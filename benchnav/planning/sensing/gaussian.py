@@ -258,7 +258,7 @@ def _factor(covariance: ndarray, root: ndarray) -> Tensor:
 
 
 def _taken(factor: Tensor, root: ndarray, covariance: ndarray) -> ndarray:
-    """What terms take from the covariances of M cells, [N, M], as a matrix of that shape times its own transpose."""
+    """Return A = L⁻¹√T K for M cells, shape [N, M]; AᵀA is the reduction in covariance."""
     scaled = torch.from_numpy(root[:, None] * covariance)
     return torch.linalg.solve_triangular(factor, scaled, upper=False).numpy()
 
@@ -283,7 +283,7 @@ class _Terms(NamedTuple):
         return mean, left.diagonal().clip(_LEAST_VARIANCE)
 
     def left_out(self, mean: ndarray, variance: ndarray) -> tuple[ndarray, ndarray]:
-        """Mean and variance of each cell without its own term."""
+        """Return cavity means and variances."""
         without = 1 / (1 / variance - self.precision).clip(_LEAST_VARIANCE)
         return without * (mean / variance - self.shift), without
 

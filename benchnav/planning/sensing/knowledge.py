@@ -370,7 +370,7 @@ class Learner:
             found = self._checked(sensor.sense(*given, moment), truth.field)
             expect(
                 sensor is not self.sensor or found.appearance is not None,
-                "`Sensed.appearance` from a sensor of appearance, got none. A sensor of λ is a `ground`.",
+                "`Sensed.appearance` from a sensor of appearance, got none. List λ sensors under `grounds`.",
             )
             return found
 
@@ -426,13 +426,13 @@ def sensor_keys(noise_key: int, maps: Any) -> tuple[int, ...]:
 
 
 def check_map(what: str, values: Any, dtype: torch.dtype, like: Tensor) -> None:
-    """Refuses what is no map of all cells."""
+    """Check a tensor's dtype, shape and device."""
     if wrong := find_tensor_fault(what, values, dtype, tuple(like.shape), like.device):
         raise ConfigError(wrong)
 
 
 def call(outcome: Outcome, work: Callable[[], Result]) -> Result:
-    """Does what a part of a user's may fail at.
+    """Call user code; convert its exceptions.
 
     Raises:
         KnowledgeError: it failed, and episodes end with this outcome for it.

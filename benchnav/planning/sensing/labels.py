@@ -31,7 +31,7 @@ _HALVES = (0x5555555555555555, 0x3333333333333333, 0x0F0F0F0F0F0F0F0F)
 
 @dataclass(frozen=True)
 class Lattice:
-    """Which cells hang together.
+    """Couplings between neighbouring cells.
 
     Args:
         right: all bits set where a cell and the one to its right do, int64, shape [B, H, W].

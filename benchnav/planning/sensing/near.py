@@ -30,8 +30,8 @@ class Near(Sensor):
     The robot's own cell and its eight neighbours are always seen; other cells where their centre is in range, in the
     field of view and in line of sight. Noise is drawn for each cell and step alone, normal, with a standard deviation
     that is proportional to the distance of the cell's centre. The defaults give ±4 of 255 and ±16 mm at 8 m, as a good
-    stereo camera does; slopes of cells of 0.5 m are then known to about 1°. Layers beside colour and elevation have no
-    noise, and slopes are none of its business: they are those of the elevation that was seen.
+    stereo camera does; slopes of cells of 0.5 m are then known to about 1°. Layers other than colour and elevation
+    have no noise, and slope is computed from observed elevation.
 
     Args:
         range_m: how far it sees.

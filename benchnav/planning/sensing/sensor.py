@@ -48,8 +48,8 @@ class Appearance(Batch):
         seen: which cells are seen, bool, shape [B, H, W].
         observation: colour, elevation and layers of the seen cells; what it holds of others is not used, nor are its
             slopes, which are those of the elevation that was seen.
-        doubt: how noisy the look at each cell is, in any unit, shape [B, H, W]; of several looks at a cell the least
-            noisy one is kept.
+        doubt: observation noise of each cell, in any unit, shape [B, H, W]; of several observations of a cell the
+            least noisy one is kept.
     """
 
     seen: Tensor

@@ -20,10 +20,10 @@ class Outcome(IntEnum):
     RUNNING = 0
     SUCCESS = 1
     TIMEOUT = 2
-    STUCK = 3  # a timeout whose last 10 s drove and moved under 0.5 m: the ground held the robot
+    STUCK = 3  # a timeout whose last 10 s drove and moved under 0.5 m: low λ stopped the robot
     OUT_OF_BOUNDS = 4
     PLANNER_FAILURE = 5  # the planner gave up
-    STALLED = 6  # a timeout whose last 10 s did not drive and moved under 0.5 m: the planner held it
+    STALLED = 6  # a timeout whose last 10 s did not drive and moved under 0.5 m: the planner stopped it
     PLANNER_ERROR = 7  # the planner raised, ran out of time, or returned what no robot can do
     MODEL_ERROR = 8  # the model or the risk measure raised, or gave no distribution
     IMMOBILISED = 9  # on ground that immobilises a robot, for as long as the world allows
@@ -31,7 +31,7 @@ class Outcome(IntEnum):
     BELIEF_ERROR = 11  # the belief raised, or gave what is none
 
 
-# Which a fault of some code is to blame for.
+# Outcomes caused by an exception in user code.
 ERROR_OUTCOMES = ("planner_error", "model_error", "sensor_error", "belief_error")
 FAILURES = tuple(o for o in Outcome if o not in (Outcome.RUNNING, Outcome.SUCCESS))
 

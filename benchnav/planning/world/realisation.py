@@ -193,7 +193,7 @@ def draw_frozen(
         if len(pending) == 0:
             return field, attempts
     raise ConfigError(
-        f"Expected a feasible path from start to goal, but {MOST_ATTEMPTS} draws of λ gave none for example "
+        f"Expected a feasible path from start to goal, but {MOST_ATTEMPTS} draws of λ gave none for map "
         f"{maps[int(pending[0])]}. Lower `immobile.below`, or take easier maps."
     )
 

@@ -83,7 +83,7 @@ class Simulation:
 
     @property
     def immobilising(self) -> Tensor:
-        """Cells that immobilise a robot, bool, shape [B, H, W]; none where λ is resampled or nothing holds."""
+        """Cells that immobilise a robot, bool, shape [B, H, W]; none where λ is resampled or nothing immobilises."""
         if self.field is None or self._immobile is None:
             return self._goal_m.new_zeros(len(self._goal_m), *self._grid.shape).bool()
         return self.field < self._immobile.below

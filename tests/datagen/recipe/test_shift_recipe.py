@@ -57,7 +57,7 @@ def test_first_maps_of_std_are_those_of_paper_v1() -> None:
 
 
 @pytest.mark.parametrize("split", SHIFT.splits)
-def test_every_severities_is_solvable(split: str) -> None:
+def test_every_severity_is_solvable(split: str) -> None:
     maps = generate(SHIFT, split, np.arange(3))
     assert np.isfinite(maps["reference_time_s"]).all()
     # Start and goal are 16 m apart on both axes; no cell is crossed faster than at 1 m/s.

@@ -149,7 +149,7 @@ def test_the_ground_of_failures_is_that_of_the_best_alone() -> None:
     ) in said(best, other, failures=failures, told=told)
 
 
-def test_what_is_privileged_models_is_set_beside_it() -> None:
+def test_privileged_models_are_set_beside_it() -> None:
     sentences = said(
         condition(50, planner="astar_dwa"), condition(70, planner="astar_dwa", model="oracle", risk="mean"),
         condition(80, planner="astar_dwa", model="oracle"),

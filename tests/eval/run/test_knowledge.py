@@ -352,7 +352,7 @@ def test_a_sensor_that_fails_ends_its_episodes(said: Callable[..., Any], words: 
 def test_a_sensor_under_the_key_of_the_other_kind_is_refused() -> None:
     given = drives()
     truth = given.learning.truth
-    with pytest.raises(KnowledgeError, match="A sensor of λ is a `ground`"):
+    with pytest.raises(KnowledgeError, match="List λ sensors under `grounds`"):
         learning(given.problem, truth, sensor=Probe(1.0), law=ALIKE)
     # What senses both may stand under either.
     both = Wrong(

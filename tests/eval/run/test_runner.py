@@ -658,7 +658,7 @@ def test_a_world_that_cannot_be_drawn_is_refused_before_a_run_is_dropped(
     before = finish(suite, tmp_path / "run")
     for world, expected in (
         ({"noise": "frozen", "correlation_m": 4.1}, r"`world.correlation_m` of at most 4 m.* got 4.1 m"),
-        ({"noise": "frozen", "immobile": {"below": 0.99}}, "none for example"),
+        ({"noise": "frozen", "immobile": {"below": 0.99}}, "none for map"),
     ):
         for place in ("run", "new"):
             with pytest.raises(ConfigError, match=expected):

@@ -39,7 +39,7 @@ def test_sign_flips_agree_with_scipy_on_many_maps() -> None:
     assert sign_flip_p(gain) == pytest.approx(drawn.pvalue, abs=4 * (drawn.pvalue / 20_000) ** 0.5)
 
 
-def test_difference_with_one_episode_a_map_is_that_of_bonett_and_penalty() -> None:
+def test_difference_with_one_episode_a_map_is_that_of_bonett_and_price() -> None:
     # Their formula, on 30 maps of which 8 were won and 3 lost.
     won, lost, maps = (8 + 1) / 32, (3 + 1) / 32, 32
     half = t.ppf(0.975, 29) * ((won + lost - (won - lost) ** 2) / maps) ** 0.5

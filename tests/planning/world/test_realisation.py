@@ -295,7 +295,7 @@ def test_what_immobilises_the_robot_counts_in_drawing_again() -> None:
 def test_ground_without_any_way_is_refused_with_the_map() -> None:
     terrain = ground(2, (1.0, 0.8, 0.01))
     terrain.truth.means[1, :, :, 8] = -1.0
-    with pytest.raises(ConfigError, match=r"none for example 41\. Lower `immobile\.below`"):
+    with pytest.raises(ConfigError, match=r"none for map 41\. Lower `immobile\.below`"):
         draw_frozen(terrain, IMMOBILISING, across(2), KEY, [40, 41])
 
 

@@ -215,7 +215,7 @@ def _log_series(stream: Any, driver: Driver) -> None:
     place = recording.track[:-1]
     times = rr.TimeColumn(TIMELINE, duration=np.arange(len(place)) * recording.dt_s)
     lines = {
-        driver.entity("series/traversability", "met"): recording.traversability,
+        driver.entity("series/traversability", "observed"): recording.traversability,
         driver.entity("series/goal", "distance"): np.linalg.norm(place - recording.goal_m, axis=1),
     }
     if not driver.name:

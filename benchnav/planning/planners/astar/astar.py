@@ -70,7 +70,7 @@ def edge_costs(problem: Problem) -> Tensor:
     least, most = torch.stack([torch.stack(cost.aminmax()) for cost in per_m]).aminmax()
     if not 0 < least <= most < torch.inf:
         raise ConfigError(
-            f"Expected {name} as finite numbers > 0, got {least:g} to {most:g}. Let no metre of a path be free."
+            f"Expected {name} as finite numbers > 0, got {least:g} to {most:g}. Return a cost > 0 per metre."
         )
     penalty = PENALTY * (not_free[0] + not_free[1])
     return 0.5 * length_m * (per_m[0] + per_m[1]) + 0.5 * length_m * penalty

@@ -7,9 +7,9 @@ route. A tree is a value: a table of nodes, of which every round makes a longer 
 - Nodes are chosen by Kuwata's mix of two heuristics: the nearest in Dubins length (explore), or the one
   through which the point is reached soonest (optimise). Before a way to the goal is known 70 % of the
   choices explore, afterwards 30 %, and nodes that cannot improve on the best way are left out.
-- The goal's share of the edges goes to nodes that have not tried it yet, the most promising first: a condition
-  has no chance in it, so that a second one from the same node would be a copy. The source tries the goal from
-  every new node.
+- The goal's share of the edges goes to nodes that have not tried it yet, the most promising first: an attempt
+  is deterministic, so a second one from the same node would be a copy. The source tries the goal from every new
+  node.
 - A way costs its simulated time, and `PENALTY` for each metre of it on ground that is not free.
 
 Source: Kuwata et al. (2009), section IV and algorithm 1. Letters in shapes: B episodes, R edges of a round,

@@ -156,7 +156,7 @@ class Optimal(Planner[OptimalState]):
             ConfigError: always.
         """
         raise ConfigError(
-            f"Expected a map that stays what it is for planner {self.name!r}, which plans once, got one that changes. "
+            f"Expected a fixed map for planner {self.name!r}, which plans once, got one that changes. "
             "Take belief 'static' and sensor 'full'."
         )
 

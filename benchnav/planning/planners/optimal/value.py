@@ -93,7 +93,7 @@ class Costs(Batch):
         hazard: chance of being lost on a metre, as −ln of that of not being lost, shape [B, H, W]; None for none.
         loss: cost of being lost, shape [B].
         immobile_s: seconds on immobilising ground for each second of driving with λ = 1, 0 where none does, shape
-            [B, H, W]; None where nothing holds.
+            [B, H, W]; None where nothing immobilises a robot.
         lost_after_s: time on such ground, without a break, after which a robot is lost.
         levels: L, of time held.
     """

@@ -1,4 +1,4 @@
-"""Ways from where a robot is to the centres of cells around it, by which it goes down the cost to go.
+"""Motion primitives to nearby cell centres, by which a robot goes down the cost to go.
 
 Between cells' centres the interpolated cost to go is too low before slow ground and too high in it, so that a robot
 that looks at its next moves alone may turn to and fro. Ways therefore end at centres, up to some cells away: a turn on

@@ -64,8 +64,8 @@ def test_λ_met_stands_beside_what_was_predicted_and_the_threshold_of_free_groun
     recording = made.recording(12, free_above=0.17, free_by="mean")
     path = written(tmp_path, recording)
     series = {name: column(path, f"/series/traversability/{name}", "scalars")[1] for name in
-              ("met", "predicted", "threshold")}  # fmt: skip
-    np.testing.assert_allclose(np.ravel(series["met"]), recording.traversability, rtol=1e-6)
+              ("observed", "predicted", "threshold")}  # fmt: skip
+    np.testing.assert_allclose(np.ravel(series["observed"]), recording.traversability, rtol=1e-6)
     column_, row = np.floor(recording.states[:-1, :2] / 0.5).astype(int).T
     np.testing.assert_allclose(np.ravel(series["predicted"]), recording.predicted[row, column_], rtol=1e-6)
     assert np.ravel(series["threshold"]).tolist() == [0.17] * 12
@@ -217,11 +217,11 @@ def test_several_conditions_have_paths_colours_and_maps_of_their_own(tmp_path: P
         own = {
             entity: int(np.ravel(static(path, entity, "colors"))[0])
             for entity in (f"/world/conditions/{name}/robot", f"/map/overlay/conditions/{name}/robot",
-                           f"/series/traversability/conditions/{name}/met")
+                           f"/series/traversability/conditions/{name}/observed")
         }  # fmt: skip
         assert len(set(own.values())) == 1
         colours += [*set(own.values())]
-        assert static(path, f"/series/traversability/conditions/{name}/met", "names").tolist() == [name]
+        assert static(path, f"/series/traversability/conditions/{name}/observed", "names").tolist() == [name]
         assert column(path, f"/world/conditions/{name}/outcome", "labels")[1] == [
             [f"{name}: {recording.outcome}"]
         ]
