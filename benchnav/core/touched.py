@@ -43,10 +43,11 @@ THREADS = (
 _SYSTEM = ("/proc/", "/sys/", "/dev/")
 
 # By the source file that the event counts for.
-_files: dict[str, dict[str, str]] = {}  # digests by absolute path, as files were when they were first read
+_files: dict[str, dict[str, str]] = {}  # digests by absolute path, as files were when they were last read
 _modules: dict[str, set[str]] = {}  # names of modules
 _variables: dict[str, dict[str, str]] = {}  # digests of values by name
-_written: set[str] = set()  # files that were opened for writing too: output, of whatever part
+_written: dict[str, set[str]] = {}  # files that were opened for writing too: output
+_digests: dict[tuple[str, int, int], str] = {}  # by path, time of change and size
 _part_folders: set[str] = set()  # of parts that are installed packages
 _state = threading.local()
 _watching = False
@@ -81,7 +82,7 @@ def touches_of(targets: Iterable[Callable[..., Any]]) -> Touches:
         targets: the classes and functions of a user's own.
 
     Returns:
-        Of files and variables the digest of what was read first, empty for what was not there; of packages the
+        Of files and variables the digest of what was read last, empty for what was not there; of packages the
         version. Packages are those that the parts import, and those that these require, as far as they are loaded.
     """
     sources = {name: content for target in targets for name, content in _sources(target).items()}
@@ -89,8 +90,8 @@ def touches_of(targets: Iterable[Callable[..., Any]]) -> Touches:
     names: set[str] = set()
     for source, (package, content) in sources.items():
         names |= {*imported_names(content, package), *_modules.get(source, ())}
-        known = {path: digest for path, digest in _files.get(source, {}).items() if path not in _written}
-        touches |= {f"file {_relative(path)}": digest for path, digest in known.items()}
+        for path in set(_files.get(source, ())) - _written.get(source, set()):
+            touches[f"file {_relative(path)}"] = _files[source][path]
         touches |= {f"variable {name}": digest for name, digest in _variables.get(source, {}).items()}
     for name in sorted(names):
         file = getattr(sys.modules.get(name), "__file__", None)
@@ -99,22 +100,20 @@ def touches_of(targets: Iterable[Callable[..., Any]]) -> Touches:
     return touches | {f"package {name}": number for name, number in _versions(names).items()}
 
 
-def merge(others: Mapping[str, Mapping[str, Mapping[str, str] | Iterable[str]]]) -> None:
-    """Add what another process saw, as `snapshot` gives it."""
+def merge(others: Mapping[str, Mapping[str, Any]]) -> None:
+    """Add what another process saw, as `snapshot` returns it."""
     for source, files in others["files"].items():
-        _files[source] = {**files, **_files.get(source, {})}  # type: ignore[dict-item]
+        _files.setdefault(source, {}).update(files)
     for source, variables in others["variables"].items():
-        _variables[source] = {**variables, **_variables.get(source, {})}  # type: ignore[dict-item]
-    for source, modules in others["modules"].items():
-        _modules.setdefault(source, set()).update(modules)
-    _written.update(others["written"].get("", ()))
+        _variables.setdefault(source, {}).update(variables)
+    for kind, known in (("modules", _modules), ("written", _written)):
+        for source, names in others[kind].items():
+            known.setdefault(source, set()).update(names)
 
 
 def snapshot() -> dict[str, Any]:
-    """Return all that this process saw, as plain data for `merge`."""
-    modules = {source: sorted(names) for source, names in _modules.items()}
-    written = {"": sorted(_written)}
-    return {"files": _files, "variables": _variables, "modules": modules, "written": written}
+    """Return all that this process saw, for `merge`."""
+    return {"files": _files, "variables": _variables, "modules": _modules, "written": _written}
 
 
 def changes_since(touches: Mapping[str, str]) -> list[str]:
@@ -169,25 +168,29 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
         return
     name = os.path.abspath(os.fsdecode(path))
     if isinstance(flags, int) and (flags & (os.O_WRONLY | os.O_RDWR) or flags & os.O_CREAT):
-        _written.add(name)
+        for source in _calling_sources():
+            _written.setdefault(source, set()).add(name)
     else:
         _note_read(name)
 
 
 def _note_read(path: str) -> None:
     name = os.path.abspath(path)
-    for source in _calling_sources():
-        known = _files.setdefault(source, {})
-        if name in known or _is_left_out(name, source):
-            continue
-        _state.is_noting = True
-        try:
-            if not os.path.exists(name) or os.path.isfile(name):
-                known[name] = digest_of_path(Path(name))
-        except ConfigError:  # it cannot be read, which the part is told by its own call
-            known[name] = ""
-        finally:
-            _state.is_noting = False
+    sources = [source for source in _calling_sources() if not _is_left_out(name, source)]
+    if not sources or (os.path.exists(name) and not os.path.isfile(name)):
+        return
+    _state.is_noting = True
+    try:
+        stat = os.stat(name) if os.path.exists(name) else None
+        version = (name, stat.st_mtime_ns, stat.st_size) if stat else (name, 0, 0)
+        if version not in _digests:
+            _digests[version] = digest_of_path(Path(name))
+    except (OSError, ConfigError):  # it cannot be read, which the part learns from its own call
+        _digests[version := (name, 0, 0)] = ""
+    finally:
+        _state.is_noting = False
+    for source in sources:
+        _files.setdefault(source, {})[name] = _digests[version]
 
 
 class _WatchedEnviron(type(os.environ)):  # type: ignore[misc]
@@ -204,7 +207,7 @@ class _WatchedEnviron(type(os.environ)):  # type: ignore[misc]
             is_asked = frame is not None and key not in THREADS and _instruction(frame) != _copying()
             if is_asked and _is_own(frame.f_code.co_filename):  # type: ignore[union-attr]
                 for source in _calling_sources():
-                    _variables.setdefault(source, {}).setdefault(key, _digest_of_value(key, value))
+                    _variables.setdefault(source, {})[key] = _digest_of_value(key, value)
 
     def __iter__(self) -> Iterator[str]:
         """Iterate over names; values that the same instruction reads are those of a copy."""

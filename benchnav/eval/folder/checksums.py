@@ -41,7 +41,8 @@ def note_checksums(folder: Path, files: Iterable[Path]) -> None:
     lines = [
         f"{known[name]}  {name}\n" for name in sorted(known) if known[name] and (folder / name).is_file()
     ]
-    write_text(folder / SUMS, "".join(lines))
+    if lines or (folder / SUMS).exists():
+        write_text(folder / SUMS, "".join(lines))
 
 
 def is_as_noted(folder: Path, file: Path) -> bool:

@@ -36,8 +36,8 @@ def check_determinism(
     """Run the first unit of each condition in two processes and compare the rows bit for bit, but for planning times.
 
     The second process runs all units in the reverse order, and the maps of each, and does so twice: its second rows
-    count, so that state which parts keep has had time to grow. A unit that differs is run twice more, each time in a
-    process of its own, which distinguishes state that is kept from what comes from outside.
+    count, so that state which parts keep has had time to grow. If rows differ, a third process does what the first did,
+    which distinguishes state that is kept from what comes from outside.
 
     Args:
         suite: what is to be evaluated.
@@ -58,22 +58,22 @@ def check_determinism(
     first = _run_fresh(chosen, settings)
     backwards = [replace(unit, maps=unit.maps[::-1]) for unit in chosen[::-1]]
     second = _run_fresh([*backwards, *backwards], settings)[len(chosen) :][::-1]
-    lines = []
-    for unit, one, other in zip(chosen, first, second, strict=True):
-        if columns := _differing(one[0], other[0]):
-            single = [_run_fresh([unit], settings)[0] for _ in range(2)]
-            cause = _cause([one, other, *single])
-            lines.append(f"{unit.condition.description}: {', '.join(columns)} differ; {cause}")
+    columns = [_differing(one, other) for (one, _), (other, _) in zip(first, second, strict=True)]
+    third = _run_fresh(chosen, settings) if any(columns) else first
+    lines = [
+        f"{unit.condition.description}: {', '.join(names)} differ; {_cause(*made)}"
+        for unit, names, *made in zip(chosen, columns, first, second, third, strict=True)
+        if names
+    ]
     return len(chosen), lines
 
 
-def _cause(made: Sequence[_Made]) -> str:
-    """Say why rows of a unit differ: of two runs among others, and of two in a process of their own."""
-    generators = sorted({name for _, drawn in made for name in drawn})
-    *_, one, other = made
+def _cause(one: _Made, other: _Made, again: _Made) -> str:
+    """Say why rows of a unit differ between one process and another; `again` did what the first did."""
+    generators = sorted({*one[1], *other[1], *again[1]})
     if generators:
         return f"a part draws from the global generator of {' and '.join(generators)}"
-    if _differing(one[0], other[0]):
+    if _differing(one[0], again[0]):
         return "a part depends on something outside, such as a clock, entropy or the order of threads"
     return "a part keeps state between episodes or units, so that rows depend on what ran before"
 

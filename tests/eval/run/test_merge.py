@@ -145,7 +145,9 @@ def test_shards_that_are_killed_and_extended_are_the_extended_run(suite: Suite, 
 def test_a_shard_has_rows_and_no_tables(parts: list[Path]) -> None:
     part = parts[0]
     assert open_run(part).shard == Shard(index=1, of=OF)
-    assert {path.name for path in part.iterdir()} <= {"run.json", "units", "steps", "playback", "errors.txt"}
+    assert {path.name for path in part.iterdir()} <= {
+        "run.json", "units", "steps", "playback", "errors.txt", "SHA256SUMS"
+    }  # fmt: skip
     with pytest.raises(ConfigError, match=r"shard 1/3 of a run and has no tables.*benchnav-eval merge"):
         read_table(part, "episodes.parquet")
 
@@ -255,11 +257,11 @@ def test_a_unit_may_be_there_twice_if_it_is_the_same(whole: Path, parts: list[Pa
     later = table.set_column(
         table.schema.get_field_index("planning_ms"), "planning_ms", pa.array([1e6] * len(table))
     )
-    pq.write_table(later, unit)
+    pq.write_table(with_metadata(later, metadata(unit)), unit)
     list(merge_shards([*parts, again], tmp_path / "all"))
     same(whole, tmp_path / "all")
     other = table.set_column(table.schema.get_field_index("score"), "score", pa.array([0.25] * len(table)))
-    pq.write_table(other, unit)
+    pq.write_table(with_metadata(other, metadata(unit)), unit)
     with pytest.raises(
         ConfigError, match=rf"{unit.stem.rpartition('-')[0]} .* differs between .*part1.* and .*again"
     ):
@@ -332,3 +334,24 @@ def test_shards_of_one_suite_share_their_hypotheses(suite: Suite, parts: list[Pa
     parts[1] = finish(replace(suite, hypotheses=(claim,)), tmp_path / "other" / "part2", shard)
     with pytest.raises(ConfigError, match="part2: hypotheses"):
         list(merge_shards(parts, tmp_path / "all"))
+
+
+def test_damaged_units_and_parts_that_read_something_else_are_not_merged(
+    parts: list[Path], tmp_path: Path
+) -> None:
+    unit = sorted(parts[1].glob("units/*/*.parquet"))[-1]
+    table, about = pq.read_table(unit, partitioning=None), metadata(unit)
+    others = list(parts[0].glob("units/*/*.parquet"))
+    for path in others:
+        read = {**metadata(path), "touched": {"file a.npz": "1"}}
+        pq.write_table(with_metadata(pq.read_table(path, partitioning=None), read), path)
+    pq.write_table(with_metadata(table, {**about, "touched": {"file a.npz": "2"}}), unit)
+    with pytest.raises(
+        ConfigError, match=r"parts read the same, got .*part\d.*differs .* in file a\.npz\. Give"
+    ):
+        list(merge_shards(parts, tmp_path / "all"))
+    scores = pa.array([0.25] * len(table))
+    pq.write_table(table.set_column(table.schema.get_field_index("score"), "score", scores), unit)
+    with pytest.raises(ConfigError, match=rf"part2 is damaged: units/.*{unit.name}"):
+        list(merge_shards(parts, tmp_path / "all"))
+    assert not (tmp_path / "all").exists()

@@ -1,0 +1,79 @@
+"""A suite can be asked whether its conditions repeat, and names those that do not, with the cause."""
+
+from pathlib import Path
+
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.run.determinism import check_determinism
+
+PARTS = """
+import random, time
+
+import numpy as np
+import torch
+from benchnav.planning import Plan, Planner
+
+COUNT = []
+
+
+class Steady(Planner):
+    steers = (("speed_mps", "turn_rate_radps"),)
+
+    def init(self, problem, generator):
+        return 0
+
+    def plan(self, step, plan_state):
+        action = torch.zeros(len(step.state), 2)
+        action[:, 0] = 0.3 + 0.2 * self.draw()
+        return action, plan_state, Plan.empty(len(step.state))
+
+    def draw(self):
+        return 0.5
+
+
+class Clock(Steady):
+    def draw(self):
+        return time.perf_counter_ns() % 1009 / 1009
+
+
+class Python(Steady):
+    def draw(self):
+        return random.random()
+
+
+class NumPy(Steady):
+    def draw(self):
+        return np.random.rand()
+
+
+class Torch(Steady):
+    def draw(self):
+        return torch.rand(()).item()
+
+
+class Counting(Steady):
+    def draw(self):
+        COUNT.append(1)
+        return min(len(COUNT) / 1e4, 1.0)
+"""
+
+
+def test_conditions_that_do_not_repeat_are_named_with_the_cause(dataset_path: Path, tmp_path: Path) -> None:
+    (tmp_path / "parts.py").write_text(PARTS)
+    names = ("Steady", "Clock", "Python", "NumPy", "Torch", "Counting")
+    suite = Suite(
+        data=str(dataset_path), model="oracle", planners=tuple(f"{tmp_path / 'parts.py'}:{name}" for name in names),
+        risks=("mean",), scenarios=("std",), maps=2, world={"time_budget_s": 2.0}, record="none",
+    )  # fmt: skip
+    said: list[str] = []
+    count, lines = check_determinism(suite, said.append)
+    assert count == len(names)
+    assert len(said) == 1
+    causes = {line.partition("planner ")[2].partition(",")[0]: line.rpartition("; ")[2] for line in lines}
+    assert causes == {
+        "Clock": "a part depends on something outside, such as a clock, entropy or the order of threads",
+        "Python": "a part draws from the global generator of random",
+        "NumPy": "a part draws from the global generator of numpy.random",
+        "Torch": "a part draws from the global generator of torch",
+        "Counting": "a part keeps state between episodes or units, so that rows depend on what ran before",
+    }
+    assert not any("planning" in line for line in lines)
