@@ -35,6 +35,7 @@ def settings(shift: int = 0) -> pd.DataFrame:
 
 
 OTHER_MODULE = code_with(modules={"benchnav.eval.run.unit": "t"})
+PARTS = code_with(parts={"planner mppi": "1"})
 PAPER = {"noise": "resampled", "time_budget_s": 100.0}
 
 
@@ -63,7 +64,7 @@ def run_folder(
             "paper-v1": {"id": "paper-v1", "maps": {"test/std": [f"{i:x}" for i in range(MAPS)]}, "about": {}}
         },
     }
-    given = {"code": code_with(parts={"planner mppi": "1"})} | about | changes
+    given = {"code": PARTS | {"touched": {"file a.npz": "1"}}} | about | changes
     return forge_run(folder, episodes, known, **given)
 
 
@@ -124,6 +125,7 @@ OTHER_CODE = {
     "part": (code_with(parts={"planner mppi": "2"}), "planner mppi"),
     "module": (OTHER_MODULE, "benchnav.eval.run.unit"),
     "version": (code_with(environment={"torch": "2.2"}), "torch (2.1 to 2.2)"),
+    "data": (PARTS | {"touched": {"file a.npz": "2", "variable GAIN": "1"}}, "file a.npz"),
     "processor": (code_with(environment={"processor": "AVX512"}), "processor (AVX2 to AVX512)"),
     "compiles": (code_with(environment={"compiles": False}), "compiles (True to False)"),
     "limit": (code_with(environment={"planner_limit_s": 5.0}), "planner_limit_s (0.0 to 5.0)"),

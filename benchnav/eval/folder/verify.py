@@ -29,7 +29,7 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
     except BenchnavError as error:
         if not (folder / RUN).is_file():
             raise
-        return [str(error)], []
+        return [f"{RUN}: {error}"], []
     files = sorted((folder / "units").glob("*/*.parquet"))
     undigested = 0
     for path in files:

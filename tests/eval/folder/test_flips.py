@@ -20,6 +20,7 @@ from benchnav.eval.folder.verify import verify_run
 from benchnav.eval.recording import GROUND, Ground, Recording
 from benchnav.eval.report.playback.viewer_file import write_viewer_files
 from benchnav.eval.run.runner import run_suite
+from tests.commands import call
 
 FLIPS = 120  # of every file alike; the suite's share of the many that were tried by hand
 
@@ -141,3 +142,33 @@ def test_missing_files_and_units_of_another_run_are_told(run: Path, tmp_path: Pa
     assert damage == []  # its key is another's, so that the unit lacks its steps
     unit.unlink()
     assert "1 of 2 units are not finished" in verify_run(copy)[1]
+
+
+def test_a_damaged_viewer_file_is_written_again(run: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    first, second = sorted(copy.glob("playback/*.rrd"))
+    for path in (first, second):
+        path.write_bytes(path.read_bytes()[:-9])
+    assert len(verify_run(copy)[0]) == 2
+    assert call("eval", "replay", copy, "--planner", "straight", "--view", "false") == 0
+    assert len(verify_run(copy)[0]) == 1  # the episode that was asked for
+    write_viewer_files(copy)
+    assert verify_run(copy) == ([], [])
+
+
+def test_the_command_prints_what_is_damaged_and_ends_with_status_1(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    assert call("eval", "verify", copy) == 0
+    assert capsys.readouterr().out == f"{copy}: no file is damaged\n"
+    (copy / "summary.md").write_text("Everything arrived.")
+    (copy / "run.json").write_text(
+        (copy / "run.json").read_text().replace('"device": "cpu"', '"device": "gpu"')
+    )
+    assert call("eval", "verify", copy) == 1
+    assert "run.json is damaged: it was changed after benchnav wrote it" in capsys.readouterr().out
+    shutil.copyfile(run / "run.json", copy / "run.json")
+    assert call("eval", "verify", copy) == 1
+    assert "damaged: summary.md: it was changed after benchnav wrote it\n" in capsys.readouterr().out
+    assert call("eval", "verify", tmp_path) == 2
