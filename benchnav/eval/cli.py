@@ -123,12 +123,12 @@ def verify(folder: str) -> int:
         print(f"note: {line}")
     for line in damage:
         print(f"damaged: {line}")
-    if damage:
-        print(
-            "Give the run's command again: damaged units are run again, and tables, figures and playback written."
-        )
-    else:
+    if not damage:
         print(f"{folder}: no file is damaged")
+    elif not damage[0].startswith("run.json"):
+        print(
+            "Give the run's command again: it runs damaged units again and writes tables, figures and playback."
+        )
     return 1 if damage else 0
 
 
