@@ -127,13 +127,15 @@ def read_conditions(runs: Sequence[Run]) -> list[Compared]:
         episodes = dict(list(read_table(run.folder, EPISODES).groupby("condition", sort=False)))
         for condition, (known, _) in run.conditions.items():
             labels, value, rows = known.labels, known.value, episodes[condition]
+            dataset = run.about["datasets"][labels["data"]]
             found.append(
                 Compared(
                     labels={**labels, "run": name if shared[condition] > 1 else NOT_USED},
                     value=value,
-                    maps=run.about["datasets"][labels["data"]]["maps"][value["split"]],
+                    maps=dataset["maps"][value["split"]],
                     episodes=rows.assign(time_budget_s=time_budgets(rows, value["world"])),
                     code=_codes(run.about, name, rows["code"].unique()),
+                    about=dataset.get("about", {}).get(value["split"], ""),
                 )
             )
     return found

@@ -34,6 +34,8 @@ PART_KINDS = ("model", "risk", "planner", "robot", "objective", *KNOWLEDGE)
 # Columns of `Condition.labels`, in the order of tables.
 LABELS = ("data", "scenario", "world", "robot", "objective", "model", *KNOWLEDGE, "planner", "risk")
 NOT_USED = "–"
+# What the numbers of a split's maps rest on besides the maps: `TerrainDataset.about_digest` is its digest.
+MEANING = "class table, λ_stuck, resolution or kind of truth"
 _ORDER = ("robot", "objective", "model", *KNOWLEDGE, "risk", "planner")  # of tables
 # What a product lists, by the names that a suite has for it.
 _LISTED = ("data", "scenarios", *(f"{kind}s" for kind in PART_KINDS), "world", "task")
