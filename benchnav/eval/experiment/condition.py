@@ -309,11 +309,6 @@ def _as_run_once(condition: Condition) -> Condition:
         condition = replace(condition, ground=unused["ground"])
     if condition.model.part != "clairvoyant":
         return condition
-    if condition.world.noise == "resampled":
-        raise ConfigError(
-            f"Expected a world with λ that stays for the model 'clairvoyant', got {condition.world_label!r}, which "
-            "resamples λ at each step. Take the world stakes, or `world.noise` frozen or stored."
-        )
     if condition.make("sensor").sees_all:
         condition = replace(condition, ground=unused["ground"], belief=unused["belief"])
     return replace(condition, risk=any_risk)

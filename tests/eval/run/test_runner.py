@@ -667,18 +667,6 @@ def test_a_world_that_cannot_be_drawn_is_refused_before_a_run_is_dropped(
     assert not (tmp_path / "new").exists()
 
 
-def test_single_class_of_a_model_without_classes_is_refused_before_the_run(
-    dataset_path: Path, tmp_path: Path
-) -> None:
-    suite = Suite(
-        data=str(dataset_path), model="tests.eval.parts:TwoModes", planners=("straight", "astar_dwa"),
-        scenarios=("std",), maps=1, record="steps", world={"time_budget_s": 1.0},
-    )  # fmt: skip
-    with pytest.raises(ConfigError, match="which has no `class_names`"):
-        finish(replace(suite, risks=("mean", "single-class")), tmp_path / "run")
-    assert set(finish(suite, tmp_path / "run")["risk"]) == {"–", *Suite().risks}
-
-
 def test_a_command_that_may_start_no_processes_runs_its_units_itself(tmp_path: Path) -> None:
     config = tmp_path / "suite.yaml"
     data = factories.tiny_dataset(tmp_path / "d.h5")
