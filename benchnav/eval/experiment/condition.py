@@ -6,7 +6,7 @@ is run, and belong to the suite.
 """
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -317,6 +317,17 @@ def _as_run_once(condition: Condition) -> Condition:
 def label_words(labels: Mapping[str, str], names: Iterable[str] = LABELS[1:]) -> list[str]:
     """The labels of some columns, those that are used."""
     return [labels[name] for name in names if labels[name] != NOT_USED]
+
+
+def condition_names(conditions: Sequence[Condition]) -> list[str]:
+    """Names conditions by scenario, planner, risk setting, and by those other labels that differ among them."""
+    labels = [condition.labels for condition in conditions]
+    varying = [
+        name
+        for name in LABELS
+        if name in ("scenario", "planner", "risk") or len({one[name] for one in labels} - {NOT_USED}) > 1
+    ]
+    return [" ".join(label_words(one, varying)) for one in labels]
 
 
 def differences(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:

@@ -147,7 +147,7 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
             )
         raise ConfigError(
             f"Expected a finished run, got {folder} without {name}. Give its `benchnav-eval run` command again to "
-            "finish it."
+            "finish it; `benchnav-eval report --partial` and `replay` read what is there."
         )
     with damaged(path, "Remove it and give the run's command again."):
         if run.about.get("tables", {}).get(name) != digest_of_path(path):

@@ -12,6 +12,7 @@ import pandas as pd
 
 from benchnav.core.device import device_of_run
 from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.progress import Progress
 from benchnav.core.store import sole_writer
 from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.unit import Unit, units
@@ -43,8 +44,8 @@ def rerun(
     scheduler: str = "",
     overwrite: bool = False,
     say: Say = lambda line: None,
-) -> Iterator[tuple[int, int]]:
-    """Runs all of a finished run again, yielding (units done, units in all); to be iterated to the end.
+) -> Iterator[Progress]:
+    """Runs all of a finished run again, yielding its progress in units; to be iterated to the end.
 
     Args:
         run_folder: what is repeated.
