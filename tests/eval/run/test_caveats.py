@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -185,6 +186,15 @@ def test_what_is_left_out_is_told_before_anything_is_run_and_until_it_can_be_run
     work = Work(**vars(checked), suite={}, record="none", settings=Settings())
     begin(work, tmp_path / "run", said.append)
     assert open_run(tmp_path / "run").about["dropped"] == []
+
+
+def test_a_planner_whose_settings_are_never_prepared_is_refused(dataset_path: Path) -> None:
+    """Its settings are at fault, where what drops out would be all that the suite has of it."""
+    suite = suite_on(dataset_path, planners=(FREE, HAZARD), robots=("unicycle",), world="paper")
+    with pytest.raises(ConfigError, match="immobilises robots for `hazard`"):
+        check_suite(suite, elsewhere=False)
+    left = check_suite(replace(suite, world=("paper", "stakes")), elsewhere=False)
+    assert [entry["world"] for entry in left.dropped] == ["paper"]
 
 
 @pytest.mark.parametrize(
