@@ -17,8 +17,8 @@ from jsonargparse import ArgumentParser
 from benchmarks.cai.run import SETTINGS, run_trials
 from benchmarks.cai.tables import PAIRS, tabulate_pairs, tabulate_success
 from benchmarks.cai.task import Setup, planner_config
-from benchnav.core.command import show_progress
 from benchnav.core.errors import ConfigError
+from benchnav.core.progress import show_progress
 from benchnav.core.store import replacing
 
 

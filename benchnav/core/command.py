@@ -1,4 +1,4 @@
-"""How the commands read their words, report errors and show progress: one way for all three.
+"""How the commands read their words and report errors: one way for all three.
 
 Words and YAML files make one plain mapping, which `benchnav.core.settings` reads by the types of the function's
 parameters; the help is jsonargparse's. `--contact-sheet` is `--contact_sheet true`, `--maps 3` is `--maps [3]`; a
@@ -14,7 +14,7 @@ import sys
 import threading
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -147,32 +147,6 @@ def tell(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
     except BrokenPipeError:
         sys.stderr = open(os.devnull, "w")  # noqa: SIM115
-
-
-def show_progress(steps: Iterable[tuple[int, int]], what: str) -> None:
-    """Runs work to its end while showing how far it is: a bar in a terminal, plain lines elsewhere.
-
-    Args:
-        steps: the work, yielding (done, total) as it goes.
-        what: what is counted, for example "maps".
-    """
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if console.is_terminal:
-        from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
-
-        columns = [*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn()]
-        with Progress(*columns, console=console) as bar:
-            task = bar.add_task(what, total=None)
-            for done, total in steps:
-                bar.update(task, completed=done, total=total)
-        return
-    tenths = -1  # so that work which takes long says at once what it is
-    for done, total in steps:
-        if done * 10 // total > tenths:
-            tenths = done * 10 // total
-            tell(f"{what}: {done}/{total}")
 
 
 def _call(program: str, command: Command, words: Sequence[str]) -> int | None:

@@ -20,7 +20,7 @@ from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path as MarkerPath
-from matplotlib.transforms import Affine2D
+from matplotlib.transforms import Affine2D, Bbox, ScaledTranslation
 
 from benchnav.core.grid import is_azimuth
 from benchnav.core.store import replacing
@@ -28,6 +28,7 @@ from benchnav.core.store import replacing
 # Widths of a journal's column and of a page.
 ONE_COLUMN_IN, TWO_COLUMNS_IN = 88 / 25.4, 180 / 25.4
 TEXT, TITLE = 7.0, 8.0
+_STRIP_IN = 0.2
 DPI = 200
 
 _STYLE: dict[Any, Any] = {
@@ -288,7 +289,14 @@ def frame_map(panel: Axes) -> None:
     panel.spines[:].set_visible(True)
 
 
-def save(figure: Figure, path: Path, kind: str, dpi: float | str = "figure", trim: bool = False) -> None:
+def save(
+    figure: Figure,
+    path: Path,
+    kind: str,
+    dpi: float | str = "figure",
+    trim: bool = False,
+    strip_in: float = 0.0,
+) -> None:
     """Writes a figure with its fonts embedded.
 
     Args:
@@ -297,12 +305,16 @@ def save(figure: Figure, path: Path, kind: str, dpi: float | str = "figure", tri
         kind: png, pdf, svg or jpg.
         dpi: dots an inch; those of the figure where not given.
         trim: cut white borders away.
+        strip_in: height of a strip over the figure that is written too.
     """
+    box: Any = "tight" if trim else None
+    if strip_in and not trim:
+        box = Bbox.from_extents(0, 0, figure.get_figwidth(), figure.get_figheight() + strip_in)
     with matplotlib.rc_context(_SAVED):
-        figure.savefig(path, format=kind, dpi=dpi, bbox_inches="tight" if trim else None, pad_inches=0.05)
+        figure.savefig(path, format=kind, dpi=dpi, bbox_inches=box, pad_inches=0.05 if trim else 0)
 
 
-def save_twice(figure: Figure, path: Path, trim: bool = False, dpi: float = DPI) -> None:
+def save_twice(figure: Figure, path: Path, trim: bool = False, dpi: float = DPI, mark: str = "") -> None:
     """Writes a figure as PNG and, beside it, as PDF; each whole or not at all.
 
     Args:
@@ -310,6 +322,7 @@ def save_twice(figure: Figure, path: Path, trim: bool = False, dpi: float = DPI)
         path: of the PNG; its folder is made.
         trim: cut white borders away; a figure made for a column keeps its width without.
         dpi: dots an inch.
+        mark: a line that is drawn in a strip over the figure; none where empty.
     """
     # Laid out for good, so that both files are drawn alike and no layout is made twice.
     figure.set_dpi(dpi)
@@ -317,9 +330,14 @@ def save_twice(figure: Figure, path: Path, trim: bool = False, dpi: float = DPI)
     if engine is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)
+    if mark:
+        over = figure.dpi_scale_trans + ScaledTranslation(0, figure.get_figheight(), figure.dpi_scale_trans)
+        figure.text(
+            0.05, 0.04, mark, transform=over, fontsize=TITLE, color=ORANGE, weight="bold", va="bottom"
+        )
     for suffix in (".png", ".pdf"):
         with replacing(path.with_suffix(suffix)) as partial:
-            save(figure, partial, suffix[1:], dpi, trim)
+            save(figure, partial, suffix[1:], dpi, trim, _STRIP_IN if mark else 0.0)
 
 
 def layer_scale(name: str, values: np.ndarray) -> dict[str, Any]:

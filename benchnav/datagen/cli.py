@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Literal
 
 from benchnav import datagen
-from benchnav.core.command import INTERRUPTED, Command, run, show_progress, tell
+from benchnav.core.command import INTERRUPTED, Command, run, tell
 from benchnav.core.errors import DatasetError, choose, expect
+from benchnav.core.progress import show_progress
 from benchnav.core.store import output_path, read_shard, replacing, write_text
 from benchnav.core.tables import Table, print_table
 from benchnav.datagen.import_commands import import_dem, import_drives

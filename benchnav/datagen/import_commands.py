@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from benchnav import datagen
-from benchnav.core.command import show_progress
 from benchnav.core.errors import expect
+from benchnav.core.progress import show_progress
 from benchnav.core.store import output_path
 from benchnav.datagen.dem.raster import Rasters
 

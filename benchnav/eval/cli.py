@@ -8,8 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from benchnav.core.command import INTERRUPTED, Command, Device, run, show_progress, tell
+from benchnav.core.command import INTERRUPTED, Command, Device, run, tell
 from benchnav.core.errors import ConfigError
+from benchnav.core.progress import show_progress
 from benchnav.core.store import read_shard
 from benchnav.eval.experiment.suite import Labels, Suite
 from benchnav.eval.replay import other_folder, program, replay
@@ -60,6 +61,9 @@ def run_command(
         suite, folder, jobs, overwrite, planner_limit_s, _say, own, scheduler, device, reuse_code
     )
     show_progress(steps, "units")
+    if not _is_whole(folder):
+        print(f"so far:  {program('benchnav-eval')} report {shlex.quote(str(folder))} --partial")
+        return _failed(folder)
     if own is None:
         return _finish(folder)
     print(f"shard {own} is finished in {folder}")
@@ -143,14 +147,17 @@ def list_command(kinds: list[str]) -> None:
     print_catalogue(*kinds)
 
 
-def report(folder: str, out: str = "") -> None:
-    """Write the report of a finished run again (tables, figures, page), and print it.
+def report(folder: str, out: str = "", partial: bool = False) -> None:
+    """Write the report of a run again (tables, figures, page), and print it.
 
     Args:
         folder: Run folder.
-        out: Folder for them, for a run that cannot be written; the run folder when not given.
+        out: Folder for them, for a run that cannot be written; if empty, the run folder, or FOLDER/partial.
+        partial: Also of a run that is not finished, while it is running too; every table and figure says so.
     """
-    _report(Path(folder), other_folder(folder, out))
+    if out:
+        other_folder(folder, out)
+    _report(Path(folder), Path(out) if out else None, partial)
 
 
 def compare(
@@ -212,7 +219,7 @@ def _finish(folder: Path) -> int:
     from benchnav.eval.report.playback.viewer_file import write_viewer_files
 
     write_viewer_files(folder)
-    _report(folder, folder)
+    _report(folder)
     _print_recorded(folder)
     _print_replay(folder)
     return _failed(folder)
@@ -237,16 +244,28 @@ def _say(line: str) -> None:
     tell(f"benchnav-eval: {line}")
 
 
-def _report(folder: Path, place: Path) -> None:
-    from benchnav.eval.folder.run_folder import EPISODES, open_run, read_table
-    from benchnav.eval.report.write import PAGE, print_report, write_report
+def _is_whole(folder: Path) -> bool:
+    """Whether a run has its table, or a shard all its units."""
+    from benchnav.eval.folder.results import newest_units
+    from benchnav.eval.folder.run_folder import EPISODES, open_run
+
+    run = open_run(folder)
+    if run.shard is None:
+        return (folder / EPISODES).exists()
+    own = [finished for unit, finished in newest_units(run) if unit.shard(run.shard.of) == run.shard]
+    return all(own)
+
+
+def _report(folder: Path, out: Path | None = None, unfinished: bool = False) -> None:
+    from benchnav.eval.folder.results import read_results
+    from benchnav.eval.report.write import PAGE, PARTIAL, print_report, write_report
     from benchnav.eval.run.recordings import record_driven
 
-    # What is no finished run is refused before anything is said.
-    open_run(folder)
-    read_table(folder, EPISODES)
-    _say("writing the report")
-    print_report(write_report(folder, partial(record_driven, folder), place))
+    # What cannot be reported is refused before anything is said.
+    mark = read_results(folder, unfinished).mark
+    place = out or (folder / PARTIAL if mark else folder)
+    _say(f"writing the report{f' ({mark})' if mark else ''}")
+    print_report(write_report(folder, partial(record_driven, folder), place, unfinished))
     print(f"report:  {place / PAGE}")
 
 

@@ -17,7 +17,15 @@ from benchnav.core.tables import Table, to_latex, to_markdown
 from benchnav.eval.experiment.condition import LABELS, NOT_USED, label_words
 from benchnav.eval.experiment.unit import DRAW
 from benchnav.eval.folder.provenance import code_differences
-from benchnav.eval.folder.run_folder import EPISODES, Run, caveats, differences, open_run, read_table
+from benchnav.eval.folder.run_folder import (
+    EPISODES,
+    Run,
+    caveats,
+    differences,
+    dropped_labels,
+    open_run,
+    read_table,
+)
 from benchnav.eval.report.result_tables import comparison_table
 from benchnav.eval.report.words import reading_name
 from benchnav.eval.stats.comparison import compare
@@ -127,13 +135,15 @@ def read_conditions(runs: Sequence[Run]) -> list[Compared]:
         episodes = dict(list(read_table(run.folder, EPISODES).groupby("condition", sort=False)))
         for condition, (known, _) in run.conditions.items():
             labels, value, rows = known.labels, known.value, episodes[condition]
+            dataset = run.about["datasets"][labels["data"]]
             found.append(
                 Compared(
                     labels={**labels, "run": name if shared[condition] > 1 else NOT_USED},
                     value=value,
-                    maps=run.about["datasets"][labels["data"]]["maps"][value["split"]],
+                    maps=dataset["maps"][value["split"]],
                     episodes=rows.assign(time_budget_s=time_budgets(rows, value["world"])),
                     code=_codes(run.about, name, rows["code"].unique()),
+                    about=dataset.get("about", {}).get(value["split"], ""),
                 )
             )
     return found
@@ -267,9 +277,13 @@ def _maps(maps: Sequence[int]) -> str:
 
 
 def _concerning(conditions: Sequence[Compared], about: Mapping[str, Any]) -> dict[str, Any]:
-    """What a run is about, of the pairs that it left out those of planners and robots that are compared."""
-    known = {name: {condition.labels[name] for condition in conditions} for name in ("planner", "robot")}
-    dropped = [pair for pair in about["dropped"] if all(pair[name] in known[name] for name in known)]
+    """What a run is about; of what it left out those combinations whose labels are all compared."""
+    known = {name: {condition.labels[name] for condition in conditions} for name in LABELS}
+    dropped = [
+        entry
+        for entry in about["dropped"]
+        if all(label in known[name] for name, label in dropped_labels(entry).items())
+    ]
     return {**about, "dropped": dropped}
 
 

@@ -10,7 +10,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.settings import hint
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.experiment.unit import Unit, units
-from benchnav.eval.folder.run_folder import EPISODES, Run, open_run, read_table
+from benchnav.eval.folder.run_folder import EPISODES, Run, find_units, open_run, read_table
 from benchnav.eval.recording import GROUND, Ground
 
 
@@ -101,7 +101,9 @@ def propose(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
 
 
 def _find(run: Run, asked: Mapping[str, str], episode: tuple[int | None, int, int]) -> Unit | None:
-    """The unit of the first condition that fits; one that does not use a part fits any label where no other does.
+    """The unit of the first condition that fits, of a run that is not finished of the first that has rows.
+
+    One that does not use a part fits any label where no other does.
 
     Args:
         run: where.
@@ -109,11 +111,17 @@ def _find(run: Run, asked: Mapping[str, str], episode: tuple[int | None, int, in
         episode: seed, realisation and map.
     """
     seed, realisation, map_index = episode
+    is_finished = (run.folder / EPISODES).exists()
+    first = None
     for others in (set(), {NOT_USED}):
         for condition, extent in run.conditions.values():
             own = {condition.labels[name] for name, label in asked.items() if condition.labels[name] != label}
             wanted = extent.seeds[0] if seed is None else seed
             for unit in units({condition.id: (condition, extent)}) if own <= others else ():
                 if (unit.seed, unit.realisation) == (wanted, realisation) and map_index in unit.maps:
-                    return unit
+                    if is_finished or find_units(run.folder, unit):
+                        return unit
+                    first = first or unit
+        if first:
+            return first
     return None

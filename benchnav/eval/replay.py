@@ -56,7 +56,7 @@ def replay(
     run, place = Path(folder), other_folder(folder, out)
     found = find_episodes(run, labels.asked, seed, realisation, map)
     if video:
-        from benchnav.core.command import show_progress
+        from benchnav.core.progress import show_progress
         from benchnav.eval.report.playback.video import write_video
 
         show_progress(write_video(_recordings(run, found, place), Path(video)), "frames")

@@ -3,14 +3,13 @@
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import pytest
 
-from benchnav.core.command import Command, run, show_progress, tell
+from benchnav.core.command import Command, run
 from benchnav.core.device import gpu_failed
 from benchnav.core.errors import ConfigError
 
@@ -368,30 +367,6 @@ def test_a_schedulers_signal_to_end_is_an_interruption(capsys: pytest.CaptureFix
     finally:
         signal.signal(signal.SIGTERM, before)
     assert capsys.readouterr().err == "x: interrupted\n"
-
-
-class Unread:
-    """A standard error whose reader has gone."""
-
-    def write(self, text: str) -> int:
-        raise BrokenPipeError
-
-    def flush(self) -> None:
-        raise BrokenPipeError
-
-
-def test_work_goes_on_where_no_one_reads_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stderr", Unread())
-    reached = []
-
-    def steps() -> Iterator[tuple[int, int]]:
-        for done in range(11):
-            reached.append(done)
-            yield done, 10
-
-    show_progress(steps(), "units")
-    tell("a line more")
-    assert reached == list(range(11))
 
 
 @pytest.mark.parametrize(

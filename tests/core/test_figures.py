@@ -82,6 +82,26 @@ def test_the_robots_mark_turns_and_keeps_its_size() -> None:
     np.testing.assert_allclose(tips[0][::-1], tips[1], atol=1e-9)
 
 
+@pytest.mark.parametrize("trim", [False, True])
+def test_a_mark_stands_in_a_strip_over_a_figure_that_stays_as_it_is(tmp_path: Path, trim: bool) -> None:
+    drawn = []
+    for mark in ("", "Partial: 3 of 6 units"):
+        with styled():
+            figure = Figure(figsize=(3, 2), layout="constrained")
+            figure.subplots().plot([0, 1], [0, 1])
+            figure.suptitle("title")
+        save_twice(figure, tmp_path / "one.png", dpi=100, trim=trim, mark=mark)
+        drawn.append(matplotlib.image.imread(tmp_path / "one.png")[..., :3])
+    plain, marked = drawn
+    strip = len(marked) - len(plain)
+    assert 10 <= strip <= 25
+    assert (marked[:strip] < 0.9).any()
+    if not trim:
+        np.testing.assert_array_equal(marked[strip:], plain)
+    same = marked[-len(plain) :, -plain.shape[1] :]
+    assert (same < 0.9).sum() == pytest.approx((plain < 0.9).sum(), rel=0.05)
+
+
 @pytest.mark.usefixtures("whole_fonts")
 def test_a_figure_is_written_whole_as_png_and_pdf_at_its_width(tmp_path: Path) -> None:
     path, settings = tmp_path / "new" / "one.png", dict(matplotlib.rcParams)

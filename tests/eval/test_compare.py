@@ -313,6 +313,35 @@ def test_runs_with_conditions_of_their_own_are_compared_across(tmp_path: Path) -
         compare_runs([cautious, elsewhere], "", "mean", {}, 0.05)
 
 
+@pytest.mark.parametrize("joined", [False, True])
+@pytest.mark.parametrize(
+    ("about", "groups", "words"),
+    [
+        ({"test/std": "2"}, 1, "differ in class table, λ_stuck, resolution or kind of truth of paper-v1 test/std"),
+        ({"test/std": "1"}, 2, "differ in groups of maps of paper-v1 test/std"),
+        ({"test/std": "2"}, 2, "kind of truth of paper-v1 test/std, groups of maps"),
+    ],
+)  # fmt: skip
+def test_maps_of_another_meaning_are_no_pair_and_no_joined_condition(
+    tmp_path: Path, joined: bool, about: Mapping[str, str], groups: int, words: str
+) -> None:
+    episodes = settings()[lambda rows: rows["planner"] == "mppi"]
+
+    def made(name: str, risks: set[str], about: Mapping[str, str], size: int) -> Path:
+        maps = {"test/std": [f"{i:x}" for i in range(MAPS)]}
+        own = episodes[episodes["risk"].isin(risks)].assign(group=lambda rows: rows["map"] // size)
+        datasets = {"paper-v1": {"id": "paper-v1", "maps": maps, "about": about}}
+        return run_folder(tmp_path / name, own, datasets=datasets)
+
+    first = made("a", {"mean", "cvar"} if joined else {"cvar"}, {"test/std": "1"}, 1)
+    alike = made("b", {"mean"}, {"test/std": "1"}, 1)
+    assert len(compare_runs([first, alike], "risk", "", {}, 0.05)[0]) == 1
+    # An earlier version did not write what maps mean.
+    assert len(compare_runs([first, made("c", {"mean"}, {}, 1)], "risk", "", {}, 0.05)[0]) == 1
+    with pytest.raises(ConfigError, match=words):
+        compare_runs([first, made("d", {"mean"}, about, groups)], "risk", "", {}, 0.05)
+
+
 def test_command_prints_and_writes(tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
     folder = run_folder(tmp_path / "run", settings())
     out = tmp_path / "made" / "cautious"

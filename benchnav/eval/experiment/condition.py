@@ -6,7 +6,7 @@ is run, and belong to the suite.
 """
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,6 +34,8 @@ PART_KINDS = ("model", "risk", "planner", "robot", "objective", *KNOWLEDGE)
 # Columns of `Condition.labels`, in the order of tables.
 LABELS = ("data", "scenario", "world", "robot", "objective", "model", *KNOWLEDGE, "planner", "risk")
 NOT_USED = "–"
+# What the numbers of a split's maps rest on besides the maps: `TerrainDataset.about_digest` is its digest.
+MEANING = "class table, λ_stuck, resolution or kind of truth"
 _ORDER = ("robot", "objective", "model", *KNOWLEDGE, "risk", "planner")  # of tables
 # What a product lists, by the names that a suite has for it.
 _LISTED = ("data", "scenarios", *(f"{kind}s" for kind in PART_KINDS), "world", "task")
@@ -307,11 +309,6 @@ def _as_run_once(condition: Condition) -> Condition:
         condition = replace(condition, ground=unused["ground"])
     if condition.model.part != "clairvoyant":
         return condition
-    if condition.world.noise == "resampled":
-        raise ConfigError(
-            f"Expected a world with λ that stays for the model 'clairvoyant', got {condition.world_label!r}, which "
-            "resamples λ at each step. Take the world stakes, or `world.noise` frozen or stored."
-        )
     if condition.make("sensor").sees_all:
         condition = replace(condition, ground=unused["ground"], belief=unused["belief"])
     return replace(condition, risk=any_risk)
@@ -320,6 +317,17 @@ def _as_run_once(condition: Condition) -> Condition:
 def label_words(labels: Mapping[str, str], names: Iterable[str] = LABELS[1:]) -> list[str]:
     """The labels of some columns, those that are used."""
     return [labels[name] for name in names if labels[name] != NOT_USED]
+
+
+def condition_names(conditions: Sequence[Condition]) -> list[str]:
+    """Names conditions by scenario, planner, risk setting, and by those other labels that differ among them."""
+    labels = [condition.labels for condition in conditions]
+    varying = [
+        name
+        for name in LABELS
+        if name in ("scenario", "planner", "risk") or len({one[name] for one in labels} - {NOT_USED}) > 1
+    ]
+    return [" ".join(label_words(one, varying)) for one in labels]
 
 
 def differences(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:

@@ -1,12 +1,12 @@
 """Units of work: a condition's block of maps under one seed and realisation, run as one batch."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from benchnav.core.store import Shard
-from benchnav.eval.experiment.condition import Condition
+from benchnav.eval.experiment.condition import Condition, condition_names
 from benchnav.eval.experiment.suite import Record
 
 BLOCK_MAPS = 50
@@ -157,6 +157,26 @@ def in_table_order(made: Iterable[Unit], conditions: Conditions) -> list[Unit]:
     """Units in the order in which tables list them, whatever the order they were run in."""
     order = {condition_id: place for place, condition_id in enumerate(conditions)}
     return sorted(made, key=lambda u: (order[u.condition.id], u.seed, u.realisation, u.block))
+
+
+def unit_names(known: Sequence[Unit]) -> Callable[[Unit], str]:
+    """Names units among others by scenario, planner, risk setting and what else differs, and by their maps.
+
+    Args:
+        known: all that are to be told apart.
+    """
+    conditions = {unit.condition.id: unit.condition for unit in known}
+    labels = condition_names(list(conditions.values()))
+    names = dict(zip(conditions, labels, strict=True))
+    draws = [name for name in ("seed", "realisation") if len({getattr(unit, name) for unit in known}) > 1]
+
+    def name(unit: Unit) -> str:
+        words = [names[unit.condition.id]]
+        words += [f"{draw} {getattr(unit, draw)}" for draw in draws]
+        first, last = unit.maps[0], unit.maps[-1]
+        return ", ".join([*words, f"map {first}" if first == last else f"maps {first} to {last}"])
+
+    return name
 
 
 def _blocks(condition: Condition, extent: Extent, record: Record) -> Iterator[Unit]:

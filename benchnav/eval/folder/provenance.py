@@ -31,7 +31,7 @@ from benchnav.core.store import text_digest
 from benchnav.core.touched import Touches, touches_of, unlike
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.eval.experiment.condition import PART_KINDS, Condition, is_checkpoint
+from benchnav.eval.experiment.condition import MEANING, PART_KINDS, Condition, is_checkpoint
 from benchnav.eval.experiment.unit import Conditions, Unit
 from benchnav.models.checkpoint import digests_of, read_config
 from benchnav.models.predictor import find_checkpoint, find_family, find_ground_statistics, split_own
@@ -205,7 +205,7 @@ def dataset_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> l
             if any(before != after for before, after in pairs):
                 changed.append(f"maps of {data} {split}")
             if other["about"].get(split, about["about"][split]) != about["about"][split]:
-                changed.append(f"class table, λ_stuck, resolution or kind of truth of {data} {split}")
+                changed.append(f"{MEANING} of {data} {split}")
     return changed
 
 

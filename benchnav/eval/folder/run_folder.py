@@ -23,7 +23,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.settings import one_line
 from benchnav.core.sources import digest_of_path
 from benchnav.core.store import Shard, replacing, seal, unseal, write_text
-from benchnav.eval.experiment.condition import KNOWLEDGE, Condition, condition_from, later_labels
+from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED, Condition, condition_from, later_labels
 from benchnav.eval.experiment.suite import RECORDS
 from benchnav.eval.experiment.unit import DRAW, Extent, Unit, steps_path
 from benchnav.eval.folder.provenance import TOUCHED, Origin, code_digest, touches
@@ -103,16 +103,28 @@ def write_run(folder: Path, about: Mapping[str, Any]) -> None:
 
 
 def caveats(about: Mapping[str, Any]) -> list[str]:
-    """What readers of a run's tables should know: its warnings, and the pairs that it left out.
+    """What readers of a run's tables should know: its warnings, and the combinations that it left out.
 
     Args:
         about: of its `run.json` at least `warnings` and `dropped`.
     """
-    left_out = [
-        f"left out: planner {pair['planner']} cannot steer robot {pair['robot']}" for pair in about["dropped"]
-    ]
+    left_out = [f"left out: {_in_words(entry)}" for entry in about["dropped"]]
     warnings = [*about["warnings"], *([about["reused"]] if about.get("reused") else [])]
     return [*(f"warning: {line}" for line in warnings), *left_out]
+
+
+def dropped_labels(entry: Mapping[str, str]) -> dict[str, str]:
+    """The labels that do not go together, by column, of an entry of `dropped`."""
+    return {column: label for column, label in entry.items() if column != "reason"}
+
+
+def _in_words(entry: Mapping[str, str]) -> str:
+    """A combination that was left out; versions before 1.1 left out planners with robots alone."""
+    labels = dropped_labels(entry)
+    if list(labels) == ["planner", "robot"]:
+        return f"planner {labels['planner']} cannot steer robot {labels['robot']}"
+    words = ", ".join(f"{column} {label}" for column, label in labels.items() if label != NOT_USED)
+    return f"{words}: {entry['reason']}"
 
 
 def read_table(folder: Path, name: str) -> pd.DataFrame:
@@ -130,7 +142,7 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
             )
         raise ConfigError(
             f"Expected a finished run, got {folder} without {name}. Give its `benchnav-eval run` command again to "
-            "finish it."
+            "finish it; `benchnav-eval report --partial` and `replay` read what is there."
         )
     with damaged(path, "Remove it and give the run's command again."):
         if run.about.get("tables", {}).get(name) != digest_of_path(path):

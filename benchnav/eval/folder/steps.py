@@ -21,7 +21,7 @@ from benchnav.core.settings import check_known
 from benchnav.core.store import replacing
 from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.folder.run_folder import damaged, open_run
+from benchnav.eval.folder.run_folder import EPISODES, damaged, open_run
 from benchnav.eval.folder.sealed import DamageError, metadata, read_sealed, with_metadata
 
 STEPS = "steps"
@@ -89,7 +89,13 @@ def open_steps(folder: Path) -> ds.Dataset | None:
     with damaged(folder / STEPS, _REMEDY):
         # By its type, since an id of digits alone would be taken for a number.
         parts = ds.partitioning(pa.schema([("condition", pa.string())]), flavor="hive")
-        return ds.dataset(folder / STEPS, partitioning=parts)
+        source = ds.dataset(folder / STEPS, partitioning=parts)
+        if not (
+            folder / EPISODES
+        ).exists():  # files of a run that is not finished may differ in their columns
+            schemas = [fragment.physical_schema for fragment in source.get_fragments()]
+            source = source.replace_schema(pa.unify_schemas([source.schema, *schemas]).remove_metadata())
+        return source
 
 
 def rows_of(

@@ -11,7 +11,7 @@ from benchnav.core.resampling import LEAST_MAPS
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.hypotheses import Hypothesis
-from benchnav.eval.report.words import count_range, p_in_words, p_value, reading_names, signed
+from benchnav.eval.report.words import NOT_YET, count_range, p_in_words, p_value, reading_names, signed
 from benchnav.eval.stats.comparison import ALPHA
 
 _TESTS = {
@@ -58,7 +58,7 @@ def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
             f"{_value(row['mean_one'])} : {_value(row['mean_other'])}",
             _with_unit(row),
             _interval(row),
-            p_value(row["p_holm"]),
+            NOT_USED if np.isnan(row["p_holm"]) else p_value(row["p_holm"]),
             Bold(_verdict(row)) if row["supported"] else _verdict(row),
         )
         for number, row in enumerate(tests.to_dict("records"), start=1)
@@ -100,6 +100,8 @@ def _claim(row: Mapping[Any, Any]) -> str:
 
 
 def _verdict(row: Mapping[Any, Any]) -> str:
+    if np.isnan(row["p_holm"]):
+        return f"partial: {NOT_YET}"
     kind, direction = row["kind"], row["direction"]
     if kind in _OF_MARGINS:
         return _OF_MARGINS[kind] if row["supported"] else f"{kind} not shown"
@@ -112,7 +114,8 @@ def _numbers(row: Mapping[Any, Any], unit: str) -> str:
     words = [f"difference {_with_unit(row)}"]
     if (ends := _interval(row)) != NOT_USED:
         words.append(f"interval {ends}")
-    return ", ".join([*words, p_in_words(row["p_holm"]), f"{row['n_maps']} {unit}s"])
+    p = [] if np.isnan(row["p_holm"]) else [p_in_words(row["p_holm"])]
+    return ", ".join([*words, *p, f"{row['n_maps']} {unit}s"])
 
 
 def _extended(about: Mapping[str, Any]) -> list[str]:

@@ -175,7 +175,7 @@ def _lost(row: Mapping[Any, Any], full: Mapping[Any, Any] | None) -> tuple[str, 
     return f"{success:+.1f}", f"{row['total_time_mean_s'] - full['total_time_mean_s']:+.1f}"
 
 
-def paper_table(summary: pd.DataFrame, label: str) -> str:
+def paper_table(summary: pd.DataFrame, label: str, mark: str = "") -> str:
     """Writes a complete LaTeX table, settings down and blocks across, each with success, T_total and λ̄.
 
     More than three blocks stand in several tabulars under each other.
@@ -183,12 +183,13 @@ def paper_table(summary: pd.DataFrame, label: str) -> str:
     Args:
         summary: from `summary.summarise`, joined with `best.against_best`.
         label: what the table is referred to by.
+        mark: words that the caption begins with.
     """
     known = blocks(summary)
     count = maps_in_words(*(count_range(summary[name]) for name in ("n_maps", "n_groups")))
     note = f" Bold: {bold_note(summary)}" if bold_note(summary) else ""
     caption = (
-        f"Planning results on {count} per scenario: success rate with its 95 % interval; total time T_total, a "
+        f"{mark}Planning results on {count} per scenario: success rate with its 95 % interval; total time T_total, a "
         f"failure counted as the time budget T; and mean observed traversability λ̄. ± is the standard deviation over "
         f"episodes.{note}"
     )

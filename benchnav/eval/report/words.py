@@ -16,6 +16,7 @@ FAILURE_COUNTS = {
     f"{outcome.name.lower()}_count": outcome.name.lower().replace("_", " ") for outcome in FAILURES
 }
 _READ = {"planner": planner_name, "risk": risk_name}
+NOT_YET = "not yet a test"  # of a hypothesis, while its run is not finished
 # Labels that tell conditions of one map apart.
 NAMING = ("planner", "risk", "model", *KNOWLEDGE, "robot", "objective", "world")
 
@@ -127,7 +128,9 @@ def p_value(p: float) -> str:
 
 
 def p_in_words(p: float) -> str:
-    """Writes a p-value for a sentence."""
+    """Writes a p-value for a sentence or a figure; one that is NaN is not computed before the run is finished."""
+    if np.isnan(p):
+        return NOT_YET
     return f"p {p_value(p)}" if p <= 1e-4 else f"p = {p_value(p)}"
 
 

@@ -4,7 +4,7 @@ import base64
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,8 @@ from benchnav.core.tables import Table, markdown, print_table, to_latex, to_mark
 from benchnav.eval.experiment.condition import KNOWLEDGE
 from benchnav.eval.folder.checksums import note_checksums
 from benchnav.eval.folder.provenance import command_lines
-from benchnav.eval.folder.run_folder import ERRORS, caveats, open_run, read_table
+from benchnav.eval.folder.results import read_results
+from benchnav.eval.folder.run_folder import ERRORS, caveats
 from benchnav.eval.recording import MAP, Ground, Recording, read_recordings
 from benchnav.eval.report.charts.conditions import (
     distribution_figure,
@@ -52,6 +53,7 @@ from benchnav.eval.stats.summary import summarise
 from benchnav.planning.world.outcome import ERROR_OUTCOMES
 
 PAGE = "report.html"
+PARTIAL = "partial"  # folder of the report of a run that is not finished
 
 _FILES = (PAGE, *(f"summary.{suffix}" for suffix in ("csv", "md", "tex")), "failures.csv", "hypotheses.csv")
 _FILES += ("hypotheses.tex", "regret.csv")
@@ -75,7 +77,8 @@ class Report:
         episodes: the rows behind the summary.
         failures: a row a failed episode.
         sheets: failures on their ground.
-        about: all of `run.json`.
+        about: all of `run.json`; of a run that is not finished with the conditions that have rows.
+        mark: what says that the run is not finished; empty where it is.
     """
 
     name: str
@@ -90,35 +93,49 @@ class Report:
     failures: pd.DataFrame
     sheets: Sheets
     about: Mapping[str, Any]
+    mark: str = ""
 
     @property
     def learning(self) -> Table | None:
         """What robots learnt on their way; None where none learnt."""
-        return learning_table(self.summary)
+        table = learning_table(self.summary)
+        return table and self.marked(table)
 
     @property
     def hypotheses(self) -> Table:
         """The table of `tests`."""
-        return hypothesis_table(self.tests, unit_of_statistics(self.summary))
+        return self.marked(hypothesis_table(self.tests, unit_of_statistics(self.summary)))
+
+    def marked(self, table: Table) -> Table:
+        """A table that says so where the run is not finished."""
+        return replace(table, notes=(*([_capital(self.mark)] if self.mark else []), *table.notes))
+
+    def csv(self, table: pd.DataFrame, digits: int = 6) -> str:
+        """A table as CSV; of a run that is not finished it has a column `partial`."""
+        marked = table.assign(partial=self.mark.removeprefix("partial: ")) if self.mark else table
+        return marked.to_csv(index=False, float_format=f"%.{digits}g")
 
 
-def read_report(folder: Path, record_driven: RecordDriven | None = None) -> Report:
-    """Makes the report of a finished run, and writes nothing.
+def read_report(folder: Path, record_driven: RecordDriven | None = None, partial: bool = False) -> Report:
+    """Makes the report of a run, and writes nothing.
 
     Args:
         folder: a finished run.
         record_driven: records driven episodes again, as `run.recordings.record_driven` does of the folder; without it
             no failure is shown on a map.
+        partial: also of a run that is not finished, of what is there.
 
     Raises:
         ConfigError: the folder is no run folder, or its run is not finished.
     """
-    run, episodes = open_run(folder), read_table(folder, "episodes.parquet")
-    about = run.about
+    results = read_results(folder, partial)
+    about, episodes = results.run.about, results.episodes
     worlds = {condition: entry["value"]["world"] for condition, entry in about["conditions"].items()}
     summary = summarise(episodes, worlds)
     tests = (
-        test_hypotheses(about["hypotheses"], episodes, worlds) if "hypotheses" in about else pd.DataFrame()
+        test_hypotheses(about["hypotheses"], episodes, worlds, not results.is_partial)
+        if "hypotheses" in about
+        else pd.DataFrame()
     )
     best = against_best(episodes, summary, privileged_models(about["conditions"]))
     summary = summary.merge(best, on="condition", how="left", validate="1:1")
@@ -132,7 +149,10 @@ def read_report(folder: Path, record_driven: RecordDriven | None = None) -> Repo
         # Beside hypotheses that were fixed before the run all else is exploratory.
         explored = {f"Exploratory: {title}": sentences for title, sentences in said.items()}
         said = hypothesis_findings(tests, about, unit_of_statistics(summary)) | explored
-    warnings = caveats(about)
+    if results.mark:
+        said = {f"{_capital(results.mark)}. {title}": sentences for title, sentences in said.items()}
+    warnings = [*results.notes(), *caveats(about)]
+    about = {**about, "conditions": results.conditions}
     if count := summary[[f"{name}_count" for name in ERROR_OUTCOMES]].to_numpy().sum():
         episodes_in_words = "1 episode" if count == 1 else f"{count} episodes"
         warnings.append(
@@ -140,7 +160,7 @@ def read_report(folder: Path, record_driven: RecordDriven | None = None) -> Repo
         )
     if sheets.left_out:
         warnings.append(f"note: {sheets.left_out}")
-    return Report(
+    report = Report(
         name=folder.resolve().name,
         header=(*_header(summary, about), *_rejected_draws(episodes, about["conditions"])),
         findings=said,
@@ -153,40 +173,51 @@ def read_report(folder: Path, record_driven: RecordDriven | None = None) -> Repo
         failures=failures,
         sheets=sheets,
         about=about,
+        mark=results.mark,
     )
+    return replace(report, table=report.marked(report.table))
 
 
-def write_report(folder: Path, record_driven: RecordDriven | None = None, out: Path | None = None) -> Report:
+def write_report(
+    folder: Path,
+    record_driven: RecordDriven | None = None,
+    out: Path | None = None,
+    partial: bool = False,
+) -> Report:
     """Writes `report.html`, `summary.{csv,md,tex}`, `failures.csv` and `figures/` of a run.
 
     Args:
         folder: a finished run.
         record_driven: records driven episodes again, as `run.recordings.record_driven` does of the folder; without it
             no failure is shown on a map.
-        out: where to; the run folder when not given.
+        out: where to. If not given, the run folder, and its folder `PARTIAL` for a run that is not finished.
+        partial: also of a run that is not finished, of what is there.
 
     Returns:
         What was written of.
     """
-    report, out = read_report(folder, record_driven), out or folder
-    write_text(out / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))
-    write_text(out / "failures.csv", report.failures.to_csv(index=False, float_format="%.4g"))
+    report = read_report(folder, record_driven, partial)
+    out = out or (folder / PARTIAL if report.mark else folder)
+    write_text(out / "summary.csv", report.csv(report.summary))
+    write_text(out / "failures.csv", report.csv(report.failures, digits=4))
     comments = "".join(f"% {line}\n" for line in (*report.header, *report.table.notes, *report.warnings))
-    write_text(out / "summary.tex", comments + paper_table(report.summary, report.name))
+    mark = f"{_capital(report.mark)}. " if report.mark else ""
+    write_text(out / "summary.tex", comments + paper_table(report.summary, report.name, mark))
     if not report.tests.empty:
-        write_text(out / "hypotheses.csv", report.tests.to_csv(index=False, float_format="%.6g"))
-        caption = "Tests of the hypotheses that were fixed before the run."
+        write_text(out / "hypotheses.csv", report.csv(report.tests))
+        caption = f"{mark}Tests of the hypotheses that were fixed before the run."
         write_text(
             out / "hypotheses.tex", to_latex([report.hypotheses], caption, f"{report.name}-hypotheses")
         )
     if not report.regret.empty:
-        write_text(out / "regret.csv", report.regret.to_csv(index=False, float_format="%.6g"))
+        write_text(out / "regret.csv", report.csv(report.regret))
     figures = {}
     for name, caption, figure in _figures(folder, report, record_driven):
         path = out / "figures" / f"{name}.png"
         # These are as wide as their maps: white borders are cut away.
-        save_twice(figure, path, trim=name.partition("-")[0] in ("trajectories", "driven", "knowledge"))
-        figures[path] = caption
+        is_of_maps = name.partition("-")[0] in ("trajectories", "driven", "knowledge")
+        save_twice(figure, path, trim=is_of_maps, mark=_capital(report.mark))
+        figures[path] = mark + caption
     for file in ("summary.md", PAGE):
         write_text(out / file, render(file, report, figures))
     drawn = [path.with_suffix(suffix) for path in figures for suffix in (".png", ".pdf")]
@@ -196,12 +227,16 @@ def write_report(folder: Path, record_driven: RecordDriven | None = None, out: P
 
 def print_report(report: Report) -> None:
     """Prints what a run says and its table, as wide as the terminal, or unbroken where none is."""
-    print("\n".join(report.header))
+    print("\n".join([*([_capital(report.mark)] if report.mark else []), *report.header]))
     print_table(report.table)
     if report.learning:
         print_table(report.learning)
     said = [line for title, lines in report.findings.items() for line in (f"{title}:", *lines)]
     print("\n".join([*report.warnings, *said]))
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _figures(

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,6 +23,7 @@ from benchnav.eval.folder.run_folder import (
     FORMAT_VERSION,
     RUN,
     Run,
+    dropped_labels,
     is_taken,
     open_run,
     write_run,
@@ -131,7 +132,7 @@ def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> di
         "suite": dict(work.suite),
         **({"hypotheses": fixed} if (fixed := earlier.get("hypotheses", work.hypotheses)) else {}),
         "conditions": entries,
-        "dropped": provenance.join(earlier.get("dropped", ()), work.dropped),
+        "dropped": _still_dropped([*earlier.get("dropped", ()), *work.dropped], conditions),
         "warnings": provenance.join(earlier.get("warnings", ()), work.warnings),
         **asdict(work.settings),
         "gpu": gpu_name(work.settings.device),
@@ -141,6 +142,16 @@ def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> di
         **{name: earlier[name] for name in ("codes", "reused", "tables") if name in earlier},
     }
     return json.loads(json.dumps(about))
+
+
+def _still_dropped(dropped: Iterable[dict[str, str]], conditions: Conditions) -> list[dict[str, str]]:
+    """What was left out and is in no condition, as its parts may have been changed since; each once."""
+    known = [set(condition.labels.items()) for condition, _ in conditions.values()]
+    return provenance.join(
+        entry
+        for entry in dropped
+        if not any(set(dropped_labels(entry).items()) <= labels for labels in known)
+    )
 
 
 def _notes(condition: Condition) -> dict[str, Any]:

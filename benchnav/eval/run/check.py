@@ -1,9 +1,9 @@
 """Before a run: every condition is built on one map, so that what cannot be run is refused before anything is.
 
-Nothing is predicted and nothing is planned, but a planner prepares itself on a tiny map of its own.
+Nothing is predicted and nothing is planned. Combinations of parts that cannot be run are left out; see `combinations`.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,23 +12,20 @@ import torch
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
-from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.settings import call, hint
-from benchnav.core.terrain import Grid, Observation
+from benchnav.core.settings import hint
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
 from benchnav.eval.experiment.condition import KNOWLEDGE, PART_KINDS, Condition, conditions_of, is_checkpoint
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.experiment.unit import BLOCK_MAPS, Extent
+from benchnav.eval.experiment.unit import BLOCK_MAPS, Conditions, Extent
+from benchnav.eval.folder import provenance
+from benchnav.eval.run.combinations import LeftOut, find_left_out
 from benchnav.eval.run.unit import noise_key, read_maps
-from benchnav.models.base import PrivilegedModel
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.predictor import class_mismatch, find_checkpoint, find_ground_statistics, load_model
-from benchnav.planning.planners.planner import check_steers
-from benchnav.planning.problem import Task, pose_problem
-from benchnav.planning.sensing.belief import Fields, Law, Static
+from benchnav.planning.problem import Task
 from benchnav.planning.world.realisation import check_known
 from benchnav.planning.world.simulation import Simulation
 
@@ -41,7 +38,7 @@ class Checked:
 
     Args:
         conditions: by id, with how often each is to be run.
-        dropped: pairs of which the planner cannot steer the robot, by their labels, each with the reason.
+        dropped: combinations that cannot be run: the labels that do not go together, by column, and the `reason`.
         warnings: what readers of the results should know.
         hypotheses: from `fix_hypotheses`.
     """
@@ -60,7 +57,8 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         elsewhere: parts are made in other processes.
 
     Raises:
-        ConfigError: a part, scenario, map or combination cannot be had, or no planner can steer any robot.
+        ConfigError: a part, scenario or map cannot be had, no combination can be run, or a hypothesis names one that
+            cannot.
         DatasetError: there is no such dataset.
     """
     conditions = conditions_of(suite, scenarios_of)
@@ -70,21 +68,49 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         )
     for condition in conditions:
         check_split(condition, suite.maps)
-    conditions, dropped = _steered(conditions)
+    left_out = find_left_out(conditions)
+    kept = [condition for condition in conditions if condition.id not in left_out]
+    if not kept:
+        raise ConfigError(next(iter(left_out.values())).reason)
     if elsewhere:
-        check_everywhere(conditions)
-    warnings, wanted = build_each(conditions, suite.all_seeds[0], suite.maps), {}
-    for condition in conditions:
-        dataset = _open(condition)
-        warnings += _doubts(condition, dataset)
-        maps = suite.maps or dataset.map_count(condition.split)
-        wanted[condition.id] = (condition, Extent.product(suite.all_seeds, suite.realisations, maps))
+        check_everywhere(kept)
+    extents = {condition.id: _extent(condition, suite) for condition in conditions}
+    hypotheses = _fix_hypotheses(suite, {c.id: (c, extents[c.id]) for c in conditions}, left_out)
+    warnings = build_each(kept, suite.all_seeds[0], suite.maps)
+    for condition in kept:
+        warnings += _doubts(condition, _open(condition))
     return Checked(
-        conditions=wanted,
-        dropped=tuple(dropped),
+        conditions={condition.id: (condition, extents[condition.id]) for condition in kept},
+        dropped=tuple(provenance.join(one.entry for one in left_out.values())),
         warnings=tuple(dict.fromkeys(warnings)),
-        hypotheses=fix_hypotheses(suite.hypotheses, wanted),
+        hypotheses=hypotheses,
     )
+
+
+def _extent(condition: Condition, suite: Suite) -> Extent:
+    maps = suite.maps or _open(condition).map_count(condition.split)
+    return Extent.product(suite.all_seeds, suite.realisations, maps)
+
+
+def _fix_hypotheses(suite: Suite, conditions: Conditions, left_out: Mapping[str, LeftOut]) -> dict[str, Any]:
+    """Fixes the hypotheses of a suite on the conditions that are run.
+
+    Raises:
+        ConfigError: If a hypothesis compares a condition that is run with one that is left out, or is invalid.
+    """
+    kept = {i: entry for i, entry in conditions.items() if i not in left_out}
+    try:
+        tests = fix_hypotheses(suite.hypotheses, conditions).get("tests", ())
+    except ConfigError:  # perhaps of a combination that is left out
+        tests = ()
+    for test in tests:
+        lost = [left_out[test[side]] for side in ("one", "other") if test[side] in left_out]
+        if len(lost) == 1:
+            raise ConfigError(
+                f"Expected hypotheses on conditions that can be run, got {test['claim']!r}, which names one that "
+                f"cannot: {lost[0].reason}"
+            )
+    return fix_hypotheses(suite.hypotheses, kept)
 
 
 def _open(condition: Condition) -> TerrainDataset:
@@ -138,11 +164,6 @@ def build_each(conditions: Iterable[Condition], seed: int, maps: int) -> list[st
     for condition in conditions:
         dataset, task, world = _open(condition), condition.make_task(), condition.world
         place = condition.data, condition.split
-        posed = condition.robot, condition.objective, condition.rules, world.immobile
-        if is_new("planner", condition.planner, condition.data, *posed):
-            _check_planner(condition, task, dataset.grid.resolution_m)
-        if not condition.blind:
-            _check_told(condition)
         if is_new("ground", *place, world.noise):
             _check_known_ground(condition, dataset, maps)
         if is_new("world", *place, world, condition.rules, condition.robot):
@@ -152,9 +173,7 @@ def build_each(conditions: Iterable[Condition], seed: int, maps: int) -> list[st
             warnings += _late(condition, task, dataset, maps)
         if is_new("knowledge", *place, condition.model, *(getattr(condition, kind) for kind in KNOWLEDGE)):
             _check_knowledge(condition, dataset)
-        if not condition.blind and is_new(
-            "model", condition.model, condition.data, condition.risk.part, condition.belief, condition.sensor
-        ):
+        if not condition.blind and is_new("model", condition.model, condition.data):
             warnings += _check_model(condition, dataset)
     return warnings
 
@@ -167,71 +186,6 @@ def _make_all(dataset: TerrainDataset, split: str, maps: int) -> str:
     if whole is None or whole.maps < maps:
         return ""
     return f" All maps of {dataset.id} are made with `benchnav-datagen create {dataset.id}`."
-
-
-def _steered(conditions: list[Condition]) -> tuple[list[Condition], list[dict[str, str]]]:
-    """The conditions in which the planner can steer the robot, and the pairs in which it cannot."""
-    reasons: dict[tuple[str, str], str] = {}
-    for condition in conditions:
-        pair = condition.planner.label, condition.robot.label
-        if pair not in reasons:
-            task, planner = condition.make_task(), condition.make_planner()
-            try:
-                check_steers(planner, task.robot, condition.planner.label)
-                reasons[pair] = ""
-            except ConfigError as error:
-                reasons[pair] = str(error)
-    left = [one for one in conditions if not reasons[one.planner.label, one.robot.label]]
-    if not left:
-        raise ConfigError(next(iter(reasons.values())))
-    dropped = [
-        {"planner": planner, "robot": robot, "reason": reason}
-        for (planner, robot), reason in reasons.items()
-        if reason
-    ]
-    return left, dropped
-
-
-def _check_told(condition: Condition) -> None:
-    """Refuses what a planner cannot be told."""
-    planner, name = condition.make_planner(), condition.planner.label
-    if planner.plans_once and condition.learns:
-        raise ConfigError(
-            f"Expected belief 'static' and sensor 'full' for planner {name!r}, which plans once, got "
-            f"{condition.belief.label!r} and {condition.sensor.label!r}."
-        )
-    if planner.given_truth and condition.model.part != "clairvoyant":
-        raise ConfigError(
-            f"Expected model 'clairvoyant' for planner {name!r}, which is given λ itself, got "
-            f"{condition.model.label!r}."
-        )
-
-
-def _check_planner(condition: Condition, task: Task, resolution_m: float) -> None:
-    """Lets a shipped planner refuse what only its preparation can tell, such as its bounds."""
-    if not registry.find("planner", condition.planner.part).shipped:
-        return
-    ground = torch.full((1, 4, 4), 0.9)
-    grid = Grid(4, 4, resolution_m)
-    seen = Observation(torch.zeros(1, 3, 4, 4, dtype=torch.uint8), 0 * ground, 0 * ground, grid)
-    ones = torch.ones_like(ground).unsqueeze(1)
-    mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
-    start, goal = (torch.full((1, 2), cells * resolution_m) for cells in (0.5, 3.5))
-
-    def prepare() -> None:
-        fields = Fields(Static(), Static().init(mixture, Law(grid=grid, correlation_m=0.0)), (0,))
-        world = condition.world
-        problem = pose_problem(
-            task, seen, mixture, ground, start, goal, 1.0, immobile=world.immobile, fields=fields
-        )
-        condition.make_planner().init(problem, torch.Generator())
-
-    labels = condition.labels
-    call(
-        f"Planner {labels['planner']!r} for robot {labels['robot']!r} and objective {labels['objective']!r}",
-        prepare,
-        {},
-    )
 
 
 def _check_knowledge(condition: Condition, dataset: TerrainDataset) -> None:
@@ -269,20 +223,9 @@ def _late(condition: Condition, task: Task, dataset: TerrainDataset, maps: int) 
 
 
 def _check_model(condition: Condition, dataset: TerrainDataset) -> list[str]:
-    """Loads the model, which may refuse; tells of another class table, and refuses single-class where it has none."""
+    """Loads the model, which may reject its options; warns of another class table."""
     part = condition.model.part
     model: Any = load_model(condition.model)
-    knows_classes = bool(model.class_names) or isinstance(model, PrivilegedModel)
-    if condition.risk.part == "single-class" and condition.make("belief").learns:
-        raise ConfigError(
-            "Expected a belief that does not learn for the risk setting 'single-class', got "
-            f"{condition.belief.label!r}: what is learnt of λ is of no class. Take the belief static."
-        )
-    if condition.risk.part == "single-class" and not knows_classes:
-        raise ConfigError(
-            f"Expected a model that predicts classes for the risk setting 'single-class', got "
-            f"{condition.model.label!r}, which has no `class_names`."
-        )
     if is_checkpoint("model", part):
         model = load_checkpoint(find_checkpoint(part))  # which has a class table in any case
     line = class_mismatch(model, dataset.recipe, f"model {condition.model.label}")

@@ -14,7 +14,8 @@ from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.checksums import note_checksums
-from benchnav.eval.folder.run_folder import EPISODES, Run, open_run, read_table
+from benchnav.eval.folder.results import code_of
+from benchnav.eval.folder.run_folder import EPISODES, KEYS, Run, find_units, open_run, read_table, unit_rows
 from benchnav.eval.folder.steps import LAST_COLUMN, open_steps, read_steps
 from benchnav.eval.recording import GROUND, MAP, Ground, Recording
 from benchnav.eval.run.recorder import Recorder
@@ -36,7 +37,7 @@ def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = Non
     """Gives the recording of an episode, running its unit again where it was not recorded.
 
     Args:
-        folder: a finished run.
+        folder: a run in which that unit is finished.
         unit: the episode's.
         member: which of the unit's episodes.
         out: folder that the recording of an episode that is run again is written to; the run's when not given.
@@ -74,8 +75,11 @@ def _recorder(unit: Unit, settings: Settings, members: Sequence[int]) -> tuple[R
 
 
 def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
-    """What a finished run holds of an episode."""
-    rows = read_table(folder, EPISODES)
+    """What a run holds of an episode, which may be finished before the run is."""
+    if (folder / EPISODES).exists():
+        rows = read_table(folder, EPISODES)
+    else:
+        rows = pd.concat([pd.DataFrame(columns=KEYS), *map(unit_rows, find_units(folder, unit)[:1])])
     known = {
         "condition": unit.condition.id,
         "seed": unit.seed,
@@ -85,7 +89,8 @@ def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
     own = (rows[list(known)] == pd.Series(known)).all(axis=1)
     if not own.any():
         raise ConfigError(
-            f"Expected a finished run, got {folder} without that episode. Give its command again to finish it."
+            f"Expected an episode that is finished, got one that {folder} does not have yet. Give its `benchnav-eval "
+            "run` command again to finish it, or name another condition."
         )
     return rows[own].to_dict("records")[0]
 
@@ -128,7 +133,7 @@ def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
     maps = tuple(rows["map"].tolist())
     seed, realisation = int(first["seed"]), int(first["realisation"])
     unit = Unit(condition=condition, seed=seed, realisation=realisation, maps=maps)
-    origin, made = Settings().origins().of(unit), run.about["codes"][first["code"]]
+    origin, made = Settings().origins().of(unit), code_of(run, first["code"])
     digests = run.about["datasets"][condition.data]["maps"][condition.split]
     if origin.maps[1:] != tuple(digests[i] for i in maps):
         raise BenchnavError(f"Expected {condition.data} with the maps of {run.folder}, got other maps.")

@@ -12,6 +12,7 @@ import pandas as pd
 
 from benchnav.core.device import device_of_run
 from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.progress import Progress
 from benchnav.core.store import sole_writer
 from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.unit import Unit, units
@@ -29,6 +30,7 @@ from benchnav.eval.folder.run_folder import (
 )
 from benchnav.eval.run.begin import Work
 from benchnav.eval.run.check import Say, build_each, check_everywhere, check_split
+from benchnav.eval.run.combinations import find_left_out
 from benchnav.eval.run.runner import run_work
 from benchnav.eval.run.unit import Settings
 
@@ -42,8 +44,8 @@ def rerun(
     scheduler: str = "",
     overwrite: bool = False,
     say: Say = lambda line: None,
-) -> Iterator[tuple[int, int]]:
-    """Runs all of a finished run again, yielding (units done, units in all); to be iterated to the end.
+) -> Iterator[Progress]:
+    """Runs all of a finished run again, yielding its progress in units; to be iterated to the end.
 
     Args:
         run_folder: what is repeated.
@@ -142,7 +144,10 @@ def _check_there(run: Run) -> None:
                 lacking[str(error)] = None
     if lacking:
         raise ConfigError(f"Expected all that {run.folder} was made with, got a lack: {' '.join(lacking)}")
-    build_each((condition for condition, _ in run.conditions.values()), seed=0, maps=1)
+    conditions = [condition for condition, _ in run.conditions.values()]
+    for one in find_left_out(conditions).values():
+        raise ConfigError(one.reason)
+    build_each(conditions, seed=0, maps=1)
 
 
 def _verdict(

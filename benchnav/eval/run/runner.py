@@ -5,7 +5,7 @@ or extended by giving the same command or another. A row does not depend on the 
 units, or on interruptions.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import chdir
 from dataclasses import replace
 from functools import partial
@@ -14,15 +14,17 @@ from typing import Any
 
 from benchnav.core.device import find_device, gpu_name
 from benchnav.core.errors import ConfigError
+from benchnav.core.progress import Progress
 from benchnav.core.settings import plain
 from benchnav.core.store import Shard, sole_writer
 from benchnav.core.touched import changes_since, unlike
 from benchnav.core.workers import connected, run_calls
 from benchnav.eval.experiment.suite import RECORDS, Record, Suite
-from benchnav.eval.experiment.unit import Unit, in_table_order, units
+from benchnav.eval.experiment.unit import Conditions, Unit, in_table_order, unit_names, units
 from benchnav.eval.folder.checksums import note_checksums
 from benchnav.eval.folder.provenance import TOUCHED, Origin, Origins, code_differences
 from benchnav.eval.folder.run_folder import (
+    EPISODES,
     ERRORS,
     Finished,
     caveats,
@@ -51,12 +53,15 @@ def run_suite(
     scheduler: str = "",
     device: str = "cpu",
     reuse_code: bool = False,
-) -> Iterator[tuple[int, int]]:
-    """Runs what is not finished of a suite, yielding (units done, units in all); to be iterated to the end.
+) -> Iterator[Progress]:
+    """Runs what is not finished of a suite, yielding its progress in units; to be iterated to the end.
+
+    Units of a run that the suite does not name are left as they are. While any of them is not finished, the run has no
+    table; `say` is told of it.
 
     Args:
         suite: what is evaluated.
-        folder: the run folder; it may hold a run, which is gone on with or extended.
+        folder: the run folder; it may hold a run, which is resumed or extended.
         jobs: worker processes.
         overwrite: drop the run that is there.
         planner_limit_s: time limit of each call of a planner; 0 for none.
@@ -89,7 +94,7 @@ def run_suite(
 
 def run_work(
     work: Work, folder: Path, jobs: int, scheduler: str, overwrite: bool, say: Say
-) -> Iterator[tuple[int, int]]:
+) -> Iterator[Progress]:
     """Runs what is not finished of some work in a folder that the caller holds; otherwise as `run_suite`."""
     if scheduler:
         with connected(scheduler):  # else nothing is dropped or written
@@ -101,25 +106,35 @@ def run_work(
     conditions = begin(work, folder, say)
     every = units(conditions, work.record)
     own = [unit for unit in every if work.shard is None or unit.shard(work.shard.of) == work.shard]
+    named, others = _parted(own, work.conditions)
     origins = work.settings.origins()
-    missing = _missing(own, origins, folder, work.reuse_code, say, is_here=not scheduler)
-    done = len(own) - len(missing)
-    if own:
-        yield done, len(own)
-    else:
+    missing = _missing(named, origins, folder, work.reuse_code, say, is_here=not scheduler)
+    if not own:
         say(f"shard {work.shard} holds none of the {len(every)} units")
     # Workers may be older than this call, so that they are told where names of files begin.
     run = partial(run_on_worker, Path.cwd()) if scheduler else partial(_run_in, Path.cwd(), folder.resolve())
     calls: list[Any] = [partial(run, unit, origin, work.settings) for unit, origin in missing]
-    for files in run_calls(calls, jobs, scheduler):
+    steps = _Steps(named, [unit for unit, _ in missing], in_turn=jobs == 1 and not scheduler)
+    if named:
+        yield steps.progress()
+    for unit, files in run_calls(calls, jobs, scheduler):
         if scheduler:
-            store_files(folder, *files)
-        done += 1
-        yield done, len(own)
+            store_files(folder, unit, files)
+        yield steps.progress(unit)
     if missing:
         say("measuring the planning time of one robot alone")
-    measure_latencies(folder, {unit.condition.id for unit in own}, work.settings)
-    finished, reused = _finished(in_table_order(own, conditions), origins, folder, work.reuse_code)
+    measure_latencies(folder, {unit.condition.id for unit in named}, work.settings)
+    finished, reused = _finished(in_table_order(named, conditions), origins, folder, work.reuse_code)
+    if others:
+        lacking = [unit for unit in others if _counted(unit, origins, folder, work.reuse_code) is None]
+        if lacking:
+            write_errors(folder, finished)
+            note_checksums(folder, [folder / ERRORS])
+            if missing:  # a table that is there is of other makings of what was run
+                (folder / EPISODES).unlink(missing_ok=True)
+            say(_unfinished(folder, lacking, len(conditions)))
+            return
+        finished, reused = _finished(in_table_order(own, conditions), origins, folder, work.reuse_code)
     if not work.reuse_code:
         _check_steady([one for _, one in finished], is_here=not scheduler)
     if work.shard is not None:
@@ -132,9 +147,62 @@ def run_work(
     keep_ground(folder)
 
 
-def _run_in(here: Path, folder: Path, unit: Unit, origin: Origin, settings: Settings) -> None:
+def _parted(own: Sequence[Unit], conditions: Conditions) -> tuple[list[Unit], list[Unit]]:
+    """The units of a run that hold anything of what a command names, and the others; a block of maps stays whole."""
+    blocks = {(u.condition.id, u.seed, u.realisation, u.block) for u in units(conditions)}
+    parted: tuple[list[Unit], list[Unit]] = [], []
+    for u in own:
+        parted[(u.condition.id, u.seed, u.realisation, u.block) not in blocks].append(u)
+    return parted
+
+
+def _unfinished(folder: Path, lacking: Sequence[Unit], conditions: int) -> str:
+    ids = {unit.condition.id for unit in lacking}
+    other = sum(bool(find_units(folder, unit)) for unit in lacking)
+    why = f" ({other} of their units are of other code or maps)" if other else ""
+    return (
+        f"what this command names is finished; {len(ids)} of {conditions} conditions of {folder} are not{why}, so that "
+        "the run has no new table. Give the command that named them, or read what is there with `report --partial`"
+    )
+
+
+class _Steps:
+    """Counts units as they are finished, and names them by what tells them apart."""
+
+    def __init__(self, named: Sequence[Unit], missing: Sequence[Unit], in_turn: bool) -> None:
+        """Takes all units of a command, those that are to be run, and whether one is run after the other."""
+        self._names = unit_names(named)
+        self._total, self._episodes = len(named), sum(len(unit.maps) for unit in named)
+        self._waiting, self._in_turn = list(missing), in_turn
+        self._left = len(missing)
+        self._left_episodes = sum(len(unit.maps) for unit in missing)
+
+    def progress(self, finished: Unit | None = None) -> Progress:
+        """The progress, once a unit was finished; the first without one."""
+        if finished is not None:
+            self._left -= 1
+            self._left_episodes -= len(finished.maps)
+        done = len(self._waiting) - self._left
+        doing = f"finished {self._names(finished)}" if finished is not None else ""
+        if self._left and (self._in_turn or finished is None):
+            doing = f"running {self._names(self._waiting[done])}"
+        return Progress(
+            self._total - self._left,
+            self._total,
+            doing=doing,
+            size_done=self._episodes - self._left_episodes,
+            size=self._episodes,
+            sized="episodes",
+        )
+
+
+def _run_in(
+    here: Path, folder: Path, unit: Unit, origin: Origin, settings: Settings
+) -> tuple[Unit, dict[str, bytes]]:
+    """Runs a unit in a process of this machine; gives it, and no files, which it wrote itself."""
     with chdir(here):
         run_unit(unit, folder, origin, settings)
+    return unit, {}
 
 
 def _missing(
@@ -214,6 +282,11 @@ def _counting(known: list[Finished], unit: Unit, origin: Origin, reuse_code: boo
     return max(counting, key=lambda finished: finished.about["key"] == key, default=None)
 
 
+def _counted(unit: Unit, origins: Origins, folder: Path, reuse_code: bool) -> Finished | None:
+    """The making of a unit that counts now; None where it is not finished."""
+    return _counting(find_units(folder, unit), unit, origins.of(unit), reuse_code)
+
+
 def _differences(finished: Finished, origin: Origin) -> list[str]:
     """What differs between the origin of a finished unit and another, in words."""
     maps = ["maps"] if finished.about["digests"] != list(origin.maps) else []
@@ -251,8 +324,7 @@ def _finished(
     found, reused = [], 0
     other: dict[str, None] = {}
     for unit in own:
-        origin = origins.of(unit)
-        counts = _counting(find_units(folder, unit), unit, origin, reuse_code)
+        origin, counts = origins.of(unit), _counted(unit, origins, folder, reuse_code)
         if counts is None:
             raise ConfigError(
                 f"Expected unit {unit.name} of condition {unit.condition.id} in {folder}, got none: it was removed. "

@@ -26,7 +26,10 @@ _MOST = 1 - 1e-12
 
 
 def test_hypotheses(
-    about: Mapping[str, Any], episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]]
+    about: Mapping[str, Any],
+    episodes: pd.DataFrame,
+    worlds: Mapping[str, Mapping[str, Any]],
+    is_whole: bool = True,  # noqa: PT028
 ) -> pd.DataFrame:
     """Tests the hypotheses of a run.
 
@@ -34,6 +37,8 @@ def test_hypotheses(
         about: from `fix_hypotheses`.
         episodes: all rows of the run.
         worlds: by condition what λ did.
+        is_whole: the run is finished. Of a part of it differences and intervals are computed on common episodes, and
+            `p`, `p_holm` are NaN: a test is made once.
 
     Returns:
         A row a hypothesis, of which `difference` is of `one` less `other`: all fields of `Hypothesis` and `claim`;
@@ -47,8 +52,9 @@ def test_hypotheses(
     for plain in about["tests"]:
         test = Hypothesis(**{name: value for name, value in plain.items() if name not in ("names", "claim")})
         one, other = (
-            rows[condition].assign(time_budget_s=time_budgets(rows[condition], worlds[condition]))
+            own.assign(time_budget_s=time_budgets(own, worlds[condition]))
             for condition in (test.one, test.other)
+            for own in [rows.get(condition, episodes.iloc[:0])]
         )
         # Episodes of which the metric is known; of a path, where both arrived.
         column = METRICS[test.metric].column
@@ -57,13 +63,13 @@ def test_hypotheses(
         )
         if test.metric == "path_length":
             both = both[both["success"] & both["success_other"]]
-        made.append({**plain, **_test(test, both.dropna(subset=[column, f"{column}_other"]))})
+        made.append({**plain, **_test(test, both.dropna(subset=[column, f"{column}_other"]), is_whole)})
     table = pd.DataFrame(made)
-    table["p_holm"] = holm(table["p"].to_numpy())
+    table["p_holm"] = holm(table["p"].to_numpy()) if is_whole else np.nan
     return table.assign(supported=table["p_holm"] < ALPHA)
 
 
-def _test(test: Hypothesis, rows: pd.DataFrame) -> dict[str, Any]:
+def _test(test: Hypothesis, rows: pd.DataFrame, is_whole: bool) -> dict[str, Any]:
     metric = METRICS[test.metric]
     row: dict[str, Any] = {
         "unit": metric.unit,
@@ -75,7 +81,7 @@ def _test(test: Hypothesis, rows: pd.DataFrame) -> dict[str, Any]:
     for suffix, confidence in (("_90", 0.9), ("", 0.95)):
         difference, low, high = _interval(rows, test.metric, confidence)
         row |= {"difference": difference, f"low{suffix}": low, f"high{suffix}": high}
-    return row | {"p": p_of(test, rows)}
+    return row | {"p": p_of(test, rows) if is_whole else np.nan}
 
 
 def _interval(rows: pd.DataFrame, metric: str, confidence: float) -> tuple[float, float, float]:

@@ -9,7 +9,7 @@ import pandas as pd
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import check_known
-from benchnav.eval.experiment.condition import KNOWLEDGE, LABELS, NOT_USED, differences
+from benchnav.eval.experiment.condition import KNOWLEDGE, LABELS, MEANING, NOT_USED, differences
 from benchnav.eval.experiment.unit import DRAW
 
 # By what conditions may differ, each with its keys in a condition's value. Other data or scenarios are other maps.
@@ -32,6 +32,7 @@ class Compared:
         maps: digests of its maps, in the order of maps.
         episodes: its rows, with T of each as `time_budget_s`.
         code: what code made the rows, by run: names of sources, versions and parts with what identifies them.
+        about: digest of what the maps mean, `MEANING`; empty where the run does not have it.
     """
 
     labels: Mapping[str, str]
@@ -39,6 +40,7 @@ class Compared:
     maps: Sequence[str]
     episodes: pd.DataFrame
     code: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    about: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -231,15 +233,28 @@ def side_by_side(one: pd.DataFrame, other: pd.DataFrame, measures: Sequence[str]
 
 
 def check_maps(one: Compared, other: Compared, names: str) -> None:
-    """Refuses conditions that did not meet the same maps.
+    """Checks that two conditions were evaluated on the same maps, with the same meaning and in the same groups.
 
     Raises:
-        ConfigError: maps of one number have other digests.
+        ConfigError: If maps of one index have different digests, or what the maps mean or their groups differ.
     """
     common = min(len(one.maps), len(other.maps))
     if list(one.maps[:common]) != list(other.maps[:common]):
         raise ConfigError(
             f"Expected conditions on the same maps, got {names}, whose maps have other digests."
+        )
+    groups, other_groups = (rows.groupby("map")["group"].first() for rows in (one.episodes, other.episodes))
+    both = groups.index.intersection(other_groups.index)
+    unlike = {
+        MEANING: bool(one.about and other.about) and one.about != other.about,
+        "groups of maps": not groups[both].equals(other_groups[both]),
+    }
+    if any(unlike.values()):
+        split = f"of {one.value['data']} {one.value['split']}"
+        differing = ", ".join(f"{name} {split}" for name, differs in unlike.items() if differs)
+        raise ConfigError(
+            f"Expected conditions on maps of one meaning, got {names}, which differ in {differing}. Run them on one "
+            "dataset."
         )
 
 

@@ -35,8 +35,8 @@ def evaluate(
         device: Where the model is measured; auto takes CUDA where there is a GPU. Figures are made on the CPU.
     """
     from benchnav import __version__
-    from benchnav.core.command import show_progress
     from benchnav.core.errors import expect
+    from benchnav.core.progress import show_progress
     from benchnav.core.store import output_path, write_text
     from benchnav.core.tables import print_table
     from benchnav.datagen.files.find import find_dataset

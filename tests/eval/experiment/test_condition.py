@@ -252,7 +252,6 @@ def test_a_world_with_stakes_is_distinguished_by_what_is_changed() -> None:
         ({"world": {"preset": "stakes", "correlation_m": False}}, "as a number, got False"),
         ({"world": {"immobile": 3}}, "`world.immobile` as a mapping or null, got 3"),
         ({"world": {"immobile": {"belw": 0.2}}}, "Did you mean 'below'"),
-        ({"model": "clairvoyant"}, "with λ that stays for the model 'clairvoyant', got 'paper'"),
     ],
 )
 def test_worlds_that_contradict_themselves_are_refused(changes: dict[str, object], expected: str) -> None:

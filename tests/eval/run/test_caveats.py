@@ -1,6 +1,8 @@
 """What readers of a run's tables should know: pairs that were left out, and what was warned of."""
 
 import json
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +13,21 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard
 from benchnav.core.tables import to_terminal
 from benchnav.eval.compare import compare_runs
+from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.run_folder import open_run
+from benchnav.eval.folder.run_folder import caveats, open_run
 from benchnav.eval.report.write import print_report, write_report
+from benchnav.eval.run.begin import Work, begin
+from benchnav.eval.run.check import check_suite, scenarios_of
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.rerun import rerun
 from benchnav.eval.run.runner import run_suite
+from benchnav.eval.run.unit import Settings
+from tests.eval.parts import TwoModes
 
 FREE, STEERING = "tests.eval.parts:Faulty", "tests.eval.parts:Steering"
+TWO_MODES = "tests.eval.parts:TwoModes"
+HAZARD = {"part": "optimal", "label": "careful", "options": {"hazard": True}}
 LINE = "left out: planner Steering cannot steer robot bicycle"
 WARNING = (
     "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within the time budget T"
@@ -104,13 +113,12 @@ def test_a_merged_run_says_what_its_shards_said(dataset_path: Path, tmp_path: Pa
         ({"planner": "optimal", "sensors": ("near:4",)}, "'optimal', which plans once, got 'static' and 'near:4'"),
         ({"planner": "optimal_bound"}, "planner 'optimal_bound', which is given λ itself, got 'oracle'"),
         ({"planner": "optimal", "robots": ("bicycle",)}, "Expected robot Unicycle for planner 'optimal', got Bicycle"),
-        (
-            {"planner": {"part": "optimal", "options": {"hazard": True}}, "world": "paper"},
-            "immobilises robots for `hazard`",
-        ),
+        ({"planner": HAZARD, "world": "paper"}, "immobilises robots for `hazard`"),
+        ({"planner": FREE, "model": "clairvoyant", "world": "paper"}, "with λ that stays for the model 'clairvoyant'"),
+        ({"planner": FREE, "risks": ("single-class",), "model": TWO_MODES}, "has no `class_names`"),
     ],
 )  # fmt: skip
-def test_what_a_planner_cannot_be_told_is_refused_before_anything_is_run(
+def test_a_suite_in_which_no_combination_can_be_run_is_refused_before_anything_is_run(
     dataset_path: Path, tmp_path: Path, changes: dict[str, Any], words: str
 ) -> None:
     planner = changes.pop("planner")
@@ -118,6 +126,98 @@ def test_what_a_planner_cannot_be_told_is_refused_before_anything_is_run(
     with pytest.raises(ConfigError, match=words):
         list(run_suite(suite_on(dataset_path, **suite), tmp_path / "run"))
     assert not (tmp_path / "run").exists()
+
+
+# Which cells of a product can be run, as the parts are documented.
+POSSIBLE: tuple[Callable[[dict[str, str]], bool], ...] = (
+    lambda cell: not (cell["risk"] == "single-class" and cell["model"] == "TwoModes"),
+    lambda cell: not (cell["risk"] == "single-class" and cell["belief"] == "copula"),
+    lambda cell: (
+        not (cell["planner"] in ("optimal", "careful", "optimal_bound") and cell["belief"] == "copula")
+    ),
+    lambda cell: not (cell["planner"] == "optimal_bound" and cell["model"] != "clairvoyant"),
+    lambda cell: not (cell["planner"] == "careful" and cell["world"] == "paper"),
+    lambda cell: not (cell["model"] == "clairvoyant" and cell["world"] == "paper"),
+)
+
+
+def test_of_a_product_exactly_the_combinations_that_can_be_run_are_left(dataset_path: Path) -> None:
+    listed: dict[str, Any] = {
+        "planners": (FREE, "straight", "optimal", HAZARD, "optimal_bound"),
+        "models": ("oracle", TWO_MODES, "clairvoyant"),
+        "risks": ("mean", "single-class"), "beliefs": ("static", "copula"), "world": ("paper", "stakes"),
+    }  # fmt: skip
+    suite = suite_on(dataset_path, robots=("unicycle",), maps=1, **listed)
+    checked = check_suite(suite, elsewhere=False)
+    columns = ("planner", "model", "risk", "belief", "world")
+    labels = [condition.labels for condition in conditions_of(suite, scenarios_of)]
+    # What a condition does not use is like a label with which all goes together.
+    expected = [cell for cell in labels if all(possible(cell) for possible in POSSIBLE)]
+    left = [condition.labels for condition, _ in checked.conditions.values()]
+    assert left == expected
+    assert 0 < len(left) < len(labels)
+    # Each combination is named once, and its labels are in no condition that is left.
+    pairs = [{name: label for name, label in entry.items() if name != "reason"} for entry in checked.dropped]
+    assert len({tuple(pair.items()) for pair in pairs}) == len(pairs)
+    for cell in labels:
+        assert (cell in left) != any(pair.items() <= cell.items() for pair in pairs)
+    assert {"model": "TwoModes", "risk": "single-class"} in pairs
+    assert all(set(pair) < {*columns, "sensor", "robot", "objective", "data"} for pair in pairs)
+
+
+def test_what_is_left_out_is_told_before_anything_is_run_and_until_it_can_be_run(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = suite_on(
+        dataset_path, planners=(FREE,), robots=("unicycle",), models=("oracle", TWO_MODES),
+        risks=("mean", "single-class"),
+    )  # fmt: skip
+    said: list[str] = []
+    next(steps := run_suite(suite, tmp_path / "run", say=said.append))
+    steps.close()
+    (line,) = [line for line in said if line.startswith("left out")]
+    assert line.startswith(
+        "left out: model TwoModes, risk single-class: Expected a model that predicts classes"
+    )
+    assert line in caveats(open_run(tmp_path / "run").about)
+    # The class has learnt its classes.
+    monkeypatch.setattr(TwoModes, "class_names", ("firm", "soft"))
+    checked = check_suite(suite, elsewhere=False)
+    work = Work(**vars(checked), suite={}, record="none", settings=Settings())
+    begin(work, tmp_path / "run", said.append)
+    assert open_run(tmp_path / "run").about["dropped"] == []
+
+
+def test_a_planner_whose_settings_are_never_prepared_is_refused(dataset_path: Path) -> None:
+    """Its settings are at fault, where what drops out would be all that the suite has of it."""
+    suite = suite_on(dataset_path, planners=(FREE, HAZARD), robots=("unicycle",), world="paper")
+    with pytest.raises(ConfigError, match="immobilises robots for `hazard`"):
+        check_suite(suite, elsewhere=False)
+    left = check_suite(replace(suite, world=("paper", "stakes")), elsewhere=False)
+    assert [entry["world"] for entry in left.dropped] == ["paper"]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "words"),
+    [
+        ({"risk": "single-class", "model": "TwoModes"}, {"risk": "mean", "model": "TwoModes"}, "has no `class_names`"),
+        ({"risk": "single-class"}, {"risk": "mean"}, "has no `class_names`"),
+        ({"risk": "single-class", "model": "oracle"}, {"risk": "mean", "model": "oracle"}, ""),
+        ({"risk": "mean", "model": "TwoModes"}, {"risk": "mean", "model": "oracle"}, ""),
+    ],
+)  # fmt: skip
+def test_a_hypothesis_on_what_is_left_out_is_refused(
+    dataset_path: Path, tmp_path: Path, one: dict[str, str], other: dict[str, str], words: str
+) -> None:
+    suite = suite_on(
+        dataset_path, planners=(FREE,), robots=("unicycle",), models=("oracle", TWO_MODES),
+        risks=("mean", "single-class"), hypotheses=({"one": one, "other": other, "metric": "success"},),
+    )  # fmt: skip
+    if words:
+        with pytest.raises(ConfigError, match=f"names one that cannot: .*{words}"):
+            check_suite(suite, elsewhere=False)
+    else:
+        assert len(check_suite(suite, elsewhere=False).hypotheses["tests"]) == 1
 
 
 @pytest.mark.parametrize("once", [False, True])

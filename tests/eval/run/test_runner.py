@@ -18,6 +18,7 @@ import torch
 
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.settings import plain
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.eval.compare import compare_runs
 from benchnav.eval.experiment.suite import Suite
@@ -25,7 +26,7 @@ from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.provenance import Origin
-from benchnav.eval.folder.run_folder import open_run, read_table
+from benchnav.eval.folder.run_folder import EPISODES, open_run, read_table
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.report.playback.viewer_file import write_viewer_files
 from benchnav.eval.report.write import write_report
@@ -35,6 +36,7 @@ from benchnav.eval.run.recordings import find_recording
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings, run_unit
 from tests import factories
+from tests.commands import call
 from tests.eval.report.playback.rrd import read_path
 
 BUDGETS = {
@@ -312,7 +314,83 @@ def test_a_unit_of_another_run_counts_if_the_same_made_it(dataset_path: Path, tm
     )
     said.clear()
     finish(replace(suite, seed=5), tmp_path / "two", say=said.append)
-    assert "1 of 2 units were there already" in said
+    assert not any("there already" in line for line in said)
+
+
+def test_a_narrower_command_runs_no_more_than_it_names(
+    dataset_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wide = quick(dataset_path, risks=("mean", "cvar"), seeds=(0, 1))
+    narrow = replace(wide, risks=("cvar",), scenarios=("std",))
+    whole, folder = finish(wide, tmp_path / "whole"), tmp_path / "run"
+    next(steps := run_suite(wide, folder))
+    steps.close()
+    said: list[str] = []
+    steps = run_suite(narrow, folder, say=said.append)
+    assert [tuple(step) for step in steps] == [(0, 2), (1, 2), (2, 2)]
+    made = pd.concat(map(pd.read_parquet, folder.glob("units/*/*.parquet")))
+    assert set(made["risk"]) | set(made["scenario"]) == {"cvar", "std"}
+    assert len(made) == 4
+    (line,) = [line for line in said if "finished" in line]
+    others = whole[["scenario", "risk"]].drop_duplicates().shape[0]
+    assert f"{others - 1} of {others} conditions of {folder} are not" in line
+    assert not (folder / EPISODES).exists()
+    # The command says the same, has no report, and is content.
+    config = tmp_path / "narrow.yaml"
+    config.write_text(json.dumps(plain(narrow)))
+    assert call("eval", "run", "--config", config, "--out", folder) == 0
+    told = capsys.readouterr()
+    assert f"{others - 1} of {others} conditions" in told.err
+    assert "report" in told.out
+    assert "--partial" in told.out
+    assert not (folder / "report.html").exists()
+    # What is lacking may come in parts; the part that completes the run makes its table.
+    for risk in ("mean", "cvar"):
+        list(run_suite(replace(wide, risks=(risk,)), folder))
+    same(pd.read_parquet(folder / EPISODES), whole)
+
+
+def test_a_block_of_maps_stays_whole_under_a_narrower_command(dataset_path: Path, tmp_path: Path) -> None:
+    wide = quick(dataset_path, scenarios=("std",), risks=("mean", "cvar"), maps=2)
+    next(steps := run_suite(wide, tmp_path / "run"))
+    steps.close()
+    list(run_suite(replace(wide, risks=("mean",), maps=1), tmp_path / "run"))
+    list(run_suite(replace(wide, risks=("cvar",)), tmp_path / "run"))
+    assert len(pd.read_parquet(tmp_path / "run" / EPISODES)) == 4
+
+
+def test_a_table_does_not_stay_beside_newer_units_than_it_holds(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wide = quick(dataset_path, scenarios=("std",), risks=("mean", "cvar"))
+    before = finish(wide, tmp_path / "run")
+    narrow = replace(wide, risks=("mean",))
+    monkeypatch.setattr(provenance, "version", lambda name: "another")
+    said: list[str] = []
+    list(run_suite(narrow, tmp_path / "run", say=said.append))
+    assert not (tmp_path / "run" / EPISODES).exists()
+    assert "1 of 2 conditions" in said[-1]
+    assert "(1 of their units are of other code or maps)" in said[-1]
+    # The units of the old code are still there and count again with it.
+    monkeypatch.undo()
+    list(run_suite(narrow, tmp_path / "run"))
+    same(pd.read_parquet(tmp_path / "run" / EPISODES), before)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_progress_names_what_is_run_and_counts_episodes(
+    dataset_path: Path, tmp_path: Path, jobs: int
+) -> None:
+    suite = quick(dataset_path, scenarios=("std",), risks=("mean", "cvar"), maps=2)
+    first, *middle, last = run_suite(suite, tmp_path / "run", jobs)
+    names = {"std Faulty mean, maps 0 to 1", "std Faulty cvar, maps 0 to 1"}
+    assert first.doing.removeprefix("running ") in names
+    assert last.doing.removeprefix("finished ") in names
+    (between,) = middle
+    assert between.doing.startswith("running" if jobs == 1 else "finished")
+    assert [(step.size_done, step.size, step.sized) for step in (first, between, last)] == [
+        (done, 4, "episodes") for done in (0, 2, 4)
+    ]
 
 
 @pytest.mark.parametrize("risk", ["cvar:1.5", "var:-0.1", "expected-time:-1", "chance:2", "single-class:1"])
@@ -665,18 +743,6 @@ def test_a_world_that_cannot_be_drawn_is_refused_before_a_run_is_dropped(
                 finish(replace(suite, world=world), tmp_path / place, overwrite=True)
     same(before, pd.read_parquet(tmp_path / "run" / "episodes.parquet"))
     assert not (tmp_path / "new").exists()
-
-
-def test_single_class_of_a_model_without_classes_is_refused_before_the_run(
-    dataset_path: Path, tmp_path: Path
-) -> None:
-    suite = Suite(
-        data=str(dataset_path), model="tests.eval.parts:TwoModes", planners=("straight", "astar_dwa"),
-        scenarios=("std",), maps=1, record="steps", world={"time_budget_s": 1.0},
-    )  # fmt: skip
-    with pytest.raises(ConfigError, match="which has no `class_names`"):
-        finish(replace(suite, risks=("mean", "single-class")), tmp_path / "run")
-    assert set(finish(suite, tmp_path / "run")["risk"]) == {"–", *Suite().risks}
 
 
 def test_a_command_that_may_start_no_processes_runs_its_units_itself(tmp_path: Path) -> None:

@@ -32,7 +32,14 @@ from benchnav.core.figures import (
 )
 from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.experiment.hypotheses import METRICS
-from benchnav.eval.report.words import blocks, outcome_in_words, p_in_words, reading_names, with_names
+from benchnav.eval.report.words import (
+    NOT_YET,
+    blocks,
+    outcome_in_words,
+    p_in_words,
+    reading_names,
+    with_names,
+)
 
 # From what the ground did to what the code did; success is light, each failure has a colour of its own.
 OUTCOME_COLOURS = {
@@ -230,9 +237,11 @@ def forest_figure(tests: pd.DataFrame) -> Figure:
     axes = figure.subplots(len(panels), squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
     for panel, rows in zip(axes, panels, strict=True):
         _draw_tests(panel, rows)
+    point: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 0}
+    is_tested = tests["p_holm"].notna().all()
     looks: dict[str, Any] = {
-        "supported": {"marker": "o", "ms": 4, "lw": 0},
-        "not supported": {"marker": "o", "ms": 4, "lw": 0, "mfc": "white"},
+        **({"supported": point} if is_tested else {}),
+        "not supported" if is_tested else NOT_YET: {**point, "mfc": "white"},
         "90 % interval": {"lw": 2.6},
         "95 % interval": {"lw": 0.9},
     }

@@ -39,8 +39,8 @@ def compare(
         device: Where the models are measured and timed; auto takes CUDA where there is a GPU.
     """
     from benchnav import __version__
-    from benchnav.core.command import show_progress
     from benchnav.core.errors import expect
+    from benchnav.core.progress import show_progress
     from benchnav.core.store import output_path
     from benchnav.core.tables import print_table
     from benchnav.datagen.files.find import find_dataset
@@ -195,8 +195,8 @@ def _notes(
 
 
 def _write(out: str, title: str, about: dict[str, Any], comparison: "Comparison", notes: list[str]) -> None:
-    from benchnav.core.command import show_progress
     from benchnav.core.figures import save_twice
+    from benchnav.core.progress import show_progress
     from benchnav.core.store import output_path, write_text
     from benchnav.models.quality.compare.report import (
         comparison_csv,
