@@ -39,7 +39,6 @@ from benchnav.core.settings import (
     call,
     config_class,
     list_options,
-    load_yaml,
     of,
     one_line,
     parameters,
@@ -59,6 +58,7 @@ from benchnav.core.sources import (
     load_file,
     moved,
 )
+from benchnav.core.yaml_text import load_yaml
 
 KINDS = ("planner", "model", "risk", "robot", "objective", "sensor", "ground", "belief")
 

@@ -14,11 +14,12 @@ from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from enum import Enum
 from functools import cache, partial
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from types import MappingProxyType, NoneType, SimpleNamespace, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.yaml_text import MAX_DEPTH, check_yaml
 
 NO_DEFAULT = inspect.Parameter.empty
 
@@ -166,6 +167,8 @@ def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAU
         return origin(read(members[0], item, name, f"{key}.{inner}") for inner, item in named)
     if value is None and NoneType in members:
         return None
+    if isinstance(value, str) and kind is not str:
+        check_yaml(value)  # which the parser reads without a look at keys and nesting
     try:
         return _parsed(kind, value)
     except ValueError as error:
@@ -222,6 +225,8 @@ def changed(data: Any, path: Sequence[str], value: Any) -> Any:
     Raises:
         ConfigError: on the way is something that has no keys.
     """
+    if len(path) > MAX_DEPTH:
+        raise ConfigError(f"Expected at most {MAX_DEPTH} keys with dots between, got {len(path)}.")
     if not path:
         return value
     key, rest = path[0], path[1:]
@@ -233,47 +238,6 @@ def changed(data: Any, path: Sequence[str], value: Any) -> Any:
     if not isinstance(data, Mapping | None):
         raise ConfigError(f"Expected a mapping in which {'.'.join(path)!r} can be set, got {data!r}.")
     return {**(data or {}), key: changed((data or {}).get(key), rest, value)}
-
-
-def load_yaml(text: str, place: str = "") -> Any:
-    """Reads YAML in which 1e-3 is a number.
-
-    Args:
-        text: the YAML.
-        place: where it stands, for messages.
-
-    Raises:
-        ConfigError: it is none.
-    """
-    import yaml
-    from jsonargparse import get_loader
-
-    try:
-        try:
-            content = get_loader("yaml")(text)
-        except TypeError:  # which jsonargparse raises of `{0: null}`
-            return yaml.safe_load(text)
-        if isinstance(content, str) and isinstance(without_values := yaml.safe_load(text), dict):
-            return without_values  # which jsonargparse leaves as text
-        return content
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f", line {mark.line + 1}" if place and mark else ""
-        wrong = getattr(error, "problem", None) or error
-        raise ConfigError(f"Expected YAML, got {place or repr(text)}{line}: {wrong}.") from error
-
-
-def read_yaml(path: Path) -> Any:
-    """Reads a YAML file; see `load_yaml`.
-
-    Raises:
-        ConfigError: it cannot be read, or is no YAML.
-    """
-    try:
-        return load_yaml(path.read_text(), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise ConfigError(f"Expected a YAML file, got {str(path)!r}: {reason}.") from error
 
 
 def _names(items: Sequence[Any]) -> list[str]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import BenchnavError, ConfigError, expect
 
 SEAL = "manifest_digest"
 
@@ -44,17 +44,23 @@ def replacing(path: Path, durable: bool = True) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def output_path(name: str) -> Path:
-    """The place on this machine that a user names for an output.
+def check_output(name: str, option: str = "out") -> None:
+    """Refuse what is no path on this machine that an output can be written to.
+
+    Args:
+        name: the path.
+        option: what it is given as, for messages.
 
     Raises:
-        ConfigError: it is an address, such as s3://bucket/name, which would become a folder `s3:`.
+        ConfigError: If it is empty, an address, such as s3://bucket/name, which would become a folder `s3:`, or has
+            characters that no listing shows.
     """
-    if re.match(r"[A-Za-z][A-Za-z0-9+.-]*:/", name):
-        raise ConfigError(
-            f"Expected `out` as a place on this machine, got the address {name!r}. Write to a folder here, and copy it."
-        )
-    return Path(name).expanduser()
+    expect(name, f"`{option}` as a path, got ''.")
+    expect(name.isprintable(), f"`{option}` as a path of printable characters, got {name!r}.")
+    expect(
+        not re.match(r"[A-Za-z][A-Za-z0-9+.-]*:/", name),
+        f"`{option}` as a path on this machine, got the address {name!r}. Write to a folder here, and copy it.",
+    )
 
 
 def write_text(path: Path, text: str) -> None:

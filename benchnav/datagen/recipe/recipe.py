@@ -17,7 +17,8 @@ from numpy import ndarray
 from benchnav.core.copula import LONGEST_CORRELATION
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
-from benchnav.core.settings import changed, load_yaml, plain, read, read_yaml
+from benchnav.core.settings import changed, plain, read
+from benchnav.core.yaml_text import load_yaml, read_yaml
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes, plain_classes
 from benchnav.datagen.recipe.environments import AlikeClasses, deal_classes, deal_units, never_shown
