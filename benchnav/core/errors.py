@@ -79,6 +79,8 @@ _NO_MEMORY = re.compile(
 
 def out_of_memory(error: BaseException) -> OutOfMemoryError | None:
     """Return what to say where an error, or one that it was raised from, is that memory ran out; else None."""
+    if isinstance(error, BenchnavError) and _NO_MEMORY.search(str(error)):
+        return None  # which says so
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, OutOfMemoryError):
@@ -87,8 +89,8 @@ def out_of_memory(error: BaseException) -> OutOfMemoryError | None:
         if is_known or (isinstance(cause, RuntimeError | OSError) and _NO_MEMORY.search(str(cause))):
             said = " ".join(str(cause).split())[:200].rstrip(".") or type(cause).__name__
             return OutOfMemoryError(
-                f"Memory ran out ({said}). Ask for less at once: fewer `jobs`, samples or maps of a batch, smaller maps "
-                "or a smaller network."
+                f"Memory ran out ({said}). Ask for less at once: fewer `jobs`, samples or maps of a batch, smaller "
+                "maps or a smaller network."
             )
         cause = cause.__cause__
     return None

@@ -32,7 +32,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, out_of_memory
 from benchnav.core.settings import NO_DEFAULT as NO_DEFAULT
 from benchnav.core.settings import Option as Option
 from benchnav.core.settings import (
@@ -382,7 +382,9 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
     except (Exception, SystemExit) as error:
         if not isinstance(error, ModuleNotFoundError) or not f"{place}.".startswith(f"{error.name}."):
             line = f"{one_line(error)}{moved(error)}"
-            raise ConfigError(f"module {place} could not be imported: {line}") from error
+            raise out_of_memory(error) or ConfigError(
+                f"module {place} could not be imported: {line}"
+            ) from error
         file = Path(*place.split(".")).with_suffix(".py")
         beside = f" Did you mean './{file}:{name}'?" if file.is_file() else hint(place, names(kind))
         remedy = moved(error).removeprefix(".") or beside

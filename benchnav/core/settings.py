@@ -18,7 +18,7 @@ from pathlib import PurePath
 from types import MappingProxyType, NoneType, SimpleNamespace, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import BenchnavError, ConfigError, out_of_memory
 from benchnav.core.yaml_text import MAX_DEPTH, check_yaml
 
 NO_DEFAULT = inspect.Parameter.empty
@@ -126,7 +126,7 @@ def call(what: str, target: Callable[..., Any], arguments: Mapping[str, Any]) ->
     except BenchnavError:
         raise
     except Exception as error:
-        raise ConfigError(f"{what} could not be made: {one_line(error)}") from error
+        raise out_of_memory(error) or ConfigError(f"{what} could not be made: {one_line(error)}") from error
 
 
 # --- from plain data --------------------------------------------------------------------------------
@@ -150,6 +150,7 @@ def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAU
     Raises:
         ConfigError: a key is unknown or missing, or a value is of another type or refused by its dataclass.
     """
+    _check_size(value, name(key))
     if kind is Any or (isinstance(kind, type) and type(value) is kind) or (value is None and now is None):
         return value
     config, origin, members = dataclass_in(kind), get_origin(kind), get_args(kind)
@@ -170,11 +171,19 @@ def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAU
     if isinstance(value, str) and kind is not str:
         check_yaml(value)  # which the parser reads without a look at keys and nesting
     try:
-        return _parsed(kind, value)
+        parsed = _parsed(kind, value)
     except ValueError as error:
         got = "null" if value is None else repr(value)
         near = hint(str(value), [member for member in members_of(kind) if isinstance(member, str)])
         raise ConfigError(f"Expected {name(key)} as {in_words(kind)}, got {got}.{near}") from error
+    _check_size(parsed, name(key))
+    return parsed
+
+
+def _check_size(value: Any, what: str) -> None:
+    """Refuse whole numbers that no array and no generator takes."""
+    if type(value) is int and abs(value) >= 2**64:
+        raise ConfigError(f"Expected {what} as a whole number of at most 64 bits, got {value}.")
 
 
 def read_options(

@@ -19,6 +19,7 @@ from typing import Any
 from benchnav.core.errors import BenchnavError, ConfigError, expect
 
 SEAL = "manifest_digest"
+MAX_JOBS = 10_000
 
 
 @contextmanager
@@ -268,3 +269,21 @@ def read_shard(text: str) -> Shard | None:
     if numbers is None:
         raise ConfigError(f"Expected `shard` I/N, such as 2/5, got {text!r}.")
     return Shard(index=int(numbers[1]), of=int(numbers[2]))
+
+
+def check_workers(jobs: int, backend: str, scheduler: str) -> None:
+    """Refuse numbers and kinds of workers that no machine has.
+
+    Args:
+        jobs: worker processes of this machine.
+        backend: "local" or "dask".
+        scheduler: address of a Dask cluster's scheduler; empty for none.
+
+    Raises:
+        ConfigError: If there is none or more than `MAX_JOBS`, or a cluster without an address or the reverse.
+    """
+    expect(1 <= jobs <= MAX_JOBS, f"`jobs` in 1–{MAX_JOBS}, got {jobs}.")
+    expect(
+        (backend == "dask") == bool(scheduler),
+        "`backend` dask and `scheduler` together, got one of the two. Pass both.",
+    )

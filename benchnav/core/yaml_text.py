@@ -107,7 +107,7 @@ def _check_nesting(text: str, place: str) -> None:
         if isinstance(event, yaml.AliasEvent):
             if event.anchor in open_anchors:
                 raise _refusal(text, place, f"*{event.anchor} is within &{event.anchor}", event.start_mark)
-            values += sizes[event.anchor]
+            values += sizes[event.anchor or ""]
         elif isinstance(event, yaml.CollectionEndEvent):
             anchor, start = open_anchors.pop(), starts.pop()
             sizes[anchor or ""] = values - start

@@ -12,7 +12,7 @@ from typing import Literal
 from benchnav import datagen
 from benchnav.core.command import INTERRUPTED, Command, run, show_progress, tell
 from benchnav.core.errors import DatasetError, choose, expect
-from benchnav.core.store import read_shard, replacing, write_text
+from benchnav.core.store import check_workers, read_shard, replacing, write_text
 from benchnav.core.tables import Table, print_table
 from benchnav.datagen.import_commands import import_dem, import_drives
 
@@ -52,11 +52,7 @@ def create(
     from benchnav.datagen.files.describe import written
     from benchnav.datagen.files.manifest import is_dataset
 
-    expect(jobs >= 1, f"`jobs` ≥ 1, got {jobs}.")
-    expect(
-        (backend == "dask") == bool(scheduler),
-        "`backend` dask and `scheduler` together, got one without the other.",
-    )
+    check_workers(jobs, backend, scheduler)
     expect(first >= 0, f"`first` ≥ 0, got {first}.")
     own = read_shard(shard)
     chosen = datagen.load_recipe(recipe, overrides)

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from benchnav.core.batch import map_tensors
 from benchnav.core.conditioned import ConditionedDistribution
 from benchnav.core.distribution import TraversabilityDistribution, tail_of
-from benchnav.core.errors import ConfigError, expect, quiet
+from benchnav.core.errors import ConfigError, expect, out_of_memory, quiet
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.pooled import PooledDistribution, pool
@@ -343,7 +343,7 @@ def export_onnx(
                 input_names=list(graph.layers), output_names=list(graph.names), dynamic_shapes=(tuple(sizes),),
             )  # fmt: skip
     except Exception as error:  # of many kinds
-        raise ConfigError(
+        raise out_of_memory(error) or ConfigError(
             f"Expected a network that PyTorch writes as ONNX, got {type(model).__name__}: "
             f"{one_line(error.__cause__ or error)[:300]}"
         ) from error

@@ -32,6 +32,11 @@ _LEAST_GAP = 0.3  # between classes of one colour, in E[λ] on flat ground
 REFERENCE_M = 32.0  # side of the square that relief and crater counts of synthesis 2 are for
 
 
+# More than a machine makes; a shard's name counts maps in eight digits.
+MAX_MAPS = 10**8 - 1
+MAX_CELLS = 2**40
+
+
 @dataclass(frozen=True, kw_only=True)
 class Split:
     """One split of a dataset.
@@ -342,6 +347,11 @@ def _check_environments(recipe: Recipe) -> None:
 
 def _check_splits(recipe: Recipe) -> None:
     expect(recipe.splits, "at least one split in `splits`, got none.")
+    maps, cells = sum(split.maps for split in recipe.splits.values()), recipe.height * recipe.width
+    expect(
+        maps <= MAX_MAPS and maps * cells <= MAX_CELLS,
+        f"at most {MAX_MAPS:,} maps of {MAX_CELLS:,} cells together, got {maps:,} of {cells:,}. Ask for fewer `maps`.",
+    )
     for name, split in recipe.splits.items():
         for part in name.split("/"):
             check_name("split name", part)

@@ -8,7 +8,7 @@ from typing import Any
 from lightning.pytorch.callbacks import EarlyStopping
 
 from benchnav.core import registry
-from benchnav.core.errors import BenchnavError, ConfigError, expect
+from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memory
 from benchnav.core.settings import config_class, of, one_line, read
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.ground import layer_means
@@ -271,7 +271,7 @@ def fit_network(
     except BenchnavError:
         raise
     except Exception as error:  # a user's code may raise anything
-        raise ConfigError(
+        raise out_of_memory(error) or ConfigError(
             f"Expected `calibrate` of {type(network).__name__} to succeed, got: {one_line(error)} "
             "Mend it, and train again with --overwrite."
         ) from error
