@@ -184,7 +184,8 @@ def _call(program: str, command: Command, words: Sequence[str]) -> int | None:
     """Calls the function of a subcommand with what its words say, or prints its help or settings."""
     import yaml
 
-    check_text("".join(words))
+    for word in words:
+        check_text(word)
     if {"-h", "--help"} & set(words):
         return _print_help_of(program, command)
     flags, places = _read_words(program, command, words)

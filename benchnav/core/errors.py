@@ -66,6 +66,19 @@ def check_text(text: str, place: str = "") -> None:
     )
 
 
+def check_label(what: str, text: str) -> None:
+    """Refuse what no table can show: text that is empty, or has a line break or a character that is not printed.
+
+    Args:
+        what: what is called by the text.
+        text: what a user wrote.
+
+    Raises:
+        ConfigError: If it is such.
+    """
+    expect(text.strip() and text.isprintable(), f"{what} as printable text on one line, got {text!r}.")
+
+
 class OutOfMemoryError(BenchnavError):
     """Memory ran out; nothing that was given is to blame but its size."""
 

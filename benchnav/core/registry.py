@@ -32,7 +32,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from benchnav.core.errors import ConfigError, out_of_memory
+from benchnav.core.errors import ConfigError, check_label, out_of_memory
 from benchnav.core.settings import NO_DEFAULT as NO_DEFAULT
 from benchnav.core.settings import Option as Option
 from benchnav.core.settings import (
@@ -183,7 +183,8 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
         )
         options = {name: value, **options}
     place = source.rpartition(":")[0]
-    label = fields.get("label") or (text[len(place) + 1 :] if place else text)
+    label = fields.get("label", text[len(place) + 1 :] if place else text)
+    check_label(f"a label of {kind} {source!r}", str(label))
     return Part(part=source, label=str(label), options=options)
 
 

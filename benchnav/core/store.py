@@ -49,7 +49,7 @@ def check_output(name: str, option: str = "out") -> None:
     """Refuse what is no path on this machine that an output can be written to.
 
     Args:
-        name: the path.
+        name: the path; `~` is the user's home.
         option: what it is given as, for messages.
 
     Raises:
@@ -61,6 +61,16 @@ def check_output(name: str, option: str = "out") -> None:
     expect(
         not re.match(r"[A-Za-z][A-Za-z0-9+.-]*:/", name),
         f"`{option}` as a path on this machine, got the address {name!r}. Write to a folder here, and copy it.",
+    )
+    path = Path(name).expanduser()
+    nearest = next((place for place in path.absolute().parents if os.path.lexists(place)), path)
+    expect(
+        nearest.is_dir(),
+        f"`{option}` as a path in a folder, got {name!r}, and {nearest} is no folder. Choose another `{option}`.",
+    )
+    expect(
+        option == "out" or not path.is_dir(),
+        f"`{option}` as a file, got the folder {name!r}. Name a file in it.",
     )
 
 

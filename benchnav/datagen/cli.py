@@ -91,12 +91,12 @@ def list_datasets(folder: str = "") -> None:
     from benchnav.datagen.files.manifest import FOLDER_MANIFEST
     from benchnav.datagen.recipe.recipe import shipped_sizes
 
+    expect(not folder or Path(folder).is_dir(), f"`folder` as a folder that exists, got {folder!r}.")
     print("recipes:")
     wide = widest(datagen.shipped_recipes())
     for name in datagen.shipped_recipes():
         sizes = ", ".join(f"{split} {maps}" for split, maps in shipped_sizes(name).items())
         print(f"  {name:{wide}} {sizes}")
-    expect(not folder or Path(folder).is_dir(), f"`folder` as a folder that exists, got {folder!r}.")
     for place in [Path(folder)] if folder else dataset_folders():
         folders = [manifest.parent for manifest in place.glob(f"*/{FOLDER_MANIFEST}")]
         files = sorted([*place.glob("*.h5"), *folders])

@@ -56,6 +56,7 @@ from benchnav.models.training.gaussian_processes import train_gps_on_maps
 from benchnav.models.training.masks import RandomMasks
 from benchnav.models.training.target import Target, fresh_checkpoint, open_target
 
+MAX_MEMBERS = 1000  # of an ensemble
 _FEW_MAPS = 19  # with which 1 / (n + 1) is 0.05
 
 
@@ -168,7 +169,7 @@ def train_networks(
         gp: of the GPs, if any.
         members: how many networks there are to be.
     """
-    expect(members >= 1, f"`members` ≥ 1, got {members}.")
+    expect(1 <= members <= MAX_MEMBERS, f"`members` in 1–{MAX_MEMBERS}, got {members}.")
     check_seed(how.seed, members)
     dataset, trainer = open_dataset(data), dict(how.trainer or {})
     # These are the network's own settings, wherever they are said.
