@@ -164,6 +164,7 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
         or not {"part"} <= set(fields) <= {"part", "label", "options"}
         or not isinstance(fields["part"], str)
         or not isinstance(fields.get("options") or {}, Mapping)
+        or isinstance(fields.get("label"), Mapping | list | tuple)
     ):
         raise ConfigError(
             f"Expected {_a(kind)} as NAME or as {{part: NAME, label: LABEL, options: {{…}}}}, got {given!r}."
@@ -183,7 +184,9 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
         )
         options = {name: value, **options}
     place = source.rpartition(":")[0]
-    label = fields.get("label", text[len(place) + 1 :] if place else text)
+    label = fields.get("label")
+    if label is None:
+        label = text[len(place) + 1 :] if place else text
     check_label(f"a label of {kind} {source!r}", str(label))
     return Part(part=source, label=str(label), options=options)
 

@@ -183,7 +183,9 @@ def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAU
 def _check_size(value: Any, what: str) -> None:
     """Refuse whole numbers that no array and no generator takes."""
     if type(value) is int and abs(value) >= 2**64:
-        raise ConfigError(f"Expected {what} as a whole number of at most 64 bits, got {value}.")
+        raise ConfigError(
+            f"Expected {what} as a whole number of at most 64 bits, got one of {value.bit_length()}."
+        )
 
 
 def read_options(

@@ -275,7 +275,7 @@ def read_shard(text: str) -> Shard | None:
     """
     if not text:
         return None
-    numbers = re.fullmatch(r"(\d+)/(\d+)", text)
+    numbers = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
     if numbers is None:
         raise ConfigError(f"Expected `shard` I/N, such as 2/5, got {text!r}.")
     return Shard(index=int(numbers[1]), of=int(numbers[2]))

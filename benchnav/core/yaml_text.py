@@ -14,6 +14,7 @@ from typing import Any
 from benchnav.core.errors import ConfigError, check_text
 
 MAX_DEPTH = 100  # mappings and lists within one another
+MAX_DIGITS = 100
 MAX_VALUES = 100_000  # with what aliases stand for
 
 _TAG = "tag:yaml.org,2002:"
@@ -47,7 +48,7 @@ def load_yaml(text: str, place: str = "") -> Any:
         return None if node is None else loader.construct_document(node)
     except ConfigError:
         raise
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: a number of too many digits
+    except (yaml.YAMLError, ValueError, KeyError) as error:  # `!!int many`, `!!bool perhaps`
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
         raise _refusal(text, place, problem or str(error), mark) from error
 
@@ -77,7 +78,7 @@ def check_yaml(text: str) -> None:
         _composed(text, "")
     except ConfigError:
         raise
-    except (yaml.YAMLError, ValueError):
+    except (yaml.YAMLError, ValueError, KeyError):
         return
 
 
@@ -91,6 +92,8 @@ def _composed(text: str, place: str) -> tuple[Any, Any]:
     for inner in _nodes(node) if node is not None else ():
         if isinstance(inner, yaml.ScalarNode):
             check_text(inner.value, place)
+            if inner.tag == f"{_TAG}int" and len(inner.value) > MAX_DIGITS:
+                raise _refusal(text, place, f"a number of more than {MAX_DIGITS} digits", inner.start_mark)
         elif isinstance(inner, yaml.MappingNode):
             _check_keys(loader, inner, text, place)
     return loader, node
