@@ -283,7 +283,7 @@ LINES: list[str] = [
     )),
     *(f"train evaluate oracle --data d.h5 {words}" for words in ("--maps -1", "--maps nan", "--seed -1", f"--seed {2**63}", "--seed nan", "--splits nope", "--splits '[]'", "--splits ''", "--device tpu", "--json nope/o.json")),
     *(f"train compare oracle --data d.h5 {words}" for words in ("oracle", "--seed -1", "--splits nope", "--splits '[]'", "nope", "'or\nacle'")),
-    *(f"train export stakes-v1 --onnx {words}" for words in ("o.onnx --level nan", "o.onnx --level 1", "o.onnx --level -1", "o.onnx --level inf", "o.onnx --opset 0", "o.onnx --opset -1", "o.onnx --opset 1000000000", "o.onnx --opset nan", "o.txt", "nope/../s3:/o.onnx")),
+    *(f"train export stakes-v1 --onnx {words}" for words in ("o.onnx --level nan", "o.onnx --level 1", "o.onnx --level -1", "o.onnx --level inf", "o.onnx --opset 0", "o.onnx --opset -1", "o.onnx --opset 1000000000", "o.onnx --opset nan", "o.txt")),
     "train export oracle --onnx o.onnx", "train nope", "train fit mdn", "train fit --data d.h5 --out o",
 ]  # fmt: skip
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from benchnav.core.errors import ConfigError
 from benchnav.core.yaml_text import MAX_DEPTH, MAX_VALUES, load_yaml, read_yaml
 
-KEYS = st.text(st.characters(codec="ascii", categories=("L", "N")), min_size=1, max_size=5)
+KEYS = st.from_regex(r"k[a-z0-9]{0,4}", fullmatch=True)
 DATA = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | KEYS,
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=4),

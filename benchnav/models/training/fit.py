@@ -30,7 +30,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from benchnav.core.command import tell
 from benchnav.core.device import find_device
-from benchnav.core.errors import CheckpointError, ConfigError, expect, quiet
+from benchnav.core.errors import CheckpointError, ConfigError, expect, out_of_memory, quiet
 from benchnav.core.settings import check_known, one_line
 from benchnav.core.store import MAX_JOBS, replacing, sole_writer, write_text
 from benchnav.models.config import TrainOptions
@@ -272,8 +272,8 @@ def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Traine
             use_distributed_sampler=False,
             **settings,
         )
-    except (ValueError, TypeError, RuntimeError, MisconfigurationException) as error:
-        raise _unusable(error) from error
+    except Exception as error:  # Lightning raises of settings what its code meets
+        raise out_of_memory(error) or _unusable(error) from error
 
 
 def _unusable(error: Exception) -> ConfigError:
