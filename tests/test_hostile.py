@@ -2,6 +2,7 @@
 
 # ruff: noqa: E501 - a case a line
 
+import os
 import shlex
 from pathlib import Path
 
@@ -314,25 +315,31 @@ def lay_out(folder: Path, dataset: Path) -> None:
 
 
 def files_in(folder: Path) -> dict[str, int]:
-    """All that is in a folder, with the time of its last change."""
-    return {str(path): path.lstat().st_mtime_ns for path in folder.rglob("*") if not path.is_dir()} | {
-        str(path): 0 for path in folder.rglob("*") if path.is_dir()
-    }
+    """All files and folders in a folder, files with the time of their last change."""
+    found = {}
+    for place, folders, files in os.walk(folder):
+        found |= {f"{place}/{name}": 0 for name in folders}
+        found |= {f"{place}/{name}": os.lstat(f"{place}/{name}").st_mtime_ns for name in files}
+    return found
 
 
 @pytest.fixture(scope="module")
-def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("hostile")
-    lay_out(place, dataset_path)
-    return place
+def laid_out(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, int]]:
+    """The folder, and all that is in it."""
+    folder = tmp_path_factory.mktemp("hostile")
+    lay_out(folder, dataset_path)
+    return folder, files_in(folder)
 
 
 @pytest.mark.parametrize("line", CASES, ids=[f"{n} {ascii(line)[1:90]}" for n, line in enumerate(CASES)])
 def test_hostile_input_ends_in_one_line(
-    line: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    line: str,
+    laid_out: tuple[Path, dict[str, int]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    folder, before = laid_out
     monkeypatch.chdir(folder)
-    before = files_in(folder)
     program, *words = shlex.split(line)
     assert call(program, *words) == 2
     out, err = capsys.readouterr()

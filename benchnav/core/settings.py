@@ -168,10 +168,15 @@ def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAU
         return origin(read(members[0], item, name, f"{key}.{inner}") for inner, item in named)
     if value is None and NoneType in members:
         return None
+    data = value
     if isinstance(value, str) and kind is not str:
-        check_yaml(value)  # which the parser reads without a look at keys and nesting
+        allowed = members_of(kind)
+        is_list = str not in allowed and any(get_origin(member) in (list, tuple) for member in allowed)
+        if is_list and not value.lstrip().startswith(("[", "(")):
+            data = f"[{value}]"
+        check_yaml(data)  # which the parser reads without a look at keys and nesting
     try:
-        parsed = _parsed(kind, value)
+        parsed = _parsed(kind, data)
     except ValueError as error:
         got = "null" if value is None else repr(value)
         near = hint(str(value), [member for member in members_of(kind) if isinstance(member, str)])
@@ -259,10 +264,6 @@ def _names(items: Sequence[Any]) -> list[str]:
 def _parsed(kind: Any, value: Any) -> Any:
     from jsonargparse import ArgumentError
 
-    members = members_of(kind)
-    is_list = str not in members and any(get_origin(member) in (list, tuple) for member in members)
-    if is_list and isinstance(value, str) and not value.lstrip().startswith(("[", "(")):
-        value = f"[{value}]"
     try:
         parser = _parser(kind)
         # The parser takes null, and anything but a mapping for a dataclass, for nothing given.

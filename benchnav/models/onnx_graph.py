@@ -321,12 +321,14 @@ def export_onnx(
         ConfigError: such a model has no graph, or the packages of the extra `onnx` are missing.
     """
     try:
+        import onnx
         import onnxscript  # noqa: F401  torch.onnx needs it
     except ImportError as error:
         raise ConfigError(
             "Expected the packages of the extra `onnx`, got none. Install them: pip install 'benchnav[onnx]'."
         ) from error
-    expect(opset >= 18, f"`opset` of at least 18, which torch.onnx writes, got {opset}.")
+    newest = onnx.defs.onnx_opset_version()
+    expect(18 <= opset <= newest, f"`opset` in 18–{newest}, which torch.onnx writes, got {opset}.")
     layers = _tried(graph := Graph(model, level), model)
     batch, height, width = (torch.export.Dim(name) for name in ("batch", "height", "width"))
     sizes = [
