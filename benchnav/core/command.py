@@ -20,7 +20,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_origin
 
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import BenchnavError, ConfigError, check_text, expect, out_of_memory
 from benchnav.core.registry import KINDS
 from benchnav.core.settings import (
     NO_DEFAULT,
@@ -30,15 +30,19 @@ from benchnav.core.settings import (
     hint,
     in_words,
     list_options,
-    load_yaml,
     members_of,
     of,
     plain,
     read_options,
-    read_yaml,
 )
+from benchnav.core.store import check_output
+from benchnav.core.yaml_text import load_yaml, read_yaml
 
 INTERRUPTED = 130
+
+# Options that name what a command writes, of all commands.
+OUTPUTS = ("out", "json", "onnx", "video")
+_LONGEST = 2000  # characters of a message, of which the middle of a longer one is left out
 
 _Flag = tuple[list[str], str]  # the option that a flag stands for, keys within its value; and its text
 
@@ -128,13 +132,14 @@ def run(
                 f"Expected a command among {', '.join(commands)}, got {asked!r}.{hint(asked, commands)}"
             )
         return _call(f"{program} {asked}", command, words) or 0
-    except (BenchnavError, UnicodeDecodeError) as error:
-        return _refuse(program, str(error))
     except BrokenPipeError:
         sys.stderr.close()
         return 0
-    except OSError as error:
-        return _refuse(program, _unusable(error, command))
+    except Exception as error:
+        line = _said(error, command)
+        if line is None:
+            raise
+        return _refuse(program, line)
     except KeyboardInterrupt as stopped:  # by Ctrl-C, or by a scheduler's SIGTERM
         # A command that knows what it has kept says so by the interruption's text.
         print("; ".join([f"{program}: interrupted", *map(str, stopped.args)]), file=sys.stderr)
@@ -153,6 +158,8 @@ def _call(program: str, command: Command, words: Sequence[str]) -> int | None:
     """Calls the function of a subcommand with what its words say, or prints its help or settings."""
     import yaml
 
+    for word in words:
+        check_text(word)
     if {"-h", "--help"} & set(words):
         return _print_help_of(program, command)
     flags, places = _read_words(program, command, words)
@@ -167,10 +174,23 @@ def _call(program: str, command: Command, words: Sequence[str]) -> int | None:
     if lacking := [name for name in command.options if name not in known | arguments]:
         named = [name.upper() if name in command.positionals else f"--{name}" for name in lacking]
         raise ConfigError(f"Expected {' and '.join(named)}, got none. See `{program} --help`.")
+    _check_texts(command, arguments)
     for parameter, kind in command.settings.items():
         own = {name: arguments.pop(name) for name in list_options(kind) if name in arguments}
         arguments[parameter] = kind(**own)
     return command.function(**arguments)
+
+
+def _check_texts(command: Command, arguments: dict[str, Any]) -> None:
+    """Refuse text that is empty where that means nothing, and outputs that are no paths here; fill in `~` in these."""
+    for name, value in arguments.items():
+        option = command.options[name]
+        shown = name.upper() if name in command.positionals else f"--{name}"
+        texts = value if option.kind == list[str] else [value]
+        expect(option.default == "" or "" not in texts, f"{shown} as text, got ''.")
+        if name in OUTPUTS and option.kind is str and value:
+            check_output(value, name)
+            arguments[name] = os.path.expanduser(value)
 
 
 def _read_arguments(
@@ -273,8 +293,19 @@ def _read_config(command: Command, value: str) -> dict[str, Any]:
         raise ConfigError(f"Expected {path} to hold settings as `name: value`, got {type(content).__name__}.")
     settings: dict[str, Any] = {}
     for key, item in (content or {}).items():
-        settings = changed(settings, str(key).split("."), item)
+        keys = str(key).split(".")
+        expect(not _is_set(settings, keys), f"each setting of {path} once, got {str(key)!r} twice.")
+        settings = changed(settings, keys, item)
     return settings
+
+
+def _is_set(settings: Any, keys: Sequence[str]) -> bool:
+    """Whether settings have a value, or values within it, where keys lead to."""
+    for key in keys:
+        if not isinstance(settings, Mapping) or key not in settings:
+            return False
+        settings = settings[key]
+    return True
 
 
 def _print_help(program: str, description: str, commands: Mapping[str, Command]) -> None:
@@ -316,8 +347,20 @@ def _takes_mapping(kind: Any) -> bool:
 
 
 def _refuse(program: str, message: str) -> int:
-    print(f"{program}: error: {' '.join(message.split())}", file=sys.stderr)
+    line = " ".join(message.split())
+    if len(line) > _LONGEST:
+        line = f"{line[: _LONGEST // 2]} … {line[-_LONGEST // 2 :]}"
+    print(f"{program}: error: {line}", file=sys.stderr)
     return 2
+
+
+def _said(error: Exception, command: Command | None) -> str | None:
+    """A line on what a user can mend; None of a fault of ours."""
+    if no_memory := out_of_memory(error):
+        return str(no_memory)
+    if isinstance(error, BenchnavError | UnicodeDecodeError):
+        return str(error)
+    return _unusable(error, command) if isinstance(error, OSError) else None
 
 
 def _unusable(error: OSError, command: Command | None) -> str:
@@ -328,7 +371,7 @@ def _unusable(error: OSError, command: Command | None) -> str:
     path = Path(str(error.filename))
     if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"could not use {path}: {reason}"
-    existing = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
+    existing = next(place for place in (path.absolute(), *path.absolute().parents) if os.path.exists(place))
     remedy = "Choose another place with --out, or change" if command and "out" in command.flags else "Change"
     return f"could not use {path.absolute()}: {reason}. {remedy} the permissions of {existing}."
 

@@ -3,7 +3,9 @@
 A message names the argument, what was expected, what came, and what to do.
 """
 
+import errno
 import logging
+import re
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 
@@ -41,6 +43,70 @@ def choose(what: str, asked: Collection[str] | None, known: Iterable[str]) -> li
     unknown = [name for name in asked if name not in known]
     expect(asked and not unknown, f"`{what}` among {known}, got {unknown or 'none'}.")
     return [name for name in known if name in asked]
+
+
+# NUL ends a path, others move the cursor of a terminal; surrogates stand for bytes that are no UTF-8.
+_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
+
+
+def check_text(text: str, place: str = "") -> None:
+    """Refuse text that no name, path or setting holds: control characters but for tab and line break.
+
+    Args:
+        text: what a user wrote.
+        place: where it stands, for the message.
+
+    Raises:
+        ConfigError: If it holds such a character, or bytes that are no UTF-8.
+    """
+    where = f" in {place}" if place else ""
+    expect(
+        not _CONTROL.search(text),
+        f"text in UTF-8 without control characters{where}, got {text!r}. Leave them out.",
+    )
+
+
+def check_label(what: str, text: str) -> None:
+    """Refuse what no table can show: text that is empty, or has a line break or a character that is not printed.
+
+    Args:
+        what: what is called by the text.
+        text: what a user wrote.
+
+    Raises:
+        ConfigError: If it is such.
+    """
+    expect(text.strip() and text.isprintable(), f"{what} as printable text on one line, got {text!r}.")
+
+
+class OutOfMemoryError(BenchnavError):
+    """Memory ran out; nothing that was given is to blame but its size."""
+
+
+# What PyTorch, HDF5 and C++ say where `MemoryError` is not what they raise.
+_NO_MEMORY = re.compile(
+    r"can't allocate memory|cannot allocate memory|not enough memory|out of memory|std::bad_alloc|unable to allocate",
+    re.IGNORECASE,
+)
+
+
+def out_of_memory(error: BaseException) -> OutOfMemoryError | None:
+    """Return what to say where an error, or one that it was raised from, is that memory ran out; else None."""
+    if isinstance(error, BenchnavError) and _NO_MEMORY.search(str(error)):
+        return None  # which says so
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OutOfMemoryError):
+            return cause
+        is_known = isinstance(cause, MemoryError) or getattr(cause, "errno", None) == errno.ENOMEM
+        if is_known or (isinstance(cause, RuntimeError | OSError) and _NO_MEMORY.search(str(cause))):
+            said = " ".join(str(cause).split())[:200].rstrip(".") or type(cause).__name__
+            return OutOfMemoryError(
+                f"Memory ran out ({said}). Ask for less at once: fewer `jobs`, samples or maps of a batch, smaller "
+                "maps or a smaller network."
+            )
+        cause = cause.__cause__
+    return None
 
 
 class DatasetError(BenchnavError):

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+MAX_CELLS = 2**28  # of a map; no machine holds its fields
+
+
 @dataclass(frozen=True)
 class Grid:
     """Size and resolution of a map.
@@ -35,6 +38,10 @@ class Grid:
     def __post_init__(self) -> None:
         """Refuses empty grids and resolutions that are not positive."""
         expect(min(self.shape) >= 3, f"a grid of at least 3×3 cells, got {self.height}×{self.width}.")
+        expect(
+            self.height * self.width <= MAX_CELLS,
+            f"a map of at most {MAX_CELLS:,} cells, got {self.height}×{self.width}.",
+        )
         expect(0 < self.resolution_m < float("inf"), f"`resolution_m` > 0, got {self.resolution_m}.")
 
     @property

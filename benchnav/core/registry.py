@@ -34,14 +34,13 @@ from pathlib import Path
 from typing import Any
 
 from benchnav.core import touched
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, check_label, out_of_memory
 from benchnav.core.settings import NO_DEFAULT as NO_DEFAULT
 from benchnav.core.settings import Option as Option
 from benchnav.core.settings import (
     call,
     config_class,
     list_options,
-    load_yaml,
     of,
     one_line,
     parameters,
@@ -61,6 +60,7 @@ from benchnav.core.sources import (
     load_file,
     moved,
 )
+from benchnav.core.yaml_text import load_yaml
 
 KINDS = ("planner", "model", "risk", "robot", "objective", "sensor", "ground", "belief")
 
@@ -166,6 +166,7 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
         or not {"part"} <= set(fields) <= {"part", "label", "options"}
         or not isinstance(fields["part"], str)
         or not isinstance(fields.get("options") or {}, Mapping)
+        or isinstance(fields.get("label"), Mapping | list | tuple)
     ):
         raise ConfigError(
             f"Expected {_a(kind)} as NAME or as {{part: NAME, label: LABEL, options: {{…}}}}, got {given!r}."
@@ -185,7 +186,10 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
         )
         options = {name: value, **options}
     place = source.rpartition(":")[0]
-    label = fields.get("label") or (text[len(place) + 1 :] if place else text)
+    label = fields.get("label")
+    if label is None:
+        label = text[len(place) + 1 :] if place else text
+    check_label(f"a label of {kind} {source!r}", str(label))
     return Part(part=source, label=str(label), options=options)
 
 
@@ -387,7 +391,9 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
     except (Exception, SystemExit) as error:
         if not isinstance(error, ModuleNotFoundError) or not f"{place}.".startswith(f"{error.name}."):
             line = f"{one_line(error)}{moved(error)}"
-            raise ConfigError(f"module {place} could not be imported: {line}") from error
+            raise out_of_memory(error) or ConfigError(
+                f"module {place} could not be imported: {line}"
+            ) from error
         file = Path(*place.split(".")).with_suffix(".py")
         beside = f" Did you mean './{file}:{name}'?" if file.is_file() else hint(place, names(kind))
         remedy = moved(error).removeprefix(".") or beside

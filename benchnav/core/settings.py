@@ -14,11 +14,12 @@ from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from enum import Enum
 from functools import cache, partial
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from types import MappingProxyType, NoneType, SimpleNamespace, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import BenchnavError, ConfigError, out_of_memory
+from benchnav.core.yaml_text import MAX_DEPTH, check_yaml
 
 NO_DEFAULT = inspect.Parameter.empty
 
@@ -125,7 +126,7 @@ def call(what: str, target: Callable[..., Any], arguments: Mapping[str, Any]) ->
     except BenchnavError:
         raise
     except Exception as error:
-        raise ConfigError(f"{what} could not be made: {one_line(error)}") from error
+        raise out_of_memory(error) or ConfigError(f"{what} could not be made: {one_line(error)}") from error
 
 
 # --- from plain data --------------------------------------------------------------------------------
@@ -149,6 +150,7 @@ def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAU
     Raises:
         ConfigError: a key is unknown or missing, or a value is of another type or refused by its dataclass.
     """
+    _check_size(value, name(key))
     if kind is Any or (isinstance(kind, type) and type(value) is kind) or (value is None and now is None):
         return value
     config, origin, members = dataclass_in(kind), get_origin(kind), get_args(kind)
@@ -166,12 +168,29 @@ def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAU
         return origin(read(members[0], item, name, f"{key}.{inner}") for inner, item in named)
     if value is None and NoneType in members:
         return None
+    data = value
+    if isinstance(value, str) and kind is not str:
+        allowed = members_of(kind)
+        is_list = str not in allowed and any(get_origin(member) in (list, tuple) for member in allowed)
+        if is_list and not value.lstrip().startswith(("[", "(")):
+            data = f"[{value}]"
+        check_yaml(data)  # which the parser reads without a look at keys and nesting
     try:
-        return _parsed(kind, value)
+        parsed = _parsed(kind, data)
     except ValueError as error:
         got = "null" if value is None else repr(value)
         near = hint(str(value), [member for member in members_of(kind) if isinstance(member, str)])
         raise ConfigError(f"Expected {name(key)} as {in_words(kind)}, got {got}.{near}") from error
+    _check_size(parsed, name(key))
+    return parsed
+
+
+def _check_size(value: Any, what: str) -> None:
+    """Refuse whole numbers that no array and no generator takes."""
+    if type(value) is int and abs(value) >= 2**64:
+        raise ConfigError(
+            f"Expected {what} as a whole number of at most 64 bits, got one of {value.bit_length()}."
+        )
 
 
 def read_options(
@@ -222,6 +241,8 @@ def changed(data: Any, path: Sequence[str], value: Any) -> Any:
     Raises:
         ConfigError: on the way is something that has no keys.
     """
+    if len(path) > MAX_DEPTH:
+        raise ConfigError(f"Expected at most {MAX_DEPTH} keys with dots between, got {len(path)}.")
     if not path:
         return value
     key, rest = path[0], path[1:]
@@ -235,47 +256,6 @@ def changed(data: Any, path: Sequence[str], value: Any) -> Any:
     return {**(data or {}), key: changed((data or {}).get(key), rest, value)}
 
 
-def load_yaml(text: str, place: str = "") -> Any:
-    """Reads YAML in which 1e-3 is a number.
-
-    Args:
-        text: the YAML.
-        place: where it stands, for messages.
-
-    Raises:
-        ConfigError: it is none.
-    """
-    import yaml
-    from jsonargparse import get_loader
-
-    try:
-        try:
-            content = get_loader("yaml")(text)
-        except TypeError:  # which jsonargparse raises of `{0: null}`
-            return yaml.safe_load(text)
-        if isinstance(content, str) and isinstance(without_values := yaml.safe_load(text), dict):
-            return without_values  # which jsonargparse leaves as text
-        return content
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f", line {mark.line + 1}" if place and mark else ""
-        wrong = getattr(error, "problem", None) or error
-        raise ConfigError(f"Expected YAML, got {place or repr(text)}{line}: {wrong}.") from error
-
-
-def read_yaml(path: Path) -> Any:
-    """Reads a YAML file; see `load_yaml`.
-
-    Raises:
-        ConfigError: it cannot be read, or is no YAML.
-    """
-    try:
-        return load_yaml(path.read_text(), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise ConfigError(f"Expected a YAML file, got {str(path)!r}: {reason}.") from error
-
-
 def _names(items: Sequence[Any]) -> list[str]:
     """What items of a list go by: their `name`, or their number."""
     return [str(item.get("name", n)) if isinstance(item, Mapping) else str(n) for n, item in enumerate(items)]
@@ -284,10 +264,6 @@ def _names(items: Sequence[Any]) -> list[str]:
 def _parsed(kind: Any, value: Any) -> Any:
     from jsonargparse import ArgumentError
 
-    members = members_of(kind)
-    is_list = str not in members and any(get_origin(member) in (list, tuple) for member in members)
-    if is_list and isinstance(value, str) and not value.lstrip().startswith(("[", "(")):
-        value = f"[{value}]"
     try:
         parser = _parser(kind)
         # The parser takes null, and anything but a mapping for a dataclass, for nothing given.

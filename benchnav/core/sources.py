@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import BenchnavError, ConfigError, out_of_memory
 from benchnav.core.settings import hint, one_line
 from benchnav.core.shipped_files import PACKAGE
 
@@ -120,7 +120,9 @@ def load_file(path: Path, content: bytes) -> ModuleType:
         remedy = moved(error)
         if not remedy and isinstance(error, ModuleNotFoundError):
             remedy = ". A file stands alone: install what it imports, or write it into the file."
-        raise ConfigError(f"{path} could not be imported: {one_line(error)}{at}{remedy}") from error
+        raise out_of_memory(error) or ConfigError(
+            f"{path} could not be imported: {one_line(error)}{at}{remedy}"
+        ) from error
     return module
 
 

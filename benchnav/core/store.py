@@ -16,9 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import BenchnavError, ConfigError, expect
 
 SEAL = "manifest_digest"
+MAX_JOBS = 10_000
 
 
 @contextmanager
@@ -44,17 +45,33 @@ def replacing(path: Path, durable: bool = True) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def output_path(name: str) -> Path:
-    """The place on this machine that a user names for an output.
+def check_output(name: str, option: str = "out") -> None:
+    """Refuse what is no path on this machine that an output can be written to.
+
+    Args:
+        name: the path; `~` is the user's home.
+        option: what it is given as, for messages.
 
     Raises:
-        ConfigError: it is an address, such as s3://bucket/name, which would become a folder `s3:`.
+        ConfigError: If it is empty, an address, such as s3://bucket/name, which would become a folder `s3:`, or has
+            characters that no listing shows.
     """
-    if re.match(r"[A-Za-z][A-Za-z0-9+.-]*:/", name):
-        raise ConfigError(
-            f"Expected `out` as a place on this machine, got the address {name!r}. Write to a folder here, and copy it."
-        )
-    return Path(name).expanduser()
+    expect(name, f"`{option}` as a path, got ''.")
+    expect(name.isprintable(), f"`{option}` as a path of printable characters, got {name!r}.")
+    expect(
+        not re.match(r"[A-Za-z][A-Za-z0-9+.-]*:/", name),
+        f"`{option}` as a path on this machine, got the address {name!r}. Write to a folder here, and copy it.",
+    )
+    path = Path(name).expanduser()
+    nearest = next((place for place in path.absolute().parents if os.path.lexists(place)), path)
+    expect(
+        nearest.is_dir(),
+        f"`{option}` as a path in a folder, got {name!r}, and {nearest} is no folder. Choose another `{option}`.",
+    )
+    expect(
+        option == "out" or not path.is_dir(),
+        f"`{option}` as a file, got the folder {name!r}. Name a file in it.",
+    )
 
 
 def write_text(path: Path, text: str) -> None:
@@ -258,7 +275,25 @@ def read_shard(text: str) -> Shard | None:
     """
     if not text:
         return None
-    numbers = re.fullmatch(r"(\d+)/(\d+)", text)
+    numbers = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
     if numbers is None:
         raise ConfigError(f"Expected `shard` I/N, such as 2/5, got {text!r}.")
     return Shard(index=int(numbers[1]), of=int(numbers[2]))
+
+
+def check_workers(jobs: int, backend: str, scheduler: str) -> None:
+    """Refuse numbers and kinds of workers that no machine has.
+
+    Args:
+        jobs: worker processes of this machine.
+        backend: "local" or "dask".
+        scheduler: address of a Dask cluster's scheduler; empty for none.
+
+    Raises:
+        ConfigError: If there is none or more than `MAX_JOBS`, or a cluster without an address or the reverse.
+    """
+    expect(1 <= jobs <= MAX_JOBS, f"`jobs` in 1–{MAX_JOBS}, got {jobs}.")
+    expect(
+        (backend == "dask") == bool(scheduler),
+        "`backend` dask and `scheduler` together, got one of the two. Pass both.",
+    )

@@ -13,7 +13,7 @@ from benchnav import datagen
 from benchnav.core.command import INTERRUPTED, Command, run, tell
 from benchnav.core.errors import DatasetError, choose, expect
 from benchnav.core.progress import show_progress
-from benchnav.core.store import output_path, read_shard, replacing, write_text
+from benchnav.core.store import check_workers, read_shard, replacing, write_text
 from benchnav.core.tables import Table, print_table
 from benchnav.datagen.import_commands import import_dem, import_drives
 
@@ -53,11 +53,7 @@ def create(
     from benchnav.datagen.files.describe import written
     from benchnav.datagen.files.manifest import is_dataset
 
-    expect(jobs >= 1, f"`jobs` ≥ 1, got {jobs}.")
-    expect(
-        (backend == "dask") == bool(scheduler),
-        "`backend` dask and `scheduler` together, got one without the other.",
-    )
+    check_workers(jobs, backend, scheduler)
     expect(first >= 0, f"`first` ≥ 0, got {first}.")
     own = read_shard(shard)
     chosen = datagen.load_recipe(recipe, overrides)
@@ -69,7 +65,7 @@ def create(
         sizes[name] = replace(spec, maps=min(first or spec.maps, spec.maps))
     chosen, maps = replace(chosen, splits=sizes), sum(spec.maps for spec in sizes.values())
     is_folder = own is not None or maps * chosen.height * chosen.width > _MOST_CELLS_OF_A_FILE
-    path = output_path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}")
+    path = Path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}")
     steps = datagen.create_dataset(chosen, path, jobs, scheduler, own, overwrite)
     done, total = next(steps)
     if done:
@@ -96,12 +92,12 @@ def list_datasets(folder: str = "") -> None:
     from benchnav.datagen.files.manifest import FOLDER_MANIFEST
     from benchnav.datagen.recipe.recipe import shipped_sizes
 
+    expect(not folder or Path(folder).is_dir(), f"`folder` as a folder that exists, got {folder!r}.")
     print("recipes:")
     wide = widest(datagen.shipped_recipes())
     for name in datagen.shipped_recipes():
         sizes = ", ".join(f"{split} {maps}" for split, maps in shipped_sizes(name).items())
         print(f"  {name:{wide}} {sizes}")
-    expect(not folder or Path(folder).is_dir(), f"`folder` as a folder that exists, got {folder!r}.")
     for place in [Path(folder)] if folder else dataset_folders():
         folders = [manifest.parent for manifest in place.glob(f"*/{FOLDER_MANIFEST}")]
         files = sorted([*place.glob("*.h5"), *folders])
@@ -185,7 +181,7 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
     from benchnav.datagen.files.describe import written
     from benchnav.datagen.files.merge import merge as merge_datasets
 
-    path = output_path(out)
+    path = Path(out)
     sources = [Path(file) if Path(file).is_dir() else datagen.find_dataset(file) for file in files]
     show_progress(merge_datasets(sources, path, id, overwrite), "maps")
     written(path)
@@ -205,7 +201,7 @@ def ground(file: str, out: str = "", overwrite: bool = False) -> None:
     from benchnav.datagen.ground import fit_ground, ground_file
 
     dataset = _opened(file)
-    path = output_path(out) if out else ground_file(dataset.path)
+    path = Path(out) if out else ground_file(dataset.path)
     expect(path.suffix == ".json", f"`out` as a file .json, got {out!r}.")
     expect(
         overwrite or not path.exists(),
@@ -257,7 +253,7 @@ def export(
         "imported maps those of the elevation model, its classes and photo.",
     )
     publication = Publication(license=license or "MIT", creator=creator or AUTHORS, url=url, date=date)
-    path = output_path(out)
+    path = Path(out)
     steps = export_dataset(dataset, path, publication, chosen, fields, maps_per_file, overwrite)
     show_progress(steps, "maps")
     files = sorted(path.rglob("*.parquet"))
@@ -288,7 +284,7 @@ def preview(
 
     dataset = _opened(file)
     split = split or ("test/std" if "test/std" in dataset.splits else next(iter(dataset.splits)))
-    path = output_path(out or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png")
+    path = Path(out or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png")
     expect(
         path.suffix in (".png", ".pdf", ".svg", ".jpg"),
         f"`out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.",

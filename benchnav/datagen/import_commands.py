@@ -5,12 +5,12 @@ What is heavy is imported where it is called, so that the command's help is quic
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from benchnav import datagen
 from benchnav.core.errors import expect
 from benchnav.core.progress import show_progress
-from benchnav.core.store import output_path
 from benchnav.datagen.dem.raster import Rasters
 
 _MOST_PACE = 2.5  # of what positions say beside speeds, or its inverse; km/h are 3.6 m/s
@@ -152,7 +152,7 @@ def _import(
     from benchnav.datagen.files.describe import written
     from benchnav.datagen.files.hdf5 import name_of
 
-    path = output_path(options.out)
+    path = Path(options.out)
     name = options.id or name_of(path)
     scenario = settings.get("scenario", "std")
     used = f"splits={{imported: {{scenario: {scenario}, maps: 1}}}}"  # so that others need not fit the maps

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Literal
 
 from benchnav.core.command import INTERRUPTED, Command, Device, run, tell
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.progress import show_progress
-from benchnav.core.store import read_shard
+from benchnav.core.store import check_workers, read_shard
 from benchnav.eval.experiment.suite import Labels, Suite
 from benchnav.eval.replay import other_folder, program, replay
 
+_MAX_LIMIT_S = 1_000_000
 SUITES = Path(__file__).parent / "suites"
 
 
@@ -52,8 +53,9 @@ def run_command(
 
     _check_workers(jobs, backend, scheduler)
     own = read_shard(shard)
-    if planner_limit_s < 0:
-        raise ConfigError(f"Expected `planner_limit_s` ≥ 0, got {planner_limit_s}.")
+    expect(
+        0 <= planner_limit_s <= _MAX_LIMIT_S, f"`planner_limit_s` in 0–{_MAX_LIMIT_S}, got {planner_limit_s}."
+    )
     folder = _own_folder(out)
     if check_determinism and not _repeats(suite, planner_limit_s, device):
         return 1
@@ -204,10 +206,7 @@ def _own_folder(path: str) -> Path:
 
 
 def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
-    if jobs < 1:
-        raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
-    if (backend == "dask") != bool(scheduler):
-        raise ConfigError("Expected `backend` dask and `scheduler` together, got one of the two. Pass both.")
+    check_workers(jobs, backend, scheduler)
     if scheduler and jobs > 1:
         raise ConfigError(
             f"Expected no `jobs` with `backend` dask, got {jobs}. The cluster has its own workers: leave `jobs` out."

@@ -43,6 +43,7 @@ _CAPTION = (
     "Differences of success and of time between conditions that met the same maps with the same draws of λ."
 )
 _LISTED, _NAMED = 8, 3
+_MIN_DIFFERENCE = 1e-5  # of success; a run has 10⁸ episodes at most
 
 
 def compare_runs(
@@ -72,8 +73,8 @@ def compare_runs(
     """
     if not folders:
         raise ConfigError("Expected one or more run folders, got none.")
-    if not 0 < difference <= 1:
-        raise ConfigError(f"Expected `points` in (0, 100], got {100 * difference:g}.")
+    if not _MIN_DIFFERENCE <= difference <= 1:
+        raise ConfigError(f"Expected `points` in [{100 * _MIN_DIFFERENCE:g}, 100], got {100 * difference:g}.")
     runs = [open_run(folder) for folder in folders]
     conditions = _chosen(read_conditions(runs), asked)
     check_one_value_each(conditions)

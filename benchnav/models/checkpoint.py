@@ -29,7 +29,7 @@ from benchnav.core.ground import GroundStatistics
 from benchnav.core.sources import digest_of_path
 from benchnav.core.store import (
     building,
-    output_path,
+    check_output,
     real_place,
     refuse_taken,
     replacing,
@@ -198,7 +198,7 @@ def open_place(folder: str | Path) -> Iterator[tuple[Path, Path]]:
         OSError: it cannot be written.
         ConfigError: the name is that of something else.
     """
-    output_path(str(folder))  # refuses addresses
+    check_output(str(folder))
     place = real_place(Path(os.path.normpath(folder)))  # a/../b is b, whether or not there is an a
     restore(place)
     refuse_taken(

@@ -9,6 +9,7 @@ from benchnav.core.errors import expect
 
 DEEPEST = 5  # stages of the encoders of segmentation-models-pytorch
 
+_MAX_PRIOR = 10  # of λ, which is at most 1; beyond it the GPs cannot be solved
 _SEEDS = 2**63  # PyTorch's generators take no others
 
 
@@ -207,9 +208,9 @@ class LatentGPConfig:
         _check_least(self, 2, "inducing_points")
         _check_least(self, 1, "epochs", "epoch_steps")
         for name in ("prior_level", "prior_fall"):
-            _check(self, math.isfinite(getattr(self, name)), name, "to be finite")
+            _check(self, abs(getattr(self, name)) <= _MAX_PRIOR, name, f"in ±{_MAX_PRIOR}")
         for name in ("prior_fall_std", "noise_spread"):
-            _check(self, 0 < getattr(self, name) < math.inf, name, "> 0")
+            _check(self, 0 < getattr(self, name) <= _MAX_PRIOR, name, f"> 0 and at most {_MAX_PRIOR}")
         for name, limits in (
             ("prior_std", "prior_std_range"),
             ("length_deg", "length_range_deg"),

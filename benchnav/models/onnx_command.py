@@ -16,12 +16,11 @@ def export(checkpoint: str, onnx: str, level: float = 0.9, opset: int = 18, over
     from rich.filesize import decimal
 
     from benchnav.core.errors import expect
-    from benchnav.core.store import output_path
     from benchnav.models.onnx_graph import export_onnx
     from benchnav.models.predictor import load_model
 
     expect(onnx.endswith(".onnx"), f"`onnx` as a file FILE.onnx, got {onnx!r}.")
-    path = output_path(onnx)
+    path = Path(onnx)
     expect(
         overwrite or not path.exists(),
         f"`onnx` as a new file, got {onnx}, which exists. Pass --overwrite to replace it.",

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from benchnav.core.batch import map_tensors
 from benchnav.core.conditioned import ConditionedDistribution
 from benchnav.core.distribution import TraversabilityDistribution, tail_of
-from benchnav.core.errors import ConfigError, expect, quiet
+from benchnav.core.errors import ConfigError, expect, out_of_memory, quiet
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.pooled import PooledDistribution, pool
@@ -321,12 +321,14 @@ def export_onnx(
         ConfigError: such a model has no graph, or the packages of the extra `onnx` are missing.
     """
     try:
+        import onnx
         import onnxscript  # noqa: F401  torch.onnx needs it
     except ImportError as error:
         raise ConfigError(
             "Expected the packages of the extra `onnx`, got none. Install them: pip install 'benchnav[onnx]'."
         ) from error
-    expect(opset >= 18, f"`opset` of at least 18, which torch.onnx writes, got {opset}.")
+    newest = onnx.defs.onnx_opset_version()
+    expect(18 <= opset <= newest, f"`opset` in 18–{newest}, which torch.onnx writes, got {opset}.")
     layers = _tried(graph := Graph(model, level), model)
     batch, height, width = (torch.export.Dim(name) for name in ("batch", "height", "width"))
     sizes = [
@@ -343,7 +345,7 @@ def export_onnx(
                 input_names=list(graph.layers), output_names=list(graph.names), dynamic_shapes=(tuple(sizes),),
             )  # fmt: skip
     except Exception as error:  # of many kinds
-        raise ConfigError(
+        raise out_of_memory(error) or ConfigError(
             f"Expected a network that PyTorch writes as ONNX, got {type(model).__name__}: "
             f"{one_line(error.__cause__ or error)[:300]}"
         ) from error

@@ -15,7 +15,7 @@ import torch
 
 from benchnav.core import hub, registry
 from benchnav.core.command import tell
-from benchnav.core.errors import CheckpointError, ConfigError, expect
+from benchnav.core.errors import CheckpointError, ConfigError, expect, out_of_memory
 from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.shipped_files import shipped_folder
@@ -171,7 +171,7 @@ def _rebuilt(family: registry.Found, checkpoint: Checkpoint) -> TraversabilityMo
     except CheckpointError:
         raise
     except Exception as error:  # a user's class may raise anything
-        raise CheckpointError(
+        raise out_of_memory(error) or CheckpointError(
             f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
         ) from error
 

@@ -588,3 +588,11 @@ def test_the_registry_is_light_to_import() -> None:
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("label", ["", " ", "a\nb", "a\x1b[31m", "\u202eb", ["a"]])
+def test_a_label_is_printable_text(label: object) -> None:
+    with pytest.raises(ConfigError, match="label"):
+        registry.read_part("planner", {"part": "mppi", "label": label})
+    assert registry.read_part("planner", {"part": "mppi", "label": None}).label == "mppi"
+    assert registry.read_part("planner", {"part": "mppi", "label": 3}).label == "3"

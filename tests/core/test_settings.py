@@ -17,12 +17,10 @@ from benchnav.core.settings import (
     hint,
     in_words,
     list_options,
-    load_yaml,
     of,
     plain,
     read,
     read_options,
-    read_yaml,
 )
 
 
@@ -178,21 +176,6 @@ def test_plain_data_is_what_json_reads_back() -> None:
 )
 def test_types_are_told_in_words(kind: Any, words: str) -> None:
     assert in_words(kind) == words
-
-
-def test_yaml_has_numbers_with_exponents_and_mappings_without_values(tmp_path: Path) -> None:
-    assert load_yaml("{a: 1e-3, b: yes, c: 2024-01-01}") == {"a": 0.001, "b": True, "c": "2024-01-01"}
-    assert load_yaml("a:\n") == {"a": None}
-    assert load_yaml("{0: null}") == {0: None}
-    path = tmp_path / "a.yaml"
-    path.write_text("a: 1\nb: [\n")
-    with pytest.raises(ConfigError, match=r"^Expected YAML, got .*a.yaml, line 3: did not find"):
-        read_yaml(path)
-    path.write_bytes(b"\xff\xfe")
-    with pytest.raises(ConfigError, match=r"a\.yaml': it is no text"):
-        read_yaml(path)
-    with pytest.raises(ConfigError, match="Is a directory"):
-        read_yaml(tmp_path)
 
 
 def test_names_of_earlier_versions_are_told_with_todays() -> None:

@@ -363,7 +363,7 @@ def test_command_prints_and_writes(tmp_path: Path, capsys) -> None:  # type: ign
     [
         ((), "one or more run folders"),
         (("RUN", "--planner", "mpi"), "Did you mean 'mppi'"),
-        (("RUN", "--points", "0"), r"`points` in (0, 100]"),
+        (("RUN", "--points", "0"), r"`points` in [0.001, 100]"),
         (("RUN", "RUN"), "Expected runs that differ"),
         (("RUN", "--by", "data"), "other maps"),
     ],

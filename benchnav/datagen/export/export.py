@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from benchnav.core.errors import ConfigError, choose, expect
+from benchnav.core.errors import ConfigError, check_label, choose, expect
 from benchnav.core.sources import digest_of_path
 from benchnav.core.store import building, take_place
 from benchnav.datagen.export.parquet import FOLDER, MAP, columns_of, split_names, write_split
@@ -81,6 +81,8 @@ class Publication:
         """Checks what programs read."""
         from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
 
+        for name in ("license", "creator"):
+            check_label(f"`{name}`", getattr(self, name))
         try:
             listed = str(canonicalize_license_expression(self.license))
         except InvalidLicenseExpression:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy import ndarray
 
 import benchnav
-from benchnav.core.errors import DatasetError
+from benchnav.core.errors import DatasetError, out_of_memory
 from benchnav.core.store import refuse_taken, replacing, restore, seal, sole_writer, take_place, write_text
 from benchnav.datagen import schema
 from benchnav.datagen.files.manifest import FOLDER_MANIFEST, open_file, read_manifest
@@ -267,7 +267,7 @@ def named_errors(path: Path) -> Iterator[None]:
         yield
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-        raise DatasetError(
+        raise out_of_memory(error) or DatasetError(
             f"Could not write {path}: {reason}. When that is mended, give the same command again."
         ) from error
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchnav.core.errors import expect
+from benchnav.core.errors import check_label, expect
 from benchnav.core.settings import plain
 
 LEAST_HEIGHT_M, MOST_HEIGHT_M = 0.01, 100.0  # of vegetation
@@ -90,6 +90,7 @@ class TerrainClass:
 
     def __post_init__(self) -> None:
         """Refuses values that make no LT function or no colour."""
+        check_label("`name` of a class", self.name)
         _check_colour(f"class {self.name!r}", self.colour)
         numbers = self.scale, self.exponent, self.offset, self.noise
         expect(

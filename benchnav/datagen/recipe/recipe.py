@@ -17,7 +17,8 @@ from numpy import ndarray
 from benchnav.core.copula import LONGEST_CORRELATION
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
-from benchnav.core.settings import changed, load_yaml, plain, read, read_yaml
+from benchnav.core.settings import changed, plain, read
+from benchnav.core.yaml_text import load_yaml, read_yaml
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes, plain_classes
 from benchnav.datagen.recipe.environments import AlikeClasses, deal_classes, deal_units, never_shown
@@ -29,6 +30,11 @@ from benchnav.datagen.schema import FIELDS, LAYERS, UNLABELLED, Fields
 _MOST_CRATERED = 0.4  # share of a map; discs laid at random one by one jam at 0.55
 _LEAST_GAP = 0.3  # between classes of one colour, in E[λ] on flat ground
 REFERENCE_M = 32.0  # side of the square that relief and crater counts of synthesis 2 are for
+
+
+# More than a machine makes; a shard's name counts maps in eight digits.
+MAX_MAPS = 10**8 - 1
+MAX_CELLS = 2**40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -341,6 +347,11 @@ def _check_environments(recipe: Recipe) -> None:
 
 def _check_splits(recipe: Recipe) -> None:
     expect(recipe.splits, "at least one split in `splits`, got none.")
+    maps, cells = sum(split.maps for split in recipe.splits.values()), recipe.height * recipe.width
+    expect(
+        maps <= MAX_MAPS and maps * cells <= MAX_CELLS,
+        f"at most {MAX_MAPS:,} maps of {MAX_CELLS:,} cells together, got {maps:,} of {cells:,}. Ask for fewer `maps`.",
+    )
     for name, split in recipe.splits.items():
         for part in name.split("/"):
             check_name("split name", part)

@@ -19,7 +19,7 @@ from benchnav.core.registry import Part
 from benchnav.core.settings import check_known, of, read
 from benchnav.core.store import text_digest
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.experiment.sweep import each_mapping, each_part
+from benchnav.eval.experiment.sweep import check_count, each_mapping, each_part
 from benchnav.planning.free_space import Rules
 from benchnav.planning.problem import Task
 from benchnav.planning.world.world import World, read_world
@@ -183,6 +183,7 @@ def conditions_of(suite: Suite, scenarios_of: Any) -> list[Condition]:
                 words = " ".join(label_words(condition.labels))
                 raise ConfigError(f"Expected settings that differ, got {words} twice.")
             here.add(condition.id)
+            check_count([len(every)])
             every.append(_as_run_once(condition))
     check_labels(every)
     return list({condition.id: condition for condition in every}.values())
@@ -246,8 +247,10 @@ def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Con
         for task in each_mapping(listed_task)
     ]
     for data in listed["data"]:
+        scenarios = listed["scenarios"] or scenarios_of(data)
+        check_count(map(len, (listed["data"], scenarios, worlds, *parts.values())))
         for scenario, (world, rules, label), *chosen in itertools.product(
-            listed["scenarios"] or scenarios_of(data), worlds, *(parts[kind] for kind in _ORDER)
+            scenarios, worlds, *(parts[kind] for kind in _ORDER)
         ):
             condition = Condition(
                 data=data, scenario=scenario, rules=rules, world=world, world_label=label,

@@ -6,13 +6,18 @@
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, expect
 
 PartSpec = str | dict[str, Any]
 
 # What is kept of episodes beside their rows, each with all that stands before it.
 Record = Literal["none", "steps", "first", "failures", "all"]
 RECORDS: tuple[Record, ...] = get_args(Record)
+
+# More than any study needs; what exceeds them is a slip, and would fill memory before anything is run.
+MAX_EPISODES = 10**8
+MAX_UNITS = 10**6
+MAX_CONDITIONS = 10**5
 
 _SEEDS = 2**63  # what a table's column of whole numbers holds
 
@@ -90,6 +95,7 @@ class Suite:
                 raise ConfigError(f"Expected `seed` ≥ 0 and below 2^63, got {seed}.")
         if len(set(self.all_seeds)) != len(self.all_seeds):
             raise ConfigError(f"Expected `seeds` that differ, got {list(self.seeds)}.")
+        check_size(1, len(self.all_seeds), self.realisations, max(1, self.maps))
         if self.record not in RECORDS:
             raise ConfigError(
                 f"Expected `record` as {', '.join(RECORDS[:-1])} or {RECORDS[-1]}, got {self.record!r}."
@@ -99,6 +105,30 @@ class Suite:
     def all_seeds(self) -> tuple[int, ...]:
         """The root seeds."""
         return self.seeds or (self.seed,)
+
+
+def check_size(
+    conditions: int, seeds: int, realisations: int, maps: int, block_maps: int = MAX_EPISODES
+) -> None:
+    """Refuse a run that is larger than any study, before anything of it is built.
+
+    Args:
+        conditions: their number.
+        seeds: root seeds of each.
+        realisations: draws of λ for each seed.
+        maps: of each draw.
+        block_maps: most maps of a unit.
+
+    Raises:
+        ConfigError: If it has more than `MAX_EPISODES` episodes or `MAX_UNITS` units.
+    """
+    draws = conditions * seeds * realisations
+    episodes, n_units = draws * maps, draws * -(-maps // block_maps)
+    expect(
+        episodes <= MAX_EPISODES and n_units <= MAX_UNITS,
+        f"a run of at most {MAX_EPISODES:,} episodes in {MAX_UNITS:,} units, got {episodes:,} episodes in {n_units:,}: "
+        f"{conditions} conditions × {seeds} seeds × {realisations} `realisations` × {maps} `maps`. Ask for fewer.",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,14 +1,16 @@
 """Sweeps: where a suite gives several values for one, it means each of them."""
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import product
 from typing import Any
 
 from benchnav.core import registry
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.registry import Part
 from benchnav.core.settings import changed, of, read
+from benchnav.eval.experiment.suite import MAX_CONDITIONS
 
 _Chosen = dict[tuple[str, ...], Any]  # values by where they stand
 
@@ -49,8 +51,25 @@ def each_mapping(given: Any) -> list[Any]:
 def _choices(given: Mapping[str, Any]) -> Iterator[_Chosen]:
     """A value for each list in a mapping, by where it stands, in all combinations."""
     lists = dict(_lists(given, ()))
+    check_count(map(len, lists.values()))
     for values in product(*lists.values()):
         yield dict(zip(lists, values, strict=True))
+
+
+def check_count(counts: Iterable[int]) -> None:
+    """Refuse a product of more than `MAX_CONDITIONS` settings before it is built.
+
+    Args:
+        counts: of values, in each list of the product.
+
+    Raises:
+        ConfigError: If there are more.
+    """
+    counts = [count for count in counts if count > 1]
+    expect(
+        math.prod(counts) <= MAX_CONDITIONS,
+        f"at most {MAX_CONDITIONS:,} settings, got a product of {' × '.join(map(str, counts))} values. List fewer.",
+    )
 
 
 def _taken(kind: str, source: str, name: str, option: Any, value: Any) -> bool:

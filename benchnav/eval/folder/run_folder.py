@@ -19,7 +19,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, out_of_memory
 from benchnav.core.settings import one_line
 from benchnav.core.sources import digest_of_path
 from benchnav.core.store import Shard, replacing, seal, unseal, write_text
@@ -159,7 +159,7 @@ def damaged(path: Path, remedy: str) -> Iterator[None]:
         raise
     except Exception as error:  # of a table what its library raises, of a rule what refuses a suite
         said = error if isinstance(error, DamageError | ConfigError) else one_line(error)
-        raise ConfigError(f"{path} is damaged: {said}. {remedy}") from error
+        raise out_of_memory(error) or ConfigError(f"{path} is damaged: {said}. {remedy}") from error
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
 from benchnav.eval.experiment.condition import KNOWLEDGE, PART_KINDS, Condition, conditions_of, is_checkpoint
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
-from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.suite import Suite, check_size
 from benchnav.eval.experiment.unit import BLOCK_MAPS, Conditions, Extent
 from benchnav.eval.folder import provenance
 from benchnav.eval.run.combinations import LeftOut, find_left_out
@@ -68,6 +68,8 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         )
     for condition in conditions:
         check_split(condition, suite.maps)
+    most_maps = suite.maps or max(_open(one).map_count(one.split) for one in conditions)
+    check_size(len(conditions), len(suite.all_seeds), suite.realisations, most_maps, BLOCK_MAPS)
     left_out = find_left_out(conditions)
     kept = [condition for condition in conditions if condition.id not in left_out]
     if not kept:

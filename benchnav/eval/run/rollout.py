@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.device import GPU_FAULTS, DeviceError, gpu_failed
-from benchnav.core.errors import BenchnavError
+from benchnav.core.errors import BenchnavError, out_of_memory
 from benchnav.core.settings import fault
 from benchnav.eval.run.knowledge import Knowing, Learning
 from benchnav.planning.objective import distance
@@ -260,6 +260,8 @@ def run_episodes(
     except GPU_FAULTS as error:
         raise gpu_failed(error) from error
     except (Exception, SystemExit) as error:
+        if no_memory := out_of_memory(error):
+            raise no_memory from error
         trace = traceback.format_exc() if bool(now.running.any()) else ""
         log.blame(now.running, fault(error))
         outcome = error.outcome if isinstance(error, KnowledgeError) else Outcome.PLANNER_ERROR
@@ -342,4 +344,6 @@ def _move(
         raise gpu_failed(error) from error
     except Exception as error:
         robot = type(simulation.robot).__name__
-        raise RobotError(f"Robot {robot} failed in the simulation: {fault(error)}") from error
+        raise out_of_memory(error) or RobotError(
+            f"Robot {robot} failed in the simulation: {fault(error)}"
+        ) from error

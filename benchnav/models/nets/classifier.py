@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torchmetrics import Metric
 from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
-from benchnav.core.errors import ConfigError, expect, quiet
+from benchnav.core.errors import ConfigError, expect, out_of_memory, quiet
 from benchnav.core.settings import hint, one_line
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import CLASSIFIER, Checkpoint, member_names
@@ -232,7 +232,7 @@ def build_network(config: ClassifierConfig, channels: int, class_count: int) -> 
         except (OSError, KeyError, RuntimeError) as error:
             if not config.pretrained:
                 raise
-            raise ConfigError(
+            raise out_of_memory(error) or ConfigError(
                 f"Expected to download ImageNet weights of {config.encoder} for `pretrained`, got: {one_line(error)} "
                 "Try again where there is a connection, or leave --classifier.pretrained or --mdn.pretrained out."
             ) from error

@@ -37,7 +37,7 @@ def evaluate(
     from benchnav import __version__
     from benchnav.core.errors import expect
     from benchnav.core.progress import show_progress
-    from benchnav.core.store import output_path, write_text
+    from benchnav.core.store import write_text
     from benchnav.core.tables import print_table
     from benchnav.datagen.files.find import find_dataset
     from benchnav.datagen.files.reader import TerrainDataset
@@ -45,7 +45,7 @@ def evaluate(
 
     check_seed(seed)
     expect(maps >= 0, f"`maps` ≥ 0, got {maps}. 0 leaves the map sheets out.")
-    target, folder = output_path(json), output_path(out)
+    target, folder = Path(json), Path(out)
     if json:
         expect(
             target.parent.is_dir() and not target.is_dir(),

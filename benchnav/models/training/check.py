@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.distribution import TraversabilityDistribution
-from benchnav.core.errors import BenchnavError, ConfigError, expect
+from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memory
 from benchnav.core.ground import SEEN
 from benchnav.core.settings import call, of, one_line, read
 from benchnav.core.shipped_files import PACKAGE
@@ -230,7 +230,7 @@ def check_distribution(given: Any, shape: tuple[int, ...], device: torch.device,
     )
 
 
-def _unfit(network: TrainableNetwork, maps: Mapping[str, Tensor], error: Exception) -> ConfigError:
+def _unfit(network: TrainableNetwork, maps: Mapping[str, Tensor], error: Exception) -> BenchnavError:
     """Says what a batch of maps raised: where in the file of the class, or of which architecture and encoder."""
     config, (batch, height, width) = network.config, maps[network.target].shape
     what, remedy = type(network).__name__, "Choose another."
@@ -240,7 +240,7 @@ def _unfit(network: TrainableNetwork, maps: Mapping[str, Tensor], error: Excepti
     if own := [at for at in frames if "site-packages" not in at.filename and str(PACKAGE) not in at.filename]:
         at, what = own[-1], type(network).__name__
         remedy = f"See {Path(at.filename).name}, line {at.lineno}, in `{at.name}`."
-    return ConfigError(
+    return out_of_memory(error) or ConfigError(
         f"Expected a network that takes batches of {batch} maps of {height}×{width} cells, got {what}, which does not: "
         f"{one_line(error).rstrip('.')}. {remedy}"
     )

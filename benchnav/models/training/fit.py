@@ -30,9 +30,9 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from benchnav.core.command import tell
 from benchnav.core.device import find_device
-from benchnav.core.errors import CheckpointError, ConfigError, expect, quiet
+from benchnav.core.errors import CheckpointError, ConfigError, expect, out_of_memory, quiet
 from benchnav.core.settings import check_known, one_line
-from benchnav.core.store import replacing, sole_writer, write_text
+from benchnav.core.store import MAX_JOBS, replacing, sole_writer, write_text
 from benchnav.models.config import TrainOptions
 from benchnav.models.training.trackers import described, make_callbacks, make_loggers
 
@@ -67,7 +67,7 @@ class FitOptions(TrainOptions):
 
     def __post_init__(self) -> None:
         """Checks the settings by name."""
-        expect(self.workers >= 0, f"`workers` ≥ 0, got {self.workers}.")
+        expect(0 <= self.workers <= MAX_JOBS, f"`workers` in 0–{MAX_JOBS}, got {self.workers}.")
         asked = self.trainer or {}
         expect(
             "accelerator" not in asked, "no `trainer.accelerator`, which is now `device`: auto, cpu or cuda."
@@ -272,8 +272,8 @@ def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Traine
             use_distributed_sampler=False,
             **settings,
         )
-    except (ValueError, TypeError, RuntimeError, MisconfigurationException) as error:
-        raise _unusable(error) from error
+    except Exception as error:  # Lightning raises of settings what its code meets
+        raise out_of_memory(error) or _unusable(error) from error
 
 
 def _unusable(error: Exception) -> ConfigError:

@@ -8,7 +8,7 @@ from typing import Any
 from lightning.pytorch.callbacks import EarlyStopping
 
 from benchnav.core import registry
-from benchnav.core.errors import BenchnavError, ConfigError, expect
+from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memory
 from benchnav.core.settings import config_class, of, one_line, read
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.ground import layer_means
@@ -56,6 +56,7 @@ from benchnav.models.training.gaussian_processes import train_gps_on_maps
 from benchnav.models.training.masks import RandomMasks
 from benchnav.models.training.target import Target, fresh_checkpoint, open_target
 
+MAX_MEMBERS = 1000  # of an ensemble
 _FEW_MAPS = 19  # with which 1 / (n + 1) is 0.05
 
 
@@ -168,7 +169,7 @@ def train_networks(
         gp: of the GPs, if any.
         members: how many networks there are to be.
     """
-    expect(members >= 1, f"`members` ≥ 1, got {members}.")
+    expect(1 <= members <= MAX_MEMBERS, f"`members` in 1–{MAX_MEMBERS}, got {members}.")
     check_seed(how.seed, members)
     dataset, trainer = open_dataset(data), dict(how.trainer or {})
     # These are the network's own settings, wherever they are said.
@@ -271,7 +272,7 @@ def fit_network(
     except BenchnavError:
         raise
     except Exception as error:  # a user's code may raise anything
-        raise ConfigError(
+        raise out_of_memory(error) or ConfigError(
             f"Expected `calibrate` of {type(network).__name__} to succeed, got: {one_line(error)} "
             "Mend it, and train again with --overwrite."
         ) from error

@@ -17,7 +17,7 @@ from lightning.pytorch import loggers as lightning_loggers
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger
 
-from benchnav.core.errors import ConfigError, expect
+from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memory
 from benchnav.core.settings import hint, one_line
 from benchnav.core.sources import attribute, digest_of_file_part, digest_of_target, load_file
 
@@ -104,8 +104,10 @@ def _class(what: str, place: str) -> type:
     else:
         try:
             found = attribute(importlib.import_module(owner), owner, name)
-        except ImportError as error:
-            raise ConfigError(
+        except BenchnavError:
+            raise
+        except Exception as error:  # a user's module may raise anything
+            raise out_of_memory(error) or ConfigError(
                 f"Expected `trainer.{what}` from a module, got {place!r}: {one_line(error)}"
             ) from error
     expect(
@@ -135,7 +137,9 @@ def _made(what: str, item: Any, folder: Path | None) -> Any:
             f"Install it, such as: pip install {package.partition('.')[0]}"
         ) from error
     except Exception as error:  # a user's class may raise anything
-        raise ConfigError(f"Expected arguments that {place} takes, got: {one_line(error)[:300]}") from error
+        raise out_of_memory(error) or ConfigError(
+            f"Expected arguments that {place} takes, got: {one_line(error)[:300]}"
+        ) from error
 
 
 def _digest(kind: type, place: str) -> str:

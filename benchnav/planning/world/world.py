@@ -18,6 +18,8 @@ from benchnav.planning.free_space import FreeSpace, Immobile, Rules
 
 NOISES = ("resampled", "stored", "frozen")
 
+MAX_STEPS = 10**6  # of an episode; a day at 0.1 s is 864 000
+
 _BUDGETS = ("time_budget_s", "time_budget_ratio")
 
 
@@ -111,14 +113,19 @@ class World:
         """Time steps in time budgets, int64, shape of `budget_s`.
 
         Raises:
-            ConfigError: there is none.
+            ConfigError: If there is none, or more than `MAX_STEPS`.
         """
-        steps = (budget_s / dt_s).round().long()
-        if bool((steps < 1).any()):
-            raise ConfigError(
-                f"Expected a time budget of at least one time step of {dt_s:g} s, got {float(budget_s.min()):g} s."
-            )
-        return steps
+        steps = (budget_s / dt_s).round()
+        least, most = float(budget_s.min()), float(budget_s.max())
+        expect(
+            bool((steps >= 1).all()),
+            f"a time budget of at least one time step of {dt_s:g} s, got {least:g} s.",
+        )
+        expect(
+            bool((steps <= MAX_STEPS).all()),
+            f"a time budget of at most {MAX_STEPS:,} time steps of {dt_s:g} s, got {most:g} s.",
+        )
+        return steps.long()
 
     def to_dict(self) -> dict[str, Any]:
         """All that bears on what happens, as plain data for JSON.

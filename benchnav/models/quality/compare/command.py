@@ -1,6 +1,7 @@
 """The command `benchnav-train compare`: which of several models predicts best, and whether that is chance."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchnav.core.command import Device
@@ -41,14 +42,13 @@ def compare(
     from benchnav import __version__
     from benchnav.core.errors import expect
     from benchnav.core.progress import show_progress
-    from benchnav.core.store import output_path
     from benchnav.core.tables import print_table
     from benchnav.datagen.files.find import find_dataset
     from benchnav.datagen.files.reader import TerrainDataset
     from benchnav.models.config import check_seed
 
     check_seed(seed)
-    folder = output_path(out)
+    folder = Path(out)
     if out:
         check_folder(folder, overwrite, (REPORT, CSV, DIFFERENCES, PAGE), "a comparison")
     dataset = TerrainDataset(find_dataset(data))
@@ -197,7 +197,7 @@ def _notes(
 def _write(out: str, title: str, about: dict[str, Any], comparison: "Comparison", notes: list[str]) -> None:
     from benchnav.core.figures import save_twice
     from benchnav.core.progress import show_progress
-    from benchnav.core.store import output_path, write_text
+    from benchnav.core.store import write_text
     from benchnav.models.quality.compare.report import (
         comparison_csv,
         comparison_figures,
@@ -205,7 +205,7 @@ def _write(out: str, title: str, about: dict[str, Any], comparison: "Comparison"
         comparison_markdown,
     )
 
-    folder = output_path(out)
+    folder = Path(out)
     write_text(folder / REPORT, comparison_json(about, comparison))
     write_text(folder / CSV, comparison_csv(comparison))
     write_text(folder / DIFFERENCES, comparison.pairs.to_csv(index=False, float_format="%.6g"))
