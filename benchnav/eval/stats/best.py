@@ -30,7 +30,7 @@ from benchnav.eval.stats.paired_difference import POWER, alike, success_interval
 # Conditions of a block met the same maps and the same noise, and were asked the same.
 BLOCK = ("data", "scenario", "world", "robot", "objective")
 # On fewer maps nothing is called worse: no sign-flip test of five maps can reach 0.05 either.
-LEAST_MAPS = 6
+FEWEST_MAPS = 6
 # Privileged models, the one that knows most first.
 PRIVILEGED = ("clairvoyant", "oracle", "ideal")
 
@@ -92,11 +92,11 @@ def best_set_p(wins: np.ndarray, draws: np.ndarray | int) -> tuple[np.ndarray, n
 
     Returns:
         p by condition, corrected for their number, shape [K], 1 for the best and all where there are fewer than
-        `LEAST_MAPS` maps; and by condition the minimum detectable difference to the one with most successes, with
+        `FEWEST_MAPS` maps; and by condition the minimum detectable difference to the one with most successes, with
         80 % power at the level of the first step, infinite where no result would be significant, shape [K].
     """
     maps, count = wins.shape
-    if maps < LEAST_MAPS or count < 2:
+    if maps < FEWEST_MAPS or count < 2:
         return np.ones(count), np.full(count, np.inf)
     order = np.argsort(-wins.sum(0), kind="stable")
     values, size = _canonical(wins[:, order], np.broadcast_to(draws, maps))

@@ -79,7 +79,7 @@ def test_best_set_is_the_stepwise_bootstrap_t_by_hand(
     p, shown = best_set_p(wins, size)
     np.testing.assert_allclose(p, by_hand(wins, size))
     assert p[wins.sum(0).argmax()] == 1
-    assert p.min() < 0.05
+    assert p.min() < 0.2
     assert np.all(shown[wins.sum(0) < wins.sum(0).max()] < 1)
 
 
