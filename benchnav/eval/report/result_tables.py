@@ -121,7 +121,7 @@ def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, An
         why = (
             f"with fewer than {FEWEST_MAPS} {unit_of_statistics(summary)}s none can be called"
             if few
-            else "none is significantly"
+            else "no setting is significantly"
         )
         notes.append(f"No rate is bold: {why} worse than the best.")
     return Table(
