@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from scipy.stats import wilcoxon
 
@@ -31,7 +31,8 @@ TESTS = [
         ("non-inferiority", "higher"),
     )
 ]
-few = settings(deadline=None, max_examples=12)
+# No shrinking: a table of episodes gets no shorter, and each try is slow.
+few = settings(deadline=None, max_examples=12, phases=[Phase.explicit, Phase.generate])
 
 
 @st.composite
