@@ -16,29 +16,30 @@ from itertools import combinations, product
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import beta, binomtest, bootstrap, norm
+from scipy.stats import beta, binomtest, bootstrap, norm, t
 
-from benchnav.core.resampling import sign_flips
 from benchnav.eval.stats.best import best_set_p
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.paired_difference import (
+    alike,
     sign_flip_p,
     signed_rank_p,
     success_interval,
     total_time_interval,
 )
-from benchnav.eval.stats.summary import cautious_design_effect, wilson_interval
+from benchnav.eval.stats.summary import design_effect, wilson_interval
 
+# Of the studies of few, large groups: rates of two conditions, correlation within a group, and what they share.
+GROUPS, IN_A_GROUP = (5, 8, 12), (20, 60)
+GROUP_RATES, GROUP_LIKENESS = ((0.99, 0.9), (0.8, 0.6)), tuple(product((0.1, 0.3, 0.5), (0.0, 0.5)))
+_MAPS_WITHIN = 0.2  # correlation within a map of a group, about the group's chance
 RATES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
 MAPS = (50, 100, 200)
 DRAWS = (1, 3)
 # Correlation within a map, and the share of chances and noise that two conditions have in common.
 LIKENESS = ((0.1, 0.3), (0.3, 0.7), (0.6, 0.9))
 TIME_BUDGET_S = 100.0
-_MEDIAN_S, _SPREAD = 33.0, 0.3
-
-# Flips of signs in a study of the best: of as many as a report draws, the first.
-_FLIPS = 2_000
+_MEDIAN_S, _SPREAD, _STEP_S = 33.0, 0.3, 0.1
 
 
 def chances(
@@ -71,7 +72,8 @@ def times(generator: np.random.Generator, success: np.ndarray, hardness: np.ndar
     """T_total in seconds, of the shape of `success`; hardness of maps as normal scores, of that less the last."""
     own = generator.standard_normal(success.shape)
     arrival = _MEDIAN_S * np.exp(_SPREAD * np.sqrt(0.5) * (hardness[..., None] + own))
-    return np.where(success, np.minimum(arrival, TIME_BUDGET_S - 1), TIME_BUDGET_S)
+    steps = np.rint(np.minimum(arrival, TIME_BUDGET_S - 1) / _STEP_S)
+    return np.where(success, steps * _STEP_S, TIME_BUDGET_S)
 
 
 def hardness(chance: np.ndarray, rates: np.ndarray, within: float) -> np.ndarray:
@@ -108,7 +110,7 @@ def cover_of_success(
         chance = chances(generator, np.array([rate]), (studies, maps), within, common)
         held = 0
         for study in outcomes(generator, chance, draws, common)[:, 0]:
-            effect = cautious_design_effect(study.ravel(), member)
+            effect = design_effect(study.ravel(), member)
             low, high = wilson_interval(study.mean(), study.size / effect)
             held += low <= rate <= high
         yield held / studies
@@ -144,7 +146,7 @@ def time_intervals(
     member = np.repeat(np.arange(maps), draws)
     arrivals = np.where(success, taken, 0.0).sum((2, 3)), success.sum((2, 3))
     failed, by_map = 1.0 - success.mean(-1), taken.mean(-1)
-    effects = [cautious_design_effect(study.ravel(), member) for study in success[:, 0]]
+    effects = [design_effect(study.ravel(), member) for study in success[:, 0]]
     rates = success[:, 0].mean((1, 2))
     ends = np.array(
         [wilson_interval(rate, maps * draws / effect) for rate, effect in zip(rates, effects, strict=True)]
@@ -221,36 +223,95 @@ def false_findings(
         for study in range(studies):
             pairs = list(combinations(range(settings), 2))
             by_success = [sign_flip_p(wins[study, i] - wins[study, j]) for i, j in pairs]
-            by_time = [signed_rank_p(taken[study, i] - taken[study, j]) for i, j in pairs]
+            late = [alike(taken[study, i] - taken[study, j], TIME_BUDGET_S) for i, j in pairs]
+            by_time = [signed_rank_p(values) for values in late]
             # Holm's correction finds something where its first step does.
             found += [min(p) <= ALPHA / len(pairs) for p in (by_success, by_time)]
         yield tuple(found / studies)
 
 
-def called_worse(
+def group_wins(
+    generator: np.random.Generator,
+    rates: Sequence[float],
+    shape: tuple[int, int],
+    episodes: int,
+    like: tuple[float, float],
+    one_map: bool,
+) -> np.ndarray:
+    """Successes by group, shape [studies, conditions, groups], with all episodes on one map or each on its own."""
+    chance = chances(generator, np.array(rates), shape, *like)
+    if one_map:
+        return outcomes(generator, chance, episodes, like[1]).sum(-1)
+    size, inside = 1 / _MAPS_WITHIN - 1, np.clip(chance, 1e-9, 1 - 1e-9)[..., None]
+    maps = generator.beta(inside * size, (1 - inside) * size, (*chance.shape, episodes))
+    return outcomes(generator, maps, 1, like[1])[..., 0].sum(-1)
+
+
+def cover_of_groups(
     generator: np.random.Generator,
     studies: int,
-    rates: Sequence[float],
-    maps: int,
-    draws: int,
+    groups: int,
+    episodes: int,
+    rates: tuple[float, float],
     like: tuple[float, float],
-) -> dict[str, np.ndarray]:
-    """Which conditions are called worse than the best by success and by T_total, bool, shape [studies, conditions].
-
-    Conditions of one rate have one distribution of times, so that those of the highest rate are the best by both.
-    """
-    success, total_time_s = drives(generator, rates, (studies, maps), draws, like)
-    flips = sign_flips(maps)[:_FLIPS] if 2**maps > _FLIPS else sign_flips(maps)
-    measures = {"success": success.sum(-1), "time": -total_time_s.mean(-1)}
-    return {
-        name: np.array([best_set_p(study.T.astype(float), flips)[0] < ALPHA for study in values])
-        for name, values in measures.items()
+) -> dict[str, float]:
+    """Cover of the intervals of a difference and of each rate, and half-widths, those of a cluster t beside them."""
+    wins = np.concatenate(
+        [
+            group_wins(generator, rates, (studies // 2, groups), episodes, like, one_map)
+            for one_map in (True, False)
+        ]
+    )
+    gain, truth = wins[:, 0] - wins[:, 1], rates[0] - rates[1]
+    mean, low, high = success_interval(gain, episodes)
+    error = (gain / episodes).std(-1, ddof=1) / np.sqrt(groups)
+    half = t.ppf(0.975, groups - 1) * error
+    found = {
+        "cover": float(np.mean((low <= truth) & (truth <= high))),
+        "half": float(np.mean(high - low) / 2),
+        "cover_t": float(np.mean(np.abs(mean - truth) <= half)),
+        "half_t": float(half.mean()),
     }
+    member = np.repeat(np.arange(groups), episodes)
+    for place, rate in enumerate(rates):
+        held = 0
+        for own in wins[:, place]:
+            success = np.arange(episodes) < own[:, None]
+            effect = design_effect(success.ravel(), member)
+            low_rate, high_rate = wilson_interval(success.mean(), success.size / effect)
+            held += low_rate <= rate <= high_rate
+        found[f"cover_{place}"] = held / len(wins)
+    return found
 
 
-def study_intervals(studies: int, seed: int) -> list[dict[str, object]]:
+def unlike(
+    generator: np.random.Generator, studies: int, settings: int, maps: int, draws: int, same_maps: bool
+) -> np.ndarray:
+    """Successes of settings of one mean and unlike shape, shape [studies, settings, maps].
+
+    The first half succeeds with a chance of 0.9 everywhere, the other always but for a tenth of the maps, where it
+    always fails: the same maps for all of that half, or each its own.
+    """
+    half = settings // 2
+    steady = generator.binomial(draws, 0.9, (studies, half, maps))
+    failing = generator.random((studies, 1 if same_maps else settings - half, maps)) < 0.1
+    return np.concatenate(
+        [steady, np.broadcast_to(draws * ~failing, (studies, settings - half, maps))], axis=1
+    )
+
+
+def called_worse(wins: np.ndarray, draws: int) -> np.ndarray:
+    """Which settings a report calls worse than the best, bool, of the shape [studies, settings].
+
+    Args:
+        wins: successes, shape [studies, settings, maps].
+        draws: episodes a map.
+    """
+    return np.array([best_set_p(study.T, draws)[0] < ALPHA for study in wins])
+
+
+def study_intervals(studies: int, seed: int) -> Iterator[dict[str, object]]:
     """Cover of the intervals of success and of its difference, and how often `compare` errs."""
-    rows = []
     for maps, draws in product(MAPS, DRAWS):
         generator = np.random.default_rng([seed, maps, draws])
         row: dict[str, object] = {"maps": maps, "episodes a map": draws}
@@ -260,13 +321,11 @@ def study_intervals(studies: int, seed: int) -> list[dict[str, object]]:
         false = 100 * np.array(list(false_findings(generator, studies // 5, maps, draws)))
         for place, name in enumerate(("false: success", "false: T_total")):
             row[name] = f"{false[:, place].mean():.1f}, {false[:, place].max():.1f}"
-        rows.append(row)
-    return rows
+        yield row
 
 
-def study_times(studies: int, seed: int) -> list[dict[str, object]]:
+def study_times(studies: int, seed: int) -> Iterator[dict[str, object]]:
     """Cover and width of the intervals of T_total and of its difference, beside those of a bootstrap."""
-    rows = []
     for maps, draws, rate in product((8, 20, 30), DRAWS, (0.8, 0.95, 0.99)):
         generator = np.random.default_rng([seed, maps, draws, round(100 * rate)])
         row: dict[str, object] = {"maps": maps, "episodes a map": draws, "success": rate}
@@ -275,39 +334,54 @@ def study_times(studies: int, seed: int) -> list[dict[str, object]]:
             for how, by in (("", ""), ("_bootstrap", ", bootstrap")):
                 cover, width = found[f"{name}_cover{how}"], found[f"{name}_width{how}"]
                 row[words + by] = f"{100 * cover:.1f} ({width:.1f} s)"
-        rows.append(row)
-    return rows
+        yield row
 
 
-def study_best(studies: int, seed: int) -> list[dict[str, object]]:
-    """How often a condition that is as good as the best is called worse, and one that is 10 points worse."""
-    rows = []
-    for settings, (maps, draws), rate in product((6, 12, 24), ((20, 1), (50, 3), (200, 3)), (0.8, 0.95)):
-        generator = np.random.default_rng([seed, settings, maps, draws, round(100 * rate)])
+def study_groups(studies: int, seed: int) -> Iterator[dict[str, object]]:
+    """Cover and width of the intervals of success and of its difference on few, large groups."""
+    for groups, episodes, like in product(GROUPS, IN_A_GROUP, GROUP_LIKENESS):
+        generator = np.random.default_rng([seed, groups, episodes, *(round(100 * value) for value in like)])
         row: dict[str, object] = {
-            "settings": settings,
-            "maps": maps,
-            "episodes a map": draws,
-            "success": rate,
+            "groups": groups,
+            "episodes": episodes,
+            "correlation": like[0],
+            "shared": like[1],
         }
+        covers: dict[str, object] = {}
+        for rates in GROUP_RATES:
+            found = cover_of_groups(generator, studies, groups, episodes, rates, like)
+            one, other = (f"{rate:g}" for rate in rates)
+            row[f"{one} − {other}"] = f"{100 * found['cover']:.1f} ({found['half']:.2f})"
+            row[f"{one} − {other}, t"] = f"{100 * found['cover_t']:.1f} ({found['half_t']:.2f})"
+            covers |= {name: f"{100 * found[f'cover_{i}']:.1f}" for i, name in enumerate((one, other))}
+        yield row | covers
+
+
+def study_best(studies: int, seed: int) -> Iterator[dict[str, object]]:
+    """How often a condition that is as good as the best is called worse, and one that is 10 or 20 points worse."""
+    for settings, maps, draws in product((6, 12), (20, *MAPS), DRAWS):
+        generator = np.random.default_rng([seed, settings, maps, draws])
+        row: dict[str, object] = {"settings": settings, "maps": maps, "episodes a map": draws}
+
         half = settings // 2
-        cases = {"all tied": (settings, 0), "half tied": (half, half), "power": (settings - 1, 1)}
-        for case, (tied, worse) in cases.items():
-            rates = [rate] * tied + [rate - 0.1] * worse
-            found = called_worse(generator, studies, rates, maps, draws, LIKENESS[1])
-            for name, called in found.items():
-                words = "T_total" if name == "time" else name
-                if case == "power":
-                    row[f"power, {words}"] = f"{100 * called[:, -1].mean():.0f}"
-                else:
-                    row[f"{case}, {words}"] = _share(called[:, :tied].any(1))
-        rows.append(row)
-    return rows
+        cases = {f"all tied, {rate:g}": [rate] * settings for rate in (0.8, 0.95)}
+        for words, rates in (cases | {"half tied": [0.8] * half + [0.7] * half}).items():
+            success, _ = drives(generator, rates, (studies, maps), draws, LIKENESS[1])
+            tied = np.array(rates) == max(rates)
+            row[words] = _share(called_worse(success.sum(-1), draws)[:, tied].any(1))
+        for words, same_maps in (("unlike", False), ("unlike, same maps", True)):
+            wins = unlike(generator, studies, settings, maps, draws, same_maps)
+            row[words] = _share(called_worse(wins, draws).any(1))
+        for points in (10, 20):
+            rates = [0.8] * (settings - 1) + [0.8 - points / 100]
+            success, _ = drives(generator, rates, (studies, maps), draws, LIKENESS[1])
+            called = called_worse(success.sum(-1), draws)
+            row[f"power, {points} points"] = f"{100 * called[:, -1].mean():.0f}"
+        yield row
 
 
-def study_hypotheses(studies: int, seed: int) -> list[dict[str, object]]:
+def study_hypotheses(studies: int, seed: int) -> Iterator[dict[str, object]]:
     """How often a single hypothesis is shown where it is false: no difference, or one as large as the margin."""
-    rows = []
     for maps, draws, rate in product((20, 50, 200), DRAWS, (0.8, 0.95)):
         generator = np.random.default_rng([seed, maps, draws, round(100 * rate), 1])
         row: dict[str, object] = {"maps": maps, "episodes a map": draws, "success": rate}
@@ -324,8 +398,7 @@ def study_hypotheses(studies: int, seed: int) -> list[dict[str, object]]:
         margin = (far[0, 0] - far[0, 1]).mean()
         row["non-inferiority, T_total"] = _share(high < margin)
         row["equivalence, T_total"] = _share((high < margin) & (low > -margin))
-        rows.append(row)
-    return rows
+        yield row
 
 
 def _share(found: np.ndarray) -> str:
@@ -334,10 +407,14 @@ def _share(found: np.ndarray) -> str:
     return f"{100 * found.mean():.1f} ({100 * ends.low:.1f}–{100 * ends.high:.1f})"
 
 
-STUDIES: dict[str, tuple[Callable[[int, int], list[dict[str, object]]], str]] = {
+STUDIES: dict[str, tuple[Callable[[int, int], Iterator[dict[str, object]]], str]] = {
     "intervals": (
         study_intervals,
         "Cover of 95 % intervals [%], mean and least over conditions; false findings of a family, mean and most.",
+    ),
+    "groups": (
+        study_groups,
+        "Cover of 95 % intervals on few, large groups [%] and mean half-width, those of a cluster t beside them.",
     ),
     "times": (
         study_times,
@@ -349,7 +426,7 @@ STUDIES: dict[str, tuple[Callable[[int, int], list[dict[str, object]]], str]] = 
     ),
     "best": (
         study_best,
-        "How often a condition as good as the best is called worse [%], with its 95 % interval; power at 10 points.",
+        "How often a condition as good as the best is called worse [%], with its 95 % interval; power.",
     ),
 }
 
@@ -362,14 +439,15 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=STUDIES, default=list(STUDIES), help="which studies")
     parser.add_argument("--json", type=Path, help="where the numbers are written")
     given = parser.parse_args()
-    tables = {}
+    tables: dict[str, list[dict[str, object]]] = {}
     for part in given.parts:
         make, title = STUDIES[part]
-        tables[part] = make(given.studies, given.seed)
-        columns = list(tables[part][0])
-        print(f"\n{title}\n\n| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
-        for row in tables[part]:
-            print(f"| {' | '.join(str(row[name]) for name in columns)} |", flush=True)
+        tables[part] = []
+        for row in make(given.studies, given.seed):
+            if not tables[part]:
+                print(f"\n{title}\n\n| {' | '.join(row)} |\n|{'---|' * len(row)}")
+            tables[part].append(row)
+            print(f"| {' | '.join(map(str, row.values()))} |", flush=True)
     if given.json:
         given.json.write_text(json.dumps(tables, indent=1))
 

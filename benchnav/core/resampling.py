@@ -5,6 +5,8 @@
 All draws are those of one fixed seed, so that the same numbers give the same p and the same interval.
 """
 
+from functools import lru_cache
+
 import numpy as np
 
 LEAST_MAPS = 8  # for an interval of what may have any distribution
@@ -30,16 +32,22 @@ def sign_flips(maps: int) -> np.ndarray:
     return np.concatenate([np.ones((1, maps)), 1.0 - 2.0 * drawn])
 
 
-def bootstrap_counts(maps: int) -> np.ndarray:
+@lru_cache(maxsize=4)
+def bootstrap_counts(maps: int, added: int = 0) -> np.ndarray:
     """How often each map is in one of 2 000 samples of as many maps, drawn with replacement (Efron, 1979).
 
     Args:
         maps: M.
+        added: pseudo-maps that samples are drawn from too.
 
     Returns:
-        Whole numbers whose rows add up to M, float64, shape [2000, M].
+        Whole numbers whose rows add up to M, float64, read-only, shape [2000, M + added].
     """
-    return np.random.default_rng(0).multinomial(maps, np.full(maps, 1 / maps), _RESAMPLES).astype(float)
+    drawn_from = maps + added
+    generator = np.random.default_rng(0)
+    counts = generator.multinomial(maps, np.full(drawn_from, 1 / drawn_from), _RESAMPLES).astype(float)
+    counts.flags.writeable = False
+    return counts
 
 
 def holm(p: np.ndarray) -> np.ndarray:

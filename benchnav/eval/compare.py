@@ -1,10 +1,13 @@
 """Compares conditions of one run or several: reads them, refuses what else differs, and writes the table."""
 
 import json
+import math
+import sys
+import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import chain, combinations, islice
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +39,7 @@ from benchnav.eval.stats.pairs import (
     check_maps,
     check_one_value_each,
     find_pairs,
+    matches,
 )
 from benchnav.eval.stats.summary import time_budgets
 
@@ -44,6 +48,9 @@ _CAPTION = (
 )
 _LISTED, _NAMED = 8, 3
 _MIN_DIFFERENCE = 1e-5  # of success; a run has 10⁸ episodes at most
+# From so many pairs on their time is announced, from that of a few.
+_MANY, _TIMED = 5_000, 5
+_UNITS = (("days", 86_400), ("hours", 3_600), ("minutes", 60), ("seconds", 1))
 
 
 def compare_runs(
@@ -81,6 +88,7 @@ def compare_runs(
     by = by_what(conditions, by, against)
     if by != "run":
         conditions = _once_each(conditions)
+    _announce(conditions, by, against, difference)
     pairs = find_pairs(conditions, by, against)
     unlike = [_unlike_code(pair.members) for pair in pairs]
     # Versions and machines may differ between rows; what a label names may not.
@@ -148,6 +156,23 @@ def read_conditions(runs: Sequence[Run]) -> list[Compared]:
                 )
             )
     return found
+
+
+def _announce(conditions: Sequence[Compared], by: str, against: str, difference: float) -> None:
+    """Print on stderr about how long a comparison of many pairs takes, from the time of a few."""
+    if math.comb(len(conditions), 2) < _MANY:
+        return
+    count = sum(1 for _ in matches(conditions, by, against))
+    if count < _MANY:
+        return
+    few = list(islice(matches(conditions, by, against), _TIMED))
+    begin = time.perf_counter()
+    compare(find_pairs(list(dict.fromkeys(chain(*few))), by, against)[:_TIMED], difference)
+    seconds = (time.perf_counter() - begin) / _TIMED * count
+    unit, value = next((unit, seconds / size) for unit, size in _UNITS if seconds >= size or size == 1)
+    print(
+        f"benchnav-eval: comparing {count} pairs takes about {value:.0f} {unit}.", file=sys.stderr, flush=True
+    )
 
 
 def _codes(about: Mapping[str, Any], run: str, digests: Iterable[str]) -> dict[str, Any]:

@@ -20,3 +20,11 @@ def test_each_sample_of_the_bootstrap_has_as_many_maps_drawn_with_replacement() 
     # How often a map is in a sample is binomial, of variance 1 − 1/20.
     assert abs(counts.mean(0) - 1).max() < 0.1
     assert abs(counts.var() - 0.95) < 0.05
+
+
+def test_pseudo_maps_are_drawn_as_often_as_maps() -> None:
+    counts = bootstrap_counts(20, 4)
+    assert counts.shape == (2000, 24)
+    assert (counts.sum(1) == 20).all()
+    assert abs(counts[:, 20:].mean() - 20 / 24) < 0.03
+    assert not counts.flags.writeable  # the same for all who ask

@@ -89,6 +89,23 @@ def test_the_numbers_are_those_of_the_pairs_of_the_run(tmp_path: Path) -> None:
     assert (table["arrival_time_difference_s"] == [3, 7]).all()
 
 
+def test_how_long_many_pairs_take_is_said_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of three settings each of two planners makes three pairs."""
+    folder = run_folder(tmp_path / "run", settings())
+    compare_runs([folder], "risk", "", {}, 0.05)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr("benchnav.eval.compare._MANY", 7)
+    compare_runs([folder], "risk", "", {}, 0.05)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr("benchnav.eval.compare._MANY", 6)
+    clock = iter([0.0, 5.0])
+    monkeypatch.setattr("time.perf_counter", lambda: next(clock))
+    compare_runs([folder], "risk", "", {}, 0.05)
+    assert capsys.readouterr().err == "benchnav-eval: comparing 6 pairs takes about 6 seconds.\n"
+
+
 def test_what_is_looked_at_can_be_narrowed(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run", settings())
     every, _ = compare_runs([folder], "", "", {}, 0.05)

@@ -8,7 +8,7 @@ import pandas as pd
 
 from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.report.words import FAILURE_COUNTS, blocks, p_in_words, rate_in_words, with_names
-from benchnav.eval.stats.best import BLOCK, PRIVILEGED, competing
+from benchnav.eval.stats.best import BLOCK, FEWEST_MAPS, PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
 
 _MOST_NAMED = 6
@@ -90,7 +90,10 @@ def _rank(best: Mapping[Any, Any], others: pd.DataFrame, apart: Mapping[str, boo
         return
     alike, worse = others[others["best_alike"]], others[~others["best_alike"]]
     unit = "group" if best["n_groups"] < best["n_maps"] else "map"
-    test = f"max-T sign-flip test by {unit} over {len(others) + 1} settings"
+    test = f"max-T bootstrap test by {unit} over {len(others) + 1} settings"
+    if best["best_maps"] < FEWEST_MAPS:
+        yield f"No setting is marked: with fewer than {FEWEST_MAPS} {unit}s none can be called worse."
+        return
     if worse.empty:
         shown, p = others["best_shown"].max(), others["best_p"].min()
         maps = f"{int(best['best_maps'])} {unit}s"

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.core.resampling import LEAST_MAPS
 from benchnav.core.tables import Bold, Table, to_latex
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.report.words import (
@@ -29,7 +28,7 @@ from benchnav.eval.report.words import (
     success_interval_in_words,
     unit_of_statistics,
 )
-from benchnav.eval.stats.best import PRIVILEGED, competing
+from benchnav.eval.stats.best import FEWEST_MAPS, PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
 
 # What `follows` is where a planner follows the user's objective alone.
@@ -56,7 +55,7 @@ _COLUMNS = {
     "Succ. [%]": "share of episodes that reached the goal.",
     "95 % interval": "Wilson's interval of the success rate, with maps as the unit.",
     "T_total [s]": "mean time to the goal, a failure counted as the time budget T, with its 95 % interval in brackets; "
-    f"no interval under {LEAST_MAPS} maps.",
+    f"no interval under {FEWEST_MAPS} maps.",
     "T if success [s]": "time of the episodes that reached the goal, mean ± standard deviation.",
     "λ̄ [%]": "mean observed λ of an episode, mean ± standard deviation over episodes.",
     ALONE: "planning time of a step of one robot alone, on one thread: median (95th percentile, maximum) over at most "
@@ -118,7 +117,13 @@ def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, An
     if any("¶" in cell for row in rows for cell in row):
         notes.append("¶ The planner ran as compiled code.")
     if (summary["best_rivals"] > 0).any() and not summary["best_marked"].any():
-        notes.append("No rate is bold: no setting is significantly worse than the best.")
+        few = summary["best_maps"].max() < FEWEST_MAPS
+        why = (
+            f"with fewer than {FEWEST_MAPS} {unit_of_statistics(summary)}s none can be called"
+            if few
+            else "no setting is significantly"
+        )
+        notes.append(f"No rate is bold: {why} worse than the best.")
     return Table(
         headings=headings,
         labels=len(labels),
@@ -240,7 +245,7 @@ def bold_note(summary: pd.DataFrame) -> str:
         return ""
     several = "" if len(blocks(summary)) == 1 else " of a block"
     words = (
-        f"highest success rate{several} and all without a significant difference from it (max-T sign-flip test by "
+        f"highest success rate{several} and all without a significant difference from it (max-T bootstrap test by "
         f"{unit_of_statistics(summary)}, p ≥ {ALPHA})"
     )
     left_out = pd.concat([rows[~competing(rows)] for _, rows in blocks(summary)])
@@ -379,7 +384,7 @@ def _comparison_columns(unit: str) -> tuple[tuple[str, str], ...]:
         (
             f"Δ T_total [{unit}], 95 %",
             f"difference of the mean time, a failure counted as the time budget T{share}; a dash for an interval of "
-            f"fewer than {LEAST_MAPS} maps.",
+            f"fewer than {FEWEST_MAPS} maps.",
         ),
         (
             "p (ranks)",

@@ -16,6 +16,7 @@ from benchnav.eval.stats.paired_difference import (
     smallest_difference,
     standard_deviation,
     success_interval,
+    sums_by_map,
     total_time_interval,
 )
 from benchnav.eval.stats.pairs import Pair
@@ -45,9 +46,8 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
     table = pd.DataFrame([_compare_success(pair, alpha, difference) for pair in pairs])
     unit = "share" if any(map(budgets_differ, pairs)) else "s"
     rows = [_in_shares(pair.episodes) if unit == "share" else pair.episodes for pair in pairs]
-    late = [mean_differences(one) for one in rows]
     table = table.join(_columns("time", unit, [time_difference(one) for one in rows]))
-    table["time_p"] = [signed_rank_p(values) for values in late]
+    table["time_p"] = [signed_rank_p(summed_differences(one)) for one in rows]
     arrived = [
         mean_differences(pair.episodes[pair.episodes["success"] & pair.episodes["success_other"]])
         for pair in pairs
@@ -80,18 +80,21 @@ def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> tuple[float
     arrival = arrivals.mean() if len(arrivals) else 0.0
     gain, draws = gain_by_map(rows)
     _, low, high = success_interval(gain, draws, confidence)
+    failed = by_map(
+        (rows["success_other"].astype(float) - rows["success"]).to_numpy(), rows["group"].to_numpy()
+    )
     mean, low_s, high_s = total_time_interval(
-        mean_differences(rows), -gain / draws, (-high, -low), pd.concat(budget_s).mean() - arrival,
+        mean_differences(rows), failed, (-high, -low), pd.concat(budget_s).mean() - arrival,
         len(set.intersection(*arrived)), confidence,
     )  # fmt: skip
     return float(mean), float(low_s), float(high_s)
 
 
-def gain_by_map(rows: pd.DataFrame) -> tuple[np.ndarray, float]:
-    """Successes of the one less those of the other by map, shape [M], and the mean number of episodes on a map."""
+def gain_by_map(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Successes of the one less those of the other, and the number of episodes, by map, both of shape [M]."""
     gain = rows["success"].astype(int) - rows["success_other"].astype(int)
-    by_unit = gain.groupby(rows["group"]).sum().to_numpy()
-    return by_unit, len(rows) / max(len(by_unit), 1)
+    by_unit = gain.groupby(rows["group"].to_numpy())
+    return by_unit.sum().to_numpy(), by_unit.size().to_numpy()
 
 
 def budgets_differ(pair: Pair) -> bool:
@@ -126,8 +129,22 @@ def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, o
 
 def mean_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.ndarray:
     """By how much one condition has more of a column, such as time, by map or group of maps, shape [M]."""
-    more = (rows[column] - rows[f"{column}_other"]).to_numpy(dtype=float)
-    return by_map(more, rows["group"].to_numpy())
+    return by_map(*_differences(rows, column))
+
+
+def summed_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.ndarray:
+    """What tests by signs and ranks ask for: `sums_by_map` of the differences, shape [M]."""
+    return sums_by_map(*_differences(rows, column))
+
+
+def _differences(rows: pd.DataFrame, column: str) -> tuple[np.ndarray, np.ndarray, float]:
+    """Differences by episode, their maps, and the largest value that they are made of."""
+    one, other = (rows[name].to_numpy(dtype=float) for name in (column, f"{column}_other"))
+    return (
+        one - other,
+        rows["group"].to_numpy(),
+        float(max(np.abs(one).max(initial=0), np.abs(other).max(initial=0))),
+    )
 
 
 def _in_shares(rows: pd.DataFrame) -> pd.DataFrame:

@@ -16,7 +16,13 @@ from scipy.optimize import brentq
 
 from benchnav.core.resampling import holm, sign_flips
 from benchnav.eval.experiment.hypotheses import METRICS, Hypothesis
-from benchnav.eval.stats.comparison import ALPHA, gain_by_map, mean_differences, time_difference
+from benchnav.eval.stats.comparison import (
+    ALPHA,
+    gain_by_map,
+    mean_differences,
+    summed_differences,
+    time_difference,
+)
 from benchnav.eval.stats.paired_difference import mean_interval, sign_flip_p, success_interval
 from benchnav.eval.stats.pairs import side_by_side
 from benchnav.eval.stats.summary import time_budgets
@@ -118,14 +124,16 @@ def _difference_p(test: Hypothesis, rows: pd.DataFrame) -> float:
         return 1.0
     if test.metric == "success":
         return sign_flip_p(gain_by_map(rows)[0].astype(int), test.direction)
-    column = METRICS[test.metric].column
-    more = rows[column] - rows[f"{column}_other"]
-    sums = more.groupby(rows["group"].to_numpy()).sum().to_numpy()
-    flipped, seen = sign_flips(len(sums)) @ sums, sums.sum()
+    sums = summed_differences(rows, METRICS[test.metric].column)
+    # Sizes in one order, so that neither the order of maps nor one without a difference matters.
+    sizes = np.sort(np.abs(sums[sums != 0]))[::-1]
+    flipped, seen = sign_flips(len(sizes)) @ sizes, sums.sum()
+    if test.direction == "lower":
+        seen = -seen
+    elif not test.direction:
+        flipped, seen = np.abs(flipped), abs(seen)
     # Sums are exact to rounding, and ways that tie with what was seen count.
-    slack = 1e-9 * np.abs(sums).sum()
-    far = {"higher": flipped >= seen - slack, "lower": flipped <= seen + slack}
-    return float(np.mean(far.get(test.direction, np.abs(flipped) >= abs(seen) - slack)))
+    return float(np.mean(flipped >= seen - 1e-9 * sizes.sum()))
 
 
 def _margin_p(metric: str, rows: pd.DataFrame, margin: float, side: float) -> float:

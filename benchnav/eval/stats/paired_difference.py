@@ -13,12 +13,56 @@ from scipy.stats import binom, norm, rankdata, t, wilcoxon
 from benchnav.core.resampling import LEAST_MAPS
 
 POWER = 0.8
-# Up to so many maps a test is exact.
+# Up to so many maps that differ a test is exact.
 _EXACT = 13
+# Of the scale of what is summed: far more than rounding, far less than a time step.
+_ROUNDING = 1e-9
+# Pseudo-maps of an interval are as if this share of the maps had ended wholly unlike.
+UNSEEN = 0.01
 
 
-def by_map(values: np.ndarray, maps: np.ndarray) -> np.ndarray:
-    """One number a map, with the mean over maps equal to that over episodes.
+def alike(values: np.ndarray, scale: float) -> np.ndarray:
+    """Return values in which sizes that differ by rounding are one size, and 0 where they are as small.
+
+    Tests by ranks and by signs ask which values are 0 and which are equal. Sums of times on a grid of steps answer that
+    but for rounding, which the order of episodes decides.
+
+    Args:
+        values: shape [M].
+        scale: largest number that the values were computed from.
+
+    Returns:
+        Shape [M], within a few `_ROUNDING` of the scale.
+    """
+    order = np.argsort(np.abs(values))
+    sizes = np.concatenate([[0.0], np.abs(values)[order]])
+    is_new = ~(np.diff(sizes) <= _ROUNDING * scale)
+    first = np.maximum.accumulate(np.where(is_new, np.arange(1, len(sizes)), 0))
+    snapped = np.empty(len(values))
+    snapped[order] = sizes[first]
+    return np.copysign(snapped, values) + 0.0
+
+
+def sums_by_map(values: np.ndarray, maps: np.ndarray, scale: float | None = None) -> np.ndarray:
+    """Return the sum of each map over the mean number of episodes a map, without rounding (see `alike`).
+
+    Args:
+        values: one an episode, shape [N].
+        maps: which map each was on, any labels, shape [N].
+        scale: largest number that the values were computed from; their own where not given.
+
+    Returns:
+        Shape [M], in the order of sorted labels.
+    """
+    if not len(values):
+        return np.empty(0)
+    _, member, size = np.unique(maps, return_inverse=True, return_counts=True)
+    sums = np.bincount(member, weights=values) / size.mean()
+    return alike(sums, float(np.abs(values).max()) if scale is None else scale)
+
+
+def by_map(values: np.ndarray, maps: np.ndarray, scale: float | None = None) -> np.ndarray:
+    """Return one number a map, whose mean over maps is that over episodes.
 
     Of maps with equally many episodes it is the mean of each. Else it is the contribution of each map to the mean of
     all, Σ(v − v̄)·M/N + v̄, whose standard deviation is that of a ratio estimator.
@@ -27,45 +71,48 @@ def by_map(values: np.ndarray, maps: np.ndarray) -> np.ndarray:
     Args:
         values: one an episode, shape [N].
         maps: which map each was on, any labels, shape [N].
+        scale: as in `sums_by_map`.
 
     Returns:
         Shape [M], in the order of sorted labels.
     """
-    if not len(values):
-        return np.empty(0)
-    _, member, size = np.unique(maps, return_inverse=True, return_counts=True)
-    mean = values.mean()
-    return mean + np.bincount(member, weights=values - mean) / size.mean()
+    sums = sums_by_map(values, maps, scale)
+    _, size = np.unique(maps, return_counts=True)
+    if np.all(size == size[:1]):
+        return sums
+    return sums + values.mean() * (1 - size / size.mean())
 
 
 def success_interval(
-    gain: np.ndarray, draws: float, confidence: float = 0.95
+    gain: np.ndarray, draws: float | np.ndarray, confidence: float = 0.95
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Difference of success rates, with the adjusted Wald interval for paired proportions.
 
-    To the maps two are added, on one of which one condition, on the other the other condition, arrived once more often.
-    With one episode a map this is the interval of Bonett and Price, with the t quantile in place of the normal
-    one. Unlike a bootstrap it is no point where the two conditions ended alike on every map. The difference itself
-    is given as it was seen.
-    Source: Bonett and Price (2012), "Adjusted Wald confidence interval for a difference of binomial proportions
-    based on paired data".
+    To the maps two are added, on which the conditions differ by ±c. c is the size of a difference on a map, each map
+    weighted by its own, as if one map in a hundred had ended wholly unlike: (mean d² + 0.01) / (mean |d| + 0.01). With
+    one episode a map c is 1, and this is the interval of Bonett and Price, with the t quantile in place of the normal
+    one. Where no map differs c is 1 too, so that unlike a bootstrap it is no point. Twice the same episodes give the
+    same interval. Where maps have unequally many episodes the rate is a ratio of sums. The difference itself is as it
+    was seen.
+    Sources: Bonett and Price (2012), "Adjusted Wald confidence interval for a difference of binomial proportions
+    based on paired data"; Cochran (1977), "Sampling Techniques", 6.3, for the ratio. How often the interval covers the
+    truth on few, large groups: `benchmarks/statistics_studies.py`, part `groups`.
 
     Args:
         gain: successes of the one condition less those of the other by map, whole numbers, shape [..., M], M ≥ 2.
-        draws: episodes of a condition on each map, their mean where the numbers differ.
+        draws: episodes of a condition on each map, one number or of shape [M].
         confidence: coverage asked for.
 
     Returns:
         Difference, lower and upper end, in [−1, 1], each of shape [...].
     """
-    share = gain / draws
-    maps = gain.shape[-1]
-    centre = share.sum(-1) / (maps + 2)
-    half = t.ppf((1 + confidence) / 2, maps - 1) * standard_deviation(gain, draws) / np.sqrt(maps + 2)
-    return share.mean(-1), np.maximum(centre - half, -1), np.minimum(centre + half, 1)
+    maps, (centre, std) = gain.shape[-1], _smoothed(gain, draws)
+    half = t.ppf((1 + confidence) / 2, maps - 1) * std / np.sqrt(maps + 2)
+    mean = gain.sum(-1) / np.broadcast_to(draws, gain.shape).sum(-1)
+    return mean, np.maximum(centre - half, -1), np.minimum(centre + half, 1)
 
 
-def standard_deviation(gain: np.ndarray, draws: float) -> np.ndarray:
+def standard_deviation(gain: np.ndarray, draws: float | np.ndarray) -> np.ndarray:
     """Standard deviation over maps of the difference of success, with the two maps that `success_interval` adds.
 
     Args:
@@ -75,9 +122,20 @@ def standard_deviation(gain: np.ndarray, draws: float) -> np.ndarray:
     Returns:
         Shape [...], above 0.
     """
-    share = gain / draws
-    maps = gain.shape[-1] + 2
-    return np.sqrt(((share**2).sum(-1) + 2 / draws**2) / maps - (share.sum(-1) / maps) ** 2)
+    return _smoothed(gain, draws)[1]
+
+
+def _smoothed(gain: np.ndarray, draws: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of the difference over the maps and the two that `success_interval` adds."""
+    maps, episodes = gain.shape[-1], np.broadcast_to(draws, gain.shape)
+    total = episodes.sum(-1)
+    size = episodes * (maps / total)[..., None]
+    share = gain * (maps / total)[..., None]
+    c = ((gain**2 / episodes).sum(-1) / total + UNSEEN) / (np.abs(gain).sum(-1) / total + UNSEEN)
+    added = np.sqrt((size**2).mean(-1))  # the size of an added map
+    centre = share.sum(-1) / (maps + 2 * added)
+    squares = ((share - centre[..., None] * size) ** 2).sum(-1) + 2 * added**2 * (c**2 + centre**2)
+    return centre, np.sqrt(squares * (maps + 2)) / (maps + 2 * added)
 
 
 def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
@@ -95,6 +153,7 @@ def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
     Returns:
         Share of all ways with a sum at least as far from 0, or as far in the direction.
     """
+    gain = gain // max(np.gcd.reduce(gain), 1)  # of repeated episodes as of each once
     sizes, counts = np.unique(np.abs(gain[gain != 0]), return_counts=True)
     chances = np.ones(1)
     for size, count in zip(sizes, counts, strict=True):
@@ -168,15 +227,15 @@ def _half_width(values: np.ndarray, freedom: np.ndarray | int, confidence: float
 def signed_rank_p(late: np.ndarray) -> float:
     """Two-sided p of Wilcoxon's signed-rank test that neither condition takes longer; 1 where no map differs.
 
-    On few maps it is exact with ties too: the ranks' signs are flipped in all ways. SciPy's p is the same there, but
-    it calls a function for each way.
+    Maps without a difference count for nothing. On few that differ the test is exact with ties too: the ranks' signs
+    are flipped in all ways. SciPy's p is the same there, but it calls a function for each way.
 
     Args:
-        late: difference of time by map, shape [M].
+        late: difference of time by map without rounding, as `sums_by_map` returns it, shape [M].
     """
-    if len(late) > _EXACT:
-        return float(wilcoxon(late).pvalue) if np.any(late) else 1.0
     differing = late[late != 0]
+    if len(differing) > _EXACT:
+        return float(wilcoxon(differing).pvalue)
     # Whole numbers, those of ties too.
     twice_ranks = np.rint(2 * rankdata(np.abs(differing))) * np.sign(differing)
     return sign_flip_p(twice_ranks.astype(np.int64))

@@ -1,6 +1,6 @@
 """Which conditions are compared: those whose values differ in one thing, on the same maps and the same draws of λ."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
@@ -86,12 +86,7 @@ def find_pairs(conditions: Sequence[Compared], by: str = "", against: str = "") 
     )
     if against:
         check_known("`against`", against, values)
-    pairs = [
-        # What is compared first: the later of the two, unless the earlier is compared with a named one.
-        _pair(a, b, by) if against and b.labels[by] == against else _pair(b, a, by)
-        for a, b in combinations(conditions, 2)
-        if _differ_in(a, b, by) and (not against or against in (a.labels[by], b.labels[by]))
-    ]
+    pairs = [_pair(one, other, by) for one, other in matches(conditions, by, against)]
     if not pairs:
         raise ConfigError(
             f"Expected two conditions or more that differ in their {by} and in nothing else, got {by} "
@@ -99,6 +94,22 @@ def find_pairs(conditions: Sequence[Compared], by: str = "", against: str = "") 
         )
     families = list(dict.fromkeys(tuple(pair.shared.values()) for pair in pairs))
     return sorted(pairs, key=lambda pair: families.index(tuple(pair.shared.values())))
+
+
+def matches(
+    conditions: Sequence[Compared], by: str, against: str = ""
+) -> Iterator[tuple[Compared, Compared]]:
+    """Yield the conditions of each pair that `find_pairs` makes: what is compared, and with what.
+
+    Args:
+        conditions: as there.
+        by: from `by_what`.
+        against: as there.
+    """
+    for a, b in combinations(conditions, 2):
+        if _differ_in(a, b, by) and (not against or against in (a.labels[by], b.labels[by])):
+            # The later of the two comes first, unless the earlier is compared with a named one.
+            yield (a, b) if against and b.labels[by] == against else (b, a)
 
 
 def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> str:

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import norm, t
 from statsmodels.stats.proportion import proportion_confint
 
 from benchnav.eval.experiment.condition import LABELS
-from benchnav.eval.stats.paired_difference import by_map, total_time_interval
+from benchnav.eval.stats.paired_difference import UNSEEN, by_map, total_time_interval
 from benchnav.planning.world.outcome import FAILURES
 
 # Of each column its name in the summary, which the statistic parts, and its unit.
@@ -47,61 +48,34 @@ def wilson_interval(rate: float, n: float) -> tuple[float, float]:
 
 
 def design_effect(success: np.ndarray, maps: np.ndarray) -> float:
-    """How many episodes tell as much as one on a map of its own would.
+    """Return how many episodes tell as much as one on a map of its own would.
 
-    1 + (m − 1)·ρ, with m the size-weighted mean number of episodes a map and ρ the intra-class correlation
-    of success by map, from the analysis of variance and kept in [0, 1]. Where the outcomes do not differ at
-    all, or there is but one map, ρ cannot be seen; it is then 1, so that a map counts as one episode. Since ρ
-    is an estimate, a 95 % interval made with it holds 93 % of the time on 20 maps and 95 % on 60 (simulated,
-    five episodes a map).
-    Source: Donner and Klar (2000), "Design and Analysis of Cluster Randomization Trials in Health Research", 1.2 and
-    6.2.1; Ridout, Demétrio and Firth (1999) for the estimator on binary data.
+    It is the number of episodes over n = M·k, with k the variance of one episode, p(1 − p), over that of the rates of
+    maps, both as if one map in a hundred had shown no more than one episode would. Above 1, k is divided by (t/z)² of
+    M − 1 degrees of freedom, down to 1, since few maps tell their variance badly. With one episode a map, or where all
+    episodes end alike, n is M; twice the same episodes have the same n.
+    Sources: Korn and Graubard (1998), "Confidence intervals for proportions with small expected number of positive
+    counts estimated from survey data", for n and Student's quantile; Cochran (1977), "Sampling Techniques", 6.3, for
+    the variance where maps have unequally many episodes. How often the interval covers the truth:
+    `benchmarks/statistics_studies.py`, parts `intervals` and `groups`.
 
     Args:
         success: bool, shape [N].
         maps: which map each episode was on, any labels, shape [N].
 
     Returns:
-        At least 1, at most N.
+        Above 0, N on one map.
     """
-    _, member, size = np.unique(maps, return_inverse=True, return_counts=True)
-    value, episodes, count = success.astype(float), len(success), len(size)
-    if episodes == count:
-        return 1.0
-    weighted = float((size**2).sum()) / episodes
-    within_maps = 1.0
-    if count > 1:
-        mean = np.bincount(member, weights=value) / size
-        between = float((size * (mean - value.mean()) ** 2).sum()) / (count - 1)
-        within = float(((value - mean[member]) ** 2).sum()) / (episodes - count)
-        if between or within:
-            typical = (episodes - weighted) / (count - 1)
-            within_maps = min(max((between - within) / (between + (typical - 1) * within), 0.0), 1.0)
-    return 1 + (weighted - 1) * within_maps
-
-
-def cautious_design_effect(success: np.ndarray, maps: np.ndarray) -> float:
-    """Does `design_effect` as if two more maps had been met, on one of which all arrived and on the other none.
-
-    Near 0 and 1 the correlation is seen by few maps, and underestimated where these are few: intervals made with
-    `design_effect` alone then hold 0.90 where 0.95 is promised (50 maps, three episodes each), with this 0.95 and
-    more; see `benchmarks/statistics_studies.py`.
-
-    Args:
-        success: as there.
-        maps: as there.
-
-    Returns:
-        At least 1.
-    """
-    _, member, size = np.unique(maps, return_inverse=True, return_counts=True)
-    each = round(size.mean())
-    if each == 1:
-        return design_effect(success, maps)
-    added = np.repeat([len(size), len(size) + 1], each)
-    ends = np.repeat([True, False], each)
-    effect = design_effect(np.concatenate([success, ends]), np.concatenate([member, added]))
-    return min(effect, len(success))
+    _, member, episodes = np.unique(maps, return_inverse=True, return_counts=True)
+    count, rate = len(episodes), success.mean()
+    if count == 1:
+        return float(len(success))
+    size = episodes / episodes.mean()
+    residual = size * (np.bincount(member, weights=success) / episodes - rate)
+    gain = (rate * (1 - rate) + UNSEEN) / ((residual**2).mean() + UNSEEN * (size**2).mean())
+    if gain > 1:
+        gain = max(gain * (norm.ppf(0.975) / t.ppf(0.975, count - 1)) ** 2, 1.0)
+    return float(len(success) / (count * gain))
 
 
 def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
@@ -120,9 +94,9 @@ def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
 
 
 def success_mean(episodes: pd.DataFrame) -> tuple[float, float, float]:
-    """Success rate of one condition with its 95 % interval, Wilson's on the episodes over `cautious_design_effect`."""
+    """Success rate of one condition with its 95 % interval, Wilson's on the episodes over `design_effect`."""
     success = episodes["success"].to_numpy(dtype=bool)
-    effect = cautious_design_effect(success, episodes["group"].to_numpy())
+    effect = design_effect(success, episodes["group"].to_numpy())
     return float(success.mean()), *wilson_interval(float(success.mean()), len(success) / effect)
 
 
@@ -157,7 +131,7 @@ def summarise(episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]]) -
     Returns:
         A row a condition: `condition` and its labels; `n_episodes`, `n_maps`, and `n_groups`, which is the number of
         maps where the dataset has no groups; `success_rate` with Wilson's interval `success_low`, `success_high` on the
-        number of episodes over `cautious_design_effect`. Of each quantity
+        number of episodes over `design_effect`. Of each quantity
         `NAME_mean`, `NAME_std` and `NAME_n`, the number of episodes that have it: total time, a failure
         counted as T; time of the successes alone; observed λ; time over the reference time; score; path length;
         share of stuck steps; roughness. `total_time_low_s`, `total_time_high_s`, the 95 % interval of its mean,
@@ -171,7 +145,7 @@ def summarise(episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]]) -
 
 def _summarise_condition(group: pd.DataFrame, world: Mapping[str, Any]) -> dict[str, object]:
     success = group["success"].to_numpy(dtype=bool)
-    effect = cautious_design_effect(success, group["group"].to_numpy())
+    effect = design_effect(success, group["group"].to_numpy())
     rate, low, high = success_mean(group)
     row: dict[str, object] = {name: group[name].iloc[0] for name in ("condition", *LABELS)}
     row |= {"n_episodes": len(group), "n_maps": group["map"].nunique(), "n_groups": group["group"].nunique()}

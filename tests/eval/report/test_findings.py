@@ -36,7 +36,7 @@ def test_a_best_that_all_others_are_worse_than() -> None:
         "MPPI, mean is the best of those that are significantly worse: 40 %, 50.0 points less (95 % interval of this "
         "pair alone "
     )
-    assert sentences[2].endswith(", p ≤ 0.0001 (max-T sign-flip test by map over 3 settings).")
+    assert sentences[2].endswith(", p = 0.0005 (max-T bootstrap test by map over 3 settings).")
     assert sentences[3] == "MPPI, CVaR₀.₉ failed in 10 of 100 episodes: 10 immobilised (100 %)."
     assert sentences[4] == (
         "All 3 compared settings together failed in 140 of 300 episodes: 140 immobilised (100 %)."
@@ -63,7 +63,7 @@ def test_several_that_are_not_worse_are_named_up_to_six() -> None:
 def test_where_nothing_is_worse_there_is_no_significant_difference() -> None:
     sentences = said(condition(90, risk="a"), condition(89, risk="b"), condition(88, risk="c"))
     assert re.fullmatch(
-        r"There is no significant difference between the settings \(max-T sign-flip test by map over 3 settings, "
+        r"There is no significant difference between the settings \(max-T bootstrap test by map over 3 settings, "
         r"p ≥ 0\.\d+; 100 maps detect differences of \d points or more with 80 % power\)\.",
         sentences[1],
     )
@@ -100,7 +100,7 @@ def test_a_single_setting_and_two() -> None:
     two = said(condition(90, risk="a"), condition(10, risk="b"))
     assert two[1] == "The other setting is significantly worse."
     assert two[-1].startswith("Both compared settings together failed in 100 of 200 episodes: ")
-    assert two[2].endswith("(max-T sign-flip test by map over 2 settings).")
+    assert two[2].endswith("(max-T bootstrap test by map over 2 settings).")
 
 
 def test_a_setting_that_is_alone_with_its_objective_is_said_to_be_and_how_objectives_are_compared() -> None:

@@ -55,7 +55,7 @@ def test_golden_table() -> None:
         "\n¹ Cost minimised in place of J: its own time.\n"
         "\n² limits 0.5 m/s²\n"
         "\n¶ The planner ran as compiled code.\n"
-        "\nNo rate is bold: no setting is significantly worse than the best."
+        "\nNo rate is bold: with fewer than 6 maps none can be called worse than the best."
     )
 
 
@@ -109,7 +109,7 @@ def test_bold_is_what_is_not_worse_than_the_best_where_another_is() -> None:
     rate = table.headings.index("Succ. [%]")
     assert made.bold_cells(table) == {(1, rate), (2, rate)}
     assert table.bold_note == (
-        "highest success rate and all without a significant difference from it (max-T sign-flip test by map, p ≥ "
+        "highest success rate and all without a significant difference from it (max-T bootstrap test by map, p ≥ "
         "0.05). Privileged models (oracle) do not compete."
     )
     alike = table_of(rows[rows["risk"].isin(["var", "cvar"]) & (rows["model"] != "oracle")])
@@ -203,7 +203,7 @@ def test_groups_are_counted_and_named_where_there_are_such() -> None:
     assert [row[3:5] for row in table.rows] == [("20", "40"), ("18", "36")]
     worse = [made.row(made.condition(risk="c"), i, None, group=i // 2) for i in range(40)]
     text = table_of(made.rows(grouped(made.condition(risk="a"), 40), worse)).bold_note
-    assert "sign-flip test by group" in text
+    assert "bootstrap test by group" in text
     paper = paper_table(made.summary(made.rows(grouped(made.condition(), 40))), "run")
     assert "on 40 maps in 20 groups per scenario" in paper
 
