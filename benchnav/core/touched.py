@@ -90,7 +90,8 @@ def touches_of(targets: Iterable[Callable[..., Any]]) -> Touches:
     names: set[str] = set()
     for source, (package, content) in sources.items():
         names |= {*imported_names(content, package), *_modules.get(source, ())}
-        for path in set(_files.get(source, ())) - _written.get(source, set()):
+        # Sources that are imported by name are part of the key of a unit.
+        for path in set(_files.get(source, ())) - _written.get(source, set()) - set(sources):
             touches[f"file {_relative(path)}"] = _files[source][path]
         touches |= {f"variable {name}": digest for name, digest in _variables.get(source, {}).items()}
     for name in sorted(names):

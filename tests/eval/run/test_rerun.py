@@ -171,7 +171,7 @@ def test_files_that_a_part_imports_or_is_named_are_seen_by_extension_resumption_
         if changed is weights:
             _, lines = repeat(run, tmp_path / "again")
             assert lines[0].startswith("2 of 2 rows came out differently")
-            assert lines[-1] == f"the environments differ in: weights.txt of {name}"
+            assert lines[-1] == f"the environments differ in: weights.txt of {name}; file weights.txt"
         changed.write_text(before)
     steps = run_suite(suite, tmp_path / "other")
     next(steps)
