@@ -1,6 +1,7 @@
 """Progress: the rate and the time left are closed forms of a clock that the tests set."""
 
 import sys
+import threading
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -88,10 +89,13 @@ def test_plain_lines_tell_of_work_that_makes_no_step(
     lines: list[str] = []
     monkeypatch.setattr(progress, "tell", lambda line: (lines.append(line), said(line)))
 
+    ended = threading.Event()
+
     def steps() -> Iterator[Progress]:
         yield Progress(0, 1, "running one")
-        while len(lines) < 3:
-            pass
+        for _ in range(1000):
+            if len(lines) < 3:
+                ended.wait(0.01)
         yield Progress(1, 1, "finished one")
 
     show_progress(steps(), "units")
