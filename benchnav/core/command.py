@@ -279,7 +279,7 @@ def _merged(name: str, kind: Any, now: Any, keys: Sequence[str], text: str) -> A
 
 def _read_config(command: Command, value: str) -> dict[str, Any]:
     """Reads a YAML file of settings, by path or by the name of a shipped one."""
-    path = Path(value).expanduser()
+    path = Path(os.path.expanduser(value))
     if not path.is_file():
         path = command.shipped.get(value, path)
     if not path.exists():

@@ -426,7 +426,7 @@ def _installed_folder(place: str) -> Path | None:
 
 
 def _found_in_file(kind: str, path: Path, name: str) -> Found:
-    path = path.expanduser()
+    path = Path(os.path.expanduser(path))
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -468,7 +468,7 @@ def option_files(kind: str, part: Part) -> dict[str, str]:
     written = getattr(find(kind, part.part).target, "writes", ())
     found = {}
     for text in _texts([value for name, value in part.options.items() if name not in written]):
-        path = Path(text).expanduser()
+        path = Path(os.path.expanduser(text))
         there = os.path.exists(path)  # of what cannot be a path false, where Path raises
         if there and path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
             raise ConfigError(

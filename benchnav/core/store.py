@@ -62,7 +62,7 @@ def check_output(name: str, option: str = "out") -> None:
         not re.match(r"[A-Za-z][A-Za-z0-9+.-]*:/", name),
         f"`{option}` as a path on this machine, got the address {name!r}. Write to a folder here, and copy it.",
     )
-    path = Path(name).expanduser()
+    path = Path(os.path.expanduser(name))
     nearest = next((place for place in path.absolute().parents if os.path.lexists(place)), path)
     expect(
         nearest.is_dir(),

@@ -540,12 +540,7 @@ def test_datasets_are_made_listed_and_shown_without_pytorch(tmp_path: Path) -> N
     ("arguments", "said"),
     [
         (("create", "tiny-v1", "--seed", "-1"), "Expected `seed` in 0–2^63 − 1, got -1."),
-        (("create", "tiny-v1", "--seed", "99999999999999999999999"), "Expected `seed` in 0–2^63 − 1"),
-        (("create", "tiny-v1", "--out", "s3://bucket/maps.h5"), "place on this machine, got the address"),
-        (("merge", "a.h5", "b.h5", "--out", "gs://bucket/maps.h5"), "place on this machine"),
-        (("import-dem", "dem.tif", "--out", "s3://bucket/maps.h5"), "place on this machine"),
-        (("export", "paper-v1", "--out", "https://host/maps"), "place on this machine"),
-        (("preview", "paper-v1", "--out", "s3://bucket/maps.png"), "place on this machine"),
+        (("create", "tiny-v1", "--seed", "99999999999999999999999"), "at most 64 bits"),
         (
             ("create", "tiny-v1", "--splits", "{a: 1}"),
             "Expected --splits as a list, each text or null, got '{a: 1}'",

@@ -117,7 +117,7 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
                 ([f"--{NETWORKS[kind]}.architecture", "DeepLabV3+"], "Did you mean 'deeplabv3plus'?"),
                 (["--trainer.limit_val_batches", "0"], "`trainer.limit_val_batches` that leaves a batch"),
                 (["--trainer.gradient_clip_val", "many"], "`gradient_clip_val` should be"),
-                (["--seed", "99999999999999999999999"], "Expected `seed` in 0–"),
+                (["--seed", "99999999999999999999999"], "at most 64 bits"),
                 (["--seed", "-1"], "got -1."),
             )
         ),
@@ -127,10 +127,6 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
             "Expected --classifier.decoder_channels as a list, each a whole number, got 'many'.",
         ),
         (["all", "--data", "DATA", "--out", "x/y", "--members", "2", "--seed", str(2**63 - 1)], "`seed`"),
-        *(
-            ([command, "--data", "DATA", "--out", "s3://bucket/model"], "place on this machine")
-            for command in ("all", "classifier", "gp", "mdn")
-        ),
     ],
 )
 def test_bad_input_is_refused_in_one_line(

@@ -7,6 +7,7 @@ may: these are recorded, with a digest of the code of those that are not Lightni
 
 import importlib
 import inspect
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -93,7 +94,7 @@ def _class(what: str, place: str) -> type:
             f"{place!r}.{hint(place, known)}"
         )
     if owner.endswith(".py"):
-        path = Path(owner).expanduser()
+        path = Path(os.path.expanduser(owner))
         try:
             content = path.read_bytes()
         except OSError as error:
@@ -145,6 +146,6 @@ def _made(what: str, item: Any, folder: Path | None) -> Any:
 def _digest(kind: type, place: str) -> str:
     owner = place.rpartition(":")[0]
     if owner.endswith(".py"):
-        path = Path(owner).expanduser().resolve()
+        path = Path(os.path.expanduser(owner)).resolve()
         return digest_of_file_part(path, path.read_bytes())
     return digest_of_target(kind)

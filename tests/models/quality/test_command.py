@@ -131,8 +131,6 @@ def test_a_series_is_drawn_where_there_is_one(
         (["oracle", "--data", "DATA", "--splits", "[test/hg]"], "test/hg"),
         (["oracle", "--data", "DATA", "--json", "no/such/folder.json"], "no/such"),
         (["oracle", "--data", "DATA", "--json", "folder"], "folder"),
-        (["oracle", "--data", "DATA", "--out", "s3://bucket/quality"], "place on this machine"),
-        (["oracle", "--data", "DATA", "--json", "s3://bucket/quality.json"], "place on this machine"),
         (["oracle", "--data", "DATA", "--out", "folder"], "something else"),
         (["oracle", "--data", "DATA", "--out", "folder/file"], "something else"),
         (["oracle", "--data", "DATA", "--out", "folder/file/deeper/out"], "folder/file"),

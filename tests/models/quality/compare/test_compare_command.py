@@ -316,7 +316,6 @@ def test_a_series_is_drawn_where_there_is_one(
         (["colours", "--seed", "-1"], "`seed`"),
         (["colours", "--out", "folder"], "is something else than a comparison"),
         (["colours", "--out", "folder/file/out"], "folder/file"),
-        (["colours", "--out", "s3://bucket/out"], "place on this machine"),
     ],
 )
 def test_bad_input_is_refused_in_one_line_before_any_work(
