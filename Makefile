@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 LOWEST := .venv-lowest
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
+INSTALL := $(BIN)/python tools/install.py
 # A worker takes up to 2 GB.
 JOBS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
@@ -24,9 +24,9 @@ help:
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null || { \
 	  echo "benchnav: expected Python 3.11, 3.12 or 3.13, got \"$$($(PYTHON) --version 2>&1)\" from $(PYTHON); run make PYTHON=/path/to/python3.12" >&2; exit 2; }
-	@echo "benchnav: setting up $(VENV) (several minutes and about 7 GB, once)"
+	@echo "benchnav: setting up $(VENV) (one or two minutes and about 7 GB, once)"
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) '.[dev]'
+	$(INSTALL) dev
 	@touch $(STAMP)
 
 demo: $(STAMP)
@@ -34,20 +34,20 @@ demo: $(STAMP)
 
 # Tests run beside one another, and so do the commands that they start: a thread each. One process more than there are
 # processors works while others wait for commands. They plan on many small maps, each of which would be compiled for; what
-# is compiled is tried in tests of its own.
+# is compiled is tried in tests of its own. Commands and workers share bytecode, even where the environment forbids it.
 test: $(STAMP)
-	OMP_NUM_THREADS=1 TORCH_COMPILE_DISABLE=1 $(BIN)/python -m pytest -n $$(($(JOBS) + 1)) --dist loadfile --no-loadscope-reorder
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 TORCH_COMPILE_DISABLE=1 $(BIN)/python -m pytest -n $$(($(JOBS) + 1)) --dist loadfile --no-loadscope-reorder
 
 # A page that is not well-formed, or a link that leads nowhere, fails the build.
 docs: $(STAMP)
-	$(INSTALL) '.[docs]'
+	$(INSTALL) docs
 	$(BIN)/python tools/reference.py docs/reference/commands
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 
 # Every block of every page and every cell of every notebook, on so many maps where these have many.
 MAPS ?= 2
 docs-test: $(STAMP)
-	$(INSTALL) '.[notebook]'
+	$(INSTALL) notebook
 	BENCHNAV_DOCS_MAPS=$(MAPS) OMP_NUM_THREADS=1 TORCH_COMPILE_DISABLE=1 $(BIN)/python -m pytest -n $(JOBS) -m docs tests/docs
 
 test-slow: $(STAMP)
@@ -57,10 +57,10 @@ test-slow: $(STAMP)
 test-lowest:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || { \
 	  echo "benchnav: expected Python 3.11, got \"$$($(PYTHON) --version 2>&1)\" from $(PYTHON); run make test-lowest PYTHON=/path/to/python3.11" >&2; exit 2; }
-	@echo "benchnav: setting up $(LOWEST) (several minutes and about 7 GB)"
+	@echo "benchnav: setting up $(LOWEST) (one or two minutes and about 7 GB)"
 	$(PYTHON) -m venv --clear $(LOWEST)
 	$(PYTHON) tools/lowest.py > $(LOWEST)/constraints.txt
-	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(LOWEST)/constraints.txt --editable '.[dask,geo,test]'
+	$(LOWEST)/bin/python tools/install.py --constraint $(LOWEST)/constraints.txt dask,geo,test
 	$(LOWEST)/bin/python -m pytest -n $(JOBS) --dist loadfile
 
 bench: $(STAMP)
@@ -79,7 +79,7 @@ lint: $(STAMP)
 
 # The wheel is built from the source archive. What *.egg-info lists of an earlier build would go into the archive.
 wheel: $(STAMP)
-	$(INSTALL) '.[release]'
+	$(INSTALL) release
 	rm -rf dist *.egg-info
 	$(BIN)/python -m build --no-isolation
 	$(BIN)/python -m twine check --strict dist/*

@@ -1,5 +1,7 @@
 """Fixtures shared by the tests."""
 
+import atexit
+import gc
 from pathlib import Path
 
 import pytest
@@ -8,10 +10,20 @@ import torch
 from benchnav.core import figures
 from tests import factories
 
+# What collection imports stays. To search it for garbage takes seconds, while it is imported and in each test.
+_THRESHOLD = gc.get_threshold()
+gc.set_threshold(1_000_000)
 torch.set_num_threads(1)
 # To embed a font as publishers ask takes half a second a file.
 _SAVED = figures._SAVED.copy()
 figures._SAVED["pdf.fonttype"] = 3
+
+
+def pytest_collection_finish() -> None:
+    """Excludes what collection imported from garbage collection until the process ends."""
+    gc.freeze()
+    atexit.register(gc.unfreeze)
+    gc.set_threshold(*_THRESHOLD)
 
 
 @pytest.fixture

@@ -206,16 +206,19 @@ def package_modules(names: Iterable[str]) -> dict[str, str]:
     todo = list(names)
     while todo:
         name = todo.pop()
-        path = PACKAGE.parent.joinpath(*name.split(".")).with_suffix(".py")
-        if name.partition(".")[0] == PACKAGE.name and name not in found and path.is_file():
-            found[name], imported = _module(path)
+        module = None if name in found else _module(name)
+        if module is not None:
+            found[name], imported = module
             todo += imported
     return dict(sorted(found.items()))
 
 
 @cache
-def _module(path: Path) -> tuple[str, tuple[str, ...]]:
-    """The digest of a module, and what it imports."""
+def _module(name: str) -> tuple[str, tuple[str, ...]] | None:
+    """The digest of a module of this package, and what it imports; None of any other name."""
+    path = PACKAGE.parent.joinpath(*name.split(".")).with_suffix(".py")
+    if name.partition(".")[0] != PACKAGE.name or not path.is_file():
+        return None
     content = path.read_bytes()
     tree = ast.parse(content)
     for node in ast.walk(tree):
