@@ -22,7 +22,7 @@ from benchnav.eval.report.playback.viewer_file import write_viewer_files
 from benchnav.eval.run.runner import run_suite
 from tests.commands import call
 
-FLIPS = 120  # of every file alike; the suite's share of the many that were tried by hand
+FLIPS = 80  # of every file alike; the suite's share of the many that were tried by hand
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_a_flipped_bit_is_found_or_makes_no_difference(run: Path, tmp_path: Path
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     whole = list(everything(copy))
     files = sorted(path for path in copy.rglob("*") if path.is_file())
-    files += 4 * sorted(copy.glob("units/*/*.parquet"))  # the larger part of them is metadata
+
     chance = random.Random(0)
     found = 0
     for _ in range(FLIPS):
