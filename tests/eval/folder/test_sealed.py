@@ -21,11 +21,15 @@ TABLE = pa.table(
 )
 
 
+def same(table: pa.Table) -> bool:
+    return bool(table.to_pandas().equals(TABLE.to_pandas()))
+
+
 def test_every_bit_counts_or_makes_no_difference(tmp_path: Path) -> None:
     path = tmp_path / "unit.parquet"
     pq.write_table(with_metadata(TABLE, {"key": "k", "code": {"torch": "2.1"}}), path)
     content, about = path.read_bytes(), metadata(path)
-    assert read_sealed(path).equals(TABLE)
+    assert same(read_sealed(path))
     assert about["key"] == "k"
     chance = random.Random(0)
     damaged = 0
@@ -35,7 +39,7 @@ def test_every_bit_counts_or_makes_no_difference(tmp_path: Path) -> None:
         path.write_bytes(bytes(changed))
         assert metadata(path) in ({}, about)
         try:
-            assert read_sealed(path).equals(TABLE), f"byte {place}"
+            assert same(read_sealed(path)), f"byte {place}"
         except DamageError:
             damaged += 1
     assert damaged > 0.4 * len(content)
@@ -68,7 +72,7 @@ def test_files_of_version_1_0_are_read_without_a_digest(tmp_path: Path) -> None:
     path = tmp_path / "unit.parquet"
     pq.write_table(TABLE.replace_schema_metadata({b"benchnav": b'{"key": "k"}'}), path)
     assert metadata(path) == {"key": "k"}
-    assert read_sealed(path).equals(TABLE)
+    assert same(read_sealed(path))
     pq.write_table(TABLE, path)
     with pytest.raises(DamageError):
         read_sealed(path)
