@@ -163,7 +163,7 @@ def unit_names(known: Sequence[Unit]) -> Callable[[Unit], str]:
     """Names units among others by scenario, planner, risk setting and what else differs, and by their maps.
 
     Args:
-        known: all that are to be told apart.
+        known: all that are to be distinguished.
     """
     conditions = {unit.condition.id: unit.condition for unit in known}
     labels = condition_names(list(conditions.values()))
