@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from benchnav.eval.folder.provenance import code_digest
 from benchnav.eval.folder.run_folder import EPISODES, FORMAT_VERSION, open_run, write_run
+from benchnav.eval.folder.sealed import with_metadata
 
 CODE: dict[str, dict[str, Any]] = {
     "modules": {"benchnav.eval.run.unit": "s"},
@@ -56,3 +59,9 @@ def _write_rows(folder: Path, rows: pd.DataFrame, about: Mapping[str, Any]) -> N
     rows.to_parquet(folder / EPISODES)
     digest = hashlib.sha256((folder / EPISODES).read_bytes()).hexdigest()
     write_run(folder, {**about, "tables": {EPISODES: digest}})
+
+
+def forge_steps(path: Path, steps: pd.DataFrame) -> None:
+    """Writes a file of steps by hand, sealed as those of a run are."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(with_metadata(pa.Table.from_pandas(steps, preserve_index=False), {"key": "forged"}), path)

@@ -4,13 +4,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.failures import Sheets, collect_sheets, failures_table
+from tests.eval.forged import forge_steps
 from tests.eval.report import made
 
 
@@ -27,10 +26,8 @@ def steps(condition: str, map_index: int, met: list[float], **changes: Any) -> p
 
 def keep(folder: Path, *episodes: pd.DataFrame) -> None:
     for condition, rows in pd.concat(episodes).groupby("condition"):
-        place = folder / "steps" / f"condition={condition}"
-        place.mkdir(parents=True)
-        table = pa.Table.from_pandas(rows.drop(columns="condition"), preserve_index=False)
-        pq.write_table(table, place / "0-0-00000.parquet")
+        path = folder / "steps" / f"condition={condition}" / "0-0-00000.parquet"
+        forge_steps(path, rows.drop(columns="condition"))
 
 
 def test_where_and_on_what_failures_ended(tmp_path: Path) -> None:
@@ -124,8 +121,7 @@ def collected(folder: Path, record: Any, steps: bool = True) -> tuple[Sheets, di
         ]
         for place, part in enumerate(parts):
             path = folder / "steps" / f"condition={part['condition'].iloc[0]}" / f"{place}.parquet"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            part.drop(columns="condition").to_parquet(path, index=False)
+            forge_steps(path, part.drop(columns="condition"))
     summary = made.summary(rows)
     sheets = collect_sheets(summary, failures_table(folder, rows), record)
     return sheets, dict(zip(summary["risk"], summary["condition"], strict=True))

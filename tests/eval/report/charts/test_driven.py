@@ -14,6 +14,7 @@ from benchnav.eval.recording import GROUND, Ground
 from benchnav.eval.report import write
 from benchnav.eval.report.charts.maps import driven_figure, read_driven
 from benchnav.eval.report.plan_layers import IMMOBILISING
+from tests.eval.forged import forge_steps
 from tests.eval.report import made
 from tests.eval.report.test_write import run_folder
 
@@ -136,8 +137,7 @@ def with_steps(folder: Path, rows: pd.DataFrame) -> None:
                 for i in unit["map"]
             )  # fmt: skip
             path = folder / "steps" / f"condition={condition}" / f"{seed}-{realisation}-00000.parquet"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            steps.to_parquet(path, index=False)
+            forge_steps(path, steps)
 
 
 def test_the_figure_is_of_the_stored_steps_of_its_map(tmp_path: Path) -> None:

@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,6 +13,7 @@ from matplotlib.figure import Figure
 from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, hatching, robot_marker
 from benchnav.core.grid import outline
 from benchnav.core.resampling import LEAST_MAPS
+from benchnav.eval.folder.sealed import read_sealed
 from benchnav.eval.recording import Recording
 from benchnav.eval.report import write
 from benchnav.eval.report.charts.knowledge import (
@@ -23,6 +22,7 @@ from benchnav.eval.report.charts.knowledge import (
     learning_figure,
     read_learning,
 )
+from tests.eval.forged import forge_steps
 from tests.eval.report import made
 from tests.eval.report.test_write import run_folder
 
@@ -142,8 +142,7 @@ def write_steps(folder: Path, rows: pd.DataFrame, seconds: float = 6.0) -> None:
         table = table.assign(**numbers, ahead_log_score=-numbers["ahead_rmse"])
         table = table.head(4 if place == 0 else len(table))
         path = folder / "steps" / f"condition={condition}" / f"0-0-{place}.parquet"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(pa.Table.from_pandas(table, preserve_index=False), path)
+        forge_steps(path, table)
 
 
 def test_curves_are_means_over_maps_of_those_that_still_drive(tmp_path: Path) -> None:
@@ -176,8 +175,7 @@ def test_without_steps_of_learning_there_are_no_curves(tmp_path: Path) -> None:
     write_steps(folder, rows[rows["planner"] == "mppi"])
     assert read_learning(folder, rows).empty
     for path in folder.glob("steps/*/*.parquet"):
-        table = pq.read_table(path, partitioning=None)
-        pq.write_table(table.drop_columns(list(METRICS)), path)
+        forge_steps(path, read_sealed(path).drop_columns(list(METRICS)).to_pandas())
     assert read_learning(folder, rows).empty
 
 
@@ -269,9 +267,10 @@ def labelled(recording: Recording, rows: pd.DataFrame, condition: str) -> Record
 def test_a_report_holds_what_robots_knew_where_they_learnt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def touch(figure: Figure, path: Path, trim: bool) -> None:
+    def touch(figure: Figure, path: Path, trim: bool, mark: str) -> None:
         path.parent.mkdir(exist_ok=True)
-        path.write_bytes(bytes(30))
+        for suffix in (".png", ".pdf"):
+            path.with_suffix(suffix).write_bytes(bytes(30))
 
     monkeypatch.setattr(write, "save_twice", touch)  # pictures take time
     rows = learners()
