@@ -60,7 +60,7 @@ def test_a_fault_of_ours_stays_a_traceback() -> None:
         run("x", "Does.", {"f": Command(faulty, ("work",))}, ["f", "a"])
     assert out_of_memory(RuntimeError("index out of bounds")) is None
     assert out_of_memory(ValueError("not enough memory")) is None
-    assert out_of_memory(ConfigError("Expected `jobs` ≥ 1, got 0.")) is None
+    assert out_of_memory(ConfigError("Expected `jobs` in 1–10000, got 0.")) is None
 
 
 def test_neither_part_nor_file_nor_checkpoint_is_blamed(

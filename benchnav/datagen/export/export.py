@@ -93,7 +93,6 @@ class Publication:
             self.is_url or is_listed,
             f"`license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got {self.license!r}.{near}",
         )
-        expect(self.creator.strip(), "`creator` to be a name, got an empty one.")
         expect(_URL.fullmatch(self.url) or not self.url, f"`url` to begin with https://, got {self.url!r}.")
         try:
             datetime.date.fromisoformat(self.date or "2024-05-21")

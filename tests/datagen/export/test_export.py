@@ -288,7 +288,7 @@ def test_what_is_there_is_refused_and_replaced_only_where_it_is_an_export(
         (["--license", "cc-by-4.0"], "got 'cc-by-4.0'. Did you mean 'CC-BY-4.0'?"),
         (["--license", "LicenseRef-mine"], "got 'LicenseRef-mine'"),
         (["--license", "MIT OR CC0-1.0"], "got 'MIT OR CC0-1.0'"),
-        (["--creator", " "], "`creator` to be a name"),
+        (["--creator", " "], "`creator` as printable text"),
         (["--url", "here"], "`url` to begin with https://"),
         (["--date", "tomorrow"], "`date` as YYYY-MM-DD"),
     ],

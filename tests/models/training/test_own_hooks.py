@@ -169,7 +169,7 @@ def test_a_class_of_a_name_that_is_ours_is_refused(
         (["own.py:CellModel", "--settings.inputs", "[]"], "`inputs` as layers, each once"),
         (["own.py:CellModel", "--settings.width", "3"], "got 'width'"),
         (["own.py:CellModel", "--crop", "33"], r"`crop` in 8–32 cells"),
-        (["own.py:CellModel", "--members", "0"], "`members` ≥ 1"),
+        (["own.py:CellModel", "--members", "0"], "`members` in 1–1000"),
         (
             ["own.py:CellConfig"],
             "Expected a model that can be trained, fused, .*mdn.* got 'own.py:CellConfig'",
