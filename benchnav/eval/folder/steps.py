@@ -90,9 +90,8 @@ def open_steps(folder: Path) -> ds.Dataset | None:
         # By its type, since an id of digits alone would be taken for a number.
         parts = ds.partitioning(pa.schema([("condition", pa.string())]), flavor="hive")
         source = ds.dataset(folder / STEPS, partitioning=parts)
-        if not (
-            folder / EPISODES
-        ).exists():  # files of a run that is not finished may differ in their columns
+        # Files of a run that is not finished may differ in their columns.
+        if not (folder / EPISODES).exists():
             schemas = [fragment.physical_schema for fragment in source.get_fragments()]
             source = source.replace_schema(pa.unify_schemas([source.schema, *schemas]).remove_metadata())
         return source
