@@ -13,6 +13,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.touched import _is_installed, _is_own, changes_since
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.provenance import code_differences
+from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.folder.sealed import metadata
 from benchnav.eval.run import runner
 from benchnav.eval.run.runner import run_suite
@@ -91,14 +92,14 @@ def paths(own: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         cached.cache_clear()
 
 
-def run(own: Path, dataset: Path, name: str, planner_limit_s: float = 0.0) -> list[str]:
+def run(own: Path, dataset: Path, name: str, planner_limit_s: float = 0.0, **options: bool) -> list[str]:
     """Run the part and a shipped planner; gives what was said."""
     suite = Suite(
         data=str(dataset), model="oracle", planners=(f"{own / 'part.py'}:Own", "straight"), risks=("mean",),
         scenarios=("std",), maps=2, world={"time_budget_s": 2.0}, record="none",
     )  # fmt: skip
     lines: list[str] = []
-    list(run_suite(suite, own.parent / name, planner_limit_s=planner_limit_s, say=lines.append))
+    list(run_suite(suite, own.parent / name, planner_limit_s=planner_limit_s, say=lines.append, **options))
     return [line for line in lines if not line.startswith("warning: ")]
 
 
@@ -127,6 +128,9 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
 
     monkeypatch.setenv("OWN_GAIN", "0.5")
     assert changes_since(touched) == ["variable OWN_GAIN"]
+    assert run(own, dataset_path, "run", reuse_code=True) == ["2 of 2 units were there already"]
+    reused = open_run(own.parent / "run").about["reused"]
+    assert reused.startswith("1 of 2 units were made by other code (variable OWN_GAIN)")
     (own / "speed.json").write_text("0.4")
     (own / "helper.py").write_text("FACTOR = 0.9")
     _install(own.parent / "site", "2.0")
