@@ -26,7 +26,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 class Installers:
-    """Records commands in place of running them; those with `failing` in them fail."""
+    """Records commands in place of running them; those with `failing` in them fail, and pip's last has status 3."""
 
     def __init__(self, listing: str = "", failing: str = "\0") -> None:
         self.listing, self.failing = listing, failing
@@ -39,7 +39,8 @@ class Installers:
             raise subprocess.CalledProcessError(2, command, stderr="error: no\nmore")
         if command[2] == "uv":
             self.variables = env
-        return subprocess.CompletedProcess(command, 0, self.listing, "")
+        status = 3 if command[2] == "pip" and "--editable" in command else 0
+        return subprocess.CompletedProcess(command, status, self.listing, "")
 
 
 def test_settings_of_pip_go_to_uv_and_variables_of_uv_go_first(
@@ -87,7 +88,7 @@ def test_pip_installs_where_uv_does_not(
     why: str,
 ) -> None:
     monkeypatch.setattr(subprocess, "run", installers.run)
-    assert install.main() == 0
+    assert install.main() == 3
     said = capsys.readouterr().err
     assert said == f"benchnav: installing with pip, several minutes, since uv failed: {why}\n"
     assert installers.commands[-1][0] == "pip"

@@ -259,19 +259,22 @@ def test_what_is_moved_is_where_the_table_says() -> None:
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A package in place of this one: `unit` imports `rows`, late; nothing imports `drawing`."""
     place = tmp_path / "benchnav"
     place.mkdir()
     (place / "__init__.py").write_text("from benchnav import drawing\n")
-    (place / "unit.py").write_text("def run():\n    from benchnav import rows\n    return rows\n")
+    (place / "unit.py").write_text(
+        "import aid\n\ndef run():\n    from benchnav import rows\n    return rows\n"
+    )
+    (tmp_path / "aid.py").write_text("")
     (place / "rows.py").write_text(
         '"""Rows."""\n\n\ndef row():\n    """One row."""\n    return 1  # of many\n'
     )
     (place / "drawing.py").write_text("colour = 'blue'\n")
     monkeypatch.setattr(sources, "PACKAGE", place)
+    yield place
     sources._module.cache_clear()
-    return place
 
 
 def digests() -> dict[str, str]:
