@@ -116,15 +116,15 @@ class World:
             ConfigError: If there is none, or more than `MAX_STEPS`.
         """
         steps = (budget_s / dt_s).round()
-        least, most = float(budget_s.min()), float(budget_s.max())
-        expect(
-            bool((steps >= 1).all()),
-            f"a time budget of at least one time step of {dt_s:g} s, got {least:g} s.",
-        )
-        expect(
-            bool((steps <= MAX_STEPS).all()),
-            f"a time budget of at most {MAX_STEPS:,} time steps of {dt_s:g} s, got {most:g} s.",
-        )
+        if bool((~(steps >= 1)).any()):
+            raise ConfigError(
+                f"Expected a time budget of at least one time step of {dt_s:g} s, got {float(budget_s.min()):g} s."
+            )
+        if bool((steps > MAX_STEPS).any()):
+            raise ConfigError(
+                f"Expected a time budget of at most {MAX_STEPS:,} time steps of {dt_s:g} s, got "
+                f"{float(budget_s.max()):g} s."
+            )
         return steps.long()
 
     def to_dict(self) -> dict[str, Any]:
