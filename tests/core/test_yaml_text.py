@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchnav.core.errors import ConfigError
@@ -34,11 +34,13 @@ def test_yaml_has_numbers_with_exponents_and_mappings_without_values(tmp_path: P
         read_yaml(tmp_path)
 
 
+@settings(deadline=None)
 @given(DATA)
 def test_what_is_written_as_yaml_is_read_back(data: Any) -> None:
     assert load_yaml(yaml.safe_dump(data)) == data
 
 
+@settings(deadline=None)
 @given(st.dictionaries(KEYS, st.integers(), min_size=1, max_size=6), st.data())
 def test_a_key_twice_is_refused_wherever_it_stands(data: dict[str, int], draw: st.DataObject) -> None:
     lines = yaml.safe_dump(data).splitlines()
