@@ -144,17 +144,18 @@ def test_a_bag_becomes_a_log_of_drives(tmp_path: Path) -> None:
     np.testing.assert_allclose(rows["commanded_m_s"], wanted)
 
 
-def evaluate(dataset: Path, folder: Path, *flags: str) -> pd.DataFrame:
-    """Runs `benchnav-eval run` with two jobs, as a user does, and gives the rows."""
-    command = [
-        Path(sys.executable).with_name("benchnav-eval"), "run", "--data", dataset, "--model", "oracle",
-        "--maps", "2", "--scenarios", "[std]", "--record", "none", "--jobs", "2", "--out", "run",
-        "--world.time_budget_s", "60",
+def evaluate(dataset: Path, folder: Path, *flags: str, jobs: int = 1) -> pd.DataFrame:
+    """Runs `benchnav-eval run` and gives the rows; with two jobs in processes of its own, as a user does."""
+    words = [
+        "run", "--data", str(dataset), "--model", "oracle", "--maps", "2", "--scenarios", "[std]", "--record", "none",
+        "--jobs", str(jobs), "--out", str(folder / "run"), "--world.time_budget_s", "60", *flags,
     ]  # fmt: skip
-    done = subprocess.run(
-        [*map(str, command), *flags], cwd=folder, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
+    if jobs == 1:
+        assert call("eval", *words) == 0
+    else:
+        command = [str(Path(sys.executable).with_name("benchnav-eval")), *words]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
     return pd.read_parquet(folder / "run" / "episodes.parquet")
 
 
@@ -169,6 +170,7 @@ def test_a_planner_and_a_risk_measure_of_ones_own_by_file(dataset_path: Path, tm
         "[straight,./own_planner.py:Fan]",
         "--risks",
         "[mean,./own_risk.py:worst]",
+        jobs=2,
     )
     cells = rows.groupby(["planner", "risk"]).size()
     assert dict(cells) == {("straight", "–"): 2, ("Fan", "mean"): 2, ("Fan", "worst"): 2}

@@ -175,19 +175,21 @@ def test_planners_with_a_time_limit_have_processes_of_their_own_on_workers_too(
     same(tmp_path / "here", tmp_path / "cluster", without=("code",))  # of which a time limit is part
 
 
-def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(dataset_path: Path, tmp_path: Path) -> None:
+def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(
+    cluster_of_two: Cluster, dataset_path: Path, tmp_path: Path
+) -> None:
+    """The last test of the cluster, which it ends."""
     suite = suite_on(dataset_path, tmp_path / "log")
-    lost = Cluster(tmp_path, 1)
-    (tmp_path / "log.hold").write_text(f"{lost.workers[0].pid} 5")
-    try:
-        steps = run_suite(suite, tmp_path / "run", scheduler=lost.address)
-        while next(steps).done < 4:
-            pass
-        lost.scheduler.kill()
-        with pytest.raises(BenchnavError, match=r"was lost\. Finished work is kept"):
-            list(steps)
-    finally:
-        lost.stop()
+    gone, worker = cluster_of_two.workers
+    gone.kill()
+    (tmp_path / "log.hold").write_text(f"{worker.pid} 5")
+    steps = run_suite(suite, tmp_path / "run", scheduler=cluster_of_two.address)
+    while next(steps).done < 4:
+        pass
+    cluster_of_two.scheduler.kill()
+    with pytest.raises(BenchnavError, match=r"was lost\. Finished work is kept"):
+        list(steps)
+    cluster_of_two.stop()
     kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").glob("units/*/*.parquet")}
     assert len(kept) == 4
     list(run_suite(suite, tmp_path / "run"))

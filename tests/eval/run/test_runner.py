@@ -115,6 +115,14 @@ def finished(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> tu
     return suite, folder
 
 
+@pytest.fixture(scope="module")
+def brief(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of `quick`, to be copied."""
+    folder = tmp_path_factory.mktemp("brief") / "run"
+    finish(quick(dataset_path), folder)
+    return folder
+
+
 def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> None:
     _, folder = finished
     episodes = pd.read_parquet(folder / "episodes.parquet")
@@ -218,11 +226,14 @@ def is_alive(group: int) -> bool:
     return True
 
 
-def test_the_same_suite_again_runs_nothing_and_says_so(dataset_path: Path, tmp_path: Path) -> None:
-    suite, said = quick(dataset_path), []
-    first = finish(suite, tmp_path / "run")
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").glob("units/*/*")}
-    again = finish(suite, tmp_path / "run", say=said.append)
+def test_the_same_suite_again_runs_nothing_and_says_so(
+    brief: Path, dataset_path: Path, tmp_path: Path
+) -> None:
+    said: list[str] = []
+    folder = shutil.copytree(brief, tmp_path / "run")
+    first = pd.read_parquet(folder / "episodes.parquet")
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")}
+    again = finish(quick(dataset_path), folder, say=said.append)
     pd.testing.assert_frame_equal(first, again)
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert said == ["4 of 4 units were there already"]
@@ -244,10 +255,15 @@ def test_the_same_suite_again_runs_nothing_and_says_so(dataset_path: Path, tmp_p
     ],
 )
 def test_a_run_is_extended_by_what_is_missing(
-    change: dict[str, object], conditions: int, rows: int, kept: int, dataset_path: Path, tmp_path: Path
+    change: dict[str, object],
+    conditions: int,
+    rows: int,
+    kept: int,
+    brief: Path,
+    dataset_path: Path,
+    tmp_path: Path,
 ) -> None:
-    folder = tmp_path / "run"
-    finish(quick(dataset_path), folder)
+    folder = shutil.copytree(brief, tmp_path / "run")
     before = {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")}
     extended = finish(quick(dataset_path, **change), folder)
     assert (extended["condition"].nunique(), len(extended)) == (conditions, rows)
