@@ -16,20 +16,23 @@ BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 9)
 )
 
+# What makes a suite short, so that one which is not refused ends soon.
+SHORT = "data: d.h5\nmodel: oracle\nscenarios: [std]\nplanners: [straight]\n"
+
 # Suites, by what is wrong with them: `eval run --config NAME.yaml --out o` is tried with each.
 SUITES: dict[str, str | bytes] = {
     # keys twice
-    "twice": "maps: 1\nmaps: 2\n",
-    "twice-far": "maps: 1\nseed: 3\nrisks: [mean]\nmaps: 1\n",
-    "twice-inner": "world: {noise: stored, noise: frozen}\n",
+    "twice": SHORT + "maps: 1\nmaps: 2\n",
+    "twice-far": SHORT + "maps: 1\nseed: 3\nrisks: [mean]\nmaps: 1\n",
+    "twice-inner": SHORT + "maps: 1\nworld: {noise: stored, noise: frozen}\n",
     "twice-in-list": "conditions:\n- planners: [straight]\n  planners: [mppi]\n",
     "twice-deep": "planners:\n- part: mppi\n  options: {samples: 8, samples: 16}\n",
     "twice-null": "world: {0: null, 0: null}\n",
     "twice-equal": "world: {1: a, 1.0: b}\n",
     "twice-without-values": "{maps, maps}\n",
-    "twice-dotted": "world.noise: stored\nworld.noise: frozen\n",
-    "twice-dotted-first": "world.noise: stored\nworld: {noise: frozen}\n",
-    "twice-dotted-last": "world: {noise: stored}\nworld.noise: frozen\n",
+    "twice-dotted": SHORT + "maps: 1\nworld.noise: stored\nworld.noise: frozen\n",
+    "twice-dotted-first": SHORT + "maps: 1\nworld.noise: stored\nworld: {noise: frozen}\n",
+    "twice-dotted-last": SHORT + "maps: 1\nworld: {noise: stored}\nworld.noise: frozen\n",
     # structure
     "recursive": "conditions: &a [*a]\n",
     "recursive-mapping": "world: &a {preset: *a}\n",
