@@ -21,7 +21,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from functools import cache
+from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
 from pathlib import Path
 from types import FrameType
@@ -324,7 +324,8 @@ def _content(name: str) -> bytes:
 
 def _versions(modules: Iterable[str]) -> dict[str, str]:
     """Return the versions of the distributions of modules and of what these require, as far as it is loaded."""
-    distributions = packages_distributions()
+    places = _places()
+    distributions = _distributions(places)
     loaded = {name.partition(".")[0] for name in list(sys.modules)}
     there = {dist for package in loaded for dist in distributions.get(package, ())}
     tops = {name.partition(".")[0] for name in modules} & loaded
@@ -335,13 +336,35 @@ def _versions(modules: Iterable[str]) -> dict[str, str]:
         dist = todo.pop()
         if dist in versions or _normal(dist) == PACKAGE.name:
             continue
-        versions[dist] = version(dist)
-        for text in requires(dist) or ():
-            with suppress(InvalidRequirement):
-                required = Requirement(text)
-                if required.marker is None or required.marker.evaluate({"extra": ""}):
-                    todo += [by_name[name] for name in [_normal(required.name)] if name in by_name]
+        versions[dist], required = _metadata(places, dist)
+        todo += [by_name[name] for name in required if name in by_name]
     return versions
+
+
+def _places() -> tuple[tuple[str, int], ...]:
+    """Return where modules are looked for, with the times at which the folders changed last, as installing does."""
+    return tuple(
+        (place, os.stat(place or ".").st_mtime_ns if os.path.exists(place or ".") else 0)
+        for place in sys.path
+    )
+
+
+@lru_cache(maxsize=1)
+def _distributions(places: tuple[tuple[str, int], ...]) -> Mapping[str, list[str]]:
+    """Return the installed distributions of each top-level module; to look takes a quarter of a second."""
+    return packages_distributions()
+
+
+@lru_cache(maxsize=1024)
+def _metadata(places: tuple[tuple[str, int], ...], dist: str) -> tuple[str, tuple[str, ...]]:
+    """Return the version of a distribution, and the names that it requires here."""
+    required = []
+    for text in requires(dist) or ():
+        with suppress(InvalidRequirement):
+            requirement = Requirement(text)
+            if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+                required.append(_normal(requirement.name))
+    return version(dist), tuple(required)
 
 
 def _normal(name: str) -> str:
