@@ -35,6 +35,10 @@ LAWS = {
 EACH = pytest.mark.parametrize("law", LAWS.values(), ids=LAWS.keys())
 
 
+def these(*names: str) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("law", [LAWS[name] for name in names], ids=names)
+
+
 def close(found: Tensor, wanted: Tensor, relative: float = 0.0) -> None:
     assert found.dtype == wanted.dtype
     torch.testing.assert_close(found, wanted, rtol=relative, atol=0 if relative else 1e-4)
@@ -72,7 +76,7 @@ def test_the_chance_of_a_cdf_is_that_of_the_exact_form(law: TraversabilityDistri
     close(Hidden(law).chance(bound), law.chance(bound))
 
 
-@EACH
+@these("wide", "narrow", "wide and narrow", "points", "many", "quantiles")
 def test_the_crps_of_a_cdf_is_the_integral_that_defines_it(law: TraversabilityDistribution) -> None:
     observed = torch.rand(law.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     observed[0, 0, :2] = torch.tensor([0.0, 1.0])
@@ -80,9 +84,11 @@ def test_the_crps_of_a_cdf_is_the_integral_that_defines_it(law: TraversabilityDi
         close(Hidden(law).crps(observed), law.crps(observed))
         return
     count = 20_000  # a midpoint rule, off by half a step times all rises of a monotone function
-    total = torch.zeros_like(observed)
-    for x in (torch.arange(count, dtype=torch.float64) + 0.5) / count:
-        total += (law.cdf(float(x)) - (observed <= x).double()).square()
+    total, many = torch.zeros_like(observed), law.select(torch.arange(len(observed)).repeat(500))
+    for points in ((torch.arange(count, dtype=torch.float64) + 0.5) / count).view(-1, 500, 1, 1, 1):
+        x = points.expand(-1, *observed.shape)
+        below = many.cdf(x.flatten(0, 1)).view_as(x)
+        total += (below - (observed <= x).double()).square().sum(0)
     close(Hidden(law).crps(observed), total / count)
 
 
@@ -162,7 +168,7 @@ def test_levels_and_floors_out_of_range_are_refused(value: float) -> None:
         Hidden(mixture(1, 0.1, 0.2)).expected_time(value + 0.5 if value == 1 else value)
 
 
-@EACH
+@these("wide and narrow", "20 points", "quantiles")
 def test_the_integrals_of_a_cell_are_its_own_however_many_others_there_are(
     law: TraversabilityDistribution, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,10 +12,13 @@ import pytest
 import torch
 
 
-@pytest.mark.parametrize("cases", ["units", "models", *(["gpu"] if torch.cuda.is_available() else [])])
-def test_cases_on_another_device(cases: str) -> None:
+@pytest.mark.parametrize(
+    "cases", [("units", "models"), *([("gpu",)] if torch.cuda.is_available() else [])], ids=" and ".join
+)
+def test_cases_on_another_device(cases: tuple[str, ...]) -> None:
     here = Path(__file__).parent
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", str(here / f"{cases}.py")]
+    files = [str(here / f"{name}.py") for name in cases]
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *files]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     done = subprocess.run(command, cwd=here.parents[1], env=environment, capture_output=True, text=True)
     if done.returncode == pytest.ExitCode.NO_TESTS_COLLECTED:

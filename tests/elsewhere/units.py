@@ -39,7 +39,7 @@ from tests.elsewhere.device import elsewhere, waits
 
 SMALL = {"samples": 20, "horizon_s": 0.4}
 DWA = {"part": "astar_dwa", "options": {"dwa": {"speeds": 3, "turn_rates": 3, "horizon_s": 0.4}}}
-CL_RRT = {"part": "cl_rrt", "options": {"expansions": 50, "edge_time_s": 3.0}}
+CL_RRT = {"part": "cl_rrt", "options": {"expansions": 12, "edge_time_s": 3.0}}
 MPPI = {"part": "mppi", "options": SMALL}
 GUIDED = {"part": "astar_mppi", "label": "guided", "options": {"mppi": SMALL}}
 
@@ -87,7 +87,6 @@ def made(folder: Path) -> dict[str, Any]:
         {"planners": (GUIDED,)},
         {"planners": (CL_RRT,)},
         {"planners": (faulty("nan"),)},
-        {"planners": (faulty("give up"),)},
         {"planners": (faulty("raise"),)},
         {"world": {"noise": "frozen", "immobile": {"below": 0.2, "for_s": 0.5}}},
         {"planners": (DWA,), "world": {"noise": "stored"}, "model": "ideal"},
@@ -128,7 +127,6 @@ def test_a_unit_is_the_same_on_another_device(
     [
         ("straight", "unicycle"),
         (DWA, "unicycle"),
-        (DWA, "differential_drive"),
         (MPPI, "differential_drive"),
         (GUIDED, "unicycle"),
     ],
@@ -138,7 +136,7 @@ def test_nothing_waits_for_a_device_at_every_step(
     planner: Any, robot: str, dataset_path: Path, tmp_path: Path
 ) -> None:
     counted = []
-    for budget_s in (0.8, 2.4):  # neither is enough to arrive
+    for budget_s in (0.4, 1.2):  # neither is enough to arrive
         unit = unit_of(dataset_path, planners=(planner,), robots=(robot,), world={"time_budget_s": budget_s})
         unit = replace(unit, record="steps")
         with elsewhere() as device:
@@ -146,8 +144,8 @@ def test_nothing_waits_for_a_device_at_every_step(
             counted.append(len(waits))
         (path,) = tmp_path.glob(f"{budget_s:g}/units/**/*.parquet")
         assert pd.read_parquet(path)["end_time_s"].to_list() == pytest.approx([budget_s] * 2)
-    # 16 steps more, and a look at every eighth.
-    assert counted[1] - counted[0] <= 16 / 8 + 1
+    # 8 steps more, and a look at every eighth.
+    assert counted[1] - counted[0] <= 8 / 8 + 1
 
 
 class Exhausted(Planner[Problem]):
