@@ -36,7 +36,7 @@ demo: $(STAMP)
 # processors works while others wait for commands. They plan on many small maps, each of which would be compiled for; what
 # is compiled is tried in tests of its own. Commands and workers share bytecode, even where the environment forbids it.
 test: $(STAMP)
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 TORCH_COMPILE_DISABLE=1 $(BIN)/python -m pytest -n $$(($(JOBS) + 1)) --dist loadfile --no-loadscope-reorder
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 TORCH_COMPILE_DISABLE=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 # A page that is not well-formed, or a link that leads nowhere, fails the build.
 docs: $(STAMP)

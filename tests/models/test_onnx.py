@@ -83,7 +83,13 @@ MODELS = {
 }
 
 
-@pytest.mark.parametrize("name", MODELS)
+# To write a graph takes ten seconds and more.
+QUICK = ("fused", "quantile calibrated")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in MODELS]
+)
 def test_the_runtime_gives_what_the_model_gives(name: str, tmp_path: Path) -> None:
     pytest.importorskip("onnxscript", reason="the extra onnx is not installed")
     model, path = MODELS[name](), tmp_path / "model.onnx"

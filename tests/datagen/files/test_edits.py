@@ -21,7 +21,7 @@ from tests.commands import call
 from tests.factories import tiny_dataset, tiny_recipe
 
 EDITS = pytest.mark.parametrize(
-    "seeds", [range(50), pytest.param(range(50, 350), marks=pytest.mark.slow)], ids=["50", "300"]
+    "seeds", [range(30), pytest.param(range(30, 350), marks=pytest.mark.slow)], ids=["30", "320"]
 )
 VALUES: list[Any] = [None, -1, 0, 3, 10**30, 0.5, "", "x", "../x.h5", [], {}, True]
 

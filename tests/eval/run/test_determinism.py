@@ -62,7 +62,7 @@ def test_conditions_that_do_not_repeat_are_named_with_the_cause(dataset_path: Pa
     names = ("Steady", "Clock", "Python", "NumPy", "Torch", "Counting")
     suite = Suite(
         data=str(dataset_path), model="oracle", planners=tuple(f"{tmp_path / 'parts.py'}:{name}" for name in names),
-        risks=("mean",), scenarios=("std",), maps=2, world={"time_budget_s": 2.0}, record="none",
+        risks=("mean",), scenarios=("std",), maps=2, world={"time_budget_s": 0.6}, record="none",
     )  # fmt: skip
     said: list[str] = []
     count, lines = check_determinism(suite, said.append)

@@ -190,8 +190,16 @@ SENSES = [
 ]
 
 
-@pytest.mark.parametrize("name", SHIPPED)
-@pytest.mark.parametrize(("sensor", "ground", "belief"), SENSES)
+# Every planner meets every sensor, ground sensor and belief, and every combination some planner.
+@pytest.mark.parametrize(
+    ("name", "sensor", "ground", "belief"),
+    [
+        (name, *sense)
+        for place, name in enumerate(SHIPPED)
+        for number, sense in enumerate(SENSES)
+        if (place + number) % 3 == 0
+    ],
+)
 def test_what_was_not_sensed_changes_no_action(
     name: str, sensor: Sensor, ground: Sensor, belief: str
 ) -> None:

@@ -66,19 +66,27 @@ def risk_maps(dataset: TerrainDataset, scenario: str, risk: str) -> torch.Tensor
     return RISKS[risk](dataset.terrain(f"test/{scenario}").truth)
 
 
+@lru_cache(maxsize=None)
+def ground_at_start(dataset: TerrainDataset, scenario: str, map_index: int) -> tuple[float, float, float]:
+    """λ, and mean and standard deviation of the distribution it was drawn from."""
+    terrain = dataset.terrain(f"test/{scenario}", [map_index])
+    row, column = int(4.0 // 0.5), int(3.0 // 0.5)
+    mean, std = (float(t[0, 0, row, column]) for t in (terrain.truth.means, terrain.truth.stds))
+    return float(terrain.traversability[0, row, column]), mean, std
+
+
+@lru_cache(maxsize=None)
 def expected_noise(
     dataset: TerrainDataset, scenario: str, map_index: int, seed: int, realisation: int, noise: str
 ) -> np.ndarray:
     """λ of the first three steps at the start, from the streams."""
-    terrain = dataset.terrain(f"test/{scenario}", [map_index])
-    row, column = int(4.0 // 0.5), int(3.0 // 0.5)
+    stored, mean, std = ground_at_start(dataset, scenario, map_index)
     if noise == "stored":
-        return np.full(3, float(terrain.traversability[0, row, column]))
+        return np.full(3, stored)
     names = (f"test/{scenario}", realisation) if realisation else (f"test/{scenario}",)
     key = rng.stream_key(rng.stream_key(seed, "simulation", *names), map_index)
     drawn = rng.normal(key, np.zeros(1, np.int64), (6,))[0, :3]
-    mean, std = (t[0, 0, row, column] for t in (terrain.truth.means, terrain.truth.stds))
-    return np.clip(float(mean) + float(std) * drawn, 0, 1)
+    return np.clip(mean + std * drawn, 0, 1)
 
 
 def identify(dataset: TerrainDataset, note: dict[str, Any]) -> tuple[str, str, tuple[int, ...]]:

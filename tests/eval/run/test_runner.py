@@ -242,11 +242,9 @@ def test_the_same_suite_again_runs_nothing_and_says_so(
 @pytest.mark.parametrize(
     ("change", "conditions", "rows", "kept"),
     [
-        ({"risks": ("cvar", "mean", "var")}, 6, 12, 4),
         ({"risks": ("var",)}, 6, 12, 4),
         ({"planners": ("tests.eval.parts:Faulty", "straight")}, 6, 12, 4),
         ({"models": ("oracle", "tests.eval.parts:Gaussian")}, 8, 16, 4),
-        ({"seeds": (0, 5)}, 4, 16, 4),
         ({"seed": 5}, 4, 16, 4),
         ({"seed": 5, "maps": 1}, 4, 12, 4),
         ({"realisations": 3}, 4, 24, 4),
