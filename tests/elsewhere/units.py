@@ -89,10 +89,9 @@ def made(folder: Path) -> dict[str, Any]:
         {"planners": (faulty("nan"),)},
         {"planners": (faulty("raise"),)},
         {"world": {"noise": "frozen", "immobile": {"below": 0.2, "for_s": 0.5}}},
-        {"planners": (DWA,), "world": {"noise": "stored"}, "model": "ideal"},
         {"planners": (DWA,), "world": {"noise": "frozen"}, "model": "clairvoyant"},
         {"planners": (DWA,), "risks": ("expected-time",)},
-        {"planners": (DWA,), "risks": ("var:0.9",)},
+        {"planners": (DWA,), "world": {"noise": "stored"}, "model": "ideal", "risks": ("var:0.9",)},
         {"planners": (DWA,), "model": "tests.eval.parts:Broken"},
     ],
 )

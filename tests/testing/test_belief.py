@@ -20,7 +20,7 @@ from benchnav.planning.sensing.sensor import Sensed
 from benchnav.testing import check_belief
 from tests.testing.refusal import refusal
 
-SMALL = ((6, 8),)
+SMALL, FEW = ((6, 8),), 50
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "at of all": (giving("at", lambda _, s, __: s.prior), "from `at`, got [4, 6, 8]"),
     "at of the prediction": (giving("at", lambda _, s, cells: s.prior.at(cells)), "Expected mean and CVaR of `at`"),
-    "too few fields": (giving("sample_fields", lambda f, *_: f[:, 0]), "Expected fields of shape [4, 200, 6, 8]"),
+    "too few fields": (giving("sample_fields", lambda f, *_: f[:, 0]), "Expected fields of shape [4, 50, 6, 8]"),
     "fields of no λ": (giving("sample_fields", lambda f, *_: f + 1), "Expected fields of λ in [0, 1]"),
     "fields without keys": (giving("sample_fields", unkeyed), "Expected other fields under other keys"),
     "fields by place": (giving("sample_fields", in_turn), "fields to be those of its own key"),
@@ -179,7 +179,8 @@ BAD: dict[str, tuple[Any, str]] = {
 
 
 @pytest.mark.parametrize(("belief", "expected"), BAD.values(), ids=BAD.keys())
-def test_a_breach_is_caught_and_named(belief: Any, expected: str) -> None:
+def test_a_breach_is_caught_and_named(belief: Any, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("benchnav.testing.belief._FIELDS", FEW)
     assert expected in refusal(lambda one: check_belief(one, SMALL), belief)
 
 

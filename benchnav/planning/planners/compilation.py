@@ -25,7 +25,14 @@ R = TypeVar("R")
 def can_compile() -> bool:
     """Tells whether anything is compiled here: PyTorch's switch is not off, and there is a C++ compiler."""
     compilers = (os.environ.get("CXX", ""), "g++", "clang++")
-    return not torch._dynamo.config.disable and any(shutil.which(name) for name in compilers if name)
+    return not _is_switched_off() and any(shutil.which(name) for name in compilers if name)
+
+
+def _is_switched_off() -> bool:
+    """Return whether PyTorch compiles nothing; its compiler, which takes a second to import, need not be loaded."""
+    if "torch._dynamo" in sys.modules:
+        return bool(torch._dynamo.config.disable)
+    return os.environ.get("TORCH_COMPILE_DISABLE") == "1"
 
 
 def worth_compiling(rollouts: int, least: int, device: torch.device) -> bool:
@@ -60,7 +67,7 @@ class Fused(Generic[R]):
     def __call__(self, *args: Any) -> R:
         """Calls the function."""
         if self.compiled is None and (
-            torch._dynamo.config.disable or not worth_compiling(self._rollouts, self._least, args[0].device)
+            _is_switched_off() or not worth_compiling(self._rollouts, self._least, args[0].device)
         ):
             self.compiled = False
         if self.compiled is False:

@@ -6,7 +6,7 @@ workers; expectations are worked out here from the dataset and the random stream
 
 from collections import Counter
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -61,12 +61,12 @@ def ran(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -> tu
     return notes, pd.read_parquet(folder / "run" / "episodes.parquet")
 
 
-@lru_cache
+@cache
 def risk_maps(dataset: TerrainDataset, scenario: str, risk: str) -> torch.Tensor:
     return RISKS[risk](dataset.terrain(f"test/{scenario}").truth)
 
 
-@lru_cache(maxsize=None)
+@cache
 def ground_at_start(dataset: TerrainDataset, scenario: str, map_index: int) -> tuple[float, float, float]:
     """λ, and mean and standard deviation of the distribution it was drawn from."""
     terrain = dataset.terrain(f"test/{scenario}", [map_index])
@@ -75,7 +75,7 @@ def ground_at_start(dataset: TerrainDataset, scenario: str, map_index: int) -> t
     return float(terrain.traversability[0, row, column]), mean, std
 
 
-@lru_cache(maxsize=None)
+@cache
 def expected_noise(
     dataset: TerrainDataset, scenario: str, map_index: int, seed: int, realisation: int, noise: str
 ) -> np.ndarray:

@@ -185,7 +185,6 @@ def test_an_episode_that_does_not_repeat_is_refused(name: str, dataset: Path, tm
     ("record", "expected"),
     [
         ("none", lambda rows: rows["map"] < 0),
-        ("steps", lambda rows: rows["map"] < 0),
         ("first", lambda rows: (rows["map"] == 0) & (rows["seed"] == SEEDS[0])),
         ("failures", lambda rows: ~rows["success"] | ((rows["map"] == 0) & (rows["seed"] == SEEDS[0]))),
         ("all", lambda rows: rows["map"] >= 0),

@@ -190,7 +190,7 @@ def test_a_class_that_was_not_measured_is_shaded_throughout(dataset: TerrainData
 
 
 @pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's where a layout does not work out
-@pytest.mark.parametrize("count", [1, 5])
+@pytest.mark.parametrize("count", [1, 2, 4, 5])
 def test_every_number_of_splits_can_be_drawn(count: int, qualities: Qualities) -> None:
     many = {f"split-{number}": qualities["valid"] for number in range(count)}
     sure = {
