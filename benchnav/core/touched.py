@@ -14,6 +14,7 @@ packages, and temporary and cache folders, unless the file lies below the folder
 """
 
 import hashlib
+import importlib
 import inspect
 import os
 import sys
@@ -21,10 +22,10 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from functools import cache, lru_cache
+from functools import cache, lru_cache, wraps
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
 from pathlib import Path
-from types import FrameType
+from types import FrameType, ModuleType
 from typing import Any
 
 from packaging.requirements import InvalidRequirement, Requirement
@@ -66,6 +67,7 @@ def watch(part_folder: Path | None = None) -> None:
     if not _watching:
         _watching = True
         sys.addaudithook(_hook)
+        importlib.import_module = _watched(importlib.import_module)
         os.environ.__class__ = _WatchedEnviron
 
 
@@ -192,6 +194,19 @@ def _note_read(path: str) -> None:
         _state.is_noting = False
     for source in sources:
         _files.setdefault(source, {})[name] = _digests[version]
+
+
+def _watched(import_module: Callable[..., ModuleType]) -> Callable[..., ModuleType]:
+    """Return `importlib.import_module`, which raises no audit event, as a function that notes the name."""
+
+    @wraps(import_module)
+    def watched(name: str, package: str | None = None) -> ModuleType:
+        module = import_module(name, package)
+        for source in _calling_sources():
+            _modules.setdefault(source, set()).add(module.__name__)
+        return module
+
+    return watched
 
 
 class _WatchedEnviron(type(os.environ)):  # type: ignore[misc]

@@ -18,6 +18,7 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder.results import newest_units, read_results
 from benchnav.eval.folder.run_folder import EPISODES, KEYS, open_run
+from benchnav.eval.folder.steps import open_steps
 from benchnav.eval.report.write import write_report
 from benchnav.eval.run.recordings import find_recording, record_driven
 from benchnav.eval.run.runner import run_suite
@@ -171,6 +172,12 @@ def test_episodes_of_finished_units_are_replayed_while_the_run_goes_on(running: 
     # Of what is not named the first condition that has rows is taken.
     ((unit, member),) = find_episodes(running, {}, 1, 0, 1)
     assert known[unit.condition.labels["risk"]] is not None
+    mean = next(iter(open_run(running).conditions))
+    (lost,) = running.glob(f"units/{mean}/0-*")
+    lost.rename(tmp_path / "lost")
+    ((other, _),) = find_episodes(running, {}, 0, 0, 1)
+    assert (other.seed, other.condition.labels["risk"]) == (0, "cvar")
+    (tmp_path / "lost").rename(lost)
     recording = find_recording(running, unit, member, tmp_path / "out")
     rows = read_results(running, partial=True).episodes
     row = rows[(rows["condition"] == unit.condition.id) & (rows["seed"] == 1) & (rows["map"] == 1)].iloc[0]
@@ -218,6 +225,9 @@ def test_steps_of_robots_with_other_actions_are_read_before_they_are_aligned(
     for step in steps:
         if step.done == 2:
             break
+    known = open_steps(tmp_path / "run")
+    assert known is not None
+    assert {"turn_rate_radps", "steering_rad"} <= set(known.schema.names)
     report = write_report(tmp_path / "run", lambda rows: record_driven(tmp_path / "run", rows), partial=True)
     assert not report.sheets.left_out
     assert {one.about["robot"] for _, lines in report.sheets.shown for line in lines for one in line.recordings} == {

@@ -1,5 +1,6 @@
 """What a user's own part reads is recorded with its units, and a unit is run again when that has changed."""
 
+import runpy
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -10,7 +11,8 @@ import pytest
 
 from benchnav.core import sources
 from benchnav.core.errors import ConfigError
-from benchnav.core.touched import _is_installed, _is_own, changes_since
+from benchnav.core.touched import _is_installed, _is_own, changes_since, snapshot, watch
+from benchnav.core.workers import run_calls
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.provenance import code_differences
 from benchnav.eval.folder.run_folder import open_run
@@ -21,7 +23,7 @@ from benchnav.eval.run.runner import run_suite
 CACHES: tuple[Any, ...] = (sources.installed_folders, _is_own, _is_installed)
 
 PART = """
-import importlib, json, os, sys, tempfile
+import importlib, json, os
 from pathlib import Path
 
 import torch
@@ -35,15 +37,13 @@ class Own(Planner):
     steers = (("speed_mps", "turn_rate_radps"),)
 
     def init(self, problem, generator):
-        import ownlib
-
+        importlib.import_module("".join(["own", "lib"]))
         self.gain = float(os.environ.get("OWN_GAIN", "1"))
         dict(os.environ), {**os.environ}, list(os.environ.items())
         self.helper = importlib.import_module("".join(["hel", "per"]))
         (HERE / "log.txt").write_text("output")
         (HERE / "log.txt").read_text()
-        with tempfile.TemporaryFile() as file:
-            file.write(b"x")
+        (HERE.parent / "passing.txt").read_text()  # in the temporary folder, and not beside the part
         return 0
 
     def plan(self, step, plan_state):
@@ -65,6 +65,7 @@ def own(tmp_path: Path) -> Path:
     (folder / "part.py").write_text(PART)
     (folder / "helper.py").write_text("FACTOR = 1.0")
     (folder / "speed.json").write_text("0.5")
+    (tmp_path / "passing.txt").write_text("nothing")
     return folder
 
 
@@ -73,7 +74,9 @@ def _install(site: Path, version: str) -> None:
         shutil.rmtree(info)
     info = site / f"ownlib-{version}.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: ownlib\nVersion: {version}\n")
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: ownlib\nVersion: {version}\nRequires-Dist: pandas\n"
+    )
     (info / "top_level.txt").write_text("ownlib\n")
     (info / "RECORD").write_text("ownlib/__init__.py,,\n")
 
@@ -126,8 +129,9 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
         "variable OWN_GAIN"
     ]  # no copy of all
     assert touched["package ownlib"] == "1.0"
-    assert {"package torch", "package mpmath"} <= set(touched)  # which SymPy requires, and that PyTorch
-    assert not {"package benchnav", "package h5py", "package pandas"} & set(touched)
+    # dateutil is what pandas requires, and that what ownlib does.
+    assert {"package torch", "package pandas", "package python-dateutil"} <= set(touched)
+    assert not {"package benchnav", "package h5py", "package gymnasium"} & set(touched)
     assert changes_since(touched) == []
     assert run(own, dataset_path, "run") == ["2 of 2 units were there already"]
 
@@ -184,6 +188,19 @@ def test_what_changes_during_a_run_ends_it(
         ConfigError, match=r"stay the same during the run, got changes: file .*speed\.json\. Give"
     ):
         run(own, dataset_path, "run")
+
+
+def test_what_a_script_reads_itself_is_none_of_its_parts(own: Path) -> None:
+    """Only what benchnav called it for counts."""
+    script = own / "script.py"
+    script.write_text("def read(path):\n    return lambda: path.read_text()\n")
+    read = runpy.run_path(str(script))["read"]
+    for name in ("itself", "called"):
+        (own / name).touch()
+    watch()
+    read(own / "itself")()
+    list(run_calls([read(own / "called")]))
+    assert [Path(path).name for path in snapshot()["files"][str(script)]] == ["called"]
 
 
 def test_runs_whose_parts_read_something_else_are_of_other_code() -> None:
