@@ -39,7 +39,7 @@ from tests.elsewhere.device import elsewhere, waits
 
 SMALL = {"samples": 20, "horizon_s": 0.4}
 DWA = {"part": "astar_dwa", "options": {"dwa": {"speeds": 3, "turn_rates": 3, "horizon_s": 0.4}}}
-CL_RRT = {"part": "cl_rrt", "options": {"expansions": 12, "edge_time_s": 3.0}}
+CL_RRT = {"part": "cl_rrt", "options": {"expansions": 25, "edge_time_s": 3.0}}
 MPPI = {"part": "mppi", "options": SMALL}
 GUIDED = {"part": "astar_mppi", "label": "guided", "options": {"mppi": SMALL}}
 

@@ -155,6 +155,8 @@ def test_a_damaged_viewer_file_is_written_again(run: Path, tmp_path: Path) -> No
     assert len(verify_run(copy)[0]) == 1  # the episode that was asked for
     write_viewer_files(copy)
     assert verify_run(copy) == ([], [])
+    for path in (first, second):
+        assert path.stat().st_size >= (run / path.relative_to(copy)).stat().st_size
 
 
 def test_the_command_prints_what_is_damaged_and_ends_with_status_1(

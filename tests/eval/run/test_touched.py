@@ -37,7 +37,8 @@ class Own(Planner):
     steers = (("speed_mps", "turn_rate_radps"),)
 
     def init(self, problem, generator):
-        importlib.import_module("".join(["own", "lib"]))
+        __import__("".join(["own", "lib"]))
+        importlib.import_module("".join(["own", "more"]))
         self.gain = float(os.environ.get("OWN_GAIN", "1"))
         dict(os.environ), {**os.environ}, list(os.environ.items())
         self.helper = importlib.import_module("".join(["hel", "per"]))
@@ -58,9 +59,10 @@ def own(tmp_path: Path) -> Path:
     """A part that reads a file, a variable, a module whose name is put together, and an installed package."""
     folder = tmp_path / "own"
     site = tmp_path / "site"
-    (site / "ownlib").mkdir(parents=True)
-    (site / "ownlib" / "__init__.py").touch()
-    _install(site, "1.0")
+    for name in ("ownlib", "ownmore"):
+        (site / name).mkdir(parents=True)
+        (site / name / "__init__.py").touch()
+        _install(site, name, "1.0")
     folder.mkdir()
     (folder / "part.py").write_text(PART)
     (folder / "helper.py").write_text("FACTOR = 1.0")
@@ -69,16 +71,16 @@ def own(tmp_path: Path) -> Path:
     return folder
 
 
-def _install(site: Path, version: str) -> None:
-    for info in site.glob("*.dist-info"):
+def _install(site: Path, name: str, version: str) -> None:
+    for info in site.glob(f"{name}-*.dist-info"):
         shutil.rmtree(info)
-    info = site / f"ownlib-{version}.dist-info"
+    info = site / f"{name}-{version}.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: ownlib\nVersion: {version}\nRequires-Dist: pandas\n"
+        f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\nRequires-Dist: pandas\n"
     )
-    (info / "top_level.txt").write_text("ownlib\n")
-    (info / "RECORD").write_text("ownlib/__init__.py,,\n")
+    (info / "top_level.txt").write_text(f"{name}\n")
+    (info / "RECORD").write_text(f"{name}/__init__.py,,\n")
 
 
 @pytest.fixture(autouse=True)
@@ -89,7 +91,7 @@ def paths(own: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for cached in CACHES:
         cached.cache_clear()
     yield
-    for name in ("helper", "ownlib"):
+    for name in ("helper", "ownlib", "ownmore"):
         sys.modules.pop(name, None)
     for cached in CACHES:
         cached.cache_clear()
@@ -113,9 +115,13 @@ def records(own: Path, name: str) -> list[dict[str, str]]:
 
 
 def files_of(own: Path, touched: Mapping[str, str]) -> set[str]:
-    """Names of the recorded files, but for those of the installed package."""
+    """Recorded files, by name where they lie beside the part, but for those of the installed packages."""
     paths = [Path(name.removeprefix("file ")) for name in touched if name.startswith("file ")]
-    return {path.name for path in paths if not path.is_relative_to(own.parent / "site")}
+    return {
+        path.name if path.parent == own else str(path)
+        for path in paths
+        if not path.is_relative_to(own.parent / "site")
+    }
 
 
 def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
@@ -128,11 +134,12 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
     assert [name for name in touched if name.startswith("variable ")] == [
         "variable OWN_GAIN"
     ]  # no copy of all
-    assert touched["package ownlib"] == "1.0"
+    assert touched["package ownlib"] == touched["package ownmore"] == "1.0"
     # dateutil is what pandas requires, and that what ownlib does.
     assert {"package torch", "package pandas", "package python-dateutil"} <= set(touched)
     assert not {"package benchnav", "package h5py", "package gymnasium"} & set(touched)
     assert changes_since(touched) == []
+    assert [code["touched"] for code in open_run(own.parent / "run").about["codes"].values()] == [touched]
     assert run(own, dataset_path, "run") == ["2 of 2 units were there already"]
 
     monkeypatch.setenv("OWN_GAIN", "0.5")
@@ -142,7 +149,7 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
     assert reused.startswith("1 of 2 units were made by other code (variable OWN_GAIN)")
     (own / "speed.json").write_text("0.4")
     (own / "helper.py").write_text("FACTOR = 0.9")
-    _install(own.parent / "site", "2.0")
+    _install(own.parent / "site", "ownlib", "2.0")
     sys.modules.pop("helper")
     for name in [name for name in sys.modules if name.startswith("benchnav_file_part_")]:
         del sys.modules[name]
