@@ -314,6 +314,32 @@ def test_the_goal_stays_free_whatever_is_known_of_it() -> None:
     assert (~first.free)[(field < 0.02) & ~at_goal].double().mean() > 0.9
 
 
+def test_the_goal_that_stays_free_is_that_of_the_episode_that_is_left() -> None:
+    given = drives(ground=Probe(30.0))
+    goal = given.problem.goal_m.clone()
+    goal[1] = torch.tensor([5.25, 8.25])
+    truth = replace(given.learning.truth, field=torch.zeros_like(given.learning.truth.field))
+    knowing = Knowing(replace(given.learning, truth=truth), replace(given.problem, goal_m=goal))
+    knowing.keep(torch.tensor([1]))
+    told = knowing.learn(0, given.problem.start[1:2], torch.ones(1, dtype=torch.bool))
+    assert told is not None
+    assert torch.equal(told.free, cells_at_goal(LAW.grid, goal[1:2], RULES.goal_radius_m))
+
+
+def test_a_robot_that_has_ended_sees_and_senses_nothing_more() -> None:
+    """Also where it is moved on, as a loop might that goes on for the others."""
+    given = drives(
+        sensor=Near(range_m=2.0), ground=Probe(1.0), law=ALIKE,
+        predict=lambda terrain, seen: Oracle().predict_terrain(terrain),
+    )  # fmt: skip
+    knowing, running = Knowing(given.learning, given.problem), torch.arange(BATCH) < 3
+    before = knowing.known
+    knowing.learn(0, given.problem.start + torch.tensor([3.0, 3.0, 0.0]), running)
+    for name in ("seen", "ever_sensed"):
+        more = (getattr(knowing.known, name) & ~getattr(before, name)).flatten(1).any(1)
+        assert torch.equal(more, running), name
+
+
 def test_episodes_that_left_do_not_change_the_others(probed: Episodes) -> None:
     given = drives()
     assert sorted(probed.steps.tolist())[3] < 160, "nobody left early"
