@@ -416,9 +416,15 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
 
 
 def _installed_folder(place: str) -> Path | None:
-    """The folder of a package, whose code is a part's although it may lie among installed packages."""
+    """The folder of a package, whose code is a part's although it may lie among installed packages.
+
+    None of the standard library, which a name may lead to by mistake.
+    """
+    package = place.partition(".")[0]
+    if package in sys.stdlib_module_names:
+        return None
     try:
-        spec = importlib.util.find_spec(place.partition(".")[0])
+        spec = importlib.util.find_spec(package)
     except (ImportError, ValueError):
         return None
     folders = list(spec.submodule_search_locations or ()) if spec else []

@@ -139,7 +139,7 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
     assert {"package torch", "package pandas", "package python-dateutil"} <= set(touched)
     assert not {"package benchnav", "package h5py", "package gymnasium"} & set(touched)
     assert changes_since(touched) == []
-    assert [code["touched"] for code in open_run(own.parent / "run").about["codes"].values()] == [touched]
+    assert touched in [code["touched"] for code in open_run(own.parent / "run").about["codes"].values()]
     assert run(own, dataset_path, "run") == ["2 of 2 units were there already"]
 
     monkeypatch.setenv("OWN_GAIN", "0.5")
