@@ -12,6 +12,7 @@ from tests.commands import call
 STRANGER = Path(__file__).parent / "data" / "stranger.py"
 
 
+@pytest.mark.slow  # each step by itself: tests/models/training/test_own_model.py, tests/test_examples.py
 def test_from_one_file_of_under_80_lines(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -32,11 +32,12 @@ def test_knowing_the_truth_each_planner_succeeds_on_nearly_every_std_map(
         planners=({"part": planner, "options": FEW_SAMPLES.get(planner, {})},),
         risks=("mean",),
         scenarios=("std",),
-        record="steps",
+        maps=10,
+        record="none",
     )
     for _ in run_suite(suite, tmp_path / "run"):
         pass
-    assert pd.read_parquet(tmp_path / "run" / "episodes.parquet")["success"].sum() >= 18
+    assert pd.read_parquet(tmp_path / "run" / "episodes.parquet")["success"].sum() >= 9
 
 
 # `straight` with the oracle on the first maps of std, in the world `paper`, seed 0: total time, path length, λ̄.

@@ -84,7 +84,7 @@ MODELS = {
 
 
 # To write a graph takes ten seconds and more.
-QUICK = ("fused", "quantile calibrated")
+QUICK = ("fused",)
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ from benchnav.models.training.check import check_network
 from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
 from benchnav.models.training.networks import fit_network
+from tests.commands import call
 from tests.models.support import names, trainable
 
 EXACT = {"precision": "32-true"}
@@ -413,7 +414,7 @@ def test_a_command_that_is_killed_and_resumed_ends_as_if_it_had_not_been(
         cli.main()
     assert refused.value.code == 2
     assert "--resume" in capsys.readouterr().err
-    subprocess.run([*command, "--resume"], capture_output=True, env=environment, check=True)
+    assert call("train", *command[3:], "--resume") == 0
     there = load_checkpoint(tmp_path / "m").part("classifier")
     for name, value in whole[1].state_dict().items():
         assert torch.equal(value, there.tensors[name]), name
