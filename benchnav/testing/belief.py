@@ -18,7 +18,7 @@ from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.quantiles import LEVELS, quantiles_at
 from benchnav.planning.sensing.belief import Belief, Law, draw_scores
-from benchnav.planning.sensing.sensor import Sensed
+from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
 from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
 from benchnav.testing.distribution import check_functions
 
@@ -28,6 +28,8 @@ _STEPS = 3
 _STD = 0.1  # of what is sensed
 _VALUES = (0.0, 0.1, 0.4, 0.8)  # of λ, at which distributions are compared
 _FIELDS = 200
+_DRAWS = 8  # of all that is sensed
+_BY_CHANCE = 0.01  # by which the mean over so few draws may rise
 _FAR_OFF = 6  # standard errors
 _QUICK = 0.01  # by how much λ̂ of `at` may differ from that of `distribution`
 
@@ -45,7 +47,8 @@ def check_belief(
     The contract: the distribution is a TraversabilityDistribution of shape [B, H, W] on the prediction's device, whose
     functions fit each other; it is the prediction until something is sensed, and stays in an episode in which nothing
     is; a new prediction takes the old one's place there. What was sensed once more changes nothing where it is nothing,
-    nor anything at all in a belief that does not learn. `changed` names all cells of which something else is believed;
+    or what was known without noise, nor anything at all in a belief that does not learn. What is drawn from the
+    prediction makes it surer on average. `changed` names all cells of which something else is believed;
     `at` tells λ̂ of some cells within 0.01 of the distribution's. `sample_fields` gives λ in [0, 1] of shape
     [B, M, H, W], the same under the same keys and others under others, whose cells have what is believed up to chance.
     Arguments and global generators are left as they were; the answer is the same when asked again, after other maps
@@ -108,6 +111,8 @@ class _Trial:
         self.expect(same(again, shown), "Expected the same after other maps were begun, got another.")
         check_functions(self.belief.distribution(state), self.tolerance, self.breaches)
         self.try_nothing(first, state)
+        self.try_repeated(state, looks[-1])
+        self.try_drawn(first, looks)
         self.try_prior(state)
         self.try_at(state)
         self.try_fields(state)
@@ -195,6 +200,39 @@ class _Trial:
             )
         said = "Expected the prediction of an episode in which nothing was sensed, got another."
         self.expect_of(last, self.prior, said, _UNTOLD)
+
+    def try_repeated(self, last: Any, sensed: Sensed) -> None:
+        """Expects that λ which is told twice without noise changes nothing the second time."""
+        exact = Sensed(
+            traversability=sensed.traversability, std=torch.full_like(sensed.traversability, LEAST_STD)
+        )
+        once = self.update(last, exact)
+        twice = NOTHING if once is NOTHING else self.update(once, exact)
+        if twice is not NOTHING and self.is_sound(twice):
+            said = "Expected λ that is sensed again without noise to change nothing, got a change."
+            self.expect(self.alike(twice, once, self.tolerance), said)
+
+    def try_drawn(self, first: Any, looks: Sequence[Sensed]) -> None:
+        """Expects that what is drawn from the prediction makes other cells surer on average.
+
+        Of the chance p of λ under a number the variance is p (1 − p); over what may be sensed its mean cannot rise (the
+        law of total variance). One update alone may raise it.
+        """
+        if not self.belief.learns:
+            return
+        seen = torch.stack([sensed.mask for sensed in looks]).any(0)
+        law = draw_scores(self.law, _DRAWS, _KEYS).to(self.prior.device, self.prior.dtype)
+        before, after = _shown(self.prior), []
+        for number in range(_DRAWS):
+            field = self.prior.from_normal(law[:, number])
+            state = self.update(first, _sensed(torch.where(seen, field, torch.nan), self.prior))
+            if state is NOTHING or not self.is_sound(state):
+                return
+            found = _shown(self.belief.distribution(state))
+            after.append(found * (1 - found))
+        rise = (torch.stack(after).mean(0) - before * (1 - before))[:, ~seen]
+        said = "Expected what is drawn from the prediction to make it surer on average, got less sure."
+        self.expect(float(rise.mean()) <= _BY_CHANCE, said)
 
     def try_prior(self, last: Any) -> None:
         """Expects a new prediction to be taken."""

@@ -160,6 +160,16 @@ BAD: dict[str, tuple[Any, str]] = {
     "changed by scores alone": (
         giving("changed", lambda _, a, b: (a.score != b.score) | (a.std != b.std)), "Expected `changed` to name all"
     ),
+    "counts again what it knows": (
+        giving("update", lambda new, old, s, *_: replace(new, std=torch.where(s.mask, 0.5 * old.std, new.std))),
+        "Expected λ that is sensed again without noise to change nothing",
+    ),
+    "less sure by what it learns": (
+        giving("update", lambda new, old, s, *_: replace(
+            new, std=torch.where(s.mask.flatten(1).any(1)[:, None, None] & ~s.mask, 1.3 * old.std, new.std)
+        )),
+        "to make it surer on average",
+    ),
     "learns though it says no": (having(learns=False), "a belief that does not learn (`learns`)"),
     "keeps the old prediction": (
         giving("update", lambda new, old, *_: replace(new, prior=old.prior)), "to take the old one's place"

@@ -29,10 +29,15 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.planning.sensing.belief import Belief, Law, Predicted, draw_scores
 from benchnav.planning.sensing.gaussian import Field, Observed, condition, evidence, predict
+from benchnav.planning.sensing.lattice import Lattice, condition_and_predict, spacing_of
 from benchnav.planning.sensing.score_table import ScoreTable, TabulatedDistribution
 from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
 
 _REACH = 4.0  # ℓ; the correlation is 3e-4 there
+_BEYOND = 2.0  # ℓ; what is observed farther off changes no cell within `_REACH` by `_LEAST_CHANGE`
+_MOST_AT_ONCE = (
+    2048  # observations that are conditioned on without a lattice, so that an update takes half a second
+)
 _SAME_SCORE, _SAME_STD = 1e-6, 0.99  # a second look that tells less than this is none
 _LEAST_CHANGE = 0.005  # of a score
 _OF_SKEW = 1 / 6  # by how much the score of the median moves with the skewness
@@ -316,30 +321,60 @@ def note(state: CopulaState, sensed: Sensed) -> tuple[CopulaState, Tensor]:
 
 
 def _condition(field: Field, own: int, maps: dict[str, ndarray], new: ndarray, window: int) -> None:
-    """Updates terms of observations, and scores of cells, near what is new in one episode; writes into its maps."""
-    forgotten = ~np.isnan(maps["value"])
-    cells = nearest(forgotten, new, window)
-    forgotten[cells] = False
+    """Updates terms of observations, and scores of cells, near what is new in one episode; writes into its maps.
+
+    Cells are rewritten within `_REACH` ℓ of what is new, from all that was observed within `_BEYOND` ℓ more: nothing
+    that bears on them is left out, so that nothing is forgotten.
+    """
+    length = float(field.length[own])
+    reach = math.ceil(_REACH * length)
+    rows, columns = _around(new, reach)
+    observed_there = np.zeros_like(new)
+    near = _around(new, reach + math.ceil(_BEYOND * length))
+    observed_there[near] = ~np.isnan(maps["value"][near])
+    cells = observed_there.nonzero()
+    many = len(cells[0]) > window
+    if not (many and spacing_of(length) > 1) and len(cells[0]) > _MOST_AT_ONCE:
+        cells = nearest(observed_there, new, _MOST_AT_ONCE)
+    left_out = observed_there
+    left_out[cells] = False
     observed = _observed(maps, *cells)
-    row, column = (torch.from_numpy(places)[:, None] for places in cells)
-    covariance = field.covariance(own, row - row.T, column - column.T).numpy()
-    known = condition(covariance, observed)
-    reach = math.ceil(_REACH * float(field.length[own]))
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    if many and spacing_of(length) > 1:
+        down, across = (
+            places.ravel() for places in np.mgrid[rows.start : rows.stop, columns.start : columns.stop]
+        )
+        precision, shift, (mean, variance, skew) = condition_and_predict(
+            Lattice.around(field, own, cells), observed, cells, (down, across)
+        )
+    else:
+        row, column = (torch.from_numpy(places)[:, None] for places in cells)
+        covariance = field.covariance(own, row - row.T, column - column.T).numpy()
+        known = condition(covariance, observed)
+        precision, shift = known.precision, known.shift
+        downs, acrosses = torch.arange(rows.start, rows.stop), torch.arange(columns.start, columns.stop)
+        block = field.covariance(own, (row - downs)[..., None], (column - acrosses)[:, None])
+        mean, variance, skew = predict(known, covariance, observed, block.flatten(1).numpy())
+    found = np.stack((mean, np.sqrt(variance.clip(0)), skew)).reshape(3, *shape)
+    old = np.stack([maps[name][rows, columns] for name in ("mean", "std", "skew")])
+    # What was observed at a cell says more of it than what there is room for. Numbers make no cell less sure.
+    kept = left_out[rows, columns]
+    if not observed.interval.any():
+        kept |= found[1] > old[1] + _LEAST_CHANGE
+        found[1] = np.minimum(found[1], old[1])
+    moved = (abs(found - old) >= _LEAST_CHANGE / np.array((1, 1, _OF_SKEW))[:, None, None]).any(0) & ~kept
+    for name, values in zip(("mean", "std", "skew"), found, strict=True):
+        np.copyto(maps[name][rows, columns], values, where=moved)
+    maps["precision"][cells], maps["shift"][cells] = precision, shift
+
+
+def _around(new: ndarray, reach: int) -> tuple[slice, slice]:
+    """Rows and columns of a map within some cells of what is new."""
     rows, columns = (
         slice(max(low - reach, 0), min(high + reach + 1, size))
         for (low, high), size in zip(bounds(new), new.shape, strict=True)
     )
-    down, across = torch.arange(rows.start, rows.stop), torch.arange(columns.start, columns.stop)
-    block = field.covariance(own, (row - down)[..., None], (column - across)[:, None])
-    mean, variance, skew = predict(known, covariance, observed, block.flatten(1).numpy())
-    found = np.stack((mean, np.sqrt(variance), skew)).reshape(3, *block.shape[1:])
-    old = [maps[name][rows, columns] for name in ("mean", "std", "skew")]
-    moved = (abs(found - old) >= _LEAST_CHANGE / np.array((1, 1, _OF_SKEW))[:, None, None]).any(0)
-    # What was observed at a cell says more of it than all that the window has room for.
-    moved &= ~forgotten[rows, columns]
-    for values, whole in zip(found, old, strict=True):
-        np.copyto(whole, values, where=moved)
-    maps["precision"][cells], maps["shift"][cells] = known.precision, known.shift
+    return rows, columns
 
 
 def _observed(maps: dict[str, ndarray], row: ndarray, column: ndarray) -> Observed:

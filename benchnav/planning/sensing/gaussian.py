@@ -25,10 +25,10 @@ from benchnav.core.batch import Batch
 from benchnav.core.copula import correlations
 
 _DAMPING = 0.8
-_ROUNDS = 40
-_ENOUGH = 1e-3  # change of a mean and of a standard deviation, in normal scores
+DAMPED_ROUNDS = 40
+ENOUGH = 1e-3  # change of a mean and of a standard deviation, in normal scores
 _LEAST_SHARE = 1e-9  # of the variance that an interval leaves
-_LEAST_VARIANCE = 1e-12
+LEAST_VARIANCE = 1e-12
 _MOST_SKEW = 2.0  # that of an exponential, which a number far out in a tail is
 
 
@@ -84,10 +84,14 @@ class Field(Batch):
             rows: between both cells, of either sign, int64.
             columns: as many.
         """
-        found = self.down[member, rows.abs()] * self.across[member, columns.abs()]
+        found = self.shared(member, rows, columns)
         if self.nugget:
-            found = torch.where((rows == 0) & (columns == 0), found, (1 - self.nugget) * found)
+            found = torch.where((rows == 0) & (columns == 0), found + self.nugget, found)
         return found
+
+    def shared(self, member: int | Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+        """Return what of `covariance` is shared with neighbours: all but the nugget, also of a cell with itself."""
+        return (1 - self.nugget) * self.down[member, rows.abs()] * self.across[member, columns.abs()]
 
 
 @dataclass(frozen=True)
@@ -140,7 +144,7 @@ class Posterior:
             times its own transpose.
         """
         taken = _taken(self.factor, self.root, covariance)
-        return _times(self.weights, covariance), (1 - np.square(taken).sum(0)).clip(0), taken
+        return times(self.weights, covariance), (1 - np.square(taken).sum(0)).clip(0), taken
 
 
 def posterior(covariance: ndarray, precision: ndarray, shift: ndarray) -> Posterior:
@@ -154,7 +158,7 @@ def posterior(covariance: ndarray, precision: ndarray, shift: ndarray) -> Poster
     root = np.sqrt(precision)
     factor = _factor(covariance, root)
     # (K⁻¹ + T)⁻¹ ν = K (ν − √T (I + √T K √T)⁻¹ √T K ν)
-    pulled = torch.from_numpy(root * _times(covariance, shift))
+    pulled = torch.from_numpy(root * times(covariance, shift))
     weights = shift - root * torch.cholesky_solve(pulled[:, None], factor)[:, 0].numpy()
     return Posterior(root=root, factor=factor, weights=weights, precision=precision, shift=shift)
 
@@ -175,17 +179,17 @@ def condition(covariance: ndarray, observed: Observed) -> Posterior:
     # The intervals alone, as a field of few cells that the numbers have given a mean.
     columns = covariance[:, held]
     centre, _, taken = numbers.moments(columns)
-    left = columns[held] - _times(taken.T, taken)
-    terms = _Terms(observed.precision[held], observed.shift[held])
+    left = columns[held] - times(taken.T, taken)
+    terms = Terms(observed.precision[held], observed.shift[held])
     ends = observed.lower[held], observed.upper[held], observed.std[held]
-    for _ in range(_ROUNDS):
+    for _ in range(DAMPED_ROUNDS):
         mean, variance = terms.moments(left, centre)
         new = terms.towards(mean, variance, *ends)
         more = new.precision - terms.precision
         # By how much each term moves its own cell, were it alone to change.
         moved = abs(new.shift - terms.shift) + abs(more * mean)
         terms = new
-        if (moved / (1 / variance + more.clip(0))).max() <= _ENOUGH:
+        if (moved / (1 / variance + more.clip(0))).max() <= ENOUGH:
             break
     precision, shift = precision.copy(), shift.copy()
     precision[held], shift[held] = terms
@@ -205,8 +209,8 @@ def evidence(covariance: ndarray, observed: Observed, found: Posterior) -> float
     mean, variance, _ = found.moments(covariance)
     whole = 0.5 * (found.shift * mean).sum() - np.log(found.factor.diagonal().numpy()).sum()
     held = observed.interval
-    terms = _Terms(found.precision[held], found.shift[held])
-    centre, without = terms.left_out(mean[held], variance[held].clip(_LEAST_VARIANCE))
+    terms = Terms(found.precision[held], found.shift[held])
+    centre, without = terms.left_out(mean[held], variance[held].clip(LEAST_VARIANCE))
     total = without + np.square(observed.std[held])
     mass = _standard(centre, total, observed.lower[held], observed.upper[held])[2]
     # What the Gaussian term has in the place of the interval.
@@ -237,17 +241,38 @@ def predict(
     if not held.any():
         return mean, variance, np.zeros_like(mean)
     own_mean, own_variance, own = found.moments(covariance[:, held])
-    own_variance = own_variance.clip(_LEAST_VARIANCE)
-    terms = _Terms(found.precision[held], found.shift[held])
-    centre, without = terms.left_out(own_mean, own_variance)
+    own_variance = own_variance.clip(LEAST_VARIANCE)
+    third = third_cumulants(observed, found.precision, found.shift, own_mean, own_variance)
+    regression = (block[held] - times(own.T, taken)) / own_variance[:, None]
+    return mean, variance, skewness(third, regression, variance)
+
+
+def third_cumulants(
+    observed: Observed, precision: ndarray, shift: ndarray, mean: ndarray, variance: ndarray
+) -> ndarray:
+    """Return the third cumulants of the cells of intervals.
+
+    Args:
+        observed: what is known, of N cells.
+        precision: of all terms, shape [N].
+        shift: of all terms, shape [N].
+        mean: of the cells of intervals.
+        variance: of the cells of intervals, > 0.
+    """
+    held = observed.interval
+    centre, without = Terms(precision[held], shift[held]).left_out(mean, variance)
     total = without + np.square(observed.std[held])
     third = _third_cumulant(centre, total, observed.lower[held], observed.upper[held])
-    regression = (block[held] - _times(own.T, taken)) / own_variance[:, None]
+    return third * (without / total) ** 3
+
+
+def skewness(third: ndarray, regression: ndarray, variance: ndarray) -> ndarray:
+    """Return the skewness of M cells, by third cumulants of intervals and the regression on these, [intervals, M]."""
     # Products and roots, which are far quicker than powers.
-    third = _times(third * (without / total) ** 3, regression * regression * regression)
-    spread = variance.clip(_LEAST_VARIANCE)
-    skew = third / (spread * np.sqrt(spread))
-    return mean, variance, skew.clip(-_MOST_SKEW, _MOST_SKEW)
+    found = times(third, regression * regression * regression)
+    spread = variance.clip(LEAST_VARIANCE)
+    skew: ndarray = found / (spread * np.sqrt(spread))
+    return skew.clip(-_MOST_SKEW, _MOST_SKEW)
 
 
 def _factor(covariance: ndarray, root: ndarray) -> Tensor:
@@ -263,12 +288,12 @@ def _taken(factor: Tensor, root: ndarray, covariance: ndarray) -> ndarray:
     return torch.linalg.solve_triangular(factor, scaled, upper=False).numpy()
 
 
-def _times(one: ndarray, other: ndarray) -> ndarray:
+def times(one: ndarray, other: ndarray) -> ndarray:
     """A product of matrices or vectors."""
     return (torch.from_numpy(one) @ torch.from_numpy(other)).numpy()
 
 
-class _Terms(NamedTuple):
+class Terms(NamedTuple):
     """Gaussian terms, one a cell: exp(shift · z − precision · z² / 2), each of shape [N]."""
 
     precision: ndarray
@@ -278,18 +303,18 @@ class _Terms(NamedTuple):
         """Mean and variance of the cells of a field of covariance [N, N] and mean [N], given the terms."""
         root = np.sqrt(self.precision)
         taken = _taken(_factor(covariance, root), root, covariance)
-        left = covariance - _times(taken.T, taken)
-        mean = centre + _times(left, self.shift - self.precision * centre)
-        return mean, left.diagonal().clip(_LEAST_VARIANCE)
+        left = covariance - times(taken.T, taken)
+        mean = centre + times(left, self.shift - self.precision * centre)
+        return mean, left.diagonal().clip(LEAST_VARIANCE)
 
     def left_out(self, mean: ndarray, variance: ndarray) -> tuple[ndarray, ndarray]:
         """Return cavity means and variances."""
-        without = 1 / (1 / variance - self.precision).clip(_LEAST_VARIANCE)
+        without = 1 / (1 / variance - self.precision).clip(LEAST_VARIANCE)
         return without * (mean / variance - self.shift), without
 
     def towards(
         self, mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray, std: ndarray
-    ) -> "_Terms":
+    ) -> "Terms":
         """Terms that give each cell more nearly the moments of its interval, all else as it is."""
         centre, without = self.left_out(mean, variance)
         total = without + np.square(std)
@@ -298,7 +323,7 @@ class _Terms(NamedTuple):
         left = (1 - without * shrink).clip(_LEAST_SHARE)
         precision = shrink / left
         shift = centre * precision + (noisy_mean - centre) / total / left
-        return _Terms(
+        return Terms(
             self.precision + _DAMPING * (precision - self.precision),
             self.shift + _DAMPING * (shift - self.shift),
         )

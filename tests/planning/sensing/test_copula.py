@@ -1,9 +1,12 @@
+import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy import stats
 from torch import Tensor
 
@@ -16,6 +19,7 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.planning.sensing.belief import Law
 from benchnav.planning.sensing.copula import Copula, CopulaState
+from benchnav.planning.sensing.gaussian import Observed, condition, predict
 from benchnav.planning.sensing.sensor import LEAST_STD, Contact, Moment, Probe, Sensed
 from tests.planning.sensing import made
 
@@ -301,18 +305,103 @@ def test_the_length_that_is_believed_takes_the_worlds_place(correlation_m: float
         assert (state.mean != 0).nonzero().tolist() == [[0, 6, 6]]
 
 
-def test_a_window_looks_at_what_is_near_and_loses_little() -> None:
-    prior = made.mixture(1, HEIGHT, WIDTH)
-    score = made.scores(LAW, 1)
-    field = prior.from_normal(score)
-    path = [(2 + place // 2, 2 + place) for place in range(12)]
-    looks = [looked({place: float(field[0][place])}, 0.1) for place in path]
-    whole, near, one = (after(Copula(window=window), prior, *looks) for window in (256, 6, 1))
-    ahead = (slice(None), slice(6, 12), slice(10, 16))
-    assert (whole.mean[ahead] - near.mean[ahead]).abs().max() < 0.12
-    assert (whole.mean[ahead] - one.mean[ahead]).abs().max() > (
-        whole.mean[ahead] - near.mean[ahead]
-    ).abs().max()
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.integers(2, 60),
+    parts=st.integers(2, 6),
+    length_m=st.sampled_from([1.0, 1.5, 2.5]),
+    window=st.sampled_from([8, 256]),
+)
+def test_numbers_make_no_cell_less_sure_and_tell_the_same_one_by_one(
+    seed: int, count: int, parts: int, length_m: float, window: int
+) -> None:
+    """With the dense equations, and where the window is small and ℓ long with the lattice."""
+    generator, law = np.random.default_rng(seed), made.law(HEIGHT, WIDTH, length_m)
+    prior = TraversabilityMixture(
+        *(torch.full((1, 1, HEIGHT, WIDTH), one).double() for one in (1.0, 0.5, 0.1))
+    )
+    field = prior.from_normal(made.scores(law, 1, seed))[0]
+    places = generator.choice(EVERY, count, replace=False, axis=0)
+    looks = [
+        looked({(row, column): float(field[row, column]) for row, column in some}, 0.2)
+        for some in np.array_split(places, parts)
+    ]
+    belief = Copula(window=window)
+    state = belief.init(prior, law)
+    for sensed in looks:
+        before, state = state, belief.update(state, sensed)
+        assert float((state.std - before.std).max()) <= 0
+    once = belief.update(
+        belief.init(prior, law), looked({tuple(p): float(field[tuple(p)]) for p in places}, 0.2)
+    )
+    for name in ("mean", "std"):
+        torch.testing.assert_close(getattr(state, name), getattr(once, name), atol=0.02, rtol=0)
+    exact = looked({tuple(places[0]): float(field[tuple(places[0])])})
+    sure = belief.update(state, exact)
+    again = belief.update(sure, exact)
+    assert not belief.changed(sure, again).any()
+
+
+def way(turns: bool, steps: int = 121) -> Tensor:
+    """12 m of driving in steps of 0.1 m, straight or turning until it crosses itself, shape [N, 3]."""
+    turn = torch.zeros(steps)
+    if turns:
+        turn[40:] = 0.1 * 2 * math.pi / 7.0  # a circle of 7 m
+    heading = turn.cumsum(0)
+    moves = 0.1 * torch.stack((heading.cos(), heading.sin()), 1)
+    start = torch.tensor([1.5, 3.0 if turns else 5.0])
+    return torch.cat((start + moves.cumsum(0) - moves[0], heading[:, None]), 1)
+
+
+@pytest.mark.parametrize(("resolution_m", "radius_m"), [(0.25, 2.0), (0.5, 4.0)])
+@pytest.mark.parametrize("turns", [False, True])
+def test_what_was_learnt_is_never_forgotten(resolution_m: float, radius_m: float, turns: bool) -> None:
+    """Against all observations at once, in the cells within ℓ of what was sensed."""
+    height, width = round(10 / resolution_m), round(16 / resolution_m)
+    law = made.law(height, width, 1.5, resolution_m)
+    shape = (1, 2, height, width)
+    weights, means, stds = (
+        torch.tensor(pair).view(1, 2, 1, 1).expand(shape) for pair in ((0.1, 0.9), (0.05, 0.66), (0.05, 0.1))
+    )
+    prior = TraversabilityMixture(weights.contiguous(), means.contiguous(), stds.contiguous())
+    field = prior.from_normal(made.scores(law, 1, 7).float())
+    terrain, sensor, belief = made.terrain(prior, field, resolution_m), Probe(radius_m), Copula()
+    state = belief.init(prior, law)
+    for step, pose in enumerate(way(turns)):
+        if step % 5 == 0:
+            state = belief.update(state, sensor.sense(terrain, field, pose[None], Moment((1,), step)))
+    cells = state.observed[0].nonzero(as_tuple=True)
+    known = Observed(
+        *(
+            getattr(state, name)[0][cells].numpy()
+            for name in ("lower", "upper", "noise_std", "precision", "shift")
+        )
+    )
+    column, row = way(turns)[:, :2].T / resolution_m - 0.5
+    lines = torch.arange(height)[:, None, None], torch.arange(width)[None, :, None]
+    away = torch.hypot(lines[0] - row, lines[1] - column).amin(-1) * resolution_m
+    wanted = (~state.observed[0] & (away < radius_m + 1.5)).nonzero(as_tuple=True)
+    among, across = (
+        state.field.covariance(0, cells[0][:, None] - other[0], cells[1][:, None] - other[1]).numpy()
+        for other in (cells, wanted)
+    )
+    mean, variance, skew = predict(condition(among, known), among, known, across)
+    std = np.sqrt(variance)
+    assert len(std) > 100
+    assert 0.05 < std.mean() < 0.5
+    assert abs(state.std[0][wanted].numpy() - std).mean() < 0.02
+    place = torch.zeros(1, height, width, dtype=torch.bool)
+    place[0][wanted] = True
+    found = belief.distribution(state).at(place)
+    moments = (torch.from_numpy(values)[None, :, None].float() for values in (mean, std, skew))
+    whole = ConditionedDistribution(
+        prior.at(place), *(values.view(prior.at(place).shape) for values in moments)
+    )
+    scores = [
+        one.log_prob(field[place].view(prior.at(place).shape)).clamp(min=-10).mean() for one in (found, whole)
+    ]
+    assert abs(float(scores[0] - scores[1])) < 0.05
 
 
 def test_what_was_observed_at_a_cell_is_kept_where_the_window_has_no_room_for_it() -> None:
