@@ -5,13 +5,13 @@
 50 episodes on maps of `stakes-v1-test` in the world `stakes`, A*+DWA, the oracle under expected-time, one thread. A row
 has the processor's time of a second of driving of an episode, beside that of `static` in the same turn, and how much of
 it is learning and planning: medians of three turns. `copula` is told λ within 1 m and may plan anew each 0.5 s; it is
-to take at most 5 times as long. Another table has what a window of observations costs and loses: milliseconds of an
-update of all episodes, and the largest differences of mean, CVaR and P(λ < 0.1) from a belief that looks at all
-observations, over the cells within 2ℓ of the robots at the end of the way. Some four minutes.
+to take at most 5 times as long. Another table has the milliseconds of an update of one episode, at the beginning of a
+way and at its end: they grow with the cells that a probe reaches, and not with the way. Some two minutes.
 """
 
 import time
 from functools import partial
+from itertools import product
 from statistics import median
 from typing import Any
 
@@ -20,6 +20,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchnav.core import rng
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
@@ -32,17 +34,15 @@ from benchnav.planning.objective import TravelTime
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing.belief import Law
+from benchnav.planning.sensing.belief import Law, draw_scores
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.knowledge import Learner, Truth
-from benchnav.planning.sensing.sensor import Full, Moment, Probe, Sensed
+from benchnav.planning.sensing.sensor import Full, Moment, Probe
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import PRESETS, Places
 
 EPISODES, STEPS = 50, 100  # steps of 0.1 s
 TIMES = 3
-UPDATES = 40  # of the second table, 0.5 m apart
-WINDOWS = (64, 128, 256)
 
 
 def drive() -> tuple[Problem, Simulation, Terrain, Law]:
@@ -92,26 +92,30 @@ def driven_ms(
     return 1e3 * took / driven_s, found.learning_s / waited, float(found.planning_s.sum()) / waited
 
 
-def looks(problem: Problem, terrain: Terrain, field: torch.Tensor) -> list[Sensed]:
-    """What robots sense that drive straight at their goals."""
-    ahead = problem.goal_m - problem.start[:, :2]
-    unit = ahead / torch.linalg.vector_norm(ahead, dim=1, keepdim=True)
-    state = problem.start.clone()
-    found = []
-    for number in range(UPDATES):
-        state[:, :2] = problem.start[:, :2] + 0.5 * number * unit
-        found.append(Probe(1.0).sense(terrain, field, state, Moment(list(range(EPISODES)), number)))
-    return found
-
-
-def update_ms(belief: Copula, problem: Problem, law: Law, told: list[Sensed]) -> tuple[float, Any]:
-    """Median milliseconds of an update in the second half of a way, and what is known at its end."""
-    state, times = belief.init(problem.distribution, law), []
-    for sensed in told:
+def update_ms(resolution_m: float, radius_m: float) -> tuple[float, float, int]:
+    """Milliseconds of an update on the first and the last 4 m of 24 m of driving, and how many cells were sensed."""
+    height, width = round(12 / resolution_m), round(28 / resolution_m)
+    law = Law(grid=Grid(height, width, resolution_m), correlation_m=1.5)
+    parameters = (
+        torch.tensor(pair).view(1, 2, 1, 1).expand(1, 2, height, width)
+        for pair in ((0.1, 0.9), (0.05, 0.7), (0.1, 0.1))
+    )
+    prior = TraversabilityMixture(*(values.contiguous() for values in parameters))
+    field = prior.from_normal(draw_scores(law, 1, (0,))[:, 0].float())
+    flat = torch.zeros(1, height, width)
+    terrain = Terrain(
+        rgb=torch.zeros(1, 3, height, width, dtype=torch.uint8), class_id=flat.long(), elevation_m=flat, slope_deg=flat,
+        truth=prior, traversability=field, grid=law.grid,
+    )  # fmt: skip
+    belief, times = Copula(), []
+    state = belief.init(prior, law)
+    for number in range(49):
+        pose = torch.tensor([[2 + 0.5 * number, 6.0, 0.0]])
+        sensed = Probe(radius_m).sense(terrain, field, pose, Moment((0,), number))
         start = time.process_time()
         state = belief.update(state, sensed)
         times.append(1e3 * (time.process_time() - start))
-    return median(times[UPDATES // 2 :]), state
+    return median(times[1:9]), median(times[-8:]), int(state.observed.sum())
 
 
 def main() -> None:
@@ -140,22 +144,10 @@ def main() -> None:
             name, f"{whole:.1f}", f"{100 * learnt:.0f} %", f"{100 * planned:.0f} %", f"{ratio:.1f} ×"
         )
     Console().print(table)
-    told = looks(problem, terrain, field)
-    every = torch.stack([sensed.mask for sensed in told]).any(0)
-    near = torch.nn.functional.max_pool2d(
-        told[-1].mask.float(), 2 * round(2 * law.correlation_cells) + 1, 1, round(2 * law.correlation_cells)
-    ).bool()
-    exact = Copula(window=int(every.flatten(1).sum(1).max()))
-    _, wanted = update_ms(exact, problem, law, told)
-    table = Table("window", "ms of an update", "mean", "CVaR 0.8", "P(λ < 0.1)")
-    for window in WINDOWS:
-        took, state = update_ms(Copula(window=window), problem, law, told)
-        one, other = (Copula().at(own, near) for own in (state, wanted))
-        lost = [
-            float((of(one) - of(other)).abs().max())
-            for of in (lambda d: d.mean(), lambda d: d.cvar(0.8), lambda d: d.cdf(0.1))
-        ]
-        table.add_row(str(window), f"{took:.0f}", *(f"{value:.3f}" for value in lost))
+    table = Table("cells", "probe", "sensed in 24 m", "ms an update, first 4 m", "last 4 m")
+    for resolution_m, radius_m in product((0.5, 0.25), (1.0, 2.0, 4.0)):
+        early, late, count = update_ms(resolution_m, radius_m)
+        table.add_row(f"{resolution_m:g} m", f"{radius_m:g} m", str(count), f"{early:.1f}", f"{late:.1f}")
     Console().print(table)
 
 

@@ -3,12 +3,13 @@
 A cell's λ has a rank in its own predicted distribution, whose normal score is a number, or an interval where the
 distribution has an atom, as at 0 and 1. The scores of all cells are a correlated Gaussian field
 (`benchnav.core.copula`), which the observed scores condition (`gaussian`). With the true distribution of each cell this
-is the posterior under the law, up to expectation propagation for intervals, the reach and the window below, and the
-rejection of draws without a feasible path; with a model's prediction it is an approximation.
+is the posterior under the law, up to expectation propagation for intervals, the reach below, the lattice that stands for
+many observations (`lattice`), and the rejection of draws without a feasible path; with a model's prediction it is an
+approximation.
 
-Only cells within `_REACH` ℓ of what is new are updated, from the observations nearest to what is new, and only where
-mean or standard deviation of the score change by `_LEAST_CHANGE` or more. λ that a prediction holds impossible is taken
-for the end of what it allows, `_FARTHEST` standard deviations off.
+Only cells within `_REACH` ℓ of what is new are updated, from all that was observed within `_BEYOND` ℓ more, and only
+where mean or standard deviation of the score change by `_LEAST_CHANGE` or more. λ that a prediction holds impossible is
+taken for the end of what it allows, `_FARTHEST` standard deviations off.
 Letters in shapes: B episodes, H×W cells, N observations, R×C cells of a block, K values of λ.
 """
 
@@ -98,8 +99,8 @@ class Copula(Belief[CopulaState]):
             `estimated` in each episode from what is observed in it: the mode of the posterior of log ℓ under a
             log-normal prior of median 1.5 m and standard deviation ln 2. It is estimated from 8, 16, 32, … observations
             on, until the window is full; before, it is the median.
-        window: most observations that an update or an estimate looks at, those nearest to what is new; an update looks
-            at more where more is new. Of an observed cell that there is no room for what is known stays.
+        window: most observations that an estimate of ℓ looks at, those nearest to what is new; where more are near, and
+            ℓ is four cells or more, an update solves for a lattice of cells (`lattice`).
         nugget: share of the variance of a cell's score that is its own and no neighbour's; None for the law's.
     """
 
@@ -329,18 +330,16 @@ def _condition(field: Field, own: int, maps: dict[str, ndarray], new: ndarray, w
     length = float(field.length[own])
     reach = math.ceil(_REACH * length)
     rows, columns = _around(new, reach)
-    observed_there = np.zeros_like(new)
     near = _around(new, reach + math.ceil(_BEYOND * length))
-    observed_there[near] = ~np.isnan(maps["value"][near])
-    cells = observed_there.nonzero()
-    many = len(cells[0]) > window
-    if not (many and spacing_of(length) > 1) and len(cells[0]) > _MOST_AT_ONCE:
-        cells = nearest(observed_there, new, _MOST_AT_ONCE)
-    left_out = observed_there
-    left_out[cells] = False
+    left = np.zeros_like(new)
+    left[near] = ~np.isnan(maps["value"][near])
+    by_lattice = left.sum() > window and spacing_of(length) > 1
+    row, column = nearest(left, new, left.size if by_lattice else _MOST_AT_ONCE)
+    cells = row, column
+    left[cells] = False
     observed = _observed(maps, *cells)
     shape = rows.stop - rows.start, columns.stop - columns.start
-    if many and spacing_of(length) > 1:
+    if by_lattice:
         down, across = (
             places.ravel() for places in np.mgrid[rows.start : rows.stop, columns.start : columns.stop]
         )
@@ -348,17 +347,17 @@ def _condition(field: Field, own: int, maps: dict[str, ndarray], new: ndarray, w
             Lattice.around(field, own, cells), observed, cells, (down, across)
         )
     else:
-        row, column = (torch.from_numpy(places)[:, None] for places in cells)
-        covariance = field.covariance(own, row - row.T, column - column.T).numpy()
+        at_row, at_column = (torch.from_numpy(places)[:, None] for places in cells)
+        covariance = field.covariance(own, at_row - at_row.T, at_column - at_column.T).numpy()
         known = condition(covariance, observed)
         precision, shift = known.precision, known.shift
         downs, acrosses = torch.arange(rows.start, rows.stop), torch.arange(columns.start, columns.stop)
-        block = field.covariance(own, (row - downs)[..., None], (column - acrosses)[:, None])
+        block = field.covariance(own, (at_row - downs)[..., None], (at_column - acrosses)[:, None])
         mean, variance, skew = predict(known, covariance, observed, block.flatten(1).numpy())
     found = np.stack((mean, np.sqrt(variance.clip(0)), skew)).reshape(3, *shape)
     old = np.stack([maps[name][rows, columns] for name in ("mean", "std", "skew")])
     # What was observed at a cell says more of it than what there is room for. Numbers make no cell less sure.
-    kept = left_out[rows, columns]
+    kept = left[rows, columns]
     if not observed.interval.any():
         kept |= found[1] > old[1] + _LEAST_CHANGE
         found[1] = np.minimum(found[1], old[1])
