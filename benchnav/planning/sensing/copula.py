@@ -3,9 +3,9 @@
 A cell's λ has a rank in its own predicted distribution, whose normal score is a number, or an interval where the
 distribution has an atom, as at 0 and 1. The scores of all cells are a correlated Gaussian field
 (`benchnav.core.copula`), which the observed scores condition (`gaussian`). With the true distribution of each cell this
-is the posterior under the law, up to expectation propagation for intervals, the reach below, the lattice that stands for
-many observations (`lattice`), and the rejection of draws without a feasible path; with a model's prediction it is an
-approximation.
+is the posterior under the law, up to expectation propagation for intervals, the reach below, the lattice that stands
+for many observations (`lattice`), and the rejection of draws without a feasible path; with a model's prediction it is
+an approximation.
 
 Only cells within `_REACH` ℓ of what is new are updated, from all that was observed within `_BEYOND` ℓ more, and only
 where mean or standard deviation of the score change by `_LEAST_CHANGE` or more. λ that a prediction holds impossible is
