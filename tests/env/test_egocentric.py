@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 from torch import Tensor
 
 import benchnav  # noqa: F401 - registers the environment
@@ -75,6 +74,8 @@ def test_the_checkers_of_gymnasium_and_stable_baselines_pass(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         check_env(env)
+        from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
+
         check_env_for_sb3(env)
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 import benchnav  # noqa: F401 - registers the environment
 from benchnav.core import registry
@@ -56,6 +55,8 @@ def test_the_checkers_of_gymnasium_and_stable_baselines_pass(dataset_path: Path,
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         check_env(env)
+        from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
+
         check_env_for_sb3(env)
 
 
@@ -372,6 +373,8 @@ def test_layers_are_seen_by_their_names(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         check_env(env)
+        from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
+
         check_env_for_sb3(env)
     seen, _ = env.reset(options={"map": 2})
     assert set(env.observation_space) == {"state", "goal", "rgb", "elevation_m", "slope_deg", "vegetation_m"}

@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 from benchnav.testing import check_planner
 
@@ -27,6 +26,8 @@ def test_the_batch_is_what_environments_one_after_the_other_are(
 ) -> None:
     given = {**SETTINGS, "data": dataset_path, "ground": "probe", "belief": "copula"}
     batch = example["Batched"](3, **given)
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
     single = DummyVecEnv([lambda: gymnasium.make("benchnav/OffRoad-v1", **given)] * 3)
     for envs in (batch, single):
         envs.seed(5)

@@ -149,14 +149,15 @@ def test_a_damaged_viewer_file_is_written_again(run: Path, tmp_path: Path) -> No
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     first, second = sorted(copy.glob("playback/*.rrd"))
     for path in (first, second):
-        path.write_bytes(path.read_bytes()[:-9])
+        content = path.read_bytes()
+        path.write_bytes(content[: len(content) // 2])
     assert len(verify_run(copy)[0]) == 2
     assert call("eval", "replay", copy, "--planner", "straight", "--view", "false") == 0
     assert len(verify_run(copy)[0]) == 1  # the episode that was asked for
     write_viewer_files(copy)
     assert verify_run(copy) == ([], [])
     for path in (first, second):
-        assert path.stat().st_size >= (run / path.relative_to(copy)).stat().st_size
+        assert path.stat().st_size > 0.9 * (run / path.relative_to(copy)).stat().st_size
 
 
 def test_the_command_prints_what_is_damaged_and_ends_with_status_1(

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,7 +29,7 @@ from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings
 from tests.commands import call
 
-distributed = pytest.importorskip("distributed")
+pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="the extra dask is not installed")
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 600  # a busy machine takes its time to start processes
@@ -47,7 +48,9 @@ class Cluster:
         of_one = ("worker", self.address, "--no-nanny", "--nthreads", "1")
         self.workers = [self._start(*of_one) for _ in range(workers)]
         try:
-            with distributed.Client(self.address, timeout=PATIENCE_S, set_as_default=False) as client:
+            from distributed import Client
+
+            with Client(self.address, timeout=PATIENCE_S, set_as_default=False) as client:
                 client.wait_for_workers(workers, timeout=PATIENCE_S)
         except BaseException:
             self.stop()

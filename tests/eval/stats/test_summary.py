@@ -1,7 +1,6 @@
 import numpy as np
 import pandas as pd
 import pytest
-import statsmodels.api as sm
 from scipy.stats import binomtest, norm, t
 
 from benchnav.eval.stats.paired_difference import by_map, total_time_interval
@@ -54,6 +53,8 @@ def test_many_maps_have_the_error_of_a_clustered_regression() -> None:
     size = np.tile([1, 2, 9], 100)
     success = drawn(generator, len(size), 9, 0.3, 0.7)[np.arange(9) < size[:, None]]
     maps = np.repeat(np.arange(len(size)), size)
+    import statsmodels.api as sm  # heavy, as all that tests import where they need it
+
     fit = sm.OLS(success.astype(float), np.ones(len(success))).fit(
         cov_type="cluster", cov_kwds={"groups": maps, "use_correction": False}
     )

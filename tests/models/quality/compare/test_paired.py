@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import bootstrap, permutation_test
-from statsmodels.stats.multitest import multipletests
 
 from benchnav.core.resampling import bootstrap_counts, holm
 from benchnav.models.quality.compare.paired import (
@@ -39,6 +38,8 @@ def sums_of(crps: list[float] | np.ndarray, seed: int = 0, classes: bool = True)
 
 
 def holm_of_statsmodels(p: np.ndarray | list[float]) -> np.ndarray:
+    from statsmodels.stats.multitest import multipletests
+
     with patch("gc.collect"):  # which it calls each time, for a fifth of a second
         corrected: np.ndarray = multipletests(p, method="holm")[1]
     return corrected
