@@ -36,9 +36,9 @@ from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
 
 _REACH = 4.0  # ℓ; the correlation is 3e-4 there
 _BEYOND = 2.0  # ℓ; what is observed farther off changes no cell within `_REACH` by `_LEAST_CHANGE`
-_MOST_AT_ONCE = (
-    2048  # observations that are conditioned on without a lattice, so that an update takes half a second
-)
+# Observations that are conditioned on without a lattice, those nearest to what is new, so that an update takes half a
+# second at most. Cells that were observed and are left out keep what is known of them.
+_MOST_AT_ONCE = 2048
 _SAME_SCORE, _SAME_STD = 1e-6, 0.99  # a second look that tells less than this is none
 _LEAST_CHANGE = 0.005  # of a score
 _OF_SKEW = 1 / 6  # by how much the score of the median moves with the skewness

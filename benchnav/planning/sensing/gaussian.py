@@ -26,7 +26,7 @@ from benchnav.core.copula import correlations
 
 _DAMPING = 0.8
 DAMPED_ROUNDS = 40
-ENOUGH = 1e-3  # change of a mean and of a standard deviation, in normal scores
+_ENOUGH = 1e-3  # change of a mean and of a standard deviation, in normal scores
 _LEAST_SHARE = 1e-9  # of the variance that an interval leaves
 LEAST_VARIANCE = 1e-12
 _MOST_SKEW = 2.0  # that of an exponential, which a number far out in a tail is
@@ -184,12 +184,8 @@ def condition(covariance: ndarray, observed: Observed) -> Posterior:
     ends = observed.lower[held], observed.upper[held], observed.std[held]
     for _ in range(DAMPED_ROUNDS):
         mean, variance = terms.moments(left, centre)
-        new = terms.towards(mean, variance, *ends)
-        more = new.precision - terms.precision
-        # By how much each term moves its own cell, were it alone to change.
-        moved = abs(new.shift - terms.shift) + abs(more * mean)
-        terms = new
-        if (moved / (1 / variance + more.clip(0))).max() <= ENOUGH:
+        terms, settled = terms.step(mean, variance, *ends)
+        if settled:
             break
     precision, shift = precision.copy(), shift.copy()
     precision[held], shift[held] = terms
@@ -311,6 +307,15 @@ class Terms(NamedTuple):
         """Return cavity means and variances."""
         without = 1 / (1 / variance - self.precision).clip(LEAST_VARIANCE)
         return without * (mean / variance - self.shift), without
+
+    def step(
+        self, mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray, std: ndarray
+    ) -> "tuple[Terms, bool]":
+        """Return the terms of `towards`, and whether none moves its own cell by more than `_ENOUGH`."""
+        new = self.towards(mean, variance, lower, upper, std)
+        more = new.precision - self.precision
+        moved = abs(new.shift - self.shift) + abs(more * mean)
+        return new, bool((moved / (1 / variance + more.clip(0))).max() <= _ENOUGH)
 
     def towards(
         self, mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray, std: ndarray

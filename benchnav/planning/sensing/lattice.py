@@ -1,8 +1,8 @@
 """A field of correlated standard normals, given many observations, by a lattice of some of its cells.
 
-Where ℓ is several cells long, the field is smooth from cell to cell. It is then told by its values on a lattice of
-every few cells, the basis, and what the basis leaves of a cell's variance is taken for that cell's own, with which no
-other cell has to do. All observations count; the cost is of N m² for N of them and m cells of the basis, not of N³.
+Where ℓ is several cells long, the field is smooth from cell to cell. Its values on a lattice of every few cells, the
+basis, then determine it, and what the basis leaves of a cell's variance counts as that cell's own, independent of all
+others. All observations count; the cost is of N m² for N of them and m cells of the basis, not of N³.
 
 Sources: Snelson and Ghahramani (2006), "Sparse Gaussian processes using pseudo-inputs" (FITC), for numbers;
 Naish-Guzman and Holden (2008), "The generalized FITC approximation", for intervals, by expectation propagation as in
@@ -21,7 +21,6 @@ from torch import Tensor
 
 from benchnav.planning.sensing.gaussian import (
     DAMPED_ROUNDS,
-    ENOUGH,
     LEAST_VARIANCE,
     Field,
     Observed,
@@ -47,7 +46,7 @@ class Lattice:
     """A basis of some cells of a field.
 
     Args:
-        field: how scores hang together.
+        field: correlations of the scores.
         own: which field of it.
         basis: the cells.
         root: Cholesky factor of their covariance, shape [m, m].
@@ -165,11 +164,8 @@ def condition_and_predict(
             known = Known.of(before[0] + more, before[1] + pulled)
             mean, variance, _ = _moments(known, combined[:, held], own[held], *terms)
             variance = variance.clip(LEAST_VARIANCE)
-            new = terms.towards(mean, variance, *ends)
-            risen = new.precision - terms.precision
-            moved = abs(new.shift - terms.shift) + abs(risen * mean)
-            terms = new
-            if (moved / (1 / variance + risen.clip(0))).max() <= ENOUGH:
+            terms, settled = terms.step(mean, variance, *ends)
+            if settled:
                 break
         precision[held], shift[held] = terms
         more, pulled = _weighted(combined[:, held], own[held], *terms)
