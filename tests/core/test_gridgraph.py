@@ -1,6 +1,7 @@
 import networkx
 import numpy as np
 import pytest
+from scipy.ndimage import generate_binary_structure, label
 
 from benchnav.core import gridgraph
 
@@ -76,3 +77,18 @@ def test_travel_time_is_half_in_each_cell() -> None:
     assert edge[0, 1] == pytest.approx(1 / 0.5 + 1 / 1.0)
     assert edge[1, 2] == pytest.approx(np.sqrt(2) * (1 / 1.0 + 1 / 0.25))
     assert np.isinf(edge[0, 3])
+
+
+@pytest.mark.parametrize(("closed_corners", "shared"), [(True, 1), (False, 2)])
+def test_steps_join_what_shared_edges_join_and_once_what_corners_do(
+    closed_corners: bool, shared: int
+) -> None:
+    shape, batch = (9, 7), 40
+    free = np.random.default_rng(4).random((batch, *shape)) < 0.55
+    costs = gridgraph.travel_time_costs(np.ones(free.shape), free, 0.5, closed_corners)
+    goals = np.zeros_like(free)
+    goals[:, 4, 3] = free[:, 4, 3]
+    reached = np.isfinite(gridgraph.cost_to_go(costs, goals, shape)[0])
+    for b in range(batch):
+        parts, _ = label(free[b], generate_binary_structure(2, shared))
+        assert np.array_equal(reached[b], (parts == parts[4, 3]) & free[b] & free[b, 4, 3])

@@ -76,6 +76,9 @@ class Recipe:
             at 0, as in synthesis 1, each cell's is its own.
         vegetation_period_m: lattice spacing of the noise that vegetation grows by: a patch is about half as wide;
             0 where no class has vegetation. Synthesis 2 only.
+        closed_corners: whether a diagonal step between two cells that are not free is no way, for solvable maps and
+            reference times. False in the shipped recipes and in files of versions before 1.2; a recipe with an id of
+            its own has it true, unless it says otherwise.
         environments: number of environments; each shows its own choice of classes.
         occupancy: share of the cells that each class of an environment covers, summing to 1.
         class_periods_m: lattice spacings of the class noise, one an octave.
@@ -102,6 +105,7 @@ class Recipe:
     places: PlacesRule | None = None
     correlation_m: float = 0.0
     vegetation_period_m: float = 0.0
+    closed_corners: bool = False
 
     def __post_init__(self) -> None:
         """Refuses recipes that contradict themselves."""
@@ -187,6 +191,7 @@ class Recipe:
                 del scenario["tints"]  # as versions without them wrote it
         unused = ["places"] if self.places is None else ["start_m", "goal_m"]
         unused += [] if self.has_vegetation else ["vegetation_period_m"]
+        unused += [] if self.closed_corners else ["closed_corners"]
         if self.synthesis == 1:
             # As version 0.1 wrote it, so that its files and readers stay as they are.
             unused += ["synthesis", "correlation_m"]
@@ -221,6 +226,8 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
         name, equals, value = text.partition("=")
         expect(equals and all(name.split(".")), f"an override such as splits.train.maps=50, got {text!r}.")
         own = changed(own, name.split("."), load_yaml(value))
+    if isinstance(own, dict) and own.get("id") not in shipped:
+        own = {"closed_corners": True, **own}
     recipe = recipe_from_dict(own, str(source))
     expect(
         not overrides or recipe.id != data.get("id"),

@@ -72,7 +72,8 @@ def reference_time_s(recipe: Recipe, maps: Maps) -> ndarray:
         Seconds, infinite where no free path joins start and goal, shape [B].
     """
     expected = latent.expected_of(latent.truth(maps["class_id"], maps["slope_deg"], recipe.classes))
-    costs = gridgraph.travel_time_costs(expected, expected > recipe.stuck_threshold, recipe.resolution_m)
+    free = expected > recipe.stuck_threshold
+    costs = gridgraph.travel_time_costs(expected, free, recipe.resolution_m, recipe.closed_corners)
     every = np.arange(len(expected))
     goals = np.zeros(expected.shape, dtype=bool)
     goals[(every, *recipe.cells_of(maps["goal_m"]))] = True

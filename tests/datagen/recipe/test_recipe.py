@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,8 +7,10 @@ import torch
 import yaml
 
 from benchnav.core.errors import ConfigError
+from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict, shipped_recipes, shipped_sizes
 from benchnav.datagen.recipe.scenario import Scenario, blend
+from benchnav.datagen.synth.generate import reference_time_s
 
 TINY = yaml.safe_load((Path(load_recipe.__globals__["RECIPES"]) / "tiny-v1.yaml").read_text())
 
@@ -17,6 +20,41 @@ def test_shipped_recipes_load_and_survive_their_manifest() -> None:
     for name in shipped_recipes():
         recipe = load_recipe(name)
         assert recipe_from_dict(recipe.to_dict(), "manifest") == recipe
+
+
+def test_maps_of_a_new_id_close_corners_and_those_of_ids_before_do_not(tmp_path: Path) -> None:
+    assert not any(load_recipe(name).closed_corners for name in shipped_recipes())
+    path = tmp_path / "own.yaml"
+    path.write_text(yaml.safe_dump(TINY | {"id": "own"}))
+    recipe = load_recipe(path)
+    assert recipe.closed_corners
+    assert load_recipe("tiny-v1", ["id=other"]).closed_corners
+    assert not load_recipe("tiny-v1", ["id=other", "closed_corners=false"]).closed_corners
+    # A manifest holds what was used; without the key its maps are of a version that knew no such rule.
+    assert recipe_from_dict(recipe.to_dict(), "manifest") == recipe
+    assert not recipe_from_dict(TINY | {"id": "own"}, "manifest").closed_corners
+
+
+@pytest.mark.parametrize("closed_corners", [False, True])
+def test_a_goal_behind_cells_that_touch_at_corners_has_a_reference_time_only_by_the_former_rule(
+    closed_corners: bool,
+) -> None:
+    recipe = recipe_from_dict(TINY | {"closed_corners": closed_corners}, "test")
+    flat = np.zeros((1, 1, len(recipe.classes)))
+    expected = latent.expected_of(
+        latent.truth(np.arange(len(recipe.classes))[None, None], flat, recipe.classes)
+    )
+    size = np.arange(recipe.height)
+    class_id = np.full((1, recipe.height, recipe.width), int(expected.argmax()))
+    class_id[0, size, recipe.width - 1 - size] = int(expected.argmin())
+    recipe = replace(recipe, stuck_threshold=float(expected.mean()))
+    ends = (
+        np.array([[end, end]]) for end in (0.25 * recipe.grid.extent_m[0], 0.75 * recipe.grid.extent_m[0])
+    )
+    maps = {"class_id": class_id, "slope_deg": np.zeros(class_id.shape)} | dict(
+        zip(("start_m", "goal_m"), ends, strict=True)
+    )
+    assert np.isinf(reference_time_s(recipe, maps)[0]) == closed_corners
 
 
 def test_severity_moves_from_std_to_the_preset() -> None:

@@ -3,12 +3,14 @@
 λ̂ does not change during an episode, so the exact cost to go h* is found once for every cell, by one
 compiled search, Dijkstra's, backward from the goal, on the host. A* with h* as its heuristic expands the
 cells of a cheapest path alone: replanning from wherever the robot stands is following pointers. Ground that
-is not free costs its penalty a metre, on the half of an edge that lies in it, so that every cell has a path.
+is not free costs its penalty a metre, on the half of an edge that lies in it, so that every cell has a path. A step
+between two cells that touch at a corner and are not free costs as much on its whole length (`gridgraph.squeezes`).
 Sources: Hart, Nilsson and Raphael (1968); paper IV-A1. Letters in shapes: B episodes, H×W cells, N points,
 E edges.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -72,7 +74,9 @@ def edge_costs(problem: Problem) -> Tensor:
         raise ConfigError(
             f"Expected {name} as finite numbers > 0, got {least:g} to {most:g}. Return a cost > 0 per metre."
         )
-    penalty = PENALTY * (not_free[0] + not_free[1])
+    free_of = partial(_of_cells, problem.free.flatten(1))
+    squeezed = gridgraph.squeezes(free_of, source, target, problem.grid.width)
+    penalty = PENALTY * (not_free[0] + not_free[1] + 2 * squeezed)
     return 0.5 * length_m * (per_m[0] + per_m[1]) + 0.5 * length_m * penalty
 
 
@@ -142,13 +146,18 @@ def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
     to_go, per_m = costs.unbind(1)
     column, row = (x_m / size).floor(), (y_m / size).floor()
     own, ended = grid.lookup(per_m, x_m, y_m), grid.lookup(to_go, x_m, y_m) == 0
-    best = torch.full_like(x_m, torch.inf)
-    for above in (-0.5, 0.5, 1.5):
-        for right in (-0.5, 0.5, 1.5):
-            centre_x, centre_y = (column + right) * size, (row + above) * size
-            length = torch.sqrt((x_m - centre_x) ** 2 + (y_m - centre_y) ** 2)
-            line = 0.5 * length * (own + grid.lookup(per_m, centre_x, centre_y))
-            best = torch.minimum(best, grid.lookup(to_go, centre_x, centre_y) + line)
+    sides, best = (-0.5, 0.5, 1.5), torch.full_like(x_m, torch.inf)
+    centres = {(up, right): ((column + right) * size, (row + up) * size) for up in sides for right in sides}
+    metre = {side: grid.lookup(per_m, *centre) for side, centre in centres.items()}
+    for (up, right), (centre_x, centre_y) in centres.items():
+        there = metre[up, right]
+        # Cells that touch at a corner and are not free leave no way between them, see `edge_costs`; where they are
+        # the cell itself and its neighbour across an edge, one of the ends is not free.
+        beside = torch.minimum(metre[up, 0.5], metre[0.5, right]) >= PENALTY
+        squeezed = beside & (torch.maximum(own, there) < PENALTY)
+        length = torch.sqrt((x_m - centre_x) ** 2 + (y_m - centre_y) ** 2)
+        line = length * (0.5 * (own + there) + PENALTY * squeezed)
+        best = torch.minimum(best, grid.lookup(to_go, centre_x, centre_y) + line)
     return torch.where(ended, 0, best)
 
 

@@ -4,10 +4,11 @@ An edge is what becomes of the robot when its controller follows a reference fro
 through F with predicted traversability, step by step, and ends where its reference ends, at the goal, after
 its time, or where it collides.
 
-- An edge collides where it leaves the map or *enters* ground that is not free. One that begins on such
-  ground, because the truth differs from the prediction, may leave it, and goes on.
+- An edge collides where it leaves the map, *enters* ground that is not free, or passes in one time step between
+  two such cells that touch at a corner (`gridgraph.squeezes`). One that begins on ground that is not free, because
+  the truth differs from the prediction, may leave it, and goes on.
 - A loop that may cross does not collide with ground that is not free. How far an edge drives on such
-  ground is counted, since a metre of it has a penalty.
+  ground, or between such cells, is counted, since a metre of it has a penalty.
 - Of an edge that collides the nearer half of its free part stays, as the source keeps feasible nodes along
   the way: in tight places no edge of full length is free.
 
@@ -17,12 +18,15 @@ T time steps, N points of a reference, P drawn points of an edge, S state dimens
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch
+from benchnav.core.gridgraph import squeezes
 from benchnav.planning.objective import distance
+from benchnav.planning.planners.astar.astar import cell_at
 from benchnav.planning.planners.cl_rrt.dubins import dubins_segments_to_point, sample_segments
 from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, PathFollower, Reference, Tracking
 from benchnav.planning.problem import Problem, motion_traversability
@@ -129,6 +133,8 @@ def drive(loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Te
     """
     problem, end_m = loop.problem, length_m.clamp(max=loop.step_m)
     path, progress, free, collided, integral, error = _simulate(loop, begin, reference, end_m)
+    squeezed = _squeezed(problem, path, free)
+    collided = collided | (squeezed & ~loop.crossing[:, None]).cummax(dim=0).values
     at_goal = distance(path, problem.goal_m[:, None]) < problem.goal_radius_m
     over = (progress >= end_m) | at_goal
     over[-1] = True  # no edge goes on past the log
@@ -141,7 +147,7 @@ def drive(loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Te
         kept=last > 0,
         at=LoopState(state=_at(path, last), tracking=tracking, free=_at(free, last)),
         time_s=last.to(path) * problem.dt_s,
-        blocked_m=_at(_blocked_m(path, free), last),
+        blocked_m=_at(_blocked_m(path, free, squeezed), last),
         arrived=_at(at_goal, last),
         end_m=_at(progress, last),
         drawn=_thin(path[..., :2], progress, last, loop.drawn_points),
@@ -175,9 +181,26 @@ def _simulate(loop: ClosedLoop, begin: LoopState, reference: Reference, end_m: T
     return [torch.stack(values) for values in zip(*log, strict=True)]
 
 
-def _blocked_m(path: Tensor, free: Tensor) -> Tensor:
-    """Metres driven on ground that is not free up to each step, shape [T, B, R]."""
-    moved = torch.where(free[:-1], 0, distance(path[1:], path[:-1]))
+def _squeezed(problem: Problem, path: Tensor, free: Tensor) -> Tensor:
+    """Tell at which steps a robot has just passed between two cells that are not free, bool, shape [T, B, R].
+
+    Args:
+        problem: B problems.
+        path: states, shape [T, B, R, S].
+        free: which are on free ground, bool, shape [T, B, R].
+    """
+    cells = cell_at(problem.grid, path).movedim(0, -1)
+    source, target = (part.flatten(1) for part in (cells[..., :-1], cells[..., 1:]))
+    free_cells = problem.free.flatten(1)
+    passed = squeezes(partial(torch.gather, free_cells, 1), source, target, problem.grid.width)
+    # A robot off the map is read in the nearest cell.
+    passed = passed.unflatten(1, (path.shape[2], -1)).movedim(-1, 0) & free[:-1] & free[1:]
+    return torch.nn.functional.pad(passed, (0, 0, 0, 0, 1, 0))
+
+
+def _blocked_m(path: Tensor, free: Tensor, squeezed: Tensor) -> Tensor:
+    """Metres driven on ground that is not free, or between such cells, up to each step, shape [T, B, R]."""
+    moved = torch.where(free[:-1] & ~squeezed[1:], 0, distance(path[1:], path[:-1]))
     return torch.nn.functional.pad(moved.cumsum(dim=0), (0, 0, 0, 0, 1, 0))
 
 

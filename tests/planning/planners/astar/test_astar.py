@@ -25,7 +25,10 @@ def random_problem(seed: int, robot: Unicycle, by_time: bool = False) -> Problem
 
 
 def networkx_graph(problem: Problem, member: int, by_time: bool) -> networkx.Graph:
-    """Halves of an edge at their own cell's cost; penalties on the flat length."""
+    """Halves of an edge at their own cell's cost; penalties on the flat length.
+
+    A diagonal edge between two free cells is penalised whole where the two cells beside it are not free.
+    """
     free, height = problem.free[member].numpy(), problem.elevation_m[member].double().numpy()
     pace = 1 / problem.risk_map[member].double().clamp(min=0.3).numpy() / problem.robot.top_speed_mps
     graph = networkx.Graph()
@@ -39,6 +42,8 @@ def networkx_graph(problem: Problem, member: int, by_time: bool) -> networkx.Gra
                     if by_time:
                         cost = half * (pace[i, j] + pace[k, m])
                     penalty = half * PENALTY * (int(not free[i, j]) + int(not free[k, m]))
+                    if free[i, j] and free[k, m] and not free[i, m] and not free[k, j]:
+                        penalty = 2 * half * PENALTY
                     graph.add_edge((i, j), (k, m), weight=cost + penalty)
     return graph
 
@@ -152,6 +157,22 @@ def test_a_wall_without_a_gap_is_crossed_where_it_is_thinnest() -> None:
     assert field.cost[1, 2, 2] < 100
 
 
+@pytest.mark.parametrize("gap", [False, True])
+def test_a_wall_of_cells_that_touch_at_corners_is_a_wall(gap: bool) -> None:
+    wall = torch.full((1, 16, 16), 0.9)
+    wall[0, torch.arange(16), 15 - torch.arange(16)] = 0.0
+    wall[0, 15, 0] = 0.9 if gap else 0.0
+    problem = factories.problem(wall, (2.25, 2.25), (6.75, 6.75))
+    field = astar.search(problem)
+    cells = astar.path_cells(field, torch.tensor([4 * 16 + 4]), 60)[0]
+    blocked = (~problem.free[0].flatten()[cells]).sum()
+    assert blocked == (0 if gap else 1)
+    # From both sides of a corner the way to the goal is as long as from the cells' centres.
+    beside = torch.tensor([[[3.99, 3.99], [4.01, 4.01]]])
+    near, far = astar.cost_at(problem.grid, astar.framed(problem, field), *beside.unbind(-1))[0].tolist()
+    assert near > far + (2 if gap else 0.3 * PENALTY)
+
+
 def test_a_goal_in_a_ring_that_is_not_free_is_reached_through_its_disc() -> None:
     closed = torch.full((1, 16, 16), 0.9)
     closed[0, 10:, 10:] = 0.0
@@ -201,7 +222,12 @@ def test_the_cost_between_centres_is_the_least_of_lines_to_those_near() -> None:
     problem = random_problem(2, Unicycle(), by_time=True)
     field, points = astar.search(problem), everywhere(problem, 60)
     found = astar.cost_at(problem.grid, astar.framed(problem, field), points[..., 0], points[..., 1])
-    per_m = 1 / problem.risk_map.clamp(min=0.3) + PENALTY * ~problem.free
+    per_m, free = 1 / problem.risk_map.clamp(min=0.3) + PENALTY * ~problem.free, problem.free
+
+    def squeezed(b: int, i: int, j: int, k: int, m: int) -> torch.Tensor:
+        return free[b, i, j] & free[b, k, m] & ~free[b, i, m] & ~free[b, k, j]
+
+    assert sum(squeezed(b, i, j, i + 1, j + 1).item() for b in range(3) for i in range(15) for j in range(11))
     for b, each in enumerate(points):
         for (x, y), value in zip(each.tolist(), found[b].tolist(), strict=True):
             row, column = int(y // 0.5), int(x // 0.5)
@@ -212,7 +238,9 @@ def test_the_cost_between_centres_is_the_least_of_lines_to_those_near() -> None:
                 field.cost[b, i, j].item()
                 + np.hypot(x - 0.5 * j - 0.25, y - 0.5 * i - 0.25)
                 * 0.5
-                * (per_m[b, row, column] + per_m[b, i, j]).item()
+                * (
+                    per_m[b, row, column] + per_m[b, i, j] + 2 * PENALTY * squeezed(b, row, column, i, j)
+                ).item()
                 for i in range(max(row - 1, 0), min(row + 2, 16))
                 for j in range(max(column - 1, 0), min(column + 2, 12))
             )

@@ -161,3 +161,27 @@ def test_robot_on_ground_that_is_not_free_may_leave_it_but_not_enter_more() -> N
     assert edges.at.state[0, 0, 0] == pytest.approx(10.0, abs=0.1)
     assert edges.at.state[0, 1, 0] < 11
     torch.testing.assert_close(edges.blocked_m, torch.full((1, 2), 0.5), rtol=0, atol=0.1)
+
+
+@pytest.mark.parametrize("crossing", [False, True])
+def test_edge_between_two_cells_that_touch_at_a_corner_is_one_through_a_wall(crossing: bool) -> None:
+    maps = open_map()
+    rows = torch.arange(32)
+    maps[0, rows, 31 - rows] = 0.1
+    loop = make_loop(maps, crossing=crossing)
+    # Along the diagonal each time step leads from corner to corner, and none ends in the wall.
+    edges = edge(loop, (7.0, 7.0, math.pi / 4), (9.0, 9.0), (7.5, 7.5))
+    assert edges.kept.all()
+    beyond = edges.at.state[0, :, 0] > 8
+    assert beyond.tolist() == [crossing, False]
+    assert edges.at.free.all()
+    expected = [0.08, 0.0] if crossing else [0.0, 0.0]  # one step of 0.8 m/s
+    torch.testing.assert_close(edges.blocked_m, torch.tensor([expected]), rtol=0, atol=1e-3)
+
+
+def test_edge_round_one_cell_that_is_not_free_passes_its_corner() -> None:
+    maps = open_map()
+    maps[0, 15, 16] = 0.1
+    edges = edge(make_loop(maps), (7.0, 7.0, math.pi / 4), (9.0, 9.0))
+    assert edges.at.state[0, 0, 0] == pytest.approx(9.0, abs=0.1)
+    assert edges.blocked_m.item() == 0
