@@ -23,7 +23,7 @@ _RESULTS = (
     *("outcome", "success", "total_time_s", "end_time_s", "traversability", "reference_time_s", "time_ratio"),
     *("score", "path_length_m", "stuck_share", "roughness_radps2", "planning_ms", "planning_ms_p95"),
     *("planning_start_ms", "revisions", "seen_cells", "sensed_cells", "ahead_rmse", "ahead_log_score"),
-    *("learning_ms", "rejected_draws", "compiled", "error"),
+    *("learning_ms", "rejected_draws", "lower_bound_s", "compiled", "error"),
 )
 
 
@@ -35,6 +35,7 @@ def episode_rows(
     reference_time_s: np.ndarray,
     rejected_draws: Sequence[int],
     compiled: bool,
+    lower_bound_s: Sequence[float] | None = None,
 ) -> pd.DataFrame:
     """Tabulates episodes, a row each.
 
@@ -46,6 +47,8 @@ def episode_rows(
         reference_time_s: grid reference times at 1 m/s, shape [B]; NaN where there is none.
         rejected_draws: draws of λ of each episode in which no feasible path joins start and goal, B of them.
         compiled: the planner ran compiled.
+        lower_bound_s: time to the goal that no trajectory undercuts, infinite where none arrives, B of them; None where
+            it was not computed.
 
     Returns:
         The condition's id and labels, `seed`, `realisation`, `map`, `group`; `outcome`, `success`; `total_time_s`,
@@ -54,7 +57,7 @@ def episode_rows(
         the robot's top speed, NaN for failures; `score`, BARN's, 0 for failures; `path_length_m`;
         `stuck_share`, share of steps with λ at most λ_stuck; `roughness_radps2`, the mean change of the
         commanded turn rate; wall times of planning as of `planning_times`; what was learnt on the way, as of
-        `_learnt`; `rejected_draws`; `compiled`; `error`.
+        `_learnt`; `rejected_draws`; `lower_bound_s`; `compiled`; `error`.
         What an episode that ended at once does not have is NaN.
     """
     top_speed, rows = problem.robot.top_speed_mps, []
@@ -85,6 +88,7 @@ def episode_rows(
                 **planning_times(episodes, b),
                 **_learnt(episodes, b, steps),
                 "rejected_draws": rejected_draws[b],
+                "lower_bound_s": np.nan if lower_bound_s is None else lower_bound_s[b],
                 "compiled": compiled,
                 "error": episodes.errors[b],
             }

@@ -41,6 +41,7 @@ from benchnav.planning.problem import Problem, heading_to, pose_problem
 from benchnav.planning.sensing.belief import Fields, Law
 from benchnav.planning.sensing.knowledge import KnowledgeError, Learner, Truth, call, sensor_keys
 from benchnav.planning.sensing.sensor import Step
+from benchnav.planning.world.lower_bound import BOUNDED_ROBOTS, Motion, lower_bound_s
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import Places
@@ -93,6 +94,8 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
         watched = unit.watched()
         recorder = Recorder(unit, problem, simulation, block.terrain, watched)
         episodes, compiled = simulate(unit, built, settings, **(recorder.watching if watched else {}))
+        failed = all(episodes.errors)  # a planner that cannot be made, say
+        least_s = None if failed else _lower_bounds_s(unit, built)
     succeeded = (episodes.outcome == Outcome.SUCCESS).tolist()
     for member in unit.recorded(succeeded):
         recorder.recording(episodes, member).save(folder / unit.recording_path(member))
@@ -100,7 +103,7 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
         write_steps(folder, unit, origin.key(unit), step_table(unit, problem, episodes))
     reference = block.places.reference_time_s.cpu().numpy()
     rejected_draws = (simulation.attempts - 1).tolist()
-    rows = episode_rows(unit, block.groups, problem, episodes, reference, rejected_draws, compiled)
+    rows = episode_rows(unit, block.groups, problem, episodes, reference, rejected_draws, compiled, least_s)
     errors = sorted({error for error in episodes.errors if error})
     write_unit(folder, unit, origin, rows, errors, episodes.traceback)
 
@@ -299,6 +302,21 @@ def simulate(unit: Unit, built: Built, settings: Settings, **options: Any) -> tu
             planner, built.problem, built.simulation, generator, learning=built.learning, **options
         )
     return episodes, bool(planner.compiled)
+
+
+def _lower_bounds_s(unit: Unit, built: Built) -> list[float] | None:
+    """Lower bounds of the time to the goal where the planner is given λ, of robots and worlds that have one."""
+    problem, field, condition = built.problem, built.simulation.field, unit.condition
+    if field is None or type(problem.robot) not in BOUNDED_ROBOTS or condition.model.part != "clairvoyant":
+        return None
+    if not condition.make_planner().given_truth:
+        return None
+    motion = Motion(
+        robot=problem.robot, goal_radius_m=problem.goal_radius_m, immobile=condition.world.immobile
+    )
+    ends = problem.start[:, :2].cpu().numpy(), problem.goal_m.cpu().numpy()
+    each = zip(field.cpu().numpy(), *ends, strict=True)
+    return [lower_bound_s(values, problem.grid, motion, start_m, goal_m) for values, start_m, goal_m in each]
 
 
 class _Unmade(Planner[None]):

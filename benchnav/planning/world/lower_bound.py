@@ -39,7 +39,9 @@ from scipy.sparse.linalg import splu
 
 from benchnav.core.grid import Grid
 from benchnav.planning.free_space import Immobile
-from benchnav.planning.robots import Robot, steps_in
+from benchnav.planning.robots import Bicycle, DifferentialDrive, Robot, Unicycle, steps_in
+
+BOUNDED_ROBOTS = (Unicycle, DifferentialDrive, Bicycle)
 
 _MOST_SQUARES = 300_000  # of a map; the equations' factors stay under a gigabyte
 _LEAST_TRAVERSABILITY = 1e-3

@@ -119,8 +119,8 @@ def wall(thickness: int, traversability: float) -> ndarray:
         (wall(3, 0.45), Immobile(below=0.5, for_s=3.5)),
         (wall(1, 0.09), Immobile(below=0.1, for_s=2.0)),
         (wall(1, 0.45), Immobile(below=0.5, for_s=0.9)),
-        (np.random.default_rng(1).choice([0.05, 0.09, 0.6, 0.9], GRID.shape, p=[0.25, 0.15, 0.3, 0.3]), Immobile()),
-        (np.random.default_rng(2).choice([0.3, 0.45, 0.9], GRID.shape, p=[0.3, 0.4, 0.3]), Immobile(below=0.5, for_s=1.2)),
+        (np.random.default_rng(1).choice([0.05, 0.09, 0.6, 0.9], GRID.shape), Immobile()),
+        (np.random.default_rng(2).choice([0.3, 0.45, 0.9], GRID.shape), Immobile(below=0.5, for_s=1.2)),
     ],
 )  # fmt: skip
 def test_no_jumping_robot_arrives_earlier_or_where_nobody_can(
@@ -131,7 +131,7 @@ def test_no_jumping_robot_arrives_earlier_or_where_nobody_can(
     quickest, least = quickest_jumps(field, immobile, 160), bound(field, immobile)
     assert least <= quickest
     if math.isfinite(quickest):  # but not far from it
-        assert least > 0.75 * quickest
+        assert least > 0.65 * quickest
 
 
 @pytest.mark.parametrize("thickness", [1, 2])
