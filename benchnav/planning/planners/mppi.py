@@ -175,6 +175,14 @@ class MPPI(LocalPlanner[MPPIState]):
         self._weigh = Fused(weigh, rollouts, least, batched=(*OF_EPISODES, 14, 15))  # going, to_go
 
     @property
+    def seeks_goal(self) -> bool:
+        """True with a cost to go: the last state pays to the goal, and so must the steps before it.
+
+        If the steps ended at a waypoint, to stand on it would cost nothing.
+        """
+        return self.config.cost_to_go != "objective"
+
+    @property
     def _fields(self) -> int:
         return self.config.fields if self.config.risk_on == "cost" else 1
 

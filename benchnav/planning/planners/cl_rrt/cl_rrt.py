@@ -54,7 +54,7 @@ from benchnav.planning.planners.cl_rrt.pursuit import (
     Tracking,
 )
 from benchnav.planning.planners.cl_rrt.tree import Route, no_route, search
-from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, check_finite
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, check_finite, check_steers
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, TURN_RATE
 from benchnav.planning.sensing.sensor import Step
@@ -179,6 +179,7 @@ class CLRRT(Planner[CLRRTState]):
             ConfigError: the robot cannot follow references, or none of the turning radius.
         """
         config = self.config
+        check_steers(self, problem.robot, "cl_rrt")
         follower = PathFollower(config.follower, problem.robot)
         expect(
             config.turning_radius_m >= follower.tightest_m,
