@@ -16,6 +16,8 @@ Risk is that of λ in each cell, as the risk map has it, or that of the cost (`r
 out on M fields of λ, and its cost is the CVaR over them; see `benchnav.planning.planners.cost_risk`. What is beyond the
 horizon J takes for a straight line over good ground; `cost_to_go` looks at the map's cheapest paths instead.
 
+A robot that is steered by an angle also considers turns (`turns`), where its mean is no better than standing.
+
 What differs: noise and temperature are relative by default, so that one setting serves robots and objectives of
 any unit. The control cost is off by default. The mean is not smoothed. Noise is read anew from one bank, a pure
 function of seed and step (`NoiseBank`); the episodes of a batch share it, so an episode has the same noise alone as
@@ -42,6 +44,7 @@ from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.cost_risk import advance_entrapped, framed_fields, tail_cost, within_reach
 from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank, perturb
 from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
+from benchnav.planning.planners.turns import TURN_HORIZONS, is_steered, turning_primitives
 from benchnav.planning.problem import (
     Problem,
     Task,
@@ -175,6 +178,14 @@ class MPPI(LocalPlanner[MPPIState]):
         self._weigh = Fused(weigh, rollouts, least, batched=(*OF_EPISODES, 14, 15))  # going, to_go
 
     @property
+    def seeks_goal(self) -> bool:
+        """True with a cost to go: the last state pays to the goal, and so must the steps before it.
+
+        If the steps ended at a waypoint, to stand on it would cost nothing.
+        """
+        return self.config.cost_to_go != "objective"
+
+    @property
     def _fields(self) -> int:
         return self.config.fields if self.config.risk_on == "cost" else 1
 
@@ -253,9 +264,10 @@ class MPPI(LocalPlanner[MPPIState]):
         self, step: Step, plan_state: MPPIState, target_m: Tensor
     ) -> tuple[Tensor, MPPIState, Plan]:
         """Solves one step; see `LocalPlanner`."""
-        problem, config, mean = plan_state.problem, self.config, plan_state.mean
+        problem, config = plan_state.problem, self.config
         noise, ground = plan_state.noise.at(plan_state.step), self._ground(plan_state, step.state)
         held = self._held(plan_state, step)
+        mean = self._turned(step, plan_state, target_m, ground, held)
         advance = self._advance if held is None else self._advance_entrapped
         states, cost, going = roll_out(
             problem, step.state, mean, noise, target_m, advance, ground, held, step.time_s
@@ -275,6 +287,41 @@ class MPPI(LocalPlanner[MPPIState]):
         after = replace(plan_state, mean=shifted, step=plan_state.step + 1)
         return updated[:, 0], after if held is None else replace(after, held=held), plan
 
+    def _turned(
+        self, step: Step, plan_state: MPPIState, target_m: Tensor, ground: Tensor, held: Tensor | None
+    ) -> Tensor:
+        """Mean action sequences or, where these are no better than standing, turns, shape [B, T, A].
+
+        A turn replaces the mean and is no sample: the average of a turn to the left and one to the right is neither.
+        Where none pays within T they are compared over a longer time, since what is gained by a turn comes after it.
+        """
+        problem, mean = plan_state.problem, plan_state.mean
+        horizon = TURN_HORIZONS * mean.shape[1]
+        primitives = turning_primitives(problem.robot, horizon, mean)
+        if primitives is None:
+            return mean
+
+        def cost_of(base: Tensor, offset: Tensor) -> Tensor:
+            advance = advance_chunk if held is None else advance_entrapped
+            states, cost, going = roll_out(
+                problem, step.state, base, offset, target_m, advance, ground, held, step.time_s
+            )
+            target = target_m[:, None].repeat_interleave(self._fields, 0)
+            parts = problem.grid, problem.objective, self._fields, self.config.level, going, plan_state.to_go
+            return total_cost(states, cost, ground, target, *parts)[0]
+
+        rest = torch.zeros_like(primitives[..., :1])
+        choices = torch.cat((rest, primitives), dim=2)
+        short = slice(mean.shape[1])
+        goes_on = torch.cat((mean, mean[:, -1:].expand(-1, horizon - mean.shape[1], -1)), dim=1)
+        mean_cost, turn_cost = cost_of(mean, rest[short]), cost_of(0 * mean, choices[short])
+        standing = turn_cost[:, :1]
+        pays = turn_cost.amin(dim=1, keepdim=True) < standing
+        longer = torch.cat((cost_of(goes_on, rest), cost_of(0 * goes_on, choices)), dim=1)
+        best = torch.where(pays, torch.cat((mean_cost, turn_cost), dim=1), longer).argmin(dim=1)
+        turn = primitives[short].movedim(2, 0)[(best - 2).clamp(min=0)]
+        return torch.where(((mean_cost >= standing)[:, 0] & (best > 1))[:, None, None], turn, mean)
+
     def _ground(self, plan_state: MPPIState, state: Tensor) -> Tensor:
         """What rollouts from these states are on in this step, shape [B·M, N]."""
         problem = plan_state.problem
@@ -283,7 +330,8 @@ class MPPI(LocalPlanner[MPPIState]):
         if plan_state.ground is not None:
             return plan_state.ground.flatten(0, 1)
         key = rng.stream_key(plan_state.key, plan_state.step)
-        cells = within_reach(problem, state, plan_state.mean.shape[1] * problem.dt_s)
+        steps = plan_state.mean.shape[1] * (TURN_HORIZONS if is_steered(problem.robot) else 1)
+        cells = within_reach(problem, state, steps * problem.dt_s)
         return framed_fields(problem, problem.sample_fields(self._fields, key, cells))
 
     def _held(self, plan_state: MPPIState, step: Step) -> Tensor | None:
@@ -386,10 +434,28 @@ def weigh(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Adds the cost of the last states, weighs the samples by exp(−cost / temperature) and moves the mean.
 
+    Returns:
+        Weights of the samples, shape [B, K], and the mean action sequences, shape [B, T, A].
+    """
+    cost, each = total_cost(states, cost, padded_ground, target, grid, objective, fields, level, going, to_go)
+    scale: Tensor | float | None = temperature
+    if scale is None:
+        stopped = None if going is None else (~going).unflatten(0, (-1, fields)).sum(1)
+        scale = temperature_share * cost_spread(cost, each, stopped)
+    weights = torch.softmax((cost.amin(dim=1, keepdim=True) - cost) / scale, dim=1)
+    return weights, average(mean, noise, weights, low, high)
+
+
+def total_cost(
+    states: Tensor, cost: Tensor, padded_ground: Tensor, target: Tensor, grid: Grid, objective: Objective,
+    fields: int = 1, level: float = 0.0, going: Tensor | None = None, to_go: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Add the cost of the last states.
+
     Of rollouts on M fields the cost is the CVaR over them; those that have stopped have paid all that there is to pay.
 
     Returns:
-        Weights of the samples, shape [B, K], and the mean action sequences, shape [B, T, A].
+        Cost of the samples, shape [B, K], and on each field, shape [B, M, K].
     """
     ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
     if to_go is None:
@@ -401,13 +467,7 @@ def weigh(
         last = paths.view_as(cost) + PENALTY * (ground <= 0)
     cost = cost + (last if going is None else torch.where(going, last, 0))
     each = cost.unflatten(0, (-1, fields))
-    cost = tail_cost(each, level) if fields > 1 else cost
-    scale: Tensor | float | None = temperature
-    if scale is None:
-        stopped = None if going is None else (~going).unflatten(0, (-1, fields)).sum(1)
-        scale = temperature_share * cost_spread(cost, each, stopped)
-    weights = torch.softmax((cost.amin(dim=1, keepdim=True) - cost) / scale, dim=1)
-    return weights, average(mean, noise, weights, low, high)
+    return tail_cost(each, level) if fields > 1 else cost, each
 
 
 def cost_spread(cost: Tensor, each: Tensor | None = None, stopped: Tensor | None = None) -> Tensor:

@@ -16,11 +16,18 @@ from torch import Tensor
 
 from benchnav.core.errors import ConfigError, expect
 from benchnav.planning.problem import Problem, Task
-from benchnav.planning.robots import Robot
+from benchnav.planning.robots import STEERING, Robot
 from benchnav.planning.sensing.sensor import Step
 
 # What a `Plan` draws, with the dimensions of each layer between that of the episodes and (x, y).
 LAYERS = {"path": "N", "samples": "MN", "reference": "N", "tree": "EN"}
+
+# Remedies for a robot that a planner does not steer.
+_SAMPLED = "Take a planner that samples actions, such as mppi."
+_STEERED = (
+    "The planner commands a turn rate; this robot is steered by an angle, and turns only while it drives. "
+    "Take mppi, astar_mppi or straight."
+)
 
 
 class PlanStatus(IntEnum):
@@ -164,6 +171,11 @@ class LocalPlanner(Planner[State]):
     name: str
     """What tables call it."""
 
+    @property
+    def seeks_goal(self) -> bool:
+        """Whether it minimises a cost that runs to the goal, whatever target it is given."""
+        return False
+
     def plan(self, step: Step, plan_state: Any) -> tuple[Tensor, State, Plan]:
         """Plans toward the goal; see `Planner`."""
         return self.plan_toward(step, plan_state, plan_state.problem.goal_m)
@@ -220,10 +232,11 @@ def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:
     names = tuple(robot.action_names)
     known = (names,) if planner.steers is None else planner.steers
     actions = " or ".join(f"({', '.join(each)})" for each in known)
+    steered = STEERING in names and not any(STEERING in each for each in known)
     expect(
         names in known,
         f"a robot with actions {actions} for planner {name!r}, got {type(robot).__name__} with "
-        f"({', '.join(names)}). Take a planner that samples actions, such as mppi.",
+        f"({', '.join(names)}). {_STEERED if steered else _SAMPLED}",
     )
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 
 from benchnav.core import rng
+from benchnav.planning.free_space import Immobile
 from benchnav.planning.planners.mppi import advance_chunk, roll_out
 from benchnav.planning.planners.planner import rollout_path
 from benchnav.planning.problem import Problem
@@ -46,11 +47,17 @@ def with_start(problem: Problem, *start: float) -> Problem:
     return replace(problem, start=torch.tensor([start] * len(problem)))
 
 
-def drive(planner: Any, problem: Problem, truth: Tensor | None = None, time_budget_s: float = 60.0) -> Drive:
+def drive(
+    planner: Any,
+    problem: Problem,
+    truth: Tensor | None = None,
+    time_budget_s: float = 60.0,
+    immobile: Immobile | None = None,
+) -> Drive:
     """Runs episodes where the truth is what is predicted, unless it is given, shape [B, H, W]."""
     ground = problem.risk_map if truth is None else truth
     terrain = replace(factories.terrain(ground, 0.05), grid=problem.grid)
-    world = World(time_budget_s=time_budget_s)
+    world = World(time_budget_s=time_budget_s, immobile=immobile)
     noise = rng.stream_key(0, "noise")
     simulation = Simulation(
         terrain, problem.task, world, factories.places(problem.goal_m), noise, range(len(problem))

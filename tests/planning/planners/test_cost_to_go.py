@@ -47,7 +47,13 @@ def test_the_last_state_pays_what_the_setting_says(wanted: str, guided: bool) ->
     planner = AStarMPPI(AStarMPPIConfig(mppi=config)) if guided else MPPI(config)
     whole = planner.init(problem, generator())
     plan_state, local = (whole.local, planner.local) if guided else (whole, planner)
-    _, following, _ = local.plan_toward(first(problem), plan_state, problem.goal_m)
+    # With a cost to go both costs run to the goal, of its radius, whatever guides it.
+    if wanted == "objective":
+        _, following, _ = local.plan_toward(first(problem), plan_state, problem.goal_m)
+    else:
+        assert plan_state.problem.objective == problem.objective
+        following = planner.plan(first(problem), whole)[1]
+        following = following.local if guided else following
     own, noise = plan_state.problem, plan_state.noise.at(0)
     states, cost, _ = roll_out(own, problem.start, plan_state.mean, noise, problem.goal_m, advance_chunk)
     if wanted == "objective":
@@ -115,6 +121,16 @@ def test_it_leads_out_of_a_dead_end_that_a_straight_line_leads_into(cost: bool) 
     assert outcomes == [Outcome.TIMEOUT, Outcome.SUCCESS]
 
 
+def test_under_a_cost_to_go_a_guide_takes_no_action_of_mppi_elsewhere() -> None:
+    """Steps to a waypoint and a last cost to the goal would be two targets: to stand on the waypoint costs nothing."""
+    problem = posed()
+    config = replace(SMALL, cost_to_go="map")
+    guided = drive(AStarMPPI(AStarMPPIConfig(mppi=config)), problem, time_budget_s=3.0)
+    alone = drive(MPPI(config), problem, time_budget_s=3.0)
+    assert torch.equal(guided.actions, alone.actions)
+    assert float(guided.actions[..., 0].mean()) > 0.5
+
+
 @pytest.mark.parametrize("wanted", ["map", "expected-time"])
 def test_an_episode_alone_does_as_it_does_in_a_batch(wanted: str) -> None:
     problem = posed(3)
@@ -142,3 +158,5 @@ def test_what_cannot_be_told_is_refused() -> None:
     MPPI(SMALL).init(problem, generator())
     with pytest.raises(ConfigError, match="`path_cost` for option `cost_to_go` of MPPI, got OwnUnit"):
         MPPI(replace(SMALL, cost_to_go="map")).init(problem, generator())
+    with pytest.raises(ConfigError, match=r"`explore` = 0 for A\*\+MPPI with `cost_to_go` 'map'"):
+        AStarMPPIConfig(explore=0.5, mppi=replace(SMALL, cost_to_go="map"))

@@ -11,11 +11,20 @@ from benchnav.planning.planners import mppi
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
 from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank
 from benchnav.planning.planners.straight import Straight
+from benchnav.planning.planners.turns import turning_primitives
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
-from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda, rollout_cost
+from tests.planning.planners.driving import (
+    drive,
+    fake_cuda,
+    first,
+    generator,
+    on_cuda,
+    rollout_cost,
+    with_start,
+)
 
 SMALL = MPPIConfig(samples=256, horizon_s=2)
 
@@ -448,3 +457,62 @@ def test_runs_begin_everywhere_and_parts_change_hands() -> None:
     assert len((moment // 200).unique()) == 5
     assert (begin % 200).min() < 10
     assert (begin % 200).max() > 140
+
+
+@pytest.mark.parametrize(
+    ("objective", "least_mps", "within_s"),
+    [("travel_time", 0.0, 12.0), ("goal_distance", 0.0, 12.0), ("goal_distance", -1.0, 8.0)],
+)
+def test_a_bicycle_with_the_goal_behind_it_arrives(objective: str, least_mps: float, within_s: float) -> None:
+    """Half a turn of radius 0.73 m and 5 m back take 8.5 s at 0.85 m/s, 5 m in reverse 5.9 s."""
+    robot = Bicycle(speed_mps=(least_mps, 1.0))
+    cost = registry.make("objective", objective, robot=robot, goal_radius_m=1.0)
+    problem = factories.problem(torch.full((2, 40, 40), 0.85), (13.0, 10.0), (7.0, 10.0), robot, cost)
+    problem = with_start(problem, 13.0, 10.0, 0.0)
+    driven = drive(MPPI(replace(SMALL, samples=128, horizon_s=5.0)), problem, None, within_s)
+    assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
+
+
+def test_turns_are_full_steering_for_some_of_the_time_and_then_straight() -> None:
+    like = torch.zeros(1)
+    assert turning_primitives(Unicycle(), 32, like) is None
+    assert turning_primitives(DifferentialDrive(), 32, like) is None
+    forward = turning_primitives(Bicycle(speed_mps=(0.2, 0.8)), 32, like)
+    both = turning_primitives(Bicycle(speed_mps=(-0.5, 0.8)), 32, like)
+    assert forward is not None
+    assert both is not None
+    assert forward.shape == (32, 2, 34)
+    assert both.shape == (32, 2, 102)
+    assert torch.equal(both[..., :34], forward)
+    assert bool((forward[:, 0] == 0.8).all())
+    steering = forward[:, 1]
+    assert (steering != 0).sum(0).tolist() == [*range(0, 33, 2)] * 2
+    assert bool((steering.abs().diff(dim=0) <= 0).all())
+    assert steering[0].tolist() == pytest.approx([0.0, *[-0.6] * 16, 0.0, *[0.6] * 16])
+    assert bool((both[:, 0, 34:68] == -0.5).all())
+    shunts = both[:, :, 68:]
+    assert torch.equal(shunts[:, 0] == -0.5, shunts[:, 1] != 0)
+    assert bool(((shunts[:, 0] == 0.8) | (shunts[:, 0] == -0.5)).all())
+
+
+def test_a_turn_replaces_only_a_mean_that_is_no_better_than_standing() -> None:
+    """Two robots at rest, the goal behind the first and ahead of the second, and the first again with a good mean."""
+    ground = torch.full((3, 40, 40), 0.85)
+    problem = factories.problem(ground, (13.0, 10.0), (7.0, 10.0), Bicycle())
+    start = torch.tensor([[13.0, 10.0, 0.0], [13.0, 10.0, math.pi], [13.0, 10.0, math.pi]])
+    problem = replace(problem, start=start)
+    planner = MPPI(replace(SMALL, horizon_s=5.0))
+    state = planner.init(problem, generator())
+    mean = state.mean.clone()
+    mean[2, :, 0] = 0.5
+    state = replace(state, mean=mean)
+    turned = planner._turned(first(problem), state, problem.goal_m, problem.padded_ground, None)
+    assert bool((turned[0, :, 0] == 1).all())
+    steered = turned[0, :, 1].abs() > 0
+    # Half a turn takes π·0.73 m / 0.85 m/s = 2.7 s.
+    assert 20 <= int(steered.sum()) <= 34
+    assert torch.equal(turned[2], mean[2])
+    alone = problem.select(torch.tensor([0]))
+    state = planner.select(state, torch.tensor([0]))
+    single = planner._turned(first(alone), state, alone.goal_m, alone.padded_ground, None)
+    assert torch.equal(single, turned[:1])

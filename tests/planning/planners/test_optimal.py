@@ -24,11 +24,12 @@ from benchnav.planning.planners.optimal.value import (
 )
 from benchnav.planning.planners.optimal.ways import path_of, ways_from
 from benchnav.planning.planners.planner import PlanStatus
+from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
-from tests.planning.planners.driving import drive, first, generator, with_start
+from tests.planning.planners.driving import drive, first, generator, step_at, with_start
 
 RULES = Rules(min_traversability=0.01, free_space=FreeSpace(above=0.0))
 
@@ -248,7 +249,7 @@ def test_over_several_cells_the_time_held_adds_up(for_s: float, crosses: bool) -
     state = planner.init(posed, generator())
     found = float(ways_from(posed.start, state.held, state).cost.min())
     _, _, plan = planner.plan(first(posed), state)
-    assert plan.status.tolist() == [PlanStatus.OK if crosses else PlanStatus.FAILED]
+    assert plan.status.tolist() == [PlanStatus.OK if crosses else PlanStatus.PARTIAL]
     if crosses:
         assert found == pytest.approx((14 - 1.5) / 0.9 + 1.5 / 0.095, rel=0.02)
     else:
@@ -392,17 +393,21 @@ def test_an_episode_alone_does_as_it_does_in_a_batch() -> None:
     assert plan.status.tolist() == [PlanStatus.OK] * 11
 
 
-def test_where_there_is_no_way_it_gives_up() -> None:
+def test_without_a_path_it_drives_straight() -> None:
     ground = torch.full((2, 24, 24), 0.9)
     ground[0, :, 10:13] = 0.02
     posed = replace(
-        problem(ground, (2.25, 6.25), (9.25, 6.25)),
+        problem(ground, (2.25, 6.25), (9.25, 7.25)),
         immobile=Immobile(),
         distribution=factories.certain(ground),
     )
     planner = OptimalBound()
-    _, _, plan = planner.plan(first(posed), planner.init(posed, generator()))
-    assert plan.status.tolist() == [PlanStatus.FAILED, PlanStatus.OK]
+    step = step_at(posed.start + torch.tensor([0.0, 0.0, 0.1]))
+    action, _, plan = planner.plan(step, planner.init(posed, generator()))
+    assert plan.status.tolist() == [PlanStatus.PARTIAL, PlanStatus.OK]
+    straight, _, _ = Straight().plan(step, posed)
+    assert torch.equal(action[0], straight[0])
+    assert not torch.equal(action[1], straight[1])
 
 
 @pytest.mark.parametrize("kind", [Optimal, OptimalBound])

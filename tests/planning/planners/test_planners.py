@@ -1,5 +1,6 @@
 """What every registered planner does in a closed loop with the simulation, with every robot that it steers."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -8,6 +9,7 @@ from torch import Tensor
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
+from benchnav.planning.free_space import Immobile
 from benchnav.planning.planners.planner import Planner, PlanStatus, check_steers
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
@@ -140,6 +142,18 @@ def test_a_closed_wall_that_can_be_passed_in_truth_is_crossed(planner: str, robo
         assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
 
 
+@pytest.mark.parametrize("planner", registry.names("planner"))
+def test_on_ground_that_carries_no_robot_all_are_immobilised_alike(planner: str) -> None:
+    ground, immobile = torch.zeros(2, 16, 16), Immobile(below=0.3, for_s=1.5)
+    problem = factories.problem(ground, start=(1.75, 3.75), goal=(6.25, 3.75))
+    problem = replace(problem, distribution=factories.certain(ground), immobile=immobile)
+    watched = Watched(make(planner))
+    driven = drive(watched, problem, time_budget_s=20.0, immobile=immobile)
+    assert driven.outcome.tolist() == [Outcome.IMMOBILISED] * 2
+    assert driven.steps.tolist() == [15, 15]
+    assert PlanStatus.FAILED not in watched.statuses
+
+
 @FEW
 def test_the_same_seed_gives_the_same_episode(planner: str, robot: str) -> None:
     ground = torch.full((2, 16, 16), 0.85)
@@ -153,7 +167,8 @@ def test_every_planner_steers_the_papers_robot_and_refuses_what_it_does_not_stee
         assert (planner, "unicycle") in STEERED
         for robot in ROBOTS:
             if (planner, robot) not in STEERED:
-                with pytest.raises(ValueError, match=f"for planner '{planner}'"):
+                steered = "turns only while it drives" if (planner, robot) == ("cl_rrt", "bicycle") else ""
+                with pytest.raises(ConfigError, match=f"for planner '{planner}'.*{steered}"):
                     check_steers(make(planner), registry.make("robot", robot), planner)
             else:
                 check_steers(make(planner), registry.make("robot", robot), planner)

@@ -8,9 +8,14 @@ import torch
 from torch import Tensor
 
 from benchnav.core import registry
+from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners import boundary
 from benchnav.planning.planners.astar import astar
+from benchnav.planning.planners.cl_rrt import cl_rrt
+from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT
+from benchnav.planning.planners.planner import PlanStatus
 from benchnav.planning.problem import Problem
+from benchnav.planning.robots import Unicycle
 from tests import factories
 from tests.planning.planners.driving import first, generator, step_at
 from tests.planning.planners.test_planners import NAMES as ALL
@@ -145,6 +150,120 @@ def test_cl_rrt_keeps_a_path_that_is_free_and_leaves_one_that_is_no_longer() -> 
     _, after, _ = planner.plan(step_at(posed.start), revised)
     assert not torch.equal(after.route.path[0].nan_to_num(), plan_state.route.path[0].nan_to_num())
     assert torch.equal(after.route.path[1].nan_to_num(), plan_state.route.path[1].nan_to_num())
+
+
+def slow(traversability: float, rows: slice = slice(8, 16)) -> Tensor:
+    """Free ground of little λ̂ across the straight path, 3 m thick, on the first of two maps only."""
+    changed = ground()
+    changed[0, rows, 13:19] = traversability
+    return changed
+
+
+def cl_rrt_on_its_path(monkeypatch: pytest.MonkeyPatch) -> tuple[CLRRT, Any, list[int]]:
+    """CL-RRT with a path to the goal, and a list to which each search adds its number of episodes."""
+    planner, posed, searched = make("cl_rrt"), problem(ground()), []
+    _, plan_state, _ = planner.plan(first(posed), planner.init(posed, generator()))
+    assert plan_state.route.status.tolist() == [PlanStatus.OK] * 2
+    search = cl_rrt.search
+
+    def count(loop: Any, root: Tensor, *rest: Any) -> Any:
+        searched.append(len(root))
+        return search(loop, root, *rest)
+
+    monkeypatch.setattr(cl_rrt, "search", count)
+    return planner, plan_state, searched
+
+
+def test_cl_rrt_drives_around_ground_that_turns_slow_and_stays_free() -> None:
+    planner = make("cl_rrt")
+    track = drive(planner, problem(ground()), problem(slow(0.32)), 145)
+    # Straight on it takes 10 m less 3 m at 0.85 m/s and 3 m at 0.32 m/s: 17.6 s.
+    assert float((track[0, -1, :2] - torch.tensor(GOAL)).norm()) < 1.2
+    unchanged = drive(planner, problem(ground()), problem(ground()), 145)
+    assert torch.equal(track[1], unchanged[1])
+
+
+@pytest.mark.parametrize(("traversability", "searches"), [(0.85, []), (0.68, []), (0.6, [1]), (0.95, [])])
+def test_cl_rrt_searches_where_its_path_costs_a_tenth_more(
+    traversability: float, searches: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 10 m ahead 3 m turn slow: the path costs 1.1 times as much at λ̂ = 0.64."""
+    planner, plan_state, searched = cl_rrt_on_its_path(monkeypatch)
+    then = problem(slow(traversability, slice(None)))
+    for _ in range(2):  # the second revision brings nothing new
+        plan_state = planner.revise(plan_state, then)
+        for _ in range(2):
+            _, plan_state, _ = planner.plan(step_at(then.start), plan_state)
+    assert searched == searches
+
+
+def test_cl_rrt_keeps_a_dearer_path_that_no_new_one_undercuts(monkeypatch: pytest.MonkeyPatch) -> None:
+    planner, before, _ = cl_rrt_on_its_path(monkeypatch)
+    # Slow ground from edge to edge, and a new path 3 m beside the old one.
+    monkeypatch.setattr(cl_rrt, "search", lambda loop, root, *rest: detour)
+    detour = before.route.select(torch.tensor([0]))
+    detour = replace(detour, path=detour.path + torch.tensor([0.0, 3.0]))
+    detour = replace(detour, path=torch.cat((before.problem.start[:1, None, :2], detour.path[:, :-1]), 1))
+    then = problem(slow(0.4, slice(None)))
+    _, after, _ = planner.plan(step_at(then.start), planner.revise(before, then))
+    assert torch.equal(after.route.path.nan_to_num(), before.route.path.nan_to_num())
+    assert after.doubted.tolist() == [False, False]
+    # Over quick ground the same path is taken.
+    _, after, _ = planner.plan(step_at(then.start), planner.revise(before, problem(slow(0.4, slice(8, 14)))))
+    assert torch.equal(after.route.path[0].nan_to_num(), detour.path[0].nan_to_num())
+    assert torch.equal(after.route.path[1].nan_to_num(), before.route.path[1].nan_to_num())
+
+
+def test_cl_rrt_tries_a_few_times_for_a_path_in_place_of_a_dearer_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    planner, plan_state, _ = cl_rrt_on_its_path(monkeypatch)
+    before, radii = plan_state.route, []
+
+    def none(loop: Any, root: Tensor, *rest: Any) -> Any:
+        radii.append(float(loop.radius_m[0]))
+        assert not bool(loop.crossing.any())
+        partial = torch.full_like(before.status[:1], int(PlanStatus.PARTIAL))
+        return replace(before.select(torch.tensor([0])), status=partial)
+
+    monkeypatch.setattr(cl_rrt, "search", none)
+    then = problem(slow(0.4))
+    plan_state = planner.revise(plan_state, then)
+    alone = planner.select(plan_state, torch.tensor([0]))
+    assert alone.doubted.tolist() == [True]
+    for _ in range(8):
+        _, plan_state, _ = planner.plan(step_at(then.start), plan_state)
+    assert radii == pytest.approx([1.0, 0.5, 0.25, 0.125, 0.1])
+    assert plan_state.failures.tolist() == [0, 0]
+    assert torch.equal(plan_state.route.path.nan_to_num(), before.path.nan_to_num())
+    # What is behind the robot is driven already.
+    passed = replace(then, start=then.start + torch.tensor([8.0, 0.0, 0.0]))
+    fresh = replace(alone, doubted=torch.tensor([False]))
+    assert planner.revise(fresh, passed.select(torch.tensor([0]))).doubted.tolist() == [False]
+
+
+def test_cl_rrt_leaves_a_partial_path_that_costs_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    planner, plan_state, _ = cl_rrt_on_its_path(monkeypatch)
+    partial = torch.full_like(plan_state.route.status, int(PlanStatus.PARTIAL))
+    plan_state = replace(plan_state, route=replace(plan_state.route, status=partial))
+    revised = planner.revise(plan_state, problem(slow(0.4)))
+    assert revised.edge.tolist() == [int(plan_state.route.depth[0]), int(plan_state.edge[1])]
+    assert revised.doubted.tolist() == [False, False]
+
+
+def test_cl_rrt_costs_what_is_left_of_a_path_by_the_time_that_its_metres_take() -> None:
+    planner, posed = make("cl_rrt"), problem(ground(), robot=Unicycle(speed_mps=(0.0, 2.0)))
+    _, plan_state, _ = planner.plan(first(posed), planner.init(posed, generator()))
+    line = torch.full((2, 60, 2), torch.nan)
+    line[:, :21, 0], line[:, :21, 1] = torch.linspace(2, 12, 21), 6.1
+    route = replace(plan_state.route, path=line)
+    state = torch.tensor([[2.0, 6.0, 0.0], [7.0, 6.3, 0.0]])
+    then = problem(slow(0.4), robot=Unicycle(speed_mps=(0.0, 2.0)))
+    then = replace(then, free=then.free.clone())
+    then.free[1, :, 20:22] = False
+    cost = planner._cost_ahead(replace(plan_state, problem=then), route, state)
+    wanted = torch.tensor([7 / 1.7 + 3 / 0.8, 5 / 1.7 + PENALTY])
+    torch.testing.assert_close(cost, wanted, rtol=1e-4, atol=0.01)
 
 
 class Counts(registry.find("planner", "straight").target):  # type: ignore[misc]

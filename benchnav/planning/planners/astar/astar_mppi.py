@@ -5,6 +5,7 @@ Beyond the paper, which runs MPPI without a global path and combines global and 
 
 from dataclasses import dataclass, field
 
+from benchnav.core.errors import expect
 from benchnav.planning.planners.astar.guided import GuideConfig, Guided
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
 from benchnav.planning.planners.straight import STEERS
@@ -20,9 +21,20 @@ class AStarMPPIConfig(GuideConfig):
 
     mppi: MPPIConfig = field(default_factory=MPPIConfig)
 
+    def __post_init__(self) -> None:
+        """Check that `explore` has a path to move."""
+        super().__post_init__()
+        expect(
+            self.explore == 0 or self.mppi.cost_to_go == "objective",
+            f"`explore` = 0 for A*+MPPI with `cost_to_go` {self.mppi.cost_to_go!r}, whose costs run to the goal "
+            f"and not to waypoints of A*, got {self.explore}.",
+        )
+
 
 class AStarMPPI(Guided[MPPIState]):
     """A* gives way-points to model predictive path integral control.
+
+    With a cost to go, which is A*'s, MPPI minimises a cost that runs to the goal; A*'s path then serves recovery.
 
     Args:
         config: settings.

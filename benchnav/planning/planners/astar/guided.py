@@ -103,7 +103,7 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
 
     def init(self, problem: Problem, generator: torch.Generator) -> GuidedState[Local]:
         """Searches the maps; see `Planner`."""
-        local = self.local.init(_toward_waypoints(problem), generator)
+        local = self.local.init(self._local_problem(problem), generator)
         recovery, problem = Recovery.none(problem.start), optimistic(problem, self.config.explore)
         return GuidedState(problem, astar.search(problem), ground_costs(problem), local, recovery)
 
@@ -114,7 +114,8 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         count = 2 + int(self.config.lookahead_m / problem.grid.resolution_m)
         points = astar.path_points(problem, field, state, count)
         target, straight = choose_waypoint(plan_state.ground, points, self.config.lookahead_m)
-        action, local, plan = self.local.plan_toward(step, plan_state.local, target)
+        aim_m = problem.goal_m if self.local.seeks_goal else target
+        action, local, plan = self.local.plan_toward(step, plan_state.local, aim_m)
         recovery = watch(plan_state.recovery, state, action, problem.robot)
         recovery = aim(recovery, plan_state.recovery.active, problem, field, state, straight)
         away = steer_toward(state, recovery.target_m, problem.robot)
@@ -128,7 +129,7 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
 
     def revise(self, plan_state: GuidedState[Local], problem: Problem) -> GuidedState[Local]:
         """Searches maps anew whose ground has changed, and keeps the local planner's motion; see `Planner`."""
-        local = self.local.revise(plan_state.local, _toward_waypoints(problem))
+        local = self.local.revise(plan_state.local, self._local_problem(problem))
         before, field = plan_state.problem, plan_state.field
         problem = optimistic(problem, self.config.explore)
         changed = (problem.padded_ground != before.padded_ground).flatten(1).any(1).nonzero()[:, 0]
@@ -142,6 +143,12 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         # The local planner alone knows which of its tensors are of episodes.
         shared: GuidedState[Any] = replace(plan_state, local=None)  # type: ignore[arg-type]
         return replace(shared.select(members), local=self.local.select(plan_state.local, members))
+
+    def _local_problem(self, problem: Problem) -> Problem:
+        """The local planner's problem: J to the goal where it seeks that, else J from waypoint to waypoint."""
+        if self.local.seeks_goal:
+            return problem
+        return replace(problem, task=replace(problem.task, objective=toward_waypoints(problem.objective)))
 
 
 def optimistic(problem: Problem, explore: float) -> Problem:
@@ -161,8 +168,3 @@ def optimistic(problem: Problem, explore: float) -> Problem:
         return problem
     bonus = explore * problem.distribution.spread().to(problem.risk_map)
     return replace(problem, risk_map=(problem.risk_map + bonus).clamp(max=1))
-
-
-def _toward_waypoints(problem: Problem) -> Problem:
-    """The local planner's problem, whose objective is that of driving from way-point to way-point."""
-    return replace(problem, task=replace(problem.task, objective=toward_waypoints(problem.objective)))

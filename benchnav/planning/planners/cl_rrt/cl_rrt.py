@@ -14,6 +14,10 @@ the source calls the execution loop, algorithm 2: when to plan, and from what.
   where there is none that is safe. Here a tree is grown where a plan is due, at the path's end or when the
   robot has strayed or stalled (paper IV-A2), and not kept. Nodes need not be safe to stop at.
 - References are Dubins paths; the source draws straight lines and takes Dubins lengths for its heuristics.
+- Where λ̂ falls along a path to the goal, so that what is ahead costs over a tenth more than by the map that it was
+  chosen on, a new tree is grown and the cheaper of both paths is driven. Both costs are times along the predicted
+  positions under the new λ̂. Without a new path the next steps try again, up to `most_failures` times. A partial path
+  is left at once. So a map that stays as it is costs no tree, and one that changes little by little only a few.
 - Sampled points carry no heading, so references are the shortest paths to a point with free heading: the
   least over all end headings of the Dubins length, and no random heading makes a detour.
 - A plan without a way to the goal leads along the best partial path, and is tried anew at the next steps with
@@ -44,6 +48,7 @@ from torch import Tensor
 from benchnav.core import rng
 from benchnav.core.batch import Batch, map_tensors
 from benchnav.core.errors import expect
+from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import TravelTime, distance
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import (
@@ -54,12 +59,13 @@ from benchnav.planning.planners.cl_rrt.pursuit import (
     Tracking,
 )
 from benchnav.planning.planners.cl_rrt.tree import Route, no_route, search
-from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, check_finite
-from benchnav.planning.problem import Problem, Task
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, check_finite, check_steers
+from benchnav.planning.problem import Problem, Task, motion_traversability
 from benchnav.planning.robots import SPEED, TURN_RATE
 from benchnav.planning.sensing.sensor import Step
 
 _STALL_M = 0.25  # progress less than this in `stall_s` is none
+_RISE = 0.1  # fraction by which the cost of the path ahead rises before it is compared with a new one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,6 +127,8 @@ class CLRRTState(Batch):
         failures: plans in a row without a way to the goal, int64, shape [B].
         mark_m: progress along the path when last some was seen, shape [B].
         mark_step: the step of it, int64, shape [B].
+        ground: `Problem.padded_ground` on which the path was chosen, shape [B, N].
+        doubted: the path has become dearer since, and is to be compared with a new one, bool, shape [B].
         follower: the controller.
         seed: root of the samples.
         step: steps planned so far.
@@ -134,6 +142,8 @@ class CLRRTState(Batch):
     failures: Tensor
     mark_m: Tensor
     mark_step: Tensor
+    ground: Tensor
+    doubted: Tensor
     follower: PathFollower
     seed: int
     step: int
@@ -179,6 +189,7 @@ class CLRRT(Planner[CLRRTState]):
             ConfigError: the robot cannot follow references, or none of the turning radius.
         """
         config = self.config
+        check_steers(self, problem.robot, "cl_rrt")
         follower = PathFollower(config.follower, problem.robot)
         expect(
             config.turning_radius_m >= follower.tightest_m,
@@ -196,6 +207,8 @@ class CLRRT(Planner[CLRRTState]):
             failures=none,
             mark_m=zero,
             mark_step=none,
+            ground=problem.padded_ground,
+            doubted=none.bool(),
             follower=follower,
             seed=int(torch.randint(2**62, (), generator=generator)),
             step=0,
@@ -209,7 +222,7 @@ class CLRRT(Planner[CLRRTState]):
         arrived = distance(state, problem.goal_m) < problem.goal_radius_m
         lost = self._off_route(state, now)
         partial = now.route.status == PlanStatus.PARTIAL
-        again = partial & (now.failures < config.most_failures) & (ground > 0)
+        again = ((partial & (now.failures < config.most_failures)) | now.doubted) & (ground > 0)
         due = ((lost | again) & ~arrived & (ground != 0)).nonzero()[:, 0]  # not off the map
         if len(due):
             now = self._replan(state, now, due, lost[due])
@@ -229,12 +242,37 @@ class CLRRT(Planner[CLRRTState]):
         return plan_state.select(members)
 
     def revise(self, plan_state: CLRRTState, problem: Problem) -> CLRRTState:
-        """Keeps the paths over ground that is as free as it was, and leaves the others; see `Planner`."""
+        """Keep paths that cost what they did, doubt dearer ones, leave those that are free no more; see `Planner`."""
         route, before = plan_state.route, plan_state.problem
-        was, now = (own.ground_at(route.path.nan_to_num(nan=-1.0)) for own in (before, problem))
-        closed = ((was > 0) & (now < 0)).any(dim=1)
+        points, length_m = self._ahead(route, problem, problem.start)
+        was, now = (own.ground_at(points) for own in (before, problem))
+        closed = ((was > 0) & (now < 0) & (length_m > 0)).any(dim=1)
+        judged = problem.grid.lookup(plan_state.ground, points[..., 0], points[..., 1])
+        cost, judged_cost = (self._cost(plan_state, ground, length_m) for ground in (now, judged))
+        dearer = cost > (1 + _RISE) * judged_cost
+        leads = route.status == PlanStatus.OK
         # At the end of its path a robot looks for another.
-        return replace(plan_state, problem=problem, edge=torch.where(closed, route.depth, plan_state.edge))
+        edge = torch.where(closed | (dearer & ~leads), route.depth, plan_state.edge)
+        return replace(plan_state, problem=problem, edge=edge, doubted=plan_state.doubted | (dearer & leads))
+
+    def _ahead(self, route: Route, problem: Problem, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Pieces of the paths as `Route.pieces`, those behind the robots of length 0."""
+        points, length_m = route.pieces(0.5 * problem.grid.resolution_m)
+        away = distance(points, state[:, None, :2]).masked_fill(length_m == 0, math.inf)
+        ahead = torch.arange(away.shape[1], device=away.device) >= away.argmin(dim=1)[:, None]
+        return points, torch.where(ahead, length_m, 0)
+
+    def _cost(self, now: CLRRTState, ground: Tensor, length_m: Tensor) -> Tensor:
+        """Cost of pieces in seconds, [B], from values of `padded_ground` and lengths [B, K], as of a tree's edges."""
+        robot, rules = now.problem.robot, now.problem.task.rules
+        reach_mps = motion_traversability(ground, rules.min_traversability) * robot.action_high[0]
+        pace = 1 / reach_mps.clamp(max=now.follower.wanted_mps) + PENALTY * (ground <= 0)
+        return torch.where(length_m > 0, pace * length_m, 0).sum(dim=1)
+
+    def _cost_ahead(self, now: CLRRTState, route: Route, state: Tensor) -> Tensor:
+        """Cost of what is left of paths from states [B, S] on, shape [B]."""
+        points, length_m = self._ahead(route, now.problem, state)
+        return self._cost(now, now.problem.ground_at(points), length_m)
 
     def _follow(self, state: Tensor, now: CLRRTState) -> CLRRTState:
         """Moves the progress to where the robots are, on to the next edge where one is done."""
@@ -265,17 +303,28 @@ class CLRRT(Planner[CLRRTState]):
         return (now.edge >= now.route.depth) | (square > self.config.replan_distance_m**2) | stalled
 
     def _replan(self, state: Tensor, now: CLRRTState, due: Tensor, lost: Tensor) -> CLRRTState:
-        """Plans for some episodes, indices [M]; those not lost, bool [M], change for a way to the goal alone."""
+        """Plan for some episodes, indices [M].
+
+        Those not lost, bool [M], change only for a path to the goal, and from one in doubt only for a cheaper one.
+        """
         used_up = lost & (now.route.depth[due] > 0)
         failures = torch.where(used_up, 0, now.failures[due])
         route = self._search(state[due], now, due, failures)
         found = route.status == PlanStatus.OK
         crosses = (failures >= self.config.most_failures) & (route.depth > 0)
         failures = torch.where(found | crosses, 0, failures + 1)
-        taken = (found | lost).nonzero()[:, 0]
+        compared = now.doubted[due] & ~lost
+        new_route = now.route.put(due, route)
+        cheaper = self._cost_ahead(now, new_route, state) < self._cost_ahead(now, now.route, state)
+        taken = (lost | (found & (cheaper[due] | ~compared))).nonzero()[:, 0]
         members = due[taken]
+        # A path that nothing better is found for is kept as it is.
+        kept = compared & (failures >= self.config.most_failures)
+        failures = torch.where(kept, 0, failures)
         return replace(
             now,
+            ground=now.ground.index_copy(0, due, now.problem.padded_ground[due]),
+            doubted=now.doubted.index_copy(0, due, compared & ~found & ~kept),
             route=map_tensors(now.route, lambda old, new: old.index_copy(0, members, new[taken]), route),
             edge=now.edge.index_fill(0, members, 0),
             progress_m=now.progress_m.index_fill(0, members, 0),

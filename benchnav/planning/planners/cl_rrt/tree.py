@@ -104,6 +104,22 @@ class Route(Batch):
     path: Tensor
     tree: Tensor
 
+    def pieces(self, most_m: float) -> tuple[Tensor, Tensor]:
+        """Split paths into short straight pieces.
+
+        Args:
+            most_m: maximum length of a piece, where the drawn points are `DRAWN_M` apart.
+
+        Returns:
+            Midpoints (x, y), shape [B, K, 2], and lengths, shape [B, K]; 0 m at (0, 0) past the end of a path.
+        """
+        count = math.ceil(DRAWN_M / most_m)
+        offset = self.path.diff(dim=1)[:, :, None]
+        at = (torch.arange(count, device=offset.device) + 0.5) / count
+        points = (self.path[:, :-1, None] + at[:, None] * offset).flatten(1, 2).nan_to_num(nan=0.0)
+        length_m = torch.linalg.vector_norm(offset, dim=-1).expand(-1, -1, count) / count
+        return points, length_m.flatten(1, 2).nan_to_num(nan=0.0)
+
     @property
     def line(self) -> Tensor:
         """Points of the references as far as they are driven, NaN where unused, shape [B, D·Q, 2]."""

@@ -22,6 +22,7 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.optimal.value import UNREACHED, Costs, Moves, value_iteration
 from benchnav.planning.planners.optimal.ways import OptimalState, path_of, ways_from
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, check_steers
+from benchnav.planning.planners.straight import steer_toward
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, TURN_RATE, Unicycle
 from benchnav.planning.sensing.sensor import Step
@@ -140,7 +141,12 @@ class Optimal(Planner[OptimalState]):
         low, high = problem.action_bounds
         drives = ways.rolls[own, best] | (rate.abs() <= high[1])
         action = torch.stack((torch.where(drives, high[0], 0.0), rate.clamp(low[1], high[1])), 1)
-        status = PlanStatus.FAILED * (cost >= self.no_way(plan_state.costs)).long()
+        # Without a path the robot drives straight, as other planners do, and the world says how that ends.
+        stranded = cost >= self.no_way(plan_state.costs)
+        action = torch.where(
+            stranded[:, None], steer_toward(step.state, problem.goal_m, problem.robot), action
+        )
+        status = PlanStatus.PARTIAL * stranded.long()
         drawn = {"path": path_of(plan_state, pose, held)} if step.draw else {}
         plan = replace(Plan.empty(len(held), held.device, **drawn), status=status)
         return action, replace(plan_state, held=held), plan
@@ -203,7 +209,7 @@ class OptimalBound(Optimal):
     def no_way(self, costs: Costs) -> Tensor:
         """Twice T, as the value of where there is no way reaches into cells beside it; see `Optimal`.
 
-        Not T itself: the grid makes times a little too long, and a failed plan ends an episode that may arrive.
+        Not T itself: the grid makes times a little too long, and a path that takes little more than T may arrive.
         """
         return 2 * costs.loss
 
