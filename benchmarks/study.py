@@ -10,7 +10,7 @@
 part B, `sensitivity` and `kernel` part C, `seen` has old maps, `nugget` maps to develop on. `cost` is risk on the
 cost: `levels` drives each arm at each level on maps to develop on, `primary` holds the hypotheses, `frontier` the
 levels that these leave out and `own` another time to go, both and `primary` once more with `--maps 50 --out
-runs/first50`, and `best` the optimal planners. Parts are suites of docs/knowledge and docs/cost, each with a run of its
+runs/first50`, and `best` the optimal planners. `confirmation` has six hypotheses of what these found by looking. Parts are suites of docs/knowledge and docs/cost, each with a run of its
 own. Maps and runs lie in the folders `--maps_in` and `--out`, and `--maps` takes the first maps alone, to try it.
 """
 
@@ -85,6 +85,7 @@ STUDIES = {
         parts=("primary", "known", "known-mppi", "near", "sensitivity", "kernel", "seen", "nugget"),
     ),
     "cost": Study(name="cost", page="risk.md", parts=("levels", "primary", "frontier", "own", "best")),
+    "confirmation": Study(name="confirmation", page="risk.md", parts=("primary",)),
 }
 SPLIT = "test/std"
 ALPHA = 0.05
@@ -180,7 +181,8 @@ def power(study: Study, out: Path) -> str:
     """The power of each hypothesis, by what was found on the maps that the study was developed on.
 
     For the first and the last place of Holm's correction, where the difference is the one that was found; of
-    equivalence and non-inferiority also where there is none.
+    equivalence and non-inferiority also where there is none. Of differences also the smallest that is shown with a
+    power of 0.8 in the first place.
     """
     maps = yaml.safe_load((study.suites / "primary.yaml").read_text())["maps"]
     report, rows = read_report(out / study.developed), []
@@ -196,8 +198,12 @@ def power(study: Study, out: Path) -> str:
         )
         none = none if row["kind"] in ("equivalence", "non-inferiority") else "–"
         ends = f"{row['low']:+.1f} to {row['high']:+.1f}"
-        rows.append((str(number), row["claim"], f"{row['difference']:+.2f} ({ends})", found, none))
+        tails = 1 if row["direction"] else 2
+        least = error * (norm.ppf(1 - ALPHA / len(report.tests) / tails) + norm.ppf(0.8))
+        smallest = f"{least:.1f}" if row["kind"] == "difference" else "–"
+        rows.append((str(number), row["claim"], f"{row['difference']:+.2f} ({ends})", found, none, smallest))
     headings = ("", "hypothesis", "found on other maps (95 %)", "power, if so", "power, if no difference")
+    headings = (*headings, "smallest difference with a power of 0.8")
     return to_markdown(Table(headings=headings, labels=2, rows=tuple(rows)))
 
 
@@ -340,7 +346,7 @@ def _draw(summaries: list[Path], figure: Callable[[pd.DataFrame], Figure], name:
 def report(study: Study, out: Path) -> None:
     """Writes the figure, the tables of the page where there is one, and the power where it is known."""
     print(f"hypotheses {hashlib.sha256((study.suites / 'primary.yaml').read_bytes()).hexdigest()}")
-    {"knowledge": knowledge_report, "cost": cost_report}[study.name](out)
+    {"knowledge": knowledge_report, "cost": cost_report}.get(study.name, lambda out: None)(out)
     page = ROOT / "docs/studies" / study.page
     subprocess.run([sys.executable, ROOT / "benchmarks/tables.py", page, "--runs", out], check=True)
     if (out / study.developed / "episodes.parquet").exists():
