@@ -10,8 +10,9 @@
 part B, `sensitivity` and `kernel` part C, `seen` has old maps, `nugget` maps to develop on. `cost` is risk on the
 cost: `levels` drives each arm at each level on maps to develop on, `primary` holds the hypotheses, `frontier` the
 levels that these leave out and `own` another time to go, both and `primary` once more with `--maps 50 --out
-runs/first50`, and `best` the optimal planners. `confirmation` has six hypotheses of what these found by looking. Parts are suites of docs/knowledge and docs/cost, each with a run of its
-own. Maps and runs lie in the folders `--maps_in` and `--out`, and `--maps` takes the first maps alone, to try it.
+runs/first50`, and `best` the optimal planners. `confirmation` tests on new maps what these studies found by looking.
+Parts are suites of docs/knowledge, docs/cost and docs/confirmation, each with a run of its own. Maps and runs lie in
+the folders `--maps_in` and `--out`, and `--maps` takes the first maps alone, to try it.
 """
 
 import argparse
