@@ -216,7 +216,8 @@ def power_of(row: Mapping[Any, Any], error: float, alpha: float, difference: flo
             (margin + away) / max(error, 1e-9) - norm.ppf(1 - alpha) for away in (difference, -difference)
         )
         return max(0.0, float(sum(norm.cdf(end) for end in ends)) - 1)
-    gain = difference * (-1 if row["direction"] == "lower" else 1)
+    # Of a difference either way the side that it lies on counts.
+    gain = difference * (-1 if row["direction"] == "lower" else 1) if row["direction"] else abs(difference)
     least = -margin if kind == "non-inferiority" else margin
     tails = 1 if row["direction"] else 2
     return float(norm.cdf((gain - least) / max(error, 1e-9) - norm.ppf(1 - alpha / tails)))
