@@ -3,8 +3,8 @@
 From a planner with a model's prediction to the optimal planner with the same prediction, with that of ideal eyes
 (`ideal`), with the true distribution (`oracle`), and to the near-optimal reference, which is given λ itself. What that
 drives is feasible, so regret against it is at most that against the least time. Each step is a paired difference of its
-own. They add up to the whole by construction, which does not make them causes: a step may be negative, and another order
-of steps would give others.
+own. They add up to the whole by construction, which does not make them causes: a step may be negative, and another
+order of steps would give others.
 """
 
 from collections.abc import Mapping, Sequence
