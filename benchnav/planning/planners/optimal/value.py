@@ -27,6 +27,7 @@ from benchnav.planning.robots import Unicycle
 
 _POINTS = 8  # N
 UNREACHED = 1e6  # cost to go before a way is found, and where there is none
+_MIXED = UNREACHED / 100  # from there on a cost to go is for the most part of what is not reached
 _BARRED = 1e-9  # weight of a cell that is not free beside one that is
 _SETTLED = 1e-3  # least change that counts
 _CHECK_EVERY = 10  # sweeps
@@ -250,7 +251,11 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> CostToGo:
         if dwell is not None and dwell_before is not None:
             dwell = torch.where(settled, dwell_before, dwell)
         if sweep % _CHECK_EVERY == 0:
-            settled = (before - value).flatten(1).amax(1)[:, None, None, None, None] < _SETTLED
+            change = before - value
+            if dwell is not None:
+                # Between states with a way and without, values go down for long, and mean nothing.
+                change = torch.where(value < _MIXED, change, 0.0)
+            settled = change.flatten(1).amax(1)[:, None, None, None, None] < _SETTLED
             if bool(settled.all()):
                 break
     return CostToGo(value=value, max_dwell_s=dwell)
