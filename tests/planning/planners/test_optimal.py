@@ -230,6 +230,12 @@ def test_between_two_bars_the_time_held_is_over() -> None:
     )
     wanted = (7 - 1.0) / 0.9 + 2 * 0.5 / 0.08
     assert float(time_to_go(NearOptimal(), posed)) == pytest.approx(wanted, rel=0.05)
+    # What it simulates is what the world does.
+    simulated = NearOptimal().init(posed, generator()).drive
+    done = drive(NearOptimal(), posed, world=known_world(posed))
+    assert simulated is not None
+    assert simulated.steps.tolist() == done.steps.tolist()
+    assert torch.equal(simulated.states[0, : int(done.steps[0]) + 1], done.states[0])
 
 
 def wide_bar(for_s: float) -> Problem:
@@ -354,6 +360,26 @@ def test_who_has_no_time_left_to_leave_such_ground_is_lost_by_every_way(held: fl
 def test_there_are_as_many_levels_as_are_asked_for(levels: int) -> None:
     planner = NearOptimal(NearOptimalConfig(levels=levels))
     assert Optimal.init(planner, wide_bar(4.0), generator()).to_go.value.shape[1] == levels
+
+
+def test_deep_in_a_bar_a_robot_with_little_time_left_takes_the_dearer_side() -> None:
+    """Ahead is the near side, behind it the goal: to leave takes 7 s of 20, to turn and cross twice that."""
+    ground = torch.full((1, 40, 34), 0.9)
+    ground[:, :36, 10:22] = 0.4
+    posed = replace(
+        problem(ground, (7.75, 5.25), (14.25, 5.25), time_budget_s=120.0),
+        immobile=Immobile(below=0.5, for_s=20.0),
+        distribution=factories.certain(ground),
+    )
+    state = Optimal.init(NearOptimal(), posed, generator())
+    pose = torch.tensor([[7.75, 5.25, math.pi]])
+    some, more, most = (
+        float(ways_from(pose, torch.tensor([held]), state).cost.min()) for held in (0.0, 8.0, 15.0)
+    )
+    across = 3.25 / 0.4 + 2.25 / 0.9
+    assert across < some < 1.02 * (across + math.pi / 0.4)
+    assert 1.5 * some < more < 120
+    assert most >= UNREACHED / 2
 
 
 def test_a_robot_that_was_held_has_less_time_left() -> None:
