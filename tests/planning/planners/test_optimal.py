@@ -19,7 +19,7 @@ from benchnav.planning.planners.optimal.optimal import (
 )
 from benchnav.planning.planners.optimal.value import UNREACHED, Moves, headings_of
 from benchnav.planning.planners.optimal.ways import path_of, ways_from
-from benchnav.planning.planners.planner import PlanStatus
+from benchnav.planning.planners.planner import Plan, PlanStatus
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
@@ -328,6 +328,29 @@ def test_it_succeeds_wherever_a_star_with_dwa_or_straight_do_and_no_later(seed: 
         assert not bool(succeeds.all())
         assert bool((reference.outcome == Outcome.SUCCESS)[succeeds].all())
         assert bool((reference.steps <= other.steps)[succeeds].all())
+
+
+def test_where_value_iteration_fails_it_follows_the_earlier_of_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ground = torch.full((2, 16, 24), 0.9)
+    ground[1, :12, 11] = 0.02
+    posed = problem(ground, (2.25, 3.25), (9.25, 3.25), time_budget_s=30.0)
+    posed = replace(posed, immobile=Immobile(), distribution=factories.certain(ground), free=ground > 0.1)
+    world = known_world(posed)
+    guided, straight = (drive(planner, posed, world=world) for planner in (AStarDWA(), Straight()))
+    assert straight.outcome.tolist() == [Outcome.SUCCESS, Outcome.IMMOBILISED]
+    assert guided.outcome.tolist() == [Outcome.SUCCESS] * 2
+    assert int(straight.steps[0]) < int(guided.steps[0])
+
+    def stand(self: Optimal, step: Any, plan_state: Any) -> Any:
+        observed = self.observe(step, plan_state)
+        return torch.zeros_like(step.state[:, :2]), observed, Plan.empty(len(step.state))
+
+    monkeypatch.setattr(Optimal, "plan", stand)
+    done = drive(NearOptimal(), posed, world=world)
+    assert done.outcome.tolist() == [Outcome.SUCCESS] * 2
+    assert done.steps.tolist() == [int(straight.steps[0]), int(guided.steps[1])]
 
 
 def test_a_robot_that_is_off_its_drive_goes_on_by_value_iteration() -> None:
