@@ -24,9 +24,9 @@ FACES = {
     "TraversabilityModel Window evaluate_model find_checkpoint fit_model list_checkpoints load_checkpoint "
     "load_model measure_margin predict predict_tiles save_checkpoint write_risk_maps",
     "benchnav.planning": "AStarDWA AStarMPPI Appearance Belief Bicycle CLRRT Classes Contact Copula "
-    "DifferentialDrive FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Near Objective Optimal "
-    "OptimalBound Places Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensed Sensor Simulation "
-    "Static Step Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem",
+    "DifferentialDrive FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Near NearOptimal "
+    "Objective Optimal OptimalBound Places Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensed "
+    "Sensor Simulation Static Step Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem",
     "benchnav.testing": "check_belief check_model check_objective check_planner check_risk check_robot "
     "check_sensor",
 }

@@ -97,7 +97,8 @@ _PLANNERS = {
     "cl_rrt": ("CL-RRT", ORANGE),
     "mppi": ("MPPI", GREEN),
     "optimal": ("optimal", AMBER),
-    "optimal_bound": ("optimal, bound", SKY),
+    "near_optimal": ("near-optimal", SKY),
+    "optimal_bound": ("near-optimal", SKY),
     "straight": ("straight", BLIND),
 }
 

@@ -4,7 +4,7 @@ from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI
 from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig
-from benchnav.planning.planners.optimal.optimal import Optimal, OptimalBound
+from benchnav.planning.planners.optimal.optimal import NearOptimal, Optimal, OptimalBound
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, PlanStatus
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, Task, pose_problem
@@ -40,6 +40,7 @@ __all__ = [
     "MPPIConfig",
     "Moment",
     "Near",
+    "NearOptimal",
     "Objective",
     "Optimal",
     "OptimalBound",

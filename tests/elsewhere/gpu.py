@@ -20,8 +20,12 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is 
 @pytest.mark.parametrize(
     "changes",
     [
-        *({"planners": (name,)} for name in names("planner") if name != "optimal_bound"),
-        {"planners": ("optimal_bound",), "model": "clairvoyant", "world": HOLDS},
+        *(
+            {"planners": (name,)}
+            for name in names("planner")
+            if name not in ("near_optimal", "optimal_bound")
+        ),
+        {"planners": ("near_optimal",), "model": "clairvoyant", "world": HOLDS},
         {"planners": ({"part": "optimal", "options": {"hazard": True}},), "world": HOLDS},
         {"planners": ({"part": "mppi", "options": ON_COST},), "world": HOLDS},
         {"planners": ({"part": "mppi", "options": ON_COST | {"entrapment": True}},), "world": HOLDS},

@@ -265,8 +265,9 @@ def _figures(
         shown = f" The first {MOST_CHAINS} of {chains} chains are shown." if chains > MOST_CHAINS else ""
         yield (
             "regret",
-            "From a planner to the bound, step by step, on the episodes that all have in common: paired differences "
-            "with 95 % intervals. A step may be negative, and in another order steps would be others, so that none is "
+            "Regret against the near-optimal reference, a drive on λ itself and no bound: step by step from a planner "
+            "to it, on the episodes that all have in common, paired differences with 95 % intervals. A step may be "
+            "negative, and in another order steps would be others, so that none is "
             f"a share of the causes.{shown}",
             regret_figure(report.regret),
         )

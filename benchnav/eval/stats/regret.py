@@ -1,9 +1,10 @@
-"""Regret, split along a chain of conditions that ends at the best that any planner could do.
+"""Regret, split along a chain of conditions that ends at the near-optimal reference.
 
 From a planner with a model's prediction to the optimal planner with the same prediction, with that of ideal eyes
-(`ideal`), with the true distribution (`oracle`), and to the bound, which is given λ itself. Each step is a paired
-difference of its own. They add up to the whole by construction, which does not make them causes: a step may be
-negative, and another order of steps would give others.
+(`ideal`), with the true distribution (`oracle`), and to the near-optimal reference, which is given λ itself. What that
+drives is feasible, so regret against it is at most that against the least time. Each step is a paired difference of its
+own. They add up to the whole by construction, which does not make them causes: a step may be negative, and another
+order of steps would give others.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +21,9 @@ from benchnav.eval.stats.paired_difference import success_interval
 from benchnav.eval.stats.pairs import side_by_side
 from benchnav.eval.stats.summary import time_budgets
 
-OPTIMAL, BOUND = "optimal", "optimal_bound"
+AGAINST = "near-optimal reference"
+OPTIMAL = "optimal"
+REFERENCES = ("near_optimal", "optimal_bound")  # by its name, and by that of earlier runs
 _MODELS = ("ideal", "oracle")
 
 
@@ -34,7 +37,7 @@ def find_chains(conditions: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
 
     Returns:
         Of each chain its conditions, by id: a planner with a model, the optimal planner with it, with `ideal` and with
-        `oracle`, and the bound.
+        `oracle`, and the reference.
     """
     values = {condition: about["value"] for condition, about in conditions.items()}
 
@@ -52,17 +55,19 @@ def find_chains(conditions: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     for condition, value in values.items():
         planner, model = value["planner"]["part"], value["model"]["part"]
         blind = conditions[condition]["labels"]["model"] == NOT_USED
-        if planner in (OPTIMAL, BOUND) or model in PRIVILEGED or blind:
+        if planner in (OPTIMAL, *REFERENCES) or model in PRIVILEGED or blind:
             continue
-        bounds = [
+        references = [
             other
-            for other in like(value, ("planner", "model", "risk"), planner=BOUND, model="clairvoyant")
-            if values[other]["planner"]["options"].get("levels") != 0  # where entry is loss it is no bound
+            for part in REFERENCES
+            for other in like(value, ("planner", "model", "risk"), planner=part, model="clairvoyant")
+            if values[other]["planner"]["options"].get("levels")
+            != 0  # where entry is loss it is no reference
         ]
         for optimal in like(value, ("planner",), planner=OPTIMAL):
             told = [like(values[optimal], ("model",), model=one) for one in _MODELS]
             if all(told):
-                chains += [[condition, optimal, *(found[0] for found in told), bound] for bound in bounds]
+                chains += [[condition, optimal, *(found[0] for found in told), last] for last in references]
     return chains
 
 
@@ -79,7 +84,8 @@ def split_regret(
         worlds: by condition what λ did.
 
     Returns:
-        A row a step of a chain: `chain`, its number; labels of what it begins with; ids, planners and models of the
+        A row a step of a chain: `chain`, its number; labels of what it begins with; `against`, the end that regret is
+        against; ids, planners and models of the
         two conditions, `one`, `one_planner`, `one_model` and `other…`; `n_maps`, of which a group counts as one, and
         `n_episodes`; of `success` and of `time`, T_total in seconds, a failure counted as T: the means `_one` and
         `_other`, and the `_difference` of one less other with its 95 % interval `_low`, `_high`.
@@ -105,6 +111,7 @@ def split_regret(
                 {
                     "chain": number,
                     **about,
+                    "against": AGAINST,
                     "one": one,
                     "other": other,
                     **{

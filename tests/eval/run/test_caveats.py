@@ -111,7 +111,7 @@ def test_a_merged_run_says_what_its_shards_said(dataset_path: Path, tmp_path: Pa
     [
         ({"planner": "optimal", "beliefs": ("copula",)}, "'optimal', which plans once, got 'copula' and 'full'"),
         ({"planner": "optimal", "sensors": ("near:4",)}, "'optimal', which plans once, got 'static' and 'near:4'"),
-        ({"planner": "optimal_bound"}, "planner 'optimal_bound', which is given λ itself, got 'oracle'"),
+        ({"planner": "near_optimal"}, "planner 'near_optimal', which is given λ itself, got 'oracle'"),
         ({"planner": "optimal", "robots": ("bicycle",)}, "Expected robot Unicycle for planner 'optimal', got Bicycle"),
         ({"planner": HAZARD, "world": "paper"}, "immobilises robots for `hazard`"),
         ({"planner": FREE, "model": "clairvoyant", "world": "paper"}, "with λ that stays for the model 'clairvoyant'"),
@@ -133,9 +133,9 @@ POSSIBLE: tuple[Callable[[dict[str, str]], bool], ...] = (
     lambda cell: not (cell["risk"] == "single-class" and cell["model"] == "TwoModes"),
     lambda cell: not (cell["risk"] == "single-class" and cell["belief"] == "copula"),
     lambda cell: (
-        not (cell["planner"] in ("optimal", "careful", "optimal_bound") and cell["belief"] == "copula")
+        not (cell["planner"] in ("optimal", "careful", "near_optimal") and cell["belief"] == "copula")
     ),
-    lambda cell: not (cell["planner"] == "optimal_bound" and cell["model"] != "clairvoyant"),
+    lambda cell: not (cell["planner"] == "near_optimal" and cell["model"] != "clairvoyant"),
     lambda cell: not (cell["planner"] == "careful" and cell["world"] == "paper"),
     lambda cell: not (cell["model"] == "clairvoyant" and cell["world"] == "paper"),
 )
@@ -143,7 +143,7 @@ POSSIBLE: tuple[Callable[[dict[str, str]], bool], ...] = (
 
 def test_of_a_product_exactly_the_combinations_that_can_be_run_are_left(dataset_path: Path) -> None:
     listed: dict[str, Any] = {
-        "planners": (FREE, "straight", "optimal", HAZARD, "optimal_bound"),
+        "planners": (FREE, "straight", "optimal", HAZARD, "near_optimal"),
         "models": ("oracle", TWO_MODES, "clairvoyant"),
         "risks": ("mean", "single-class"), "beliefs": ("static", "copula"), "world": ("paper", "stakes"),
     }  # fmt: skip
@@ -233,7 +233,7 @@ def test_risk_on_the_cost_is_run_by_its_options(dataset_path: Path, tmp_path: Pa
 def test_optimal_planners_are_run_by_their_names(dataset_path: Path, tmp_path: Path) -> None:
     conditions = [
         {"planners": ["optimal", {"part": "optimal", "label": "careful", "options": {"hazard": True}}]},
-        {"planners": ["optimal", "optimal_bound"], "models": ["clairvoyant"]},
+        {"planners": ["optimal", "near_optimal"], "models": ["clairvoyant"]},
     ]
     suite = suite_on(
         dataset_path, conditions=conditions, robots=("unicycle",), risks=("mean",), world="stakes"
@@ -245,6 +245,6 @@ def test_optimal_planners_are_run_by_their_names(dataset_path: Path, tmp_path: P
     known = rows[rows["model"] == "clairvoyant"]
     assert (known["outcome"] == "success").all()
     bound, plain = (
-        known[known["planner"] == name]["end_time_s"].to_numpy() for name in ("optimal_bound", "optimal")
+        known[known["planner"] == name]["end_time_s"].to_numpy() for name in ("near_optimal", "optimal")
     )
     assert (bound <= plain + 0.5).all()

@@ -47,17 +47,23 @@ def with_start(problem: Problem, *start: float) -> Problem:
     return replace(problem, start=torch.tensor([start] * len(problem)))
 
 
+def known_world(problem: Problem) -> World:
+    """One λ field an episode, which immobilises robots as the problem says."""
+    return World(noise="stored", immobile=problem.immobile, time_budget_s=float(problem.time_budget_s.max()))
+
+
 def drive(
     planner: Any,
     problem: Problem,
     truth: Tensor | None = None,
     time_budget_s: float = 60.0,
     immobile: Immobile | None = None,
+    world: World | None = None,
 ) -> Drive:
     """Runs episodes where the truth is what is predicted, unless it is given, shape [B, H, W]."""
     ground = problem.risk_map if truth is None else truth
     terrain = replace(factories.terrain(ground, 0.05), grid=problem.grid)
-    world = World(time_budget_s=time_budget_s, immobile=immobile)
+    world = world or World(time_budget_s=time_budget_s, immobile=immobile)
     noise = rng.stream_key(0, "noise")
     simulation = Simulation(
         terrain, problem.task, world, factories.places(problem.goal_m), noise, range(len(problem))

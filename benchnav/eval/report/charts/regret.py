@@ -31,7 +31,7 @@ _MEASURES = {"success": ("success [%]", 100.0, False), "time": ("T_total [s]", 1
 
 @styled()
 def regret_figure(table: pd.DataFrame) -> Figure:
-    """Draws each chain from its planner, on top, to the bound: success on the left, T_total on the right.
+    """Draws each chain from its planner, on top, to the near-optimal reference: success left, T_total right.
 
     Args:
         table: from `regret.split_regret`, at least one row; at most `MOST_CHAINS` chains are drawn, the first.
@@ -60,7 +60,7 @@ def regret_figure(table: pd.DataFrame) -> Figure:
     handles = [
         Patch(color=ORANGE, label="the next is better"),
         Patch(color=BLUE, label="the next is worse"),
-        Patch(color=_ENDS, label="of the first, of the bound"),
+        Patch(color=_ENDS, label="of the first, of the near-optimal reference"),
     ]
     legend_outside(figure, handles, 3)
     return figure

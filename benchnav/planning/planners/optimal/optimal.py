@@ -1,14 +1,15 @@
 """The optimal planner: drives by the least cost to go of every pose on a map, found once by value iteration.
 
 `Optimal` takes λ̂ for λ: its time is the least under that map, "certainty-equivalent", and no bound on what can be done
-on the ground. `OptimalBound` is given λ itself, by the model `clairvoyant`, and knows for how long the world lets a
-robot stand on immobilising ground: what is left of a failure then is not for want of knowledge, nor of planning. Its
-time is the least up to what the grid costs. Both plan for the paper's unicycle alone, which drives forward, and once: a
-map that changes is refused.
-Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L levels of time held.
+on the ground. `NearOptimal` is given λ itself, by the model `clairvoyant`, and knows the dwell time after which the
+world immobilises a robot. What it drives is feasible, so the least time is at most its time: it is the near-optimal
+reference, and no bound. Both plan for the paper's unicycle only, which drives forward, and once: a map that changes is
+refused.
+Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L levels of dwell time.
 """
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,15 +20,19 @@ from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning.free_space import PENALTY
+from benchnav.planning.planners.astar.astar_dwa import AStarDWA
+from benchnav.planning.planners.optimal.drive import Drive, earlier, simulate
 from benchnav.planning.planners.optimal.value import UNREACHED, Costs, Moves, value_iteration
 from benchnav.planning.planners.optimal.ways import OptimalState, path_of, ways_from
-from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, check_steers
-from benchnav.planning.planners.straight import steer_toward
+from benchnav.planning.planners.planner import Plan, Planner, check_steers
+from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, TURN_RATE, Unicycle
 from benchnav.planning.sensing.sensor import Step
 
-_LEAST_KNOWN = 1e-3  # λ that the bound drives on
+_LEAST_KNOWN = 1e-3  # least λ that is planned for
+_ON_DRIVE = 1e-4  # m and rad: a robot nearer than that to a simulated drive is on it
+_MAX_LEVELS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,23 +56,34 @@ class OptimalConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OptimalBoundConfig:
-    """Settings of the bound.
+class NearOptimalConfig:
+    """Settings of the near-optimal reference.
 
     Args:
         headings: Q, in which a circle is divided.
         refine: cells of value iteration along each side of a cell of the map.
-        levels: L, of the time on immobilising ground; 0 takes a robot for lost where it enters such ground.
+        levels: L, of dwell time, between which costs to go are distinguished; 0 takes a robot for lost where it enters
+            immobilising terrain.
     """
 
     headings: int = 32
     refine: int = 1
-    levels: int = 5
+    levels: int = 3
 
     def __post_init__(self) -> None:
         """Refuses grids that are none."""
-        _check_grid("optimal_bound", self.headings, self.refine)
-        expect(0 <= self.levels <= 5, f"`levels` from 0 to 5 for optimal_bound, got {self.levels}.")
+        _check_grid(NearOptimal.name, self.headings, self.refine)
+        expect(
+            0 <= self.levels <= _MAX_LEVELS,
+            f"`levels` from 0 to {_MAX_LEVELS} for {NearOptimal.name}, got {self.levels}.",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimalBoundConfig(NearOptimalConfig):
+    """Settings of the near-optimal reference by its earlier name, with the defaults of that."""
+
+    levels: int = 5
 
 
 def _check_grid(name: str, headings: int, refine: int) -> None:
@@ -123,33 +139,40 @@ class Optimal(Planner[OptimalState]):
         )
         costs = self.costs_of(problem, grid)
         moves = Moves.of(robot, grid.resolution_m, self.config.headings)
-        value = value_iteration(costs, moves, grid, self.config.headings)
+        to_go = value_iteration(costs, moves, grid, self.config.headings)
         held = problem.start.new_zeros(len(problem))
-        return OptimalState(problem=problem, grid=grid, costs=costs, value=value, held=held)
+        return OptimalState(
+            problem=problem,
+            grid=grid,
+            costs=costs,
+            to_go=to_go,
+            held=held,
+            taken=torch.zeros_like(held).long(),
+        )
 
     def plan(self, step: Step, plan_state: OptimalState) -> tuple[Tensor, OptimalState, Plan]:
         """Begins the way that leads to the least cost; see `Planner`."""
+        plan_state = self.observe(step, plan_state)
         problem, held = plan_state.problem, plan_state.held
-        if problem.immobile is not None:
-            holds = step.traversability < problem.immobile.below
-            held = torch.where(holds, held + problem.dt_s, 0.0)
         pose, own = step.state[:, :3], torch.arange(len(held), device=held.device)
         ways = ways_from(pose, held, plan_state)
-        cost, best = ways.cost.min(1)
+        best = ways.cost.argmin(1)
         # What a turn takes to be over after this step.
         rate = ways.turn[own, best] / (problem.traversability_at(pose).clamp(min=_LEAST_KNOWN) * problem.dt_s)
         low, high = problem.action_bounds
         drives = ways.rolls[own, best] | (rate.abs() <= high[1])
         action = torch.stack((torch.where(drives, high[0], 0.0), rate.clamp(low[1], high[1])), 1)
-        # Without a path the robot drives straight, as other planners do, and the world says how that ends.
-        stranded = cost >= self.no_way(plan_state.costs)
-        action = torch.where(
-            stranded[:, None], steer_toward(step.state, problem.goal_m, problem.robot), action
-        )
-        status = PlanStatus.PARTIAL * stranded.long()
         drawn = {"path": path_of(plan_state, pose, held)} if step.draw else {}
-        plan = replace(Plan.empty(len(held), held.device, **drawn), status=status)
-        return action, replace(plan_state, held=held), plan
+        plan = Plan.empty(len(held), held.device, **drawn)
+        return action, plan_state, plan
+
+    def observe(self, step: Step, plan_state: OptimalState) -> OptimalState:
+        """Count the step, and the dwell time by the λ that the robots met in the last one."""
+        immobile, held = plan_state.problem.immobile, plan_state.held
+        if immobile is not None:
+            holds = step.traversability < immobile.below
+            held = torch.where(holds, held + plan_state.problem.dt_s, 0.0)
+        return replace(plan_state, held=held, taken=plan_state.taken + 1)
 
     def select(self, plan_state: OptimalState, members: Tensor) -> OptimalState:
         """Keeps some episodes; see `Planner`."""
@@ -165,10 +188,6 @@ class Optimal(Planner[OptimalState]):
             f"Expected a fixed map for planner {self.name!r}, which plans once, got one that changes. "
             "Take belief 'static' and sensor 'full'."
         )
-
-    def no_way(self, costs: Costs) -> Tensor:
-        """Cost from which on there is no way, shape [B]."""
-        return torch.full_like(costs.loss, UNREACHED / 2)
 
     def costs_of(self, problem: Problem, grid: Grid) -> Costs:
         """What driving costs, on the cells of value iteration."""
@@ -188,30 +207,61 @@ class Optimal(Planner[OptimalState]):
         return _on_grid(problem, grid, rate, torch.ones_like(problem.free), hazard=hazard)
 
 
-class OptimalBound(Optimal):
-    """Drives by the least time to go on λ itself, in a world that immobilises robots: a bound, up to its grid.
+class NearOptimal(Optimal):
+    """The near-optimal reference: a quick drive on λ itself, in a world that immobilises robots.
+
+    Three drives are simulated to their end as the world does it: by value iteration, by A*+DWA with its default
+    settings, and by `straight`. The robot follows the earliest to reach the goal. So wherever A*+DWA or `straight`
+    reaches the goal on the same problem, this does too, and no later. Planners that draw samples are not among the
+    three: where they are quicker, or the only ones to succeed, is a matter of measurement. A robot that has left the
+    drive is steered by value iteration. It never gives up: where no way is known, the world ends the episode.
 
     Args:
         config: settings.
     """
 
     given_truth = True
-    name = "optimal_bound"
+    name = "near_optimal"
 
-    def __init__(self, config: OptimalBoundConfig | None = None) -> None:
+    def __init__(self, config: NearOptimalConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
-        self.config = config or OptimalBoundConfig()
+        self.config = config or NearOptimalConfig()
 
     def follows(self, task: Task) -> str:
         """What it minimises; see `Planner`."""
         return "time on λ itself"
 
-    def no_way(self, costs: Costs) -> Tensor:
-        """Twice T, as the value of where there is no way reaches into cells beside it; see `Optimal`.
+    def init(self, problem: Problem, generator: torch.Generator) -> OptimalState:
+        """Finds the cost to go and simulates the drives; draws nothing. See `Planner`.
 
-        Not T itself: the grid makes times a little too long, and a path that takes little more than T may arrive.
+        Raises:
+            ConfigError: If the robot is another, or the prediction is not λ itself.
         """
-        return 2 * costs.loss
+        plan_state = super().init(problem, generator)
+        field = problem.distribution.mean()
+        drive = simulate(super().plan, OptimalState.select, plan_state, problem, field)
+        others: tuple[Planner[Any], ...] = (AStarDWA(), Straight())
+        for other in others:
+            begun = other.init(problem, generator)
+            drive = earlier(drive, simulate(other.plan, other.select, begun, problem, field, drive))
+        return replace(plan_state, drive=drive)
+
+    def plan(self, step: Step, plan_state: OptimalState) -> tuple[Tensor, OptimalState, Plan]:
+        """Follows the drive, or value iteration where the robot is not on it; see `Planner`."""
+        drive, taken = plan_state.drive, plan_state.taken
+        assert drive is not None
+        action, follows = _follow(drive, taken, step.state)
+        rest = torch.arange(drive.states.shape[1], device=action.device) >= taken[:, None]
+        path = torch.where((rest & follows[:, None])[..., None], drive.states[..., :2], torch.nan)
+        if bool(follows.all()):
+            drawn = {"path": path} if step.draw else {}
+            plan = Plan.empty(len(action), action.device, **drawn)
+            return action, self.observe(step, plan_state), plan
+        steered, following, plan = super().plan(step, plan_state)
+        if step.draw:
+            steered_path = torch.where(follows[:, None, None], torch.nan, plan.path)
+            plan = replace(plan, path=torch.cat((path, steered_path), 1))
+        return torch.where(follows[:, None], action, steered), following, plan
 
     def costs_of(self, problem: Problem, grid: Grid) -> Costs:
         """What driving costs; see `Optimal`."""
@@ -226,14 +276,39 @@ class OptimalBound(Optimal):
         holds = torch.zeros_like(problem.free) if immobile is None else field < immobile.below
         if immobile is None or self.config.levels == 0:
             return _on_grid(problem, grid, torch.where(holds, UNREACHED, rate), ~holds)
-        most_s = self.config.levels * grid.resolution_m / (problem.robot.top_speed_mps * immobile.below)
-        expect(
-            immobile.for_s <= most_s,
-            f"`immobile.for_s` of at most {most_s:g} s for {self.config.levels} `levels` of planner {self.name!r}, "
-            f"each no longer than a cell of λ = {immobile.below:g} takes, got {immobile.for_s:g}.",
-        )
         costs = _on_grid(problem, grid, rate, ~holds, immobile_s=torch.where(holds, rate, 0.0))
         return replace(costs, lost_after_s=immobile.for_s, levels=self.config.levels)
+
+
+class OptimalBound(NearOptimal):
+    """The near-optimal reference by its earlier name, with a warning.
+
+    Args:
+        config: settings.
+    """
+
+    name = "optimal_bound"
+
+    def __init__(self, config: OptimalBoundConfig | None = None) -> None:
+        """Keeps the settings, and warns of the name."""
+        warnings.warn(
+            "'optimal_bound' names the near-optimal reference, a drive that is feasible, not a bound. Take "
+            "'near_optimal': the name goes with 2.0.",
+            FutureWarning,
+            stacklevel=2,
+        )
+        super().__init__(config or OptimalBoundConfig())
+
+
+def _follow(drive: Drive, taken: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the next action of drives, shape [B, A], and which robots are on them, bool, shape [B]."""
+    member = torch.arange(len(taken), device=taken.device)
+    index = taken.clamp(max=drive.actions.shape[1] - 1)
+    action = drive.actions[member, index]
+    off = (state - drive.states[member, index]).abs().amax(1)
+    # Of an ended drive both are NaN, which is no nearer.
+    follows = (taken == index) & (off < _ON_DRIVE) & ~action.isnan().any(1)
+    return torch.where(follows[:, None], action, 0.0), follows
 
 
 def _on_grid(

@@ -7,8 +7,11 @@ all maps. So a sweep over all states is a convolution of the values for each arc
 bilinearly, over those that are open. Source: Falcone and Ferretti (2013), "Semi-Lagrangian approximation schemes for
 linear and Hamilton-Jacobi equations".
 
+Where terrain immobilises a robot after some dwell time, a state has several costs to go: the least of all drives, and
+those of drives that can still be begun after more and more dwell time. With each stands the dwell time up to which it
+can be begun, without rounding, so that moves add up exactly.
 Letters in shapes: B maps, H×W cells, Q headings, A actions, N points along an arc, R reach of an arc in cells, L levels
-of time held.
+of dwell time.
 """
 
 import math
@@ -24,10 +27,12 @@ from benchnav.planning.robots import Unicycle
 
 _POINTS = 8  # N
 UNREACHED = 1e6  # cost to go before a way is found, and where there is none
+_MIXED = UNREACHED / 100  # from there on a cost to go is for the most part of what is not reached
 _BARRED = 1e-9  # weight of a cell that is not free beside one that is
 _SETTLED = 1e-3  # least change that counts
 _CHECK_EVERY = 10  # sweeps
 _MOST_SWEEPS = 40  # for a cell of the longer side
+_LEAST_DWELL_S = 1e-6  # a drive that leaves no more than that cannot be begun
 _MAPS_AT_ONCE = 8  # so that what is worked on stays near the cache
 
 
@@ -92,10 +97,10 @@ class Costs(Batch):
         final: cost to go where ways end, under 0 where the robot has arrived before; NaN elsewhere, shape [B, H, W].
         hazard: chance of being lost on a metre, as −ln of that of not being lost, shape [B, H, W]; None for none.
         loss: cost of being lost, shape [B].
-        immobile_s: seconds on immobilising ground for each second of driving with λ = 1, 0 where none does, shape
-            [B, H, W]; None where nothing immobilises a robot.
-        lost_after_s: time on such ground, without a break, after which a robot is lost.
-        levels: L, of time held.
+        immobile_s: dwell time for each second of driving with λ = 1, 0 on other terrain, shape [B, H, W]; None where
+            nothing immobilises a robot.
+        lost_after_s: dwell time after which a robot is lost.
+        levels: L, of dwell time.
     """
 
     rate: Tensor
@@ -107,27 +112,38 @@ class Costs(Batch):
     lost_after_s: float = 1.0
     levels: int = 1
 
-    def level(self, held: Tensor) -> Tensor:
-        """Nearest level of a time held, at least 1 where there is any, int64, of the same shape; L is lost."""
-        nearest = (held / self.lost_after_s * self.levels + 0.5).floor().long()
-        return torch.where(held > 0, nearest.clamp(1, self.levels), 0)
+
+@dataclass(frozen=True, kw_only=True)
+class CostToGo(Batch):
+    """The least cost to go of every state.
+
+    Args:
+        value: cost to go, `UNREACHED` where there is no drive, shape [B, L, Q, H, W]. At level l it is the least of
+            drives that a robot can still begin after l / L of the dwell time after which it is lost.
+        max_dwell_s: dwell time of the robot under which that drive reaches the goal, of the same shape; None where
+            nothing immobilises a robot.
+    """
+
+    value: Tensor
+    max_dwell_s: Tensor | None = None
 
 
-def value_iteration(costs: Costs, moves: Moves, grid: Grid, headings: int) -> Tensor:
-    """The least cost to go of every state, shape [B, L, Q, H, W].
+def value_iteration(costs: Costs, moves: Moves, grid: Grid, headings: int) -> CostToGo:
+    """Return the least cost to go of every state.
 
     Args:
         costs: of B maps.
         moves: what the robot may do.
         grid: of the maps.
         headings: Q.
-
-    Returns:
-        `UNREACHED` where there is no way; at the level l a robot has had l / L of the time after which it is lost.
     """
     arcs = _arcs(moves, grid, headings, costs.rate)
     maps = torch.arange(len(costs.rate), device=costs.rate.device).split(_MAPS_AT_ONCE)
-    return torch.cat([_solve(costs.select(some), arcs, grid) for some in maps])
+    solved = [_solve(costs.select(chunk), arcs, grid) for chunk in maps]
+    dwell = [each.max_dwell_s for each in solved if each.max_dwell_s is not None]
+    return CostToGo(
+        value=torch.cat([each.value for each in solved]), max_dwell_s=torch.cat(dwell) if dwell else None
+    )
 
 
 @dataclass(frozen=True)
@@ -182,11 +198,11 @@ def _arcs(moves: Moves, grid: Grid, headings: int, like: Tensor) -> list[_Arc]:
     return found
 
 
-def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> Tensor:
+def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> CostToGo:
     headings, levels = len(arcs[0].ends), costs.levels
     frame = (arcs[0].reach,) * 4
     weights = torch.where(costs.open, 1.0, _BARRED)[:, None]
-    spent, share, after = [], [], []
+    spent, share, dwells = [], [], []
     kept: list[Tensor | None] = []
     # Off the map a second costs as much as no way at all, and a cell beyond is as the one at the border.
     rate, framed = pad(costs.rate[:, None], frame, value=UNREACHED), pad(weights, frame, mode="replicate")
@@ -199,56 +215,97 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> Tensor:
             cost = cost + (1 - keep) * costs.loss[:, None, None, None]
         spent.append(cost)
         kept.append(keep)
-        after.append(None if costs.immobile_s is None else _held_after(costs, arc))
+        dwells.append(None if costs.immobile_s is None else _dwell_along(costs, arc))
+
+    def at_end(arc: _Arc, share: Tensor, values: Tensor) -> Tensor:
+        """Values between the cells and headings where an arc ends."""
+        turned = values.roll(-arc.turn, 2)
+        if not arc.metres:
+            return turned
+        inside = pad((turned * weights[:, None]).flatten(0, 1), frame, mode="replicate")
+        return conv2d(inside, arc.ends, groups=headings).view_as(values) * share[:, None]
+
     final = costs.final[:, None, None]
     value = torch.where(final.isnan(), UNREACHED, final).expand(-1, levels, headings, -1, -1).clone()
+    dwell = None if costs.immobile_s is None else torch.full_like(value, costs.lost_after_s)
     settled = torch.zeros_like(final, dtype=torch.bool)[..., :1, :1]
     for sweep in range(1, _MOST_SWEEPS * max(grid.shape)):
-        before = value
+        before, dwell_before = value, dwell
         for number, arc in enumerate(arcs):
-            turned = value.roll(-arc.turn, 2)
-            if arc.metres:
-                inside = pad((turned * weights[:, None]).flatten(0, 1), frame, mode="replicate")
-                ended = conv2d(inside, arc.ends, groups=headings).view_as(value) * share[number][:, None]
-            else:
-                ended = turned
-            level = after[number]
-            if level is not None:
-                lost = torch.full_like(ended[:, :1], UNREACHED)
-                ended = torch.cat((ended, lost), 1).gather(1, level)
+            ended, along = at_end(arc, share[number], value), dwells[number]
+            ended_dwell = None
+            if along is not None:
+                assert dwell is not None
+                ended, ended_dwell = along.before(
+                    ended, at_end(arc, share[number], dwell), costs.lost_after_s
+                )
             keep = kept[number]
             found = (ended if keep is None else ended * keep[:, None]) + spent[number][:, None]
-            value = torch.where(final.isnan(), torch.minimum(value, found), final)
+            better = final.isnan() & (found < value)
+            value = torch.where(better, found, value)
+            if ended_dwell is not None:
+                assert dwell is not None
+                dwell = torch.where(better, ended_dwell, dwell)
         # A map that has settled stays, so that none depends on those beside it.
         value = torch.where(settled, before, value)
+        if dwell is not None and dwell_before is not None:
+            dwell = torch.where(settled, dwell_before, dwell)
         if sweep % _CHECK_EVERY == 0:
-            settled = (before - value).flatten(1).amax(1)[:, None, None, None, None] < _SETTLED
+            change = before - value
+            if dwell is not None:
+                # Between states with a way and without, values go down for long, and mean nothing.
+                change = torch.where(value < _MIXED, change, 0.0)
+            settled = change.flatten(1).amax(1)[:, None, None, None, None] < _SETTLED
             if bool(settled.all()):
                 break
-    return value
+    return CostToGo(value=value, max_dwell_s=dwell)
 
 
-def _held_after(costs: Costs, arc: _Arc) -> Tensor:
-    """Levels of time held after an arc, by that before it, L where the robot is lost, int64, shape [B, L, Q, H, W]."""
-    assert costs.immobile_s is not None
-    (size, height, width), reach = costs.immobile_s.shape, arc.reach
-    headings, step = len(arc.ends), arc.seconds / _POINTS
-    around = pad(costs.immobile_s[:, None], (reach,) * 4)[:, 0]
-    before = torch.arange(costs.levels, device=around.device)[None, :, None, None, None]
-    start = before.to(around) * (costs.lost_after_s / costs.levels)
-    held = start.expand(size, -1, headings, height, width).clone()
-    lost, whole = (torch.full_like(held, value, dtype=torch.bool) for value in (False, True))
-    for rows, columns in arc.points:
-        seconds = step * torch.stack(
-            [
-                around[:, row : row + height, column : column + width]
-                for row, column in zip(rows, columns, strict=True)
-            ],
-            1,
+@dataclass(frozen=True)
+class _Dwell:
+    """Dwell time along an arc, from every state.
+
+    Args:
+        first_s: until the arc first leaves immobilising terrain, or of all of it, shape [B, Q, H, W].
+        last_s: after it last left it, 0 where it never does, of the same shape.
+        leaves: whether a point of it lies on other terrain, bool, of the same shape.
+        is_lost: whether a robot is lost between both, bool, of the same shape.
+    """
+
+    first_s: Tensor
+    last_s: Tensor
+    leaves: Tensor
+    is_lost: Tensor
+
+    def before(self, value: Tensor, max_dwell_s: Tensor, lost_after_s: float) -> tuple[Tensor, Tensor]:
+        """Return costs to go and their dwell times at an arc's beginning, from those at its end, [B, L, Q, H, W]."""
+        levels = value.shape[1]
+        dwell = torch.where(self.leaves[:, None], lost_after_s, max_dwell_s) - self.first_s[:, None]
+        is_lost = self.is_lost[:, None] | (max_dwell_s <= self.last_s[:, None])
+        dwell = torch.where(is_lost, 0.0, dwell)
+        # The more dwell time a drive leaves, the more it costs: the first that leaves enough is the cheapest.
+        least_s = [max(level * lost_after_s / levels, _LEAST_DWELL_S) for level in range(levels)]
+        index = torch.stack([(dwell < least).sum(1) for least in least_s], 1)
+        none = torch.full_like(value[:, :1], UNREACHED)
+        unlimited = torch.full_like(none, lost_after_s)
+        return (
+            torch.cat((value, none), 1).gather(1, index),
+            torch.cat((dwell, unlimited), 1).gather(1, index),
         )
-        held = torch.where(seconds[:, None] > 0, held + seconds[:, None], 0.0)
-        lost |= held >= costs.lost_after_s
-        whole &= seconds[:, None] > 0
-    # A move that is all on such ground adds a level: else the time of short ones would never add up.
-    level = torch.maximum(costs.level(held), torch.where(whole, before + 1, 0))
-    return torch.where(lost, costs.levels, level)
+
+
+def _dwell_along(costs: Costs, arc: _Arc) -> _Dwell:
+    assert costs.immobile_s is not None
+    (_, height, width), reach = costs.immobile_s.shape, arc.reach
+    around = pad(costs.immobile_s[:, None], (reach,) * 4)[:, 0]
+    first = now = torch.zeros(1).to(around)
+    leaves = is_lost = torch.zeros(1).to(around).bool()
+    for rows, columns in arc.points:
+        cells = zip(rows, columns, strict=True)
+        passed = [around[:, row : row + height, column : column + width] for row, column in cells]
+        seconds = arc.seconds / _POINTS * torch.stack(passed, 1)
+        leaves = leaves | (seconds == 0)
+        first = first + torch.where(leaves, 0.0, seconds)
+        now = torch.where(seconds > 0, now + seconds, 0.0)
+        is_lost = is_lost | (leaves & (now >= costs.lost_after_s))
+    return _Dwell(first_s=first, last_s=torch.where(leaves, now, 0.0), leaves=leaves, is_lost=is_lost)

@@ -3,7 +3,7 @@
 Between cells' centres the interpolated cost to go is too low before slow ground and too high in it, so that a robot
 that looks at its next moves alone may turn to and fro. Ways therefore end at centres, up to some cells away: a turn on
 the spot, along a circle at full speed, and straight on.
-Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L levels of time held.
+Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L levels of dwell time.
 """
 
 import math
@@ -14,7 +14,8 @@ from torch import Tensor
 
 from benchnav.core.batch import Batch
 from benchnav.core.grid import Grid
-from benchnav.planning.planners.optimal.value import UNREACHED, Costs
+from benchnav.planning.planners.optimal.drive import Drive
+from benchnav.planning.planners.optimal.value import UNREACHED, Costs, CostToGo
 from benchnav.planning.problem import Problem
 
 _NEAR_CELLS = 4  # how far ways lead
@@ -32,15 +33,19 @@ class OptimalState(Batch):
         problem: what is being solved.
         grid: cells of value iteration, H×W.
         costs: of driving on them.
-        value: cost to go, shape [B, L, Q, H, W].
-        held: time that the robots have been on immobilising ground, in seconds, shape [B].
+        to_go: cost to go of every state.
+        held: dwell time of the robots in seconds, shape [B].
+        taken: steps taken, int64, shape [B].
+        drive: simulated to its end; a robot follows it as long as it is on it; None for none.
     """
 
     problem: Problem
     grid: Grid
     costs: Costs
-    value: Tensor
+    to_go: CostToGo
     held: Tensor
+    taken: Tensor
+    drive: Drive | None = None
 
 
 @dataclass(frozen=True)
@@ -67,7 +72,7 @@ def ways_from(pose: Tensor, held: Tensor, plan_state: OptimalState) -> Ways:
 
     Args:
         pose: (x, y, θ), shape [B, 3].
-        held: time that the robots have been on immobilising ground, shape [B].
+        held: dwell time of the robots in seconds, shape [B].
         plan_state: costs and values.
     """
     grid, robot = plan_state.grid, plan_state.problem.robot
@@ -110,7 +115,7 @@ def ways_from(pose: Tensor, held: Tensor, plan_state: OptimalState) -> Ways:
     cells = row.repeat(1, count), column.repeat(1, count)
     cost = _cost(pose, held, points, off / rate, drive_s, heading, cells, plan_state)
     return Ways(
-        cost=torch.where(possible, cost, UNREACHED),
+        cost=torch.where(possible, cost, torch.inf),
         turn=side * (off + arc),
         rolls=off == 0,
         points=torch.cat((points, (pose[:, None, :2] + away)[:, :, None]), 2),
@@ -160,7 +165,7 @@ def _cost(
 
     Args:
         pose: (x, y, θ), shape [B, 3].
-        held: time that the robots have been on immobilising ground, shape [B].
+        held: dwell time of the robots in seconds, shape [B].
         points: (x, y) along the ways, shape [B, K, N, 2].
         spot_s: for how long they turn on the spot, with λ = 1, shape [B, K].
         drive_s: for how long they drive, with λ = 1, shape [B, K].
@@ -178,30 +183,37 @@ def _cost(
 
     here, along = read(costs.rate, UNREACHED)
     cost = spot_s * here + drive_s * along.mean(2)
-    level, lost = torch.zeros_like(cells[0]), torch.zeros_like(cost, dtype=torch.bool)
+    most = now = torch.zeros_like(cost)
     if costs.immobile_s is not None:
         here, along = read(costs.immobile_s, 0.0)
-        now = held[:, None] + spot_s * here
-        lost = now >= costs.lost_after_s
+        most = now = torch.where(here > 0, held[:, None] + spot_s * here, 0.0)
         for seconds in (along * drive_s[..., None] / _POINTS).unbind(2):
             now = torch.where(seconds > 0, now + seconds, 0.0)
-            lost = lost | (now >= costs.lost_after_s)
-        level = costs.level(now)
-        lost, level = lost | (level == costs.levels), level.clamp(max=costs.levels - 1)
-    to_go = _value_at(plan_state.value, level, heading, cells)
+            most = torch.maximum(most, now)
+    to_go = _value_at(plan_state.to_go, now, heading, cells)
     if costs.hazard is not None:
         _, along = read(costs.hazard, 0.0)
         kept = torch.exp(-along.mean(2) * drive_s * problem.robot.top_speed_mps)
         to_go = kept * to_go + (1 - kept) * costs.loss[:, None]
-    return torch.where(lost, UNREACHED, cost + to_go)
+    # Where every way loses the robot, that with the least dwell time is the best.
+    return torch.where(most < costs.lost_after_s, cost + to_go, UNREACHED * (1 + most / costs.lost_after_s))
 
 
-def _value_at(value: Tensor, level: Tensor, heading: Tensor, cells: tuple[Tensor, ...]) -> Tensor:
+def _value_at(to_go: CostToGo, dwell_s: Tensor, heading: Tensor, cells: tuple[Tensor, ...]) -> Tensor:
     """The cost to go of poses at cells' centres, between headings, shape [B, K]; cells off the map mean nothing."""
-    batch, _, headings, height, width = value.shape
-    own = torch.arange(batch, device=value.device)[:, None]
+    _, levels, headings, height, width = to_go.value.shape
     row, column = cells[0].clamp(0, height - 1), cells[1].clamp(0, width - 1)
     place = heading / (2 * math.pi / headings)
-    first = place.floor().long()
-    before, behind = (value[own, level, (first + more) % headings, row, column] for more in (0, 1))
-    return torch.lerp(before, behind, place - first)
+    first = place.floor()
+    index = [(first.long() + more) % headings * height * width + row * width + column for more in (0, 1)]
+
+    def read(values: Tensor) -> Tensor:
+        """Values of all levels, shape [B, L, K]."""
+        flat = values.flatten(2)
+        before, behind = (flat.gather(2, each[:, None].expand(-1, levels, -1)) for each in index)
+        return torch.lerp(before, behind, (place - first)[:, None])
+
+    value = read(to_go.value)
+    if to_go.max_dwell_s is not None:
+        value = torch.where(read(to_go.max_dwell_s) > dwell_s[:, None], value, UNREACHED)
+    return value.amin(1)
