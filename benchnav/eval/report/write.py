@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 import benchnav
 from benchnav.core.errors import BenchnavError
-from benchnav.core.figures import save_twice
+from benchnav.core.figures import planner_name, save_twice
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
 from benchnav.eval.experiment.condition import KNOWLEDGE
@@ -48,8 +48,8 @@ from benchnav.eval.report.result_tables import LATENCIES, learning_table, paper_
 from benchnav.eval.report.words import NOT_USED, joined, maps_in_words, unit_of_statistics
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
-from benchnav.eval.stats.regret import split_regret
-from benchnav.eval.stats.summary import summarise
+from benchnav.eval.stats.regret import best_possible, split_regret
+from benchnav.eval.stats.summary import summarise, time_budgets
 from benchnav.planning.world.outcome import ERROR_OUTCOMES
 
 PAGE = "report.html"
@@ -162,7 +162,11 @@ def read_report(folder: Path, record_driven: RecordDriven | None = None, partial
         warnings.append(f"note: {sheets.left_out}")
     report = Report(
         name=folder.resolve().name,
-        header=(*_header(summary, about), *_rejected_draws(episodes, about["conditions"])),
+        header=(
+            *_header(summary, about),
+            *_rejected_draws(episodes, about["conditions"]),
+            *_bracket(episodes, about["conditions"], worlds),
+        ),
         findings=said,
         table=result_table(summary, about["conditions"]),
         warnings=tuple(warnings),
@@ -403,6 +407,26 @@ def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> li
     return [
         f"{100 * share:.1f} % of the draws of λ had no feasible path from start to goal and were rejected."
     ]
+
+
+def _bracket(
+    episodes: pd.DataFrame, conditions: Mapping[str, Any], worlds: Mapping[str, Mapping[str, Any]]
+) -> list[str]:
+    """Both ends between which the least time lies, of each condition whose planner is given λ."""
+    found = []
+    for name, rows in episodes.groupby("condition", sort=False):
+        rows = rows.assign(time_budget_s=time_budgets(rows, worlds[str(name)]))
+        best = best_possible(rows)
+        if np.isnan(best["time_bound"]):
+            continue
+        reached, time_s = rows["success"].mean(), rows["total_time_s"].mean()
+        labels = conditions[str(name)]["labels"]
+        found.append(
+            f"The best that any planner can do ({labels['scenario']}, {labels['world']}) lies between a lower bound "
+            f"and what {planner_name(labels['planner'])} drives: T_total {best['time_bound']:.1f} to {time_s:.1f} s, "
+            f"success {100 * reached:.1f} to {100 * best['success_bound']:.1f} %."
+        )
+    return found
 
 
 def _world(value: Mapping[str, Any]) -> str:

@@ -2,7 +2,8 @@
 
 From a planner with a model's prediction to the optimal planner with the same prediction, with that of ideal eyes
 (`ideal`), with the true distribution (`oracle`), and to the near-optimal reference, which is given λ itself. What that
-drives is feasible, so regret against it is at most that against the least time. Each step is a paired difference of its
+drives is feasible, so regret against it is at most that against the least time; beside it stands the lower bound of the
+time, which no trajectory undercuts. Each step is a paired difference of its
 own. They add up to the whole by construction, which does not make them causes: a step may be negative, and another
 order of steps would give others.
 """
@@ -88,7 +89,8 @@ def split_regret(
         against; ids, planners and models of the
         two conditions, `one`, `one_planner`, `one_model` and `other…`; `n_maps`, of which a group counts as one, and
         `n_episodes`; of `success` and of `time`, T_total in seconds, a failure counted as T: the means `_one` and
-        `_other`, and the `_difference` of one less other with its 95 % interval `_low`, `_high`.
+        `_other`, and the `_difference` of one less other with its 95 % interval `_low`, `_high`; and `_bound`, the best
+        mean that the lower bounds of the time allow, NaN where the reference's rows have none.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
     made: list[dict[str, Any]] = []
@@ -105,6 +107,7 @@ def split_regret(
         }
         labels = conditions[chain[0]]["labels"]
         about = {name: labels[name] for name in (*BLOCK, "planner", "model", "risk")}
+        bounds = best_possible(own[chain[-1]])
         for one, other in pairwise(chain):
             both = side_by_side(own[one], own[other], ["success", "total_time_s", "time_budget_s"])
             made.append(
@@ -120,9 +123,26 @@ def split_regret(
                         for kind in ("planner", "model")
                     },
                     **_differences(both),
+                    **bounds,
                 }
             )
     return pd.DataFrame(made)
+
+
+def best_possible(rows: pd.DataFrame) -> dict[str, float]:
+    """The best means that the lower bounds of the time allow: `success_bound`, and `time_bound` in seconds of T_total.
+
+    Args:
+        rows: episodes, with `time_budget_s`; NaN where some have no `lower_bound_s`.
+    """
+    least = rows.get("lower_bound_s")
+    if least is None or least.isna().any():
+        return {"success_bound": float("nan"), "time_bound": float("nan")}
+    limit = rows["time_budget_s"]
+    return {
+        "success_bound": float((least <= limit).mean()),
+        "time_bound": float(least.clip(upper=limit).mean()),
+    }
 
 
 def _differences(both: pd.DataFrame) -> dict[str, Any]:

@@ -30,6 +30,8 @@ TIMES: list[list[float | None]] = [
     [33, 32, 31, None, 33, 32, 33, 35, 34, 33],
     [29, 28, 27, 31, 30, 28, 30, 31, 29, 30],
 ]
+LAST = [29.0, 28.0, 27.0, 31.0, 30.0, 28.0, 30.0, 31.0, 29.0, 30.0]
+assert TIMES[-1] == LAST
 
 
 def name_of(planner: str, model: str, risk: str = "cvar") -> str:
@@ -214,7 +216,7 @@ def test_one_map_has_no_interval() -> None:
 
 @pytest.mark.usefixtures("whole_fonts")
 def test_the_report_of_a_run_with_a_chain_has_it(tmp_path: Path) -> None:
-    rows = episodes()
+    rows = bounded_episodes()
     parts = {kind: {"part": kind, "options": {}} for kind in ("robot", "objective")}
     known = {
         name: about
@@ -231,9 +233,38 @@ def test_the_report_of_a_run_with_a_chain_has_it(tmp_path: Path) -> None:
     assert (folder / "figures/regret.png").is_file()
     assert len(pd.read_csv(folder / "regret.csv")) == 4
     assert "in another order steps would be others" in (folder / "report.html").read_text()
+    said = (folder / "summary.md").read_text()
+    assert f"T_total {report.regret['time_bound'][0]:.1f} to {np.mean(LAST):.1f} s" in said
+    assert "success 100.0 to 90.0 %" in said
     one = rows[rows["planner"] == "astar_dwa"]
     folder = forge_run(
         tmp_path / "alone", one, {name: known[name] for name in set(one["condition"])}, history=history
     )
     write_report(folder)
     assert not (folder / "regret.csv").exists()
+
+
+def bounded_episodes() -> pd.DataFrame:
+    """Lower bounds of the reference's time; of the tenth map nobody reaches the goal."""
+    rows = episodes()
+    rows.loc[rows["planner"] == "near_optimal", "lower_bound_s"] = [
+        *(0.9 * time for time in LAST[:-1]),
+        np.inf,
+    ]
+    return rows
+
+
+def test_the_lower_bound_stands_beside_the_reference_where_its_rows_have_one() -> None:
+    rows = episodes()
+    assert split(rows)[["time_bound", "success_bound"]].isna().all(axis=None)
+    table = split(bounded_episodes())
+    limit_s = made.PAPER["world"]["time_budget_s"]
+    assert table["success_bound"].eq(0.9).all()
+    assert table["time_bound"].to_numpy() == pytest.approx(0.09 * sum(LAST[:-1]) + 0.1 * limit_s)
+    drawn = [
+        line
+        for panel in regret_figure(table).axes
+        for line in panel.get_lines()
+        if line.get_linestyle() == "--"
+    ]
+    assert [line.get_xdata()[0] for line in drawn] == pytest.approx([90.0, table["time_bound"][0]])

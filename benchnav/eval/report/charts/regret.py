@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from benchnav.core.figures import (
@@ -25,6 +27,7 @@ from benchnav.eval.stats.best import BLOCK
 MOST_CHAINS = 6
 _ROW_IN = 0.24
 _ENDS = "0.75"
+_BOUND = "0.25"
 # Of each measure its axis, its factor, and whether more is worse.
 _MEASURES = {"success": ("success [%]", 100.0, False), "time": ("T_total [s]", 1.0, True)}
 
@@ -57,12 +60,14 @@ def regret_figure(table: pd.DataFrame) -> Figure:
     for panel, (label, *_) in zip(axes[-1], _MEASURES.values(), strict=True):
         panel.set_xlabel(label)
         panel.set_xlim(left=0)
-    handles = [
+    handles: list[Artist] = [
         Patch(color=ORANGE, label="the next is better"),
         Patch(color=BLUE, label="the next is worse"),
         Patch(color=_ENDS, label="of the first, of the near-optimal reference"),
     ]
-    legend_outside(figure, handles, 3)
+    if table["time_bound"].notna().any():
+        handles.append(Line2D([], [], color=_BOUND, ls="--", lw=1.1, label="lower bound: nobody is better"))
+    legend_outside(figure, handles, len(handles))
     return figure
 
 
@@ -99,6 +104,9 @@ def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
         panel.text(1.02, place, words, transform=beside, va="center", size=TEXT)
     for place, value in enumerate(means):
         panel.plot([value, value], [place - 0.35, place + 1.35], color="0.5", lw=0.5)
+    bound = factor * rows[f"{measure}_bound"].iloc[0]
+    if bound == bound:
+        panel.axvline(bound, color=_BOUND, ls="--", lw=1.1)
     panel.grid(axis="x", color="0.93")
     panel.set_axisbelow(True)
     panel.use_sticky_edges = False
