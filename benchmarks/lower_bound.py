@@ -4,7 +4,7 @@
     python benchmarks/lower_bound.py worlds --worlds 500
 
 `gap` takes λ fields of the shipped test maps as the world `stakes` draws them, and the near-optimal reference. What
-lies between the two is told apart by bounds that leave a cause out: the excess of slopes that W is divided by; that a
+lies between the two is split by bounds that leave a cause out: the excess of slopes that W is divided by; that a
 step reaches from quick cells into slow ones; that robots may dip into immobilising ground. What is left are turns, the
 time held, and what the reference loses. `worlds` draws small worlds with a wall of slow cells across, some of which
 immobilise a robot before it is over, and drives the planners that are given λ.
