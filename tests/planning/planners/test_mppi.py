@@ -495,11 +495,38 @@ def test_turns_are_full_steering_for_some_of_the_time_and_then_straight() -> Non
     assert bool(((shunts[:, 0] == 0.8) | (shunts[:, 0] == -0.5)).all())
 
 
+@dataclass
+class Asked:
+    """Fields that note on which cells they are drawn."""
+
+    cells: torch.Tensor | None = None
+
+    def sample(self, count: int, key: int, cells: torch.Tensor | None = None) -> torch.Tensor:
+        assert cells is not None
+        self.cells = cells
+        return torch.full((len(cells), count, *cells.shape[1:]), 0.5)
+
+    def select(self, members: torch.Tensor) -> "Asked":
+        return self
+
+
+@pytest.mark.parametrize(("robot", "reach_m"), [(Unicycle(), 2.0), (Bicycle(), 4.0)])
+def test_fields_are_drawn_as_far_as_what_is_rolled_out(robot: Unicycle | Bicycle, reach_m: float) -> None:
+    fields = Asked()
+    problem = factories.problem(torch.full((1, 40, 40), 0.8), (1.25, 10.25), (13.0, 10.25), robot)
+    problem = replace(problem, fields=fields)
+    planner = MPPI(replace(SMALL, risk_on="cost", fields=10))
+    planner.plan(first(problem), planner.init(problem, generator()))
+    assert fields.cells is not None
+    assert int(fields.cells[0, 20].sum()) == 3 + round((reach_m + 0.5) / 0.5)
+
+
 def test_a_turn_replaces_only_a_mean_that_is_no_better_than_standing() -> None:
-    """Two robots at rest, the goal behind the first and ahead of the second, and the first again with a good mean."""
-    ground = torch.full((3, 40, 40), 0.85)
+    """Goals behind, ahead of a robot at rest, ahead of one with a good mean, and behind on slow ground."""
+    ground = torch.full((4, 40, 40), 0.85)
+    ground[3] = 0.5  # half a turn takes 4.6 s, so that none pays within 5 s
     problem = factories.problem(ground, (13.0, 10.0), (7.0, 10.0), Bicycle())
-    start = torch.tensor([[13.0, 10.0, 0.0], [13.0, 10.0, math.pi], [13.0, 10.0, math.pi]])
+    start = torch.tensor([[13.0, 10.0, 0.0], [13.0, 10.0, math.pi], [13.0, 10.0, math.pi], [13.0, 10.0, 0.0]])
     problem = replace(problem, start=start)
     planner = MPPI(replace(SMALL, horizon_s=5.0))
     state = planner.init(problem, generator())
@@ -512,6 +539,7 @@ def test_a_turn_replaces_only_a_mean_that_is_no_better_than_standing() -> None:
     # Half a turn takes π·0.73 m / 0.85 m/s = 2.7 s.
     assert 20 <= int(steered.sum()) <= 34
     assert torch.equal(turned[2], mean[2])
+    assert int((turned[3, :, 1].abs() > 0).sum()) >= 40
     alone = problem.select(torch.tensor([0]))
     state = planner.select(state, torch.tensor([0]))
     single = planner._turned(first(alone), state, alone.goal_m, alone.padded_ground, None)

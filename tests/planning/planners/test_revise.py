@@ -12,7 +12,8 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners import boundary
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.cl_rrt import cl_rrt
-from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT
+from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT, CLRRTConfig
+from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig
 from benchnav.planning.planners.planner import PlanStatus
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
@@ -252,7 +253,9 @@ def test_cl_rrt_leaves_a_partial_path_that_costs_more(monkeypatch: pytest.Monkey
 
 
 def test_cl_rrt_costs_what_is_left_of_a_path_by_the_time_that_its_metres_take() -> None:
-    planner, posed = make("cl_rrt"), problem(ground(), robot=Unicycle(speed_mps=(0.0, 2.0)))
+    """At the wanted 1 m/s on quick ground, at 0.4 · 2 m/s on slow ground."""
+    planner = CLRRT(CLRRTConfig(expansions=25, follower=FollowerConfig(speed_mps=1.0)))
+    posed = problem(ground(), robot=Unicycle(speed_mps=(0.0, 2.0)))
     _, plan_state, _ = planner.plan(first(posed), planner.init(posed, generator()))
     line = torch.full((2, 60, 2), torch.nan)
     line[:, :21, 0], line[:, :21, 1] = torch.linspace(2, 12, 21), 6.1
@@ -262,7 +265,7 @@ def test_cl_rrt_costs_what_is_left_of_a_path_by_the_time_that_its_metres_take() 
     then = replace(then, free=then.free.clone())
     then.free[1, :, 20:22] = False
     cost = planner._cost_ahead(replace(plan_state, problem=then), route, state)
-    wanted = torch.tensor([7 / 1.7 + 3 / 0.8, 5 / 1.7 + PENALTY])
+    wanted = torch.tensor([7 + 3 / 0.8, 5 + PENALTY])
     torch.testing.assert_close(cost, wanted, rtol=1e-4, atol=0.01)
 
 
