@@ -25,7 +25,7 @@ from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
-from tests.planning.planners.driving import drive, first, generator, known_world, with_start
+from tests.planning.planners.driving import drive, first, generator, known_world, step_at, with_start
 
 RULES = Rules(min_traversability=0.01, free_space=FreeSpace(above=0.0))
 
@@ -336,7 +336,10 @@ def test_where_value_iteration_fails_it_follows_the_earlier_of_the_others(
     ground = torch.full((2, 16, 24), 0.9)
     ground[1, :12, 11] = 0.02
     posed = problem(ground, (2.25, 3.25), (9.25, 3.25), time_budget_s=30.0)
-    posed = replace(posed, immobile=Immobile(), distribution=factories.certain(ground), free=ground > 0.1)
+    # On the first map the wall is quick, but not free.
+    free = torch.ones_like(ground).bool()
+    free[:, :12, 11] = False
+    posed = replace(posed, immobile=Immobile(), distribution=factories.certain(ground), free=free)
     world = known_world(posed)
     guided, straight = (drive(planner, posed, world=world) for planner in (AStarDWA(), Straight()))
     assert straight.outcome.tolist() == [Outcome.SUCCESS, Outcome.IMMOBILISED]
@@ -510,8 +513,12 @@ def test_where_there_is_no_way_the_world_ends_the_episode() -> None:
         distribution=factories.certain(ground),
     )
     planner = NearOptimal()
-    _, _, plan = planner.plan(first(posed), planner.init(posed, generator()))
-    assert plan.status.tolist() == [PlanStatus.OK] * 3
+    # On its drive, and off it.
+    for turned in (0.0, 0.1):
+        step = step_at(posed.start + torch.tensor([0.0, 0.0, turned]))
+        action, _, plan = planner.plan(step, planner.init(posed, generator()))
+        assert plan.status.tolist() == [PlanStatus.PARTIAL, PlanStatus.OK, PlanStatus.PARTIAL]
+        assert torch.equal(action[[0, 2]], Straight().plan(step, posed)[0][[0, 2]])
     done = drive(planner, posed, world=known_world(posed))
     assert done.outcome[1:].tolist() == [Outcome.SUCCESS, Outcome.IMMOBILISED]
     assert done.outcome[0] != Outcome.SUCCESS

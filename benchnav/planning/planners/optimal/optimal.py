@@ -24,8 +24,8 @@ from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.optimal.drive import Drive, earlier, simulate
 from benchnav.planning.planners.optimal.value import UNREACHED, Costs, Moves, value_iteration
 from benchnav.planning.planners.optimal.ways import OptimalState, path_of, ways_from
-from benchnav.planning.planners.planner import Plan, Planner, check_steers
-from benchnav.planning.planners.straight import Straight
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, check_steers
+from benchnav.planning.planners.straight import Straight, steer_toward
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, TURN_RATE, Unicycle
 from benchnav.planning.sensing.sensor import Step
@@ -156,14 +156,20 @@ class Optimal(Planner[OptimalState]):
         problem, held = plan_state.problem, plan_state.held
         pose, own = step.state[:, :3], torch.arange(len(held), device=held.device)
         ways = ways_from(pose, held, plan_state)
-        best = ways.cost.argmin(1)
+        cost, best = ways.cost.min(1)
         # What a turn takes to be over after this step.
         rate = ways.turn[own, best] / (problem.traversability_at(pose).clamp(min=_LEAST_KNOWN) * problem.dt_s)
         low, high = problem.action_bounds
         drives = ways.rolls[own, best] | (rate.abs() <= high[1])
         action = torch.stack((torch.where(drives, high[0], 0.0), rate.clamp(low[1], high[1])), 1)
+        # Without a path the robot drives straight, as other planners do, and the world says how that ends.
+        stranded = cost >= self.no_way(plan_state.costs)
+        action = torch.where(
+            stranded[:, None], steer_toward(step.state, problem.goal_m, problem.robot), action
+        )
+        status = PlanStatus.PARTIAL * stranded.long()
         drawn = {"path": path_of(plan_state, pose, held)} if step.draw else {}
-        plan = Plan.empty(len(held), held.device, **drawn)
+        plan = replace(Plan.empty(len(held), held.device, **drawn), status=status)
         return action, plan_state, plan
 
     def observe(self, step: Step, plan_state: OptimalState) -> OptimalState:
@@ -188,6 +194,10 @@ class Optimal(Planner[OptimalState]):
             f"Expected a fixed map for planner {self.name!r}, which plans once, got one that changes. "
             "Take belief 'static' and sensor 'full'."
         )
+
+    def no_way(self, costs: Costs) -> Tensor:
+        """Cost from which on there is no way, shape [B]."""
+        return torch.full_like(costs.loss, UNREACHED / 2)
 
     def costs_of(self, problem: Problem, grid: Grid) -> Costs:
         """What driving costs, on the cells of value iteration."""
@@ -214,7 +224,7 @@ class NearOptimal(Optimal):
     settings, and by `straight`. The robot follows the earliest to reach the goal. So wherever A*+DWA or `straight`
     reaches the goal on the same problem, this does too, and no later. Planners that draw samples are not among the
     three: where they are quicker, or the only ones to succeed, is a matter of measurement. A robot that has left the
-    drive is steered by value iteration. It never gives up: where no way is known, the world ends the episode.
+    drive is steered by value iteration.
 
     Args:
         config: settings.
@@ -253,15 +263,24 @@ class NearOptimal(Optimal):
         action, follows = _follow(drive, taken, step.state)
         rest = torch.arange(drive.states.shape[1], device=action.device) >= taken[:, None]
         path = torch.where((rest & follows[:, None])[..., None], drive.states[..., :2], torch.nan)
+        status = PlanStatus.PARTIAL * drive.steps.isinf().long()
         if bool(follows.all()):
             drawn = {"path": path} if step.draw else {}
-            plan = Plan.empty(len(action), action.device, **drawn)
+            plan = replace(Plan.empty(len(action), action.device, **drawn), status=status)
             return action, self.observe(step, plan_state), plan
         steered, following, plan = super().plan(step, plan_state)
+        plan = replace(plan, status=torch.where(follows, status, plan.status))
         if step.draw:
             steered_path = torch.where(follows[:, None, None], torch.nan, plan.path)
             plan = replace(plan, path=torch.cat((path, steered_path), 1))
         return torch.where(follows[:, None], action, steered), following, plan
+
+    def no_way(self, costs: Costs) -> Tensor:
+        """Twice T, as the value of where there is no way reaches into cells beside it; see `Optimal`.
+
+        Not T itself: the grid makes times a little too long, and a path that takes little more than T may arrive.
+        """
+        return 2 * costs.loss
 
     def costs_of(self, problem: Problem, grid: Grid) -> Costs:
         """What driving costs; see `Optimal`."""

@@ -115,7 +115,7 @@ def ways_from(pose: Tensor, held: Tensor, plan_state: OptimalState) -> Ways:
     cells = row.repeat(1, count), column.repeat(1, count)
     cost = _cost(pose, held, points, off / rate, drive_s, heading, cells, plan_state)
     return Ways(
-        cost=torch.where(possible, cost, torch.inf),
+        cost=torch.where(possible, cost, UNREACHED),
         turn=side * (off + arc),
         rolls=off == 0,
         points=torch.cat((points, (pose[:, None, :2] + away)[:, :, None]), 2),
@@ -195,8 +195,7 @@ def _cost(
         _, along = read(costs.hazard, 0.0)
         kept = torch.exp(-along.mean(2) * drive_s * problem.robot.top_speed_mps)
         to_go = kept * to_go + (1 - kept) * costs.loss[:, None]
-    # Where every way loses the robot, that with the least dwell time is the best.
-    return torch.where(most < costs.lost_after_s, cost + to_go, UNREACHED * (1 + most / costs.lost_after_s))
+    return torch.where(most < costs.lost_after_s, cost + to_go, UNREACHED)
 
 
 def _value_at(to_go: CostToGo, dwell_s: Tensor, heading: Tensor, cells: tuple[Tensor, ...]) -> Tensor:
