@@ -13,9 +13,9 @@ from benchnav.core.device import gpu_name
 from benchnav.core.errors import ConfigError
 from benchnav.core.registry import NO_DEFAULT, Part
 from benchnav.core.store import Shard
-from benchnav.eval.experiment.condition import Condition, check_labels, differences
+from benchnav.eval.experiment.condition import Condition, check_labels, differences, merge, merge_alike
 from benchnav.eval.experiment.suite import Record
-from benchnav.eval.experiment.unit import Conditions
+from benchnav.eval.experiment.unit import Conditions, Extent
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.run_folder import (
     EPISODES,
@@ -67,12 +67,20 @@ def begin(work: Work, folder: Path, say: Say) -> Conditions:
         return work.conditions
     earlier = open_run(folder)
     _check_extends(work, earlier)
-    conditions = dict(earlier.conditions)
+    conditions = _merge_earlier(earlier)
+    # What differs from an earlier condition only in what is not used is run as that one.
+    rows_ids = {condition.rows_id: name for name, (condition, _) in reversed(conditions.items())}
     for condition_id, (condition, extent) in work.conditions.items():
-        known = conditions.get(condition_id)
-        conditions[condition_id] = (condition, known[1].union(extent) if known else extent)
+        name = condition_id if condition_id in conditions else rows_ids.get(condition.rows_id, condition_id)
+        if name in conditions:
+            known, known_extent = conditions[name]
+            condition = merge(condition if condition.id == name else known, (known, condition))
+            extent = known_extent.union(extent)
+        conditions[name] = (condition, extent)
     if conditions != earlier.conditions:
-        new = len(conditions) - len(earlier.conditions)
+        new = len(conditions.keys() - earlier.conditions.keys())
+        if dropped := len(earlier.conditions.keys() - conditions.keys()):
+            say(f"{dropped} conditions of {folder} differ from others only in what is not used, and are merged")
         more = {0: "by more episodes", 1: "by 1 new condition"}.get(new, f"by {new} new conditions")
         say(f"{folder} is extended {more}")
         (folder / EPISODES).unlink(missing_ok=True)  # until all that is asked for is there
@@ -80,6 +88,26 @@ def begin(work: Work, folder: Path, say: Say) -> Conditions:
     if now != earlier.about:
         write_run(folder, now)
     return conditions
+
+
+def _merge_earlier(earlier: Run) -> dict[str, tuple[Condition, Extent]]:
+    """The conditions of a run, of which versions before 1.2 did not merge those that differ in what is not used.
+
+    Those that a hypothesis names stay.
+    """
+    tests = earlier.about.get("hypotheses", {}).get("tests", ())
+    named = {test[side] for test in tests for side in ("one", "other")}
+    conditions = {name: condition for name, (condition, _) in earlier.conditions.items()}
+    merged = {one.id: one for one in merge_alike(one for name, one in conditions.items() if name not in named)}
+    extents = {condition.rows_id: Extent(draws=()) for condition in merged.values()}
+    for name, (condition, extent) in earlier.conditions.items():
+        if name not in named:
+            extents[condition.rows_id] = extents[condition.rows_id].union(extent)
+    return {
+        name: (merged[name], extents[merged[name].rows_id]) if name in merged else earlier.conditions[name]
+        for name in conditions
+        if name in merged or name in named
+    }
 
 
 def drop(folder: Path) -> None:
@@ -120,6 +148,7 @@ def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> di
     entries = {
         condition_id: {
             **{"value": condition.value, "labels": condition.labels, **_notes(condition)},
+            **({"stands_for": condition.stands_for} if condition.stands_for else {}),
             **{"seeds": extent.seeds, "draws": extent.draws},
             **{name: value for name, value in known.get(condition_id, {}).items() if name == "latency"},
         }
@@ -158,9 +187,13 @@ def _notes(condition: Condition) -> dict[str, Any]:
     """What tables say of a condition's planner."""
     planner = condition.make_planner()
     task = condition.make_task()
+    merged = [
+        f"One row for {kind} {', '.join(labels)}, which the planner does not use here"
+        for kind, labels in condition.stands_for.items()
+    ]
     return {
         "follows": planner.follows(task),
-        "remarks": list(planner.remarks(task)),
+        "remarks": [*planner.remarks(task), *merged],
         "changed": changed_options(condition.planner),
     }
 

@@ -25,7 +25,9 @@ FAN = "tests.eval.parts:Faulty"
 
 
 def conditions(**changes: object) -> list[Condition]:
-    given = {"model": "oracle", "planners": (FAN,), "risks": ("mean",)} | changes
+    given = {"models": ("oracle",), "planners": (FAN,), "risks": ("mean",)} | changes
+    if "model" in changes:
+        del given["models"]
     return conditions_of(Suite(**given), lambda data: ["std", "hg"])  # type: ignore[arg-type]
 
 
