@@ -86,7 +86,7 @@ def check_planner(
             posed = _make_problem(task, height, width, torch.device(device), made.given_truth)
             _Trial(made, posed, tolerance, breaches).run()
         for by in ("risk", "mean"):
-            breaches.place = f"{name} with free space by {by}"
+            breaches.place = f"{name} on {shapes[0][0]}×{shapes[0][1]}"
             task = Task(robot=robot, objective=goal, rules=replace(rules, free_space=FreeSpace(by=by)))
             posed = _make_problem(task, *shapes[0], torch.device(device), made.given_truth)
             _Trial(made, posed, tolerance, breaches).check_uses()
@@ -159,7 +159,7 @@ class _Trial:
             return
         of_inputs = isinstance(used, frozenset) and used <= INPUTS
         known = ", ".join(sorted(INPUTS))
-        if not expect(of_inputs, f"Expected `uses` to give a frozenset of {known}, got something else."):
+        if not expect(of_inputs, f"Expected `uses` to return a frozenset of {known}, got {used!r}."):
             return
         blind = not self.planner.blind or not used
         expect(blind, "Expected `uses` of a `blind` planner to give no input, got some.")

@@ -80,7 +80,9 @@ def begin(work: Work, folder: Path, say: Say) -> Conditions:
     if conditions != earlier.conditions:
         new = len(conditions.keys() - earlier.conditions.keys())
         if dropped := len(earlier.conditions.keys() - conditions.keys()):
-            say(f"{dropped} conditions of {folder} differ from others only in what is not used, and are merged")
+            say(
+                f"{dropped} conditions of {folder} differ from others only in what is not used, and are merged"
+            )
         more = {0: "by more episodes", 1: "by 1 new condition"}.get(new, f"by {new} new conditions")
         say(f"{folder} is extended {more}")
         (folder / EPISODES).unlink(missing_ok=True)  # until all that is asked for is there
@@ -98,7 +100,9 @@ def _merge_earlier(earlier: Run) -> dict[str, tuple[Condition, Extent]]:
     tests = earlier.about.get("hypotheses", {}).get("tests", ())
     named = {test[side] for test in tests for side in ("one", "other")}
     conditions = {name: condition for name, (condition, _) in earlier.conditions.items()}
-    merged = {one.id: one for one in merge_alike(one for name, one in conditions.items() if name not in named)}
+    merged = {
+        one.id: one for one in merge_alike(one for name, one in conditions.items() if name not in named)
+    }
     extents = {condition.rows_id: Extent(draws=()) for condition in merged.values()}
     for name, (condition, extent) in earlier.conditions.items():
         if name not in named:
