@@ -51,8 +51,11 @@ class Work(Checked):
     reuse_code: bool = False
 
 
-def begin(work: Work, folder: Path, say: Say) -> Conditions:
-    """Writes `run.json`, or extends the one that is there; gives all conditions of the run.
+def begin(work: Work, folder: Path, say: Say) -> tuple[Conditions, Conditions]:
+    """Writes `run.json`, or extends the one that is there.
+
+    Returns:
+        What the command asks for, and all conditions of the run.
 
     Raises:
         ConfigError: the folder holds something else, or a run that this one cannot extend.
@@ -64,24 +67,23 @@ def begin(work: Work, folder: Path, say: Say) -> Conditions:
                 "another `out`."
             )
         write_run(folder, _about({}, work, work.conditions))
-        return work.conditions
+        return work.conditions, work.conditions
     earlier = open_run(folder)
     _check_extends(work, earlier)
-    conditions = _merge_earlier(earlier)
+    conditions, asked = _merge_earlier(earlier), {}
     # What differs from an earlier condition only in what is not used is run as that one.
     rows_ids = {condition.rows_id: name for name, (condition, _) in reversed(conditions.items())}
     for condition_id, (condition, extent) in work.conditions.items():
         name = condition_id if condition_id in conditions else rows_ids.get(condition.rows_id, condition_id)
-        if name in conditions:
-            known, known_extent = conditions[name]
-            condition = merge(condition if condition.id == name else known, (known, condition))
-            extent = known_extent.union(extent)
-        conditions[name] = (condition, extent)
+        known, known_extent = conditions.get(name, (condition, extent))
+        merged = merge(condition if condition.id == name else known, (known, condition))
+        asked[name] = merged, extent
+        conditions[name] = merged, known_extent.union(extent)
     if conditions != earlier.conditions:
         new = len(conditions.keys() - earlier.conditions.keys())
         if dropped := len(earlier.conditions.keys() - conditions.keys()):
             say(
-                f"{dropped} conditions of {folder} differ from others only in what is not used, and are merged"
+                f"conditions of {folder} that differ from others only in what is not used are merged: {dropped}"
             )
         more = {0: "by more episodes", 1: "by 1 new condition"}.get(new, f"by {new} new conditions")
         say(f"{folder} is extended {more}")
@@ -89,7 +91,7 @@ def begin(work: Work, folder: Path, say: Say) -> Conditions:
     now = _about(earlier.about, work, conditions)
     if now != earlier.about:
         write_run(folder, now)
-    return conditions
+    return asked, conditions
 
 
 def _merge_earlier(earlier: Run) -> dict[str, tuple[Condition, Extent]]:
