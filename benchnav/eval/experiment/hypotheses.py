@@ -209,11 +209,10 @@ def _pairs(
             )
     itself = next((one for one in ones for other in others if one.id == other.id and one.stands_for), None)
     if not pairs and itself:
-        names = ", ".join(label_words(itself.labels))
         settings = " and ".join(f"{kind} {', '.join(own)}" for kind, own in itself.stands_for.items())
         raise ConfigError(
-            f"Expected {where} to compare two conditions, got one, {names}: its planner does not use {settings}. Leave "
-            "the hypothesis out."
+            f"Expected {where} to compare two conditions, got one: planner {itself.labels['planner']!r} does not use "
+            f"{settings}. Leave the hypothesis out."
         )
     if not pairs:
         raise ConfigError(
