@@ -34,11 +34,12 @@ def find_episodes(
         ConfigError: the run has no such episode, or they are not on one map.
     """
     run = open_run(folder)
-    labelled = [condition.labels for condition, _ in run.conditions.values()]
-    known = {
-        name: [label for label in dict.fromkeys(own[name] for own in labelled) if label != NOT_USED]
-        for name in LABELS
-    }
+    conditions = [condition for condition, _ in run.conditions.values()]
+    known = {}
+    for name in LABELS:
+        labelled = dict.fromkeys(condition.labels[name] for condition in conditions)
+        stood_for = dict.fromkeys(label for one in conditions for label in one.stands_for.get(name, ()))
+        known[name] = [label for label in labelled | stood_for if label != NOT_USED]
     found: dict[str, tuple[Unit, int]] = {}
     for values in itertools.product(*labels.values()):
         asked = dict(zip(labels, values, strict=True))

@@ -41,6 +41,11 @@ class FreeSpace:
         expect(self.by in ("risk", "mean"), f"`free_space.by` 'risk' or 'mean', got {self.by!r}.")
         expect(0 <= self.above < 1, f"`free_space.above` in [0, 1), got {self.above}.")
 
+    @property
+    def source(self) -> str:
+        """Field of a `Problem` that decides which cells are free."""
+        return "risk_map" if self.by == "risk" else "distribution"
+
     def mask(self, risk_map: Tensor, distribution: TraversabilityDistribution) -> Tensor:
         """Tells which cells are free, bool [B, H, W], from λ̂ [B, H, W] and the prediction."""
         return (risk_map if self.by == "risk" else distribution.mean()) > self.above

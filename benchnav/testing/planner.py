@@ -15,10 +15,10 @@ from benchnav.core import registry
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
-from benchnav.planning.free_space import Rules
+from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.boundary import NOT_FINITE, find_fault, find_layer_faults
-from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
+from benchnav.planning.planners.planner import INPUTS, Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.sensing.belief import Fields, Law, Static
 from benchnav.planning.sensing.sensor import Step
@@ -48,7 +48,8 @@ def check_planner(
     Python, NumPy and PyTorch; the same answer when asked again, from the same seed, after other problems
     were begun, and whether it is drawn or not; for an episode alone, and for some that `select` keeps, what it is
     in a batch; no error where some robots of the batch have arrived or left the map. What a planner makes of a
-    closed wall is its own affair.
+    closed wall is its own affair. What it does not name in `uses` is replaced, under rules by which free space comes
+    from λ̂ and from the prediction; no action may change.
 
     Args:
         planner: any planner, or the name, file or mapping of one as suites have it.
@@ -84,6 +85,11 @@ def check_planner(
             task = Task(robot=robot, objective=goal, rules=rules)
             posed = _make_problem(task, height, width, torch.device(device), made.given_truth)
             _Trial(made, posed, tolerance, breaches).run()
+        for by in ("risk", "mean"):
+            breaches.place = f"{name} on {shapes[0][0]}×{shapes[0][1]}"
+            task = Task(robot=robot, objective=goal, rules=replace(rules, free_space=FreeSpace(by=by)))
+            posed = _make_problem(task, *shapes[0], torch.device(device), made.given_truth)
+            _Trial(made, posed, tolerance, breaches).check_uses()
     breaches.expect(steered > 0, "Expected a robot among those tried that it steers, got none.")
     breaches.refuse()
 
@@ -144,10 +150,40 @@ class _Trial:
             first,
             problem,
         )
-        if self.planner.blind:
-            blind = "Expected of a `blind` planner the same action whatever is predicted, got another."
-            other = _with_other_prediction(problem)
-            self.expect_action(blind, tried[0], self.begin(other), other)
+
+    def check_uses(self) -> None:
+        """Plans some steps, and again with other values of each input that the planner says it does not use."""
+        problem, expect = self.problem, self.breaches.expect
+        used = self.breaches.watch("uses", lambda: self.planner.uses(problem.task))
+        if used is NOTHING:
+            return
+        of_inputs = isinstance(used, frozenset) and used <= INPUTS
+        known = ", ".join(sorted(INPUTS))
+        if not expect(of_inputs, f"Expected `uses` to return a frozenset of {known}, got {used!r}."):
+            return
+        blind = not self.planner.blind or not used
+        expect(blind, "Expected `uses` of a `blind` planner to give no input, got some.")
+        for name in sorted(INPUTS - used):
+            other = _with_other(problem, name)
+            same_action = (
+                f"Expected the same action whatever `{name}` holds, which is not in `uses`, got another."
+            )
+            step = Step(
+                state=problem.start,
+                traversability=torch.full_like(problem.start[:, 0], torch.nan),
+                time_s=0.0,
+            )
+            states = self.begin(problem), self.begin(other)
+            for number in range(_STEPS):
+                step = replace(step, time_s=number * problem.dt_s)
+                answer = self.ask(step, states[0], problem)
+                if answer is NOTHING:
+                    return
+                following = self.expect_action(same_action, (step, answer[0]), states[1], other)
+                states = answer[1], following
+                observed = problem.traversability_at(step.state)
+                moved = problem.robot(step.state, answer[0].clamp(*problem.action_bounds), observed)
+                step = replace(step, state=moved, traversability=observed)
 
     def begin(self, problem: Problem) -> Any:
         generator = torch.Generator().manual_seed(SEED)
@@ -228,15 +264,21 @@ class _Trial:
 
 
 def _with_other_prediction(problem: Problem) -> Problem:
-    """Firm ground for soft and soft for firm."""
+    """Firm ground for soft and soft for firm, in all inputs."""
+    return _with_other(_with_other(problem, "risk_map"), "distribution")
+
+
+def _with_other(problem: Problem, name: str) -> Problem:
+    """The problem with other values of one of `INPUTS`, and with the free space that comes from it."""
     mixture = problem.distribution
     assert isinstance(mixture, TraversabilityMixture)  # of `_make_problem`
-    return replace(
-        problem,
-        distribution=replace(mixture, means=1 - mixture.means),
-        risk_map=1 - problem.risk_map,
-        free=~problem.free,
-    )
+    others: dict[str, Any] = {
+        "risk_map": 1 - problem.risk_map,
+        "distribution": replace(mixture, means=1 - mixture.means),
+        "fields": _fields_of(replace(mixture, means=1 - mixture.means), problem.grid),
+    }
+    is_source = problem.task.rules.free_space.source == name
+    return replace(problem, free=problem.free ^ is_source, **{name: others[name]})
 
 
 def _step(problem: Problem, step: Step, ended: Tensor, number: int) -> Step:
@@ -268,6 +310,11 @@ def _make_problem(task: Task, height: int, width: int, device: torch.device, kno
     seen = Observation(rgb, elevation, 10 * elevation.abs(), grid)
     start = ground.new_tensor([1.2, 1.3]).repeat(4, 1)
     goal = (ground.new_tensor(grid.extent_m) - ground.new_tensor([1.7, 1.4])).repeat(4, 1)
-    believed = Static().init(mixture, Law(grid=grid, correlation_m=1.0))
-    fields = Fields(Static(), believed, tuple(range(len(ground))))
+    fields = _fields_of(mixture, grid)
     return pose_problem(task, seen, mixture, ground, start, goal, 60.0, fields=fields)
+
+
+def _fields_of(mixture: TraversabilityMixture, grid: Grid) -> Fields:
+    """Fields of a prediction, correlated over a metre."""
+    believed = Static().init(mixture, Law(grid=grid, correlation_m=1.0))
+    return Fields(Static(), believed, tuple(range(mixture.shape[0])))

@@ -13,7 +13,7 @@ import torch
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.models.base import TraversabilityModel
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
-from benchnav.planning.problem import Problem
+from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.sensor import Step
 
@@ -99,6 +99,27 @@ class Faulty(Planner[Problem]):
             failed = torch.full((batch,), int(PlanStatus.FAILED), device=device)
             return action, plan_state, Plan.empty(batch, device, status=failed)
         return action, plan_state, Plan.empty(batch, device)
+
+
+class Unseeing(Faulty):
+    """Says that it uses nothing."""
+
+    def uses(self, task: Task) -> frozenset[str]:
+        return frozenset()
+
+
+class ByMean(Faulty):
+    """Says that it uses the prediction alone."""
+
+    def uses(self, task: Task) -> frozenset[str]:
+        return frozenset({"distribution"})
+
+
+class Vague(Faulty):
+    """Does not say what it uses in the words for it."""
+
+    def uses(self, task: Task) -> frozenset[str]:
+        return frozenset({"maps"})
 
 
 class Steering(Faulty):

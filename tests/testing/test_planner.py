@@ -10,10 +10,11 @@ from torch import Tensor
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
+from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.objective import GoalDistance
-from benchnav.planning.planners.planner import Plan, Planner, check_steers
+from benchnav.planning.planners.planner import INPUTS, Plan, Planner, check_steers
 from benchnav.planning.planners.straight import Straight
-from benchnav.planning.problem import Problem
+from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import DifferentialDrive, Unicycle
 from benchnav.planning.sensing.sensor import Step
 from benchnav.testing import check_planner
@@ -84,6 +85,21 @@ def preparing(act: Callable[[Problem, torch.Generator], object]) -> Good:
         def init(self, problem: Problem, generator: torch.Generator) -> Any:
             act(problem, generator)
             return super().init(problem, generator)
+
+    return Bad()
+
+
+def using(names: set[str], speed: Callable[[Step, Problem], Tensor]) -> Good:
+    """Good, but for its speed, with what it says that it uses."""
+
+    class Bad(Good):
+        def uses(self, task: Any) -> frozenset[str]:
+            return frozenset(names)
+
+        def plan(self, step: Step, plan_state: Any) -> Any:
+            action, following, plan = super().plan(step, plan_state)
+            fast = speed(step, plan_state.problem).to(action).clamp(0, 1)
+            return torch.stack((fast, action[:, 1]), 1), following, plan
 
     return Bad()
 
@@ -206,8 +222,26 @@ BAD: dict[str, tuple[Any, str]] = {
     "drives otherwise when drawn": (action_of(lambda a, step: 0.9 * a if step.draw else a), "whether it is drawn"),
     "an action of the batch": (action_of(lambda a, _: a - 0.1 * a.mean(0)), "Expected for an episode alone"),
     "noise of the batch": (NoiseOfBatch(), "Expected for an episode alone"),
-    "blind that is not": (having(blind=True), "Expected of a `blind` planner"),
-    "blind by a word": (having(blind="yes"), "Expected `blind` of type bool, got 'yes'"),
+    "blind that is not": (having(blind=True), "the same action whatever `risk_map` holds, which is not in `uses`"),
+    "uses λ̂ later on and does not say so": (
+        using({"distribution"}, lambda step, p: p.traversability_at(step.state) * (step.time_s > 0)),
+        "whatever `risk_map` holds",
+    ),
+    "uses free space by risk and says the mean": (
+        using({"distribution"}, lambda step, p: p.free_at(step.state)), "whatever `risk_map` holds",
+    ),
+    "uses free space by the mean and says λ̂": (
+        using({"risk_map"}, lambda step, p: p.free_at(step.state)), "whatever `distribution` holds",
+    ),
+    "uses fields and does not say so": (
+        using({"risk_map"}, lambda step, p: p.sample_fields(1, 7)[:, 0, 8, 8]), "whatever `fields` holds",
+    ),
+    "uses what is no input": (
+        using({"free"}, lambda step, p: p.goal_m[:, 0]), "frozenset of distribution, fields, risk_map, got frozenset",
+    ),
+    "blind that uses something": (
+        type("Bad", (Straight,), {"uses": lambda self, task: INPUTS})(), "`uses` of a `blind` planner",
+    ),
     "follows no text": (having(follows=lambda self, task: 3), "Expected `follows` to give a single line"),
     "follows that is text": (having(follows="time"), "from `follows`, got TypeError"),
     "steers by one name": (having(steers=("speed_mps", "turn_rate_radps")), "`steers` as tuples of action names"),
@@ -328,11 +362,33 @@ def test_every_registered_planner_keeps_the_contract(planner: str, robot: str) -
     check_planner(made, robots=[robot])
 
 
-def test_a_planner_that_draws_fields_keeps_the_contract() -> None:
-    check_planner(
-        {"part": "mppi", "options": {"samples": 16, "risk_on": "cost", "fields": 3, "horizon_s": 1.0}},
-        robots=["unicycle"],
-    )
+COST = {"samples": 16, "risk_on": "cost", "fields": 3, "horizon_s": 1.0}
+MAPS = {"risk_map", "distribution"}
+MEAN_FREE = Rules(free_space=FreeSpace(by="mean"))
+
+
+@pytest.mark.parametrize(
+    ("part", "options", "objective", "by_mean", "by_risk"),
+    [
+        ("mppi", COST, "goal_distance", {"fields", "distribution"}, {"fields", "risk_map"}),
+        ("mppi", COST | {"cost_to_go": "map"}, "travel_time", INPUTS, {"fields", "risk_map"}),
+        ("mppi", FEW | {"cost_to_go": "expected-time"}, "travel_time", MAPS, MAPS),
+        ("astar_mppi", {"mppi": COST}, "goal_distance", {"fields", "distribution"}, {"fields", "risk_map"}),
+        ("astar_mppi", {"mppi": COST}, "travel_time", INPUTS, {"fields", "risk_map"}),
+        ("astar_dwa", {"explore": 0.5}, "travel_time", MAPS, MAPS),
+        ("astar_dwa", {"explore": 0.5}, "goal_distance", MAPS, {"risk_map"}),
+        ("straight", {}, "goal_distance", set(), set()),
+    ],
+)
+def test_planners_say_what_they_use(
+    part: str, options: dict[str, Any], objective: str, by_mean: set[str], by_risk: set[str]
+) -> None:
+    planner, robot = registry.make("planner", {"part": part, "options": options}), Unicycle()
+    cost = registry.make("objective", objective, robot=robot, goal_radius_m=1.0)
+    task = Task(robot=robot, objective=cost, rules=MEAN_FREE)
+    assert planner.uses(task) == by_mean
+    assert planner.uses(replace(task, rules=Rules())) == by_risk
+    check_planner(planner, robots=[robot], objective=objective, shapes=((16, 16),))
 
 
 @pytest.mark.parametrize("order", ["kept", "sorted"])

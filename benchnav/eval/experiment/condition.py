@@ -6,21 +6,23 @@ is run, and belong to the suite.
 """
 
 import itertools
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 
 from benchnav.core import hub, registry
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.registry import Part
-from benchnav.core.settings import check_known, of, read
+from benchnav.core.settings import call, check_known, of, read
 from benchnav.core.store import text_digest
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.sweep import check_count, each_mapping, each_part
 from benchnav.planning.free_space import Rules
+from benchnav.planning.planners.planner import INPUTS
 from benchnav.planning.problem import Task
 from benchnav.planning.world.world import World, read_world
 
@@ -34,8 +36,11 @@ PART_KINDS = ("model", "risk", "planner", "robot", "objective", *KNOWLEDGE)
 # Columns of `Condition.labels`, in the order of tables.
 LABELS = ("data", "scenario", "world", "robot", "objective", "model", *KNOWLEDGE, "planner", "risk")
 NOT_USED = "–"
+ANY_RISK = Part(part="mean", label=NOT_USED)
 # What the numbers of a split's maps rest on besides the maps: `TerrainDataset.about_digest` is its digest.
 MEANING = "class table, λ_stuck, resolution or kind of truth"
+# By what input alone a setting bears on a planner where no robot learns.
+_BEARS_BY: Mapping[str, str] = {"risk": "risk_map", "belief": "fields"}
 _ORDER = ("robot", "objective", "model", *KNOWLEDGE, "risk", "planner")  # of tables
 # What a product lists, by the names that a suite has for it.
 _LISTED = ("data", "scenarios", *(f"{kind}s" for kind in PART_KINDS), "world", "task")
@@ -60,6 +65,8 @@ class Condition:
         world: what λ does.
         world_label: what tables call rules and world.
         blind: the planner is blind; model and risk stand in for any.
+        stands_for: by kind of part the labels of the settings that differ in nothing that the planner uses and are
+            run as this one.
     """
 
     data: str
@@ -76,6 +83,7 @@ class Condition:
     world: World
     world_label: str
     blind: bool = False
+    stands_for: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def split(self) -> str:
@@ -104,6 +112,7 @@ class Condition:
     def labels(self) -> dict[str, str]:
         """What tables call it, by column."""
         parts = {kind: getattr(self, kind).label for kind in PART_KINDS}
+        parts |= dict.fromkeys(self.stands_for, NOT_USED)
         if self.blind:
             parts |= dict.fromkeys(("model", "risk", *KNOWLEDGE), NOT_USED)
         return {"data": self.data, "scenario": self.scenario, **parts, "world": self.world_label}
@@ -131,6 +140,37 @@ class Condition:
         """Whether statistics of the training maps have to be there."""
         return not self.make("sensor").sees_all or self.make("belief").needs_statistics
 
+    def planner_uses(self) -> frozenset[str]:
+        """Names the inputs that bear on what the planner does in this task, see `Planner.uses`.
+
+        Raises:
+            ConfigError: If the planner does not say it in the words of `INPUTS`.
+        """
+        planner, owner = self.make_planner(), f"`uses` of planner {self.planner.label!r}"
+        used = call(owner, planner.uses, {"task": self.make_task()})
+        expect(
+            isinstance(used, frozenset) and used <= INPUTS,
+            f"{owner} to return a frozenset of {', '.join(sorted(INPUTS))}, got {used!r}.",
+        )
+        return used
+
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Kinds of parts whose setting bears on no row, besides those that no blind planner uses.
+
+        Where a robot learns, a change of λ̂ decides when its planner is given another map, so that every setting bears.
+        """
+        if self.blind or self.learns:
+            return ()
+        used = self.planner_uses()
+        return tuple(kind for kind, name in _BEARS_BY.items() if name not in used)
+
+    @property
+    def rows_id(self) -> str:
+        """Digest of what bears on its rows; conditions that differ only in what is not used share it."""
+        stand_ins: dict[str, Any] = {"risk": ANY_RISK, "belief": Part(label=NOT_USED, **KNOWLEDGE["belief"])}
+        return replace(self, **{kind: stand_ins[kind] for kind in self.unused}).id
+
     def make(self, kind: str) -> Any:
         """Makes the part of a kind that needs nothing else to be made."""
         return registry.make(kind, getattr(self, kind))
@@ -147,7 +187,7 @@ def later_labels(model: str, risk: str) -> dict[str, str]:
 
 
 def condition_from(about: Mapping[str, Any]) -> Condition:
-    """Rebuilds a condition from its `value` and `labels`, as `run.json` holds them."""
+    """Rebuilds a condition from its `value`, `labels` and `stands_for`, as `run.json` holds them."""
     value, labels = {**KNOWLEDGE, **about["value"]}, about["labels"]
     labels = later_labels(labels["model"], labels["risk"]) | labels
     parts = {
@@ -162,6 +202,7 @@ def condition_from(about: Mapping[str, Any]) -> Condition:
         world=read(World, {"time_budget_s": None} | value["world"], of("world")),
         world_label=labels["world"],
         blind=labels["model"] == NOT_USED,
+        stands_for={kind: tuple(own) for kind, own in about.get("stands_for", {}).items()},
     )
 
 
@@ -186,7 +227,38 @@ def conditions_of(suite: Suite, scenarios_of: Any) -> list[Condition]:
             check_count([len(every)])
             every.append(_as_run_once(condition))
     check_labels(every)
-    return list({condition.id: condition for condition in every}.values())
+    return merge_alike({condition.id: condition for condition in every}.values())
+
+
+def merge_alike(conditions: Iterable[Condition]) -> list[Condition]:
+    """Merges the conditions that share a `rows_id`; the first of them is run, or that under `mean`."""
+    alike: dict[str, list[Condition]] = defaultdict(list)
+    for condition in conditions:
+        alike[condition.rows_id].append(condition)
+    return [
+        merge(next((one for one in same if one.risk.part == "mean"), same[0]), same)
+        for same in alike.values()
+    ]
+
+
+def merge(kept: Condition, conditions: Sequence[Condition]) -> Condition:
+    """Merges conditions that share a `rows_id` into one that stands for all.
+
+    Args:
+        kept: which of them is run.
+        conditions: all of them.
+
+    Returns:
+        `kept`, labelled as not using what they differ in.
+    """
+    stands_for: dict[str, tuple[str, ...]] = {}
+    for kind in _BEARS_BY:
+        own = (one.stands_for.get(kind, (getattr(one, kind).label,)) for one in conditions)
+        labels = itertools.chain.from_iterable(own)
+        if len(names := tuple(dict.fromkeys(labels))) > 1:
+            stands_for[kind] = names
+    parts: dict[str, Any] = {kind: replace(getattr(kept, kind), label=NOT_USED) for kind in stands_for}
+    return replace(kept, stands_for=stands_for, **parts)
 
 
 def check_labels(conditions: Iterable[Condition]) -> None:
@@ -225,10 +297,13 @@ def check_labels(conditions: Iterable[Condition]) -> None:
 def _listed(suite: Suite, product: Mapping[str, Any]) -> dict[str, list[Any]]:
     """What a product lists under each key, in the singular or the plural; the suite's where it names none."""
     listed = {key: getattr(suite, key) for key in _LISTED} | {"models": suite.models or suite.model}
+    spelt: dict[str, str] = {}
     for given, values in product.items():
         spellings = (given, f"{given}s", str(given).removesuffix("s"))
         key = next((key for key in spellings if key in listed), given)
         check_known("keys of `conditions`", key, listed)
+        first = spelt.setdefault(key, given)
+        expect(first == given, f"`{first}` or `{given}` in one of `conditions`, got both. Leave one out.")
         listed[key] = values
     return {
         key: list(values) if isinstance(values, list | tuple) else [values] for key, values in listed.items()
@@ -303,10 +378,9 @@ def _as_run_once(condition: Condition) -> Condition:
     What a blind planner is given is not looked at; of λ that is known every measure of risk is λ itself, and nothing is
     left to be learnt; and a belief that does not learn ignores what is sensed of the ground.
     """
-    any_risk = Part(part="mean", label=NOT_USED)
     unused = {kind: Part(label=NOT_USED, **default) for kind, default in KNOWLEDGE.items()}
-    if condition.make_planner().blind:
-        given: dict[str, Any] = {**unused, "model": Part(part="oracle", label=NOT_USED), "risk": any_risk}
+    if condition.make_planner().blind or not condition.planner_uses():
+        given: dict[str, Any] = {**unused, "model": Part(part="oracle", label=NOT_USED), "risk": ANY_RISK}
         return replace(condition, blind=True, **given)
     if not condition.make("belief").learns:
         condition = replace(condition, ground=unused["ground"])
@@ -314,7 +388,7 @@ def _as_run_once(condition: Condition) -> Condition:
         return condition
     if condition.make("sensor").sees_all:
         condition = replace(condition, ground=unused["ground"], belief=unused["belief"])
-    return replace(condition, risk=any_risk)
+    return replace(condition, risk=ANY_RISK)
 
 
 def label_words(labels: Mapping[str, str], names: Iterable[str] = LABELS[1:]) -> list[str]:

@@ -170,10 +170,15 @@ def _named(
     left, labels = list(conditions), {name: str(value) for name, value in given.items()}
     for name, value in labels.items():
         check_known(f"labels in `{side}` of {where}", name, LABELS)
-        known = dict.fromkeys(condition.labels[name] for condition in left)
+        known = dict.fromkeys(label for condition in left for label in _labels_of(condition, name))
         check_known(f"`{name}` of `{side}` of {where}", value, known)
-        left = [condition for condition in left if condition.labels[name] == value]
+        left = [condition for condition in left if value in _labels_of(condition, name)]
     return labels, left
+
+
+def _labels_of(condition: Condition, name: str) -> tuple[str, ...]:
+    """Labels of a column by which a condition is named: its own, and those of the settings that it stands for."""
+    return condition.labels[name], *condition.stands_for.get(name, ())
 
 
 def _pairs(
@@ -202,6 +207,13 @@ def _pairs(
                 f"Expected {where} to name one condition to compare with another, got {len(several)} that differ in "
                 f"{name} ({', '.join(labels[name] for labels in several)}). Name the {name} in `{side}`."
             )
+    itself = next((one for one in ones for other in others if one.id == other.id and one.stands_for), None)
+    if not pairs and itself:
+        settings = " and ".join(f"{kind} {', '.join(own)}" for kind, own in itself.stands_for.items())
+        raise ConfigError(
+            f"Expected {where} to compare two conditions, got one: planner {itself.labels['planner']!r} does not use "
+            f"{settings}. Leave the hypothesis out."
+        )
     if not pairs:
         raise ConfigError(
             f"Expected {where} to name two conditions that are the same in {', '.join(unnamed) or 'all else'}, got "

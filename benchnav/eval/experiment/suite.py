@@ -33,7 +33,7 @@ class Suite:
         data: Path or id of a dataset with splits test/SCENARIO.
         scenarios: Test splits by scenario; all of the dataset when none is named.
         model: Model, or checkpoint by folder or by name in `checkpoints/`; `oracle` is given the true distribution.
-        models: Several models in place of `model`.
+        models: Several models; refused with `model`.
         planners: Planners.
         risks: Risk settings, such as `mean` or `cvar:0.9`.
         robots: Robots F.
@@ -49,7 +49,7 @@ class Suite:
             goal_radius_m: 1.0, unseen: prior | optimistic | pessimistic, replan_every_s: 0.5}.
         maps: Maps of each scenario, the first of its split; 0 takes all.
         seed: Root seed of all draws.
-        seeds: Several root seeds in place of `seed`.
+        seeds: Several root seeds; refused with `seed`.
         realisations: How often λ is drawn for each map and seed.
         record: Kept beside the rows, each with all before it: none; steps of all episodes; recordings for playback of
             each condition's first map; of failures; of all episodes.
@@ -86,6 +86,12 @@ class Suite:
         for name in ("planners", "risks", "robots", "objectives", "sensors", "grounds", "beliefs", "world"):
             if not getattr(self, name):
                 raise ConfigError(f"Expected one or more `{name}`, got none.")
+        for name in ("model", "seed"):
+            value, values = getattr(self, name), getattr(self, f"{name}s")
+            if values and value != getattr(Suite, name):
+                raise ConfigError(
+                    f"Expected `{name}` or `{name}s`, got both, {value!r} and {list(values)}. Leave one out."
+                )
         if self.maps < 0:
             raise ConfigError(f"Expected `maps` ≥ 0, got {self.maps}.")
         if self.realisations < 1:

@@ -20,9 +20,9 @@ from benchnav.eval.folder.run_folder import (
     Finished,
     Run,
     find_units,
+    labelled_rows,
     open_run,
     read_table,
-    unit_rows,
 )
 
 _NAMED = 3
@@ -94,13 +94,14 @@ def read_results(folder: Path, partial: bool = False) -> Results:
     if (folder / EPISODES).exists() or not partial:
         return Results(run=run, episodes=read_table(folder, EPISODES))
     every = newest_units(run)
-    there = [one for _, one in every if one is not None]
+    known = [(unit, one) for unit, one in every if one is not None]
+    there = [one for _, one in known]
     if not there:
         raise ConfigError(
             f"Expected a run with a finished unit, got {folder} with none of {len(every)}. Wait for the first, or give "
             "its `benchnav-eval run` command."
         )
-    episodes = pd.concat([unit_rows(one) for one in there], ignore_index=True)
+    episodes = pd.concat([labelled_rows(unit, one) for unit, one in known], ignore_index=True)
     shown = set(episodes["condition"])
     names = condition_names([condition for condition, _ in run.conditions.values()])
     without = [name for i, name in zip(run.conditions, names, strict=True) if i not in shown]

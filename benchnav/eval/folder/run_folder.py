@@ -289,7 +289,7 @@ def finish_run(folder: Path, finished: Sequence[tuple[Unit, Finished]], reused: 
     """
     about = open_run(folder).about
     write_errors(folder, finished)
-    rows = pd.concat([unit_rows(one) for _, one in finished], ignore_index=True)
+    rows = pd.concat([labelled_rows(unit, one) for unit, one in finished], ignore_index=True)
     table = pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata(None)
     with replacing(folder / EPISODES) as partial:
         pq.write_table(table, partial)
@@ -319,6 +319,11 @@ def unit_rows(finished: Finished) -> pd.DataFrame:
     """
     with damaged(finished.path, "Give the run's command again, which runs the unit again."):
         return _with_all_labels(read_sealed(finished.path).to_pandas())
+
+
+def labelled_rows(unit: Unit, finished: Finished) -> pd.DataFrame:
+    """Reads the rows of a finished unit, under the labels that its condition has now; see `unit_rows`."""
+    return unit_rows(finished).assign(**unit.condition.labels)
 
 
 def _with_all_labels(rows: pd.DataFrame) -> pd.DataFrame:

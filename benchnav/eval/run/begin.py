@@ -13,9 +13,9 @@ from benchnav.core.device import gpu_name
 from benchnav.core.errors import ConfigError
 from benchnav.core.registry import NO_DEFAULT, Part
 from benchnav.core.store import Shard
-from benchnav.eval.experiment.condition import Condition, check_labels, differences
+from benchnav.eval.experiment.condition import Condition, check_labels, differences, merge, merge_alike
 from benchnav.eval.experiment.suite import Record
-from benchnav.eval.experiment.unit import Conditions
+from benchnav.eval.experiment.unit import Conditions, Extent
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.run_folder import (
     EPISODES,
@@ -51,8 +51,11 @@ class Work(Checked):
     reuse_code: bool = False
 
 
-def begin(work: Work, folder: Path, say: Say) -> Conditions:
-    """Writes `run.json`, or extends the one that is there; gives all conditions of the run.
+def begin(work: Work, folder: Path, say: Say) -> tuple[Conditions, Conditions]:
+    """Writes `run.json`, or extends the one that is there.
+
+    Returns:
+        What the command asks for, and all conditions of the run.
 
     Raises:
         ConfigError: the folder holds something else, or a run that this one cannot extend.
@@ -64,22 +67,53 @@ def begin(work: Work, folder: Path, say: Say) -> Conditions:
                 "another `out`."
             )
         write_run(folder, _about({}, work, work.conditions))
-        return work.conditions
+        return work.conditions, work.conditions
     earlier = open_run(folder)
     _check_extends(work, earlier)
-    conditions = dict(earlier.conditions)
+    conditions, asked = _merge_earlier(earlier), {}
+    # What differs from an earlier condition only in what is not used is run as that one.
+    rows_ids = {condition.rows_id: name for name, (condition, _) in reversed(conditions.items())}
     for condition_id, (condition, extent) in work.conditions.items():
-        known = conditions.get(condition_id)
-        conditions[condition_id] = (condition, known[1].union(extent) if known else extent)
+        name = condition_id if condition_id in conditions else rows_ids.get(condition.rows_id, condition_id)
+        known, known_extent = conditions.get(name, (condition, extent))
+        merged = merge(condition if condition.id == name else known, (known, condition))
+        asked[name] = merged, extent
+        conditions[name] = merged, known_extent.union(extent)
     if conditions != earlier.conditions:
-        new = len(conditions) - len(earlier.conditions)
+        new = len(conditions.keys() - earlier.conditions.keys())
+        if dropped := len(earlier.conditions.keys() - conditions.keys()):
+            say(
+                f"conditions of {folder} that differ from others only in what is not used are merged: {dropped}"
+            )
         more = {0: "by more episodes", 1: "by 1 new condition"}.get(new, f"by {new} new conditions")
         say(f"{folder} is extended {more}")
         (folder / EPISODES).unlink(missing_ok=True)  # until all that is asked for is there
     now = _about(earlier.about, work, conditions)
     if now != earlier.about:
         write_run(folder, now)
-    return conditions
+    return asked, conditions
+
+
+def _merge_earlier(earlier: Run) -> dict[str, tuple[Condition, Extent]]:
+    """The conditions of a run, of which versions before 1.2 did not merge those that differ in what is not used.
+
+    Those that a hypothesis names stay.
+    """
+    tests = earlier.about.get("hypotheses", {}).get("tests", ())
+    named = {test[side] for test in tests for side in ("one", "other")}
+    conditions = {name: condition for name, (condition, _) in earlier.conditions.items()}
+    merged = {
+        one.id: one for one in merge_alike(one for name, one in conditions.items() if name not in named)
+    }
+    extents = {condition.rows_id: Extent(draws=()) for condition in merged.values()}
+    for name, (condition, extent) in earlier.conditions.items():
+        if name not in named:
+            extents[condition.rows_id] = extents[condition.rows_id].union(extent)
+    return {
+        name: (merged[name], extents[merged[name].rows_id]) if name in merged else earlier.conditions[name]
+        for name in conditions
+        if name in merged or name in named
+    }
 
 
 def drop(folder: Path) -> None:
@@ -120,6 +154,7 @@ def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> di
     entries = {
         condition_id: {
             **{"value": condition.value, "labels": condition.labels, **_notes(condition)},
+            **({"stands_for": condition.stands_for} if condition.stands_for else {}),
             **{"seeds": extent.seeds, "draws": extent.draws},
             **{name: value for name, value in known.get(condition_id, {}).items() if name == "latency"},
         }
@@ -158,9 +193,13 @@ def _notes(condition: Condition) -> dict[str, Any]:
     """What tables say of a condition's planner."""
     planner = condition.make_planner()
     task = condition.make_task()
+    merged = [
+        f"One row for {kind} {', '.join(labels)}, which the planner does not use here"
+        for kind, labels in condition.stands_for.items()
+    ]
     return {
         "follows": planner.follows(task),
-        "remarks": list(planner.remarks(task)),
+        "remarks": [*planner.remarks(task), *merged],
         "changed": changed_options(condition.planner),
     }
 

@@ -63,7 +63,11 @@ def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
     for condition in conditions:
         for columns, rule in _RULES.items():
             labels = {column: condition.labels[column] for column in columns}
-            key = rule, *labels.values()
+            key = (
+                rule,
+                condition.risk.part,
+                *labels.values(),
+            )  # the part, as a label that is not used is that of any
             if key not in reasons:
                 reasons[key] = rule(condition)
             if rule is _unprepared:

@@ -103,10 +103,10 @@ def run_work(
         say(f"running on {gpu_name(work.settings.device)}")
     if overwrite:
         drop(folder)
-    conditions = begin(work, folder, say)
+    asked, conditions = begin(work, folder, say)
     every = units(conditions, work.record)
     own = [unit for unit in every if work.shard is None or unit.shard(work.shard.of) == work.shard]
-    named, others = _parted(own, work.conditions)
+    named, others = _parted(own, asked)
     origins = work.settings.origins()
     missing = _missing(named, origins, folder, work.reuse_code, say, is_here=not scheduler)
     if not own:

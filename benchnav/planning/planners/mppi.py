@@ -73,10 +73,10 @@ class MPPIConfig:
         horizon_s: how far rollouts look ahead, in seconds; T is the nearest number of steps, at least 1.
         samples: action sequences K.
         noise_share: standard deviation of each sampled action, as a share of the range from its least to its
-            greatest value.
+            greatest value; refused with `noise`.
         noise: the same in the units of the actions, such as m/s and rad/s, in place of `noise_share`.
         temperature_share: the scale of cost below which samples count alike, as a share of the spread of costs
-            (`cost_spread`) of the episode and step.
+            (`cost_spread`) of the episode and step; refused with `temperature`.
         temperature: the same in the units of J, in place of `temperature_share`; λ in the source.
         control_cost: weight γ of the information-theoretic control cost γ·uᵀΣ⁻¹ε; 0 takes the current mean
             itself as the base distribution (α = 1 in the source), the value of `temperature` takes 0 (α = 0).
@@ -114,6 +114,12 @@ class MPPIConfig:
         check_finite("MPPI", self, above, ("control_cost",))
         fits = self.noise is None or (self.noise and all(0 < scale < math.inf for scale in self.noise))
         expect(fits, f"`noise` > 0 for each action of MPPI, got {self.noise}.")
+        for name in ("noise", "temperature"):
+            fraction, default = getattr(self, f"{name}_share"), getattr(MPPIConfig, f"{name}_share")
+            expect(
+                getattr(self, name) is None or fraction == default,
+                f"`{name}` or `{name}_share` for MPPI, got both, {getattr(self, name)} and {fraction}. Leave one out.",
+            )
         expect(self.risk_on in ("map", "cost"), f"`risk_on` 'map' or 'cost' for MPPI, got {self.risk_on!r}.")
         expect(0 <= self.level < 1, f"`level` in [0, 1) for MPPI, got {self.level}.")
         alone = self.level == 0 and not self.once and self.fields == MPPIConfig.fields
@@ -199,6 +205,12 @@ class MPPI(LocalPlanner[MPPIState]):
         )
         verdicts = (rolled, self._weigh.compiled)
         return None if None in verdicts else all(verdicts)
+
+    def uses(self, task: Task) -> frozenset[str]:
+        """The map or the fields that rollouts are on, and that of free space and the cost to go; see `Planner`."""
+        to_go = {"map": {"risk_map"}, "expected-time": {"distribution"}}.get(self.config.cost_to_go, set())
+        rollouts = "fields" if self.config.risk_on == "cost" else "risk_map"
+        return frozenset({rollouts, task.rules.free_space.source, *to_go})
 
     def follows(self, task: Task) -> str:
         """What it minimises where that is not J alone; see `Planner`."""

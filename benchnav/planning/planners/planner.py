@@ -29,6 +29,9 @@ _STEERED = (
     "Take mppi, astar_mppi or straight."
 )
 
+# Fields of a `Problem` that a prediction decides; free space comes from one of the first two, as the rules say.
+INPUTS = frozenset({"risk_map", "distribution", "fields"})
+
 
 class PlanStatus(IntEnum):
     """How planning went for an episode."""
@@ -90,7 +93,7 @@ class Planner(ABC, Generic[State]):
     """Kinds of robots that it plans for, of those that it steers; None: all."""
 
     blind: bool = False
-    """On the class: it uses no map, so that one run stands for every model and risk setting."""
+    """On the class: it uses no map, so that one run stands for every model and risk setting. See `uses`."""
 
     plans_once: bool = False
     """It plans at the start alone; a robot that learns on its way is refused."""
@@ -152,6 +155,17 @@ class Planner(ABC, Generic[State]):
             `init`.
         """
         return NotImplemented
+
+    def uses(self, task: Task) -> frozenset[str]:
+        """Names the predicted inputs that bear on its actions; conditions that differ only in the others run once.
+
+        Args:
+            task: what is to be done. Its rules say from which input free space comes, see `FreeSpace.source`.
+
+        Returns:
+            Some of `INPUTS`; by default all of them, of a blind planner none.
+        """
+        return frozenset() if self.blind else INPUTS
 
     def follows(self, task: Task) -> str:
         """What it minimises in place of the task's J, in one line for tables; empty where that is J alone."""

@@ -25,7 +25,9 @@ FAN = "tests.eval.parts:Faulty"
 
 
 def conditions(**changes: object) -> list[Condition]:
-    given = {"model": "oracle", "planners": (FAN,), "risks": ("mean",)} | changes
+    given = {"models": ("oracle",), "planners": (FAN,), "risks": ("mean",)} | changes
+    if "model" in changes:
+        del given["models"]
     return conditions_of(Suite(**given), lambda data: ["std", "hg"])  # type: ignore[arg-type]
 
 
@@ -169,6 +171,75 @@ def test_a_blind_planner_is_one_condition_for_all_models_and_risks() -> None:
     assert [t.id for t in alone] == [t.id for t in blind]
 
 
+COST = {"part": "mppi", "label": "cost", "options": {"risk_on": "cost", "samples": 8}}
+MEAN_FREE = {"free_space": {"by": "mean"}}
+
+
+def test_conditions_that_differ_in_nothing_used_are_one() -> None:
+    given = {"planners": (COST,), "scenarios": ("std",), "world": "stakes"}
+    ids = {risk: one(**given, risks=(risk,)).id for risk in ("mean", "cvar:0.9", "var")}
+    for risks, kept in ((("cvar:0.9", "mean", "var"), "mean"), (("var", "cvar:0.9"), "var")):
+        merged = one(**given, risks=risks)
+        assert (merged.id, merged.labels["risk"]) == (ids[kept], NOT_USED)
+        assert merged.stands_for == {"risk": risks}
+        about = {"value": merged.value, "labels": merged.labels, "stands_for": merged.stands_for}
+        assert condition_from(about) == merged
+    # A setting with no copy keeps its label, as its id.
+    assert one(**given, risks=("var",)).labels["risk"] == "var"
+    # Fields bear on risk of the cost alone, where nothing is learnt.
+    beliefs = tuple(
+        {"part": "static", "label": name, "options": {"correlated": name == "whole"}}
+        for name in ("whole", "cells")
+    )
+    made = conditions(
+        planners=(COST, "mppi", "optimal"),
+        risks=("mean", "var"),
+        beliefs=beliefs,
+        scenarios=("std",),
+        world="stakes",
+    )
+    assert sorted((c.labels["planner"], c.labels["risk"], c.labels["belief"]) for c in made) == [
+        ("cost", NOT_USED, "cells"), ("cost", NOT_USED, "whole"), ("mppi", "mean", NOT_USED),
+        ("mppi", "var", NOT_USED), ("optimal", "mean", NOT_USED), ("optimal", "var", NOT_USED),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"task": {"free_space": {"by": "risk"}}},
+        {"sensors": ("near",)},
+        {"beliefs": ("copula",)},
+        {"planners": ({"part": "mppi", "options": {"samples": 8}},)},
+        {"planners": ({**COST, "options": COST["options"] | {"cost_to_go": "map"}},)},
+        {
+            "planners": ({"part": "astar_mppi", "options": {"mppi": COST["options"]}},),
+            "objectives": ("travel_time",),
+        },
+        {"planners": (FAN,)},
+    ],
+)
+def test_conditions_whose_planner_may_use_the_difference_stay_apart(changes: dict[str, object]) -> None:
+    made = conditions(
+        **{"planners": (COST,), "risks": ("mean", "var"), "scenarios": ("std",), "world": "stakes"} | changes
+    )
+    assert [(condition.labels["risk"], condition.stands_for) for condition in made] == [
+        ("mean", {}),
+        ("var", {}),
+    ]
+
+
+def test_a_planner_that_uses_nothing_is_as_a_blind_one() -> None:
+    made = conditions(
+        planners=("tests.eval.parts:Unseeing",),
+        risks=("mean", "var"),
+        models=("oracle", "tests.eval.parts:Gaussian"),
+    )
+    assert [condition.blind for condition in made] == [True, True]
+    with pytest.raises(ConfigError, match="`uses` of planner 'Vague' to return a frozenset of distribution"):
+        conditions(planners=("tests.eval.parts:Vague",))
+
+
 def test_two_settings_of_one_part_stand_side_by_side_with_labels() -> None:
     few, many = (
         {"part": "mppi", "label": name, "options": {"samples": n}} for name, n in (("few", 8), ("many", 9))
@@ -200,6 +271,7 @@ def test_two_settings_of_one_part_stand_side_by_side_with_labels() -> None:
         ({"task": {"free_space": {"by": "noise"}}}, "noise"),
         ({"task": {"min_traversability": "much"}}, "min_traversability"),
         ({"conditions": ({"planer": "mppi"},)}, "Did you mean 'planner"),
+        ({"conditions": ({"risk": "mean", "risks": ["var"]},)}, "`risk` or `risks` in one of"),
     ],
 )
 def test_what_cannot_be_had_is_refused(changes: dict[str, object], expected: str) -> None:
@@ -213,6 +285,8 @@ def test_a_suite_refuses_what_means_nothing() -> None:
         {"realisations": 0},
         {"maps": -1},
         {"seeds": (1, 1)},
+        {"seed": 3, "seeds": (1, 2)},
+        {"model": "oracle", "models": ("ideal",)},
         {"record": "sometimes"},
     ):
         with pytest.raises(ConfigError):

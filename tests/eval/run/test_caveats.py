@@ -36,7 +36,7 @@ WARNING = (
 
 def suite_on(dataset: Path, **changes: Any) -> Suite:
     given: dict[str, Any] = {
-        "data": str(dataset), "model": "oracle", "planners": (FREE, STEERING), "risks": ("mean", "cvar:0.5"),
+        "data": str(dataset), "models": ("oracle",), "planners": (FREE, STEERING), "risks": ("mean", "cvar:0.5"),
         "robots": ("unicycle", "bicycle"), "scenarios": ("std",), "maps": 2, "record": "none",
         "world": {"time_budget_s": 3.0},
     }  # fmt: skip
@@ -114,8 +114,8 @@ def test_a_merged_run_says_what_its_shards_said(dataset_path: Path, tmp_path: Pa
         ({"planner": "near_optimal"}, "planner 'near_optimal', which is given λ itself, got 'oracle'"),
         ({"planner": "optimal", "robots": ("bicycle",)}, "Expected robot Unicycle for planner 'optimal', got Bicycle"),
         ({"planner": HAZARD, "world": "paper"}, "immobilises robots for `hazard`"),
-        ({"planner": FREE, "model": "clairvoyant", "world": "paper"}, "with λ that stays for the model 'clairvoyant'"),
-        ({"planner": FREE, "risks": ("single-class",), "model": TWO_MODES}, "has no `class_names`"),
+        ({"planner": FREE, "models": ("clairvoyant",), "world": "paper"}, "λ that stays for the model 'clairvoyant'"),
+        ({"planner": FREE, "risks": ("single-class",), "models": (TWO_MODES,)}, "has no `class_names`"),
     ],
 )  # fmt: skip
 def test_a_suite_in_which_no_combination_can_be_run_is_refused_before_anything_is_run(

@@ -16,7 +16,7 @@ def run(
 ) -> pd.DataFrame:
     faulty = {"part": "tests.eval.parts:Faulty", "label": "faulty", "options": {"fault": fault}}
     given = {
-        "data": str(dataset_path), "model": "oracle", "planners": (faulty,), "risks": ("mean",),
+        "data": str(dataset_path), "models": ("oracle",), "planners": (faulty,), "risks": ("mean",),
         "scenarios": ("std",), "maps": 2, "world": {"noise": "stored", "time_budget_s": 30.0}, "record": "none",
     } | changes  # fmt: skip
     for _ in run_suite(Suite(**given), folder, jobs, planner_limit_s=limit_s):  # type: ignore[arg-type]

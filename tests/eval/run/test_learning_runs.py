@@ -426,7 +426,7 @@ def test_other_statistics_of_the_ground_are_another_origin(dataset_path: Path, t
 
 def test_runs_of_versions_without_sensors_open_and_compare(dataset_path: Path, tmp_path: Path) -> None:
     suite = suite_on(dataset_path, planners=(DRIVES, "straight"), sensors=("full",), beliefs=("static",))
-    suite = replace(suite, models=("oracle", "clairvoyant"), record="none")
+    suite = replace(suite, model=Suite.model, models=("oracle", "clairvoyant"), record="none")
     rows = finish(suite, tmp_path / "new")
     run = open_run(tmp_path / "new")
     learnt = ["revisions", "seen_cells", "sensed_cells", "ahead_rmse", "ahead_log_score", "learning_ms"]

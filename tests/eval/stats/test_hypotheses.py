@@ -62,6 +62,20 @@ def test_what_neither_side_names_is_paired_value_by_value() -> None:
     ]
 
 
+def test_a_setting_that_was_merged_names_the_one_row() -> None:
+    cost = {"part": "mppi", "label": "cost", "options": {"risk_on": "cost"}}
+    merged = {"planners": ("mppi", cost), "world": "stakes"}
+    for risk in ("mean", "cvar:0.9", "–"):
+        (test,) = fixed(
+            {"one": {"planner": "cost", "risk": risk}, "other": MEAN, "metric": "success"}, **merged
+        )["tests"]
+        assert conditions(**merged)[test["one"]].labels["planner"] == "cost"
+        assert test["claim"] == "success of cost differs from that of mppi, mean"
+    itself = {"one": {"planner": "cost", "risk": "cvar:0.9"}, "other": {"planner": "cost", "risk": "mean"}}
+    with pytest.raises(ConfigError, match=r"got one: planner 'cost' does not use risk mean, cvar:0\.9"):
+        fixed(itself | {"metric": "success"}, **merged)
+
+
 def test_superiority_is_by_a_margin_toward_what_is_better() -> None:
     given = {"one": CVAR, "other": MEAN, "kind": "superiority", "margin": 5}
     (success,) = fixed(given | {"metric": "success"})["tests"]

@@ -64,8 +64,9 @@ def test_rollout_cost_equals_a_loop_over_samples() -> None:
 def test_the_mean_is_moved_by_the_softmax_average_of_the_noise(
     control_cost: float, temperature: float | None
 ) -> None:
+    share = 0.3 if temperature is None else MPPIConfig.temperature_share
     config = replace(
-        SMALL, control_cost=control_cost, noise=(0.3, 0.6), temperature=temperature, temperature_share=0.3
+        SMALL, control_cost=control_cost, noise=(0.3, 0.6), temperature=temperature, temperature_share=share
     )
     problem = factories.problem(torch.full((1, 16, 16), 0.8))
     planner = MPPI(config)
@@ -193,7 +194,7 @@ def test_noise_is_a_share_of_the_range_of_each_action_unless_it_is_given() -> No
     problem = factories.problem(torch.full((1, 16, 16), 0.8), robot=Pushed(mass_kg=150.0))
     scale = MPPI(replace(SMALL, noise_share=0.25)).init(problem, generator()).noise.scale
     assert scale.tolist() == pytest.approx([75.0, 0.5])
-    given = replace(SMALL, noise=(3.0, 0.2), noise_share=0.25)
+    given = replace(SMALL, noise=(3.0, 0.2))
     assert MPPI(given).init(problem, generator()).noise.scale.tolist() == pytest.approx([3.0, 0.2])
 
 
@@ -321,6 +322,8 @@ def test_noise_for_another_number_of_actions_is_asked_for_by_name() -> None:
         {"temperature": 0.0},
         {"temperature_share": 0.0},
         {"noise_share": math.nan},
+        {"noise": (0.3, 0.6), "noise_share": 0.25},
+        {"temperature": 0.5, "temperature_share": 0.3},
         {"noise": ()},
         {"noise": (0.5, 0.0)},
         {"control_cost": -1},

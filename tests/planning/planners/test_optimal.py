@@ -23,6 +23,7 @@ from benchnav.planning.planners.planner import Plan, PlanStatus
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
+from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
 from tests.planning.planners.driving import drive, first, generator, known_world, step_at, with_start
@@ -449,6 +450,29 @@ def test_the_hazard_of_a_metre_is_that_of_its_cells() -> None:
     assert found == pytest.approx((budget_s + 1 / hazard) * (1 - math.exp(-hazard * 24)), rel=0.02)
     sure = float(time_to_go(Optimal(), posed))
     assert sure == pytest.approx(24, rel=0.02)
+
+
+def test_with_hazard_it_uses_the_distribution_alone() -> None:
+    generator_ = generator(5)
+    ground = 0.2 + 0.8 * torch.rand(4, 20, 20, generator=generator_)
+    posed = replace(
+        problem(ground, (1.25, 1.25), (8.25, 7.75)),
+        immobile=Immobile(below=0.1, for_s=2.0),
+        distribution=factories.normal(ground, torch.full_like(ground, 0.2)),
+    )
+    other = replace(posed, risk_map=1 - posed.risk_map, free=~posed.free)
+    planner = Optimal(OptimalConfig(hazard=True))
+    assert planner.uses(posed.task) == {"distribution"}
+    states = [planner.init(one, generator()) for one in (posed, other)]
+    turns = 0
+    for heading in torch.linspace(-3, 3, 25):
+        state = posed.start.clone()
+        state[:, 2] = heading
+        step = Step(state=state, traversability=torch.full((4,), 0.5), time_s=0.0)
+        actions = [planner.plan(step, plan_state)[0] for plan_state in states]
+        assert torch.equal(*actions)
+        turns += int((actions[0][:, 1].abs() < 1).sum())
+    assert turns  # that end within the step, where λ decides the rate
 
 
 @pytest.mark.parametrize("hazard", [True, False])

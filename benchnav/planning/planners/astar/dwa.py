@@ -26,6 +26,7 @@ from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite,
 from benchnav.planning.planners.straight import turn_toward
 from benchnav.planning.problem import (
     Problem,
+    Task,
     motion_traversability,
     predicted_traversability,
     stage_cost,
@@ -107,6 +108,10 @@ class DWA(LocalPlanner[DWAState]):
     def compiled(self) -> bool | None:
         """Whether it runs compiled; None before the first step."""
         return self._rollout.compiled
+
+    def uses(self, task: Task) -> frozenset[str]:
+        """λ̂ and free space; see `Planner`."""
+        return frozenset({"risk_map", task.rules.free_space.source})
 
     def init(self, problem: Problem, generator: torch.Generator) -> DWAState:
         """Starts from standing robots; draws nothing. See `LocalPlanner`."""

@@ -80,6 +80,21 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         """Whether the local planner runs compiled; see `Planner`."""
         return self.local.compiled
 
+    def uses(self, task: Task) -> frozenset[str]:
+        """What the local planner uses, free space, and λ̂ where a path's cost does; see `Planner`."""
+        path = set()
+        if self._cost_uses_map(task):
+            path = {"risk_map", "distribution"} if self.config.explore else {"risk_map"}
+        return self.local.uses(task) | {task.rules.free_space.source} | path
+
+    @staticmethod
+    def _cost_uses_map(task: Task) -> bool:
+        """Whether the cost of a metre of path changes with λ̂, on level ground or on a slope."""
+        traversability = torch.linspace(task.rules.min_traversability, 1.0, 9).expand(3, 9)
+        grade = torch.tensor([-0.3, 0.0, 0.3])[:, None].expand(3, 9)
+        cost = task.objective.path_cost(traversability, grade)
+        return bool((cost != cost[:, :1]).any())
+
     def follows(self, task: Task) -> str:
         """What A* and the local planner minimise where that is not J alone; see `Planner`."""
         own = self.local.follows(task)
@@ -92,9 +107,7 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         found, objective = [], task.objective
         if not has_path_cost(objective):
             found.append(f"A* takes the shortest path: {type(objective).__name__} has no `path_cost`")
-        ends = torch.tensor([task.rules.min_traversability, 1.0])
-        slow, fast = objective.path_cost(ends, torch.zeros(2)).tolist()
-        if slow == fast and task.rules.free_space.by == "mean":
+        if not self._cost_uses_map(task) and task.rules.free_space.by == "mean":
             found.append(
                 "A* finds the same path under every risk setting, since its cost does not use λ̂ and free ground is "
                 f"set by the mean; risk moves {self.local.name} alone (objective travel_time moves the path)"

@@ -162,6 +162,10 @@ class CLRRT(Planner[CLRRTState]):
         """Keeps the settings; all else is in the plan state."""
         self.config = config or CLRRTConfig()
 
+    def uses(self, task: Task) -> frozenset[str]:
+        """λ̂ and free space; see `Planner`."""
+        return frozenset({"risk_map", task.rules.free_space.source})
+
     def follows(self, task: Task) -> str:
         """What the tree minimises where that is not J; see `Planner`."""
         return "" if isinstance(task.objective, TravelTime) else "simulated time to the goal"

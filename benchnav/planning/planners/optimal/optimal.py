@@ -107,6 +107,12 @@ class Optimal(Planner[OptimalState]):
         """Keeps the settings; all else is in the plan state."""
         self.config: Any = config or OptimalConfig()
 
+    def uses(self, task: Task) -> frozenset[str]:
+        """With `hazard` the distribution, else λ̂ and free space; see `Planner`."""
+        if self.config.hazard:
+            return frozenset({"distribution"})
+        return frozenset({"risk_map", task.rules.free_space.source})
+
     def follows(self, task: Task) -> str:
         """What it minimises; see `Planner`."""
         return "expected time, a loss as the time limit" if self.config.hazard else "time under λ̂"
@@ -158,7 +164,9 @@ class Optimal(Planner[OptimalState]):
         ways = ways_from(pose, held, plan_state)
         cost, best = ways.cost.min(1)
         # What a turn takes to be over after this step.
-        rate = ways.turn[own, best] / (problem.traversability_at(pose).clamp(min=_LEAST_KNOWN) * problem.dt_s)
+        rate = ways.turn[own, best] / (
+            self.turning_at(pose, plan_state).clamp(min=_LEAST_KNOWN) * problem.dt_s
+        )
         low, high = problem.action_bounds
         drives = ways.rolls[own, best] | (rate.abs() <= high[1])
         action = torch.stack((torch.where(drives, high[0], 0.0), rate.clamp(low[1], high[1])), 1)
@@ -199,6 +207,13 @@ class Optimal(Planner[OptimalState]):
         """Cost from which on there is no way, shape [B]."""
         return torch.full_like(costs.loss, UNREACHED / 2)
 
+    def turning_at(self, pose: Tensor, plan_state: OptimalState) -> Tensor:
+        """λ by which a robot is taken to turn where it stands, shape [B], from poses [B, 3]."""
+        if plan_state.costs.hazard is None:
+            return plan_state.problem.traversability_at(pose)
+        padded = plan_state.grid.pad(plan_state.costs.rate, UNREACHED)
+        return 1 / plan_state.grid.lookup(padded, pose[:, 0], pose[:, 1])
+
     def costs_of(self, problem: Problem, grid: Grid) -> Costs:
         """What driving costs, on the cells of value iteration."""
         if not self.config.hazard:
@@ -236,6 +251,10 @@ class NearOptimal(Optimal):
     def __init__(self, config: NearOptimalConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or NearOptimalConfig()
+
+    def uses(self, task: Task) -> frozenset[str]:
+        """λ itself, which both the distribution and λ̂ are; see `Planner`."""
+        return frozenset({"risk_map", "distribution"})
 
     def follows(self, task: Task) -> str:
         """What it minimises; see `Planner`."""
