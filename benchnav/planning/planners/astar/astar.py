@@ -9,6 +9,7 @@ Sources: Hart, Nilsson and Raphael (1968); paper IV-A1. Letters in shapes: B epi
 E edges.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -21,9 +22,10 @@ from benchnav.core.batch import Batch
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY
-from benchnav.planning.objective import distance
+from benchnav.planning.objective import Objective, distance
 from benchnav.planning.problem import Problem
 
+_CELLS_AT_ONCE = 2**12
 _OUTSIDE = 100 * PENALTY  # cost to go off the map, where robots do not move
 
 
@@ -52,32 +54,38 @@ def edge_costs(problem: Problem) -> Tensor:
     Raises:
         ConfigError: the objective's `path_cost` is not finite and above 0.
     """
-    source, target, cells = gridgraph.neighbour_pairs(*problem.grid.shape)
-    traversability, elevation, not_free = (
-        [_of_cells(values.double().flatten(1), own) for own in (source, target)]
-        for values in (problem.traversability, problem.elevation_m, ~problem.free)
-    )
-    length_m = torch.from_numpy(cells).to(problem.start.device) * problem.grid.resolution_m
-    grade = (elevation[1] - elevation[0]) / length_m
-    objective = problem.objective
+    return torch.cat(list(_edge_costs(problem)))
+
+
+def _edge_costs(problem: Problem) -> Iterator[Tensor]:
+    """Yield those of a few maps at a time: on the host these stay in the processor's cache, twice as quick."""
+    grid, objective, free = problem.grid, problem.objective, problem.free.flatten(1)
+    source, target, cells = gridgraph.neighbour_pairs(*grid.shape)
+    length_m = torch.from_numpy(cells).to(problem.start.device) * grid.resolution_m
     name = f"`path_cost` of {type(objective).__name__}"
-    per_m = [objective.path_cost(values, grade) for values in traversability]
-    for cost in per_m:
-        got = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
-        expect(
-            got == list(grade.shape),
-            f"{name} of the shape of λ̂ and grade, {list(grade.shape)}, got {got}. Give a cost for each piece of a "
-            "path.",
+    squeezed = gridgraph.squeezes(partial(_of_cells, free), source, target, grid.width)
+    maps = grid.maps_in(_CELLS_AT_ONCE) if problem.start.device.type == "cpu" else len(problem)
+    layers = problem.traversability.flatten(1), problem.elevation_m.flatten(1), ~free, squeezed
+    for *layers_of_cells, squeezed in zip(*(layer.split(maps) for layer in layers), strict=True):
+        traversability, elevation_m, not_free = (
+            [_of_cells(values.double(), own) for own in (source, target)] for values in layers_of_cells
         )
-    least, most = torch.stack([torch.stack(cost.aminmax()) for cost in per_m]).aminmax()
-    if not 0 < least <= most < torch.inf:
-        raise ConfigError(
-            f"Expected {name} as finite numbers > 0, got {least:g} to {most:g}. Return a cost > 0 per metre."
-        )
-    free_of = partial(_of_cells, problem.free.flatten(1))
-    squeezed = gridgraph.squeezes(free_of, source, target, problem.grid.width)
-    penalty = PENALTY * (not_free[0] + not_free[1] + 2 * squeezed)
-    return 0.5 * length_m * (per_m[0] + per_m[1]) + 0.5 * length_m * penalty
+        grade = (elevation_m[1] - elevation_m[0]) / length_m
+        per_m = [objective.path_cost(values, grade) for values in traversability]
+        for cost in per_m:
+            got = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
+            expect(
+                got == list(grade.shape),
+                f"{name} of the shape of λ̂ and grade, {list(grade.shape)}, got {got}. Give a cost for each piece of a "
+                "path.",
+            )
+        least, most = torch.stack([torch.stack(cost.aminmax()) for cost in per_m]).aminmax()
+        if not 0 < least <= most < torch.inf:
+            raise ConfigError(
+                f"Expected {name} as finite numbers > 0, got {least:g} to {most:g}. Return a cost > 0 per metre."
+            )
+        penalty = PENALTY * (not_free[0] + not_free[1] + 2 * squeezed)
+        yield 0.5 * length_m * (per_m[0] + per_m[1]) + 0.5 * length_m * penalty
 
 
 def _of_cells(values: Tensor, cells: np.ndarray) -> Tensor:
@@ -103,8 +111,8 @@ def search(problem: Problem) -> CostToGo:
     goals = distance(centres, goal_m[:, None]) < problem.goal_radius_m
     # On coarse grids no centre may be that near; the goal's own cell always counts.
     goals.scatter_(1, cell_at(grid, goal_m)[:, None], True)
-    costs, shape = edge_costs(problem).cpu().numpy(), grid.shape
-    cost, following = gridgraph.cost_to_go(costs, goals.unflatten(1, shape).numpy(), shape)
+    costs = (of_map for chunk in _edge_costs(problem) for of_map in chunk.cpu().numpy())
+    cost, following = gridgraph.cost_to_go(costs, goals.unflatten(1, grid.shape).numpy(), grid.shape)
     following = np.where(following == gridgraph.NO_CELL, np.arange(following.shape[1]), following)
     start = problem.start
     return CostToGo(torch.from_numpy(cost).to(start), torch.from_numpy(following).to(start.device))
