@@ -42,6 +42,7 @@ from benchnav.eval.run.unit import Built, Settings, build, one_thread, read_bloc
 from benchnav.planning.world.realisation import joined
 
 MODELS = ("oracle", "stakes-v1")
+GROUNDS = ("contact", "probe:1", "probe:2")
 TIMES, LATEST_S = 4, 40.0
 NEAR_M = 3.0  # 2ℓ
 LAW = {"preset": "stakes", "immobile": None}
@@ -94,9 +95,9 @@ def _near(reached: Tensor, resolution_m: float) -> Tensor:
     return torch.hypot(down, across) * resolution_m <= NEAR_M
 
 
-def suite_of(data: Path, models: Sequence[str] = MODELS) -> Suite:
+def suite_of(data: Path, models: Sequence[str] = MODELS, grounds: Sequence[str] = GROUNDS) -> Suite:
     """Who learns by what, in which world."""
-    common: dict[str, Any] = {"grounds": ("contact", "probe:1", "probe:2"), "beliefs": ("copula",)}
+    common: dict[str, Any] = {"grounds": list(grounds), "beliefs": ("copula",)}
     return Suite(
         data=str(data), planners=("astar_dwa",), risks=("expected-time",), objectives=("travel_time",),
         scenarios=("std",), record="none",
@@ -121,11 +122,11 @@ def sums_of(unit: Unit, settings: Settings, out: Path) -> Tensor:
     return torch.from_numpy(np.load(path))
 
 
-def measured(data: Path, maps: int, models: Sequence[str], out: Path) -> Table:
+def measured(suite: Suite, maps: int, out: Path) -> Table:
     """Coverage of each condition."""
     conditions = {
         condition.id: (condition, Extent.product((0,), 1, maps))
-        for condition in conditions_of(suite_of(data, models), lambda data: ["std"])
+        for condition in conditions_of(suite, lambda data: ["std"])
     }
     settings, found = Settings(), dict[str, list[Tensor]]()
     out.mkdir(parents=True, exist_ok=True)
@@ -210,13 +211,14 @@ def main() -> None:
     parser.add_argument("--data", default="stakes-v1-400-seed2026", help="name of the maps in that folder")
     parser.add_argument("--maps", type=int, default=200, help="number of maps, the first ones")
     parser.add_argument("--models", nargs="+", default=MODELS, help="models in the world `stakes`")
+    parser.add_argument("--grounds", nargs="+", default=GROUNDS, help="sensors of λ")
     parser.add_argument("--out", type=Path, default=Path("runs/coverage"), help="folder of stored sums")
     given = parser.parse_args()
     data, out = (given.maps_in / f"{given.data}.h5").resolve(), given.out.resolve() / given.data
     os.chdir(Path(__file__).parents[1])  # where the shipped checkpoints are
     console = Console(width=140)
     console.print(rejection(data, given.maps))
-    console.print(measured(data, given.maps, given.models, out))
+    console.print(measured(suite_of(data, given.models, given.grounds), given.maps, out))
 
 
 if __name__ == "__main__":
