@@ -18,7 +18,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 
 _SMALLEST_STD = 1e-9
-_LEAST_SKEW = 1e-3  # under which a number counts as normal
+LEAST_SKEW = 1e-3  # under which a number counts as normal
 
 
 @dataclass(frozen=True)
@@ -118,25 +118,25 @@ def skewed(normal: Tensor, skew: Tensor) -> Tensor:
     """
     sign, root, scale, width = _log_normal(skew)
     found = sign * ((sign * width * normal).exp() - root) / scale
-    return torch.where(skew.abs() < _LEAST_SKEW, normal.double(), found)
+    return torch.where(skew.abs() < LEAST_SKEW, normal.double(), found)
 
 
 def unskewed(value: Tensor, skew: Tensor) -> Tensor:
     """The number that `skewed` makes a value of; infinite beyond its range."""
     sign, root, scale, width = _log_normal(skew)
     found = sign * (root + sign * value * scale).clamp(min=0).log() / width
-    return torch.where(skew.abs() < _LEAST_SKEW, value, found)
+    return torch.where(skew.abs() < LEAST_SKEW, value, found)
 
 
 def _slope(normal: Tensor, skew: Tensor) -> Tensor:
     """Derivative of `skewed`."""
     sign, _, scale, width = _log_normal(skew)
-    return torch.where(skew.abs() < _LEAST_SKEW, 1.0, width * (sign * width * normal).exp() / scale)
+    return torch.where(skew.abs() < LEAST_SKEW, 1.0, width * (sign * width * normal).exp() / scale)
 
 
 def _log_normal(skew: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Of exp(σ z) for the σ that gives it a skewness: the sign, the mean, the standard deviation, and σ."""
-    size = skew.double().abs().clamp(min=_LEAST_SKEW)
+    size = skew.double().abs().clamp(min=LEAST_SKEW)
     half = 1 + size.square() / 2
     third = (half + (half.square() - 1).sqrt()).pow(1 / 3)
     power = third + 1 / third - 1  # exp(σ²)

@@ -7,7 +7,7 @@ leaves the processor's cache.
 Letters in shapes: B maps, H×W cells; a cell's flat index is row·W + column.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, TypeVar
 
@@ -57,12 +57,14 @@ def squeezes(free_of: Callable[[Cells], Mask], source: Cells, target: Cells, wid
     return free_of(source) & free_of(target) & ~free_of(one) & ~free_of(other)
 
 
-def cost_to_go(edge_costs: ndarray, goals: ndarray, shape: tuple[int, int]) -> tuple[ndarray, ndarray]:
+def cost_to_go(
+    edge_costs: Iterable[ndarray], goals: ndarray, shape: tuple[int, int]
+) -> tuple[ndarray, ndarray]:
     """Finds the least cost from every cell to the nearest goal cell of its own map.
 
     Args:
         edge_costs: cost > 0 of each edge of `neighbour_pairs`, infinite where it may not be taken,
-            shape [B, E].
+            shape [E] of each of B maps, one by one.
         goals: goal cells, bool, shape [B, H, W].
         shape: (H, W).
 
@@ -71,7 +73,7 @@ def cost_to_go(edge_costs: ndarray, goals: ndarray, shape: tuple[int, int]) -> t
         the next cell on a shortest path, `NO_CELL` at goals and where there is none, int64, shape
         [B, H·W].
     """
-    batch, cells = len(edge_costs), shape[0] * shape[1]
+    batch, cells = len(goals), shape[0] * shape[1]
     # Searching backward from the goals, so the edges are turned round: rows are their targets, their order.
     source, target, _ = neighbour_pairs(*shape)
     columns, rows = source.astype(np.int32), np.searchsorted(target, np.arange(cells + 1)).astype(np.int32)
@@ -79,8 +81,7 @@ def cost_to_go(edge_costs: ndarray, goals: ndarray, shape: tuple[int, int]) -> t
     cost, following = np.empty((batch, cells)), np.empty((batch, cells), np.int64)
     # The finite limit keeps infinite edges from being taken.
     search = partial(dijkstra, graph, min_only=True, return_predecessors=True, limit=np.finfo(np.float64).max)
-    for b, starts in enumerate(goals.reshape(batch, cells)):
-        graph.data = edge_costs[b]
+    for b, (graph.data, starts) in enumerate(zip(edge_costs, goals.reshape(batch, cells), strict=True)):
         cost[b], following[b], _ = search(indices=np.flatnonzero(starts))
     return cost.reshape(batch, *shape), np.where(following >= 0, following, NO_CELL)
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch, map_tensors
-from benchnav.core.conditioned import unskewed
+from benchnav.core.conditioned import LEAST_SKEW, unskewed
 from benchnav.core.distribution import TraversabilityDistribution, check_floor, tail_of
 
 VALUES: tuple[float, ...] = (
@@ -68,9 +68,11 @@ class TabulatedDistribution(TraversabilityDistribution):
     def cvar(self, level: float) -> Tensor:
         """Mean of λ over its worst share 1 − level, 1/p ∫₀¹ max(p − F, 0), shape [*B, H, W]; see the base."""
         tail = tail_of(level)
-        below = self.below.movedim(-3, -1)
+        below, step = self.below.movedim(-3, -1), self._values().diff()
         left = (tail - below).clamp(min=0)
-        low, high, step = left[..., :-1], left[..., 1:], self._values().diff()
+        low, high = left[..., :-1], left[..., 1:]
+        if tail == 1:  # F passes it nowhere
+            return ((low + high) / 2 @ step).clamp(max=1)
         # Where F passes p, of the interval the part before.
         part = low / torch.where(high > 0, 1.0, below.diff(dim=-1).clamp(min=1e-30))
         pieces = torch.where(high > 0, (low + high) / 2, low * part / 2)
@@ -188,7 +190,7 @@ class ScoreTable(Batch):
         scores = self.rows.scores[self.place[cells]]
         mean, std = mean.to(scores), std.to(scores).clamp(min=_LEAST_STD)
         away = (scores - mean[:, None]) / std[:, None]
-        some = skew != 0
+        some = skew.abs() >= LEAST_SKEW
         if bool(some.any()):
             away = away.index_put((some,), unskewed(away[some], skew[some, None]).to(away))
         return (1 + torch.erf(away * math.sqrt(0.5))) / 2

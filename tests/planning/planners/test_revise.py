@@ -9,6 +9,7 @@ from torch import Tensor
 
 from benchnav.core import registry
 from benchnav.planning.free_space import PENALTY
+from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners import boundary
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.cl_rrt import cl_rrt
@@ -113,14 +114,19 @@ def test_a_state_is_not_changed_and_one_episode_is_not_the_others(name: str) -> 
 
 @pytest.mark.parametrize("name", ["astar_dwa", "astar_mppi"])
 def test_a_revised_search_is_the_whole_search_of_the_new_map(name: str) -> None:
-    planner, then = make(name), problem(wall())
-    plan_state = planner.init(problem(ground()), generator())
+    planner, then = make(name), problem(wall(), objective=GoalDistance())
+    plan_state = planner.init(problem(ground(), objective=GoalDistance()), generator())
     revised, anew = planner.revise(plan_state, then), astar.search(then)
     assert torch.equal(revised.field.cost, anew.cost)
     assert torch.equal(revised.field.following, anew.following)
     assert torch.equal(revised.ground.penalty_per_m, planner.init(then, generator()).ground.penalty_per_m)
     assert revised.local.problem.risk_map is not plan_state.local.problem.risk_map
     assert torch.equal(revised.local.problem.risk_map, then.risk_map)
+    # Now a hill is seen on the second map.
+    heights = torch.zeros(2, 24, 30).index_put((torch.tensor(1), torch.tensor(12)), torch.tensor(4.0))
+    hill = replace(then, observation=replace(then.observation, elevation_m=heights))
+    assert torch.equal(planner.revise(revised, hill).field.cost, astar.search(hill).cost)
+    assert not torch.equal(astar.search(hill).cost, anew.cost)
 
 
 def test_local_planners_keep_their_motion() -> None:

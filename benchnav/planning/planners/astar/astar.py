@@ -9,11 +9,14 @@ Sources: Hart, Nilsson and Raphael (1968); paper IV-A1. Letters in shapes: B epi
 E edges.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
 from benchnav.core import gridgraph
@@ -24,6 +27,7 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import distance
 from benchnav.planning.problem import Problem
 
+Cells = TypeVar("Cells", ndarray, Tensor)  # flat indices of cells
 _OUTSIDE = 100 * PENALTY  # cost to go off the map, where robots do not move
 
 
@@ -53,15 +57,52 @@ def edge_costs(problem: Problem) -> Tensor:
         ConfigError: the objective's `path_cost` is not finite and above 0.
     """
     source, target, cells = gridgraph.neighbour_pairs(*problem.grid.shape)
-    traversability, elevation, not_free = (
-        [_of_cells(values.double().flatten(1), own) for own in (source, target)]
-        for values in (problem.traversability, problem.elevation_m, ~problem.free)
-    )
     length_m = torch.from_numpy(cells).to(problem.start.device) * problem.grid.resolution_m
-    grade = (elevation[1] - elevation[0]) / length_m
+    layers = (partial(_of_cells, values.flatten(1)) for values in _layers(problem))
+    return _costs(problem, source, target, length_m, *layers)
+
+
+def revised_edge_costs(problem: Problem, before: Tensor, changed: Tensor) -> Tensor:
+    """Return `edge_costs` where ground has changed in some cells, computed for the edges near these.
+
+    Args:
+        problem: B problems.
+        before: costs of edges before the change, float64, shape [B, E]; they are not changed.
+        changed: cells whose λ̂, free ground or elevation has changed, one at least, bool, shape [B, H, W].
+    """
+    source, target, cells = gridgraph.neighbour_pairs(*problem.grid.shape)
+    # A diagonal step also depends on the two cells beside it, which touch its source.
+    near = torch.nn.functional.max_pool2d(changed.float(), 3, stride=1, padding=1) > 0
+    member, edge = _of_cells(near.flatten(1), source).nonzero(as_tuple=True)
+    of_map, edges = member * near[0].numel(), edge.cpu().numpy()
+    begin, end = (torch.from_numpy(own[edges]).to(edge.device) for own in (source, target))
+    length_m = torch.from_numpy(cells[edges]).to(edge.device) * problem.grid.resolution_m
+    layers = (partial(_of_flat_cells, values.flatten(), of_map) for values in _layers(problem))
+    return before.index_put((member, edge), _costs(problem, begin, end, length_m, *layers))
+
+
+def _layers(problem: Problem) -> tuple[Tensor, Tensor, Tensor]:
+    """What costs of edges depend on, each of shape [B, H, W]."""
+    return problem.traversability, problem.elevation_m, problem.free
+
+
+def _costs(
+    problem: Problem,
+    source: Cells,
+    target: Cells,
+    length_m: Tensor,
+    traversability_of: Callable[[Cells], Tensor],
+    elevation_of: Callable[[Cells], Tensor],
+    free_of: Callable[[Cells], Tensor],
+) -> Tensor:
+    """Costs of some edges, by what tells λ̂, elevation and free ground of cells; of the shape that these return."""
+    traversability, elevation_m, free = (
+        [of(own) for own in (source, target)] for of in (traversability_of, elevation_of, free_of)
+    )
+    grade = (elevation_m[1].double() - elevation_m[0].double()) / length_m
     objective = problem.objective
     name = f"`path_cost` of {type(objective).__name__}"
-    per_m = [objective.path_cost(values, grade) for values in traversability]
+    per_m = [objective.path_cost(values.double(), grade) for values in traversability]
     for cost in per_m:
         got = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
         expect(
@@ -74,9 +115,8 @@ def edge_costs(problem: Problem) -> Tensor:
         raise ConfigError(
             f"Expected {name} as finite numbers > 0, got {least:g} to {most:g}. Return a cost > 0 per metre."
         )
-    free_of = partial(_of_cells, problem.free.flatten(1))
     squeezed = gridgraph.squeezes(free_of, source, target, problem.grid.width)
-    penalty = PENALTY * (not_free[0] + not_free[1] + 2 * squeezed)
+    penalty = PENALTY * ((~free[0]).double() + (~free[1]).double() + 2 * squeezed)
     return 0.5 * length_m * (per_m[0] + per_m[1]) + 0.5 * length_m * penalty
 
 
@@ -87,13 +127,19 @@ def _of_cells(values: Tensor, cells: np.ndarray) -> Tensor:
     return values[:, torch.from_numpy(cells).to(values.device)]
 
 
-def search(problem: Problem) -> CostToGo:
+def _of_flat_cells(values: Tensor, of_map: Tensor, cells: Tensor) -> Tensor:
+    """Values [B·H·W] of cells of some maps, of which the first cells are given, shape [N]."""
+    return values[of_map + cells]
+
+
+def search(problem: Problem, costs: Iterable[Tensor] | None = None) -> CostToGo:
     """Finds cheapest paths to the goal's own cell and to those centred within its radius.
 
     Works on the host: on another device this copies the maps there and the answer back, once.
 
     Args:
         problem: B problems.
+        costs: of edges, B of shape [E]; None for `edge_costs`.
 
     Returns:
         Cost to go, of the problem's dtype and device.
@@ -103,8 +149,8 @@ def search(problem: Problem) -> CostToGo:
     goals = distance(centres, goal_m[:, None]) < problem.goal_radius_m
     # On coarse grids no centre may be that near; the goal's own cell always counts.
     goals.scatter_(1, cell_at(grid, goal_m)[:, None], True)
-    costs, shape = edge_costs(problem).cpu().numpy(), grid.shape
-    cost, following = gridgraph.cost_to_go(costs, goals.unflatten(1, shape).numpy(), shape)
+    on_host = (of_map.cpu().numpy() for of_map in (edge_costs(problem) if costs is None else costs))
+    cost, following = gridgraph.cost_to_go(on_host, goals.unflatten(1, grid.shape).numpy(), grid.shape)
     following = np.where(following == gridgraph.NO_CELL, np.arange(following.shape[1]), following)
     start = problem.start
     return CostToGo(torch.from_numpy(cost).to(start), torch.from_numpy(following).to(start.device))

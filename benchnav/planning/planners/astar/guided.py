@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from benchnav.core.batch import Batch, map_tensors
+from benchnav.core.batch import Batch
 from benchnav.planning.objective import GoalDistance, has_path_cost, toward_waypoints
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
@@ -50,6 +50,7 @@ class GuidedState(Batch, Generic[Local]):
 
     Args:
         problem: what is being solved, with the λ̂ that path costs are given.
+        edge_costs: of moving between neighbouring cells, float64, shape [B, E]; see `astar.edge_costs`.
         field: cheapest paths to the goal.
         ground: what a metre costs in each cell.
         local: the local planner's plan state.
@@ -57,6 +58,7 @@ class GuidedState(Batch, Generic[Local]):
     """
 
     problem: Problem
+    edge_costs: Tensor
     field: astar.CostToGo
     ground: GroundCosts
     local: Local
@@ -118,7 +120,10 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         """Searches the maps; see `Planner`."""
         local = self.local.init(self._local_problem(problem), generator)
         recovery, problem = Recovery.none(problem.start), optimistic(problem, self.config.explore)
-        return GuidedState(problem, astar.search(problem), ground_costs(problem), local, recovery)
+        costs = astar.edge_costs(problem)
+        return GuidedState(
+            problem, costs, astar.search(problem, costs), ground_costs(problem), local, recovery
+        )
 
     def plan(self, step: Step, plan_state: GuidedState[Local]) -> tuple[Tensor, GuidedState[Local], Plan]:
         """Follows the cheapest path; see `Planner`."""
@@ -141,15 +146,19 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         return action, replace(plan_state, local=local, recovery=recovery), plan
 
     def revise(self, plan_state: GuidedState[Local], problem: Problem) -> GuidedState[Local]:
-        """Searches maps anew whose ground has changed, and keeps the local planner's motion; see `Planner`."""
+        """Searches the maps again whose ground has changed, and keeps the local planner's motion; see `Planner`."""
         local = self.local.revise(plan_state.local, self._local_problem(problem))
-        before, field = plan_state.problem, plan_state.field
+        before, costs, field = plan_state.problem, plan_state.edge_costs, plan_state.field
         problem = optimistic(problem, self.config.explore)
-        changed = (problem.padded_ground != before.padded_ground).flatten(1).any(1).nonzero()[:, 0]
-        if len(changed):
-            found = astar.search(problem.select(changed))
-            field = map_tensors(field, lambda old, new: old.index_copy(0, changed, new), found)
-        return replace(plan_state, problem=problem, field=field, ground=ground_costs(problem), local=local)
+        changed = (problem.traversability != before.traversability) | (problem.free != before.free)
+        changed |= problem.elevation_m != before.elevation_m
+        members = changed.flatten(1).any(1).nonzero()[:, 0]
+        if len(members):
+            costs = astar.revised_edge_costs(problem, costs, changed)
+            found = astar.search(problem.select(members), (costs[own] for own in members.tolist()))
+            field = field.put(members, found)
+        ground = ground_costs(problem)
+        return replace(plan_state, problem=problem, edge_costs=costs, field=field, ground=ground, local=local)
 
     def select(self, plan_state: GuidedState[Local], members: Tensor) -> GuidedState[Local]:
         """Keeps some episodes; see `Planner`."""

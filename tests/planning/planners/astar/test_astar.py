@@ -4,6 +4,8 @@ import networkx
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from benchnav.core import gridgraph
 from benchnav.core.errors import ConfigError
@@ -46,6 +48,29 @@ def networkx_graph(problem: Problem, member: int, by_time: bool) -> networkx.Gra
                         penalty = 2 * half * PENALTY
                     graph.add_edge((i, j), (k, m), weight=cost + penalty)
     return graph
+
+
+@given(
+    seed=st.integers(0, 999),
+    fraction=st.sampled_from((0.01, 0.1, 1.0)),
+    layer=st.sampled_from(("risk_map", "free", "elevation_m")),
+    by_time=st.booleans(),
+)
+def test_revised_costs_of_edges_are_those_of_the_new_map(
+    seed: int, fraction: float, layer: str, by_time: bool
+) -> None:
+    before, other = (random_problem(number, Unicycle(), by_time) for number in (seed, seed + 1))
+    changed = torch.rand(3, 16, 12, generator=torch.Generator().manual_seed(seed)) < fraction
+    changed[0, 0, 0] = True
+    now = torch.where(changed, getattr(other, layer), getattr(before, layer))
+    if layer == "elevation_m":
+        then = replace(before, observation=replace(before.observation, elevation_m=now))
+    else:
+        then = replace(before, **{layer: now})
+    costs = astar.edge_costs(before)
+    kept = costs.clone()
+    assert torch.equal(astar.revised_edge_costs(then, costs, changed), astar.edge_costs(then))
+    assert torch.equal(costs, kept)
 
 
 @pytest.mark.parametrize("by_time", [False, True])

@@ -241,8 +241,10 @@ def test_no_tensor_is_made_on_another_device_but_by_the_search(
     monkeypatch: pytest.MonkeyPatch, objective: Objective
 ) -> None:
     real = factories.problem(torch.full((2, 16, 24), 0.9), robot=Bicycle(), objective=objective)
-    searched = astar.search(real)
+    searched, costs = astar.search(real), astar.edge_costs(real)
     with fake_cuda(real) as problem:
+        costs = costs.to("cuda")
+        monkeypatch.setattr(astar, "edge_costs", lambda _: costs)
         moved = astar.CostToGo(searched.cost.to("cuda"), searched.following.to("cuda"))
         monkeypatch.setattr(astar, "search", lambda *_: moved)
         planner = Guided(GuideConfig(), Constant((0.5, 0.0)))
