@@ -59,10 +59,7 @@ def cost_from_start(problem: Problem, planner: str, **options: Any) -> tuple[np.
     state = Optimal.init(made, problem, rng.generator(0))  # value iteration only
     took = time.perf_counter() - begun
     cost = ways_from(problem.start, state.held, state).cost.min(1).values.double().numpy()
-    most = (
-        2 * problem.time_budget_s.double().numpy()
-    )  # more is no way, whose value reaches into cells beside it
-    return np.where(cost < most, cost, np.inf), took / len(problem)
+    return np.where(cost < made.no_way(state.costs).double().numpy(), cost, np.inf), took / len(problem)
 
 
 def grid_table(problem: Problem) -> tuple[Table, list[tuple[np.ndarray, np.ndarray]]]:

@@ -465,7 +465,7 @@ def test_rows_of_a_planner_that_is_given_the_ground_have_a_lower_bound_and_other
 ) -> None:
     world = {"noise": "stored", "time_budget_s": 60.0, "immobile": {"below": 0.05, "for_s": 2.0}}
     suite = Suite(
-        data=str(dataset_path), models=("clairvoyant",), planners=("optimal_bound", "straight"), risks=("mean",),
+        data=str(dataset_path), models=("clairvoyant",), planners=("near_optimal", "straight"), risks=("mean",),
         scenarios=("std",), maps=2, record="none", world=(world,), task=({"min_traversability": 0.05},),
         objectives=("travel_time",),
     )  # fmt: skip
