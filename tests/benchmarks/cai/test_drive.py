@@ -154,7 +154,9 @@ def test_a_rollout_off_the_map_pays_the_penalty_or_is_still(setting: str, motion
     off = torch.tensor([[[-0.5, 4.0, 0.0]]])
     for off_map, penalty in (("penalty", PENALTY), ("still", 0.0)):
         ground = planned_ground(replace(setup, off_map=off_map), setting)[:1]
-        pair = ground if len(ground[0]) > 121 else torch.cat((ground, ground), dim=1)
+        is_paired = len(ground[0]) == 2 * 121
+        assert is_paired == (setting == "cost" and motions == "two")
+        pair = ground if is_paired else torch.cat((ground, ground), dim=1)
         states, cost = advance_pair(
             off, torch.zeros(1, 1), torch.full((1, 2, 2), 3.0), torch.zeros(2, 2, 1), *problem().action_bounds, pair,
             torch.tensor([[[8.5, 8.5]]]), GRID, ROVER, choose_objective(setup), setup.min_traversability,
