@@ -14,7 +14,7 @@ from torch import Tensor
 from benchmarks.cai.ground import DIRT, SLICES, VEGETATION
 from benchmarks.cai.world import GRID
 from benchnav.core import registry, rng
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.planning import risk
@@ -123,6 +123,13 @@ class Setup:
     fields: int = 64
     motions: Literal["one", "two"] = "one"
     off_map: Literal["penalty", "still"] = "penalty"
+
+    def __post_init__(self) -> None:
+        """Refuse two fields under an objective that rollouts on them do not have."""
+        expect(
+            self.motions == "one" or self.objective == "theirs",
+            f"`objective` 'theirs' with `motions` 'two', got {self.objective!r}.",
+        )
 
 
 def predict(vegetation: np.ndarray) -> TraversabilityMixture:

@@ -11,9 +11,10 @@ from benchmarks.cai.task import ROVER, STEPS, Setup, choose_objective, planner_c
 from benchmarks.cai.world import GRID, draw_vegetation
 from benchnav.core import rng
 from benchnav.planning.free_space import PENALTY
-from benchnav.planning.planners.mppi import MPPIConfig
+from benchnav.planning.planners.mppi import MPPIConfig, advance_chunk
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem, ground_map
+from benchnav.planning.robots import component_wise
 from benchnav.planning.sensing.sensor import Step
 
 DT_S = 0.1
@@ -114,7 +115,8 @@ def test_arrival_is_within_half_a_metre() -> None:
 def test_rollouts_on_pairs_move_as_the_world_does() -> None:
     fields = torch.rand((3, 2, *GRID.shape), generator=torch.Generator().manual_seed(0)) + 0.02
     padded = ground_map(GRID, fields, torch.ones_like(fields, dtype=torch.bool)).flatten(1)
-    noise = torch.stack((torch.rand(12, 5) * 3, torch.randn(12, 5)), dim=1)
+    draws = torch.randn((2, 12, 5), generator=torch.Generator().manual_seed(1))
+    noise = torch.stack((draws[0].abs(), draws[1]), dim=1)
     start = torch.tensor([0.5, 0.5, math.pi / 4]).expand(3, 5, 3)
     task = problem().task
     states, _ = advance_pair(
@@ -126,6 +128,23 @@ def test_rollouts_on_pairs_move_as_the_world_does() -> None:
         for action in noise[:, :, sample]:
             state = move(state, action.clamp(-math.pi, math.pi).expand(3, 2), fields, DT_S)
         torch.testing.assert_close(states[:, sample], state, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("power", [1, 2])
+def test_a_pair_of_equal_fields_costs_what_one_field_does(power: int) -> None:
+    setup = Setup(distance_power=power)
+    posed = pose(draw_vegetation(0, np.arange(2), 0.4), ["mean"], setup)
+    turns = torch.randn(90, 4, generator=torch.Generator().manual_seed(0)) / 10
+    noise = torch.stack((torch.full((90, 4), 3.0), turns), dim=1)
+    noise[:, 0, 2:] /= 10  # these never arrive
+    start = component_wise(posed.start[:, None].expand(2, 4, 3))
+    given = torch.zeros(2, 4), torch.zeros(2, 90, 2), noise, *posed.action_bounds
+    parts = posed.goal_m[:, None].contiguous(), GRID, ROVER, posed.objective, setup.min_traversability
+    states, cost = advance_chunk(start, *given, posed.padded_ground, *parts)
+    states_of_pair, cost_of_pair = advance_pair(start, *given, posed.padded_ground.repeat(1, 2), *parts)
+    assert has_arrived(states.flatten(0, 1)).any()
+    torch.testing.assert_close(states_of_pair, states, atol=1e-4, rtol=0)
+    torch.testing.assert_close(cost_of_pair, cost, rtol=1e-5, atol=0)
 
 
 def planned_ground(setup: Setup, setting: str = "cost") -> Tensor:

@@ -119,6 +119,11 @@ def test_objectives_of_ours_are_found_by_name() -> None:
     assert cost[0].item() == pytest.approx(math.hypot(8, 8))
 
 
+def test_two_fields_have_only_their_objective() -> None:
+    with pytest.raises(ConfigError, match="Expected `objective` 'theirs' with `motions` 'two'"):
+        Setup(motions="two", objective="travel_time")
+
+
 def test_their_alpha_is_the_share_of_the_worst_costs() -> None:
     cost, tail = (planner_config(setting, Setup()) for setting in ("cost", "cost-cvar:0.6"))
     assert (cost.risk_on, cost.level, cost.fields) == ("cost", 0.0, 64)
