@@ -19,6 +19,7 @@ from scipy.special import ndtr
 
 _BISECTIONS = 50
 _BINS = 20
+_PERCENT = 100
 SLICES = 100
 
 
@@ -64,13 +65,29 @@ class Ground:
         Args:
             share: of the distribution, from below, in (0, 1]; 1 gives the mean.
         """
-        edges = np.linspace(0, 1, _BINS + 1)
-        centres = (edges[1:] + edges[:-1]) / 2
-        mass = np.diff(self.cdf(edges))
+        centres, mass = self._histogram()
         last = np.searchsorted(mass.cumsum(), share) if share < 1 else _BINS - 1
         tail = slice(0, int(last) + 1)
         mean = (mass[tail] * centres[tail]).sum() / mass[tail].sum()
         return float(np.floor(100 * centres[centres >= mean][0])) / 100
+
+    def histogram_atoms(self) -> np.ndarray:
+        """Return the point masses of their sampled fields, lowest first, each of probability 1/200, shape [200].
+
+        Their sampler cuts the mass of each bin to whole per cents and gives the remainder to λ = 1. It then rounds
+        100·u, u uniform in [0, 1], so that 0 and 100 have half the probability of other per cents. The 0 gives λ = 0.
+        """
+        centres, mass = self._histogram()
+        percents = np.floor(_PERCENT * mass + 1e-9).astype(int)
+        counts = np.append(percents, _PERCENT - percents.sum())
+        values = np.append(np.floor(_PERCENT * centres + 1e-9) / _PERCENT, 1.0)
+        by_percent = np.insert(np.repeat(values, counts), 0, 0.0)
+        return by_percent.repeat(2)[1:-1]
+
+    def _histogram(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the centres of 20 bins on [0, 1] and their exact masses."""
+        edges = np.linspace(0, 1, _BINS + 1)
+        return (edges[1:] + edges[:-1]) / 2, np.diff(self.cdf(edges))
 
     def _mixture_cdf(self, value: np.ndarray) -> np.ndarray:
         return (np.asarray(self.weights) * ndtr(self._standardise(value))).sum(-1)

@@ -46,7 +46,7 @@ def run_trials(
     alike: dict[MPPIConfig, list[str]] = {}
     for setting in settings:
         alike.setdefault(planner_config(setting, setup), []).append(setting)
-    planners = {config: ManyTrialsMPPI(config) for config in alike}
+    planners = {config: ManyTrialsMPPI(config, setup) for config in alike}
     names = [round(1e6 * density) for density in densities]
     for member in range(maps):
         which = np.array([member])

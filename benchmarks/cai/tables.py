@@ -3,7 +3,7 @@
     python -m benchmarks.cai.tables published=a.csv distance²=b.csv     # runs side by side, each beside the first
 
 Intervals are Wilson's, 95 %, over trials. Two settings, or two runs, on the same trials are compared by the exact
-McNemar test, ours with theirs by Fisher's exact test.
+McNemar test, ours with theirs by Fisher's exact test and Newcombe's interval.
 """
 
 import sys
@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest, fisher_exact
+from statsmodels.stats.proportion import confint_proportions_2indep
 
 from benchmarks.cai.published import PUBLISHED, PUBLISHED_PAIRS, TRIALS
 from benchnav.core.resampling import holm
@@ -39,18 +40,22 @@ def tabulate_success(rows: pd.DataFrame) -> str:
         ]
         theirs = PUBLISHED.get((density, setting))
         if theirs is None:
-            lines.append([*cells, _NONE, _NONE, _NONE])
+            lines.append([*cells, _NONE, _NONE, _NONE, _NONE])
             continue
         table = [[arrived, trials - arrived], [theirs.successes, TRIALS - theirs.successes]]
         compared[len(lines)] = fisher_exact(table).pvalue
-        lines.append([*cells, show_share(theirs.successes, TRIALS), show_time(theirs.time_s)])
+        published = show_share(theirs.successes, TRIALS), show_time(theirs.time_s)
+        lines.append([*cells, *published, show_difference(arrived, trials, theirs.successes, TRIALS)])
     corrected = holm(np.array(list(compared.values())))
     for place, p in zip(compared, corrected, strict=True):
         lines[place].append(show_p(p))
     return markdown(
-        ["vegetation", "setting", "success, %", "time, s", "theirs, %", "theirs, s", "p of ours = theirs"],
+        [
+            "vegetation", "setting", "success, %", "time, s", "theirs, %", "theirs, s", "ours − theirs",
+            "p of ours = theirs",
+        ],
         lines,
-    )
+    )  # fmt: skip
 
 
 def tabulate_pairs(rows: pd.DataFrame, one: str, other: str) -> str:
@@ -128,6 +133,16 @@ def show_share(successes: int, trials: int) -> str:
     """A share in per cent with its interval."""
     low, high = wilson_interval(successes / trials, trials)
     return f"{100 * successes / trials:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def show_difference(a: int, n_a: int, b: int, n_b: int) -> str:
+    """A difference of two independent rates in points, a/n_a − b/n_b, with its interval.
+
+    Source: Newcombe (1998), "Interval estimation for the difference between independent proportions: comparison of
+    eleven methods", method 10.
+    """
+    low, high = confint_proportions_2indep(a, n_a, b, n_b, method="newcomb")
+    return f"{100 * (a / n_a - b / n_b):+.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def show_time(seconds: float) -> str:

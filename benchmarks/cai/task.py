@@ -14,7 +14,7 @@ from torch import Tensor
 from benchmarks.cai.ground import DIRT, SLICES, VEGETATION
 from benchmarks.cai.world import GRID
 from benchnav.core import registry, rng
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.planning import risk
@@ -75,10 +75,10 @@ class TimeAndDistance(Objective):
 
 @dataclass(frozen=True)
 class CellFields:
-    """Draws fields of which every cell is independent, by the point masses that are predicted: a `FieldSource`.
+    """Draws fields of independent cells from equally likely point masses: a `FieldSource`.
 
     Args:
-        atoms: as of `predict`, shape [B, 100, 9, 9].
+        atoms: N values of λ for each cell, shape [B, N, 9, 9].
         names: of the trials, by which their fields are drawn; trials of one name have the same.
     """
 
@@ -90,7 +90,9 @@ class CellFields:
         drawn = []
         for atoms, name in zip(self.atoms, self.names, strict=True):
             generator = rng.generator(rng.stream_key(key, "cai", "fields", name))
-            drawn.append(atoms.gather(0, torch.randint(SLICES, (count, *GRID.shape), generator=generator)))
+            drawn.append(
+                atoms.gather(0, torch.randint(len(atoms), (count, *GRID.shape), generator=generator))
+            )
         return torch.stack(drawn)
 
     def select(self, members: Tensor) -> "CellFields":
@@ -104,11 +106,13 @@ class Setup:
 
     Args:
         mppi: settings of the planner.
-        risk_map: `exact`, by our risk settings, or `histogram`, by their binning and rounding.
+        risk_map: `exact`, by our risk settings, or `histogram`, by their binning and rounding; fields of λ likewise.
         objective: `theirs`, or one of ours by name.
         distance_power: of the distance in a step's cost.
         min_traversability: least λ̂ that motion is given.
         fields: on which sequences are rolled out where the risk is that of the cost.
+        motions: whether `one` field of λ serves both motions of a rollout, or `two` independent ones.
+        off_map: whether a rollout off the map pays the `penalty` of ground that is not free, or is only `still`.
     """
 
     mppi: MPPIConfig = THEIR_MPPI
@@ -117,6 +121,15 @@ class Setup:
     distance_power: int = 1
     min_traversability: float = 0.01
     fields: int = 64
+    motions: Literal["one", "two"] = "one"
+    off_map: Literal["penalty", "still"] = "penalty"
+
+    def __post_init__(self) -> None:
+        """Refuse two fields under an objective that rollouts on them do not have."""
+        expect(
+            self.motions == "one" or self.objective == "theirs",
+            f"`objective` 'theirs' with `motions` 'two', got {self.objective!r}.",
+        )
 
 
 def predict(vegetation: np.ndarray) -> TraversabilityMixture:
@@ -128,9 +141,14 @@ def predict(vegetation: np.ndarray) -> TraversabilityMixture:
     Returns:
         Point masses, parameters of shape [B, 100, 9, 9].
     """
-    of_vegetation, of_dirt = (ground.slices()[:, None, None] for ground in (VEGETATION, DIRT))
-    atoms = torch.from_numpy(np.where(vegetation[:, None], of_vegetation, of_dirt)).float()
+    atoms = atoms_by_cell(vegetation, VEGETATION.slices(), DIRT.slices())
     return TraversabilityMixture(torch.full_like(atoms, 1 / SLICES), atoms, torch.zeros_like(atoms))
+
+
+def atoms_by_cell(vegetation: np.ndarray, of_vegetation: np.ndarray, of_dirt: np.ndarray) -> Tensor:
+    """Return the N point masses of each cell's ground, shape [B, N, 9, 9], from vegetation [B, 9, 9]."""
+    atoms = np.where(vegetation[:, None], of_vegetation[:, None, None], of_dirt[:, None, None])
+    return torch.from_numpy(atoms).float()
 
 
 def planner_config(setting: str, setup: Setup) -> MPPIConfig:
@@ -145,7 +163,7 @@ def pose(
 ) -> Problem:
     """Poses the trials of some maps under some risk settings.
 
-    Fields of λ are drawn cell by cell; one λ serves both motions, as on the map.
+    Fields of λ are drawn cell by cell.
 
     Args:
         vegetation: where it grows on D maps, bool, shape [D, 9, 9].
@@ -161,7 +179,10 @@ def pose(
     each = torch.arange(len(vegetation)).repeat_interleave(len(settings))
     trials, mixture = len(each), mixture.select(each)
     names = range(len(vegetation)) if names is None else names
-    fields = CellFields(mixture.means, tuple(names[place] for place in each.tolist()))
+    atoms = mixture.means
+    if setup.risk_map == "histogram":
+        atoms = atoms_by_cell(vegetation, VEGETATION.histogram_atoms(), DIRT.histogram_atoms())[each]
+    fields = CellFields(atoms, tuple(names[place] for place in each.tolist()))
     flat = torch.zeros(trials, *GRID.shape)
     rules = Rules(
         free_space=FreeSpace(by="mean", above=0.0),

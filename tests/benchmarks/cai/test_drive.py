@@ -1,16 +1,20 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.cai.drive import drive, has_arrived, move, traction_at
-from benchmarks.cai.task import STEPS, Setup, pose
+from benchmarks.cai.drive import ManyTrialsMPPI, advance_pair, drive, has_arrived, move, traction_at
+from benchmarks.cai.task import ROVER, STEPS, Setup, choose_objective, planner_config, pose
 from benchmarks.cai.world import GRID, draw_vegetation
 from benchnav.core import rng
+from benchnav.planning.free_space import PENALTY
+from benchnav.planning.planners.mppi import MPPIConfig, advance_chunk
 from benchnav.planning.planners.planner import Plan, Planner
-from benchnav.planning.problem import Problem
+from benchnav.planning.problem import Problem, ground_map
+from benchnav.planning.robots import component_wise
 from benchnav.planning.sensing.sensor import Step
 
 DT_S = 0.1
@@ -106,3 +110,75 @@ def test_traction_is_read_by_row_and_column_and_is_nothing_off_the_map() -> None
 def test_arrival_is_within_half_a_metre() -> None:
     state = torch.tensor([[8.5, 8.01, 0.0], [8.5, 7.99, 0.0], [8.1, 8.1, 0.0]])
     assert has_arrived(state).tolist() == [True, False, False]
+
+
+def test_rollouts_on_pairs_move_as_the_world_does() -> None:
+    fields = torch.rand((3, 2, *GRID.shape), generator=torch.Generator().manual_seed(0)) + 0.02
+    padded = ground_map(GRID, fields, torch.ones_like(fields, dtype=torch.bool)).flatten(1)
+    draws = torch.randn((2, 12, 5), generator=torch.Generator().manual_seed(1))
+    noise = torch.stack((draws[0].abs(), draws[1]), dim=1)
+    start = torch.tensor([0.5, 0.5, math.pi / 4]).expand(3, 5, 3)
+    task = problem().task
+    states, _ = advance_pair(
+        start, torch.zeros(3, 5), torch.zeros(3, 12, 2), noise, *problem().action_bounds, padded,
+        torch.tensor([[[8.5, 8.5]]]).expand(3, 1, 2), GRID, task.robot, task.objective, 1e-6,
+    )  # fmt: skip
+    for sample in range(5):
+        state = start[:, sample]
+        for action in noise[:, :, sample]:
+            state = move(state, action.clamp(-math.pi, math.pi).expand(3, 2), fields, DT_S)
+        torch.testing.assert_close(states[:, sample], state, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("power", [1, 2])
+def test_a_pair_of_equal_fields_costs_what_one_field_does(power: int) -> None:
+    setup = Setup(distance_power=power)
+    posed = pose(draw_vegetation(0, np.arange(2), 0.4), ["mean"], setup)
+    turns = torch.randn(90, 4, generator=torch.Generator().manual_seed(0)) / 10
+    noise = torch.stack((torch.full((90, 4), 3.0), turns), dim=1)
+    noise[:, 0, 2:] /= 10  # these never arrive
+    start = component_wise(posed.start[:, None].expand(2, 4, 3))
+    given = torch.zeros(2, 4), torch.zeros(2, 90, 2), noise, *posed.action_bounds
+    parts = posed.goal_m[:, None].contiguous(), GRID, ROVER, posed.objective, setup.min_traversability
+    states, cost = advance_chunk(start, *given, posed.padded_ground, *parts)
+    states_of_pair, cost_of_pair = advance_pair(start, *given, posed.padded_ground.repeat(1, 2), *parts)
+    assert has_arrived(states.flatten(0, 1)).any()
+    torch.testing.assert_close(states_of_pair, states, atol=1e-4, rtol=0)
+    torch.testing.assert_close(cost_of_pair, cost, rtol=1e-5, atol=0)
+
+
+def planned_ground(setup: Setup, setting: str = "cost") -> Tensor:
+    config = planner_config(setting, setup)
+    planner = ManyTrialsMPPI(config, setup)
+    posed = pose(draw_vegetation(0, np.arange(2), 0.4), [setting], setup)
+    return planner._ground(planner.init(posed, rng.generator(0)), posed.start)
+
+
+def test_each_rollout_on_two_fields_has_two_independent_ones() -> None:
+    setup = Setup(mppi=MPPIConfig(samples=4, horizon_s=0.2), fields=400, motions="two")
+    inside = torch.nn.functional.pad(torch.ones(GRID.shape, dtype=torch.bool), (1, 1, 1, 1)).flatten()
+    linear, angular = planned_ground(setup).chunk(2, dim=1)
+    assert len(linear) == 2 * 400
+    correlation = torch.corrcoef(torch.stack((linear[:, inside], angular[:, inside]))[:, :400, 10])[0, 1]
+    assert abs(float(correlation)) < 0.2
+    assert planned_ground(replace(setup, motions="one")).shape[1] == linear.shape[1]
+
+
+@pytest.mark.parametrize("motions", ["one", "two"])
+@pytest.mark.parametrize("setting", ["mean", "cost"])
+def test_a_rollout_off_the_map_pays_the_penalty_or_is_still(setting: str, motions: str) -> None:
+    setup = Setup(
+        mppi=MPPIConfig(samples=4, horizon_s=0.2), min_traversability=1e-6, motions=motions, fields=26
+    )
+    off = torch.tensor([[[-0.5, 4.0, 0.0]]])
+    for off_map, penalty in (("penalty", PENALTY), ("still", 0.0)):
+        ground = planned_ground(replace(setup, off_map=off_map), setting)[:1]
+        is_paired = len(ground[0]) == 2 * 121
+        assert is_paired == (setting == "cost" and motions == "two")
+        pair = ground if is_paired else torch.cat((ground, ground), dim=1)
+        states, cost = advance_pair(
+            off, torch.zeros(1, 1), torch.full((1, 2, 2), 3.0), torch.zeros(2, 2, 1), *problem().action_bounds, pair,
+            torch.tensor([[[8.5, 8.5]]]), GRID, ROVER, choose_objective(setup), setup.min_traversability,
+        )  # fmt: skip
+        torch.testing.assert_close(states, off, atol=1e-5, rtol=0)
+        assert float(cost) == pytest.approx(2 * (0.1 + math.hypot(9, 4.5) + penalty), rel=1e-4)

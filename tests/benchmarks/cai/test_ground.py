@@ -84,3 +84,30 @@ def test_histogram_is_that_of_many_draws(ground: Ground, share: float) -> None:
 def test_histogram_rounds_up() -> None:
     assert VEGETATION.histogram_cvar(1.0) == 0.52
     assert VEGETATION.slices().mean() < 0.51
+
+
+def sampled_as_they_do(ground: Ground, draws: np.ndarray) -> list[int]:
+    """Values in hundredths, one draw after the other."""
+    edges = np.linspace(0, 1, 21)
+    percents = [int(100 * mass + 1e-9) for mass in np.diff([truncated_cdf(ground, edge) for edge in edges])]
+    bins = [(0, 0), *zip(range(20), percents, strict=True), (20, 100 - sum(percents))]
+    sampled = []
+    for draw in draws:
+        total = 0
+        for index, (place, percent) in enumerate(bins):
+            total += percent
+            if round(100 * draw) <= total:
+                sampled.append(
+                    0 if index == 0 else 100 if place == 20 else int(100 * (place + 0.5) / 20 + 1e-9)
+                )
+                break
+    return sampled
+
+
+@BOTH
+def test_atoms_of_sampled_fields_are_those_of_their_sampler(ground: Ground) -> None:
+    draws = (np.arange(10_000) + 0.5) / 10_000  # 50 draws an atom
+    sampled = np.bincount(sampled_as_they_do(ground, draws), minlength=101)
+    atoms = np.bincount(np.round(100 * ground.histogram_atoms()).astype(int), minlength=101)
+    np.testing.assert_allclose(sampled / 10_000, atoms / 200, atol=1e-9)
+    assert atoms.sum() == 200

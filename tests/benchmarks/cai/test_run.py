@@ -110,3 +110,6 @@ def test_risk_on_the_cost_has_a_planner_of_its_own_and_leaves_the_other_rows(row
     assert times(alone) == times(found, setting="cost-cvar:0.6", density=0.4)
     fewer = trials(DENSITIES, ["cost"], setup=replace(QUICK, fields=1))
     assert times(fewer) != times(found, setting="cost")
+    for change in ({"motions": "two"}, {"risk_map": "histogram"}):
+        changed = trials(DENSITIES, ["cost"], setup=replace(setup, **change))
+        assert times(changed) != times(found, setting="cost"), change

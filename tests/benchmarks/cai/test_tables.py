@@ -6,6 +6,7 @@ from scipy.stats import binom, fisher_exact
 from benchmarks.cai.published import PUBLISHED, PUBLISHED_PAIRS, TRIALS
 from benchmarks.cai.tables import (
     mcnemar_p,
+    show_difference,
     show_p,
     show_share,
     tabulate_pairs,
@@ -42,6 +43,10 @@ def test_published_intervals_are_those_of_the_source() -> None:
     assert show_share(40, TRIALS) == "20.0 [15, 26]"
 
 
+def test_interval_of_a_difference_is_that_of_its_source() -> None:
+    assert show_difference(56, 70, 48, 80) == "+20.0 [5.2, 33.4]"  # Newcombe's first example, table II
+
+
 @pytest.mark.parametrize(("gained", "lost"), [(60, 6), (3, 0), (5, 5)])
 def test_mcnemar_is_the_binomial_tail(gained: int, lost: int) -> None:
     tail = 2 * binom.cdf(min(gained, lost), gained + lost, 0.5)
@@ -53,7 +58,7 @@ def test_success_stands_beside_the_published() -> None:
     table = tabulate_success(rows(0.4, mean=[True, False, True, False], cvar_7=[True, True, True, False]))
     header, _, mean, cvar = table.splitlines()
     assert mean.startswith("| 40 % | `mean` | 50.0 [15, 85] | 10.0 | 69.0 [62, 75] | 9.1 | ")
-    assert cvar == "| 40 % | `cvar:0.7` | 75.0 [30, 95] | 10.0 | – | – | – |"
+    assert cvar == "| 40 % | `cvar:0.7` | 75.0 [30, 95] | 10.0 | – | – | – | – |"
     assert header.count("|") == mean.count("|") == cvar.count("|")
 
 

@@ -97,6 +97,15 @@ def test_histograms_give_their_risk_maps() -> None:
     np.testing.assert_allclose(problem.risk_map, expected)
 
 
+def test_histograms_give_their_fields() -> None:
+    fields = pose(VEGETATED, ["cost", "mean"], Setup(risk_map="histogram")).sample_fields(2000, 0)
+    assert fields.shape == (4, 2000, 9, 9)
+    expected = np.where(VEGETATED, VEGETATION.histogram_atoms().mean(), DIRT.histogram_atoms().mean())
+    np.testing.assert_allclose(fields[::2].mean(1), expected, atol=0.04)
+    np.testing.assert_allclose(fields[1::2].mean(1), expected, atol=0.04)
+    np.testing.assert_array_equal(np.unique((100 * fields[0]).round() % 5), [0, 2])
+
+
 def test_shares_of_the_tail() -> None:
     assert [tail_share(setting) for setting in ("mean", "cvar:0.4", "cvar:0.8")] == [1.0, 0.6, 0.2]
     with pytest.raises(ConfigError, match="Expected `mean`, `cvar:LEVEL`, `cost` or `cost-cvar:LEVEL`"):
@@ -108,6 +117,11 @@ def test_objectives_of_ours_are_found_by_name() -> None:
     state = torch.tensor([[[0.5, 0.5, 0.0]]] * 2)
     cost = problem.objective.stage(state, torch.zeros(2, 1, 2), torch.ones(2, 1), problem.goal_m[:, None])
     assert cost[0].item() == pytest.approx(math.hypot(8, 8))
+
+
+def test_two_fields_have_only_their_objective() -> None:
+    with pytest.raises(ConfigError, match="Expected `objective` 'theirs' with `motions` 'two'"):
+        Setup(motions="two", objective="travel_time")
 
 
 def test_their_alpha_is_the_share_of_the_worst_costs() -> None:
