@@ -77,8 +77,8 @@ class Recipe:
         vegetation_period_m: lattice spacing of the noise that vegetation grows by: a patch is about half as wide;
             0 where no class has vegetation. Synthesis 2 only.
         closed_corners: whether a diagonal step between two cells that are not free is no way, for solvable maps and
-            reference times. False in the shipped recipes and in files of versions before 1.2; a recipe with an id of
-            its own has it true, unless it says otherwise.
+            reference times. False in the shipped recipes and in files of versions before 1.2; in a recipe of synthesis
+            2 with an id of its own true, unless it says otherwise. Synthesis 2 only.
         environments: number of environments; each shows its own choice of classes.
         occupancy: share of the cells that each class of an environment covers, summing to 1.
         class_periods_m: lattice spacings of the class noise, one an octave.
@@ -126,6 +126,7 @@ class Recipe:
                 "vegetation": self.has_vegetation,
                 "places": self.places,
                 "correlation_m": self.correlation_m,
+                "closed_corners": self.closed_corners,
             }
             for name, value in asked.items():
                 expect(
@@ -226,7 +227,7 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
         name, equals, value = text.partition("=")
         expect(equals and all(name.split(".")), f"an override such as splits.train.maps=50, got {text!r}.")
         own = changed(own, name.split("."), load_yaml(value))
-    if isinstance(own, dict) and own.get("id") not in shipped:
+    if isinstance(own, dict) and own.get("synthesis") == 2 and own.get("id") not in shipped:
         own = {"closed_corners": True, **own}
     recipe = recipe_from_dict(own, str(source))
     expect(

@@ -115,7 +115,7 @@ class MPPIConfig:
         fits = self.noise is None or (self.noise and all(0 < scale < math.inf for scale in self.noise))
         expect(fits, f"`noise` > 0 for each action of MPPI, got {self.noise}.")
         for name in ("noise", "temperature"):
-            fraction, default = getattr(self, f"{name}_share"), getattr(MPPIConfig, f"{name}_share")
+            fraction, default = getattr(self, f"{name}_share"), getattr(type(self), f"{name}_share")
             expect(
                 getattr(self, name) is None or fraction == default,
                 f"`{name}` or `{name}_share` for MPPI, got both, {getattr(self, name)} and {fraction}. Leave one out.",

@@ -24,36 +24,36 @@ def test_shipped_recipes_load_and_survive_their_manifest() -> None:
 
 def test_maps_of_a_new_id_close_corners_and_those_of_ids_before_do_not(tmp_path: Path) -> None:
     assert not any(load_recipe(name).closed_corners for name in shipped_recipes())
+    stakes = yaml.safe_load((Path(load_recipe.__globals__["RECIPES"]) / "stakes-v1.yaml").read_text())
     path = tmp_path / "own.yaml"
-    path.write_text(yaml.safe_dump(TINY | {"id": "own"}))
+    path.write_text(yaml.safe_dump(stakes | {"id": "own"}))
     recipe = load_recipe(path)
     assert recipe.closed_corners
-    assert load_recipe("tiny-v1", ["id=other"]).closed_corners
-    assert not load_recipe("tiny-v1", ["id=other", "closed_corners=false"]).closed_corners
+    assert load_recipe("stakes-v1", ["id=other"]).closed_corners
+    assert not load_recipe("stakes-v1", ["id=other", "closed_corners=false"]).closed_corners
     # A manifest holds what was used; without the key its maps are of a version that knew no such rule.
     assert recipe_from_dict(recipe.to_dict(), "manifest") == recipe
-    assert not recipe_from_dict(TINY | {"id": "own"}, "manifest").closed_corners
+    assert not recipe_from_dict(stakes | {"id": "own"}, "manifest").closed_corners
+    # Maps as version 0.1 made them know none either.
+    assert not load_recipe("tiny-v1", ["id=other"]).closed_corners
+    with pytest.raises(ConfigError, match="closed_corners"):
+        load_recipe("tiny-v1", ["id=other", "closed_corners=true"])
 
 
 @pytest.mark.parametrize("closed_corners", [False, True])
 def test_a_goal_behind_cells_that_touch_at_corners_has_a_reference_time_only_by_the_former_rule(
     closed_corners: bool,
 ) -> None:
-    recipe = recipe_from_dict(TINY | {"closed_corners": closed_corners}, "test")
-    flat = np.zeros((1, 1, len(recipe.classes)))
-    expected = latent.expected_of(
-        latent.truth(np.arange(len(recipe.classes))[None, None], flat, recipe.classes)
-    )
+    recipe = replace(load_recipe("stakes-v1"), closed_corners=closed_corners)
+    shape = 1, 1, len(recipe.classes)
+    order = np.arange(len(recipe.classes)).reshape(shape)
+    expected = latent.expected_of(latent.truth(order, np.zeros(shape), recipe.classes))
     size = np.arange(recipe.height)
     class_id = np.full((1, recipe.height, recipe.width), int(expected.argmax()))
     class_id[0, size, recipe.width - 1 - size] = int(expected.argmin())
     recipe = replace(recipe, stuck_threshold=float(expected.mean()))
-    ends = (
-        np.array([[end, end]]) for end in (0.25 * recipe.grid.extent_m[0], 0.75 * recipe.grid.extent_m[0])
-    )
-    maps = {"class_id": class_id, "slope_deg": np.zeros(class_id.shape)} | dict(
-        zip(("start_m", "goal_m"), ends, strict=True)
-    )
+    near, far = (np.array([[share * recipe.grid.extent_m[0]] * 2]) for share in (0.25, 0.75))
+    maps = {"class_id": class_id, "slope_deg": np.zeros(class_id.shape), "start_m": near, "goal_m": far}
     assert np.isinf(reference_time_s(recipe, maps)[0]) == closed_corners
 
 
