@@ -15,7 +15,7 @@ import pandas as pd
 from jsonargparse import ArgumentParser
 
 from benchmarks.cai.run import SETTINGS, run_trials
-from benchmarks.cai.tables import PAIRS, tabulate_pairs, tabulate_success
+from benchmarks.cai.tables import tabulate
 from benchmarks.cai.task import Setup, planner_config
 from benchnav.core.errors import ConfigError
 from benchnav.core.progress import show_progress
@@ -63,10 +63,7 @@ def main() -> int:
     if given.out:
         with replacing(given.out) as partial:
             trials.to_csv(partial, index=False)
-    print(tabulate_success(trials))
-    for pair in PAIRS:
-        if {*pair} <= set(given.risk):
-            print(f"\n{tabulate_pairs(trials, *pair)}")
+    print(tabulate(trials))
     return 0
 
 

@@ -1,5 +1,6 @@
 """Tables of the trials beside the published ones, as Markdown.
 
+    python -m benchmarks.cai.tables a.csv b.csv                         # of the trials of all files
     python -m benchmarks.cai.tables published=a.csv distance²=b.csv     # runs side by side, each beside the first
 
 Intervals are Wilson's, 95 %, over trials. Two settings, or two runs, on the same trials are compared by the exact
@@ -21,6 +22,17 @@ from benchnav.eval.stats.summary import wilson_interval
 # What is compared on the same trials; of the first the log of theirs is counted too.
 PAIRS = (("cvar:0.8", "mean"), ("cost-cvar:0.6", "cost"), ("cost-cvar:0.6", "cvar:0.6"))
 _NONE = "–"
+
+
+def tabulate(rows: pd.DataFrame) -> str:
+    """Return the table of success, and those of the pairs of settings that were run.
+
+    Args:
+        rows: trials, from `run_trials`.
+    """
+    settings = set(rows["setting"])
+    pairs = [tabulate_pairs(rows, *pair) for pair in PAIRS if {*pair} <= settings]
+    return "\n\n".join([tabulate_success(rows), *pairs])
 
 
 def tabulate_success(rows: pd.DataFrame) -> str:
@@ -160,9 +172,14 @@ def markdown(header: list[str], lines: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in [header, ["---"] * len(header), *lines])
 
 
+def main(words: list[str]) -> None:
+    """Print the table of files, or of runs if words are `NAME=FILE`."""
+    if not all("=" in word for word in words):
+        print(tabulate(pd.concat(map(pd.read_csv, words), ignore_index=True)))
+        return
+    named = (word.split("=", 1) for word in words)
+    print(tabulate_runs({name: pd.read_csv(path) for name, path in named}))
+
+
 if __name__ == "__main__":
-    print(
-        tabulate_runs(
-            {name: pd.read_csv(path) for name, path in (word.split("=", 1) for word in sys.argv[1:])}
-        )
-    )
+    main(sys.argv[1:])

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -5,6 +7,7 @@ from scipy.stats import binom, fisher_exact
 
 from benchmarks.cai.published import PUBLISHED, PUBLISHED_PAIRS, TRIALS
 from benchmarks.cai.tables import (
+    main,
     mcnemar_p,
     show_difference,
     show_p,
@@ -85,6 +88,17 @@ def test_pairs_are_those_of_one_trial() -> None:
     head, _, line = tabulate_pairs(shuffled, "mean", "cvar:0.8").splitlines()
     assert head == "| vegetation | points | `mean` alone, `cvar:0.8` alone | p |"
     assert line == "| 100 % | -25.0 | 1, 2 | 1.00 |"
+
+
+def test_files_are_tabulated_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = []
+    for name, outcomes in (("mean", [True, False]), ("cvar_8", [True, True])):
+        files.append(str(tmp_path / f"{name}.csv"))
+        rows(1.0, **{name: outcomes}).to_csv(files[-1], index=False)
+    main(files)
+    success, pairs = capsys.readouterr().out.split("\n\n")
+    assert len(success.splitlines()) == 4
+    assert "| 100 % | +50.0 | 1, 0 | 1.00 |" in pairs
 
 
 def test_no_arrival_has_no_time() -> None:
