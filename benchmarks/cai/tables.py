@@ -81,7 +81,10 @@ def tabulate_pairs(rows: pd.DataFrame, one: str, other: str) -> str:
     ours, lines = ["points", f"`{one}` alone, `{other}` alone", "p"], []
     counted = PUBLISHED_PAIRS if (one, other) == PAIRS[0] else {}
     for density, group in rows.groupby("density", sort=False):
-        trials = group.pivot(index=["map", "realisation"], columns="setting", values="success").astype(bool)
+        won = group.pivot(index=["map", "realisation"], columns="setting", values="success")
+        trials = won.reindex(columns=[one, other]).dropna().astype(bool)
+        if trials.empty:
+            continue
         gained = int((trials[one] & ~trials[other]).sum())
         lost = int((trials[other] & ~trials[one]).sum())
         line = [f"{100 * density:.0f} %", *show_pair(gained, lost, len(trials))]

@@ -95,10 +95,16 @@ def test_files_are_tabulated_together(tmp_path: Path, capsys: pytest.CaptureFixt
     for name, outcomes in (("mean", [True, False]), ("cvar_8", [True, True])):
         files.append(str(tmp_path / f"{name}.csv"))
         rows(1.0, **{name: outcomes}).to_csv(files[-1], index=False)
+    files.append(str(tmp_path / "sparse.csv"))
+    rows(0.4, mean=[True, True], cvar_8=[True]).to_csv(files[-1], index=False)
     main(files)
     success, pairs = capsys.readouterr().out.split("\n\n")
-    assert len(success.splitlines()) == 4
-    assert "| 100 % | +50.0 | 1, 0 | 1.00 |" in pairs
+    assert len(success.splitlines()) == 2 + 4
+    # Only trials of both settings are paired.
+    assert [line.split("|")[1:4] for line in pairs.splitlines()[2:]] == [
+        [" 100 % ", " +50.0 ", " 1, 0 "],
+        [" 40 % ", " +0.0 ", " 0, 0 "],
+    ]
 
 
 def test_no_arrival_has_no_time() -> None:
