@@ -12,7 +12,7 @@ cost: `levels` drives each arm at each level on maps to develop on, `primary` ho
 levels that these leave out and `own` another time to go, both and `primary` once more with `--maps 50 --out
 runs/first50`, and `best` the optimal planners. `confirmation` tests on new maps what these studies found by looking.
 Parts are suites of docs/knowledge, docs/cost and docs/confirmation, each with a run of its own. Maps and runs lie in
-the folders `--maps_in` and `--out`, and `--maps` takes the first maps alone, to try it.
+the folders `--maps_in` and `--out`, and `--maps` takes only the first maps, to try it.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """The 8-connected graph over a map's cells, and exact shortest paths in it for a batch of maps.
 
-A diagonal step between two free cells is no way where both cells beside it are not free: these touch at the corner
+A diagonal step between two free cells is closed where both cells next to it are not free: these touch at the corner
 that the step would pass. So what is joined by steps is joined over shared edges.
 Each map has a compiled Dijkstra search to itself: one search of the whole batch takes twice as long, since its heap
 leaves the processor's cache.
@@ -95,7 +95,7 @@ def travel_time_costs(
         traversability: share of the commanded speed, shape [B, H, W].
         free: cells that may be entered, bool, shape [B, H, W].
         resolution_m: cell width in metres.
-        closed_corners: whether `squeezes` are no way, as ever since version 1.2.
+        closed_corners: whether `squeezes` are closed, as they are since version 1.2.
 
     Returns:
         Seconds, infinite at an edge with an end that is not free or that squeezes between two, shape [B, E].

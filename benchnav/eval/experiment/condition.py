@@ -39,7 +39,7 @@ NOT_USED = "–"
 ANY_RISK = Part(part="mean", label=NOT_USED)
 # What the numbers of a split's maps rest on besides the maps: `TerrainDataset.about_digest` is its digest.
 MEANING = "class table, λ_stuck, resolution or kind of truth"
-# By what input alone a setting bears on a planner where no robot learns.
+# The only input by which a setting bears on a planner where no robot learns.
 _BEARS_BY: Mapping[str, str] = {"risk": "risk_map", "belief": "fields"}
 _ORDER = ("robot", "objective", "model", *KNOWLEDGE, "risk", "planner")  # of tables
 # What a product lists, by the names that a suite has for it.

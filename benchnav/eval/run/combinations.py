@@ -63,11 +63,8 @@ def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
     for condition in conditions:
         for columns, rule in _RULES.items():
             labels = {column: condition.labels[column] for column in columns}
-            key = (
-                rule,
-                condition.risk.part,
-                *labels.values(),
-            )  # the part, as a label that is not used is that of any
+            # With the part, since all parts that are not used have one label.
+            key = rule, condition.risk.part, *labels.values()
             if key not in reasons:
                 reasons[key] = rule(condition)
             if rule is _unprepared:

@@ -2,8 +2,8 @@
 
 From a planner with a model's prediction to the optimal planner with the same prediction, with that of ideal eyes
 (`ideal`), with the true distribution (`oracle`), and to the near-optimal reference, which is given λ itself. What that
-drives is feasible, so regret against it is at most that against the least time; beside it stands the lower bound of the
-time, which no trajectory undercuts. Each step is a paired difference of its
+drives is feasible, so regret against it is at most that against the least time; the lower bound of the time, which no
+trajectory undercuts, is given with it. Each step is a paired difference of its
 own. They add up to the whole by construction, which does not make them causes: a step may be negative, and another
 order of steps would give others.
 """

@@ -44,7 +44,7 @@ from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.cost_risk import advance_entrapped, framed_fields, tail_cost, within_reach
 from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank, perturb
 from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
-from benchnav.planning.planners.turns import TURN_HORIZONS, is_steered, turning_primitives
+from benchnav.planning.planners.turns import TURN_HORIZONS, choose, is_steered
 from benchnav.planning.problem import (
     Problem,
     Task,
@@ -304,13 +304,10 @@ class MPPI(LocalPlanner[MPPIState]):
     ) -> Tensor:
         """Mean action sequences or, where these are no better than standing, turns, shape [B, T, A].
 
-        A turn replaces the mean and is no sample: the average of a turn to the left and one to the right is neither.
-        Where none pays within T they are compared over a longer time, since what is gained by a turn comes after it.
+        See `turns.choose`.
         """
         problem, mean = plan_state.problem, plan_state.mean
-        horizon = TURN_HORIZONS * mean.shape[1]
-        primitives = turning_primitives(problem.robot, horizon, mean)
-        if primitives is None:
+        if not is_steered(problem.robot):
             return mean
 
         def cost_of(base: Tensor, offset: Tensor) -> Tensor:
@@ -322,17 +319,7 @@ class MPPI(LocalPlanner[MPPIState]):
             parts = problem.grid, problem.objective, self._fields, self.config.level, going, plan_state.to_go
             return total_cost(states, cost, ground, target, *parts)[0]
 
-        rest = torch.zeros_like(primitives[..., :1])
-        choices = torch.cat((rest, primitives), dim=2)
-        short = slice(mean.shape[1])
-        goes_on = torch.cat((mean, mean[:, -1:].expand(-1, horizon - mean.shape[1], -1)), dim=1)
-        mean_cost, turn_cost = cost_of(mean, rest[short]), cost_of(0 * mean, choices[short])
-        standing = turn_cost[:, :1]
-        pays = turn_cost.amin(dim=1, keepdim=True) < standing
-        longer = torch.cat((cost_of(goes_on, rest), cost_of(0 * goes_on, choices)), dim=1)
-        best = torch.where(pays, torch.cat((mean_cost, turn_cost), dim=1), longer).argmin(dim=1)
-        turn = primitives[short].movedim(2, 0)[(best - 2).clamp(min=0)]
-        return torch.where(((mean_cost >= standing)[:, 0] & (best > 1))[:, None, None], turn, mean)
+        return choose(cost_of, mean, problem.robot)
 
     def _ground(self, plan_state: MPPIState, state: Tensor) -> Tensor:
         """What rollouts from these states are on in this step, shape [B·M, N]."""

@@ -1,4 +1,4 @@
-"""A lower bound of the time to the goal, for every planner there is, where λ stays what it is during an episode.
+"""A lower bound of the time to the goal, for all planners, where λ stays what it is during an episode.
 
 **Claim.** Let robots move as the shipped ones do: a time step leads from p to a point at most v·dt·λ(p) away, where v
 is the top speed. Let λ⁺(x) be the greatest λ(p) of the points p from which a step can lead to x or past it, |x − p| ≤
@@ -15,8 +15,8 @@ trajectory that arrives is a polygonal line. Take a point x of it in immobilisin
 that stays there. The piece comes in by a part of one step, at most v·dt long, or begins at the start; it has at most m
 steps of v·dt·`below` from inside; and it ends where it leaves such ground or reaches the goal's disc. So it is at most
 v·dt·(1 + m·`below`) long, and x is at most half of that away from other ground, the disc or the start. Deeper points
-are removed: no arriving trajectory has any. W need not be continuous across them, and where they part start and goal
-nobody arrives.
+are removed: no arriving trajectory has any. W need not be continuous across them, and where they separate start and
+goal no trajectory arrives.
 
 **The largest W.** Of all W the one with the greatest sum over the nodes is found by the augmented Lagrangian method,
 one Poisson equation and one projection on discs a step (Ennaji, Igbida and Nguyen, 2021, "Augmented Lagrangian methods
@@ -95,7 +95,8 @@ def lower_bound_s(field: ndarray, grid: Grid, motion: Motion, start_m: ndarray, 
     begin = tuple((start_m[::-1] / squares.resolution_m).astype(int).clip(0, np.array(squares.shape) - 1))
     kept = np.ones_like(ends)
     if motion.immobile is not None:
-        exits = (fine >= motion.immobile.below) | ends
+        # In single precision, as the world compares.
+        exits = (fine >= np.float32(motion.immobile.below)) | ends
         exits[begin] = True
         kept = _near(exits, squares, _deepest_m(motion, motion.immobile) + 2 * error_m)
     parts, _ = label(kept, generate_binary_structure(2, 2))
@@ -109,7 +110,7 @@ def lower_bound_s(field: ndarray, grid: Grid, motion: Motion, start_m: ndarray, 
 
 
 def _refined(grid: Grid, step_m: float) -> Grid:
-    """Squares about as wide as a step, so many along each side of a cell."""
+    """Squares about as wide as a step, a whole number of them along each side of a cell."""
     times = max(1, math.ceil(grid.resolution_m / step_m - 1e-6))
     times = max(1, min(times, math.isqrt(_MOST_SQUARES // (grid.height * grid.width))))
     return Grid(grid.height * times, grid.width * times, grid.resolution_m / times)
@@ -122,11 +123,11 @@ def _deepest_m(motion: Motion, immobile: Immobile) -> float:
 
 def _squares_within(squares: Grid, point_m: ndarray, radius_m: float) -> ndarray:
     """Tell which closed squares come as near to a point as a radius, bool, of the shape of the squares."""
-    beside = []
+    gaps_m = []
     for size, at_m in zip(squares.shape, point_m[::-1], strict=True):
         low_m = np.arange(size) * squares.resolution_m
-        beside.append(np.maximum(np.maximum(low_m - at_m, at_m - low_m - squares.resolution_m), 0))
-    return np.hypot(beside[0][:, None], beside[1]) <= radius_m
+        gaps_m.append(np.maximum(np.maximum(low_m - at_m, at_m - low_m - squares.resolution_m), 0))
+    return np.hypot(gaps_m[0][:, None], gaps_m[1]) <= radius_m
 
 
 def _around(squares: Grid, reach_m: float) -> list[tuple[int, int, float]]:
@@ -141,7 +142,7 @@ def _around(squares: Grid, reach_m: float) -> list[tuple[int, int, float]]:
 
 
 def _shifted(values: ndarray, row: int, column: int) -> ndarray:
-    """What is so many rows and columns on, 0 beyond the edge."""
+    """Values some rows and columns on, 0 beyond the edge."""
     height, width = values.shape
     margin = max(abs(row), abs(column))
     framed = np.pad(values, margin)

@@ -463,7 +463,7 @@ def test_the_time_of_a_planner_alone_is_measured_by_what_it_knows(finished: tupl
 def test_rows_of_a_planner_that_is_given_the_ground_have_a_lower_bound_and_others_none(
     dataset_path: Path, tmp_path: Path
 ) -> None:
-    world = {"noise": "stored", "time_budget_s": 60.0, "immobile": {"below": 0.6, "for_s": 0.5}}
+    world = {"noise": "stored", "time_budget_s": 60.0, "immobile": {"below": 0.75, "for_s": 0.3}}
     suite = Suite(
         data=str(dataset_path), models=("clairvoyant",), planners=("near_optimal", SEARCHES), risks=("mean",),
         scenarios=("std",), maps=2, record="none", world=(world,), task=({"min_traversability": 0.05},),
@@ -479,7 +479,7 @@ def test_rows_of_a_planner_that_is_given_the_ground_have_a_lower_bound_and_other
     assert (arrived["lower_bound_s"] > 0.7 * arrived["total_time_s"]).all()
     dataset = TerrainDataset(dataset_path)
     places = dataset.read("test/std", fields=["start_m", "goal_m", "traversability"])
-    motion = Motion(robot=Unicycle(), goal_radius_m=1.0, immobile=Immobile(below=0.6, for_s=0.5))
+    motion = Motion(robot=Unicycle(), goal_radius_m=1.0, immobile=Immobile(below=0.75, for_s=0.3))
     for row in known.to_dict("records"):
         field, start_m, goal_m = (
             places[name][row["map"]] for name in ("traversability", "start_m", "goal_m")

@@ -11,7 +11,7 @@ from benchnav.planning.planners import mppi
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
 from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank
 from benchnav.planning.planners.straight import Straight
-from benchnav.planning.planners.turns import turning_primitives
+from benchnav.planning.planners.turns import is_steered, turning_primitives
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import Outcome
@@ -478,12 +478,13 @@ def test_a_bicycle_with_the_goal_behind_it_arrives(objective: str, least_mps: fl
 
 def test_turns_are_full_steering_for_some_of_the_time_and_then_straight() -> None:
     like = torch.zeros(1)
-    assert turning_primitives(Unicycle(), 32, like) is None
-    assert turning_primitives(DifferentialDrive(), 32, like) is None
+    assert [is_steered(robot) for robot in (Bicycle(), Unicycle(), DifferentialDrive())] == [
+        True,
+        False,
+        False,
+    ]
     forward = turning_primitives(Bicycle(speed_mps=(0.2, 0.8)), 32, like)
     both = turning_primitives(Bicycle(speed_mps=(-0.5, 0.8)), 32, like)
-    assert forward is not None
-    assert both is not None
     assert forward.shape == (32, 2, 34)
     assert both.shape == (32, 2, 102)
     assert torch.equal(both[..., :34], forward)

@@ -123,7 +123,7 @@ def wall(thickness: int, traversability: float) -> ndarray:
         (np.random.default_rng(2).choice([0.3, 0.45, 0.9], GRID.shape), Immobile(below=0.5, for_s=1.2)),
     ],
 )  # fmt: skip
-def test_no_jumping_robot_arrives_earlier_or_where_nobody_can(
+def test_no_jumping_robot_arrives_earlier_or_where_it_is_infinite(
     field: ndarray, immobile: Immobile | None
 ) -> None:
     field = field.copy()
@@ -143,6 +143,14 @@ def test_a_wall_thicker_than_a_robot_can_cross_ends_all(thickness: int) -> None:
     inside = bound(wall(4, 0.09), Immobile(below=0.1, for_s=2.0), goal_m=np.array([4.1, 3.25]))
     assert math.isfinite(inside)
     assert math.isfinite(bound(wall(4, 0.09), Immobile(below=0.1, for_s=2.0), start_m=np.array([5.4, 3.25])))
+
+
+@pytest.mark.parametrize("traversability", [0.1, 0.3, 0.7])
+def test_ground_of_just_the_limit_immobilises_no_robot(traversability: float) -> None:
+    """In single precision, in which 0.7 is less than 0.7, as in `Simulation`."""
+    field = np.full(GRID.shape, traversability, np.float32)
+    assert math.isfinite(bound(field, Immobile(below=traversability, for_s=0.1)))
+    assert math.isinf(bound(field * np.float32(0.99), Immobile(below=traversability, for_s=0.1)))
 
 
 def test_removed_squares_lie_deeper_than_a_robot_gets_and_reach_is_the_greatest_within_a_step() -> None:

@@ -66,7 +66,9 @@ def regret_figure(table: pd.DataFrame) -> Figure:
         Patch(color=_ENDS, label="of the first, of the near-optimal reference"),
     ]
     if table["time_bound"].notna().any():
-        handles.append(Line2D([], [], color=_BOUND, ls="--", lw=1.1, label="lower bound: nobody is better"))
+        handles.append(
+            Line2D([], [], color=_BOUND, ls="--", lw=1.1, label="lower bound: no planner is better")
+        )
     legend_outside(figure, handles, len(handles))
     return figure
 

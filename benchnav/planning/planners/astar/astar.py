@@ -71,7 +71,7 @@ def revised_edge_costs(problem: Problem, before: Tensor, changed: Tensor) -> Ten
         changed: cells whose λ̂, free ground or elevation has changed, one at least, bool, shape [B, H, W].
     """
     source, target, cells = gridgraph.neighbour_pairs(*problem.grid.shape)
-    # A diagonal step also depends on the two cells beside it, which touch its source.
+    # A diagonal step also depends on the two cells next to it, which touch its source.
     near = torch.nn.functional.max_pool2d(changed.float(), 3, stride=1, padding=1) > 0
     member, edge = _of_cells(near.flatten(1), source).nonzero(as_tuple=True)
     of_map, edges = member * near[0].numel(), edge.cpu().numpy()
@@ -128,7 +128,7 @@ def _of_cells(values: Tensor, cells: np.ndarray) -> Tensor:
 
 
 def _of_flat_cells(values: Tensor, of_map: Tensor, cells: Tensor) -> Tensor:
-    """Values [B·H·W] of cells of some maps, of which the first cells are given, shape [N]."""
+    """Values [B·H·W] of cells, shape [N], by the first cell of the map of each and its place in the map."""
     return values[of_map + cells]
 
 
@@ -199,8 +199,8 @@ def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
         there = metre[up, right]
         # Cells that touch at a corner and are not free leave no way between them, see `edge_costs`; where they are
         # the cell itself and its neighbour across an edge, one of the ends is not free.
-        beside = torch.minimum(metre[up, 0.5], metre[0.5, right]) >= PENALTY
-        squeezed = beside & (torch.maximum(own, there) < PENALTY)
+        closed = torch.minimum(metre[up, 0.5], metre[0.5, right]) >= PENALTY
+        squeezed = closed & (torch.maximum(own, there) < PENALTY)
         length = torch.sqrt((x_m - centre_x) ** 2 + (y_m - centre_y) ** 2)
         line = length * (0.5 * (own + there) + PENALTY * squeezed)
         best = torch.minimum(best, grid.lookup(to_go, centre_x, centre_y) + line)

@@ -46,7 +46,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core import rng
-from benchnav.core.batch import Batch, map_tensors
+from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import TravelTime, distance
@@ -318,9 +318,13 @@ class CLRRT(Planner[CLRRTState]):
         crosses = (failures >= self.config.most_failures) & (route.depth > 0)
         failures = torch.where(found | crosses, 0, failures + 1)
         compared = now.doubted[due] & ~lost
-        new_route = now.route.put(due, route)
-        cheaper = self._cost_ahead(now, new_route, state) < self._cost_ahead(now, now.route, state)
-        taken = (lost | (found & (cheaper[due] | ~compared))).nonzero()[:, 0]
+        better = ~compared
+        if bool((compared & found).any()):
+            costs = [
+                self._cost_ahead(now, each, state)[due] for each in (now.route.put(due, route), now.route)
+            ]
+            better = better | (costs[0] < costs[1])
+        taken = (lost | (found & better)).nonzero()[:, 0]
         members = due[taken]
         # A path that nothing better is found for is kept as it is.
         kept = compared & (failures >= self.config.most_failures)
@@ -329,7 +333,7 @@ class CLRRT(Planner[CLRRTState]):
             now,
             ground=now.ground.index_copy(0, due, now.problem.padded_ground[due]),
             doubted=now.doubted.index_copy(0, due, compared & ~found & ~kept),
-            route=map_tensors(now.route, lambda old, new: old.index_copy(0, members, new[taken]), route),
+            route=now.route.put(members, route.select(taken)),
             edge=now.edge.index_fill(0, members, 0),
             progress_m=now.progress_m.index_fill(0, members, 0),
             failures=now.failures.index_copy(0, due, failures),
