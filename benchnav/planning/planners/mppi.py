@@ -44,7 +44,7 @@ from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.cost_risk import advance_entrapped, framed_fields, tail_cost, within_reach
 from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank, perturb
 from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
-from benchnav.planning.planners.turns import TURN_HORIZONS, choose, is_steered
+from benchnav.planning.planners.turns import choose, is_steered
 from benchnav.planning.problem import (
     Problem,
     Task,
@@ -147,6 +147,7 @@ class MPPIState(Batch):
         problem: what is being solved.
         mean: mean action sequence, shape [B, T, A].
         held: steps in a row, up to now, on immobilising ground, shape [B].
+        follows: a robot that is steered by an angle follows a Dubins path, see `turns.choose`, bool, shape [B].
         ground: fields of λ that were drawn once, as of `framed_fields`, shape [B, M, N]; None where there are none.
         to_go: of the cheapest paths, as of `astar.framed`, shape [B, 2, N]; None where J tells the last cost.
         noise: of all steps, the same for each episode.
@@ -157,6 +158,7 @@ class MPPIState(Batch):
     problem: Problem
     mean: Tensor
     held: Tensor
+    follows: Tensor
     ground: Tensor | None
     to_go: Tensor | None
     noise: NoiseBank
@@ -245,7 +247,7 @@ class MPPI(LocalPlanner[MPPIState]):
         bank = draw_bank(seed, horizon, config.samples, scale)
         key = rng.stream_key(seed, "fields")
         held, ground = problem.start.new_zeros(len(problem)), self._drawn_once(problem, key)
-        return MPPIState(problem, mean, held, ground, self._to_go(problem), bank, key, 0)
+        return MPPIState(problem, mean, held, held.bool(), ground, self._to_go(problem), bank, key, 0)
 
     def revise(self, plan_state: MPPIState, problem: Problem) -> MPPIState:
         """Keeps the mean; see `Planner`."""
@@ -279,7 +281,7 @@ class MPPI(LocalPlanner[MPPIState]):
         problem, config = plan_state.problem, self.config
         noise, ground = plan_state.noise.at(plan_state.step), self._ground(plan_state, step.state)
         held = self._held(plan_state, step)
-        mean = self._turned(step, plan_state, target_m, ground, held)
+        mean, follows = self._turned(step, plan_state, target_m, ground, held)
         advance = self._advance if held is None else self._advance_entrapped
         states, cost, going = roll_out(
             problem, step.state, mean, noise, target_m, advance, ground, held, step.time_s
@@ -293,22 +295,21 @@ class MPPI(LocalPlanner[MPPIState]):
             config.temperature, config.temperature_share, self._fields, config.level, going,
             plan_state.to_go,
         )  # fmt: skip
+        if is_steered(problem.robot):
+            updated = torch.where(follows[:, None, None], mean, updated)
         shifted = torch.cat((updated[:, 1:], updated[:, -1:]), dim=1)
         layers = _drawn(problem, step.state, updated, mean, noise, weights) if step.draw else {}
         plan = Plan.empty(len(problem), step.state.device, **layers)
-        after = replace(plan_state, mean=shifted, step=plan_state.step + 1)
+        after = replace(plan_state, mean=shifted, follows=follows, step=plan_state.step + 1)
         return updated[:, 0], after if held is None else replace(after, held=held), plan
 
     def _turned(
         self, step: Step, plan_state: MPPIState, target_m: Tensor, ground: Tensor, held: Tensor | None
-    ) -> Tensor:
-        """Mean action sequences or, where these are no better than standing, turns, shape [B, T, A].
-
-        See `turns.choose`.
-        """
+    ) -> tuple[Tensor, Tensor]:
+        """Mean action sequences or turns, shape [B, T, A], and which are of Dubins paths, [B]; see `turns.choose`."""
         problem, mean = plan_state.problem, plan_state.mean
         if not is_steered(problem.robot):
-            return mean
+            return mean, plan_state.follows
 
         def cost_of(base: Tensor, offset: Tensor) -> Tensor:
             advance = advance_chunk if held is None else advance_entrapped
@@ -319,7 +320,7 @@ class MPPI(LocalPlanner[MPPIState]):
             parts = problem.grid, problem.objective, self._fields, self.config.level, going, plan_state.to_go
             return total_cost(states, cost, ground, target, *parts)[0]
 
-        return choose(cost_of, mean, problem.robot)
+        return choose(cost_of, mean, problem, step.state, target_m, ground, plan_state.follows)
 
     def _ground(self, plan_state: MPPIState, state: Tensor) -> Tensor:
         """What rollouts from these states are on in this step, shape [B·M, N]."""
@@ -329,8 +330,7 @@ class MPPI(LocalPlanner[MPPIState]):
         if plan_state.ground is not None:
             return plan_state.ground.flatten(0, 1)
         key = rng.stream_key(plan_state.key, plan_state.step)
-        steps = plan_state.mean.shape[1] * (TURN_HORIZONS if is_steered(problem.robot) else 1)
-        cells = within_reach(problem, state, steps * problem.dt_s)
+        cells = within_reach(problem, state, plan_state.mean.shape[1] * problem.dt_s)
         return framed_fields(problem, problem.sample_fields(self._fields, key, cells))
 
     def _held(self, plan_state: MPPIState, step: Step) -> Tensor | None:

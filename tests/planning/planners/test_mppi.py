@@ -1,17 +1,20 @@
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 import torch
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
+from benchnav.planning.free_space import FreeSpace, Immobile, Rules
 from benchnav.planning.objective import GoalDistance, Objective
 from benchnav.planning.planners import mppi
+from benchnav.planning.planners.cost_risk import framed_fields
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
 from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank
 from benchnav.planning.planners.straight import Straight
-from benchnav.planning.planners.turns import is_steered, turning_primitives
+from benchnav.planning.planners.turns import follow_dubins, is_steered, turning_primitives
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import Outcome
@@ -376,7 +379,15 @@ def test_no_tensor_is_made_on_another_device(robot, monkeypatch: pytest.MonkeyPa
         places = torch.zeros(20, 2, dtype=torch.int64, device=mean.device)
         bank = NoiseBank(scale=scale, values=values, place=places, stride=places, samples=256)
         state = MPPIState(
-            problem, mean, held=mean[:, 0, 0], ground=None, to_go=None, noise=bank, key=0, step=0
+            problem,
+            mean,
+            mean[:, 0, 0],
+            mean[:, 0, 0] > 0,
+            ground=None,
+            to_go=None,
+            noise=bank,
+            key=0,
+            step=0,
         )
         planner = MPPI(replace(SMALL, control_cost=0.1))
         action, state, plan = planner.plan(first(problem, draw=True), state)
@@ -462,15 +473,40 @@ def test_runs_begin_everywhere_and_parts_change_hands() -> None:
     assert (begin % 200).max() > 140
 
 
+BEHIND, WITHIN = (
+    (7.0, 10.0),
+    (13.0, 11.2),
+)  # goals 6 m behind the robot, and in the turning circle at its left
+
+
 @pytest.mark.parametrize(
-    ("objective", "least_mps", "within_s"),
-    [("travel_time", 0.0, 12.0), ("goal_distance", 0.0, 12.0), ("goal_distance", -1.0, 8.0)],
+    ("objective", "least_mps", "traversability", "wheelbase_m", "goal", "within_s"),
+    [
+        # Half a turn of radius 0.73 m and 5 m back take 8.5 s at 0.85 m/s, 5 m in reverse 5.9 s.
+        ("travel_time", 0.0, 0.85, 0.5, BEHIND, 12.0),
+        ("goal_distance", 0.0, 0.85, 0.5, BEHIND, 12.0),
+        ("goal_distance", -1.0, 0.85, 0.5, BEHIND, 8.0),
+        # Half a turn takes 7 s and 13 s, and the horizon is 5 s: Dubins paths of 8.5 m and 11.3 m.
+        ("goal_distance", 0.0, 0.35, 0.5, BEHIND, 26.0),
+        ("travel_time", 0.0, 0.35, 1.0, BEHIND, 32.0),
+        # A Dubins path of 8.3 m, away from the goal and back.
+        ("travel_time", 0.0, 0.85, 1.0, WITHIN, 13.0),
+        ("goal_distance", 0.0, 0.35, 1.0, WITHIN, 30.0),
+    ],
 )
-def test_a_bicycle_with_the_goal_behind_it_arrives(objective: str, least_mps: float, within_s: float) -> None:
-    """Half a turn of radius 0.73 m and 5 m back take 8.5 s at 0.85 m/s, 5 m in reverse 5.9 s."""
-    robot = Bicycle(speed_mps=(least_mps, 1.0))
-    cost = registry.make("objective", objective, robot=robot, goal_radius_m=1.0)
-    problem = factories.problem(torch.full((2, 40, 40), 0.85), (13.0, 10.0), (7.0, 10.0), robot, cost)
+def test_a_bicycle_turns_to_any_goal(
+    objective: str,
+    least_mps: float,
+    traversability: float,
+    wheelbase_m: float,
+    goal: tuple[float, float],
+    within_s: float,
+) -> None:
+    robot = Bicycle(speed_mps=(least_mps, 1.0), wheelbase_m=wheelbase_m)
+    radius_m = 1.0 if goal == BEHIND else 0.5
+    cost = registry.make("objective", objective, robot=robot, goal_radius_m=radius_m)
+    ground = torch.full((2, 40, 40), traversability)
+    problem = factories.problem(ground, (13.0, 10.0), goal, robot, cost, Rules(goal_radius_m=radius_m))
     problem = with_start(problem, 13.0, 10.0, 0.0)
     driven = drive(MPPI(replace(SMALL, samples=128, horizon_s=5.0)), problem, None, within_s)
     assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
@@ -514,21 +550,20 @@ class Asked:
         return self
 
 
-@pytest.mark.parametrize(("robot", "reach_m"), [(Unicycle(), 2.0), (Bicycle(), 4.0)])
-def test_fields_are_drawn_as_far_as_what_is_rolled_out(robot: Unicycle | Bicycle, reach_m: float) -> None:
+def test_fields_are_drawn_as_far_as_what_is_rolled_out() -> None:
     fields = Asked()
-    problem = factories.problem(torch.full((1, 40, 40), 0.8), (1.25, 10.25), (13.0, 10.25), robot)
+    problem = factories.problem(torch.full((1, 40, 40), 0.8), (1.25, 10.25), (13.0, 10.25))
     problem = replace(problem, fields=fields)
     planner = MPPI(replace(SMALL, risk_on="cost", fields=10))
     planner.plan(first(problem), planner.init(problem, generator()))
     assert fields.cells is not None
-    assert int(fields.cells[0, 20].sum()) == 3 + round((reach_m + 0.5) / 0.5)
+    assert int(fields.cells[0, 20].sum()) == 3 + round((2.0 + 0.5) / 0.5)
 
 
 def test_a_turn_replaces_only_a_mean_that_is_no_better_than_standing() -> None:
     """Goals behind, ahead of a robot at rest, ahead of one with a good mean, and behind on slow ground."""
     ground = torch.full((4, 40, 40), 0.85)
-    ground[3] = 0.5  # half a turn takes 4.6 s, so that none pays within 5 s
+    ground[3] = 0.35  # half a turn takes 6.6 s, so that none pays within 5 s
     problem = factories.problem(ground, (13.0, 10.0), (7.0, 10.0), Bicycle())
     start = torch.tensor([[13.0, 10.0, 0.0], [13.0, 10.0, math.pi], [13.0, 10.0, math.pi], [13.0, 10.0, 0.0]])
     problem = replace(problem, start=start)
@@ -537,14 +572,79 @@ def test_a_turn_replaces_only_a_mean_that_is_no_better_than_standing() -> None:
     mean = state.mean.clone()
     mean[2, :, 0] = 0.5
     state = replace(state, mean=mean)
-    turned = planner._turned(first(problem), state, problem.goal_m, problem.padded_ground, None)
-    assert bool((turned[0, :, 0] == 1).all())
-    steered = turned[0, :, 1].abs() > 0
-    # Half a turn takes π·0.73 m / 0.85 m/s = 2.7 s.
-    assert 20 <= int(steered.sum()) <= 34
+    turned, follows = planner._turned(first(problem), state, problem.goal_m, problem.padded_ground, None)
+    assert follows.tolist() == [False, False, False, True]
+    assert bool((turned[[0, 3], :, 0] == 1).all())
+    # Half a turn takes π·0.73 m / 0.85 m/s = 2.7 s, and all of 5 s where λ̂ is 0.35.
+    assert 20 <= int((turned[0, :, 1].abs() > 0).sum()) <= 34
     assert torch.equal(turned[2], mean[2])
-    assert int((turned[3, :, 1].abs() > 0).sum()) >= 40
-    alone = problem.select(torch.tensor([0]))
-    state = planner.select(state, torch.tensor([0]))
-    single = planner._turned(first(alone), state, alone.goal_m, alone.padded_ground, None)
-    assert torch.equal(single, turned[:1])
+    torch.testing.assert_close(turned[3, :, 1].abs(), torch.full((50,), 0.6))
+    for member, chosen in enumerate(turned):
+        alone = problem.select(torch.tensor([member]))
+        kept = planner.select(state, torch.tensor([member]))
+        single, _ = planner._turned(first(alone), kept, alone.goal_m, alone.padded_ground, None)
+        torch.testing.assert_close(single[0], chosen)
+
+
+@pytest.mark.parametrize("goal", [BEHIND, WITHIN])
+def test_actions_along_a_dubins_path_reach_the_goal_without_feedback(goal: tuple[float, float]) -> None:
+    robot = Bicycle(wheelbase_m=1.0)
+    problem = factories.problem(torch.full((1, 40, 40), 0.35), (13.0, 10.0), goal, robot)
+    problem = with_start(problem, 13.0, 10.0, 0.0)
+    actions, turns = follow_dubins(problem, problem.start, problem.goal_m, problem.padded_ground, 400)
+    state, nearest = problem.start, math.inf
+    for action in actions.unbind(1):
+        state = robot(state, action, torch.tensor([0.35]))
+        nearest = min(nearest, float(torch.dist(state[0, :2], problem.goal_m[0])))
+    assert bool(turns)
+    assert nearest < 0.15  # a step is straight in the simulation, and turns at its end
+
+
+def test_a_dubins_path_is_driven_as_it_is_until_the_robot_faces_the_goal() -> None:
+    """Neither samples change it nor a mean that pays ends it."""
+    problem = factories.problem(torch.full((1, 40, 40), 0.35), (13.0, 10.0), BEHIND, Bicycle())
+    problem, ahead = (with_start(problem, 13.0, 10.0, heading) for heading in (0.0, math.pi))
+    actions, _ = follow_dubins(problem, problem.start, problem.goal_m, problem.padded_ground, 50)
+    planner = MPPI(replace(SMALL, horizon_s=5.0))
+    chosen, after, _ = planner.plan(first(problem), planner.init(problem, generator()))
+    torch.testing.assert_close(chosen, actions[:, 0])
+    straight = replace(after, mean=after.mean * torch.tensor([1.0, 0.0]))
+    assert bool(planner.plan(first(problem), straight)[1].follows)
+    assert not bool(planner.plan(first(ahead), replace(straight, problem=ahead))[1].follows)
+
+
+LEFT, RIGHT = (slice(21, None), slice(26, 28)), (slice(None, 19), slice(26, 28))
+
+
+@pytest.mark.parametrize(
+    ("sides", "immobile", "kept", "side"),
+    [
+        ((), None, (1, 1), 1),  # the goal is behind, to the left
+        ((LEFT,), None, (1, 1), 1),  # slow ground is no obstacle
+        ((LEFT,), Immobile(below=0.1), (1, 1), -1),
+        ((LEFT, RIGHT), Immobile(below=0.1), (1, 1), None),
+        ((LEFT,), Immobile(below=0.1), (1, 0), 1),  # on one field of two alone
+        ((LEFT,), Immobile(below=0.01), (1, 1), 1),
+    ],
+)
+def test_a_dubins_path_keeps_to_ground_that_holds_the_robot(
+    sides: tuple[Any, ...], immobile: Immobile | None, kept: tuple[int, int], side: int | None
+) -> None:
+    rules = Rules(min_traversability=0.05, free_space=FreeSpace(above=0.0))
+    fields = torch.full((2, 40, 40), 0.5)
+    for place in sides:
+        for field, soft in zip(fields, kept, strict=True):
+            field[place] = 0.05 if soft else 0.5
+    problem = factories.problem(fields[:1], (13.0, 10.0), (7.0, 10.5), Bicycle(), rules=rules)
+    problem = replace(with_start(problem, 13.0, 10.0, 0.0), immobile=immobile)
+    ground = framed_fields(problem, fields[None])
+    actions, turns = follow_dubins(problem, problem.start, problem.goal_m, ground, 50)
+    assert bool(turns) == (side is not None)
+    assert side is None or actions[0, 0, 1].sign() == side
+    closed = replace(problem, free=fields[:1] > 0.05)
+    actions, turns = follow_dubins(
+        closed, closed.start, closed.goal_m, framed_fields(closed, fields[None]), 50
+    )
+    free = {0: 1, 1: -1 if kept[0] else 1, 2: None}[len(sides)]
+    assert bool(turns) == (free is not None)
+    assert free is None or actions[0, 0, 1].sign() == free

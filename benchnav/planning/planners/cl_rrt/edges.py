@@ -27,8 +27,8 @@ from benchnav.core.batch import Batch
 from benchnav.core.gridgraph import squeezes
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.astar.astar import cell_at
-from benchnav.planning.planners.cl_rrt.dubins import dubins_segments_to_point, sample_segments
 from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, PathFollower, Reference, Tracking
+from benchnav.planning.planners.dubins import dubins_segments_to_point, sample_segments
 from benchnav.planning.problem import Problem, motion_traversability
 from benchnav.planning.robots import steps_in
 

@@ -27,7 +27,6 @@ from torch.nn.functional import pad
 from benchnav.core.batch import Batch, map_tensors
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import distance
-from benchnav.planning.planners.cl_rrt.dubins import dubins_length_to_point
 from benchnav.planning.planners.cl_rrt.edges import (
     DRAWN_M,
     ClosedLoop,
@@ -37,6 +36,7 @@ from benchnav.planning.planners.cl_rrt.edges import (
     drive,
 )
 from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, Tracking
+from benchnav.planning.planners.dubins import dubins_length_to_point
 from benchnav.planning.planners.planner import PlanStatus
 
 _EXPLORE = (0.7, 0.3)  # share of choices that explore, before and after a way to the goal is known

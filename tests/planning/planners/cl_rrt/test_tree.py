@@ -8,7 +8,6 @@ from torch import Tensor
 
 from benchnav.core.batch import map_tensors
 from benchnav.planning.free_space import PENALTY
-from benchnav.planning.planners.cl_rrt.dubins import dubins_length_to_point
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop, draw_references, drive
 from benchnav.planning.planners.cl_rrt.pursuit import Tracking
 from benchnav.planning.planners.cl_rrt.tree import (
@@ -22,6 +21,7 @@ from benchnav.planning.planners.cl_rrt.tree import (
     search,
     stand,
 )
+from benchnav.planning.planners.dubins import dubins_length_to_point
 from benchnav.planning.planners.planner import PlanStatus
 from tests.planning.planners.cl_rrt.maps import known, make_loop, open_map, walled_map
 

@@ -22,19 +22,22 @@ def dubins_length_to_point(start: Tensor, point: Tensor, radius: float | Tensor)
     return (arc + rest) * radius
 
 
-def dubins_segments_to_point(start: Tensor, point: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+def dubins_segments_to_point(
+    start: Tensor, point: Tensor, radius: Tensor, far_side: bool = False
+) -> tuple[Tensor, Tensor]:
     """Finds the shortest path from poses to points at which any heading will do.
 
     Args:
         start: poses (x, y, θ) in metres and radians, shape [*B, 3].
         point: positions (x, y), shape [*B, 2]; the leading dimensions of both broadcast.
         radius: least turning radius in metres, broadcasts to [*B].
+        far_side: on the turning circle that lies away from the point, in place of the shortest.
 
     Returns:
         Curvatures, positive to the left, in 1/m, and lengths in metres of two segments, an arc and a straight or
         two arcs, each of shape [*B, 2].
     """
-    arc, rest, side, inside = _to_point(start, point, radius)
+    arc, rest, side, inside = _to_point(start, point, radius, far_side)
     sides = torch.where(inside, -side, side), torch.where(inside, side, 0)
     radius = radius[..., None]
     return torch.stack(sides, dim=-1) / radius, torch.stack((arc, rest), dim=-1) * radius
@@ -68,8 +71,10 @@ def sample_segments(start: Tensor, curvature: Tensor, length_m: Tensor, spacing:
     return torch.stack((x, y, heading), dim=-1)
 
 
-def _to_point(start: Tensor, point: Tensor, radius: float | Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Lengths of both segments in radii, the side of the point (±1), whether its circle holds it."""
+def _to_point(
+    start: Tensor, point: Tensor, radius: float | Tensor, far_side: bool = False
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Lengths of both segments in radii, the side of the first circle (±1), whether it holds the point."""
     # The point as the pose has it, ahead and to the left, in radii.
     scale = 1 / radius
     offset_x, offset_y = (point[..., 0] - start[..., 0]) * scale, (point[..., 1] - start[..., 1]) * scale
@@ -77,6 +82,8 @@ def _to_point(start: Tensor, point: Tensor, radius: float | Tensor) -> tuple[Ten
     x, y = offset_x * cos + offset_y * sin, offset_y * cos - offset_x * sin
     side = torch.where(y < 0, -1.0, 1.0).to(y)
     y = y.abs()
+    if far_side:
+        side, y = -side, -y
     power = x * x + y * (y - 2)  # of the point over the left circle, centre (0, 1)
     inside = power < 0
     # The arc ends where its tangent meets the point.

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchnav.planning.planners.cl_rrt.dubins import (
+from benchnav.planning.planners.dubins import (
     dubins_length_to_point,
     dubins_segments_to_point,
     sample_segments,
