@@ -1,7 +1,10 @@
 import math
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
+from typing import Any
 
+import mpmath
 import pytest
 import torch
 from hypothesis import example, given, settings
@@ -301,6 +304,65 @@ def test_the_most_likely_class_of_components_that_are_none_is_refused() -> None:
     assert alone.most_likely().cvar(0.9).item() == alone.cvar(0.9).item()
     with pytest.raises(ConfigError, match="each of 4 components, got 3"):
         replace(random_mixture(), group=(0, 1, 2))
+
+
+WEIGHTS = 0.3, 0.7
+# Two components: where both are wide, one is narrow, both are, and one is a point.
+PAIRS = [
+    ((0.3, 0.04), (0.6, 0.2)),
+    ((0.497, 0.0735), (0.01, 0.001)),
+    ((0.4, 0.001), (0.41, 0.003)),
+    ((0.4, 0.02), (0.4003, 1e-5)),
+    ((0.4, 1e-5), (0.4003, 0.02)),
+    ((0.002, 0.001), (0.99, 0.02)),
+    ((-0.01, 0.01), (1.002, 0.001)),
+    ((0.5, 0.002), (0.5, 0.002)),
+    ((0.25, 1e-9), (0.7, 0.15)),
+]
+
+
+def exactly(pair: tuple[tuple[float, float], ...], work: str, at: float) -> float:
+    """`expected_time` with a floor, or `crps` of an observation, by quadrature with 30 digits."""
+    with mpmath.workdps(30):
+        parts = [(weight, mpmath.mpf(m), mpmath.mpf(s)) for weight, (m, s) in zip(WEIGHTS, pair, strict=True)]
+
+        def cdf(x: Any) -> Any:
+            return sum(weight * mpmath.ncdf(x, m, s) for weight, m, s in parts)
+
+        def squared(x: Any) -> Any:
+            return (cdf(x) - (x >= at)) ** 2
+
+        least = at if work == "expected_time" else 0
+        edges = {m + z * s for _, m, s in parts for z in (-12, -7, -4, -2, 0, 2, 4, 7, 12)}
+        edges |= {mpmath.mpf(at), mpmath.mpf(1), mpmath.mpf(least)}
+        edges |= {mpmath.mpf(at) * mpmath.mpf(2) ** k for k in range(12)}
+        edges = sorted(edge for edge in edges if least <= edge <= 1)
+        if work == "expected_time":
+            return float(1 + mpmath.quad(lambda x: cdf(x) / x**2, edges))
+        return float(sum(mpmath.quad(squared, [a, b]) for a, b in pairwise(edges)))
+
+
+def pair_of(pair: tuple[tuple[float, float], ...]) -> TraversabilityMixture:
+    values = WEIGHTS, *zip(*pair, strict=True)
+    weights, means, stds = (torch.tensor(each, dtype=torch.float64).view(2, 1, 1) for each in values)
+    return TraversabilityMixture(weights, means, stds)
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_expected_time_is_exact_to_a_millionth_for_small_floors(
+    pair: tuple[tuple[float, float], ...],
+) -> None:
+    for floor in (0.001, 0.01, 0.05, 0.5):
+        wanted = exactly(pair, "expected_time", floor)
+        assert pair_of(pair).expected_time(floor).item() == pytest.approx(wanted, abs=1e-6, rel=0)
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_crps_is_exact_for_narrow_components(pair: tuple[tuple[float, float], ...]) -> None:
+    for observed in (0.0, 0.4, 0.997):
+        wanted = exactly(pair, "crps", observed)
+        found = pair_of(pair).crps(torch.tensor([[observed]], dtype=torch.float64)).item()
+        assert found == pytest.approx(wanted, abs=1e-5, rel=0)
 
 
 @pytest.mark.parametrize("floor", [0.02, 0.05, 0.5, 1.0])
