@@ -115,7 +115,7 @@ def run(
         argv: arguments, or None for the process's own.
 
     Returns:
-        Exit status: 0, 1 where the command says so, 2 for bad input, 130 when interrupted.
+        Exit status: 0, 1 where the command or its error says so, 2 for bad input, 130 when interrupted.
     """
     # Notices of libraries to their own developers would bury what a user has to read.
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"torch\..*")
@@ -139,7 +139,7 @@ def run(
         line = _said(error, command)
         if line is None:
             raise
-        return _refuse(program, line)
+        return _refuse(program, line, error.status if isinstance(error, BenchnavError) else 2)
     except KeyboardInterrupt as stopped:  # by Ctrl-C, or by a scheduler's SIGTERM
         # A command that knows what it has kept says so by the interruption's text.
         print("; ".join([f"{program}: interrupted", *map(str, stopped.args)]), file=sys.stderr)
@@ -237,9 +237,10 @@ def _read_words(program: str, command: Command, words: Sequence[str]) -> tuple[l
         path = _path_of(program, command, flag)
         kind = command.flags.get(".".join(path), Any)
         has_value = bool(rest) and not rest[0].startswith("--")
-        if kind is bool:
+        is_switch = bool in members_of(kind)
+        if is_switch:
             has_value = has_value and rest[0].lower() in ("true", "false", "yes", "no")
-        if not equals and not has_value and kind is not bool:
+        if not equals and not has_value and not is_switch:
             raise ConfigError(f"Expected a value after {flag} ({in_words(kind)}), got none.")
         if not equals:
             value = rest.popleft() if has_value else "true"
@@ -346,12 +347,12 @@ def _takes_mapping(kind: Any) -> bool:
     return any(get_origin(member) is dict for member in members_of(kind))
 
 
-def _refuse(program: str, message: str) -> int:
+def _refuse(program: str, message: str, status: int) -> int:
     line = " ".join(message.split())
     if len(line) > _LONGEST:
         line = f"{line[: _LONGEST // 2]} … {line[-_LONGEST // 2 :]}"
     print(f"{program}: error: {line}", file=sys.stderr)
-    return 2
+    return status
 
 
 def _said(error: Exception, command: Command | None) -> str | None:

@@ -1,4 +1,4 @@
-"""The errors BenchNav raises on purpose; `benchnav.core.command` prints them as one line, with exit status 2.
+"""The errors BenchNav raises on purpose; `benchnav.core.command` prints them as one line, and exits with their status.
 
 A message names the argument, what was expected, what came, and what to do.
 """
@@ -8,14 +8,24 @@ import logging
 import re
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
+from typing import ClassVar
 
 
 class BenchnavError(Exception):
     """Base of every error that a user can mend."""
 
+    status: ClassVar[int] = 2
+    """Exit status of a command that ends with it."""
+
 
 class ConfigError(BenchnavError, ValueError):
     """A setting, recipe or argument is not usable as given."""
+
+
+class TrainingError(BenchnavError):
+    """A training failed on its way, after usable settings."""
+
+    status: ClassVar[int] = 1
 
 
 def expect(holds: object, what: str) -> None:

@@ -165,7 +165,7 @@ class TraversabilityMixture(TraversabilityDistribution):
         return self._in_cells(lambda cells: _expected_time(cells, floor, 1.0))
 
     def time_cvar(self, level: float, floor: float) -> Tensor:
-        """CVaR of the time 1 / max(λ, floor), shape [*B, H, W], to within 1e-6 or what the dtype can hold; see the base."""
+        """CVaR of the time 1 / max(λ, floor), shape [*B, H, W], as exact as `expected_time`; see the base."""
         tail = tail_of(level)
         check_floor(floor)
         if tail == 1:

@@ -24,7 +24,8 @@ class TrainOptions:
         workers: Processes that read maps ahead. The result is the same for any number.
         in_memory: Hold all maps in memory instead of reading them when they are needed.
         half_precision: Store the weights of networks as float16.
-        symmetries: Turn and mirror training maps at random; false for photos, whose light comes from one direction.
+        symmetries: Turn and mirror training maps at random; by default all but those with a photo, whose light comes
+            from one direction.
         crop: Train on squares of so many cells a side, drawn anew each epoch; 0 takes whole maps.
         resume: Go on with an interrupted training from its finished parts and epochs.
         overwrite: Replace an existing checkpoint in `out`, or these parts of it.
@@ -38,7 +39,7 @@ class TrainOptions:
     workers: int = 0
     in_memory: bool = False
     half_precision: bool = True
-    symmetries: bool = True
+    symmetries: bool | None = None
     crop: int = 0
     resume: bool = False
     overwrite: bool = False

@@ -123,6 +123,7 @@ def _fill(file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[So
             )  # fmt: skip
             if field:
                 own[name].attrs.update(unit=field.unit, meaning=field.meaning)
+        _add_scales(group, contents)
     for split, several in sources.items():
         first = 0
         for source in several:
@@ -133,6 +134,24 @@ def _fill(file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[So
     text = seal(contents.manifest(digests)).encode()
     file.create_dataset(schema.MANIFEST, data=text, dtype=h5py.string_dtype("utf-8", len(text)))
     file.flush()
+
+
+def _add_scales(group: h5py.Group, contents: Contents) -> None:
+    """Name the dimensions of a split's arrays by HDF5 dimension scales: map_index, y_m, x_m, and axis_N of N others."""
+    recipe = contents.recipes[0]
+    for name, array in list(group.items()):
+        shape = contents.fields[name].shape if name in contents.fields else array.shape[1:]
+        labels = ({"H": "y_m", "W": "x_m"}.get(str(n), f"axis_{n}") for n in shape)
+        for at, label in enumerate(("map_index", *labels)):
+            if label in contents.fields:
+                continue
+            if label not in group:
+                values = np.arange(array.shape[at])
+                if label in ("y_m", "x_m"):
+                    values = recipe.resolution_m * (values + 0.5)
+                group.create_dataset(label, data=values, fletcher32=True)
+                group[label].make_scale(label)
+            array.dims[at].attach_scale(group[label])
 
 
 def pack(

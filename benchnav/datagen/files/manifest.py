@@ -1,6 +1,8 @@
 """Opens the files of datasets, and reads the manifest of one file or of a folder of shards."""
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import h5py
@@ -11,6 +13,7 @@ from benchnav.core.touched import note_file
 from benchnav.datagen import schema
 
 # What HDF5 and h5py raise where a file is damaged, by where the damage lies.
+_TAKEN = (errno.EAGAIN, errno.EACCES)  # of a file that another program has locked
 READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
 
 FOLDER_MANIFEST = "manifest.json"  # beside the shards of a finished dataset
@@ -25,7 +28,7 @@ def open_file(path: Path) -> h5py.File:
     """Opens a file for reading.
 
     Raises:
-        DatasetError: it is not there, is no HDF5 file, or its structure is damaged.
+        DatasetError: it is not there, is locked, is no HDF5 file, or its structure is damaged.
     """
     try:
         note_file(path)
@@ -36,6 +39,11 @@ def open_file(path: Path) -> h5py.File:
             "Make one with `benchnav-datagen create`."
         ) from error
     except OSError as error:
+        if "unable to lock file" in str(error):
+            free = "Close what writes to it."
+            if error.errno not in _TAKEN:
+                free = "If its file system cannot lock, set HDF5_USE_FILE_LOCKING=FALSE."
+            raise DatasetError(f"{path} is locked: {os.strerror(error.errno or 0)}. {free}") from error
         raise DatasetError(f"{path} is no readable HDF5 file: {error}. Make it again.") from error
 
 

@@ -129,6 +129,21 @@ class TerrainDataset:
         )
         return "generated" if known else "unknown"
 
+    @property
+    def truth(self) -> Literal["generated", "unknown"]:
+        """Whether the distribution of λ in each cell of all splits is known; see `truth_of`."""
+        known = all(self.truth_of(name) == "generated" for name in self.splits)
+        return "generated" if known else "unknown"
+
+    def has_photo(self, split: str) -> bool:
+        """Whether the colours of some maps of a split are those of a photo, which is lit from one direction.
+
+        Raises:
+            DatasetError: If there is no such split.
+        """
+        self.map_count(split)
+        return any(part.get("source", {}).get("photo") for part in self.splits[split]["parts"])
+
     def about_digest(self, split: str) -> str:
         """SHA-256 of what numbers on a split rest on beside its maps: class table, λ_stuck, resolution, kind of truth.
 

@@ -8,6 +8,7 @@ what a batch holds depends on seed and epoch alone.
 
 import inspect
 import json
+import math
 import os
 import pickle
 import signal
@@ -30,7 +31,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from benchnav.core.command import tell
 from benchnav.core.device import find_device
-from benchnav.core.errors import CheckpointError, ConfigError, expect, out_of_memory, quiet
+from benchnav.core.errors import CheckpointError, ConfigError, TrainingError, expect, out_of_memory, quiet
 from benchnav.core.settings import check_known, one_line
 from benchnav.core.store import MAX_JOBS, replacing, sole_writer, write_text
 from benchnav.models.config import TrainOptions
@@ -48,6 +49,7 @@ _OWN = {
 }  # fmt: skip
 _DEFAULTS = inspect.signature(lightning.Trainer.__init__).parameters
 _TRACKERS = ("logger", "callbacks")  # which are made from text, see `models.training.trackers`
+_LOSSES = ("train_loss", "valid_loss", "loss")
 _OF_NO_ACCOUNT = {"max_epochs", "log_every_n_steps", "detect_anomaly", "accelerator"}
 
 
@@ -144,6 +146,8 @@ def fit(
 
     Raises:
         CheckpointError: the interrupted training is damaged or has other settings.
+        ConfigError: a callback changes the weights after training.
+        TrainingError: a loss is no finite number.
         KeyboardInterrupt: the user has stopped it.
     """
     folder = options.folder / part if options.folder else None
@@ -301,6 +305,7 @@ class KeepBest(Callback):
     def __init__(self, last: bool = False) -> None:
         """Starts with none."""
         self.last = last
+        self.trained: dict[str, torch.Tensor] = {}
         self.best: dict[str, Any] = {"loss": float("inf"), "metrics": {}, "weights": {}}
         self.validated = False
 
@@ -310,12 +315,16 @@ class KeepBest(Callback):
         metrics = {name: value for name, value in measured(trainer).items() if name.startswith("valid_")}
         limit = float("inf") if self.last else self.best["loss"]
         if metrics["valid_loss"] < limit:
-            weights = {name: value.detach().clone() for name, value in module.state_dict().items()}
             metrics["epoch"] = trainer.current_epoch + 1
-            self.best = {"loss": metrics["valid_loss"], "metrics": metrics, "weights": weights}
+            self.best = {"loss": metrics["valid_loss"], "metrics": metrics, "weights": _copied(module)}
+
+    def on_train_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Copies the weights, before callbacks of a user can change them."""
+        self.trained = _copied(module)
 
     def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Puts the best weights back."""
+        _refuse_changed(self.trained, module, trainer, "on_train_end")
         if not self.best["weights"]:
             raise ConfigError(
                 "Expected a finite validation loss, got none. Train with a lower `learning_rate`."
@@ -327,6 +336,10 @@ class KeepBest(Callback):
         # The trainer's own metrics are what comes back from processes that it has started.
         metrics = self.best["metrics"].items()
         trainer.callback_metrics.update({name: torch.tensor(value) for name, value in metrics})
+
+    def teardown(self, trainer: lightning.Trainer, module: lightning.LightningModule, stage: str) -> None:
+        """Refuses callbacks that have changed the best weights since."""
+        _refuse_changed(self.best["weights"], module, trainer, "on_fit_end")
 
     def state_dict(self) -> dict[str, Any]:
         """Gives what `load_state_dict` takes."""
@@ -363,6 +376,12 @@ class History(Callback):
         if self.part and trainer.is_global_zero:
             told = in_words(found, "valid_") or in_words(found)
             tell(f"{self.part}: epoch {epoch}/{trainer.max_epochs}, {told}")
+        for name, value in found.items():
+            if name in _LOSSES and not math.isfinite(value):
+                raise TrainingError(
+                    f"{name} became {value} in epoch {epoch}. Train with a lower `learning_rate`, or mend the loss. "
+                    "Nothing was kept of this epoch."
+                )
 
     def state_dict(self) -> dict[str, Any]:
         """Gives what `load_state_dict` takes."""
@@ -383,6 +402,38 @@ class WholeFiles(TorchCheckpointIO):
         """Writes it beside its name, then renames it."""
         with replacing(Path(path), durable=False) as partial:
             torch.save(checkpoint, partial)
+
+
+def _copied(module: lightning.LightningModule) -> dict[str, torch.Tensor]:
+    return {name: value.detach().clone() for name, value in module.state_dict().items()}
+
+
+def _refuse_changed(
+    wanted: Mapping[str, torch.Tensor],
+    module: lightning.LightningModule,
+    trainer: lightning.Trainer,
+    hook: str,
+) -> None:
+    """Refuses a training whose weights were changed after it, by callbacks that have a hook.
+
+    Raises:
+        ConfigError: the weights are not those that are wanted.
+    """
+    there = {name: value.cpu() for name, value in module.state_dict().items()}
+    same = wanted.keys() == there.keys() and all(
+        torch.equal(value.cpu(), there[name]) for name, value in wanted.items()
+    )
+    if same or not wanted:
+        return
+    names = [
+        type(owner).__name__
+        for owner in (*trainer.callbacks, module)  # type: ignore[attr-defined]
+        if not getattr(type(owner), hook).__module__.startswith(("lightning.", __name__))
+    ]
+    raise ConfigError(
+        f"Expected callbacks that leave the trained weights as they are, got weights that `{hook}` of "
+        f"{' or '.join(names)} changed. What is exported are the weights of the best epoch. Leave the callback out."
+    )
 
 
 def measured(trainer: lightning.Trainer) -> dict[str, float]:

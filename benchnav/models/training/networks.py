@@ -37,6 +37,7 @@ from benchnav.models.nets.trainable import TrainableModel
 from benchnav.models.training.check import Trainable, check_network, class_names, fields_of
 from benchnav.models.training.conformal import check_valid, conformal_table, stopping_every
 from benchnav.models.training.data import (
+    TRAIN,
     VALID,
     MapData,
     MapDataset,
@@ -176,7 +177,7 @@ def train_networks(
     config = replace(
         trainable.config,
         max_epochs=trainer.pop("max_epochs", trainable.config.max_epochs),
-        symmetries=how.symmetries and trainable.config.symmetries,
+        symmetries=_is_turned(how, trainable.config, dataset),
         crop=how.crop or trainable.config.crop,
     )
     trainable = replace(trainable, config=config)
@@ -203,6 +204,14 @@ def train_networks(
         raise KeyboardInterrupt(_kept(target, trained, options)) from None
     if not target.changed and is_first_process():
         print(f"{out} was finished already and holds {' and '.join(sorted(target.checkpoint.parts))}")
+
+
+def _is_turned(how: TrainOptions, config: TrainingConfig, dataset: TerrainDataset) -> bool:
+    """Whether training maps are turned and mirrored: maps with a photo only where the user asks for it."""
+    is_lit = "rgb" in config.inputs and dataset.has_photo(TRAIN)
+    if how.symmetries is None and is_lit and config.symmetries:
+        say("note: maps with a photo are not turned or mirrored; pass --symmetries true to do so")
+    return config.symmetries and (not is_lit if how.symmetries is None else how.symmetries)
 
 
 def _kept(target: Target, trained: Sequence[str], options: FitOptions) -> str:

@@ -22,6 +22,14 @@ from benchnav.core.errors import BenchnavError, ConfigError, expect, out_of_memo
 from benchnav.core.settings import hint, one_line
 from benchnav.core.sources import attribute, digest_of_file_part, digest_of_target, load_file
 
+# Callbacks of Lightning whose effect on weights or rates the kept epoch would undo, and what to do in place of them.
+_UNDONE = {
+    "StochasticWeightAveraging": "`fit swag` averages weights.",
+    "WeightAveraging": "`fit swag` averages weights.",
+    "ModelPruning": "Leave it out.",
+    "LearningRateFinder": "Set `learning_rate`.",
+    "BatchSizeFinder": "Set `batch_size`.",
+}
 _LIGHTNING = {"logger": (lightning_loggers, Logger), "callbacks": (lightning_callbacks, Callback)}
 
 
@@ -42,9 +50,17 @@ def make_callbacks(given: Any) -> list[Callback]:
     """Makes the callbacks that a user asks for.
 
     Raises:
-        ConfigError: as of `make_loggers`.
+        ConfigError: as of `make_loggers`; or if what a callback does to weights or rates would be undone.
     """
-    return [_made("callbacks", item, None) for item in _listed(given)]
+    made = [_made("callbacks", item, None) for item in _listed(given)]
+    for name, remedy in _UNDONE.items():
+        for callback in made:
+            expect(
+                not isinstance(callback, getattr(lightning_callbacks, name)),
+                f"`trainer.callbacks` that leave weights and rates as they are, got {type(callback).__name__}, "
+                f"whose effect would be undone. {remedy}",
+            )
+    return made
 
 
 def described(given: Any) -> list[dict[str, Any]]:

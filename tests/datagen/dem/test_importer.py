@@ -251,7 +251,7 @@ def test_the_numbers_of_groups_differ_between_grounds_and_maps_side_by_side_have
 def test_the_truth_of_imported_ground_is_unknown(tmp_path: Path) -> None:
     dataset = read(write(tmp_path / "dem.tif", FLAT))
     assert source_of(dataset)["truth"] == "unknown"
-    assert dataset.truth_of("test/real") == "unknown"
+    assert dataset.truth_of("test/real") == dataset.truth == "unknown"
 
 
 @pytest.mark.parametrize("stride", [0.7, 0, -1, np.nan])

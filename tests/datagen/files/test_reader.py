@@ -1,4 +1,6 @@
+import fcntl
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +36,50 @@ def test_what_is_read_is_what_was_generated(dataset_path: Path) -> None:
     assert terrain.class_id.dtype == torch.int64
     assert terrain.truth.stds.dtype == torch.float32
     np.testing.assert_array_equal(terrain.rgb, dataset.read("train", [3, 5], ["rgb"])["rgb"])
+
+
+def test_the_truth_of_a_dataset_is_known_where_that_of_all_splits_is(dataset_path: Path) -> None:
+    dataset = TerrainDataset(dataset_path)
+    assert dataset.truth == "generated"
+    dataset.manifest["splits"]["valid"]["parts"][0] = {
+        "maps": 3,
+        "source": {"file": "dem.tif", "photo": {"file": "p"}},
+    }
+    assert (dataset.truth, dataset.truth_of("train")) == ("unknown", "generated")
+    assert [dataset.has_photo(split) for split in ("train", "valid")] == [False, True]
+
+
+def test_a_locked_file_is_called_locked(dataset_path: Path, tmp_path: Path) -> None:
+    path = tmp_path / "locked.h5"
+    shutil.copy(dataset_path, path)
+    with open(path) as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(DatasetError, match=r"locked\.h5 is locked: .*Close what writes to it\.$"):
+            TerrainDataset(path)
+    TerrainDataset(path)
+
+
+def test_dimensions_have_scales_with_the_centres_of_cells(dataset_path: Path) -> None:
+    dataset = TerrainDataset(dataset_path)
+    height, width = dataset.grid.shape
+    y, x = dataset.grid.centre_of(torch.arange(height), torch.arange(width))
+    with h5py.File(dataset_path) as file:
+        for split in dataset.splits:
+            for name, array in file[split].items():
+                if array.is_scale:
+                    continue
+                labels = [[scale.name for scale in dimension.values()] for dimension in array.dims]
+                assert [label[0].rsplit("/")[-1] for label in labels] == {
+                    **{name: ["map_index", "y_m", "x_m"] for name in schema.MAP_FIELDS},
+                    "rgb": ["map_index", "axis_3", "y_m", "x_m"],
+                    **{key: ["map_index", "axis_2"] for key in ("start_m", "goal_m")},
+                    **{key: ["map_index"] for key in ("environment", "reference_time_s")},
+                    "entry_digests": ["map_index", "axis_9", "axis_32"],
+                }[name], name
+                for size, dimension in zip(array.shape, array.dims, strict=True):
+                    assert [scale.shape for scale in dimension.values()] == [(size,)]
+            np.testing.assert_allclose(file[split]["y_m"], y)
+            np.testing.assert_allclose(file[split]["x_m"], x)
 
 
 def test_foreign_newer_and_missing_files_are_refused(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
+import pandas as pd
 import pytest
 import torch
 
@@ -260,6 +261,60 @@ def test_how_maps_are_cut_and_turned_reaches_the_training_and_the_checkpoint(
     assert call("train", *where, "--out", "b") == 0
     assert {shape[-2:] for shape, _ in seen} == {torch.Size((32, 32))}
     assert any(turned for _, turned in seen)
+
+
+@pytest.mark.parametrize(
+    ("words", "turned"),
+    [
+        ((), False),
+        (("--symmetries",), True),
+        (("--symmetries", "true", "--settings.symmetries", "false"), False),
+        (("--settings.inputs", "[slope_deg]"), True),
+    ],
+)
+def test_photos_are_turned_only_where_the_user_asks_for_it(
+    own: Path,
+    dataset: TerrainDataset,
+    words: tuple[str, ...],
+    turned: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(TerrainDataset, "has_photo", lambda self, split: split == "train")
+    command = (
+        "fit",
+        "own.py:CellModel",
+        "--data",
+        dataset.path,
+        *QUICK,
+        "--trainer.max_epochs",
+        1,
+        "--out",
+        "a",
+    )
+    assert call("train", *command, *words) == 0
+    assert load_checkpoint("a").part("CellModel").config["symmetries"] == turned
+    assert ("pass --symmetries true" in capsys.readouterr().out) == (words == ())
+
+
+def test_a_loss_that_is_no_number_ends_training_and_says_the_epoch(
+    own: Path, dataset: TerrainDataset, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It turns NaN in the second epoch, of training or of validation alone; resumed it ends there again."""
+    text = EXAMPLE.read_text()
+    broken = "            if self._trainer and self.training is {mode} and self.trainer.current_epoch == 1:\n"
+    broken += "                return observed.new_tensor(math.nan, requires_grad=True)\n"
+    at = "            mean, std = self.gaussian(outputs)\n            seen"
+    for mode, name in ((True, "train_loss"), (False, "valid_loss")):
+        Path("broken.py").write_text(text.replace(at, broken.format(mode=mode) + at))
+        command = "fit", "broken.py:CellModel", "--data", dataset.path, *QUICK, "--out", name
+        for words in ((), ("--resume",)):
+            assert call("train", *command, *words) == 1
+            assert f"{name} became nan in epoch 2." in capsys.readouterr().err
+            assert not Path(name).exists()
+        table = pd.read_csv(f"{name}.training/CellModel/metrics.csv")
+        assert table["epoch"].tolist() == [1, 2]
+        assert table[name].isna().tolist() == [False, True]
 
 
 @pytest.fixture(scope="module")

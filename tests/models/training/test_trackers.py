@@ -102,3 +102,42 @@ def test_a_missing_package_is_named_with_its_command() -> None:
         pytest.skip("mlflow is installed")
     with pytest.raises(ConfigError, match="pip install mlflow"):
         FitOptions(device="cpu", trainer={"logger": "lightning.pytorch.loggers.MLFlowLogger"})
+
+
+@pytest.mark.parametrize(
+    ("name", "init_args", "remedy"),
+    [
+        ("StochasticWeightAveraging", {"swa_lrs": 1e-2}, "fit swag"),
+        ("WeightAveraging", {}, "fit swag"),
+        ("EMAWeightAveraging", {}, "fit swag"),
+        ("ModelPruning", {"pruning_fn": "l1_unstructured"}, "Leave it out"),
+        ("LearningRateFinder", {}, "Set `learning_rate`"),
+        ("BatchSizeFinder", {}, "Set `batch_size`"),
+    ],
+)
+def test_callbacks_whose_effect_would_be_undone_are_refused_by_name(
+    name: str, init_args: dict[str, Any], remedy: str
+) -> None:
+    with pytest.raises(ConfigError, match=rf"got {name}, whose effect would be undone\. .*{remedy}"):
+        FitOptions(device="cpu", trainer={"callbacks": {"class_path": name, "init_args": init_args}})
+
+
+@pytest.mark.parametrize(
+    ("hook", "allowed"),
+    [("on_train_end", False), ("on_fit_end", False), ("on_train_epoch_start", True), ("setup", True)],
+)
+def test_a_callback_that_changes_the_trained_weights_is_refused_by_name(
+    hook: str, allowed: bool, dataset: TerrainDataset, tmp_path: Path
+) -> None:
+    file = tmp_path / "change.py"
+    file.write_text(
+        "from lightning.pytorch.callbacks import Callback\n\n\n"
+        f"class Change(Callback):\n    def {hook}(self, trainer, module, *_, **__):\n"
+        "        for value in module.parameters():\n            value.data.mul_(0.5)\n"
+    )
+    if allowed:
+        train(dataset, tmp_path / "out", callbacks=f"{file}:Change")
+        return
+    with pytest.raises(ConfigError, match=f"weights that `{hook}` of Change changed"):
+        train(dataset, tmp_path / "out", callbacks=f"{file}:Change")
+    assert not (tmp_path / "out").exists()
