@@ -14,7 +14,7 @@ ROOT = Path(__file__).parent.parent
 
 FACES = {
     "benchnav": "Batch BenchnavError CheckpointError ConditionedDistribution ConfigError DatasetError Grid "
-    "Observation QuantileDistribution Terrain TraversabilityDistribution TraversabilityMixture pool "
+    "Observation QuantileDistribution Terrain TrainingError TraversabilityDistribution TraversabilityMixture pool "
     "register",
     "benchnav.datagen": "Recipe TerrainClass TerrainDataset TerrainMaps create_dataset find_dataset generate "
     "load_recipe recipe_from_dict shipped_recipes",
