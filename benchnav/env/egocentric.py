@@ -9,7 +9,6 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -19,6 +18,7 @@ from benchnav.core import registry, rng
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.core.ground import GroundStatistics
+from benchnav.env import guard
 from benchnav.env.environment import EnvBatch, Observations, OffRoadEnv, OffRoadVectorEnv
 from benchnav.env.experience import Experience
 from benchnav.env.view import CHANNELS, View, bounds
@@ -119,9 +119,10 @@ class EgocentricEnv(OffRoadEnv):
 
     def __init__(self, render_mode: str | None = None, **arguments: Any) -> None:
         """Loads the maps of the split, and the model; see the class."""
-        _check_mode(render_mode, self.metadata)
-        super().__init__(**arguments, drawn=render_mode is not None)
+        super().__init__(render_mode, **arguments, drawn=render_mode is not None)
         self.render_mode = render_mode
+        if not guard.has_display():
+            self.metadata = {**self.metadata, "render_modes": ["rgb_array"]}
         self._window = None
         if render_mode == "human":
             from benchnav.env.picture import Window
@@ -149,7 +150,7 @@ class EgocentricEnv(OffRoadEnv):
     def render(self) -> Any:
         """The image of the last step in `"rgb_array"`; nothing in `"human"`, where it is shown already."""
         if self.render_mode is None:
-            gymnasium.logger.warn('render() draws nothing without `render_mode="rgb_array"` or "human".')
+            guard.warn('render() draws nothing without `render_mode="rgb_array"` or "human".')
         return self._batch.draw(0) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
@@ -184,8 +185,7 @@ class EgocentricVectorEnv(OffRoadVectorEnv):
 
     def __init__(self, num_envs: int = 1, render_mode: str | None = None, **arguments: Any) -> None:
         """Loads the maps of the split, and the model; see the class."""
-        _check_mode(render_mode, self.metadata)
-        super().__init__(num_envs, **arguments, drawn=render_mode is not None)
+        super().__init__(num_envs, render_mode, **arguments, drawn=render_mode is not None)
         self.render_mode = render_mode
 
     @staticmethod
@@ -206,7 +206,7 @@ class EgocentricBatch(EnvBatch):
         size: B.
         sensor: what of the ground's looks is seen.
         ground: which λ is sensed.
-        model: predicts λ.
+        model: predicts λ; if empty, `oracle`, with a warning.
         risk: gives λ̂.
         belief: what is made of sensed λ.
         unseen: what is believed of ground that was not seen.
@@ -224,7 +224,7 @@ class EgocentricBatch(EnvBatch):
         *,
         sensor: AnyPart | Sensor = "full",
         ground: AnyPart | Sensor = "contact",
-        model: AnyPart | TraversabilityModel = "oracle",
+        model: AnyPart | TraversabilityModel = "",
         risk: Any = "mean",
         belief: AnyPart | Belief[Any] = "static",
         unseen: str = "prior",
@@ -240,9 +240,12 @@ class EgocentricBatch(EnvBatch):
         super().__init__(size, **arguments)
         rules = replace(self._task.rules, unseen=unseen, replan_every_s=replan_every_s)
         self._task = replace(self._task, rules=rules)
+        if isinstance(model, str) and not model:
+            guard.warn_of_default_model()
+            model = "oracle"
         predictor: Any = model if isinstance(model, TraversabilityModel) else load_model(model)
         if mismatch := class_mismatch(predictor, self._dataset.recipe):
-            gymnasium.logger.warn(f"{mismatch}.")
+            guard.warn(f"{mismatch}.")
         sees: Any = registry.take("sensor", sensor)
         believes: Any = registry.take("belief", belief)
         clairvoyant = isinstance(predictor, Clairvoyant)
@@ -400,11 +403,3 @@ def _make_picture(grid: Grid) -> "Picture":
     from benchnav.env.picture import Picture
 
     return Picture(grid)
-
-
-def _check_mode(render_mode: str | None, metadata: Mapping[str, Any]) -> None:
-    modes = metadata["render_modes"]
-    expect(
-        render_mode is None or render_mode in modes,
-        f"`render_mode` {' or '.join(map(repr, modes))}, got {render_mode!r}.",
-    )

@@ -22,6 +22,7 @@ from benchnav.core.batch import map_tensors
 from benchnav.core.errors import expect
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.env import guard
 from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective, distance
 from benchnav.planning.problem import Task, heading_to
@@ -114,8 +115,9 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - the base class's contract
     _batch: "EnvBatch"
 
-    def __init__(self, **arguments: Any) -> None:
+    def __init__(self, render_mode: str | None = None, **arguments: Any) -> None:
         """Loads the maps of the split; see the class."""
+        guard.check_render_mode(render_mode, self.metadata["render_modes"])
         self._batch = self._make_batch(1, **arguments)
         self.observation_space = self._batch.observation_space
         self.action_space = self._batch.action_space
@@ -128,9 +130,9 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
         """Starts an episode; see the class."""
+        map_index = guard.read_options(options, ("map",), self._batch.maps).get("map")
         super().reset(seed=seed)
-        chosen = (options or {}).get("map")
-        self._batch.reset([self.np_random], np.array([True]), chosen)
+        self._batch.reset([self.np_random], np.array([True]), map_index)
         return _only(*self._batch.observe())
 
     def step(self, action: np.ndarray) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
@@ -155,8 +157,9 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012
     _batch: "EnvBatch"
 
-    def __init__(self, num_envs: int = 1, **arguments: Any) -> None:
+    def __init__(self, num_envs: int = 1, render_mode: str | None = None, **arguments: Any) -> None:
         """Loads the maps of the split; see the class."""
+        guard.check_render_mode(render_mode, self.metadata["render_modes"])
         self.num_envs = num_envs
         self._batch = self._make_batch(num_envs, **arguments)
         self.single_observation_space = self._batch.observation_space
@@ -174,7 +177,8 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
         """Starts an episode in each sub-environment, or in those of `options={"reset_mask": …}`, bool [B]."""
-        given, every = options or {}, np.ones(self.num_envs, dtype=bool)
+        given = guard.read_options(options, ("map", "reset_mask"), self._batch.maps)
+        every = np.ones(self.num_envs, dtype=bool)
         chosen = np.asarray(given.get("reset_mask", every))
         fits = chosen.shape == every.shape and chosen.dtype == bool and chosen.any()
         expect(fits, f"option `reset_mask` as bool of shape [{len(every)}], at least one true, got {chosen}.")
@@ -220,7 +224,8 @@ class EnvBatch:
         split: which of its splits; empty for `train`, else the first.
         robot: name or mapping of a registered robot, or one itself.
         objective: likewise of an objective; empty for the shaped reward.
-        world: what λ does: a preset by name, a mapping of changes to one, or a world itself.
+        world: what λ does: a preset by name, a mapping of changes to one, or a world itself; if empty, the paper's,
+            with a warning.
         goal_radius_m: a robot this near to its goal has arrived.
     """
 
@@ -231,11 +236,13 @@ class EnvBatch:
         split: str = "",
         robot: AnyPart | Robot = "unicycle",
         objective: AnyPart | Objective = "",
-        world: str | Mapping[str, Any] | World = "paper",
+        world: str | Mapping[str, Any] | World = "",
         goal_radius_m: float = 1.0,
     ) -> None:
         """Loads the maps of the split."""
-        self._world = world if isinstance(world, World) else read_world(world)[0]
+        guard.limit_threads()
+        guard.warn_of_default_world(world)
+        self._world = world if isinstance(world, World) else read_world(world or "paper")[0]
         made: Any = registry.take("robot", robot)
         self._objective: Any = None
         if objective:
@@ -246,7 +253,7 @@ class EnvBatch:
         if not split:
             split = "train" if "train" in dataset.splits else next(iter(dataset.splits))
             if split != "train":
-                gymnasium.logger.warn(f"{dataset.path} has no split 'train'; its split {split!r} is taken.")
+                guard.warn(f"{dataset.path} has no split 'train'; its split {split!r} is taken.")
         self._maps = dataset.terrain(split)
         taken = {"state", "goal"} & set(self._maps.layers)
         expect(
@@ -264,16 +271,16 @@ class EnvBatch:
         self.action_space = spaces.Box(np.float32(made.action_low), np.float32(made.action_high))
         self.observation_space = self._observation_space()
 
+    @property
+    def maps(self) -> int:
+        """How many maps the split has."""
+        return len(self._maps)
+
     def reset(
         self, generators: Sequence[np.random.Generator], chosen: np.ndarray, map_index: int | None
     ) -> None:
-        """Starts new episodes in the chosen sub-environments, bool, shape [B].
-
-        Raises:
-            ConfigError: there is no such map.
-        """
-        last = len(self._maps) - 1
-        expect(map_index is None or 0 <= map_index <= last, f"option `map` in 0–{last}, got {map_index}.")
+        """Starts new episodes in the chosen sub-environments, bool, shape [B]; maps are drawn if not given."""
+        guard.limit_threads()
         members = np.flatnonzero(chosen)
         for i in members.tolist():
             # Both are drawn always, so that naming the map changes nothing else.
@@ -315,13 +322,18 @@ class EnvBatch:
             Reward, terminated, truncated, and observed λ, each of shape [B].
 
         Raises:
-            ConfigError: the actions are of another shape.
+            ConfigError: the actions are of another shape, or not finite.
+            ResetNeeded: an episode has ended, or none has begun.
         """
+        guard.limit_threads()
         simulation, now = self._current()
         given, space = np.asarray(actions, np.float32), self.action_space
         expected = (len(self._map), *space.shape)
         expect(given.shape == expected, f"actions of shape {list(expected)}, got {list(given.shape)}.")
         waits = torch.zeros_like(now.running) if hold is None else torch.from_numpy(hold)
+        guard.check_actions(given, ~waits.numpy())
+        if bool((~now.running & ~waits).any()):
+            raise gymnasium.error.ResetNeeded("The episode has ended. Call reset() before the next step().")
         action = self._command(torch.from_numpy(given.clip(space.low, space.high)))
         moved, met = simulation.step(now, action)
         self._now = map_tensors(
