@@ -4,7 +4,7 @@ Observations hold what the robot knows by now, seen from where it stands; never 
 sub-environments, N×N cells of the crop, S state and A action dimensions.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,8 @@ from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.core.ground import GroundStatistics
 from benchnav.env import guard
-from benchnav.env.environment import EnvBatch, Observations, OffRoadEnv, OffRoadVectorEnv
+from benchnav.env.batch import AnyPart, EnvBatch, Observations
+from benchnav.env.environment import OffRoadEnv, OffRoadVectorEnv
 from benchnav.env.experience import Experience
 from benchnav.env.view import CHANNELS, View, bounds
 from benchnav.models.base import TraversabilityModel, predict
@@ -39,11 +40,9 @@ from benchnav.planning.world.outcome import Outcome
 if TYPE_CHECKING:
     from benchnav.env.picture import Picture
 
-AnyPart = str | Mapping[str, Any] | registry.Part
-
 
 class EgocentricEnv(OffRoadEnv):
-    """Drive to the goal over ground of uncertain traversability λ, by what is known of it so far.
+    """Drive to the goal over ground of uncertain traversability λ, by what is known of it; partially observed.
 
     ## Arguments
     Of `gymnasium.make("benchnav/OffRoad-v1", …)`: those of `benchnav/OffRoad-v0` (`data`, `split`, `robot`,
@@ -54,7 +53,7 @@ class EgocentricEnv(OffRoadEnv):
     |----------------------|-------------|------------------------------------------------------------------|
     | `sensor`             | `"full"`    | what of the ground's looks the robot sees                        |
     | `ground`             | `"contact"` | which λ it senses                                                |
-    | `model`              | `"oracle"`  | predicts λ from what was seen: a checkpoint or any other model   |
+    | `model`              | `""`        | predicts λ from what was seen; empty for `oracle`, with a warning |
     | `risk`               | `"mean"`    | risk measure that gives λ̂                                        |
     | `belief`             | `"static"`  | what is made of sensed λ; `"copula"` learns from it              |
     | `unseen`             | `"prior"`   | what is believed of unseen ground; or `"optimistic"`, `"pessimistic"` |
@@ -93,6 +92,12 @@ class EgocentricEnv(OffRoadEnv):
     | 3     | [0, 1]  | λ that the robot observed in the last step; 1 after a reset                   |
     | 4     | [0, 1]  | share of the time budget T that is left                                       |
     | 5 …   | [−1, 1] | what the robot's state has beyond (x, y, θ), such as velocities: x / (1 + \\|x\\|) |
+
+    ## What is hidden
+    λ of all cells but what the sensors measure; its true distribution, unless the model is privileged;
+    the dwell time on immobilising terrain, after which the episode ends; T, of which only the fraction left is
+    observed; the position and heading on the map; what is known of terrain beyond the crop; and the time until the
+    next update.
 
     ## What is known
     As in `benchnav-eval`: a belief that learns has λ sensed at each step. The sensor of appearance looks at the start

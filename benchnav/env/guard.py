@@ -5,7 +5,6 @@ import os
 import sys
 from collections.abc import Collection, Mapping
 from functools import cache
-from numbers import Integral
 from typing import Any
 
 import gymnasium
@@ -86,7 +85,7 @@ def read_options(options: Any, known: Collection[str], maps: int) -> dict[str, A
         check_known("an option of `reset`", name, known)
     index = checked.get("map")
     if index is not None:
-        is_index = isinstance(index, Integral) and not isinstance(index, bool) and 0 <= index < maps
+        is_index = isinstance(index, int | np.integer) and not isinstance(index, bool) and 0 <= index < maps
         expect(is_index, f"option `map` as a whole number in 0–{maps - 1}, got {index!r}.")
         checked["map"] = int(index)
     return checked
