@@ -70,7 +70,7 @@ print(torch.get_num_threads())
 """
 
 
-def output_of(code: str, limit_s: float = 300, **variables: str) -> tuple[str, str]:
+def output_of(code: str, limit_s: float = 120, **variables: str) -> tuple[str, str]:
     """Output and errors of a Python process, which is killed with its workers at the limit."""
     process = subprocess.Popen(
         [sys.executable, "-c", code],
