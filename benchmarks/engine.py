@@ -173,7 +173,7 @@ def risk_maps() -> list[dict[str, Any]]:
 def environments(size: int = 512) -> list[dict[str, Any]]:
     envs = gymnasium.make_vec(
         "benchnav/OffRoad-v0", num_envs=size, vectorization_mode="vector_entry_point", data="paper-v1-test",
-        split="test/std",
+        split="test/std", world="paper",
     )  # fmt: skip
     envs.reset(seed=0)
     own: Any = envs.unwrapped

@@ -73,7 +73,7 @@ def test_a_model_is_trained_and_measured_on_ground_that_is_labelled_in_part(
     assert "Expected maps with a class in every cell to drive on" in line
     assert not (tmp_path / "run").exists()
     with pytest.raises(ConfigError, match="a class in every cell"):
-        gymnasium.make("benchnav/OffRoad-v0", data="real.h5", split="train")
+        gymnasium.make("benchnav/OffRoad-v0", data="real.h5", split="train", world="paper")
 
 
 @pytest.fixture(scope="module")

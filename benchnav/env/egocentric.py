@@ -4,12 +4,11 @@ Observations hold what the robot knows by now, seen from where it stands; never 
 sub-environments, N×N cells of the crop, S state and A action dimensions.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -19,7 +18,9 @@ from benchnav.core import registry, rng
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.core.ground import GroundStatistics
-from benchnav.env.environment import EnvBatch, Observations, OffRoadEnv, OffRoadVectorEnv
+from benchnav.env import guard
+from benchnav.env.batch import AnyPart, EnvBatch, Observations
+from benchnav.env.environment import OffRoadEnv, OffRoadVectorEnv
 from benchnav.env.experience import Experience
 from benchnav.env.view import CHANNELS, View, bounds
 from benchnav.models.base import TraversabilityModel, predict
@@ -39,11 +40,9 @@ from benchnav.planning.world.outcome import Outcome
 if TYPE_CHECKING:
     from benchnav.env.picture import Picture
 
-AnyPart = str | Mapping[str, Any] | registry.Part
-
 
 class EgocentricEnv(OffRoadEnv):
-    """Drive to the goal over ground of uncertain traversability λ, by what is known of it so far.
+    """Drive to the goal over ground of uncertain traversability λ, by what is known of it; partially observed.
 
     ## Arguments
     Of `gymnasium.make("benchnav/OffRoad-v1", …)`: those of `benchnav/OffRoad-v0` (`data`, `split`, `robot`,
@@ -54,7 +53,7 @@ class EgocentricEnv(OffRoadEnv):
     |----------------------|-------------|------------------------------------------------------------------|
     | `sensor`             | `"full"`    | what of the ground's looks the robot sees                        |
     | `ground`             | `"contact"` | which λ it senses                                                |
-    | `model`              | `"oracle"`  | predicts λ from what was seen: a checkpoint or any other model   |
+    | `model`              | `""`        | predicts λ from what was seen; empty for `oracle`, with a warning |
     | `risk`               | `"mean"`    | risk measure that gives λ̂                                        |
     | `belief`             | `"static"`  | what is made of sensed λ; `"copula"` learns from it              |
     | `unseen`             | `"prior"`   | what is believed of unseen ground; or `"optimistic"`, `"pessimistic"` |
@@ -94,6 +93,12 @@ class EgocentricEnv(OffRoadEnv):
     | 4     | [0, 1]  | share of the time budget T that is left                                       |
     | 5 …   | [−1, 1] | what the robot's state has beyond (x, y, θ), such as velocities: x / (1 + \\|x\\|) |
 
+    ## What is hidden
+    λ of all cells but what the sensors measure; its true distribution, unless the model is privileged;
+    the dwell time on immobilising terrain, after which the episode ends; T, of which only the fraction left is
+    observed; the position and heading on the map; what is known of terrain beyond the crop; and the time until the
+    next update.
+
     ## What is known
     As in `benchnav-eval`: a belief that learns has λ sensed at each step. The sensor of appearance looks at the start
     and every `replan_every_s`. Then the model predicts from what was seen, the belief is told what was sensed, and λ̂
@@ -119,9 +124,10 @@ class EgocentricEnv(OffRoadEnv):
 
     def __init__(self, render_mode: str | None = None, **arguments: Any) -> None:
         """Loads the maps of the split, and the model; see the class."""
-        _check_mode(render_mode, self.metadata)
-        super().__init__(**arguments, drawn=render_mode is not None)
+        super().__init__(render_mode, **arguments, drawn=render_mode is not None)
         self.render_mode = render_mode
+        if not guard.has_display():
+            self.metadata = {**self.metadata, "render_modes": ["rgb_array"]}
         self._window = None
         if render_mode == "human":
             from benchnav.env.picture import Window
@@ -149,7 +155,7 @@ class EgocentricEnv(OffRoadEnv):
     def render(self) -> Any:
         """The image of the last step in `"rgb_array"`; nothing in `"human"`, where it is shown already."""
         if self.render_mode is None:
-            gymnasium.logger.warn('render() draws nothing without `render_mode="rgb_array"` or "human".')
+            guard.warn('render() draws nothing without `render_mode="rgb_array"` or "human".')
         return self._batch.draw(0) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
@@ -184,8 +190,7 @@ class EgocentricVectorEnv(OffRoadVectorEnv):
 
     def __init__(self, num_envs: int = 1, render_mode: str | None = None, **arguments: Any) -> None:
         """Loads the maps of the split, and the model; see the class."""
-        _check_mode(render_mode, self.metadata)
-        super().__init__(num_envs, **arguments, drawn=render_mode is not None)
+        super().__init__(num_envs, render_mode, **arguments, drawn=render_mode is not None)
         self.render_mode = render_mode
 
     @staticmethod
@@ -206,7 +211,7 @@ class EgocentricBatch(EnvBatch):
         size: B.
         sensor: what of the ground's looks is seen.
         ground: which λ is sensed.
-        model: predicts λ.
+        model: predicts λ; if empty, `oracle`, with a warning.
         risk: gives λ̂.
         belief: what is made of sensed λ.
         unseen: what is believed of ground that was not seen.
@@ -224,7 +229,7 @@ class EgocentricBatch(EnvBatch):
         *,
         sensor: AnyPart | Sensor = "full",
         ground: AnyPart | Sensor = "contact",
-        model: AnyPart | TraversabilityModel = "oracle",
+        model: AnyPart | TraversabilityModel = "",
         risk: Any = "mean",
         belief: AnyPart | Belief[Any] = "static",
         unseen: str = "prior",
@@ -240,9 +245,12 @@ class EgocentricBatch(EnvBatch):
         super().__init__(size, **arguments)
         rules = replace(self._task.rules, unseen=unseen, replan_every_s=replan_every_s)
         self._task = replace(self._task, rules=rules)
+        if isinstance(model, str) and not model:
+            guard.warn_of_default_model()
+            model = "oracle"
         predictor: Any = model if isinstance(model, TraversabilityModel) else load_model(model)
         if mismatch := class_mismatch(predictor, self._dataset.recipe):
-            gymnasium.logger.warn(f"{mismatch}.")
+            guard.warn(f"{mismatch}.")
         sees: Any = registry.take("sensor", sensor)
         believes: Any = registry.take("belief", belief)
         clairvoyant = isinstance(predictor, Clairvoyant)
@@ -400,11 +408,3 @@ def _make_picture(grid: Grid) -> "Picture":
     from benchnav.env.picture import Picture
 
     return Picture(grid)
-
-
-def _check_mode(render_mode: str | None, metadata: Mapping[str, Any]) -> None:
-    modes = metadata["render_modes"]
-    expect(
-        render_mode is None or render_mode in modes,
-        f"`render_mode` {' or '.join(map(repr, modes))}, got {render_mode!r}.",
-    )

@@ -13,6 +13,7 @@ from benchnav.testing import check_planner
 EXAMPLE = Path(__file__).parents[2] / "examples" / "ppo.py"
 SETTINGS: dict[str, Any] = {
     "split": "train", "world": {"preset": "stakes", "time_budget_s": 0.8}, "normalised_actions": True,
+    "model": "oracle",
 }  # fmt: skip
 
 

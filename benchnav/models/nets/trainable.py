@@ -133,6 +133,19 @@ class TrainableNetwork(lightning.LightningModule):
         self.stack = InputStack(self.inputs, scale)
         self.network = self.configure_network(self.stack.channels)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The state without the loss, which may be a closure; `__setstate__` configures it again."""
+        state = super().__getstate__()
+        if "loss" in state:
+            state["loss"] = None
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restores a pickled or copied network, whose loss refers to it and not to the original."""
+        super().__setstate__(state)
+        if "loss" in state:
+            self.loss = self.configure_losses()
+
     @classmethod
     def from_tensors(cls, config: Mapping[str, Any], map_classes: tuple[str, ...], tensors: Maps) -> Self:
         """Rebuilds a trained network, downloading nothing.

@@ -1,5 +1,7 @@
 """What holds of every model of the zoo: it recovers a known distribution, resumes, keeps the contract, is kept."""
 
+import copy
+import pickle
 from pathlib import Path
 
 import pytest
@@ -108,3 +110,16 @@ def test_slope_is_left_out_where_it_is_no_input(name: str) -> None:
     found = network.predict(terrain.observe()).mean()
     assert found.shape == terrain.traversability.shape
     assert network.joint[0].in_channels == make(name).joint[0].in_channels - 1
+
+
+@pytest.mark.parametrize("name", ZOO)
+def test_a_pickled_or_copied_network_is_the_same_with_a_loss_of_its_own(name: str) -> None:
+    terrain, _ = draw_two_grounds(torch.Generator().manual_seed(1))
+    network, seen = make(name), terrain.observe()
+    outputs = network(layers(terrain))
+    for other in (pickle.loads(pickle.dumps(network)), copy.deepcopy(network)):
+        assert torch.equal(other.predict(seen).quantile(0.3), network.predict(seen).quantile(0.3))
+        for training in (True, False):
+            expected = network.train(training).loss(outputs, terrain.traversability)
+            network.train(not training)
+            assert torch.equal(other.train(training).loss(outputs, terrain.traversability), expected)
