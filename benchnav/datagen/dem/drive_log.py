@@ -133,7 +133,14 @@ def read_drives(drives: Drives) -> DriveLog:
     kind = "WGS 84" if set(_PLACES["WGS 84"]) <= set(rows) and not set(_PLACES["crs"]) <= set(rows) else "crs"
     moves = _MOVES[:1] if drives.speed == "positions" else _MOVES
     columns = ("time_s", *_PLACES[kind], *moves)
-    require_columns(rows, columns, path)
+    remedy = "Name positions x_m and y_m, or longitude_deg and latitude_deg for WGS 84."
+    if set(_PLACES[kind]) <= set(rows):
+        remedy = (
+            "Log speed over ground, or pass --speed positions."
+            if set(_MOVES) - set(rows) == {"measured_m_s"}
+            else ""
+        )
+    require_columns(rows, columns, path, remedy)
     limits = {"longitude_deg": (-180.0, 360.0), "latitude_deg": (-90.0, 90.0)}
     values = {name: read_numbers(rows, name, path, limits.get(name, (-np.inf, np.inf))) for name in columns}
     for name in moves:

@@ -70,11 +70,12 @@ def compare_motion(log: DriveLog) -> DriveLog:
         log = replace(log, rows=log.rows.assign(speed=known))
     log = log.without("doubled", log.rows.duplicated().to_numpy())
     log = _leave_out(log, {"restarted": find_restarted(log.rows)})
+    beyond = (log.rows[["commanded", "speed"]].abs() > MOST_SPEED_M_S).any(axis=1).to_numpy()
+    log = _leave_out(log, {"implausible": beyond})
     rows = log.rows
     commanded, speed = (rows[name].to_numpy() for name in ("commanded", "speed"))
-    beyond = np.fmax(np.abs(commanded), np.abs(speed)) > MOST_SPEED_M_S
-    top = np.abs(commanded[~beyond]).max(initial=0.0)
-    implausible = beyond | (is_compared & (np.abs(speed) > TOP_RATIO * top))
+    top = np.abs(commanded).max(initial=0.0)
+    implausible = is_compared & (np.abs(speed) > TOP_RATIO * top)
     slow = np.abs(commanded) < settings.least_speed
     if slow.all():
         return log.without("slow", slow)
@@ -87,12 +88,12 @@ def compare_motion(log: DriveLog) -> DriveLog:
     spans = spans_of(track_of(rows[~is_faulty]), settings.least_speed)
     log = replace(log, motion=_sum_up(spans))
     _check_pace(log, spans, is_jumpy=is_jumpy)
-    if is_compared:
-        is_driven = ~(slow | beyond)
-        _check_scale(log, commanded[is_driven], speed[is_driven])
     masks = {"frozen": frozen, "jumped": jumped}
     if is_compared:
-        masks["off_pace"] = _off_pace(log, spans)
+        off_pace = _off_pace(log, spans)
+        is_driven = ~(slow | off_pace)
+        _check_scale(log, commanded[is_driven], speed[is_driven])
+        masks["off_pace"] = off_pace
     masks |= {"slow": slow, "implausible": implausible}
     if settings.speed == "positions":
         positions = speed_of_positions(track_of(rows[~(frozen | jumped | implausible)]), settings.least_speed)

@@ -20,15 +20,24 @@ ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
 _MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
 
 
-def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path) -> None:
-    """Refuses a log that lacks a column.
+def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path, remedy: str = "") -> None:
+    """Check that a log has columns.
+
+    Args:
+        rows: of the log.
+        columns: that are required.
+        path: of the log.
+        remedy: what helps where the name of no other column is near, a sentence.
 
     Raises:
-        DatasetError: it does.
+        DatasetError: If it lacks one.
     """
     names = [str(name) for name in rows.columns]
     if missing := [name for name in columns if name not in names]:
         near = hint(missing[0], [name for name in names if name not in columns])
+        near = near or (remedy and f" {remedy}")
+        if len(names) == 1 and any(separator in names[0] for separator in ";\t| "):
+            near = " Separate columns by commas, in a .tsv by tabs, and write decimals with a point."
         raise DatasetError(
             f"Expected columns {', '.join(columns)} in {path}, got no {' and no '.join(missing)}. "
             f"It has {', '.join(names) or 'none'}.{near}"
@@ -84,7 +93,12 @@ def read_numbers(rows: pd.DataFrame, name: str, path: Path, limits: tuple[float,
         within = f" within [{least:g}, {most:g}]" if np.isfinite(most) else ""
         raise DatasetError(
             f"Expected `{name}` to be numbers{within} in {path}, got {column.iloc[bad[0]]!s} in row "
-            f"{bad[0] + 1} below the header. Mend that row, or leave the value out."
+            f"{bad[0] + 1} below the header. "
+            + (
+                "Mend that row, or leave the value out."
+                if len(bad) < given.sum()
+                else "Convert the column to numbers."
+            )
         )
     return values
 
