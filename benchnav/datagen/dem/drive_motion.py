@@ -79,12 +79,13 @@ def compare_motion(log: DriveLog) -> DriveLog:
     slow = np.abs(commanded) < settings.least_speed
     if slow.all():
         return log.without("slow", slow)
-    track = track_of(rows[~implausible])
+    track = track_of(rows)
     by = "commanded" if settings.speed == "positions" else "speed"
     frozen = rows.index.isin(find_frozen(track, by, settings.least_speed))
     jumped = rows.index.isin(find_jumped(track[~track.index.isin(rows.index[frozen])], TOP_RATIO * top))
     is_jumpy = jumped.mean() > MAX_FAULTY
-    is_faulty = implausible & (implausible.mean() <= MAX_FAULTY) | frozen | jumped & (not is_jumpy)
+    # Where most rows are at fault, it is by a unit, which spans of all of them show.
+    is_faulty = frozen | (jumped & (not is_jumpy)) | (implausible & (implausible.mean() <= MAX_FAULTY))
     spans = spans_of(track_of(rows[~is_faulty]), settings.least_speed)
     log = replace(log, motion=_sum_up(spans))
     _check_pace(log, spans, is_jumpy=is_jumpy)
@@ -172,10 +173,10 @@ def _check_pace(log: DriveLog, spans: pd.DataFrame, *, is_jumpy: bool) -> None:
     longest_s = float((times.max() - times.min()).max())
     ratio, by_command = (_median_ratio(spans, of) for of in ("measured", "commanded"))
     unit, remedy = _unit_of(ratio, by_command, log.is_geographic)
-    if longest_s <= WINDOW_S and speed == "" and unit not in _TIMES:
+    if (longest_s <= WINDOW_S or spans.empty) and speed == "" and unit not in _TIMES:
         raise DatasetError(
-            f"Expected drives of more than {WINDOW_S:g} s in {path}, so that positions can be compared with "
-            f"`measured_m_s`, got up to {longest_s:.3g} s. Log `time_s` in seconds, or pass --speed measured."
+            f"Expected drives under command for more than {WINDOW_S:g} s in {path}, to compare positions with "
+            f"`measured_m_s`, got drives of up to {longest_s:.3g} s. Log `time_s` in seconds, or pass --speed measured."
         )
     if speed == "measured" or math.isnan(ratio) or PACE_LIMITS[0] <= ratio <= PACE_LIMITS[1]:
         return

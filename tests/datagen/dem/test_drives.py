@@ -491,7 +491,7 @@ MOVE = "".join(f"{step / 5},{500010 + 0.16 * step},3999910,1,0.8,a\n" for step i
         (HEAD + "0,1,1,30,30,a\n0,1,1,100,1,a\n", "`commanded_m_s` in m/s.*median of 65.*Divide km/h by 3.6"),
         (HEAD + "0,1,1,1,30,a\n", "`measured_m_s` in m/s.*median of 30"),
         (HEAD + "0,1,1,1,1,a\n", "covers x 500000 to 500096 and y .*got x 1 to 1 and y 1 to 1 in"),
-        (HEAD + "0,500010,3999910,1,1,a\n", "drives of more than 2 s .* up to 0 s"),
+        (HEAD + "0,500010,3999910,1,1,a\n", "for more than 2 s .* up to 0 s"),
         (HEAD + MOVE, "a drive for each of the 3 splits .* got 1 in .*--splits"),
         (
             HEAD + "".join(MOVE.replace("a\n", f"{name}\n") for name in "abc"),

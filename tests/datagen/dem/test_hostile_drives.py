@@ -193,7 +193,7 @@ CASES: list[Case] = [
      lambda log, line: scaled(named_factor(line), "time_s")(log)),
     ("hours", scaled(1 / 3600, "time_s"), "looks like hours",
      lambda log, line: scaled(named_factor(line), "time_s")(log)),
-    ("one time", lambda log: log.assign(time_s=5.0), "more than 2 s .* got up to 0 s", "--speed measured"),
+    ("one time", lambda log: log.assign(time_s=5.0), "more than 2 s .* up to 0 s", "--speed measured"),
     ("knots", scaled(1 / 0.5144, "measured_m_s"), "looks like knots", "--speed positions"),
     ("knots, mended", scaled(1 / 0.5144, "measured_m_s"), "looks like knots",
      lambda log, line: scaled(named_factor(line), "measured_m_s")(log)),
