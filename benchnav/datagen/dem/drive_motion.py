@@ -41,7 +41,7 @@ _VARIED_SLOPE_DEG = 10.0  # from the 5 % to the 95 % quantile along a track, so 
 _STEEPEST = 1.0  # of a track; steeper cells of a surface model are trees and walls (choice)
 
 # The ratio of positions to measured speed that each unit gives.
-_SPEEDS = {"knots": 0.5144, "km/h": 1 / 3.6, "mph": 1 / 2.237, "ft/s": 1 / 3.281, "cm/s": 0.01, "mm/s": 0.001}
+_SPEEDS = {"knots": 0.5144, "km/h": 1 / 3.6, "mph": 1 / 2.237, "ft/s": 1 / 3.281, "cm/s": 0.01}
 _TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "minutes": 60.0, "hours": 3600.0}
 _LENGTHS = {"feet": 3.281, "centimetres": 100.0, "millimetres": 1000.0}
 
@@ -209,9 +209,11 @@ def _unit_of(ratio: float, by_command: float, is_geographic: bool) -> tuple[str,
     if not is_geographic:
         others |= {name: (value, "`x_m` and `y_m`", 1 / value) for name, value in _LENGTHS.items()}
     for name, (value, column, factor) in others.items():
-        # Times and positions are off against both speeds; a measured speed is off against positions only.
-        is_plausible = _PLAUSIBLE[0] <= by_command / value <= _PLAUSIBLE[1]
-        if abs(ratio / value - 1) <= _UNIT_TOLERANCE and is_plausible:
+        # Times and positions are off against the command too, a measured speed is not.
+        mended, as_it_is = (
+            _PLAUSIBLE[0] <= by / value <= _PLAUSIBLE[1] for by in (by_command, by_command * value)
+        )
+        if abs(ratio / value - 1) <= _UNIT_TOLERANCE and mended and not as_it_is:
             return name, f"Multiply {column} by {factor:.4g}"
     for name, value in sorted(_SPEEDS.items(), key=lambda item: abs(ratio / item[1] - 1)):
         if abs(ratio / value - 1) <= _UNIT_TOLERANCE:

@@ -1,5 +1,7 @@
 """Positions of drive logs compared with their speeds."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.signal import savgol_filter
 
 from benchnav.core.errors import DatasetError
+from benchnav.datagen.dem.drive_cells import elevation_under
 from benchnav.datagen.dem.drive_log import DriveLog, Drives
 from benchnav.datagen.dem.drive_motion import compare_motion, compare_slopes
 from benchnav.datagen.dem.drive_tracks import find_jumped, speed_of_positions, track_of, velocity_of
@@ -91,6 +94,30 @@ def test_another_unit_is_named_with_its_factor(
             compare_motion(log_of(rows, "positions"))
 
 
+def test_a_measured_speed_of_no_unit_is_rejected_too() -> None:
+    rows = rough_drive()
+    for factor, ratio in (
+        (1 / 1.3, "1.3"),
+        (1 / 3.281, "3.2"),
+    ):  # positions agree with the command: they are no feet
+        with pytest.raises(
+            DatasetError, match=rf"got {ratio}\d* times .* like no unit that is known\. .* m, or pass"
+        ):
+            compare_motion(log_of(rows.assign(speed=rows["speed"] * factor)))
+
+
+def test_curves_and_gaps_are_no_disagreement() -> None:
+    turning = np.repeat([0, 1.2, -1.2, 0, 1.2], 120)
+    log = compare_motion(log_of(drive(np.ones(600), np.full(600, 0.9), turning)))
+    assert log.motion["pace"] == pytest.approx(1, abs=0.02)
+    rows = drive(np.ones(600), np.full(600, 0.9))
+    paused = rows.assign(
+        time_s=rows["time_s"] + 60 * (rows.index // 41)
+    )  # stands for a minute, and logs nothing
+    log = compare_motion(log_of(paused))
+    assert (log.motion["pace"], len(log.rows)) == (pytest.approx(1, abs=0.02), 600)
+
+
 def test_the_command_may_be_far_from_positions() -> None:
     rows = drive(np.ones(900), np.repeat([0.1, 0.4, 0.9], 300))
     log = compare_motion(log_of(rows))
@@ -163,6 +190,15 @@ def test_positions_that_repeat_until_the_next_fix_are_not_frozen() -> None:
     log = compare_motion(log_of(rows))
     assert not log.left_out["frozen"] + log.left_out["jumped"]
     assert log.motion["pace"] == pytest.approx(1, abs=0.05)
+    rows = drive(np.repeat([0.2, 1.0], [500, 200]), np.ones(700))  # much faster than usual at the end
+    rows[["x", "y"]] = rows[["x", "y"]].iloc[np.arange(700) // 20 * 20].to_numpy()
+    assert compare_motion(log_of(rows)).left_out["frozen"] == 0
+
+
+def test_each_jump_is_out_of_reach_from_the_last_right_position() -> None:
+    rows = rough_drive()
+    rows.loc[[350, 550], "x"] += 10
+    assert set(find_jumped(track_of(rows), 1.5)) == {350, 550}
 
 
 @given(st.sets(st.integers(0, 599), max_size=55), st.floats(3, 1e6), st.integers(0, 2**32))
@@ -220,6 +256,26 @@ def test_a_speed_that_follows_the_command_up_and_down_is_of_wheels(
     else:
         compare_slopes(log, elevation.to_numpy())
     compare_slopes(compare_motion(log_of(rows.assign(speed=measured), "measured")), elevation.to_numpy())
+
+
+@pytest.mark.parametrize("height", [40, 200])
+def test_elevation_is_interpolated_between_cells(height: int) -> None:
+    class Plane:
+        """A layer whose elevation is 3 · row + 5 · column, framed by one cell."""
+
+        warped = SimpleNamespace(height=height + 2, width=32)
+
+        def read(self, rows: range, columns: range) -> np.ndarray:
+            row, column = np.meshgrid(
+                np.arange(rows.start - 1, rows.stop + 1), np.arange(-1, columns.stop + 1), indexing="ij"
+            )
+            return (3.0 * row + 5.0 * column)[None]
+
+    generator = np.random.default_rng(0)
+    row, column = generator.uniform(-0.5, height - 0.5, 500), generator.uniform(-0.5, 29.5, 500)
+    log = log_of(drive(np.ones(500), np.ones(500)))
+    actual = elevation_under(log, Plane(), row, column)  # type: ignore[arg-type]
+    np.testing.assert_allclose(actual, 3 * row + 5 * column)
 
 
 # Speed of positions
