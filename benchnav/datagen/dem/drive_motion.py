@@ -208,12 +208,10 @@ def _unit_of(ratio: float, by_command: float, is_geographic: bool) -> tuple[str,
     others = {name: (value, "`time_s`", value) for name, value in _TIMES.items()}
     if not is_geographic:
         others |= {name: (value, "`x_m` and `y_m`", 1 / value) for name, value in _LENGTHS.items()}
+    # Times and positions are off against the command too, a measured speed is not.
+    is_plausible = _PLAUSIBLE[0] <= by_command <= _PLAUSIBLE[1]
     for name, (value, column, factor) in others.items():
-        # Times and positions are off against the command too, a measured speed is not.
-        mended, as_it_is = (
-            _PLAUSIBLE[0] <= by / value <= _PLAUSIBLE[1] for by in (by_command, by_command * value)
-        )
-        if abs(ratio / value - 1) <= _UNIT_TOLERANCE and mended and not as_it_is:
+        if abs(ratio / value - 1) <= _UNIT_TOLERANCE and not is_plausible:
             return name, f"Multiply {column} by {factor:.4g}"
     for name, value in sorted(_SPEEDS.items(), key=lambda item: abs(ratio / item[1] - 1)):
         if abs(ratio / value - 1) <= _UNIT_TOLERANCE:
