@@ -60,7 +60,8 @@ class Drives:
     def __post_init__(self) -> None:
         """Checks the settings."""
         expect(
-            self.file.endswith(ENDINGS), f"`drives` to end in one of {', '.join(ENDINGS)}, got {self.file!r}."
+            self.file.endswith(ENDINGS),
+            f"`drives` to end in one of {', '.join(ENDINGS)}, got {self.file!r}. Write such a table, with a header.",
         )
         expect(0 < self.least_speed < np.inf, f"`least_speed` above 0 m/s, got {self.least_speed:g}.")
         expect(
