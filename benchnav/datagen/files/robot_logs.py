@@ -17,6 +17,7 @@ from benchnav.core.settings import hint
 from benchnav.core.touched import note_file
 
 ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
+_SEPARATE = "Separate columns by commas, in a .tsv by tabs, and write decimals with a point."
 _MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
 
 
@@ -37,7 +38,7 @@ def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path, re
         near = hint(missing[0], [name for name in names if name not in columns])
         near = near or (remedy and f" {remedy}")
         if len(names) == 1 and any(separator in names[0] for separator in ";\t| "):
-            near = " Separate columns by commas, in a .tsv by tabs, and write decimals with a point."
+            near = f" {_SEPARATE}"
         raise DatasetError(
             f"Expected columns {', '.join(columns)} in {path}, got no {' and no '.join(missing)}. "
             f"It has {', '.join(names) or 'none'}.{near}"
@@ -67,8 +68,11 @@ def read_log(path: Path) -> pd.DataFrame:
         return rows.rename(columns=str.strip)
     except (OSError, EOFError, ValueError, zlib.error, pd.errors.ParserWarning) as error:
         why = [*str(error).strip().splitlines(), type(error).__name__]
+        is_text = isinstance(error, pd.errors.ParserWarning | pd.errors.ParserError)
+        remedy = f". {_SEPARATE}" if is_text else ""
         raise DatasetError(
-            f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got one that cannot be read: {why[0]}"
+            f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got one that cannot be read: "
+            f"{why[0].removesuffix('.')}{remedy}"
         ) from error
 
 

@@ -483,6 +483,8 @@ MOVE = "".join(f"{step / 5},{500010 + 0.16 * step},3999910,1,0.8,a\n" for step i
         ("time_s,x_m,y_m,commanded,measured_m_s\n0,1,1,1,1\n", "no commanded_m_s.*Did you mean 'commanded'"),
         ("t,x_m,y_m,commanded_m_s,measured_m_s\n0,1,1,1,1\n", "got no time_s. It has t, x_m"),
         ("time_s,longitude_deg,commanded_m_s,measured_m_s\n0,1,1,1\n", "got no x_m and no y_m"),
+        ((HEAD + MOVE).replace(",", ";"), "got no time_s .* Separate columns by commas"),
+        ((HEAD + MOVE).replace(",", ";").replace(".", ","), "cannot be read: .* write decimals with a point"),
         (HEAD, "got none: of 0, none"),
         (HEAD + MOVE.replace("1,0.8", "0,0"), "of 31, 31 were commanded less"),
         (HEAD + "0,1,1,fast,1,a\n", "`commanded_m_s` to be numbers in .*, got fast in row 1"),
