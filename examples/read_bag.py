@@ -18,6 +18,8 @@ from pathlib import Path
 import pandas as pd
 
 HOLDS_S = 0.5
+ODOMETRY = ("nav_msgs/msg/Odometry",)
+COMMANDS = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")
 
 
 def read(path: Path, odometry: str, command: str) -> pd.DataFrame:
@@ -35,10 +37,13 @@ def read(path: Path, odometry: str, command: str) -> pd.DataFrame:
         sys.exit(f"Expected a bag, got {path}, which is not there.")
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
         topics = {one.topic: one.msgtype for one in bag.connections}
-        for topic in (odometry, command):
-            if topic not in topics:
+        for option, topic, kinds in (("--odometry", odometry, ODOMETRY), ("--command", command, COMMANDS)):
+            if topics.get(topic) not in kinds:
                 known = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items()))
-                sys.exit(f"Expected topic {topic} in {path}, got none. It has {known or 'no topics'}.")
+                sys.exit(
+                    f"Expected topic {topic} of type {' or '.join(kinds)} in {path}, got {topics.get(topic, 'none')}. "
+                    f"Pass {option} TOPIC; the bag has {known or 'no topics'}."
+                )
         both = [one for one in bag.connections if one.topic in (odometry, command)]
         for own, nanoseconds, raw in bag.messages(both):
             message, time_s = bag.deserialize(raw, own.msgtype), nanoseconds / 1e9
@@ -46,7 +51,7 @@ def read(path: Path, odometry: str, command: str) -> pd.DataFrame:
                 place = message.pose.pose.position
                 moved.append((time_s, place.x, place.y, message.twist.twist.linear.x))
             else:
-                twist = message.twist if hasattr(message, "twist") else message
+                twist = message.twist if own.msgtype.endswith("Stamped") else message
                 told.append((time_s, twist.linear.x))
     rows = pd.DataFrame(moved, columns=["time_s", "x_m", "y_m", "measured_m_s"]).sort_values("time_s")
     commands = pd.DataFrame(told, columns=["time_s", "commanded_m_s"], dtype=float).sort_values("time_s")

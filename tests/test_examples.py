@@ -96,7 +96,8 @@ from types import SimpleNamespace as Some
 class Stores: ROS2_HUMBLE = 0
 def get_typestore(store): pass
 class AnyReader:
-    connections = [Some(topic="/odom", msgtype="o"), Some(topic="/cmd_vel", msgtype="c"), Some(topic="/x", msgtype="x")]
+    types = {"/odom": "nav_msgs/msg/Odometry", "/cmd_vel": "geometry_msgs/msg/Twist", "/imu": "sensor_msgs/msg/Imu"}
+    connections = [Some(topic=topic, msgtype=kind) for topic, kind in types.items()]
     def __init__(self, paths, default_typestore): pass
     def __enter__(self): return self
     def __exit__(self, *error): pass
@@ -109,8 +110,8 @@ class AnyReader:
             yield odom, 10**9 * (100 + step / 10), step
     def deserialize(self, step, kind):
         linear = Some(linear=Some(x=step / 2))
-        if kind == "c":
-            return linear if step == 1 else Some(twist=linear)
+        if kind == self.types["/cmd_vel"]:
+            return linear
         return Some(pose=Some(pose=Some(position=Some(x=1.0 * step, y=2.0))), twist=Some(twist=linear))
 """
 
@@ -130,7 +131,16 @@ def test_a_bag_becomes_a_log_of_drives(tmp_path: Path) -> None:
         (tmp_path / "rosbags" / f"{name}.py").write_text(ODOMETRY)
     assert "one.bag, which is not there" in read_bag().stderr
     (tmp_path / "one.bag").touch()
-    assert "It has /cmd_vel (c), /odom (o), /x (x)" in read_bag("--command", "/no").stderr
+    has = "; the bag has /cmd_vel (geometry_msgs/msg/Twist), /imu (sensor_msgs/msg/Imu), /odom "
+    for option, expected in (
+        ("--odometry", "nav_msgs/msg/Odometry"),
+        ("--command", "geometry_msgs/msg/Twist or"),
+    ):
+        for topic, kind in (("/no", "none"), ("/imu", "sensor_msgs/msg/Imu")):
+            said = read_bag(option, topic).stderr
+            assert f"Expected topic {topic} of type {expected}" in said
+            assert f"got {kind}. Pass {option} TOPIC{has}" in said
+            assert len(said.splitlines()) == 1
     done = read_bag("--origin", "500", "200", "90")
     assert "12 rows, 4 without a command" in done.stdout, done.stderr
     rows = pd.read_csv(tmp_path / "drives.csv")

@@ -6,14 +6,12 @@ What is heavy is imported where it is called, so that the command's help is quic
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from benchnav import datagen
 from benchnav.core.errors import expect
 from benchnav.core.progress import show_progress
 from benchnav.datagen.dem.raster import Rasters
-
-_MOST_PACE = 2.5  # of what positions say beside speeds, or its inverse; km/h are 3.6 m/s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +76,7 @@ def import_drives(
     class_ids: dict[int, str | None] | None = None,
     layer: tuple[str, ...] = (),
     least_speed: float = 0.1,
+    speed: Literal["", "positions", "measured"] = "",
     splits: str = "train:0.6,valid:0.2,test/site:0.2",
 ) -> None:
     """Make a dataset of measured traversability from a robot's drives; needs the extra benchnav[geo].
@@ -96,6 +95,8 @@ def import_drives(
         class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
         layer: Optional fields as [NAME=RASTER, NAME=RASTER:UNIT], such as [vegetation_m=canopy.tif].
         least_speed: Least commanded speed, forward or backward, of rows that are used, m/s.
+        speed: Source of the speed over ground: positions, or measured as logged, whatever positions say. If empty,
+            measured speed that agrees with positions.
         splits: Splits and their shares of the maps; no two of them touch, and each drive belongs to one.
     """
     from benchnav.datagen.dem.drive_log import Drives
@@ -106,7 +107,7 @@ def import_drives(
         "`photo` or `classes` with `drives`, got neither, so that no input shows where λ is low. Pass --photo RASTER.",
     )
     rasters = Rasters(photo=photo, classes=classes, class_ids=class_ids, layer=layer, unlabelled=not classes)
-    log = Drives(file=drives, least_speed=least_speed)
+    log = Drives(file=drives, least_speed=least_speed, speed=speed)
     made = _import(options, overrides, splits, dem=dem, rasters=rasters, drives=log)
     sources = {split: entry["parts"][0]["source"] for split, entry in made.splits.items()}
     about = next(iter(sources.values()))["drives"]
@@ -130,12 +131,26 @@ def _sum_up(about: Mapping[str, Any]) -> str:
         for reason, count in about["left_out"].items()
         if count
     ]
-    if about["pace"] is not None and not 1 / _MOST_PACE < about["pace"] < _MOST_PACE:
+    lines.append(_say_motion(about))
+    beyond = about["beyond"]
+    if any(beyond.values()):
         lines.append(
-            f"warning: positions move {about['pace']:g} times as far as measured_m_s says (median over spans of 2 s). "
-            "Check that speeds are in m/s, times in s and positions in m"
+            f"{beyond['below_0']} rows have λ below 0 (sliding back, or noise) and {beyond['above_1']} above 1 (faster "
+            "than the command); they are stored as 0 and 1"
         )
     return "\n  ".join(lines)
+
+
+def _say_motion(about: Mapping[str, Any]) -> str:
+    """Compare positions with both speeds, in a sentence."""
+    ratios = (
+        f"{about[name]:g} times as far as {column} says"
+        for name, column in (("pace", "measured_m_s"), ("commanded_pace", "commanded_m_s"))
+        if about[name] is not None
+    )
+    compared = " and ".join(ratios) or "too little to be compared with speeds"
+    source = {"": "", "positions": "; speeds are those of positions", "measured": "; speeds are as logged"}
+    return f"positions move {compared}{source[about['speed']]}"
 
 
 def _few(names: Sequence[str]) -> str:

@@ -12,15 +12,18 @@ from typing import Any
 
 import numpy as np
 from numpy import ndarray
+from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from benchnav.core.errors import DatasetError
-from benchnav.datagen.dem.drive_log import RATIO_LIMITS, DriveLog, pace
-from benchnav.datagen.dem.raster import Raster, transformed
+from benchnav.datagen.dem.drive_log import REASONS, DriveLog
+from benchnav.datagen.dem.raster import Layer, Raster, transformed
 from benchnav.datagen.dem.tiling import Tiling
 from benchnav.datagen.schema import Json
 
 BANDS = ("traversability", "drive_count", "drive_std")
+RATIO_LIMITS = (0.0, 1.0)  # that the ratio of a row is clipped to when it is stored
+_BLOCK_CELLS = 64  # rows of cells that are read at once
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,29 @@ def check_enough(log: DriveLog, splits: Sequence[str]) -> None:
         )
 
 
+def elevation_under(log: DriveLog, layer: Layer, row: ndarray, column: ndarray) -> ndarray:
+    """Interpolate elevation between the cells of the maps and the one around them.
+
+    Args:
+        log: the drives.
+        layer: elevation, in metres.
+        row: of each row of the log, counted northward from the middle of the first cell, float64, shape [N].
+        column: counted eastward.
+
+    Returns:
+        float64, NaN off the cells, shape [N].
+    """
+    height, width = layer.warped.height - 2, layer.warped.width - 2
+    elevation_m = np.full(len(row), np.nan)
+    block = np.floor(np.clip(row, 0, height - 1) / _BLOCK_CELLS).astype(np.int64)
+    for start in np.unique(block) * _BLOCK_CELLS:
+        own = block == start // _BLOCK_CELLS
+        cells = layer.read(range(start, min(start + _BLOCK_CELLS, height)), range(width))[0]
+        places = row[own] - start + 1, column[own] + 1  # of cells that are framed by one
+        elevation_m[own] = ndimage.map_coordinates(cells, places, order=1, cval=np.nan)
+    return elevation_m
+
+
 def drive_over(log: DriveLog, tiling: Tiling, row: ndarray, column: ndarray) -> tuple[DriveLog, DrivenCells]:
     """Gives each drive to a split and takes the mean of λ over the rows on each cell.
 
@@ -128,7 +154,9 @@ def drive_over(log: DriveLog, tiling: Tiling, row: ndarray, column: ndarray) -> 
     log = log.without("other_split", log.rows["split"].to_numpy() != owner[log.rows["drive"]])
     width = tiling.cells[1]
     cell = log.rows["row"] * width + log.rows["column"]
-    driven = log.rows["traversability"].groupby(cell).agg(["mean", "count", "std"])
+    # A row that slides back or exceeds its command stays as it is in the log; what is stored is a fraction.
+    stored = log.rows["traversability"].clip(*RATIO_LIMITS)
+    driven = stored.groupby(cell).agg(["mean", "count", "std"])
     return log, DrivenCells(driven.index.to_numpy(), driven.to_numpy(np.float64).T, width)
 
 
@@ -142,11 +170,17 @@ def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
         "ratio_limits": list(RATIO_LIMITS),
         "rows": len(log.rows) + sum(log.left_out.values()),
         "used": {split: len(rows) for split, rows in own.items()},
-        "left_out": dict(log.left_out),
+        "left_out": {reason: log.left_out[reason] for reason in REASONS if reason in log.left_out},
+        "beyond": {
+            "below_0": int((log.rows["traversability"] < 0).sum()),
+            "above_1": int((log.rows["traversability"] > 1).sum()),
+        },
         "drives": {
             split: [log.names[one] for one in np.unique(rows["drive"])] for split, rows in own.items()
         },
-        "pace": pace(log.rows),
+        "speed": log.settings.speed,
+        "pace": log.motion.get("pace"),
+        "commanded_pace": log.motion.get("commanded_pace"),
     }
 
 

@@ -1,15 +1,16 @@
-"""The log of a robot's drives: where it drove, what it was told and what it did, and the λ that follows.
+"""The log of a robot's drives: positions, commanded and measured speed, and the λ that follows.
 
 A row is a moment of a drive. Columns: `time_s`; the position, `x_m` and `y_m` in the coordinate reference system of the
 elevation model or `longitude_deg` and `latitude_deg` (WGS 84); `commanded_m_s` and `measured_m_s`, speeds forward over
-ground; and perhaps `drive`, its name. λ is measured over commanded speed. That says something of the ground only where
-the robot was to move, so rows with a slow command are left out, as are those of a ratio that no ground explains.
+ground; optionally `drive`, its name. λ is measured over commanded speed, where the robot was commanded to move. The
+ratio of a row may lie beyond [0, 1]: robots slide back and run downhill. It is clipped only when it is stored.
 Letters in shapes: N rows that are used.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -20,18 +21,22 @@ from benchnav.core.sources import digest_of_path
 from benchnav.datagen.files.robot_logs import ENDINGS, read_log, read_names, read_numbers, require_columns
 
 LEAST_SPEED_M_S = 0.1
-RATIO_LIMITS = (-0.2, 1.2)  # of measured to commanded speed; noise of a speed beyond 0 and 1 is clipped
 MOST_SPEED_M_S = 15.0  # off-road robots are slower, unless they are logged in km/h or cm/s
+TOP_RATIO = 1.5  # of a speed to the top command, which no robot exceeds (choice)
 _MOVES = ("commanded_m_s", "measured_m_s")
 _PLACES = {"crs": ("x_m", "y_m"), "WGS 84": ("longitude_deg", "latitude_deg")}
-_WINDOW_S = 2.0  # over which the noise of positions is small beside the way
 
-# Why rows are left out, in the order of being found.
+# Why rows are left out, in the order of the checks.
 REASONS = {
-    "missing": "lack a value",
-    "slow": "were commanded less than the least speed (standing, turning on the spot)",
-    "implausible": f"have a measured speed below {RATIO_LIMITS[0]:g} or above {RATIO_LIMITS[1]:g} of the commanded one",
+    "missing": "lack a value, or positions around them",
     "off_dem": "lie off the elevation model",
+    "doubled": "repeat another row",
+    "restarted": "have a time before an earlier row of their drive",
+    "frozen": "have a position that stays the same while the robot moves",
+    "jumped": f"have a position out of reach at {TOP_RATIO:g} times the top command",
+    "off_pace": "are of a drive whose positions and measured speed disagree by more than 15 %",
+    "slow": "were commanded less than the least speed (standing, turning on the spot)",
+    "implausible": f"have a speed above {MOST_SPEED_M_S:g} m/s or above {TOP_RATIO:g} times the top command",
     "between_maps": "lie between the maps",
     "other_split": "lie on the ground of a split that their drive does not belong to",
 }
@@ -44,17 +49,25 @@ class Drives:
     Args:
         file: Table, CSV, TSV, one of these with .gz, or Parquet.
         least_speed: Least commanded speed of a row, forward or backward, m/s.
+        speed: Where speed over ground comes from: `positions`, or `measured` as logged, without comparison. If empty,
+            measured speed, which must agree with the positions.
     """
 
     file: str
     least_speed: float = LEAST_SPEED_M_S
+    speed: Literal["", "positions", "measured"] = ""
 
     def __post_init__(self) -> None:
-        """Refuses what is no log or no speed."""
+        """Checks the settings."""
         expect(
-            self.file.endswith(ENDINGS), f"`drives` to end in one of {', '.join(ENDINGS)}, got {self.file!r}."
+            self.file.endswith(ENDINGS),
+            f"`drives` to end in one of {', '.join(ENDINGS)}, got {self.file!r}. Write such a table, with a header.",
         )
         expect(0 < self.least_speed < np.inf, f"`least_speed` above 0 m/s, got {self.least_speed:g}.")
+        expect(
+            self.speed in ("", "positions", "measured"),
+            f"`speed` to be 'positions' or 'measured', got {self.speed!r}.",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +79,10 @@ class DriveLog:
         sha256: of the file.
         names: of its drives.
         is_geographic: whether positions are longitude and latitude; else they are in the elevation model's CRS.
-        rows: a table of N rows: `x`, `y`, `time_s`, `speed` (measured, m/s), `traversability` (in [0, 1]) and `drive`
-            (index into `names`).
+        rows: a table of N rows: `x`, `y`, `time_s`, `commanded` and `speed` (m/s, signed), `drive` (index into
+            `names`) and, once speeds are compared with positions, `traversability` (speed over commanded).
         left_out: rows that are not, by reason.
+        motion: what the comparison of positions with speeds gave.
     """
 
     settings: Drives
@@ -77,6 +91,7 @@ class DriveLog:
     is_geographic: bool
     rows: pd.DataFrame
     left_out: Mapping[str, int] = field(default_factory=dict)
+    motion: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def places_m(self) -> ndarray:
@@ -106,7 +121,9 @@ class DriveLog:
 
 
 def read_drives(drives: Drives) -> DriveLog:
-    """Reads a log of drives and leaves out the rows that tell nothing of the ground.
+    """Read a log of drives, without rows that lack a value.
+
+    With `speed` of `positions` the log needs no measured speed.
 
     Raises:
         DatasetError: there is no such file, it cannot be read, lacks a column, holds what is no number, has speeds of
@@ -115,12 +132,19 @@ def read_drives(drives: Drives) -> DriveLog:
     path = Path(drives.file)
     rows = read_log(path)
     kind = "WGS 84" if set(_PLACES["WGS 84"]) <= set(rows) and not set(_PLACES["crs"]) <= set(rows) else "crs"
-    columns = ("time_s", *_PLACES[kind], *_MOVES)
-    require_columns(rows, columns, path)
+    moves = _MOVES[:1] if drives.speed == "positions" else _MOVES
+    columns = ("time_s", *_PLACES[kind], *moves)
+    remedy = "Name positions x_m and y_m, or longitude_deg and latitude_deg for WGS 84."
+    if set(_PLACES[kind]) <= set(rows):
+        remedy = (
+            "Log speed over ground, or pass --speed positions."
+            if set(_MOVES) - set(rows) == {"measured_m_s"}
+            else ""
+        )
+    require_columns(rows, columns, path, remedy)
     limits = {"longitude_deg": (-180.0, 360.0), "latitude_deg": (-90.0, 90.0)}
     values = {name: read_numbers(rows, name, path, limits.get(name, (-np.inf, np.inf))) for name in columns}
-    commanded, measured = (values[name] for name in _MOVES)
-    for name in _MOVES:
+    for name in moves:
         moving = np.abs(values[name])
         usual = pd.Series(moving[moving >= drives.least_speed]).median()
         if usual > MOST_SPEED_M_S:
@@ -132,8 +156,9 @@ def read_drives(drives: Drives) -> DriveLog:
     if "drive" in rows:
         names, drive = np.unique(read_names(rows, "drive", path), return_inverse=True)
     x, y = (values[name] for name in _PLACES[kind])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = measured / commanded
+    unmeasured = np.full(len(rows), np.nan)
+    if drives.speed == "positions" and "measured_m_s" in rows:  # only for the comparison
+        unmeasured = read_numbers(rows, "measured_m_s", path, (-np.inf, np.inf))
     log = DriveLog(
         settings=drives,
         sha256=digest_of_path(path),
@@ -144,38 +169,10 @@ def read_drives(drives: Drives) -> DriveLog:
                 "x": x,
                 "y": y,
                 "time_s": values["time_s"],
-                "commanded": np.abs(commanded),
-                "speed": np.abs(measured),
-                "traversability": ratio,
+                "commanded": values["commanded_m_s"],
+                "speed": values.get("measured_m_s", unmeasured),
                 "drive": drive,
             }
         ),
     )
-    log = log.without("missing", np.isnan(np.stack([*values.values()])).any(axis=0))
-    log = log.without("slow", (log.rows["commanded"] < drives.least_speed).to_numpy())
-    low, high = RATIO_LIMITS
-    log = log.without("implausible", ~log.rows["traversability"].between(low, high).to_numpy())
-    log.rows["traversability"] = log.rows["traversability"].clip(0, 1)
-    return log
-
-
-def pace(rows: pd.DataFrame) -> float | None:
-    """How far positions moved beside what the measured speed says, in the middle over spans of two seconds.
-
-    Near 1 where positions, times and speeds are in the same units; less on tight curves.
-
-    Args:
-        rows: of `DriveLog`, with positions in metres.
-
-    Returns:
-        The ratio, to three digits after the point; None where no drive goes on so long.
-    """
-    rows = rows.sort_values(["drive", "time_s"])
-    step_s = rows.groupby("drive")["time_s"].diff().fillna(0)
-    way_m = (rows["speed"] * step_s).groupby(rows["drive"]).cumsum()
-    span = (rows["time_s"] // _WINDOW_S).rename("span")
-    firsts = rows[["x", "y"]].assign(way=way_m).groupby([rows["drive"], span]).first()
-    moved = firsts.groupby("drive").diff().dropna()
-    moved = moved[moved["way"] > 0]
-    ratio = (np.hypot(moved["x"], moved["y"]) / moved["way"]).median()
-    return round(float(ratio), 3) if len(moved) else None
+    return log.without("missing", np.isnan(np.stack([*values.values()])).any(axis=0))

@@ -17,8 +17,16 @@ from numpy import ndarray
 
 from benchnav.core.errors import DatasetError, expect
 from benchnav.core.sources import digest_of_path
-from benchnav.datagen.dem.drive_cells import BANDS, check_enough, describe_drives, drive_over, lay_out
+from benchnav.datagen.dem.drive_cells import (
+    BANDS,
+    check_enough,
+    describe_drives,
+    drive_over,
+    elevation_under,
+    lay_out,
+)
 from benchnav.datagen.dem.drive_log import Drives, read_drives
+from benchnav.datagen.dem.drive_motion import compare_motion, compare_slopes
 from benchnav.datagen.dem.raster import Layer, Raster, Rasters, load_rasterio, opened
 from benchnav.datagen.dem.tiling import Run, cut, cut_around
 from benchnav.datagen.recipe.recipe import Recipe
@@ -108,7 +116,7 @@ class Survey:
         whole_m = np.array([bounds.top - bounds.bottom, bounds.right - bounds.left])
         edge_m, size_m = np.zeros(2), whole_m
         if log is not None:
-            log = lay_out(log, ground, crs, bounds)
+            log = compare_motion(lay_out(log, ground, crs, bounds))
             check_enough(log, list(shares))
             map_m, apart_m = np.multiply(recipe.grid.shape, step), np.multiply(stride, step)
             edge_m, size_m = cut_around(log.places_m, whole_m, np.array(cell_m), map_m, apart_m)
@@ -169,8 +177,9 @@ class Survey:
         self.indices = {value: np.nan if name is None else names.index(name) for value, name in named.items()}
         self.unlabelled, self.driven = rasters.unlabelled, None
         if log is not None:
-            cells_of = np.floor((log.places_m - offset_m) / step).astype(np.int64)
-            log, self.driven = drive_over(log, tiling, *cells_of.T)
+            cells_of = (log.places_m - offset_m) / step
+            log = compare_slopes(log, elevation_under(log, self.layers["dem"], *(cells_of - 0.5).T))
+            log, self.driven = drive_over(log, tiling, *np.floor(cells_of).astype(np.int64).T)
             self.source["drives"] = about = describe_drives(log, list(shares))
             self.source["traversability"] = {name: about[name] for name in ("file", "sha256")}
         self.cliff_m = _CLIFF * max(*cell_m, step) if ground.mask_kinds == {"all_valid"} else np.inf

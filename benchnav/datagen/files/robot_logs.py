@@ -17,18 +17,28 @@ from benchnav.core.settings import hint
 from benchnav.core.touched import note_file
 
 ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
+_SEPARATE = "Separate columns by commas, in a .tsv by tabs, and write decimals with a point."
 _MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
 
 
-def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path) -> None:
-    """Refuses a log that lacks a column.
+def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path, remedy: str = "") -> None:
+    """Check that a log has columns.
+
+    Args:
+        rows: of the log.
+        columns: that are required.
+        path: of the log.
+        remedy: what helps where the name of no other column is near, a sentence.
 
     Raises:
-        DatasetError: it does.
+        DatasetError: If it lacks one.
     """
     names = [str(name) for name in rows.columns]
     if missing := [name for name in columns if name not in names]:
         near = hint(missing[0], [name for name in names if name not in columns])
+        near = near or (remedy and f" {remedy}")
+        if len(names) == 1 and any(separator in names[0] for separator in ";\t| "):
+            near = f" {_SEPARATE}"
         raise DatasetError(
             f"Expected columns {', '.join(columns)} in {path}, got no {' and no '.join(missing)}. "
             f"It has {', '.join(names) or 'none'}.{near}"
@@ -58,8 +68,11 @@ def read_log(path: Path) -> pd.DataFrame:
         return rows.rename(columns=str.strip)
     except (OSError, EOFError, ValueError, zlib.error, pd.errors.ParserWarning) as error:
         why = [*str(error).strip().splitlines(), type(error).__name__]
+        is_text = isinstance(error, pd.errors.ParserWarning | pd.errors.ParserError)
+        remedy = f". {_SEPARATE}" if is_text else ""
         raise DatasetError(
-            f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got one that cannot be read: {why[0]}"
+            f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got one that cannot be read: "
+            f"{why[0].removesuffix('.')}{remedy}"
         ) from error
 
 
@@ -84,7 +97,12 @@ def read_numbers(rows: pd.DataFrame, name: str, path: Path, limits: tuple[float,
         within = f" within [{least:g}, {most:g}]" if np.isfinite(most) else ""
         raise DatasetError(
             f"Expected `{name}` to be numbers{within} in {path}, got {column.iloc[bad[0]]!s} in row "
-            f"{bad[0] + 1} below the header. Mend that row, or leave the value out."
+            f"{bad[0] + 1} below the header. "
+            + (
+                "Mend that row, or leave the value out."
+                if len(bad) < given.sum()
+                else "Convert the column to numbers."
+            )
         )
     return values
 

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from benchnav.core.errors import BenchnavError, ConfigError, DatasetError
 from benchnav.datagen.dem.drive_cells import describe_drives, drive_over
-from benchnav.datagen.dem.drive_log import DriveLog, Drives, pace, read_drives
+from benchnav.datagen.dem.drive_log import REASONS, DriveLog, Drives, read_drives
+from benchnav.datagen.dem.drive_motion import compare_motion
 from benchnav.datagen.dem.importer import import_dem
 from benchnav.datagen.dem.raster import Rasters, transformed
 from benchnav.datagen.dem.tiling import cut
@@ -49,11 +50,17 @@ def drives_over(
         x, y = (start + np.linspace(0, 1, rows)[:, None] * (end - start)).T
         inside = (x > 0) & (x < WIDTH * CELL) & (y > 0) & (y < HEIGHT * CELL)
         x, y = x[inside], y[inside]
-        told = generator.choice([-1.0, 0.5, 1.0], len(x))
-        value = field(x, y) + noise * generator.standard_normal(len(x))
-        about = {"time_s": np.arange(len(x)) * 0.1, "x": x, "y": y, "drive": f"drive-{drive:02d}"}
-        parts.append(pd.DataFrame(about | {"commanded_m_s": told, "measured_m_s": told * value}))
+        told = (1 if drive % 3 else -1) * generator.choice([0.5, 1.0], len(x))
+        about = {"x": x, "y": y, "commanded_m_s": told, "drive": f"drive-{drive:02d}"}
+        parts.append(timed(pd.DataFrame(about), noise * generator.standard_normal(len(x))))
     return pd.concat(parts, ignore_index=True)
+
+
+def timed(rows: pd.DataFrame, noise: np.ndarray | float = 0.0) -> pd.DataFrame:
+    """Adds the speed that the ground allows at each row of a drive, and the time that the way there takes by it."""
+    speed = rows["commanded_m_s"] * (field(rows["x"], rows["y"]) + noise)
+    way = np.hypot(rows["x"].diff(), rows["y"].diff()).fillna(0)
+    return rows.assign(measured_m_s=speed, time_s=(way / speed.abs().clip(lower=0.02)).cumsum())
 
 
 def log_of(rows: pd.DataFrame, path: Path) -> Path:
@@ -68,9 +75,11 @@ def dem(tmp_path: Path) -> Path:
     return write(tmp_path / "dem.tif", rough(HEIGHT, WIDTH), CELL)
 
 
-def imported(dem: Path, log: Path, least_speed: float = 0.1, **settings: Any) -> TerrainDataset:
+def imported(
+    dem: Path, log: Path, least_speed: float = 0.1, speed: Any = "", **settings: Any
+) -> TerrainDataset:
     out = dem.parent / f"out-{next(COUNTER)}.h5"
-    drives = Drives(file=str(log), least_speed=least_speed)
+    drives = Drives(file=str(log), least_speed=least_speed, speed=speed)
     settings = {
         "recipe": RECIPE,
         "shares": THREE,
@@ -156,22 +165,28 @@ def test_what_is_known_of_the_measured_is_shown_to_no_model(dem: Path) -> None:
     assert not getattr(dataset.terrain("train").observe(), "layers", {})
 
 
-def test_rows_are_left_out_by_reason_and_counted(tmp_path: Path) -> None:
+def test_rows_are_left_out_by_reason_and_kept_beyond_0_and_1(tmp_path: Path) -> None:
     head = "time_s,x_m,y_m,commanded_m_s,measured_m_s,drive\n"
-    good = ["0,1,2,1,0.5,a", "1,1,2,-0.5,-0.4,a", "2,1,2,1,1.2,b", "3,1,2,1,-0.2,b", "4,1,2,0.1,0.05,c"]
+    good = ["0,1,2,1,0.5,a", "1,1,3,-0.5,-0.4,a", "2,1,4,1,1.19,b", "3,1,5,1,-0.25,b", "4,1,6,0.1,0.05,c"]
     missing = [",1,2,1,1,a", "0,,2,1,1,a", "0,1,NaN,1,1,a", "0,1,2,,1,a", "0,1,2,1,null,a"]
-    slow = ["0,1,2,0.09,0.09,a", "0,1,2,-0.09,0,a", "0,1,2,0,0,a", "0,1,2,0,5,a"]
-    implausible = ["0,1,2,1,1.21,a", "0,1,2,1,-0.21,a", "0,1,2,-1,0.3,a"]
+    slow = ["6,1,7,0.09,0.09,a", "7,1,8,-0.09,0,a", "8,1,9,0,0,a", "9,1,9,0,1.4,a", "9,1,9,0,1.4,a"]
     path = tmp_path / "log.csv"
-    path.write_text(head + "\n".join([*missing, *good, *slow, *implausible]) + "\n")
-    log = read_drives(Drives(file=str(path)))
-    assert log.left_out == {"missing": 5, "slow": 4, "implausible": 3}
-    np.testing.assert_allclose(log.rows["traversability"], [0.5, 0.8, 1, 0, 0.5])
+    path.write_text(head + "\n".join([*missing, *good, *slow, "10,1,9,1,-1000,a"]) + "\n")
+    log = read_drives(Drives(file=str(path), speed="measured"))
+    assert log.left_out == {"missing": 5}
+    log = compare_motion(log)
+    counted = {"missing": 5, "doubled": 1, "slow": 4, "implausible": 1}
+    assert {name: count for name, count in log.left_out.items() if count} == counted
+    np.testing.assert_allclose(log.rows["traversability"], [0.5, 0.8, 1.19, -0.25, 0.5])
     assert [log.names[one] for one in log.rows["drive"]] == ["a", "a", "b", "b", "c"]
-    faster = read_drives(Drives(file=str(path), least_speed=0.6))
-    assert faster.left_out == {"missing": 5, "slow": 6, "implausible": 3}
-    slower = read_drives(Drives(file=str(path), least_speed=0.05))
-    assert slower.left_out == {"missing": 5, "slow": 2, "implausible": 3}
+    used, driven = drive_over(
+        log, cut((8, 8), (8, 8), (8, 8), {"train": 1.0}), np.zeros(5, int), np.arange(5) // 4
+    )
+    np.testing.assert_allclose(driven.values[0], [(0.5 + 0.8 + 1 + 0) / 4, 0.5])
+    assert describe_drives(used, ["train"])["beyond"] == {"below_0": 1, "above_1": 1}
+    for least, rest in ((0.6, 3), (0.05, 7)):
+        log = compare_motion(read_drives(Drives(file=str(path), speed="measured", least_speed=least)))
+        assert len(log.rows) == rest
 
 
 def test_a_log_without_drives_is_one(tmp_path: Path) -> None:
@@ -273,6 +288,26 @@ def test_a_split_that_would_be_without_a_drive_takes_the_one_that_loses_least() 
     assert about["left_out"] == {"between_maps": 0, "other_split": 13}
 
 
+def test_a_drive_belongs_where_most_of_its_rows_lie_not_where_it_comes_first() -> None:
+    tiling = cut((8, 160), (8, 8), (8, 8), {"a": 0.34, "b": 0.33, "c": 0.33})
+    start = {name: strip.start * 8 for name, strip in tiling.strips.items()}
+    rows_of = {"one": {"a": 5}, "two": {"b": 5}, "three": {"c": 5}, "late": {"a": 1, "b": 3, "c": 9}}
+    rows_of["middle"] = {"a": 2, "b": 7, "c": 3}
+    parts = [
+        pd.DataFrame({"column": start[split], "drive": drive, "traversability": 0.5}, index=range(count))
+        for drive, counts in enumerate(rows_of.values())
+        for split, count in counts.items()
+    ]
+    rows = pd.concat(parts, ignore_index=True).assign(x=0.0, y=0.0, time_s=0.0, speed=1.0)
+    log = DriveLog(
+        settings=Drives(file="x.csv"), sha256="", names=tuple(rows_of), is_geographic=False, rows=rows
+    )
+    used, _ = drive_over(log, tiling, np.zeros(len(rows), int), rows["column"].to_numpy())
+    about = describe_drives(used, ["a", "b", "c"])
+    assert about["drives"] == {"a": ["one"], "b": ["two", "middle"], "c": ["three", "late"]}
+    assert about["left_out"]["other_split"] == 1 + 3 + 2 + 3
+
+
 def best_dealing(counts: np.ndarray) -> int:
     """Most rows that a dealing of drives [D] to splits [S] uses, no split without a drive; by trying all."""
     best = {(False,) * counts.shape[1]: 0}
@@ -314,8 +349,7 @@ def test_maps_of_two_splits_and_what_drove_there_do_not_touch(dem: Path) -> None
 def test_the_ground_is_cut_around_the_drives(dem: Path) -> None:
     rows = drives_over(count=20, reach_m=5)
     rows = rows.assign(x=rows["x"] * 0.2 + 30.3, y=rows["y"] * 0.2 + 8.1)
-    told, value = rows["commanded_m_s"], field(rows["x"], rows["y"])
-    rows = rows.assign(measured_m_s=told * value)
+    rows = pd.concat(timed(own) for _, own in rows.groupby("drive"))
     dataset = imported(dem, log_of(rows, dem.parent / "log.csv"), shares={"train": 1.0})
     about = source_of(dataset)
     west, south = np.array(about["origin_m"]) - [WEST, SOUTH]
@@ -343,15 +377,14 @@ def test_the_ground_is_cut_around_the_drives(dem: Path) -> None:
 def test_drives_to_the_edge_of_the_ground_are_used_whole(dem: Path) -> None:
     corners = np.array([[0.01, 0.01], [WIDTH * CELL - 0.01, HEIGHT * CELL - 0.01]])
     x, y = np.linspace(*corners, 500).T
-    rows = pd.DataFrame({"x": x, "y": y, "time_s": 0.0, "commanded_m_s": 1.0, "measured_m_s": field(x, y)})
+    rows = timed(pd.DataFrame({"x": x, "y": y, "commanded_m_s": 1.0}))
     beyond = [rows.assign(y=y).head(100) for y in (-0.01, HEIGHT * CELL + 0.01)]
     beyond += [rows.assign(x=x).head(150) for x in (-0.01, WIDTH * CELL + 0.01)]
     rows = pd.concat([rows, *beyond])
     dataset = imported(dem, log_of(rows, dem.parent / "log.csv"), shares={"train": 1.0})
     about = source_of(dataset)
-    assert about["drives"]["left_out"] == {
-        "missing": 0, "slow": 0, "implausible": 0, "off_dem": 500, "between_maps": 0, "other_split": 0,
-    }  # fmt: skip
+    assert list(about["drives"]["left_out"]) == list(REASONS)
+    assert {name: count for name, count in about["drives"]["left_out"].items() if count} == {"off_dem": 500}
     assert about["left_out"]["not_driven"] == about["tiles"][0] * about["tiles"][1] - len(about["kept"]) > 0
 
 
@@ -438,23 +471,10 @@ def test_datasets_of_other_drives_are_merged(dem: Path) -> None:
     assert both.read("train")["drive_count"].sum() == len(near) + len(far)
 
 
-# The pace of positions
-
-
-@pytest.mark.parametrize(("speed", "seconds", "wanted"), [(1, 1, 1), (3.6, 1, 1 / 3.6), (1, 1e3, 1e-3)])
-def test_the_pace_tells_units_that_do_not_fit(speed: float, seconds: float, wanted: float) -> None:
-    rows = drives_over(count=5, rows=400)
-    moved = np.hypot(rows.groupby("drive")["x"].diff(), rows.groupby("drive")["y"].diff()).fillna(0)
-    table = rows.assign(speed=speed * moved / 0.1, time_s=seconds * rows["time_s"])
-    if seconds == 1:  # of which single steps would be too long
-        table["x"] += np.random.default_rng(0).normal(0, 0.05, len(table))
-    assert pace(table.sample(frac=1, random_state=0)) == pytest.approx(wanted, rel=0.1)
-    assert pace(rows.assign(speed=1.0, time_s=0.0)) is None
-
-
 # Bad input
 
 HEAD = "time_s,x_m,y_m,commanded_m_s,measured_m_s,drive\n"
+MOVE = "".join(f"{step / 5},{500010 + 0.16 * step},3999910,1,0.8,a\n" for step in range(31))
 
 
 @pytest.mark.parametrize(
@@ -463,17 +483,20 @@ HEAD = "time_s,x_m,y_m,commanded_m_s,measured_m_s,drive\n"
         ("time_s,x_m,y_m,commanded,measured_m_s\n0,1,1,1,1\n", "no commanded_m_s.*Did you mean 'commanded'"),
         ("t,x_m,y_m,commanded_m_s,measured_m_s\n0,1,1,1,1\n", "got no time_s. It has t, x_m"),
         ("time_s,longitude_deg,commanded_m_s,measured_m_s\n0,1,1,1\n", "got no x_m and no y_m"),
+        ((HEAD + MOVE).replace(",", ";"), "got no time_s .* Separate columns by commas"),
+        ((HEAD + MOVE).replace(",", ";").replace(".", ","), "cannot be read: .* write decimals with a point"),
         (HEAD, "got none: of 0, none"),
-        (HEAD + "0,1,1,0,0,a\n0,1,1,1,9,a\n", "of 2, 1 were commanded less.*, 1 have a measured speed below"),
+        (HEAD + MOVE.replace("1,0.8", "0,0"), "of 31, 31 were commanded less"),
         (HEAD + "0,1,1,fast,1,a\n", "`commanded_m_s` to be numbers in .*, got fast in row 1"),
         (HEAD + "0,inf,1,1,1,a\n", "`x_m` to be numbers in .*, got inf in row 1"),
         (HEAD + "0,1,1,1,1,\n", "`drive` in every row.*row 1"),
         (HEAD + "0,1,1,30,30,a\n0,1,1,100,1,a\n", "`commanded_m_s` in m/s.*median of 65.*Divide km/h by 3.6"),
         (HEAD + "0,1,1,1,30,a\n", "`measured_m_s` in m/s.*median of 30"),
         (HEAD + "0,1,1,1,1,a\n", "covers x 500000 to 500096 and y .*got x 1 to 1 and y 1 to 1 in"),
-        (HEAD + "0,500010,3999910,1,1,a\n", "a drive for each of the 3 splits .* got 1 in .*--splits"),
+        (HEAD + "0,500010,3999910,1,1,a\n", "for more than 2 s .* up to 0 s"),
+        (HEAD + MOVE, "a drive for each of the 3 splits .* got 1 in .*--splits"),
         (
-            HEAD + "".join(f"0,500010,3999910,1,1,{name}\n" for name in "abc"),
+            HEAD + "".join(MOVE.replace("a\n", f"{name}\n") for name in "abc"),
             "ground for 3 splits|a drive of its own on the ground of each split, got none for valid, test/site",
         ),
     ],
@@ -527,8 +550,8 @@ def test_the_command_says_what_was_used_and_what_was_not(
 ) -> None:
     monkeypatch.chdir(dem.parent)
     rows = drives_over(reach_m=50)
-    rows.loc[:9, "commanded_m_s"] = 0.15
-    rows.loc[:9, "measured_m_s"] = 0.1
+    rows.loc[:9, "commanded_m_s"] = -0.15
+    rows.loc[:9, "measured_m_s"] = -0.1
     log_of(rows, dem.parent / "log.csv")
     (dem.parent / "log.csv.gz").write_bytes(gzip.compress((dem.parent / "log.csv").read_bytes()))
     grid = "height=16 width=24 start_m=[2.2,2.2] goal_m=[9.2,5.2]"
@@ -560,7 +583,9 @@ def test_the_command_says_what_was_used_and_what_was_not(
     assert re.search(r"left out of train: \d+ maps have ", said)
     assert "have no cell that a drive of their split crossed" in said
     assert "group(s), the statistical unit" in said
-    assert "warning: positions move" in said  # commands here have nothing to do with how far the robot went
+    assert 0.95 < about["pace"] < 1.05
+    assert f"positions move {about['pace']:g} times as far as measured_m_s says" in said
+    assert f"and {about['commanded_pace']:g} times as far as commanded_m_s says" in said
     for line in ("validate site.h5", "show site.h5", "preview site.h5 --split train --out sheet.png"):
         assert call("datagen", *shlex.split(line)) == 0
     assert "drive_count, drive_std" in capfd.readouterr().out

@@ -1,0 +1,312 @@
+"""Positions of drive logs compared with their speeds."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import savgol_filter
+
+from benchnav.core.errors import DatasetError
+from benchnav.datagen.dem.drive_cells import elevation_under
+from benchnav.datagen.dem.drive_log import DriveLog, Drives
+from benchnav.datagen.dem.drive_motion import compare_motion, compare_slopes
+from benchnav.datagen.dem.drive_tracks import find_jumped, speed_of_positions, track_of, velocity_of
+
+STEP_S = 0.1
+
+
+def drive(commanded: np.ndarray, traversability: np.ndarray, turn: np.ndarray | float = 0.0) -> pd.DataFrame:
+    """A drive whose positions, measured speed and command agree; `turn` is the rate of turn in rad/s."""
+    speed = commanded * traversability
+    heading = np.cumsum(np.broadcast_to(turn, len(speed))) * STEP_S + 0.3
+    way = np.concatenate([[0], (speed * STEP_S)[1:]])
+    return pd.DataFrame(
+        {
+            "x": np.cumsum(way * np.cos(heading)),
+            "y": np.cumsum(way * np.sin(heading)),
+            "time_s": np.arange(len(speed)) * STEP_S,
+            "commanded": commanded,
+            "speed": speed,
+            "drive": 0,
+        }
+    )
+
+
+def log_of(rows: pd.DataFrame, speed: str = "", is_geographic: bool = False) -> DriveLog:
+    names = tuple(f"drive-{index}" for index in range(rows["drive"].max() + 1))
+    settings = Drives(file="log.csv", speed=speed)  # type: ignore[arg-type]
+    return DriveLog(settings=settings, sha256="", names=names, is_geographic=is_geographic, rows=rows)
+
+
+def rough_drive(rows: int = 600, seed: int = 0) -> pd.DataFrame:
+    """A minute of 0.5 to 1 m/s over terrain of changing λ, with noise of 3 % in the measured speed."""
+    generator = np.random.default_rng(seed)
+    commanded = np.repeat(generator.choice([0.5, 0.8, 1.0], rows // 50), 50)
+    traversability = 0.75 + 0.2 * np.sin(np.arange(rows) / 37)
+    table = drive(commanded, traversability, turn=0.1)
+    return table.assign(speed=table["speed"] * (1 + 0.03 * generator.standard_normal(rows)))
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4])
+def test_the_ratio_of_positions_to_speeds_is_that_of_the_drive(turn: float) -> None:
+    log = compare_motion(log_of(drive(np.ones(600), np.full(600, 0.8), turn)))
+    assert log.motion["pace"] == pytest.approx(1, abs=0.03)
+    assert log.motion["commanded_pace"] == pytest.approx(0.8, abs=0.03)
+    np.testing.assert_allclose(log.rows["traversability"], 0.8)
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "unit", "remedy"),
+    [
+        ("speed", 1 / 0.5144, "knots", "Multiply `measured_m_s` by 0.5144"),
+        ("speed", 3.6, "km/h", "Multiply `measured_m_s` by 0.2778"),
+        ("speed", 2.237, "mph", "Multiply `measured_m_s` by 0.447"),
+        ("speed", 3.281, "ft/s", "Multiply `measured_m_s` by 0.3048"),
+        ("time_s", 1e3, "milliseconds", "Multiply `time_s` by 0.001."),
+        ("time_s", 1e9, "nanoseconds", "Multiply `time_s` by 1e-09."),
+        ("time_s", 1 / 60, "minutes", "Multiply `time_s` by 60."),
+        ("time_s", 1 / 3600, "hours", "Multiply `time_s` by 3600."),
+        ("x y", 3.281, "feet", "Multiply `x_m` and `y_m` by 0.3048."),
+    ],
+)
+@pytest.mark.parametrize("fix_rows", [1, 5])
+def test_another_unit_is_named_with_its_factor(
+    column: str, factor: float, unit: str, remedy: str, fix_rows: int
+) -> None:
+    rows = rough_drive()
+    rows[["x", "y"]] = rows[["x", "y"]].iloc[np.arange(600) // fix_rows * fix_rows].to_numpy()
+    columns = column.split()
+    rows[columns] *= factor
+    with pytest.raises(DatasetError, match=f"which looks like {unit}\\. ") as caught:
+        compare_motion(log_of(rows))
+    assert remedy in str(caught.value)
+    mended = rows.copy()
+    mended[columns] *= float(str(caught.value).split(" by ")[1].split()[0].rstrip("."))
+    log = compare_motion(log_of(mended))
+    assert log.motion["pace"] == pytest.approx(1, abs=0.03)
+    kept = compare_motion(log_of(rows, "measured")) if "speed" in columns else log
+    assert len(kept.rows) == 600
+    if "speed" not in columns:  # off against the command as well, so that positions do not help
+        with pytest.raises(DatasetError, match=unit):
+            compare_motion(log_of(rows, "positions"))
+
+
+def test_a_measured_speed_of_no_unit_is_rejected_too() -> None:
+    rows = rough_drive()
+    for factor, ratio in (
+        (1 / 1.3, "1.3"),
+        (1 / 3.281, "3.2"),
+    ):  # positions agree with the command: they are no feet
+        with pytest.raises(
+            DatasetError, match=rf"got {ratio}\d* times .* like no unit that is known\. .* m, or pass"
+        ):
+            compare_motion(log_of(rows.assign(speed=rows["speed"] * factor)))
+
+
+def test_curves_and_gaps_are_no_disagreement() -> None:
+    turning = np.repeat([0, 1.2, -1.2, 0, 1.2], 120)
+    log = compare_motion(log_of(drive(np.ones(600), np.full(600, 0.9), turning)))
+    assert log.motion["pace"] == pytest.approx(1, abs=0.02)
+    rows = drive(np.ones(600), np.full(600, 0.9))
+    paused = rows.assign(
+        time_s=rows["time_s"] + 60 * (rows.index // 12)
+    )  # stands for a minute, and logs nothing
+    log = compare_motion(log_of(paused))
+    assert (log.motion["pace"], len(log.rows)) == (pytest.approx(1, abs=0.02), 600)
+
+
+def test_the_command_may_be_far_from_positions() -> None:
+    rows = drive(np.ones(900), np.repeat([0.1, 0.4, 0.9], 300))
+    log = compare_motion(log_of(rows))
+    assert len(log.rows) == 900
+    assert log.motion["commanded_pace"] == pytest.approx(0.4, abs=0.02)
+
+
+def test_a_drive_that_disagrees_among_many_is_left_out_and_counted() -> None:
+    parts = [rough_drive(seed=seed).assign(drive=seed) for seed in range(12)]
+    parts[3]["speed"] *= 1.3
+    log = compare_motion(log_of(pd.concat(parts, ignore_index=True)))
+    assert log.left_out["off_pace"] == 600
+    assert 3 not in set(log.rows["drive"])
+    parts[4]["speed"] *= 1.3
+    with pytest.raises(DatasetError, match=r"got 1200 of 7200 .* disagree by more than 15 %"):
+        compare_motion(log_of(pd.concat(parts, ignore_index=True)))
+
+
+def test_sliding_back_and_over_speed_are_kept() -> None:
+    traversability = np.full(600, 0.9)
+    traversability[100:200], traversability[300:320] = -0.25, 1.3
+    for speed in ("", "measured"):
+        log = compare_motion(log_of(drive(np.ones(600), traversability), speed))
+        np.testing.assert_allclose(log.rows["traversability"], traversability)
+    # From positions, away from the changes.
+    log = compare_motion(log_of(drive(np.ones(600), traversability), "positions"))
+    away = np.abs(log.rows["time_s"].to_numpy()[:, None] - [10, 20, 30, 32]).min(axis=1) > 1
+    actual = log.rows["traversability"][away]
+    np.testing.assert_allclose(
+        actual, traversability[(log.rows["time_s"][away] / STEP_S).round().astype(int)]
+    )
+    assert (actual < 0).sum() > 50
+
+
+def test_too_much_over_speed_and_the_other_sign_are_another_scale() -> None:
+    traversability = np.full(600, 0.9)
+    traversability[:31] = 1.3
+    with pytest.raises(DatasetError, match=r"above 1.2 times .* got 31 of 600, and a median of 0.9 times"):
+        compare_motion(log_of(drive(np.ones(600), traversability)))
+    commanded = np.repeat([1.0, -1.0], 300)
+    rows = drive(commanded, np.full(600, 0.9))
+    with pytest.raises(
+        DatasetError, match=r"sign of .* got the other one in 300 of 300 rows commanded backward"
+    ):
+        compare_motion(log_of(rows.assign(speed=rows["speed"].abs())))
+    assert len(compare_motion(log_of(rows.assign(speed=rows["speed"].abs()), "measured")).rows) == 600
+
+
+# Faulty rows
+
+
+def test_an_immobilised_robot_is_no_frozen_receiver() -> None:
+    traversability = np.full(600, 0.8)
+    traversability[200:400] = 0
+    stuck = compare_motion(log_of(drive(np.ones(600), traversability)))
+    assert stuck.left_out["frozen"] == 0
+    np.testing.assert_allclose(stuck.rows["traversability"], traversability)
+    rows = drive(np.ones(6000), np.full(6000, 0.8))
+    rows.loc[200:500, ["x", "y"]] = rows.loc[200, ["x", "y"]].to_numpy()
+    frozen = compare_motion(log_of(rows))
+    assert (frozen.left_out["frozen"], frozen.left_out["jumped"]) == (300, 0)
+    rows.loc[200:1000, ["x", "y"]] = rows.loc[200, ["x", "y"]].to_numpy()
+    with pytest.raises(DatasetError, match="800 of 6000 that have a position that stays the same"):
+        compare_motion(log_of(rows))
+
+
+def test_positions_that_repeat_until_the_next_fix_are_not_frozen() -> None:
+    rows = rough_drive()
+    rows[["x", "y"]] = rows[["x", "y"]].iloc[np.arange(600) // 20 * 20].to_numpy()  # every 2 s
+    log = compare_motion(log_of(rows))
+    assert not log.left_out["frozen"] + log.left_out["jumped"]
+    assert log.motion["pace"] == pytest.approx(1, abs=0.05)
+    rows = drive(np.repeat([0.2, 1.0], [500, 200]), np.ones(700))  # much faster than usual at the end
+    rows[["x", "y"]] = rows[["x", "y"]].iloc[np.arange(700) // 20 * 20].to_numpy()
+    assert compare_motion(log_of(rows)).left_out["frozen"] == 0
+
+
+def test_each_jump_is_out_of_reach_from_the_last_right_position() -> None:
+    rows = rough_drive()
+    rows.loc[[350, 550], "x"] += 10
+    assert set(find_jumped(track_of(rows), 1.5)) == {350, 550}
+
+
+@given(st.sets(st.integers(0, 599), max_size=55), st.floats(3, 1e6), st.integers(0, 2**32))
+def test_jumps_are_found_and_nothing_else(jumps: set[int], size_m: float, seed: int) -> None:
+    rows, away = rough_drive(), sorted(jumps)
+    angle = np.random.default_rng(seed).uniform(0, 2 * np.pi, len(away))
+    rows.loc[away, "x"] += size_m * np.cos(angle)
+    rows.loc[away, "y"] += size_m * np.sin(angle)
+    found = find_jumped(track_of(rows.sample(frac=1, random_state=seed % 2**31)), 1.5)
+    # A jump of 3 m is in reach again after 2 s, so that one after another may count as a track.
+    assert set(found) == jumps or size_m < 100
+
+
+def test_times_that_restart_are_counted_and_rows_out_of_order_are_not() -> None:
+    rows = rough_drive()
+    mixed = compare_motion(log_of(rows.sample(frac=1, random_state=0, ignore_index=True)))
+    assert mixed.left_out["restarted"] == 0
+    assert mixed.motion["pace"] == pytest.approx(1, abs=0.03)
+    again = rows.assign(time_s=rows["time_s"].where(rows.index < 570, rows["time_s"] - 57))
+    assert compare_motion(log_of(again)).left_out["restarted"] == 30
+    twice = rows.assign(time_s=rows["time_s"] % 30)
+    with pytest.raises(DatasetError, match=r"299 of 600 that have a time before .* column `drive`"):
+        compare_motion(log_of(twice))
+    named = twice.assign(drive=rows.index // 300)
+    assert len(compare_motion(log_of(named)).rows) == 600
+
+
+# Wheels
+
+
+def test_a_speed_that_is_the_command_is_of_wheels() -> None:
+    rows = drive(np.ones(1200), np.repeat([1.0, 0.4, 1.0], 400)).assign(speed=1.0)
+    log = compare_motion(log_of(rows))  # on most of the way they agree
+    with pytest.raises(
+        DatasetError, match=r"equals `commanded_m_s` where positions do not .*--speed positions"
+    ):
+        compare_slopes(log, np.zeros(1200))
+    with pytest.raises(DatasetError, match=r"got 0.7 times .* like wheel odometry, since it equals"):
+        compare_motion(log_of(drive(np.ones(600), np.full(600, 0.7)).assign(speed=1.0)))
+
+
+@pytest.mark.parametrize(
+    ("noise", "rise", "is_wheels"), [(0.005, 1, True), (0.05, 1, False), (0.005, 0.2, False)]
+)
+def test_a_speed_that_follows_the_command_up_and_down_is_of_wheels(
+    noise: float, rise: float, is_wheels: bool
+) -> None:
+    rows = drive(np.ones(1200), np.full(1200, 0.95))
+    measured = rows["speed"] * (1 + noise * np.random.default_rng(0).standard_normal(60).repeat(20))
+    elevation = rise * 3 * np.sin(np.hypot(rows["x"], rows["y"]) / 12)  # up to 14°
+    log = compare_motion(log_of(rows.assign(speed=measured)))
+    if is_wheels:
+        with pytest.raises(DatasetError, match=r"to 2% on slopes of -1\d° to 1\d°.*--speed measured"):
+            compare_slopes(log, elevation.to_numpy())
+    else:
+        compare_slopes(log, elevation.to_numpy())
+    compare_slopes(compare_motion(log_of(rows.assign(speed=measured), "measured")), elevation.to_numpy())
+
+
+@pytest.mark.parametrize("height", [40, 200])
+def test_elevation_is_interpolated_between_cells(height: int) -> None:
+    class Plane:
+        """A layer whose elevation is 3 · row + 5 · column, framed by one cell."""
+
+        warped = SimpleNamespace(height=height + 2, width=32)
+
+        def read(self, rows: range, columns: range) -> np.ndarray:
+            row, column = np.meshgrid(
+                np.arange(rows.start - 1, rows.stop + 1), np.arange(-1, columns.stop + 1), indexing="ij"
+            )
+            return (3.0 * row + 5.0 * column)[None]
+
+    generator = np.random.default_rng(0)
+    row, column = generator.uniform(-0.5, height - 0.5, 500), generator.uniform(-0.5, 29.5, 500)
+    log = log_of(drive(np.ones(500), np.ones(500)))
+    actual = elevation_under(log, Plane(), row, column)  # type: ignore[arg-type]
+    np.testing.assert_allclose(actual, 3 * row + 5 * column)
+
+
+# Speed of positions
+
+
+def test_velocity_is_the_derivative_of_savitzky_and_golay() -> None:
+    generator = np.random.default_rng(0)
+    x = np.cumsum(generator.normal(0.05, 0.02, 500)) + 4e6
+    rows = pd.DataFrame({"x": x, "y": 0.0, "time_s": np.arange(500) * STEP_S, "drive": 0})
+    velocity = velocity_of(track_of(rows), ["x"])["x"]
+    expected = savgol_filter(x, 21, 2, deriv=1, delta=STEP_S)
+    np.testing.assert_allclose(velocity[10:-10], expected[10:-10], atol=1e-6)
+    assert velocity.notna().all()
+
+
+@pytest.mark.parametrize("fix_rows", [1, 3, 10])
+def test_speed_of_positions_is_that_of_the_drive_forward_and_backward(fix_rows: int) -> None:
+    commanded = np.concatenate([np.full(300, 0.8), np.zeros(50), np.full(300, -0.6)])
+    rows = drive(commanded, np.full(650, 0.75), turn=0.2)
+    rows[["x", "y"]] = rows[["x", "y"]].iloc[np.arange(650) // fix_rows * fix_rows].to_numpy()
+    speed = speed_of_positions(track_of(rows), 0.1)
+    steady = (rows.index > 30) & (rows.index < 260) | (rows.index > 400) & (rows.index < 620)
+    np.testing.assert_allclose(speed[steady], 0.75 * commanded[steady], rtol=0.02)
+
+
+def test_speed_of_positions_goes_along_the_slope() -> None:
+    rows = drive(np.ones(600), np.full(600, 0.9))
+    log = compare_motion(log_of(rows.drop(columns="speed").assign(speed=np.nan), "positions"))
+    assert log.motion == {"pace": None, "commanded_pace": pytest.approx(0.9)}
+    height = np.tan(np.radians(20)) * np.hypot(log.rows["x"], log.rows["y"])
+    along = compare_slopes(log, height.to_numpy()).rows["traversability"]
+    np.testing.assert_allclose(along, 0.9 / np.cos(np.radians(20)), rtol=1e-6)
+    cliff = compare_slopes(log, 10 * height.to_numpy()).rows["traversability"]
+    np.testing.assert_allclose(cliff, 0.9 * np.sqrt(2), rtol=1e-6)
