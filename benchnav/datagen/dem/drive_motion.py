@@ -229,7 +229,11 @@ def _check_scale(log: DriveLog, commanded: ndarray, speed: ndarray) -> None:
         speed: over ground, m/s.
     """
     path, ratio = log.settings.file, speed / commanded
-    or_said = ", or pass --speed measured to take the rows as they are" if log.settings.speed == "" else ""
+    or_said = (
+        ", or pass --speed positions, or --speed measured to take the rows as they are"
+        if log.settings.speed == ""
+        else ""
+    )
     for way, is_way in (("forward", commanded > 0), ("backward", commanded < 0)):
         against = int((ratio[is_way] < 0).sum())
         if against > MAX_OVER_SPEED * len(ratio) and np.median(ratio[is_way]) < 0:
