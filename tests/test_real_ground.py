@@ -1,6 +1,8 @@
 """Real ground from rasters to a measured model, where some cells have no class."""
 
 import json
+import re
+import shlex
 from pathlib import Path
 
 import gymnasium
@@ -15,7 +17,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import load_checkpoint
 from tests.commands import call
-from tests.datagen.dem.rasters import rough, write
+from tests.datagen.dem.rasters import SOUTH, WEST, centres, rough, write
 
 rasterio = pytest.importorskip("rasterio")
 
@@ -173,3 +175,59 @@ def test_lambda_that_the_class_table_drew_is_not_called_measured(
     found = json.loads((tmp_path / "std" / "quality.json").read_text())
     assert found["truth"] == {"test/std": "generated"}
     assert found["splits"]["test/std"]["rmse_expected"] == 0
+
+
+@pytest.mark.parametrize("cell", [0.4, 0.2])
+def test_the_page_on_real_ground_is_right_to_the_letter(
+    cell: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    # The rasters of its first command, on 5 maps of 64 cells, and an elevation model with two cells to spare.
+    page = (Path(__file__).parent.parent / "docs/how-to/real-ground.md").read_text()
+    assert "two cells to spare on each side" in page
+    block = re.search(r"```sh\nbenchnav-datagen (import-dem .*?)```", page, re.DOTALL)
+    assert block
+    words = shlex.split(block[1].replace("\\\n", " "))
+    monkeypatch.chdir(tmp_path)
+    generator = np.random.default_rng(3)
+    classes = generator.choice(np.array([1, 2, 9], np.uint8), (64, 320), p=[0.6, 0.3, 0.1])
+    photo = generator.integers(0, 256, (3, 64, 320), dtype=np.uint8)
+    measured, canopy = (generator.uniform(0, 1, (64, 320)).astype(np.float32) for _ in range(2))
+    spare = round(64 * 0.4 / cell) + 4, round(320 * 0.4 / cell) + 4
+    x, y = centres(*spare, cell)
+    write(tmp_path / "site.tif", 500 + 0.3 * x + 0.1 * y, cell, offset=(-2 * cell, -2 * cell))
+    for name, values in (("cover", classes), ("ortho", photo), ("driven", measured), ("canopy", canopy)):
+        write(tmp_path / f"{name}.tif", values, 0.4)
+    # Without an origin the maps begin in the spare cells; the command says where to begin.
+    call("datagen", *words)
+    said, _ = capfd.readouterr()
+    (origin,) = set(re.findall(r"--origin '(.*?)'", said))
+    assert origin == f"[{WEST:.10g},{SOUTH:.10g}]"
+    assert call("datagen", *words, "--origin", origin, "--overwrite") == 0
+    said, _ = capfd.readouterr()
+    assert f"from the south-west corner {origin} on" in said
+    dataset = TerrainDataset("datasets/site-v1.h5")
+    names = [kind.name for kind in dataset.recipe.classes]
+    indices = {1: names.index("gravel"), 2: names.index("scree"), 9: UNLABELLED}
+    expected = {
+        "rgb": photo,
+        "class_id": np.vectorize(indices.get)(classes),
+        "vegetation_m": canopy,
+        "traversability": measured,
+    }
+    for split, entry in dataset.splits.items():
+        source, maps = entry["parts"][0]["source"], dataset.read(split)
+        assert source["origin_m"] == [WEST, SOUTH]
+        for index, number in enumerate(source["kept"]):
+            for name, values in expected.items():
+                tile = values[..., ::-1, :][..., 64 * number : 64 * number + 64]
+                np.testing.assert_allclose(maps[name][index], tile, atol=2.0**-16)
+            np.testing.assert_allclose(
+                maps["slope_deg"][index], np.degrees(np.arctan(np.hypot(0.3, 0.1))), atol=0.02
+            )
+        unlabelled = (maps["class_id"] == UNLABELLED).sum()
+        cells = maps["class_id"].size
+        assert unlabelled > 0
+        assert (
+            f"unlabelled in {split}: {unlabelled} of {cells} cells, on {len(maps['rgb'])} of {len(maps['rgb'])}"
+            in said
+        )

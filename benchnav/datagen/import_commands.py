@@ -3,15 +3,20 @@
 What is heavy is imported where it is called, so that the command's help is quick.
 """
 
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from benchnav import datagen
-from benchnav.core.errors import expect
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.progress import show_progress
-from benchnav.datagen.dem.raster import Rasters
+from benchnav.datagen.dem.raster import MAX_MAPS, Rasters
+
+if TYPE_CHECKING:
+    from benchnav.datagen.dem.extent import GroundError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +30,10 @@ class ImportOptions:
         stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
         solvable: Keep only maps whose goal can be reached, and store the grid reference time.
         overwrite: Replace what is there.
+        dem_unit: Unit of elevations: m, ft, us-ft, or metres in a unit; if empty, what the raster declares.
+        origin: Where the first map's south-west corner lies, [X,Y] in the coordinate reference system of the maps.
+        max_maps: Most maps; ground of more stops the import, with a command that makes fewer.
+        coarse: Allow an elevation model whose cells are three times as wide as the maps', or wider.
     """
 
     out: str
@@ -33,6 +42,10 @@ class ImportOptions:
     stride: float | None = None
     solvable: bool = False
     overwrite: bool = False
+    dem_unit: str = ""
+    origin: tuple[float, float] | None = None
+    max_maps: int = MAX_MAPS
+    coarse: bool = False
 
 
 def import_dem(
@@ -50,7 +63,7 @@ def import_dem(
     Args:
         rasters: What there is of the ground beside its elevation.
         options: What is made of it.
-        dem: Raster of elevations in metres, in any coordinate reference system.
+        dem: Raster of elevations, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
         splits: Splits and their shares of the maps, such as train:0.7,valid:0.1,test/site:0.2; no two of them touch.
         scenario: Which of the recipe's scenarios lights the maps.
@@ -61,6 +74,7 @@ def import_dem(
         between = left_out.pop("between_splits")
         reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in left_out.items())
         print(f"  left out of {split}: {reasons}")
+        _tell_unlabelled(made, split)
         _tell_groups(made, split)
     if between:
         print(f"  left out between splits: {between}")
@@ -88,7 +102,7 @@ def import_drives(
         drives: Log, a file .csv, .tsv, one of these with .gz, or .parquet, with the columns time_s, x_m and y_m (in the
             coordinate reference system of the elevation model) or longitude_deg and latitude_deg, commanded_m_s,
             measured_m_s and, of several drives, drive.
-        dem: Raster of elevations in metres, in any coordinate reference system.
+        dem: Raster of elevations, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
         photo: Raster of red, green and blue; painted by the class when not given.
         classes: Raster of terrain classes; no cell has one when not given.
@@ -118,6 +132,8 @@ def import_drives(
         reasons = [f"{counts[reason]} maps {why}" for reason, why in REASONS.items() if counts.get(reason)]
         if reasons:
             print(f"  left out of {split}: {', '.join(reasons)}")
+        if classes:
+            _tell_unlabelled(made, split)
         _tell_groups(made, split)
 
 
@@ -162,6 +178,7 @@ def _import(
     options: ImportOptions, overrides: list[str], splits: str, **settings: Any
 ) -> "datagen.TerrainDataset":
     """Imports under the id that is asked for, or that the output names."""
+    from benchnav.datagen.dem.extent import GroundError
     from benchnav.datagen.dem.importer import import_dem as import_maps
     from benchnav.datagen.dem.tiling import read_shares
     from benchnav.datagen.files.describe import written
@@ -176,10 +193,42 @@ def _import(
         chosen = replace(chosen, id=name)
     steps = import_maps(
         out=path, recipe=chosen, shares=read_shares(splits), stride_m=options.stride,
-        solvable=options.solvable, overwrite=options.overwrite, **settings,
+        solvable=options.solvable, overwrite=options.overwrite, dem_unit=options.dem_unit, origin_m=options.origin,
+        max_maps=options.max_maps, coarse=options.coarse, announce=print, **settings,
     )  # fmt: skip
-    show_progress(steps, "maps")
+    try:
+        show_progress(steps, "maps")
+    except GroundError as error:
+        raise _with_command(error, overrides) from error
     return written(path)
+
+
+def _with_command(error: "GroundError", overrides: Sequence[str]) -> ConfigError:
+    """Return an error whose message ends in the user's command with settings that fit the ground."""
+    if not error.changes and error.stride_m is None:
+        return ConfigError(f"{error.problem} Or take a larger raster.")
+    changed = {change.partition("=")[0] for change in error.changes}
+    kept = [text for text in overrides if text.partition("=")[0] not in changed]
+    words, rest = [], [word for word in sys.argv[1:] if word not in overrides]
+    while rest:
+        word = rest.pop(0)
+        if word == "--stride":
+            rest.pop(0)
+        elif not word.startswith("--stride="):
+            words.append(word)
+    stride = [] if error.stride_m is None else ["--stride", f"{error.stride_m:.10g}"]
+    command = shlex.join([Path(sys.argv[0]).name, *words, *kept, *error.changes, *stride])
+    return ConfigError(f"{error.problem} Or fit the maps to the raster: {command}")
+
+
+def _tell_unlabelled(made: "datagen.TerrainDataset", split: str) -> None:
+    """Print how many cells of maps have no class."""
+    entry, grid = made.splits[split], made.grid
+    counts = [count for part in entry["parts"] for count in part["source"]["unlabelled"]]
+    if any(counts):
+        maps = sum(count > 0 for count in counts)
+        cells = len(counts) * grid.height * grid.width
+        print(f"  unlabelled in {split}: {sum(counts)} of {cells} cells, on {maps} of {len(counts)} maps")
 
 
 def _tell_groups(made: "datagen.TerrainDataset", split: str) -> None:

@@ -13,7 +13,7 @@ to be left out between them, and gives no more units than maps side by side.
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,7 +24,8 @@ import numpy as np
 from benchnav.core.errors import DatasetError, expect
 from benchnav.core.store import building, real_place
 from benchnav.datagen.dem.drive_log import Drives
-from benchnav.datagen.dem.raster import Rasters, load_rasterio
+from benchnav.datagen.dem.extent import MAX_RELIEF_M
+from benchnav.datagen.dem.raster import MAX_MAPS, Rasters, load_rasterio
 from benchnav.datagen.dem.survey import Survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import SHARD_CELLS
@@ -41,6 +42,7 @@ _CACHE_BYTES = 2**29  # of rasters that GDAL keeps; what it would choose grows w
 REASONS = {
     "not_driven": "have no cell that a drive of their split crossed",
     "missing_elevation": "have cells without elevation",
+    "too_rough": f"span more than {MAX_RELIEF_M:g} m of elevation",
     "missing_classes": "have no cell with a class or measured λ, or have cells with neither class nor photo",
     "missing_colours": "have cells without colour",
     "not_solvable": "have a goal that cannot be reached",
@@ -65,6 +67,11 @@ def import_dem(
     stride_m: float | None = None,
     solvable: bool = False,
     overwrite: bool = False,
+    dem_unit: str = "",
+    origin_m: tuple[float, float] | None = None,
+    max_maps: int = MAX_MAPS,
+    coarse: bool = False,
+    announce: Callable[[str], object] = str,
 ) -> Iterator[tuple[int, int]]:
     """Makes a dataset from rasters, yielding (maps done, maps in all); to be iterated to the end.
 
@@ -73,7 +80,7 @@ def import_dem(
     left out.
 
     Args:
-        dem: elevations in metres, by any name that rasterio opens.
+        dem: elevations, by any name that rasterio opens.
         out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
         recipe: id of the dataset, size, resolution, start and goal of the maps, class table, light, seed.
         rasters: where classes, colours, λ and layers come from.
@@ -83,6 +90,11 @@ def import_dem(
         stride_m: from one map to the next; None for maps side by side.
         solvable: keep only maps whose goal can be reached, and store the grid reference time.
         overwrite: replace what is there.
+        dem_unit: of elevations: m, ft, us-ft, or metres in a unit; if empty, what the raster declares, else metres.
+        origin_m: (x, y) of the first map's south-west corner in the CRS of the maps; None for that of the raster.
+        max_maps: most maps; ground of more is rejected.
+        coarse: allow an elevation model whose cells are three times as wide as the maps', or wider.
+        announce: is given what will be imported, in sentences, before anything is read.
 
     Raises:
         ConfigError: rasterio is not installed, a setting does not fit the recipe, or `out` is taken.
@@ -103,7 +115,10 @@ def import_dem(
     with ExitStack() as stack:
         stack.enter_context(held(out, overwrite))
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
-        ground = Survey(stack, dem, rasters, recipe, shares, stride_m, drives)
+        ground = Survey(
+            stack, dem, rasters, recipe, shares, stride_m, drives, dem_unit=dem_unit, origin_m=origin_m,
+            max_maps=max_maps, coarse=coarse, announce=announce,
+        )  # fmt: skip
         folder = stack.enter_context(building(out))
         parts = {name: _Part(name, recipe, folder, ground) for name in shares}
         done = 0
@@ -164,6 +179,11 @@ class _Part:
             if name in lacking:
                 self.left_out[reason] += int((kept & lacking[name]).sum())
                 kept &= ~lacking[name]
+        relief_m = np.ptp(framed_m[:, 1:-1, 1:-1], axis=(1, 2))
+        rough = kept & (relief_m > MAX_RELIEF_M)
+        if rough.any():
+            self.left_out["too_rough"] += int(rough.sum())
+            kept &= ~rough
         numbers = (run.row * self.ground.tiling.tiles[1] + np.array(run.columns))[kept]
         if not len(numbers):
             return

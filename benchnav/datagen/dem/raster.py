@@ -17,6 +17,7 @@ from benchnav.core.errors import ConfigError, DatasetError, expect
 from benchnav.core.touched import note_file
 from benchnav.datagen.dem.layer import LayerRaster, read_layer
 
+MAX_MAPS = 20_000  # of an import, unless more are allowed
 _MOST_STRETCH = 0.02  # of a projection against the ground; within a UTM zone it is at most 0.001
 _PROBE_M = 10.0  # to either side of a place where the scale of a projection is measured
 _TOLERANCE = 0.01  # of a raster's cell that a place may be off by in another CRS
@@ -76,11 +77,16 @@ class Rasters:
 
 
 class Raster(NamedTuple):
-    """An open raster: what the user calls it, its name, rasterio's reader."""
+    """An open raster: what the user calls it, its name, rasterio's reader, and metres per unit of its values."""
 
     argument: str
     name: str
     file: Any
+    metres: float = 1.0
+
+    def raw(self, value: float) -> float:
+        """Return a value of the first band as the file holds it."""
+        return float((value / self.metres - self.file.offsets[0]) / self.file.scales[0])
 
     @property
     def mask_kinds(self) -> set[str]:
@@ -96,7 +102,7 @@ class Raster(NamedTuple):
         Raises:
             DatasetError: there is none, as of ground that is too large.
         """
-        own, bounds = _horizontal(self.file.crs), self.file.bounds
+        own, bounds = horizontal(self.file.crs), self.file.bounds
         x, y = np.meshgrid(
             np.linspace(bounds.left, bounds.right, 3), np.linspace(bounds.bottom, bounds.top, 3)
         )
@@ -128,7 +134,7 @@ class Raster(NamedTuple):
             settings |= {"add_alpha": True}
         with _naming(self.argument, self.name):
             return load_rasterio().vrt.WarpedVRT(
-                self.file, src_crs=_horizontal(self.file.crs), crs=crs, tolerance=_TOLERANCE, **settings
+                self.file, src_crs=horizontal(self.file.crs), crs=crs, tolerance=_TOLERANCE, **settings
             )
 
     def laid(self, frame: Mapping[str, Any], bands: list[int], how: str) -> "Layer":
@@ -173,7 +179,7 @@ class Layer(NamedTuple):
                 mask = warped.dataset_mask(window=window)
         values[:, (mask == 0) | ~np.isfinite(values).all(axis=0)] = np.nan
         scales, offsets = np.array([file.scales, file.offsets])[:, : len(values), None, None]
-        return (values * scales + offsets)[:, ::-1]
+        return (values * scales + offsets)[:, ::-1] * self.raster.metres
 
 
 @contextmanager
@@ -208,6 +214,11 @@ def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Ra
             raise DatasetError(
                 f"Expected one band in `{argument}`, got {file.count} in {name}. "
                 f"Take one out: rio stack --bidx 1 {name} one-band.tif"
+            )
+        if not kinds and file.dtypes[0].startswith("complex"):
+            raise DatasetError(
+                f"Expected real numbers in `{argument}`, got {file.dtypes[0]} in {name}. If the imaginary parts mean "
+                f"nothing, leave them out: rio convert --dtype float64 {name} real.tif"
             )
         if file.dtypes[: len(kinds)] != kinds:
             raise DatasetError(
@@ -292,7 +303,7 @@ def transformed(crs: Any, to: Any, x: Any, y: Any) -> np.ndarray:
         return np.full((2, len(x)), np.nan)
 
 
-def _horizontal(crs: Any) -> Any:
+def horizontal(crs: Any) -> Any:
     """The part of a CRS that says where on the map, where another says how high."""
     whole = crs.to_dict(projjson=True)
     return type(crs).from_user_input(json.dumps(whole["components"][0])) if "components" in whole else crs

@@ -7,7 +7,7 @@ covers most of it. Letters in shapes: B maps, K bands, H×W cells of a map.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -27,16 +27,16 @@ from benchnav.datagen.dem.drive_cells import (
 )
 from benchnav.datagen.dem.drive_log import Drives, read_drives
 from benchnav.datagen.dem.drive_motion import compare_motion, compare_slopes
-from benchnav.datagen.dem.raster import Layer, Raster, Rasters, load_rasterio, opened
-from benchnav.datagen.dem.tiling import Run, cut, cut_around
+from benchnav.datagen.dem.extent import Extent
+from benchnav.datagen.dem.raster import MAX_MAPS, Layer, Raster, Rasters, opened
+from benchnav.datagen.dem.sentinel import is_certain, is_missing, looks_missing
+from benchnav.datagen.dem.tiling import Run
+from benchnav.datagen.dem.units import check_metres, in_unit
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.datagen.schema import Maps
+from benchnav.datagen.schema import FIELDS, OPTIONAL, Maps
 
 _SLACK = 1e-3  # of a cell that an extent may fall short by
-_KERNEL_CELLS = 2.0  # that cubic convolution reaches to either side
-_MOST_RELIEF_M = 2048.0  # float32 holds the schema's steps of 2^-13 m up to here
 _CLIFF = 5.67  # of 80°, metres a metre: steeper than natural ground beside cells of height 0
-_METRES = ("m", "metre", "meter", "metres", "meters")
 # Rasters beside the elevation model: what the user calls them, dtypes of their bands, and how they are resampled.
 _OTHERS = (
     ("classes", (), "mode"),
@@ -71,17 +71,28 @@ class Survey:
         shares: Mapping[str, float],
         stride_m: float | None,
         drives: Drives | None = None,
+        *,
+        dem_unit: str = "",
+        origin_m: tuple[float, float] | None = None,
+        max_maps: int = MAX_MAPS,
+        coarse: bool = False,
+        announce: Callable[[str], object] = str,
     ) -> None:
         """Opens rasters and lays them on the cells of all maps.
 
         Args:
             stack: closes them.
-            dem: of elevations in metres, one band, by any name that rasterio opens.
+            dem: of elevations, one band, by any name that rasterio opens.
             rasters: the others.
             recipe: size and resolution of the maps, class table.
             shares: of the maps, by split.
             stride_m: from one map to the next; None for maps side by side.
             drives: log of drives, around which the ground is cut; None for all of the elevation model.
+            dem_unit: of elevations; if empty, what the raster declares, else metres.
+            origin_m: (x, y) of the first map's south-west corner; None for the default.
+            max_maps: most maps.
+            coarse: whether the elevation model may be much coarser than the maps.
+            announce: is given what will be imported, in sentences.
 
         Raises:
             ConfigError: a setting does not fit the recipe.
@@ -93,18 +104,8 @@ class Survey:
         expect(not unknown, f"`class_ids` to name classes of the recipe, {names}, got {unknown}.")
         log = read_drives(drives) if drives else None
         ground = stack.enter_context(opened("dem", dem))
-        unit = ground.file.units[0] or "m"
-        if unit.lower() not in _METRES:
-            raise DatasetError(
-                f"Expected elevations of `dem` in metres, got {unit!r} in {dem}. Convert them (gdal_calc.py, "
-                f"× 0.3048 for feet), then declare the unit: rio edit-info --bidx 1 --units metre {dem}"
-            )
+        ground, unit = in_unit(ground, dem_unit)
         crs, bounds, cell_m = ground.place()
-        how, reach_m = "cubic", _KERNEL_CELLS * max(*cell_m, step)
-        if np.allclose(cell_m, step, rtol=1e-9) and bounds == ground.file.bounds:
-            how, reach_m = "nearest", 0.0
-        elif max(cell_m) <= step / 2 * (1 + 1e-9):
-            how, reach_m = "average", 0.0
         stride = recipe.grid.shape
         if stride_m is not None:
             apart = stride_m / step
@@ -113,38 +114,36 @@ class Survey:
                 f"`stride` as a multiple of the maps' resolution, {step:g} m, got {stride_m:g}.",
             )
             stride = round(apart), round(apart)
-        whole_m = np.array([bounds.top - bounds.bottom, bounds.right - bounds.left])
-        edge_m, size_m = np.zeros(2), whole_m
         if log is not None:
             log = compare_motion(lay_out(log, ground, crs, bounds))
             check_enough(log, list(shares))
-            map_m, apart_m = np.multiply(recipe.grid.shape, step), np.multiply(stride, step)
-            edge_m, size_m = cut_around(log.places_m, whole_m, np.array(cell_m), map_m, apart_m)
-        cells = np.floor(size_m / step + _SLACK).astype(int).tolist()
-        if np.less(cells, recipe.grid.shape).any():
-            wide, high = recipe.grid.extent_m
-            raise DatasetError(
-                f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {dem} of "
-                f"{size_m[1]:g} m × {size_m[0]:g} m. Take a larger raster or a recipe of smaller maps."
-            )
-        self.tiling = tiling = cut(cells, recipe.grid.shape, stride, shares)
-        # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
-        offset_m = edge_m + np.clip((size_m - np.multiply(step, tiling.cells)) / 2, 0, reach_m)
-        south_m, west_m = (np.array([bounds.bottom, bounds.left]) + offset_m).tolist()
+        extent = Extent(
+            raster=ground, unit=unit, crs=crs, bounds=bounds, cell_m=np.array(cell_m), shares=shares,
+            origin_m=origin_m, places_m=None if log is None else log.places_m,
+        )  # fmt: skip
+        laid = extent.lay(recipe.grid, stride)
+        self.fields = {own.name: own.field for own in rasters.layers}
+        tiling, offset_m, how = laid
+        self.tiling = tiling
+        drive_fields = {name: OPTIONAL[name] for name in BANDS if name in OPTIONAL and log is not None}
+        announce(extent.describe(laid, recipe, FIELDS | drive_fields | self.fields))
+        extent.check(laid, recipe, max_maps, coarse)
+        south_m, west_m = (extent.corner_m + offset_m).tolist()
         height, width = tiling.cells
-        north_m = south_m + (height + 1) * step
-        transform = load_rasterio().transform.from_origin(west_m - step, north_m, step, step)
-        frame = {"crs": crs, "transform": transform, "height": height + 2, "width": width + 2}
+        frame = extent.frame(laid, step)
         sources = [(ground, how)]
         for argument, kinds, how in _OTHERS:
             if name := getattr(rasters, argument):
                 sources.append((stack.enter_context(opened(argument, name, kinds)), how))
+                extent.suggest_origin(sources[-1][0], laid, step, announce)
         area = (west_m, south_m, west_m + width * step, south_m + height * step)
         for own in rasters.layers:
             raster = stack.enter_context(opened(f"layer {own.name}", own.raster))
+            extent.suggest_origin(raster, laid, step, announce)
+            if own.field.unit == "m":
+                check_metres(raster)
             _check_covers(raster, crs, area, step)
             sources.append((raster, own.how))
-        self.fields = {own.name: own.field for own in rasters.layers}
         self.layers: dict[str, Layer] = {}
         for raster, how in sources:
             is_photo = raster.argument == "photo"
@@ -167,11 +166,13 @@ class Survey:
             "stride_m": [cells * step for cells in reversed(tiling.stride)],
             **{argument: origins.get(argument) for argument, _, _ in _OTHERS},
         }
+        if ground.metres != 1:
+            self.source["metres_per_unit"] = ground.metres
         if self.fields:
             self.source["layers"] = {name: origins[f"layer {name}"] for name in self.fields}
         self.valued: set[str] = set()
         self.known = []
-        for offset, count, size in zip(offset_m, tiling.cells, whole_m, strict=True):
+        for offset, count, size in zip(offset_m, tiling.cells, extent.size_m, strict=True):
             edges = offset + step * np.arange(-1, count + 2)
             self.known.append((edges[:-1] > -_SLACK * step) & (edges[1:] < size + _SLACK * step))
         self.indices = {value: np.nan if name is None else names.index(name) for value, name in named.items()}
@@ -203,11 +204,12 @@ class Survey:
         rows, columns = self.known
         for place, west in enumerate(wests):
             own = {name: maps[place] for name, maps in framed.items()}
+            ends = [own.get(f"dem {end}", own["dem"]) for end in ("min", "max")]
             low, high = _range("dem", own)
-            if high - low > _MOST_RELIEF_M:
-                expected = f"elevations of `dem` within {_MOST_RELIEF_M:g} m on a map"
-                raise self._out_of_range("dem", expected, low, high, low if low < -1000 else high)
-            heights = np.abs(own.get("dem min", own["dem"]))
+            for odd, heights in zip((low, high), ends, strict=True):
+                if is_missing(self.layers["dem"].raster, odd, heights, self.cliff_m):
+                    raise self._out_of_range("dem", "elevations of `dem` without stand-ins", low, high, odd)
+            heights = np.abs(ends[0])
             least = np.min(heights, initial=np.inf, where=heights > 0)
             if (heights == 0).any() and self.cliff_m < least < np.inf:
                 expected = "elevations of `dem` without a gap next to 0"
@@ -227,6 +229,11 @@ class Survey:
                 raise self._out_of_range(
                     f"layer {name}", expected, low, high, low if low < kind.least else high
                 )
+            raster = self.layers[f"layer {name}"].raster
+            if raster.mask_kinds == {"all_valid"} and is_certain(raster, low):
+                expected = f"values of `layer {name}` without stand-ins"
+                other = "Where it is a value, declare one that does not occur."
+                raise self._out_of_range(f"layer {name}", expected, low, high, low, other)
             if low <= high:
                 self.valued.add(name)
         given = {name: framed[name][:, :, 1:-1, 1:-1] for name in self.given}
@@ -243,11 +250,21 @@ class Survey:
     def _out_of_range(
         self, name: str, expected: str, low: float, high: float, odd: float, other: str = ""
     ) -> DatasetError:
-        raster = self.layers[name].raster.name
-        return DatasetError(
-            f"Expected {expected}, got {low:g} to {high:g} in {raster}. If {odd:.9g} stands for missing, "
-            f"declare it: rio edit-info --nodata {odd:.9g} {raster}{other and f'. {other}'}"
-        )
+        """Return an error that names a value as missing where it looks so, with a command that declares it."""
+        raster = self.layers[name].raster
+        said = f"Expected {expected}, got {low:g} to {high:g} in {raster.name}."
+        value = raster.raw(odd)
+        if odd and not looks_missing(raster, odd):
+            scaled = f"rio calc --not-masked -t float32 '(/ (read 1) 100.0)' {raster.name} scaled.tif"
+            how = f", from percent so: {scaled}" if name == "traversability" else "."
+            return DatasetError(f"{said} Convert them{how}")
+        if raster.file.nodata is None:
+            remedy = f"declare it: rio edit-info --nodata {value:.9g} {raster.name}"
+        else:
+            now = raster.file.nodata
+            chosen = f"(where (== (read 1) {value:.9g}) {now:.9g} (read 1))"
+            remedy = f"replace it by what is declared: rio calc '{chosen}' {raster.name} filled.tif"
+        return DatasetError(f"{said} If {value:.9g} stands for missing, {remedy}{other and f'. {other}'}")
 
     def _classes(self, values: ndarray) -> ndarray:
         indices = np.full_like(values, np.nan)

@@ -13,6 +13,7 @@ import scipy.ndimage
 
 from benchnav.core.errors import BenchnavError, ConfigError, DatasetError
 from benchnav.datagen.dem import importer
+from benchnav.datagen.dem.extent import GroundError
 from benchnav.datagen.dem.importer import import_dem
 from benchnav.datagen.dem.raster import Layer
 from benchnav.datagen.files.check import find_faults
@@ -28,6 +29,7 @@ from tests.datagen.dem.rasters import (
     STEP,
     WEST,
     maps_of,
+    plane,
     read,
     refusal,
     rough,
@@ -275,7 +277,7 @@ BAD_GROUND: dict[str, tuple[dict[str, Any], list[str]]] = {
     "no CRS": ({"crs": None}, ["`dem`", "coordinate reference system", "rio edit-info --crs"]),
     "heights in feet": (
         {"crs": "EPSG:26918+6360"},
-        ["`dem`", "in metres", "US survey foot", "--units metre"],
+        ["`dem`", "in metres", "US survey foot", "--dem-unit us-ft"],
     ),
     "nowhere": ({"transform": rasterio.Affine.identity()}, ["`dem`", "geotransform", "rio edit-info"]),
 }
@@ -390,7 +392,6 @@ def level(*shape: int) -> np.ndarray:
 REMEDIES: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "no CRS": ({"values": level(16, 24), "crs": None}, {"CODE": "32654"}),
     "bands": ({"values": level(2, 16, 24)}, {}),
-    "feet": ({"values": level(16, 24), "crs": "EPSG:26918+6360"}, {}),
     "undeclared": ({"values": np.where(np.arange(48) < 40, level(16, 48), -9999)}, {}),
 }
 
@@ -411,6 +412,101 @@ def test_the_remedy_of_the_message_is_one(tmp_path: Path, case: str) -> None:
     assert ran.exit_code == 0, ran.output
     source = source_of(read(Path(words[-1])))
     np.testing.assert_allclose(source["lowest_m"], 500, atol=0.001)
+
+
+# What an import says and takes before it begins
+
+
+def test_the_paragraph_gives_maps_size_unit_and_origin_before_anything_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Layer, "read", lambda *_: pytest.fail("read"))
+    said: list[str] = []
+    dem = write(tmp_path / "dem.tif", np.zeros((3200, 4800), np.int8), 1.0)
+    steps = import_dem(
+        str(dem),
+        tmp_path / "o.h5",
+        RECIPE,
+        origin_m=(WEST + 1, SOUTH + 2),
+        max_maps=10**6,
+        announce=said.append,
+    )
+    with pytest.raises(pytest.fail.Exception):
+        next(steps)
+    (paragraph,) = said
+    rows, columns = (3200 - 2) // 8, (4800 - 1) // 12
+    # Colours of 3 bytes, class of 1, elevation, slope and λ of 4 each; environment, start, goal and time.
+    size = rows * columns * (16 * 24 * (3 + 1 + 3 * 4) + 2 + 8 + 8 + 4)
+    for words in (
+        "3200 × 4800 cells of 1 m × 1 m", "metres", f"{rows * columns:,} maps of 16 × 24 cells of 0.5 m",
+        f"{size / 1e9:.2f} GB", f"[{WEST + 1:.10g},{SOUTH + 2:.10g}]", "EPSG:32654", "set by `origin`",
+    ):  # fmt: skip
+        assert words in paragraph
+
+
+def test_ground_that_does_not_fit_is_rejected_with_settings_that_do(tmp_path: Path) -> None:
+    dem = write(tmp_path / "dem.tif", np.zeros((100, 100)), 10.0)
+    with pytest.raises(GroundError, match=r"--coarse .* resolution_m=10 .*class_periods_m=\[") as caught:
+        next(import_dem(str(dem), tmp_path / "o.h5", RECIPE))
+    assert "resolution_m=10" in caught.value.changes
+    assert caught.value.stride_m is None
+    with pytest.raises(ConfigError, match="`max_maps`"):
+        next(import_dem(str(dem), tmp_path / "o.h5", RECIPE, max_maps=0))
+
+
+def test_an_origin_is_the_corner_of_the_first_map_around_drives_too(tmp_path: Path) -> None:
+    from tests.commands import call
+
+    dem = write(tmp_path / "dem.tif", rough(200, 200))
+    at = np.linspace(0, 1, 400)
+    columns = [at * 100, WEST + 20 + 60 * at, SOUTH + 20 + 60 * at, 1 + 0 * at, 0.85 + 0.1 * np.sin(40 * at)]
+    header = "time_s,x_m,y_m,commanded_m_s,measured_m_s"
+    np.savetxt(tmp_path / "log.csv", np.transpose(columns), "%.6f", ",", header=header, comments="")
+    photo = write(tmp_path / "photo.tif", np.full((3, 200, 200), 9, np.uint8))
+    words = ("--dem", dem, "--photo", photo, "--recipe", "tiny-v1", "--splits", "train")
+    log = ("import-drives", tmp_path / "log.csv", *words)
+    for origin, expected in ((None, [WEST + 18, SOUTH + 18]), ((WEST + 9, SOUTH + 8), [WEST + 9, SOUTH + 8])):
+        out = tmp_path / f"{origin is None}.h5"
+        option = ("--origin", list(origin)) if origin else ()
+        assert call("datagen", *log, "--out", out, *option) == 0
+        dataset = TerrainDataset(out)
+        source = source_of(dataset)
+        np.testing.assert_allclose(source["origin_m"], expected, atol=2)
+        assert origin is None or source["origin_m"] == expected
+        maps = dataset.read("train", fields=["drive_count"])["drive_count"]
+        cells = np.argwhere(maps[0] > 0)[:, ::-1] * 0.5 + 0.25 + source["origin_m"]
+        assert (np.abs(cells[:, 0] - WEST - (cells[:, 1] - SOUTH)) < 0.6).all()  # the drive is a diagonal
+
+
+@pytest.mark.parametrize(("cell", "off_m"), [(0.5, 0.0), (0.5, 0.13), (0.25, 0.13), (0.7, 0.2)])
+def test_heights_are_those_of_the_maps_cells_from_the_origin_on(
+    tmp_path: Path, cell: float, off_m: float
+) -> None:
+    size = round(40 / cell)
+    origin = WEST + 4 * cell + off_m, SOUTH + 6 * cell + off_m
+    dataset = read(write(tmp_path / "dem.tif", plane(size, size, cell), cell), origin_m=origin)
+    source, maps = source_of(dataset), maps_of(dataset)
+    assert source["origin_m"] == pytest.approx(origin)
+    x, y = (
+        (np.arange(24) + 0.5) * 0.5 + origin[0] - WEST,
+        (np.arange(16)[:, None] + 0.5) * 0.5 + origin[1] - SOUTH,
+    )
+    stored = maps["elevation_m"][0] + source["lowest_m"][0]
+    np.testing.assert_allclose(stored, 900 + 0.2 * x + 0.1 * y, atol=0.02 if cell == 0.25 else STEP)
+
+
+@pytest.mark.parametrize("value", [-1, 255, 9999])
+def test_level_ground_at_a_common_value_is_level_ground(tmp_path: Path, value: float) -> None:
+    dataset = read(write(tmp_path / "dem.tif", np.full((16, 24), value, np.int16)))
+    assert source_of(dataset)["lowest_m"] == [value]
+
+
+def test_a_declared_unit_is_kept_in_the_manifest(tmp_path: Path) -> None:
+    dem = write(tmp_path / "dem.tif", np.full((16, 24), 1000.0))
+    assert "metres_per_unit" not in source_of(read(dem))
+    source = source_of(read(dem, dem_unit="us-ft"))
+    assert source["metres_per_unit"] == pytest.approx(1200 / 3937)
+    assert source["lowest_m"] == pytest.approx([1000 * 1200 / 3937], abs=STEP)
 
 
 # Recipes of synthesis 2

@@ -1,6 +1,7 @@
 """Rasters that become layers: their values, their place, and what is refused."""
 
 import hashlib
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -248,3 +249,26 @@ def test_the_command_takes_layers_as_a_list_or_one_by_one(
     assert dataset.fields["moss"].unit == "kg"
     assert call("datagen", "show", "site.h5") == 0
     assert "imported layer" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("nodata", [None, -9999])
+def test_a_layer_of_metres_that_declares_feet_is_refused_with_a_conversion(
+    tmp_path: Path, nodata: float | None
+) -> None:
+    from click.testing import CliRunner
+    from rasterio.rio.main import main_group
+
+    height_ft = values(16, 24)
+    if nodata:
+        height_ft[2, 3] = nodata
+    dem = write(tmp_path / "dem.tif", FLAT)
+    canopy = write(tmp_path / "canopy.tif", height_ft, nodata=nodata)
+    with rasterio.open(canopy, "r+") as file:
+        file.units = ("US survey foot",)
+    command = refusal(dem, f"vegetation_m={canopy}").split(": rio ")[1]
+    words = shlex.split(command)
+    words[-1] = str(tmp_path / words[-1])
+    assert CliRunner().invoke(main_group, words).exit_code == 0
+    stored = maps_of(layered(dem, f"vegetation_m={words[-1]}"))["vegetation_m"][0]
+    expected = np.where(height_ft < 0, np.nan, height_ft * 1200 / 3937)[::-1]
+    np.testing.assert_allclose(stored, expected, rtol=1e-6)

@@ -204,7 +204,8 @@ def test_ground_in_degrees_is_laid_in_its_utm_zone(tmp_path: Path) -> None:
     ],
 )
 def test_ground_is_laid_where_metres_are_metres(tmp_path: Path, profile: dict[str, Any], crs: str) -> None:
-    assert source_of(read(write(tmp_path / "dem.tif", np.zeros((120, 120)), **profile)))["crs"] == crs
+    dem = write(tmp_path / "dem.tif", np.zeros((120, 120)), **profile)
+    assert source_of(read(dem, dem_unit="m"))["crs"] == crs
 
 
 # Radii in metres, the northing of a latitude, and how long a metre of ground is in the projection, eastward and
@@ -604,7 +605,7 @@ def test_traversability_out_of_range_is_refused_however_small_its_share(
     measured = write(tmp_path / "lambda.tif", values, cell)
     message = refusal(dem, traversability=measured, random_classes=True)
     assert "`traversability` in [0, 1]" in message
-    assert f"--nodata {value}" in message
+    assert (f"--nodata {value}" in message) == (value != 1.5)
 
 
 @pytest.mark.parametrize("cell", [0.5, 0.25, 0.8])
