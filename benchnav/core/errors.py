@@ -105,7 +105,9 @@ def out_of_memory(error: BaseException) -> OutOfMemoryError | None:
     if isinstance(error, BenchnavError) and _NO_MEMORY.search(str(error)):
         return None  # which says so
     cause: BaseException | None = error
-    while cause is not None:
+    seen: set[int] = set()  # an error may be its own cause
+    while cause is not None and id(cause) not in seen:
+        seen.add(id(cause))
         if isinstance(cause, OutOfMemoryError):
             return cause
         is_known = isinstance(cause, MemoryError) or getattr(cause, "errno", None) == errno.ENOMEM

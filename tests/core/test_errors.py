@@ -60,6 +60,10 @@ def test_a_fault_of_ours_stays_a_traceback() -> None:
         run("x", "Does.", {"f": Command(faulty, ("work",))}, ["f", "a"])
     assert out_of_memory(RuntimeError("index out of bounds")) is None
     assert out_of_memory(ValueError("not enough memory")) is None
+    cycle = ValueError("a")
+    cycle.__cause__ = ValueError("b")
+    cycle.__cause__.__cause__ = cycle
+    assert out_of_memory(cycle) is None
     assert out_of_memory(ConfigError("Expected `jobs` in 1–10000, got 0.")) is None
 
 
