@@ -150,7 +150,7 @@ class LatentGPs(lightning.LightningModule):
         self.manual_backward(-bound.sum())
         natural.step()
         others.optimizer.step()  # past Lightning, which would count a second step
-        loss = -bound.detach().sum() / batch["count"].sum()
+        loss = -bound.detach().sum() / batch["count"].sum().clamp(min=1)
         self.log("loss", loss, on_step=False, on_epoch=True, batch_size=1)
 
     def bound(self, bins: dict[str, Tensor]) -> Tensor:

@@ -337,10 +337,6 @@ class KeepBest(Callback):
         metrics = self.best["metrics"].items()
         trainer.callback_metrics.update({name: torch.tensor(value) for name, value in metrics})
 
-    def teardown(self, trainer: lightning.Trainer, module: lightning.LightningModule, stage: str) -> None:
-        """Refuses callbacks that have changed the best weights since."""
-        _refuse_changed(self.best["weights"], module, trainer, "on_fit_end")
-
     def state_dict(self) -> dict[str, Any]:
         """Gives what `load_state_dict` takes."""
         return self.best
@@ -382,6 +378,12 @@ class History(Callback):
                     f"{name} became {value} in epoch {epoch}. Train with a lower `learning_rate`, or mend the loss. "
                     "Nothing was kept of this epoch."
                 )
+
+    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Refuses callbacks of a user, which come before, that have changed the best weights."""
+        for callback in trainer.callbacks:  # type: ignore[attr-defined]
+            if isinstance(callback, KeepBest):
+                _refuse_changed(callback.best["weights"], module, trainer, "on_fit_end")
 
     def state_dict(self) -> dict[str, Any]:
         """Gives what `load_state_dict` takes."""
