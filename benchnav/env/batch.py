@@ -125,7 +125,7 @@ class EnvBatch:
         if self._simulation is None or self._now is None or len(members) == len(chosen):
             self._simulation, self._now = fresh, start
             return
-        # Only what began anew is built: the others keep their maps and noise.
+        # Only new episodes are built: the others keep their maps and noise.
         index = torch.from_numpy(members)
         self._simulation.exchange_(index, fresh)
         self._now = map_tensors(self._now, lambda now, new: now.index_copy(0, index, new), start)

@@ -130,7 +130,7 @@ def compare_slopes(log: DriveLog, elevation_m: ndarray) -> DriveLog:
 
 
 def _leave_out(log: DriveLog, masks: Mapping[str, ndarray]) -> DriveLog:
-    """Leave rows out by reason, of which the first counts, and reject a log with too many of them."""
+    """Leave rows out, each by its first reason, and reject a log with too many of them."""
     is_left = np.ones(len(log.rows), dtype=bool)
     for reason, mask in masks.items():
         count = int(mask[is_left].sum())

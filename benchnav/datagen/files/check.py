@@ -1,6 +1,6 @@
 """Checks a whole dataset: schema, per-chunk checksums, entry digests, ranges, split digests."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from itertools import groupby
 from operator import attrgetter
@@ -109,6 +109,8 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, st
                         yield first + index, name, "is out of range", own
                     digests = schema.entry_digests({name: values}, {name: dataset.fields[name]})
                     computed[maps, fields.index(name)] = digests[:, 0]
+            for name in _damaged_scales(file, split, (*fields, schema.ENTRY_DIGESTS)):
+                yield -1, name, "is damaged", own
     is_readable = not np.ma.is_masked(computed)
     unlike = (computed != stored).filled(False).any(axis=2)
     digest = schema.split_digest(computed.data, *dataset.grid.shape, dataset.fields)
@@ -121,6 +123,18 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, st
         yield index, fields[column], "does not match its digest", files[index]
     if is_readable and not unlike.any():
         yield -1, "", "the maps do not match the digest in the manifest", ""
+
+
+def _damaged_scales(file: h5py.File, split: str, known: Collection[str]) -> Iterator[str]:
+    """Name what else lies in a split, such as dimension scales, and cannot be read."""
+    others: list[str] = []
+    with suppress(*READ_ERRORS):
+        others = sorted(set(file[split]) - set(known))
+    for name in others:
+        try:
+            file[split][name][()]
+        except READ_ERRORS:
+            yield name
 
 
 def _read_some(array: h5py.Dataset) -> Iterator[tuple[int, np.ndarray | None]]:

@@ -434,7 +434,8 @@ def _refuse_changed(
     ]
     raise ConfigError(
         f"Expected callbacks that leave the trained weights as they are, got weights that `{hook}` of "
-        f"{' or '.join(names)} changed. What is exported are the weights of the best epoch. Leave the callback out."
+        f"{' or '.join(names) or 'a callback'} changed. What is exported are the weights of the best epoch. "
+        "Leave the callback out."
     )
 
 

@@ -54,6 +54,7 @@ def test_the_manifest_says_where_the_maps_came_from(tmp_path: Path) -> None:
     assert (source["kind"], source["file"], source["crs"]) == ("dem", "dem.tif", "EPSG:32654")
     assert source["resolution_m"] == [0.5, 0.5]
     assert source["classes"] is source["photo"] is None
+    assert not dataset.has_photo("test/hills")
     assert len(dataset.terrain("test/hills")) == 2
 
 
@@ -470,6 +471,7 @@ def test_an_origin_is_the_corner_of_the_first_map_around_drives_too(tmp_path: Pa
         option = ("--origin", list(origin)) if origin else ()
         assert call("datagen", *log, "--out", out, *option) == 0
         dataset = TerrainDataset(out)
+        assert dataset.has_photo("train")
         source = source_of(dataset)
         np.testing.assert_allclose(source["origin_m"], expected, atol=2)
         assert origin is None or source["origin_m"] == expected

@@ -13,6 +13,7 @@ from benchnav.core.errors import DatasetError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen import schema
 from benchnav.datagen.files import manifest, reader
+from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.files.stored_terrain import terrain_of
@@ -80,6 +81,15 @@ def test_dimensions_have_scales_with_the_centres_of_cells(dataset_path: Path) ->
                     assert [scale.shape for scale in dimension.values()] == [(size,)]
             np.testing.assert_allclose(file[split]["y_m"], y)
             np.testing.assert_allclose(file[split]["x_m"], x)
+
+
+def test_a_damaged_scale_is_found(dataset_path: Path, tmp_path: Path) -> None:
+    path = tmp_path / "damaged.h5"
+    raw = bytearray(dataset_path.read_bytes())
+    with h5py.File(dataset_path) as file:
+        raw[file["valid/y_m"].id.get_chunk_info(0).byte_offset + 3] ^= 1
+    path.write_bytes(raw)
+    assert [str(fault) for fault in find_faults(path)] == ["valid: field 'y_m' is damaged"]
 
 
 def test_foreign_newer_and_missing_files_are_refused(tmp_path: Path) -> None:

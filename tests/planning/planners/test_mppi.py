@@ -623,7 +623,7 @@ LEFT, RIGHT = (slice(21, None), slice(26, 28)), (slice(None, 19), slice(26, 28))
         ((LEFT,), None, (1, 1), 1),  # slow ground is no obstacle
         ((LEFT,), Immobile(below=0.1), (1, 1), -1),
         ((LEFT, RIGHT), Immobile(below=0.1), (1, 1), None),
-        ((LEFT,), Immobile(below=0.1), (1, 0), 1),  # on one field of two alone
+        ((LEFT,), Immobile(below=0.1), (1, 0), 1),  # on one of two fields
         ((LEFT,), Immobile(below=0.01), (1, 1), 1),
     ],
 )
