@@ -1,0 +1,1 @@
+"""Digests of results that a change of structure must not move."""

@@ -1,0 +1,114 @@
+"""Count the tokens of Python code, without comments, docstrings and layout.
+
+    python tools/size.py                    # by package, and by area
+    python tools/size.py --against REVISION # next to those of a revision of the repository
+
+Run it with Python 3.11: later versions split f-strings into tokens.
+"""
+
+import argparse
+import ast
+import io
+import subprocess
+import sys
+import tokenize
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+_LAYOUT = {
+    tokenize.COMMENT,
+    tokenize.NL,
+    tokenize.NEWLINE,
+    tokenize.INDENT,
+    tokenize.DEDENT,
+    tokenize.ENCODING,
+    tokenize.ENDMARKER,
+}
+# What is counted: of a checkout or a revision, by the first folders of a path.
+_COUNTED = ("benchnav", "benchmarks", "studies", "tools", "tests")
+
+
+def count(text: str) -> int:
+    """Count the tokens of a module that are neither layout nor documentation."""
+    documented = _docstring_lines(ast.parse(text))
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    return sum(
+        token.type not in _LAYOUT and not (token.type == tokenize.STRING and token.start[0] in documented)
+        for token in tokens
+    )
+
+
+def _docstring_lines(module: ast.Module) -> set[int]:
+    lines = set()
+    for node in ast.walk(module):
+        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        # A string that stands alone documents what is above it.
+        for statement in node.body:
+            is_text = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+            if is_text and isinstance(statement.value.value, str):
+                lines.add(statement.lineno)
+    return lines
+
+
+def sizes(revision: str = "") -> dict[str, int]:
+    """Count the tokens of each Python file of the working tree, or of a revision."""
+    listed = (
+        _git("ls-tree", "-r", "--name-only", revision)
+        if revision
+        else _git("ls-files", "-co", "--exclude-standard")
+    )
+    paths = [
+        path
+        for path in listed.splitlines()
+        if path.endswith(".py")
+        and path.partition("/")[0] in _COUNTED
+        and (revision or (ROOT / path).exists())
+    ]
+    return {
+        path: count(_git("show", f"{revision}:{path}") if revision else (ROOT / path).read_text())
+        for path in paths
+    }
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+
+
+def by_folder(files: dict[str, int]) -> Counter[str]:
+    """Sum by the first folder, and of the package by the second."""
+    totals: Counter[str] = Counter()
+    for path, tokens in files.items():
+        folders = path.split("/")[:-1]
+        totals[
+            "/".join(folders[: 3 if folders[:2] in (["benchnav", "eval"], ["benchnav", "models"]) else 2])
+        ] += tokens
+        totals["package"] += tokens * (folders[0] == "benchnav")
+    return totals
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--against", default="", help="a revision to compare with")
+    parser.add_argument("--files", action="store_true", help="each file")
+    given = parser.parse_args()
+    if sys.version_info[:2] != (3, 11):
+        print(
+            f"warning: Python {sys.version_info[0]}.{sys.version_info[1]} may split tokens otherwise than 3.11"
+        )
+    now, before = sizes(), sizes(given.against) if given.against else {}
+    if not given.files:
+        now, before = by_folder(now), by_folder(before)
+    for name in sorted(now.keys() | before.keys()):
+        change = (
+            f" {before.get(name, 0):8} {now.get(name, 0) - before.get(name, 0):+8}" if given.against else ""
+        )
+        print(f"{name:50} {now.get(name, 0):8}{change}")
+
+
+if __name__ == "__main__":
+    main()
