@@ -64,7 +64,7 @@ def drive() -> tuple[Problem, Simulation, Terrain, Law]:
 
 
 def measure(distribution: Any) -> torch.Tensor:
-    return risk.expected_time(distribution, 0.05)
+    return risk.ExpectedTime(0.05)(distribution)
 
 
 def learns(belief: Copula, problem: Problem, terrain: Terrain, field: torch.Tensor, law: Law) -> Learning:

@@ -26,6 +26,8 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.core.quantiles": ("QuantileDistribution",),
         "benchnav.core.registry": ("register",),
         "benchnav.core.terrain": ("Observation", "Terrain"),
+        "benchnav.eval.evaluate": ("evaluate",),
+        "benchnav.eval.results": ("Results", "open_results as open_run"),
     },
 )
 

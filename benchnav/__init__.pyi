@@ -8,6 +8,9 @@ from benchnav.core.pooled import pool
 from benchnav.core.quantiles import QuantileDistribution
 from benchnav.core.registry import register
 from benchnav.core.terrain import Observation, Terrain
+from benchnav.eval.evaluate import evaluate
+from benchnav.eval.results import Results
+from benchnav.eval.results import open_results as open_run
 
 __all__ = [
     "Batch",
@@ -19,10 +22,13 @@ __all__ = [
     "Grid",
     "Observation",
     "QuantileDistribution",
+    "Results",
     "Terrain",
     "TrainingError",
     "TraversabilityDistribution",
     "TraversabilityMixture",
+    "evaluate",
+    "open_run",
     "pool",
     "register",
 ]

@@ -14,19 +14,21 @@ ROOT = Path(__file__).parent.parent
 
 FACES = {
     "benchnav": "Batch BenchnavError CheckpointError ConditionedDistribution ConfigError DatasetError Grid "
-    "Observation QuantileDistribution Terrain TrainingError TraversabilityDistribution TraversabilityMixture pool "
-    "register",
+    "Observation QuantileDistribution Results Terrain TrainingError TraversabilityDistribution TraversabilityMixture "
+    "evaluate open_run pool register",
     "benchnav.datagen": "Recipe TerrainClass TerrainDataset TerrainMaps create_dataset find_dataset generate "
     "load_recipe recipe_from_dict shipped_recipes",
     "benchnav.env": "EgocentricEnv EgocentricVectorEnv OffRoadEnv OffRoadVectorEnv PolicyPlanner",
-    "benchnav.eval": "Condition Suite compare_runs open_run read_report read_steps run_suite write_report",
+    "benchnav.eval": "Comparison Condition Results Suite compare_runs evaluate open_run read_report read_steps "
+    "run_suite write_report",
     "benchnav.models": "Checkpoint ModelFamily Part TrainOptions TrainableModel TrainingConfig "
     "TraversabilityModel Window evaluate_model find_checkpoint fit_model list_checkpoints load_checkpoint "
     "load_model measure_margin predict predict_tiles save_checkpoint write_risk_maps",
     "benchnav.planning": "AStarDWA AStarMPPI Appearance Belief Bicycle CLRRT Classes Contact Copula "
     "DifferentialDrive FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Near NearOptimal "
     "Objective Optimal OptimalBound Places Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensed "
-    "Sensor Simulation Static Step Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem",
+    "Sensor Simulation Static Step Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem CVaR Chance "
+    "ExpectedTime Mean RiskMeasure SingleClass TimeCVaR VaR",
     "benchnav.testing": "check_belief check_model check_objective check_planner check_risk check_robot "
     "check_sensor",
 }

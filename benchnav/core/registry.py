@@ -23,6 +23,7 @@ so that what was recorded before they came is still the same part.
 import importlib
 import importlib.util
 import inspect
+import itertools
 import os
 import re
 import sys
@@ -125,6 +126,8 @@ class Found:
 
 
 _REGISTERED: dict[tuple[str, str], Any] = {}
+# Objects of this process that nothing describes, by kind and name.
+_OBJECTS: dict[tuple[str, str], Any] = {}
 
 
 def register(kind: str, name: str, target: Any) -> None:
@@ -138,10 +141,33 @@ def register(kind: str, name: str, target: Any) -> None:
     _REGISTERED[_checked(kind), name] = target
 
 
+def register_object(kind: str, name: str, instance: Any) -> str:
+    """Make an object itself known by name, in this process only.
+
+    Args:
+        kind: one of `KINDS`.
+        name: what it is to be called; a number follows if the name is taken.
+        instance: the object.
+
+    Returns:
+        The name under which `make` returns it.
+    """
+    candidates = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
+    known = set(names(kind))
+    free = next(one for one in candidates if _OBJECTS.get((kind, one)) is instance or one not in known)
+    _OBJECTS[_checked(kind), free] = instance
+    return free
+
+
+def is_object(kind: str, source: str) -> bool:
+    """Whether a name stands for an object of this process."""
+    return (kind, source) in _OBJECTS
+
+
 def names(kind: str) -> list[str]:
     """Names of a kind that are known here, sorted."""
-    registered = {name for known, name in _REGISTERED if known == kind}
-    return sorted(registered | {point.name for point in _points(kind)})
+    registered = {name for known, name in (*_REGISTERED, *_OBJECTS) if known == kind}
+    return sorted(registered | {point.name for point in entry_points_of(kind)})
 
 
 def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
@@ -295,7 +321,14 @@ def find(kind: str, source: str) -> Found:
         touched.watch()
         digest = partial(digest_of_target, target)
         return Found(target=target, origin="this process", source_digest=digest, everywhere=False)
-    points = [point for point in _points(kind) if point.name == source]
+    if is_object(kind, source):
+        instance = _OBJECTS[kind, source]
+        touched.watch()
+        digest = partial(digest_of_target, instance if inspect.isroutine(instance) else type(instance))
+        # A risk measure is called with a distribution; anything else is returned as it is.
+        target = instance if kind == "risk" else partial(_itself, instance)
+        return Found(target=target, origin="this process", source_digest=digest, everywhere=False)
+    points = [point for point in entry_points_of(kind) if point.name == source]
     if len(points) > 1:
         raise ConfigError(
             f"Expected one {kind} {source!r}, got several: {', '.join(point.value for point in points)}. "
@@ -312,6 +345,10 @@ def find(kind: str, source: str) -> Found:
     elif Path(f"{source}.py").is_file():
         remedy = f" Did you mean './{source}.py:Name'?"
     raise _unknown(kind, source, remedy)
+
+
+def _itself(instance: Any) -> Any:
+    return instance
 
 
 def options_of(kind: str, target: Any) -> dict[str, Option]:
@@ -331,7 +368,8 @@ def _checked(kind: str) -> str:
     return kind
 
 
-def _points(kind: str) -> tuple[EntryPoint, ...]:
+def entry_points_of(kind: str) -> tuple[EntryPoint, ...]:
+    """Return the entry points of a kind of all that is installed."""
     return _points_on(_checked(kind), tuple(sys.path))
 
 
@@ -369,6 +407,11 @@ def _skipped(kind: str, target: Any) -> tuple[str, ...]:
     """Parameters that are no options, since the program gives them."""
     if kind == "risk" and not inspect.isclass(target):
         return tuple(parameters(target))[:1]
+    return given_parameters(kind)
+
+
+def given_parameters(kind: str) -> tuple[str, ...]:
+    """Names of the parameters that the program gives, such as an objective's `robot`."""
     return _GIVEN.get(kind, ())
 
 

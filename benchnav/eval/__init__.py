@@ -7,10 +7,11 @@ __getattr__, __dir__, __all__ = face(
     {
         "benchnav.eval.compare": ("compare_runs",),
         "benchnav.eval.experiment.condition": ("Condition",),
+        "benchnav.eval.evaluate": ("evaluate",),
         "benchnav.eval.experiment.suite": ("Suite",),
-        "benchnav.eval.folder.run_folder": ("open_run",),
         "benchnav.eval.folder.steps": ("read_steps",),
         "benchnav.eval.report.write": ("read_report", "write_report"),
+        "benchnav.eval.results": ("Comparison", "Results", "open_results as open_run"),
         "benchnav.eval.run.runner": ("run_suite",),
     },
 )

@@ -1,15 +1,20 @@
 from benchnav.eval.compare import compare_runs
+from benchnav.eval.evaluate import evaluate
 from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.report.write import read_report, write_report
+from benchnav.eval.results import Comparison, Results
+from benchnav.eval.results import open_results as open_run
 from benchnav.eval.run.runner import run_suite
 
 __all__ = [
+    "Comparison",
     "Condition",
+    "Results",
     "Suite",
     "compare_runs",
+    "evaluate",
     "open_run",
     "read_report",
     "read_steps",

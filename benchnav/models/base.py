@@ -16,11 +16,12 @@ from benchnav.core.device import exact_convolutions
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.ground import SEEN
+from benchnav.core.specified import Specified
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.models.checkpoint import Checkpoint
 
 
-class TraversabilityModel(ABC):
+class TraversabilityModel(Specified, ABC):
     """The base class of models; `benchnav.testing.check_model` tries whether one keeps its contract."""
 
     class_names: tuple[str, ...] = ()

@@ -11,7 +11,7 @@ from benchnav.models.config import (
     TrainOptions,
 )
 from benchnav.models.onnx_command import export
-from benchnav.models.quality.command import evaluate
+from benchnav.models.quality.command import evaluate_command
 from benchnav.models.quality.compare.command import compare
 
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
@@ -133,7 +133,7 @@ COMMANDS = {
     "gp": Command(train_gp),
     "all": Command(train_all),
     "mdn": Command(train_mdn),
-    "evaluate": Command(evaluate, ("checkpoint",)),
+    "evaluate": Command(evaluate_command, ("checkpoint",)),
     "compare": Command(compare, ("models",)),
     "export": Command(export, ("checkpoint",)),
 }

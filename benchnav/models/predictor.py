@@ -7,18 +7,21 @@ Letters in shapes: K components.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from benchnav.core import hub, registry
 from benchnav.core.command import tell
+from benchnav.core.describe import describe, name_object
 from benchnav.core.errors import CheckpointError, ConfigError, expect, out_of_memory
 from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.shipped_files import shipped_folder
+from benchnav.core.sources import digest_of
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.ground import TRAIN, find_ground, ground_file
@@ -68,6 +71,7 @@ class Clairvoyant(PrivilegedModel):
         return TraversabilityMixture(torch.ones_like(means), means, torch.zeros_like(means), (0,))
 
 
+_SOURCE = "_source"  # attribute that keeps how a model was found
 Source = str | Path | Mapping[str, Any] | registry.Part
 # `Law.nugget` under a model that learnt; docs/reference/sensing.md has the figures it was chosen by. Without a nugget,
 # scores of neighbouring cells that the model predicts wrongly contradict each other.
@@ -89,6 +93,60 @@ def load_model(source: Source) -> TraversabilityModel:
         ConfigError: there is no such model, or it refuses its options.
         CheckpointError: the checkpoint cannot be used.
     """
+    model = _load(source)
+    if not isinstance(source, Mapping):
+        source = registry.read_part("model", str(source) if isinstance(source, Path) else source)
+    # A frozen model refuses attributes, and a network takes them for its own.
+    object.__setattr__(model, _SOURCE, registry.read_part("model", source))
+    return model
+
+
+def describe_model(model: Any) -> registry.Part:
+    """Describe a model by what loads it again; see `benchnav.core.describe.describe`.
+
+    Args:
+        model: a model, or what `load_model` takes.
+
+    Returns:
+        The part that loads a model with the same weights. A model that was trained in this process, or changed after it
+        was loaded, is known by a name in this process only.
+
+    Raises:
+        ConfigError: If it is no model.
+    """
+    if isinstance(model, Path):
+        return registry.read_part("model", str(model))
+    if isinstance(model, str | Mapping | registry.Part):
+        return registry.read_part("model", model)
+    part = getattr(model, _SOURCE, None)
+    if part is None:
+        return describe("model", model)
+    return (
+        part
+        if _digest_of_weights(load_model(part)) == _digest_of_weights(model)
+        else name_object("model", model)
+    )
+
+
+def _digest_of_weights(model: TraversabilityModel) -> str:
+    tensors = (tensor for network in networks_of(model) for tensor in network.state_dict().values())
+    return digest_of(tensor.detach().cpu().contiguous().numpy().tobytes() for tensor in tensors)
+
+
+def networks_of(value: Any) -> Iterator[nn.Module]:
+    """Yield the networks of a model and of its members."""
+    if isinstance(value, nn.Module):
+        yield value
+    elif isinstance(value, TraversabilityModel):
+        yield from networks_of(vars(value))
+    elif isinstance(value, Mapping):
+        yield from networks_of(list(value.values()))
+    elif isinstance(value, list | tuple):
+        for member in value:
+            yield from networks_of(member)
+
+
+def _load(source: Source) -> TraversabilityModel:
     part = _as_part(source)
     if isinstance(part, Path):
         own = split_own(registry.read_part("model", source).part) if not isinstance(source, Path) else None

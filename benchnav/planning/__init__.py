@@ -15,6 +15,16 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.planning.planners.planner": ("LocalPlanner", "Plan", "PlanStatus", "Planner"),
         "benchnav.planning.planners.straight": ("Straight",),
         "benchnav.planning.problem": ("Problem", "Task", "pose_problem"),
+        "benchnav.planning.risk": (
+            "CVaR",
+            "Chance",
+            "ExpectedTime",
+            "Mean",
+            "RiskMeasure",
+            "SingleClass",
+            "TimeCVaR",
+            "VaR",
+        ),
         "benchnav.planning.robots": (
             "SPEED",
             "STEERING",

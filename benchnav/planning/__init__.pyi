@@ -8,6 +8,7 @@ from benchnav.planning.planners.optimal.optimal import NearOptimal, Optimal, Opt
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, PlanStatus
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, Task, pose_problem
+from benchnav.planning.risk import Chance, CVaR, ExpectedTime, Mean, RiskMeasure, SingleClass, TimeCVaR, VaR
 from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Bicycle, DifferentialDrive, Robot, Unicycle
 from benchnav.planning.sensing.belief import Belief, Law, Static
 from benchnav.planning.sensing.classes import Classes
@@ -28,16 +29,20 @@ __all__ = [
     "Appearance",
     "Belief",
     "Bicycle",
+    "CVaR",
+    "Chance",
     "Classes",
     "Contact",
     "Copula",
     "DifferentialDrive",
+    "ExpectedTime",
     "FreeSpace",
     "Full",
     "GoalDistance",
     "Law",
     "LocalPlanner",
     "MPPIConfig",
+    "Mean",
     "Moment",
     "Near",
     "NearOptimal",
@@ -50,17 +55,21 @@ __all__ = [
     "Planner",
     "Probe",
     "Problem",
+    "RiskMeasure",
     "Robot",
     "Rules",
     "Sensed",
     "Sensor",
     "Simulation",
+    "SingleClass",
     "Static",
     "Step",
     "Straight",
     "Task",
+    "TimeCVaR",
     "TravelTime",
     "Unicycle",
+    "VaR",
     "World",
     "distance",
     "pose_problem",

@@ -17,12 +17,13 @@ import torch
 from torch import Tensor
 
 from benchnav.core.errors import expect
+from benchnav.core.specified import Specified
 from benchnav.planning.robots import Robot
 
 _WAYPOINT_M = 0.2  # a robot this near to a way-point has reached it
 
 
-class Objective(ABC):
+class Objective(Specified, ABC):
     """The base class of costs J, summed over a trajectory. Shapes broadcast over *B.
 
     `benchnav.testing.check_objective` tries whether one keeps its contract.

@@ -1,96 +1,149 @@
 """Risk measures: from the distribution of traversability to the one map a planner is given.
 
-A measure is a function of a `TraversabilityDistribution` of shape [B, H, W] that gives λ̂ in [0, 1] of that shape; its
-further keyword parameters are its options. A setting is written `name` or `name:level`: `cvar:0.9`, `var:0.95`,
+A measure maps a `TraversabilityDistribution` of shape [B, H, W] to λ̂ in [0, 1] of that shape. The shipped measures are
+values, such as `CVaR(0.8)`; a user's own may be any function of a distribution, whose further keyword parameters are
+its options. In suites and commands a setting is written `name` or `name:level`: `cvar:0.9`, `var:0.95`,
 `expected-time:0.05`, `mean`. Risk means the lower tail of λ; a higher level of CVaR or VaR is more cautious. The
-integrals are the distribution's own, the names are given in `pyproject.toml`, and the registry reads what is written.
-Source: paper II and III-B; `expected_time`, `time_cvar` and `chance` go beyond it.
+integrals are the distribution's own. Source: paper II and III-B; `ExpectedTime`, `TimeCVaR` and `Chance` go beyond it.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from torch import Tensor
 
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
+from benchnav.core.specified import Specified
 
-RiskMeasure = Callable[[TraversabilityDistribution], Tensor]
-
-
-def mean(distribution: TraversabilityDistribution) -> Tensor:
-    """E[λ], which looks at no tail."""
-    return distribution.mean()
+RiskFunction = Callable[[TraversabilityDistribution], Tensor]
 
 
-def var(distribution: TraversabilityDistribution, level: float = 0.9) -> Tensor:
-    """Value at risk: λ falls below it with probability 1 − level.
+class RiskMeasure(Specified, ABC):
+    """The base class of the shipped risk measures."""
+
+    @abstractmethod
+    def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
+        """Infer λ̂.
+
+        Args:
+            distribution: of λ in each cell, shape [B, H, W].
+
+        Returns:
+            λ̂ in [0, 1], shape [B, H, W].
+        """
+
+
+@dataclass(frozen=True)
+class Mean(RiskMeasure):
+    """E[λ], which considers no tail."""
+
+    def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
+        """Infer λ̂; see `RiskMeasure`."""
+        return distribution.mean()
+
+
+@dataclass(frozen=True)
+class VaR(RiskMeasure):
+    """Value at risk: λ is below it with probability 1 − level.
 
     Args:
-        distribution: of λ in each cell.
         level: α in [0, 1).
     """
-    return distribution.var(level)
+
+    level: float = 0.9
+
+    def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
+        """Infer λ̂; see `RiskMeasure`."""
+        return distribution.var(self.level)
 
 
-def cvar(distribution: TraversabilityDistribution, level: float = 0.9) -> Tensor:
-    """Conditional value at risk: the mean of λ over its worst share 1 − level.
+@dataclass(frozen=True)
+class CVaR(RiskMeasure):
+    """Conditional value at risk: the mean of λ over its worst fraction 1 − level.
 
     Args:
-        distribution: of λ in each cell.
         level: α in [0, 1).
     """
-    return distribution.cvar(level)
+
+    level: float = 0.9
+
+    def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
+        """Infer λ̂; see `RiskMeasure`."""
+        return distribution.cvar(self.level)
 
 
-def expected_time(distribution: TraversabilityDistribution, floor: float = 0.05) -> Tensor:
+@dataclass(frozen=True)
+class ExpectedTime(RiskMeasure):
     """1 / E[1 / max(λ, floor)], by which a path's length gives its expected time.
 
-    What a risk-neutral robot plans with where λ stays what it is at a place: it holds against the mean that
-    time is lost on slow ground, and looks at no tail. A lower floor makes ground that immobilises a robot dearer.
+    A risk-neutral robot plans with it where the λ field stays the same during an episode: unlike the mean it counts
+    the time that is lost on slow terrain, and it considers no tail. A lower floor makes immobilising terrain dearer.
 
     Args:
-        distribution: of λ in each cell.
-        floor: least speed, as a share of the commanded one, in (0, 1].
+        floor: minimum speed, as a fraction of the commanded one, in (0, 1].
     """
-    return (1 / distribution.expected_time(floor)).clamp(floor, 1)
+
+    floor: float = 0.05
+
+    def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
+        """Infer λ̂; see `RiskMeasure`."""
+        return (1 / distribution.expected_time(self.floor)).clamp(self.floor, 1)
 
 
-def time_cvar(distribution: TraversabilityDistribution, level: float = 0.9, floor: float = 0.05) -> Tensor:
-    """1 / CVaR of the time 1 / max(λ, floor), by which a path's length gives the time it takes on the worst ground.
+@dataclass(frozen=True)
+class TimeCVaR(RiskMeasure):
+    """1 / CVaR of the time 1 / max(λ, floor): a path's length over it is the path's time on the worst terrain.
 
-    As CVaR looks at the mean of λ over its worst share, this looks at the mean of the time over it.
+    CVaR averages λ over its worst fraction; this averages the time over it.
 
     Args:
-        distribution: of λ in each cell.
-        level: α in [0, 1); at 0 it is `expected_time`.
-        floor: least speed, as a share of the commanded one, in (0, 1].
+        level: α in [0, 1); at 0 it is `ExpectedTime`.
+        floor: minimum speed, as a fraction of the commanded one, in (0, 1].
     """
-    return (1 / distribution.time_cvar(level, floor)).clamp(floor, 1)
+
+    level: float = 0.9
+    floor: float = 0.05
+
+    def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
+        """Infer λ̂; see `RiskMeasure`."""
+        return (1 / distribution.time_cvar(self.level, self.floor)).clamp(self.floor, 1)
 
 
-def chance(distribution: TraversabilityDistribution, bound: float = 0.1) -> Tensor:
-    """P(λ ≥ bound), the chance that the ground carries the robot.
+@dataclass(frozen=True)
+class Chance(RiskMeasure):
+    """P(λ ≥ bound), the exceedance probability.
 
     Args:
-        distribution: of λ in each cell.
         bound: traversability in [0, 1].
     """
-    expect(0 <= bound <= 1, f"`bound` in [0, 1], got {bound}.")
-    return distribution.chance(bound)
+
+    bound: float = 0.1
+
+    def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
+        """Infer λ̂; see `RiskMeasure`."""
+        expect(0 <= self.bound <= 1, f"`bound` in [0, 1], got {self.bound}.")
+        return distribution.chance(self.bound)
 
 
-def single_class(distribution: TraversabilityDistribution, level: float = 0.9) -> Tensor:
-    """The CVaR of the most likely class alone, its soft spots with it.
+@dataclass(frozen=True)
+class SingleClass(RiskMeasure):
+    """The CVaR of the most likely class only, including its soft spots.
 
     Args:
-        distribution: one that knows of classes.
         level: α in [0, 1).
     """
-    return distribution.most_likely().cvar(level)
+
+    level: float = 0.9
+
+    def __call__(self, distribution: TraversabilityDistribution) -> Tensor:
+        """Infer λ̂; see `RiskMeasure`."""
+        return distribution.most_likely().cvar(self.level)
 
 
-def apply(measure: RiskMeasure, distribution: TraversabilityDistribution) -> Tensor:
-    """Infers λ̂ and checks it.
+def apply(measure: RiskFunction, distribution: TraversabilityDistribution) -> Tensor:
+    """Infer λ̂ and check it.
 
     Args:
         measure: any risk measure.
@@ -100,7 +153,7 @@ def apply(measure: RiskMeasure, distribution: TraversabilityDistribution) -> Ten
         λ̂ in [0, 1], shape [B, H, W].
 
     Raises:
-        ConfigError: the measure gave something else.
+        ConfigError: If the measure returns anything else.
     """
     risk_map = measure(distribution)
     shape = distribution.shape

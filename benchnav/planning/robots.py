@@ -18,12 +18,13 @@ import torch
 from torch import Tensor
 
 from benchnav.core.errors import expect
+from benchnav.core.specified import Specified
 
 # How planners know what an action is.
 SPEED, TURN_RATE, STEERING = "speed_mps", "turn_rate_radps", "steering_rad"
 
 
-class Robot(ABC):
+class Robot(Specified, ABC):
     """The base class of robots; `benchnav.testing.check_robot` tries whether one keeps its contract.
 
     What is listed as a property may also be a class attribute, or the field of a dataclass that has a default.

@@ -165,7 +165,7 @@ def test_a_shipped_name_is_found_and_its_value_sets_its_first_option() -> None:
     assert read_part("risk", "cvar") == Part(part="cvar", label="cvar")
     assert read_part("risk", "cvar:0.5") == Part(part="cvar", label="cvar:0.5", options={"level": 0.5})
     found = find("risk", "cvar")
-    assert (found.target.__name__, found.shipped, found.everywhere, found.digest) == ("cvar", True, True, "")
+    assert (found.target.__name__, found.shipped, found.everywhere, found.digest) == ("CVaR", True, True, "")
     assert found.origin == "benchnav"
 
 
@@ -207,7 +207,7 @@ def test_a_part_of_a_module_is_found(package: Path, text: str, label: str, optio
 
 
 def test_a_part_of_this_package_may_be_named_by_its_module_and_a_class_within_a_class(package: Path) -> None:
-    assert find("risk", "benchnav.planning.risk:mean").shipped
+    assert find("risk", "benchnav.planning.risk:Mean").shipped
     assert type(make("robot", "plugged.parts:Holder.Inner")).__qualname__ == "Holder.Inner"
 
 
@@ -536,7 +536,7 @@ def test_the_digest_of_a_module_is_that_of_its_file_and_of_where_the_part_is_def
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     base, front = tmp_path / "base_of_it.py", tmp_path / "front_of_it.py"
-    front.write_text("from base_of_it import Planner\nfrom benchnav.planning.risk import mean\n")
+    front.write_text("from base_of_it import Planner\nfrom benchnav.planning.risk import Mean\n")
     seen = set()
     for content in ("class Planner:\n    a = 1\n", "class Planner:\n    a = 22\n"):
         base.write_text(content)
@@ -545,7 +545,7 @@ def test_the_digest_of_a_module_is_that_of_its_file_and_of_where_the_part_is_def
         importlib.invalidate_caches()
         seen.add(find("planner", "front_of_it:Planner").digest)
     assert len(seen) == 2
-    found = find("risk", "front_of_it:mean")
+    found = find("risk", "front_of_it:Mean")
     assert (found.shipped, found.origin) == (False, "module front_of_it")
 
 

@@ -1,5 +1,4 @@
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from tests.testing.refusal import refusal
 
 def changed(change: Callable[[Tensor, TraversabilityMixture], Any]) -> Callable[[TraversabilityMixture], Any]:
     """The mean, but for what comes of it."""
-    return lambda mixture: change(risk.mean(mixture), mixture)
+    return lambda mixture: change(risk.Mean()(mixture), mixture)
 
 
 class Forgetful:
@@ -26,7 +25,7 @@ class Forgetful:
 
     def __call__(self, mixture: TraversabilityMixture) -> Tensor:
         self.asked += 1
-        return risk.mean(mixture) / (1 + 0.01 * self.asked)
+        return risk.Mean()(mixture) / (1 + 0.01 * self.asked)
 
 
 BAD: dict[str, tuple[Any, str]] = {
@@ -76,7 +75,7 @@ def test_what_needs_a_mixture_says_so_by_name_or_fails_on_quantiles() -> None:
 
     def nameless(given: TraversabilityDistribution) -> Tensor:
         if isinstance(given, TraversabilityMixture):
-            return risk.mean(given)
+            return risk.Mean()(given)
         raise ConfigError("Expected something else.")
 
     raised = nameless.__code__.co_firstlineno + 3
@@ -92,7 +91,7 @@ def test_every_registered_measure_keeps_the_contract(name: str) -> None:
 
 @pytest.mark.parametrize(
     "measure",
-    [risk.mean, partial(risk.cvar, level=0.5), {"part": "var", "options": {"level": 0.1}}, "cvar:0.99"],
+    [risk.Mean(), risk.CVaR(0.5), {"part": "var", "options": {"level": 0.1}}, "cvar:0.99"],
 )
 def test_a_measure_is_taken_as_a_function_by_name_or_by_mapping(measure: Any) -> None:
     check_risk(measure)

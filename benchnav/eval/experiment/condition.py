@@ -131,6 +131,15 @@ class Condition:
         return Task(robot=robot, objective=objective, rules=self.rules)
 
     @property
+    def unreproducible(self) -> tuple[str, ...]:
+        """Its parts that are objects of this process, each as kind and label; no other process can create them."""
+        return tuple(
+            f"{kind} {getattr(self, kind).label}"
+            for kind in PART_KINDS
+            if registry.is_object(kind, getattr(self, kind).part)
+        )
+
+    @property
     def learns(self) -> bool:
         """Whether the robot learns anything on its way."""
         return not self.make("sensor").sees_all or self.make("belief").learns

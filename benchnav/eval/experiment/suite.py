@@ -10,6 +10,18 @@ from benchnav.core.errors import ConfigError, expect
 
 PartSpec = str | dict[str, Any]
 
+# Fields that list parts, with their kinds.
+PART_FIELDS = {
+    "models": "model",
+    "planners": "planner",
+    "risks": "risk",
+    "robots": "robot",
+    "objectives": "objective",
+    "sensors": "sensor",
+    "grounds": "ground",
+    "beliefs": "belief",
+}
+
 # What is kept of episodes beside their rows, each with all that stands before it.
 Record = Literal["none", "steps", "first", "failures", "all"]
 RECORDS: tuple[Record, ...] = get_args(Record)
@@ -27,7 +39,8 @@ class Suite:
     """What is evaluated: the product of everything listed, or of each mapping in `conditions`.
 
     A planner, model, risk measure, robot, objective, sensor or belief is given as NAME, package.module:Name,
-    path/to/file.py:Name, or {part: NAME, label: LABEL, options: {...}}.
+    path/to/file.py:Name, or {part: NAME, label: LABEL, options: {...}}; in a program also as an object, which is
+    replaced by the description that creates it again.
 
     Args:
         data: Path or id of a dataset with splits test/SCENARIO.
@@ -82,7 +95,10 @@ class Suite:
     hypotheses: tuple[dict[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuses suites with nothing in them."""
+        """Describe objects as plain data, and reject a suite without conditions."""
+        for name, kind in PART_FIELDS.items():
+            object.__setattr__(self, name, tuple(_as_plain(kind, given) for given in getattr(self, name)))
+        object.__setattr__(self, "model", _as_plain("model", self.model))
         for name in ("planners", "risks", "robots", "objectives", "sensors", "grounds", "beliefs", "world"):
             if not getattr(self, name):
                 raise ConfigError(f"Expected one or more `{name}`, got none.")
@@ -111,6 +127,23 @@ class Suite:
     def all_seeds(self) -> tuple[int, ...]:
         """The root seeds."""
         return self.seeds or (self.seed,)
+
+
+def _as_plain(kind: str, given: Any) -> PartSpec:
+    """Return what describes a part as text or mapping; an object is described by `describe`."""
+    if isinstance(given, str) or (isinstance(given, dict) and isinstance(given.get("part"), str)):
+        return given
+    if isinstance(given, dict) and "part" in given:
+        return {**_described(kind, given["part"]), **{name: given[name] for name in given if name != "part"}}
+    return given if isinstance(given, dict) else _described(kind, given)
+
+
+def _described(kind: str, instance: Any) -> dict[str, Any]:
+    from benchnav.core.describe import describe
+    from benchnav.models.predictor import describe_model
+
+    part = describe_model(instance) if kind == "model" else describe(kind, instance)
+    return {"part": part.part, "label": part.label, "options": dict(part.options)}
 
 
 def check_size(

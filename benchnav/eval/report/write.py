@@ -216,7 +216,7 @@ def write_report(
     if not report.regret.empty:
         write_text(out / "regret.csv", report.csv(report.regret))
     figures = {}
-    for name, caption, figure in _figures(folder, report, record_driven):
+    for name, caption, figure in run_figures(folder, report, record_driven):
         path = out / "figures" / f"{name}.png"
         # These are as wide as their maps: white borders are cut away.
         is_of_maps = name.partition("-")[0] in ("trajectories", "driven", "knowledge")
@@ -243,7 +243,7 @@ def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _figures(
+def run_figures(
     folder: Path, report: Report, record_driven: RecordDriven | None
 ) -> Iterator[tuple[str, str, Figure]]:
     """Gives name, caption and figure of all that is drawn of a run.

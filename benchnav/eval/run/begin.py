@@ -134,6 +134,7 @@ def _check_extends(work: Work, earlier: Run) -> None:
             f"Expected `out` to be new or to hold {_in_words(work.shard)}, got {folder}, which holds "
             f"{_in_words(earlier.shard)}. Choose another `out`."
         )
+    check_resumable(earlier)
     # Others would be written after what they are tested by.
     fixed = earlier.about.get("hypotheses", {}).get("digest", "none")
     if work.hypotheses and work.hypotheses["digest"] != fixed:
@@ -142,6 +143,20 @@ def _check_extends(work: Work, earlier: Run) -> None:
             f"{work.hypotheses['digest']}). Leave `hypotheses` out to go on, or choose another `out`."
         )
     check_labels(condition for known in (earlier, work) for condition, _ in known.conditions.values())
+
+
+def check_resumable(run: Run) -> None:
+    """Reject a run whose parts were objects of a process.
+
+    Raises:
+        ConfigError: If it has such parts.
+    """
+    parts = [part for entry in run.about["conditions"].values() for part in entry.get("unreproducible", ())]
+    if parts:
+        raise ConfigError(
+            f"Expected a run that can be run again, got {run.folder}, whose {parts[0]} was an object of one process. "
+            "Evaluate it into a new folder."
+        )
 
 
 def _in_words(shard: Shard | None) -> str:
@@ -197,9 +212,13 @@ def _notes(condition: Condition) -> dict[str, Any]:
         f"One row for {kind} {', '.join(labels)}, which the planner does not use here"
         for kind, labels in condition.stands_for.items()
     ]
+    unreproducible = [
+        f"Not reproducible: {part} is an object of one process" for part in condition.unreproducible
+    ]
     return {
         "follows": planner.follows(task),
-        "remarks": [*planner.remarks(task), *merged],
+        "remarks": [*planner.remarks(task), *merged, *unreproducible],
+        **({"unreproducible": condition.unreproducible} if unreproducible else {}),
         "changed": changed_options(condition.planner),
     }
 

@@ -81,6 +81,9 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
     warnings = build_each(kept, suite.all_seeds[0], suite.maps)
     for condition in kept:
         warnings += _doubts(condition, _open(condition))
+        warnings += [
+            f"not reproducible: {part} is an object of one process" for part in condition.unreproducible
+        ]
     return Checked(
         conditions={condition.id: (condition, extents[condition.id]) for condition in kept},
         dropped=tuple(provenance.join(one.entry for one in left_out.values())),
@@ -246,8 +249,8 @@ def check_everywhere(conditions: Iterable[Condition]) -> None:
             if not is_checkpoint(kind, source) and not registry.find(kind, source).everywhere:
                 raise ConfigError(
                     f"Expected a {kind} that other processes can load (for `jobs` > 1, `scheduler` or "
-                    f"`planner_limit_s`), got {source!r}, which is registered in this process alone. Name it as "
-                    "path/to/file.py:Name."
+                    f"`planner_limit_s`), got {source!r}, which only this process has. Write its class into a file, "
+                    "and import it from there or name it as path/to/file.py:Name."
                 )
 
 

@@ -28,7 +28,7 @@ from benchnav.eval.folder.run_folder import (
     open_run,
     read_table,
 )
-from benchnav.eval.run.begin import Work
+from benchnav.eval.run.begin import Work, check_resumable
 from benchnav.eval.run.check import Say, build_each, check_everywhere, check_split
 from benchnav.eval.run.combinations import find_left_out
 from benchnav.eval.run.runner import run_work
@@ -59,6 +59,7 @@ def rerun(
         ConfigError: the run is not finished, or a part of it is no longer there.
     """
     run = _open(run_folder)
+    check_resumable(run)
     if folder.resolve() == run_folder.resolve():
         raise ConfigError(f"Expected `out` to be another folder than the run that is repeated, got {folder}.")
     if not overwrite and (folder / RUN).exists():

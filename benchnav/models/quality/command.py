@@ -9,7 +9,7 @@ from benchnav.models.quality.output import DPI, FIGURES, check_folder, check_wri
 REPORT, CSV, PAGE = "quality.json", "quality.csv", "quality.md"
 
 
-def evaluate(
+def evaluate_command(
     checkpoint: str,
     data: str,
     splits: list[str] | None = None,

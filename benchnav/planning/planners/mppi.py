@@ -264,7 +264,7 @@ class MPPI(LocalPlanner[MPPIState]):
             f"an objective with `path_cost` for option `cost_to_go` of MPPI, got {name}.",
         )
         if wanted == "expected-time":
-            risk_map = risk.expected_time(problem.distribution).to(problem.risk_map)
+            risk_map = risk.ExpectedTime()(problem.distribution).to(problem.risk_map)
             problem = replace(problem, risk_map=risk_map)
         return astar.framed(problem, astar.search(problem))
 

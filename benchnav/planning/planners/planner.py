@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.errors import ConfigError, expect
+from benchnav.core.specified import Specified
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import STEERING, Robot
 from benchnav.planning.sensing.sensor import Step
@@ -79,7 +80,7 @@ class Plan:
 State = TypeVar("State")
 
 
-class Planner(ABC, Generic[State]):
+class Planner(Specified, ABC, Generic[State]):
     """The base class of planners; `benchnav.testing.check_planner` tries whether one keeps its contract.
 
     `init` and `plan` are to be written, all else has a default. A planner holds its settings alone: whatever

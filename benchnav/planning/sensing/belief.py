@@ -22,6 +22,7 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.core.ground import GroundStatistics
+from benchnav.core.specified import Specified
 from benchnav.planning.sensing.score_table import scores_of, value_at
 from benchnav.planning.sensing.sensor import Sensed
 
@@ -62,7 +63,7 @@ class Law:
         return self.correlation_m / self.grid.resolution_m
 
 
-class Belief(ABC, Generic[State]):
+class Belief(Specified, ABC, Generic[State]):
     """Turns what was sensed into the distribution of λ: the base class of the parts of kind `belief`.
 
     Attributes:

@@ -124,7 +124,7 @@ class Learner:
     ground: Sensor
     belief: Belief[Any]
     law: Law
-    measure: risk.RiskMeasure
+    measure: risk.RiskFunction
     rules: Rules
     predict: Predict
     keeps_spread: bool = False

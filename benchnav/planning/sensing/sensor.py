@@ -18,6 +18,7 @@ from torch import Tensor
 from benchnav.core import rng
 from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
+from benchnav.core.specified import Specified
 from benchnav.core.terrain import Observation, Terrain
 
 LEAST_STD = 1e-3  # of noise, in normal scores: keeps the equations of a belief solvable
@@ -116,7 +117,7 @@ class Moment:
         return torch.from_numpy(drawn.reshape(-1, *shape)).to(wanted.device)
 
 
-class Sensor(ABC):
+class Sensor(Specified, ABC):
     """What a robot learns in a step: the base class of the parts of kinds `sensor` (appearance) and `ground` (λ).
 
     Attributes:

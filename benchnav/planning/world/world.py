@@ -4,7 +4,7 @@ Letters in shapes: B episodes.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
@@ -51,8 +51,9 @@ class World:
             ℓ; beliefs go on believing the Gaussian.
         immobile: what ends an episode as immobilised; None for nothing.
         time_budget_s: T; an episode that is not at the goal by then has failed.
-        time_budget_ratio: T in multiples of the map's grid reference time at the robot's top speed, in place
+        time_budget_ratio: T in multiples of the map's grid reference time at the robot's top speed, instead
             of `time_budget_s`.
+        preset: the entry of `PRESETS` that the world was derived from, whose rules go with it.
     """
 
     noise: str = "resampled"
@@ -61,6 +62,7 @@ class World:
     immobile: Immobile | None = None
     time_budget_s: float | None = 100.0
     time_budget_ratio: float | None = None
+    preset: str = field(default="paper", compare=False, repr=False)
 
     def __post_init__(self) -> None:
         """Refuses worlds in which no episode can run."""
@@ -81,6 +83,30 @@ class World:
         )
         for name, value in budgets.items():
             expect(0 < value < float("inf"), f"`{name}` > 0 and finite, got {value}.")
+
+    @classmethod
+    def paper(cls, **changes: Any) -> "World":
+        """Return the paper's world: λ is resampled at each step; low λ slows a robot and ends nothing.
+
+        Args:
+            **changes: fields with other values than the preset's.
+        """
+        return _changed_preset("paper", changes)
+
+    @classmethod
+    def stakes(cls, **changes: Any) -> "World":
+        """Return the world in which λ stays the same during an episode and low λ immobilises a robot.
+
+        Args:
+            **changes: fields with other values than the preset's.
+        """
+        return _changed_preset("stakes", changes)
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """The preset by name, and all fields that differ from it, as `read_world` takes them."""
+        base, now = plain(PRESETS[self.preset].world), plain(self)
+        return {"preset": self.preset, **{name: value for name, value in now.items() if value != base[name]}}
 
     def budget_s(self, reference_time_s: Tensor, top_speed_mps: float) -> Tensor:
         """T of each episode.
@@ -136,6 +162,7 @@ class World:
         unused = () if self.noise == "frozen" else ("correlation_m", "kernel")
         if self.kernel == KERNELS[0]:
             unused = (*unused, "kernel")
+        unused = (*unused, "preset")
         return {n: value for n, value in plain(self).items() if value is not None and n not in unused}
 
 
@@ -162,10 +189,18 @@ PRESETS: Mapping[str, Preset] = {
     ),
     "stakes": Preset(
         purpose="λ stays what it is at a place, and soft ground immobilises a robot.",
-        world=World(noise="frozen", immobile=Immobile(), time_budget_s=None, time_budget_ratio=3.0),
+        world=World(
+            noise="frozen", immobile=Immobile(), time_budget_s=None, time_budget_ratio=3.0, preset="stakes"
+        ),
         rules=Rules(free_space=FreeSpace(by="mean", above=0.1), min_traversability=0.05),
     ),
 }
+
+
+def _changed_preset(name: str, changes: Mapping[str, Any]) -> World:
+    # One of the two ways to give a time budget replaces the other.
+    other = dict.fromkeys(_BUDGETS) if changes.keys() & set(_BUDGETS) else {}
+    return replace(PRESETS[name].world, **{**other, **changes})
 
 
 def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
@@ -182,6 +217,7 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
     Raises:
         ConfigError: there is no such preset or field, or a value is of the wrong kind.
     """
+    world = world.spec if isinstance(world, World) else world
     expect(isinstance(world, Mapping | str), f"`world` as a mapping of settings, got {world!r}.")
     given = {"preset": world} if isinstance(world, str) else dict(world)
     name = given.pop("preset", "paper")

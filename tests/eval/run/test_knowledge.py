@@ -58,7 +58,7 @@ def astar_dwa() -> AStarDWA:
 
 
 def measure(distribution: TraversabilityDistribution) -> Tensor:
-    return risk.expected_time(distribution, 0.05)
+    return risk.ExpectedTime(0.05)(distribution)
 
 
 @dataclass

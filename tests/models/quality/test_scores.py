@@ -20,7 +20,7 @@ from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.models.quality.command import evaluate as evaluate_command
+from benchnav.models.quality.command import evaluate_command
 from benchnav.models.quality.measure import evaluate
 from benchnav.models.quality.report import LOOK_ALIKES, quality_csv, quality_json, quality_markdown
 from benchnav.models.quality.scores import (

@@ -59,7 +59,7 @@ def test_the_last_state_pays_what_the_setting_says(wanted: str, guided: bool) ->
     if wanted == "objective":
         last = own.terminal_cost(states, problem.goal_m[:, None])
     else:
-        neutral = replace(problem, risk_map=risk.expected_time(problem.distribution))
+        neutral = replace(problem, risk_map=risk.ExpectedTime()(problem.distribution))
         assert not torch.equal(neutral.risk_map, problem.risk_map)
         last = last_cost(problem, problem if wanted == "map" else neutral, states)
     cost = cost + last

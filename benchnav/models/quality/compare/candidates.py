@@ -3,18 +3,24 @@
 import statistics
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import nn
 
 from benchnav.core.errors import BenchnavError, ConfigError, expect
 from benchnav.core.terrain import Terrain
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, predict
-from benchnav.models.predictor import Ideal, Oracle, find_checkpoint, load_model, split_own, trained_on
+from benchnav.models.predictor import (
+    Ideal,
+    Oracle,
+    find_checkpoint,
+    load_model,
+    networks_of,
+    split_own,
+    trained_on,
+)
 
 # That are always compared with, where the truth is known; the one that knows most first.
 PRIVILEGED = ("oracle", "ideal")
@@ -96,21 +102,9 @@ def _labels(sources: Sequence[str]) -> dict[str, str]:
 
 def count_parameters(model: TraversabilityModel) -> int | None:
     """Number of weights in the networks of a model and of its members; None where it has no network."""
-    networks = list(_networks(model))
+    networks = list(networks_of(model))
     weights = {id(weight): weight.numel() for network in networks for weight in network.parameters()}
     return sum(weights.values()) if networks else None
-
-
-def _networks(value: Any) -> Iterator[nn.Module]:
-    if isinstance(value, nn.Module):
-        yield value
-    elif isinstance(value, TraversabilityModel):
-        yield from _networks(vars(value))
-    elif isinstance(value, Mapping):
-        yield from _networks(list(value.values()))
-    elif isinstance(value, list | tuple):
-        for inner in value:
-            yield from _networks(inner)
 
 
 def prediction_ms(model: TraversabilityModel, terrain: Terrain) -> float:

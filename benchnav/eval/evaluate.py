@@ -1,0 +1,95 @@
+"""Run an experiment on built objects, from a program or a notebook."""
+
+import tempfile
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from benchnav.core.errors import expect
+from benchnav.core.progress import show_progress
+from benchnav.core.settings import check_known, plain
+from benchnav.datagen.files.create import create
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.recipe import Recipe
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.results import Results
+from benchnav.eval.run.runner import run_suite
+from benchnav.planning.free_space import Rules
+
+_NAMES = {field.name for field in fields(Suite)} - {"data"}
+
+
+def evaluate(
+    terrain: str | Path | TerrainDataset | Recipe,
+    *,
+    folder: str | Path | None = None,
+    jobs: int = 1,
+    device: str = "auto",
+    verbose: bool = True,
+    **experiment: Any,
+) -> Results:
+    """Run every combination of planners, models, risk settings, … on the test maps of a dataset.
+
+    Parts are objects, such as `AStarDWA()` and `CVaR(0.8)`, or names as in suites. An object that other processes
+    cannot create again (a function without a name, a class of a notebook) runs in this process only: the rows of its
+    conditions are marked as not reproducible, and their folder cannot be resumed.
+
+    Args:
+        terrain: a dataset, by path, id or object; or a recipe, whose test maps are generated first.
+        folder: run folder, which is resumed or extended if it holds a run. If None, results are kept in a temporary
+            folder as long as the returned object exists; see `Results.save`.
+        jobs: number of worker processes; the results are the same for any number.
+        device: "cpu", "cuda", or "auto" for CUDA if there is a GPU.
+        verbose: whether to show progress and notes on stderr.
+        **experiment: what is evaluated, by the fields of `Suite`: `models`, `planners`, `risks`, `robots`,
+            `objectives`, `sensors`, `grounds`, `beliefs`, `world` (such as `World.stakes()`), `task` (or `rules`, a
+            `Rules`), `scenarios`, `maps`, `seed` or `seeds`, `realisations`, `record`, `conditions`, `hypotheses`.
+
+    Returns:
+        The results of the run.
+
+    Raises:
+        ConfigError: If the combination of parts cannot be run; the message names the part and the remedy.
+        DatasetError: If there is no such dataset, or it lacks what is asked for.
+    """
+    for name in experiment:
+        check_known("keywords of `evaluate`", name, {*_NAMES, "rules"})
+    if "rules" in experiment:
+        rules = experiment.pop("rules")
+        expect("task" not in experiment, "`rules` or `task`, got both. Leave one out.")
+        experiment["task"] = plain(rules) if isinstance(rules, Rules) else rules
+    expect(
+        "model" in experiment or "models" in experiment or "conditions" in experiment,
+        '`models`, such as [load_model("stakes-v1")], got none. Blind planners take models=["oracle"].',
+    )
+    temporary = None if folder else tempfile.TemporaryDirectory(prefix="benchnav-")
+    place = Path(temporary.name, "run") if temporary else Path(str(folder))
+    suite = Suite(
+        data=_path_of(terrain, place), **{name: _as_tuple(value) for name, value in experiment.items()}
+    )
+    notes: list[str] = []
+    steps = run_suite(suite, place, jobs, say=print if verbose else notes.append, device=device)
+    if verbose:
+        show_progress(steps, "units")
+    else:
+        for _ in steps:
+            pass
+    return Results(place, temporary)
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _path_of(terrain: Any, place: Path) -> str:
+    """Return the path or id of a dataset; generate the test maps of a recipe next to the run folder."""
+    if isinstance(terrain, TerrainDataset):
+        return str(terrain.path)
+    if not isinstance(terrain, Recipe):
+        return str(terrain)
+    splits = {name: split for name, split in terrain.splits.items() if name.startswith("test/")}
+    path = place.with_name(f"{place.name}-terrain.h5")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for _ in create(replace(terrain, splits=splits), path):
+        pass
+    return str(path)

@@ -1,0 +1,208 @@
+"""Results of a run as an object: episodes, tables, comparisons, figures, report."""
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from benchnav.core.errors import ConfigError, expect
+from benchnav.core.settings import hint
+from benchnav.core.tables import Table, to_markdown, to_terminal
+from benchnav.eval.compare import compare_runs, write_comparison
+from benchnav.eval.experiment.condition import LABELS
+from benchnav.eval.folder import results as rows
+from benchnav.eval.folder.run_folder import caveats, is_taken, open_run
+from benchnav.eval.report.playback.viewer_file import write_viewer_files
+from benchnav.eval.report.write import PAGE, Report, read_report, run_figures, write_report
+from benchnav.eval.run.recordings import record_driven
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Paired differences of conditions.
+
+    Args:
+        numbers: a row per pair; the columns of `compare`'s CSV.
+        table: the same for readers, with notes.
+    """
+
+    numbers: pd.DataFrame
+    table: Table
+
+    def save(self, stem: str | Path) -> list[Path]:
+        """Write STEM.csv, STEM.md and STEM.tex; return their paths."""
+        return write_comparison(Path(stem), self.numbers, self.table)
+
+    def __repr__(self) -> str:
+        """Return the size, in one line."""
+        return f"Comparison of {len(self.numbers)} pairs; .numbers is a DataFrame, print() shows the table"
+
+    def __str__(self) -> str:
+        """Return the table as text."""
+        return to_terminal(self.table)
+
+    def _repr_markdown_(self) -> str:
+        return to_markdown(self.table)
+
+
+class Results:
+    """The results of a run.
+
+    Args:
+        folder: a run folder.
+        temporary: the temporary folder that holds it, which is deleted together with this object.
+    """
+
+    def __init__(self, folder: str | Path, temporary: tempfile.TemporaryDirectory[str] | None = None) -> None:
+        """Open a run folder.
+
+        Raises:
+            ConfigError: If the folder is no run folder, or no unit of it is finished.
+        """
+        self.folder = Path(folder)
+        self._temporary = temporary
+        self._rows = rows.read_results(self.folder, partial=True)
+
+    @property
+    def episodes(self) -> pd.DataFrame:
+        """One row per episode: labels, seed, realisation, map, and all metrics."""
+        return self._rows.episodes.copy()
+
+    @property
+    def conditions(self) -> pd.DataFrame:
+        """One row per condition, by its id: the labels of its parts."""
+        about = self._rows.conditions
+        labels = [entry["labels"] for entry in about.values()]
+        return pd.DataFrame(labels, index=pd.Index(about, name="condition"), columns=list(LABELS))
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader of the results must know: warnings, combinations that were left out."""
+        return [*self._rows.notes(), *caveats(self._rows.run.about)]
+
+    @property
+    def summary(self) -> pd.DataFrame:
+        """One row per condition: rates, means and intervals, and the comparison with the best of its block."""
+        return self._report.summary.copy()
+
+    def best(self) -> pd.DataFrame:
+        """Return the conditions of each block that are not significantly worse than its best, best first.
+
+        The test is the max-T bootstrap test by map; see docs/concepts/statistics.md. In a block where nothing is
+        significantly worse, these are all conditions that compete.
+        """
+        competing = self._report.summary[self._report.summary["best_alike"].astype(bool)]
+        columns = [*LABELS, "success_rate", "success_low", "success_high", "total_time_mean_s", "best_p"]
+        return competing.sort_values("success_rate", ascending=False, kind="stable")[columns].reset_index(
+            drop=True
+        )
+
+    def compare(
+        self, by: str = "", against: str = "", points: float = 5.0, **labels: str | Sequence[str]
+    ) -> Comparison:
+        """Compare conditions that were evaluated on the same maps with the same draws of λ.
+
+        Args:
+            by: the one label in which the conditions of a pair differ, such as "risk"; if empty, that of `against`,
+                or "risk".
+            against: label that all others are compared with; if empty, all pairs.
+            points: difference of success in percentage points, for which the table counts the maps needed.
+            **labels: which conditions are compared: by column one label or several, such as planner="mppi".
+
+        Raises:
+            ConfigError: If there is nothing to compare, or conditions cannot be paired.
+        """
+        asked = {name: [value] if isinstance(value, str) else list(value) for name, value in labels.items()}
+        for name in asked:
+            expect(name in LABELS, f"labels among {', '.join(LABELS)}, got {name!r}.")
+        return Comparison(*compare_runs([self.folder], by, against, asked, points / 100))
+
+    @property
+    def plot(self) -> "Plots":
+        """The figures of the report, each as a method that returns a matplotlib figure."""
+        return Plots(self)
+
+    def report(self, folder: str | Path | None = None) -> Path:
+        """Write the report (page, tables, figures), and return the path of its page.
+
+        Args:
+            folder: where to; if None, the run folder.
+        """
+        out = Path(folder) if folder else self.folder
+        if out == self.folder and not self._rows.is_partial:
+            write_viewer_files(self.folder)
+        write_report(self.folder, partial(record_driven, self.folder), out, self._rows.is_partial)
+        return out / PAGE
+
+    def save(self, folder: str | Path) -> "Results":
+        """Copy the run to a folder, and return the results there.
+
+        Raises:
+            ConfigError: If the folder holds anything.
+        """
+        target = Path(folder)
+        if is_taken(target):
+            raise ConfigError(f"Expected `folder` to be new or empty, got {target}, which holds something.")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as copied:
+            whole = Path(copied, "run")
+            shutil.copytree(self.folder, whole)
+            whole.replace(target)
+        return Results(target)
+
+    @cached_property
+    def _report(self) -> Report:
+        return read_report(self.folder, partial=self._rows.is_partial)
+
+    def __repr__(self) -> str:
+        """Return up to six lines: size, place, success, what to read first."""
+        n_conditions, n_maps = len(self._rows.conditions), self._rows.episodes["map"].nunique()
+        rate = 100 * self._rows.episodes["success"].mean()
+        lines = [
+            f"Results of {len(self._rows.episodes)} episodes: {n_conditions} conditions on {n_maps} maps",
+            f"success {rate:.1f} % over all; folder {self.folder}",
+            *([self._rows.mark] if self._rows.mark else []),
+            ".episodes .summary .conditions .notes; .best() .compare(by=…) .plot.… .report() .save(folder)",
+        ]
+        return "\n".join(lines)
+
+    def _repr_markdown_(self) -> str:
+        return to_markdown(self._report.table)
+
+
+class Plots:
+    """Figures of a run, by the names of their files with `_` for `-`."""
+
+    def __init__(self, results: Results) -> None:
+        """Draw from results."""
+        self._results = results
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the function that draws a figure."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return partial(self._draw, name)
+
+    def _draw(self, name: str) -> Figure:
+        results, names = self._results, []
+        for shown, _, figure in run_figures(results.folder, results._report, None):
+            names.append(shown.replace("-", "_"))
+            if names[-1] == name:
+                return figure
+        raise ConfigError(f"Expected a figure among {', '.join(names)}, got {name!r}.{hint(name, names)}")
+
+
+def open_results(folder: str | Path) -> Results:
+    """Open a run folder, finished or not, as the results that `evaluate` returns.
+
+    Raises:
+        ConfigError: If the folder is no run folder, or no unit of it is finished.
+    """
+    open_run(Path(folder))
+    return Results(folder)
