@@ -7,11 +7,18 @@ from typing import Any, Self, TypeVar, cast
 import torch
 from torch import Tensor
 
+from benchnav.core.short_repr import short_repr
+
 Value = TypeVar("Value", bound=Any)
 
 
 class Batch:
     """The base of dataclasses whose tensors, and those of the batches in them, have the members first."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Give each dataclass the short representation, which its decorator keeps."""
+        super().__init_subclass__(**kwargs)
+        cls.__repr__ = short_repr  # type: ignore[method-assign]
 
     def select(self, members: Tensor) -> Self:
         """Keeps some members, by index, int64, shape [M]; one may be taken more than once."""

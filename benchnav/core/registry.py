@@ -387,8 +387,7 @@ def _split_value(kind: str, text: str) -> tuple[str, str | None]:
 
 
 def _read_options(kind: str, part: Part, target: Any) -> dict[str, Any]:
-    gone = getattr(_owner(kind, target), "gone", {})
-    return read_options(options_of(kind, target), part.options, of(f"{kind} {part.part!r}"), gone=gone)
+    return read_options(options_of(kind, target), part.options, of(f"{kind} {part.part!r}"))
 
 
 def later_options(kind: str, source: str) -> dict[str, Any]:

@@ -7,7 +7,6 @@ which key is wrong; anything else by jsonargparse.
 
 import difflib
 import inspect
-import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -15,27 +14,13 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from enum import Enum
 from functools import cache, partial
 from pathlib import PurePath
-from types import MappingProxyType, NoneType, SimpleNamespace, UnionType
+from types import NoneType, SimpleNamespace, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from benchnav.core.errors import BenchnavError, ConfigError, out_of_memory
 from benchnav.core.yaml_text import MAX_DEPTH, check_yaml
 
 NO_DEFAULT = inspect.Parameter.empty
-
-# Names of earlier versions, with those of today.
-RENAMED = {
-    "instance": "map",
-    "instances": "maps",
-    "noise": "world.noise",
-    "planner_options": "planners",
-    "recorded": "record",
-    "slowest": "min_traversability",
-    "split": "splits",
-    "steps": "record",
-    "time_budget_s": "world.time_budget_s",
-    "trials": "conditions",
-}
 
 Naming = Callable[[str], str]  # what users call a key; of an empty one, the whole
 
@@ -157,7 +142,7 @@ def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAU
     if config and isinstance(value, Mapping):
         base = now if isinstance(now, config) else None
         before = {f.name: getattr(base, f.name) for f in fields(base)} if base is not None else None
-        given = read_options(list_options(config), value, name, key, before, getattr(config, "gone", {}))
+        given = read_options(list_options(config), value, name, key, before)
         return call(name(key), partial(replace, base) if base else config, given)
     if origin is dict and dataclass_in(members[1]) and isinstance(value, Mapping):
         if not all(isinstance(inner, str) for inner in value):
@@ -199,7 +184,6 @@ def read_options(
     name: Naming,
     key: str = "",
     now: Mapping[str, Any] | None = None,
-    gone: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Gives options of their types, by name.
 
@@ -209,7 +193,6 @@ def read_options(
         name: what users call a key.
         key: where they stand, with dots; empty for the whole.
         now: what is not given, by name; without it an option that has no default is to be given.
-        gone: options that were once there, with what does their work now.
 
     Raises:
         ConfigError: as of `read`.
@@ -218,8 +201,7 @@ def read_options(
     for option in map(str, given):
         if option not in known:
             among = f"among {', '.join(known)}" if known else "none: it has none"
-            remedy = f" {gone[option]}" if option in gone else hint(option, known)
-            raise ConfigError(f"Expected keys of {name(key)} {among}, got {option!r}.{remedy}")
+            raise ConfigError(f"Expected keys of {name(key)} {among}, got {option!r}.{hint(option, known)}")
     for option, about in known.items():
         if about.default is NO_DEFAULT and option not in given and now is None:
             raise ConfigError(f"Expected {name(inner + option)} as {in_words(about.kind)}, got none.")
@@ -337,13 +319,8 @@ def in_words(kind: Any) -> str:
 
 
 def hint(name: str, known: Iterable[str], prefix: str = "") -> str:
-    """A sentence with today's name or the nearest known one, beginning with a space; empty where none is near."""
-    known = list(known)
-    old = re.split(r"[-.]", name)[-1]
-    now = name.removesuffix(old) + RENAMED.get(old, old)
-    if now != name and {now, now.rpartition(".")[0]} & set(known):
-        return f" It is now {prefix + now!r}."
-    close = difflib.get_close_matches(name, known, n=1)
+    """Return a sentence with the nearest known name, beginning with a space; empty if none is near."""
+    close = difflib.get_close_matches(name, list(known), n=1)
     return f" Did you mean {prefix + close[0]!r}?" if close else ""
 
 

@@ -22,41 +22,25 @@ from benchnav.core.errors import BenchnavError, ConfigError, out_of_memory
 from benchnav.core.settings import hint, one_line
 from benchnav.core.shipped_files import PACKAGE
 
-# Modules and names of earlier versions, with what users import from today.
-_MOVED = {
-    old: place + old.rpartition(".")[2] if place.endswith(".") else place
-    for place, names in {
-        "benchnav": "errors grid mixture registry terrain",
-        "benchnav.core.": "copula cvar device gridgraph rng",
-        "benchnav.core.figures": "drawing",
-        "benchnav.core.store": "files",
-        "benchnav.datagen": "datagen.create datagen.generate datagen.maps datagen.scenario datagen.store",
-        "benchnav.datagen.recipe.": "datagen.latent",
-        "benchnav.env": "planning.env planning.env_batch",
-        "benchnav.eval": "eval.condition eval.runner eval.suite eval.trial eval.run.steps",
-        "benchnav.models": "models.predictor.ModelFamily models.predictor.predict",
-        "benchnav.models, as TraversabilityModel,": "models.predictor.Model",
-        "benchnav.models.nets.": "models.classifier models.mdn",
-        "benchnav.models.nets.classifier": "models.network",
-        "benchnav.models.quality.": "models.scores",
-        "benchnav.models.quality.measure": "models.calibration models.evaluate",
-        "benchnav.planning": "planning.mppi planning.planners.astar_dwa planning.planners.astar_mppi",
-        "benchnav.planning.planners.astar.": "planning.planners.dwa planning.planners.guided",
-        "benchnav.planning.planners.cl_rrt.pursuit": "planning.pure_pursuit",
-        "benchnav.testing": "models.contract planning.planners.check planning.planners.contract",
-        "benchnav.testing.breaches": "testing.side_effects",
-    }.items()
-    for old in names.split()
+# Names of version 1, with those that replace them: what an import did not find is looked up here.
+MOVED = {
+    "benchnav.planning.risk.chance": "benchnav.planning.Chance",
+    "benchnav.planning.risk.cvar": "benchnav.planning.CVaR",
+    "benchnav.planning.risk.expected_time": "benchnav.planning.ExpectedTime",
+    "benchnav.planning.risk.mean": "benchnav.planning.Mean",
+    "benchnav.planning.risk.single_class": "benchnav.planning.SingleClass",
+    "benchnav.planning.risk.time_cvar": "benchnav.planning.TimeCVaR",
+    "benchnav.planning.risk.var": "benchnav.planning.VaR",
 }
 
 
 def moved(error: BaseException) -> str:
-    """Where that is now what an import of an earlier version's name did not find; empty where nothing is known."""
+    """Return a sentence with the new name of what an import did not find; empty if none is known."""
     if not isinstance(error, ImportError) or not error.name:
         return ""
     name = re.search(r"cannot import name '(\w+)'", str(error))
-    place = (f"{error.name}.{name[1]}" if name else error.name).removeprefix("benchnav.")
-    return f". Import from {_MOVED[place]} what was in benchnav.{place}." if place in _MOVED else ""
+    old = f"{error.name}.{name[1]}" if name else error.name
+    return f". {old} is now {MOVED[old]}." if old in MOVED else ""
 
 
 def attribute(module: ModuleType, place: str, name: str) -> Any:

@@ -26,6 +26,7 @@ import benchnav
 from benchnav.core import registry
 from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.ground import GroundStatistics
+from benchnav.core.short_repr import short_repr
 from benchnav.core.sources import digest_of_path
 from benchnav.core.store import (
     building,
@@ -77,6 +78,8 @@ class Part:
         conformal: whether every second map of `valid` was kept from it, to be scored in the end.
     """
 
+    __repr__ = short_repr
+
     config: dict[str, Any]
     tensors: dict[str, Tensor]
     seed: int
@@ -104,6 +107,8 @@ class Checkpoint:
             where it is not.
         ground: statistics of the maps that it was trained on last; None where it was trained on none.
     """
+
+    __repr__ = short_repr
 
     class_names: tuple[str, ...]
     parts: Mapping[str, Part] = field(default_factory=dict)

@@ -11,7 +11,6 @@ shapes: *B any leading dimensions, S state and A action dimensions.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -84,8 +83,6 @@ class TravelTime(Objective):
         robot: gives time step and top speed.
         goal_radius_m: a state this near to the target has arrived.
     """
-
-    gone: ClassVar = {"arrival_m": "It now takes the task's `goal_radius_m`."}
 
     robot: Robot
     goal_radius_m: float

@@ -228,7 +228,6 @@ def test_an_import_passes_every_setting_on(datagen: Call, capsys) -> None:  # ty
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--split", "test/hills"), "It is now '--splits'"),
         (("--splits", "train:0.7"), "sum to 1"),
         (("--stride", "0.3"), "`stride` as a multiple"),
         (("nonsense",), "Expected an override such as"),

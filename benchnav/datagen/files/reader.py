@@ -33,6 +33,8 @@ _MOST_OPEN = 128  # files that a process keeps open; far fewer than systems allo
 
 Opened = tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]  # a file, and its arrays by split and name
 
+_SHOWN_SPLITS = 8
+
 
 class Piece(NamedTuple):
     """What one file holds of a split: all maps under the split's name.
@@ -75,6 +77,17 @@ class TerrainDataset:
     def __getstate__(self) -> schema.Json:
         """Leaves out the open files, so that it may be sent to other processes."""
         return self.__dict__ | {"_opened": {}}
+
+    def __repr__(self) -> str:
+        """Return id, path, cells and the maps of each split, in up to six lines."""
+        height, width = self.grid.shape
+        splits = [f"{name} {about['maps']}" for name, about in self.splits.items()]
+        shown = ", ".join(splits[:_SHOWN_SPLITS]) + (", …" if len(splits) > _SHOWN_SPLITS else "")
+        return (
+            f"TerrainDataset {self.id} in {self.path}\n"
+            f"  {height} × {width} cells of {self.grid.resolution_m:g} m, fields {', '.join(self.field_names)}\n"
+            f"  maps: {shown}"
+        )
 
     @property
     def id(self) -> str:

@@ -18,6 +18,7 @@ from benchnav.core.copula import LONGEST_CORRELATION
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.core.settings import changed, plain, read
+from benchnav.core.short_repr import short_repr
 from benchnav.core.yaml_text import load_yaml, read_yaml
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes, plain_classes
@@ -86,6 +87,8 @@ class Recipe:
         scenarios: scenarios by name.
         splits: splits by name.
     """
+
+    __repr__ = short_repr
 
     id: str
     seed: int

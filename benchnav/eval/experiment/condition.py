@@ -18,6 +18,7 @@ from benchnav.core.errors import ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.registry import Part
 from benchnav.core.settings import call, check_known, of, read
+from benchnav.core.short_repr import short_repr
 from benchnav.core.store import text_digest
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.sweep import check_count, each_mapping, each_part
@@ -68,6 +69,8 @@ class Condition:
         stands_for: by kind of part the labels of the settings that differ in nothing that the planner uses and are
             run as this one.
     """
+
+    __repr__ = short_repr
 
     data: str
     scenario: str
@@ -189,16 +192,9 @@ class Condition:
         return registry.make("planner", self.planner)
 
 
-def later_labels(model: str, risk: str) -> dict[str, str]:
-    """Labels of a condition that a version made which had no such columns, by its labels of two others."""
-    unused = {"sensor": model == NOT_USED, "ground": True, "belief": risk == NOT_USED}
-    return {kind: NOT_USED if unused[kind] else default["part"] for kind, default in KNOWLEDGE.items()}
-
-
 def condition_from(about: Mapping[str, Any]) -> Condition:
     """Rebuilds a condition from its `value`, `labels` and `stands_for`, as `run.json` holds them."""
     value, labels = {**KNOWLEDGE, **about["value"]}, about["labels"]
-    labels = later_labels(labels["model"], labels["risk"]) | labels
     parts = {
         kind: Part(part=value[kind]["part"], label=labels[kind], options=value[kind]["options"])
         for kind in PART_KINDS

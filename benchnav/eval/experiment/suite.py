@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from benchnav.core.errors import ConfigError, expect
+from benchnav.core.short_repr import short_repr
 
 PartSpec = str | dict[str, Any]
 
@@ -72,6 +73,8 @@ class Suite:
             path_length; `kind`: difference, non-inferiority, superiority or equivalence; `direction`: higher or lower;
             `margin`.
     """
+
+    __repr__ = short_repr
 
     data: str = "paper-v1"
     scenarios: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""Run folders, format version 5: what lies where, and how it is read.
+"""Run folders, format version 6: what lies where, and how it is read.
 
 A run folder holds `run.json` (conditions, and where everything came from), `units/` (what is finished: one Parquet file
 a unit, by condition and key, with rows and, in its metadata, what else is known of it), `steps/`, `playback/`, and,
@@ -23,14 +23,13 @@ from benchnav.core.errors import ConfigError, out_of_memory
 from benchnav.core.settings import one_line
 from benchnav.core.sources import digest_of_path
 from benchnav.core.store import Shard, replacing, seal, unseal, write_text
-from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED, Condition, condition_from, later_labels
+from benchnav.eval.experiment.condition import NOT_USED, Condition, condition_from
 from benchnav.eval.experiment.suite import RECORDS
 from benchnav.eval.experiment.unit import DRAW, Extent, Unit, steps_path
 from benchnav.eval.folder.provenance import TOUCHED, Origin, code_digest, touches
 from benchnav.eval.folder.sealed import CONTENT, DamageError, metadata, read_sealed, with_metadata
 
-FORMAT, FORMAT_VERSION = "benchnav-run", 5
-_LAST_OF_0_7 = 3
+FORMAT, FORMAT_VERSION = "benchnav-run", 6
 RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
 KEYS = ["condition", *DRAW]  # of a row
 
@@ -73,20 +72,16 @@ def open_run(folder: Path) -> Run:
             }
             shard = Shard(**about["shard"]) if "shard" in about else None
             return Run(folder=folder, about=about, conditions=conditions, shard=shard)
-    remedy = "Run its suite again with this version"
-    if version > FORMAT_VERSION:
-        remedy = "Read it with a newer benchnav: pip install --upgrade benchnav"
-    elif version <= _LAST_OF_0_7:
-        remedy += f", or read it with benchnav 0.7, which reads versions 1 to {_LAST_OF_0_7}"
+    remedy = "Read it with a newer benchnav: pip install --upgrade benchnav"
+    if version < FORMAT_VERSION:
+        remedy = "Run its suite again, or read it with benchnav 1.3"
     raise ConfigError(
         f"Expected a run folder of format version {FORMAT_VERSION}, got {folder} of version {version}. {remedy}."
     )
 
 
 def _format_version(about: Any) -> int:
-    """The version of `run.json`; before there was one it had no format, but the command that made it."""
-    if isinstance(about, dict) and "format" not in about and "command" in about:
-        return 1
+    """Return the format version of `run.json`."""
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise DamageError("it does not say that it is a run")
     return int(about["format_version"])
@@ -119,11 +114,9 @@ def dropped_labels(entry: Mapping[str, str]) -> dict[str, str]:
 
 
 def _in_words(entry: Mapping[str, str]) -> str:
-    """A combination that was left out; versions before 1.1 left out planners with robots alone."""
-    labels = dropped_labels(entry)
-    if list(labels) == ["planner", "robot"]:
-        return f"planner {labels['planner']} cannot steer robot {labels['robot']}"
-    words = ", ".join(f"{column} {label}" for column, label in labels.items() if label != NOT_USED)
+    """Return a combination that was left out, and why, in words."""
+    labels = dropped_labels(entry).items()
+    words = ", ".join(f"{column} {label}" for column, label in labels if label != NOT_USED)
     return f"{words}: {entry['reason']}"
 
 
@@ -147,7 +140,7 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
     with damaged(path, "Remove it and give the run's command again."):
         if run.about.get("tables", {}).get(name) != digest_of_path(path):
             raise DamageError("it was changed after benchnav wrote it")
-        return _with_all_labels(pd.read_parquet(path))
+        return pd.read_parquet(path)
 
 
 @contextmanager
@@ -318,23 +311,12 @@ def unit_rows(finished: Finished) -> pd.DataFrame:
         ConfigError: If its file is damaged.
     """
     with damaged(finished.path, "Give the run's command again, which runs the unit again."):
-        return _with_all_labels(read_sealed(finished.path).to_pandas())
+        return read_sealed(finished.path).to_pandas()
 
 
 def labelled_rows(unit: Unit, finished: Finished) -> pd.DataFrame:
     """Reads the rows of a finished unit, under the labels that its condition has now; see `unit_rows`."""
     return unit_rows(finished).assign(**unit.condition.labels)
-
-
-def _with_all_labels(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows with the labels that the version which made them did not have."""
-    if "objective" not in rows or set(KNOWLEDGE) <= set(rows):
-        return rows
-    place = rows.columns.get_loc("objective")
-    labels = [later_labels(model, risk) for model, risk in zip(rows["model"], rows["risk"], strict=True)]
-    for after, name in enumerate(KNOWLEDGE, start=1):
-        rows.insert(place + after, name, [own[name] for own in labels])
-    return rows
 
 
 def differences(first: pd.DataFrame, second: pd.DataFrame) -> tuple[pd.DataFrame, pd.Index]:

@@ -1,8 +1,7 @@
 """Parquet files of a run that hold digests of what they hold, so that a changed bit is found.
 
 The metadata of a file is JSON text sealed as `run.json` is (`benchnav.core.store.seal`). It holds, beside what the file
-says of itself, `content`: the digest of the table. Files of version 1.0 have neither digest nor seal and are read as
-they are.
+says of itself, `content`: the digest of the table.
 """
 
 import hashlib
@@ -16,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.store import SEAL, seal, unseal
+from benchnav.core.store import seal, unseal
 
 METADATA = b"benchnav"  # key of ours in a Parquet file's metadata
 CONTENT = "content"
@@ -68,9 +67,7 @@ def _unsealed(text: bytes) -> dict[str, Any]:
     content = json.loads(text)
     if not isinstance(content, dict):
         raise DamageError("its metadata is not a JSON object")
-    if not {SEAL, CONTENT} & set(content):
-        return content  # as version 1.0 wrote it
-    return unseal(text)
+    return unseal(text) if content else {}
 
 
 def read_sealed(path: Path) -> pa.Table:
@@ -97,6 +94,6 @@ def read_sealed(path: Path) -> pa.Table:
         raise
     except Exception as error:
         raise DamageError(f"it cannot be read ({type(error).__name__})") from error
-    if not about or about.get(CONTENT, content) != content:
+    if not about or about.get(CONTENT) != content:
         raise DamageError("it was changed after benchnav wrote it")
     return table.replace_schema_metadata(None)

@@ -7,7 +7,7 @@ from benchnav.core.sources import digest_of_path
 from benchnav.eval.experiment.unit import units
 from benchnav.eval.folder.checksums import SUMS, read_checksums
 from benchnav.eval.folder.run_folder import EPISODES, RUN, Finished, find_units, open_run, read_table
-from benchnav.eval.folder.sealed import CONTENT, DamageError, metadata, read_sealed
+from benchnav.eval.folder.sealed import DamageError, metadata, read_sealed
 from benchnav.eval.folder.steps import STEPS
 
 
@@ -31,13 +31,11 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
             raise
         return [f"{RUN}: {error}"], []
     files = sorted((folder / "units").glob("*/*.parquet"))
-    undigested = 0
     for path in files:
         finished = Finished(path=path, about=metadata(path))
         if "key" not in finished.about:
             damage.append(f"{path.relative_to(folder)}: it cannot be read")
             continue
-        undigested += CONTENT not in finished.about
         damage += finished.damage()
     for path in sorted((folder / STEPS).glob("*/*.parquet")):
         try:
@@ -67,6 +65,4 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
         notes.append(
             f"{len(removed)} of {len(checksums)} files in {SUMS} are missing, the first {removed[0]}"
         )
-    if undigested:
-        notes.append(f"{undigested} of {len(files)} units hold no digest, as version 1.0 wrote them")
     return list(dict.fromkeys(damage)), notes

@@ -13,9 +13,9 @@ from benchnav.core.device import gpu_name
 from benchnav.core.errors import ConfigError
 from benchnav.core.registry import NO_DEFAULT, Part
 from benchnav.core.store import Shard
-from benchnav.eval.experiment.condition import Condition, check_labels, differences, merge, merge_alike
+from benchnav.eval.experiment.condition import Condition, check_labels, differences, merge
 from benchnav.eval.experiment.suite import Record
-from benchnav.eval.experiment.unit import Conditions, Extent
+from benchnav.eval.experiment.unit import Conditions
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.run_folder import (
     EPISODES,
@@ -70,7 +70,7 @@ def begin(work: Work, folder: Path, say: Say) -> tuple[Conditions, Conditions]:
         return work.conditions, work.conditions
     earlier = open_run(folder)
     _check_extends(work, earlier)
-    conditions, asked = _merge_earlier(earlier), {}
+    conditions, asked = dict(earlier.conditions), {}
     # What differs from an earlier condition only in what is not used is run as that one.
     rows_ids = {condition.rows_id: name for name, (condition, _) in reversed(conditions.items())}
     for condition_id, (condition, extent) in work.conditions.items():
@@ -81,10 +81,6 @@ def begin(work: Work, folder: Path, say: Say) -> tuple[Conditions, Conditions]:
         conditions[name] = merged, known_extent.union(extent)
     if conditions != earlier.conditions:
         new = len(conditions.keys() - earlier.conditions.keys())
-        if dropped := len(earlier.conditions.keys() - conditions.keys()):
-            say(
-                f"conditions of {folder} that differ from others only in what is not used are merged: {dropped}"
-            )
         more = {0: "by more episodes", 1: "by 1 new condition"}.get(new, f"by {new} new conditions")
         say(f"{folder} is extended {more}")
         (folder / EPISODES).unlink(missing_ok=True)  # until all that is asked for is there
@@ -92,28 +88,6 @@ def begin(work: Work, folder: Path, say: Say) -> tuple[Conditions, Conditions]:
     if now != earlier.about:
         write_run(folder, now)
     return asked, conditions
-
-
-def _merge_earlier(earlier: Run) -> dict[str, tuple[Condition, Extent]]:
-    """The conditions of a run, of which versions before 1.2 did not merge those that differ in what is not used.
-
-    Those that a hypothesis names stay.
-    """
-    tests = earlier.about.get("hypotheses", {}).get("tests", ())
-    named = {test[side] for test in tests for side in ("one", "other")}
-    conditions = {name: condition for name, (condition, _) in earlier.conditions.items()}
-    merged = {
-        one.id: one for one in merge_alike(one for name, one in conditions.items() if name not in named)
-    }
-    extents = {condition.rows_id: Extent(draws=()) for condition in merged.values()}
-    for name, (condition, extent) in earlier.conditions.items():
-        if name not in named:
-            extents[condition.rows_id] = extents[condition.rows_id].union(extent)
-    return {
-        name: (merged[name], extents[merged[name].rows_id]) if name in merged else earlier.conditions[name]
-        for name in conditions
-        if name in merged or name in named
-    }
 
 
 def drop(folder: Path) -> None:

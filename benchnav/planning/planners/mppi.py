@@ -91,7 +91,6 @@ class MPPIConfig:
             the problem's own.
     """
 
-    gone: ClassVar = {"horizon": "It is now `horizon_s`, in seconds."}
     added: ClassVar = ("risk_on", "level", "fields", "once", "entrapment", "cost_to_go")
 
     horizon_s: float = 5.0

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.errors import ConfigError, expect
+from benchnav.core.short_repr import short_repr
 from benchnav.core.specified import Specified
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import STEERING, Robot
@@ -55,6 +56,8 @@ class Plan:
         reference: reference path, shape [B, N, 2].
         tree: edges of a search tree as polylines, shape [B, E, N, 2].
     """
+
+    __repr__ = short_repr
 
     status: Tensor
     path: Tensor

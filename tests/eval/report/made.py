@@ -9,7 +9,7 @@ import pandas as pd
 import torch
 
 from benchnav.core.tables import Bold, Table
-from benchnav.eval.experiment.condition import LABELS, later_labels
+from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.recording import KnownMap, Recording, drawn_plan, reach_outline
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.summary import summarise
@@ -26,7 +26,9 @@ def condition(planner: str = "mppi", risk: str = "cvar", **labels: str) -> dict[
     given = (
         same | {"objective": "goal_distance", "model": "paper-v1", "planner": planner, "risk": risk} | labels
     )
-    return later_labels(given["model"], given["risk"]) | given
+    unused = {"sensor": given["model"] == "–", "ground": True, "belief": given["risk"] == "–"}
+    defaults = {"sensor": "full", "ground": "contact", "belief": "static"}
+    return {name: "–" if unused[name] else default for name, default in defaults.items()} | given
 
 
 def row(

@@ -21,7 +21,6 @@ from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.settings import plain
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.eval.compare import compare_runs
-from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.find_episodes import find_episodes
@@ -134,7 +133,7 @@ def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> 
     assert set(episodes["planner"]) == set(PLANNERS)
     assert set(episodes[episodes["planner"] == "straight"]["risk"]) == {"–"}
     about = json.loads((folder / "run.json").read_text())
-    assert (about["format"], about["format_version"]) == ("benchnav-run", 5)
+    assert (about["format"], about["format_version"]) == ("benchnav-run", 6)
     environments = [code["environment"] for code in about["codes"].values()]
     assert {known["torch"] for known in environments} == {torch.__version__.split("+")[0]}
     (data,) = about["datasets"].values()
@@ -274,34 +273,6 @@ def test_a_run_is_extended_by_what_is_missing(
     fresh = {"seeds": (0, 5)} if change == {"seed": 5} else fresh
     if not {"scenarios", "world", "maps"} & set(change):
         same(extended, finish(quick(dataset_path, **fresh), tmp_path / "fresh"))
-
-
-def test_copies_are_run_once_also_where_a_run_was_begun_with_them(
-    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As by versions before 1.2, which ran each."""
-    suite = quick(dataset_path, planners=("tests.eval.parts:ByMean",), scenarios=("std",))
-    folder, said = tmp_path / "run", list[str]()
-    hypothesis = {"one": {"risk": "cvar"}, "other": {"risk": "mean"}, "metric": "success"}
-    with monkeypatch.context() as patched:
-        patched.setattr("benchnav.eval.experiment.condition.merge_alike", list)
-        assert len(finish(suite, folder)) == 4
-        tested = replace(suite, hypotheses=(hypothesis,))
-        assert len(finish(tested, tmp_path / "tested")) == 4
-    rows = finish(suite, folder, say=said.append)
-    assert len(rows) == 2
-    assert any(line.endswith("only in what is not used are merged: 1") for line in said)
-    assert any("1 of 1 units were there already" in line for line in said)
-    more = finish(replace(suite, risks=("var",), seed=5), folder)
-    same(more[more["seed"] == 0], rows)
-    assert len(more) == 4  # of which those of another seed were run
-    ((condition_id, about),) = open_run(folder).about["conditions"].items()
-    assert condition_id == conditions_of(replace(suite, risks=("mean",)), lambda data: ["std"])[0].id
-    assert about["labels"]["risk"] == "–"
-    assert "One row for risk cvar, mean, var, which the planner does not use here" in about["remarks"]
-    same(rows, finish(replace(suite, risks=("mean", "cvar", "var")), tmp_path / "fresh"))
-    # Those of a hypothesis that was fixed stay.
-    assert len(finish(suite, tmp_path / "tested")) == 4
 
 
 def test_a_run_is_extended_by_maps(tmp_path: Path) -> None:
@@ -682,7 +653,6 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(dataset_path: Path
         ),
         ({"conditions": ({"task": 3},)}, "mapping"),
         ({"conditions": ({"planners": []},)}, "at least one condition"),
-        ({"conditions": ({"noise": "stored"},)}, "It is now 'world.noise'"),
         ({"model": {"part": "paper-v1", "lable": "mine"}}, "lable"),
     ):
         for place in (tmp_path / "run", tmp_path / "new"):

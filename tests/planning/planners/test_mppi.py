@@ -210,11 +210,6 @@ def test_the_horizon_is_in_seconds(horizon_s: float, dt_s: float, steps: int) ->
     assert (state.mean.shape[1], state.noise.at(0).shape[0]) == (steps, steps)
 
 
-def test_a_horizon_in_steps_is_answered_with_its_new_name() -> None:
-    with pytest.raises(ConfigError, match=r"got 'horizon'\. It is now `horizon_s`, in seconds"):
-        registry.make("planner", {"part": "mppi", "options": {"horizon": 50}})
-
-
 class Free(Objective):
     """Costs nothing, wherever it leads."""
 

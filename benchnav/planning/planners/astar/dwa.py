@@ -13,7 +13,6 @@ Letters in shapes: B episodes, M velocity pairs, T horizon steps, S state dimens
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -55,14 +54,6 @@ class DWAConfig:
         arrival_m: a trajectory this near to the way-point has arrived and costs no more, so that a
             near way-point does not slow the robot.
     """
-
-    gone: ClassVar = {
-        "horizon": "It is now `horizon_s`, in seconds.",
-        **dict.fromkeys(
-            ("acceleration", "turn_acceleration"),
-            "DWA keeps to the limits of a robot that has some, and to no others.",
-        ),
-    }
 
     speeds: int = 10
     turn_rates: int = 21

@@ -33,7 +33,6 @@ class GuideConfig:
         explore: optimism about ground that the robot would get to know on its way; see `optimistic`.
     """
 
-    gone: ClassVar = {"by_time": "A* now minimises the path cost of the objective: give it `travel_time`."}
     added: ClassVar = ("explore",)
 
     lookahead_m: float = 4.0
