@@ -25,7 +25,7 @@ def describe(kind: str, instance: Any) -> Part:
 
     Args:
         kind: one of `registry.KINDS`.
-        instance: an object of that kind, or what `registry.read_part` reads.
+        instance: an object of that kind; its class, if all options have defaults; or what `registry.read_part` reads.
 
     Returns:
         The part that creates the object again. If there is none, a part by a name that this process knows; see
@@ -36,6 +36,9 @@ def describe(kind: str, instance: Any) -> Part:
     """
     if isinstance(instance, str | Mapping | Part):
         return registry.read_part(kind, instance)
+    if inspect.isclass(instance):
+        source = _source_of(kind, instance)
+        return Part(part=source, label=_short(source)) if source else name_object(kind, instance)
     registry.check_base(kind, instance, f"the {kind}")
     part = _from_arguments(kind, instance)
     return part if part is not None and _is_same(kind, part, instance) else name_object(kind, instance)

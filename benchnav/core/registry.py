@@ -324,9 +324,10 @@ def find(kind: str, source: str) -> Found:
     if is_object(kind, source):
         instance = _OBJECTS[kind, source]
         touched.watch()
-        digest = partial(digest_of_target, instance if inspect.isroutine(instance) else type(instance))
-        # A risk measure is called with a distribution; anything else is returned as it is.
-        target = instance if kind == "risk" else partial(_itself, instance)
+        is_source = inspect.isroutine(instance) or inspect.isclass(instance)
+        digest = partial(digest_of_target, instance if is_source else type(instance))
+        # A class is created, a risk measure is called with a distribution; anything else is returned as it is.
+        target = instance if kind == "risk" or inspect.isclass(instance) else partial(_itself, instance)
         return Found(target=target, origin="this process", source_digest=digest, everywhere=False)
     points = [point for point in entry_points_of(kind) if point.name == source]
     if len(points) > 1:

@@ -120,6 +120,15 @@ def test_arguments_that_are_no_plain_data_are_not_described() -> None:
         Straight(5)  # type: ignore[call-arg]
 
 
+def test_a_class_is_described_with_its_defaults() -> None:
+    assert describe("objective", TravelTime) == Part(part="travel_time", label="travel_time")
+
+    class Mine(AStarDWA):
+        pass
+
+    assert isinstance(make("planner", describe("planner", Mine)), Mine)
+
+
 def test_an_object_of_another_kind_is_rejected() -> None:
     with pytest.raises(ConfigError, match=r"to be a subclass of benchnav\.planning\.Planner, got CVaR"):
         describe("planner", CVaR())
