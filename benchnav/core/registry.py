@@ -24,6 +24,7 @@ import importlib
 import importlib.util
 import inspect
 import itertools
+import json
 import os
 import re
 import sys
@@ -82,17 +83,28 @@ _GIVEN: Mapping[str, tuple[str, ...]] = {"objective": ("robot", "goal_radius_m")
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """A part as it was asked for.
+    """A part: the description that creates it in any process, and the object itself.
 
     Args:
         part: a name, `package.module:Name` or `path/to/file.py:Name`.
         label: what tables call it.
         options: values of its options.
+        kind: one of `KINDS`.
     """
 
     part: str
     label: str
     options: Mapping[str, Any] = field(default_factory=dict)
+    kind: str = field(default="", compare=False, repr=False)
+
+    @property
+    def object(self) -> Any:
+        """The object. A process creates it once; it is asked for its properties and keeps no state."""
+        return _object_of(self)
+
+    def create(self, **given: Any) -> Any:
+        """Create a new object; see `make`."""
+        return make(self.kind, self, **given)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +165,7 @@ def register_object(kind: str, name: str, instance: Any) -> str:
         The name under which `make` returns it.
     """
     candidates = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
-    known = set(names(kind))
+    known = {*names(kind), *(name for other, name in _OBJECTS if other == kind)}
     free = next(one for one in candidates if _OBJECTS.get((kind, one)) is instance or one not in known)
     _OBJECTS[_checked(kind), free] = instance
     return free
@@ -166,7 +178,7 @@ def is_object(kind: str, source: str) -> bool:
 
 def names(kind: str) -> list[str]:
     """Names of a kind that are known here, sorted."""
-    registered = {name for known, name in (*_REGISTERED, *_OBJECTS) if known == kind}
+    registered = {name for known, name in _REGISTERED if known == kind}
     return sorted(registered | {point.name for point in entry_points_of(kind)})
 
 
@@ -216,7 +228,7 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
     if label is None:
         label = text[len(place) + 1 :] if place else text
     check_label(f"a label of {kind} {source!r}", str(label))
-    return Part(part=source, label=str(label), options=options)
+    return Part(part=source, label=str(label), options=options, kind=kind)
 
 
 def complete(kind: str, part: Part) -> Part:
@@ -240,7 +252,7 @@ def complete(kind: str, part: Part) -> Part:
             raise ConfigError(
                 f"Option {name!r} of {kind} {part.part!r} cannot be recorded. {error}"
             ) from error
-    return Part(part=part.part, label=part.label, options=options)
+    return Part(part=part.part, label=part.label, options=options, kind=kind)
 
 
 def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
@@ -271,6 +283,20 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
     made = call(owner, target, arguments)
     check_base(kind, made, owner)
     return made
+
+
+# By description, with the class or function that the object was created by: that of a file changes with the file.
+_CREATED: dict[str, tuple[Any, Any]] = {}
+
+
+def _object_of(part: Part) -> Any:
+    target = find(part.kind, part.part).target
+    description = json.dumps([part.kind, part.part, plain(part.options)], sort_keys=True)
+    known, created = _CREATED.get(description, (None, None))
+    if known is not target:
+        created = part.create()
+        _CREATED[description] = target, created
+    return created
 
 
 def take(kind: str, part: Any, **given: Any) -> Any:

@@ -366,7 +366,7 @@ def _as_part(source: Source) -> registry.Part | Path:
     if split_own(part.part):
         expect(not part.options, f"no options for the checkpoint {part.part!r}, got {dict(part.options)}.")
         return find_checkpoint(part.part)
-    if part.part in registry.names("model"):
+    if part.part in registry.names("model") or registry.is_object("model", part.part):
         return part
     if (":" in part.part or part.part.endswith(".py")) and not (Path(part.part) / CONFIG).is_file():
         return part

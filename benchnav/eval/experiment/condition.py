@@ -8,7 +8,8 @@ is run, and belong to the suite.
 import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -37,7 +38,7 @@ PART_KINDS = ("model", "risk", "planner", "robot", "objective", *KNOWLEDGE)
 # Columns of `Condition.labels`, in the order of tables.
 LABELS = ("data", "scenario", "world", "robot", "objective", "model", *KNOWLEDGE, "planner", "risk")
 NOT_USED = "–"
-ANY_RISK = Part(part="mean", label=NOT_USED)
+ANY_RISK = Part(part="mean", label=NOT_USED, kind="risk")
 # What the numbers of a split's maps rest on besides the maps: `TerrainDataset.about_digest` is its digest.
 MEANING = "class table, λ_stuck, resolution or kind of truth"
 # The only input by which a setting bears on a planner where no robot learns.
@@ -88,6 +89,10 @@ class Condition:
     blind: bool = False
     stands_for: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the task, whose classes another process may have to load from a file first."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
+
     @property
     def split(self) -> str:
         """Name of the data's split."""
@@ -125,12 +130,11 @@ class Condition:
         """All labels, each after its column."""
         return ", ".join(f"{name} {label}" for name, label in self.labels.items())
 
-    def make_task(self) -> Task:
-        """Makes the robot, the objective and with them the task."""
-        robot = registry.make("robot", self.robot)
-        objective = registry.make(
-            "objective", self.objective, robot=robot, goal_radius_m=self.rules.goal_radius_m
-        )
+    @cached_property
+    def task(self) -> Task:
+        """The task: robot, objective and rules."""
+        robot = self.robot.object
+        objective = self.objective.create(robot=robot, goal_radius_m=self.rules.goal_radius_m)
         return Task(robot=robot, objective=objective, rules=self.rules)
 
     @property
@@ -145,12 +149,12 @@ class Condition:
     @property
     def learns(self) -> bool:
         """Whether the robot learns anything on its way."""
-        return not self.make("sensor").sees_all or self.make("belief").learns
+        return not self.sensor.object.sees_all or self.belief.object.learns
 
     @property
     def needs_statistics(self) -> bool:
         """Whether statistics of the training maps have to be there."""
-        return not self.make("sensor").sees_all or self.make("belief").needs_statistics
+        return not self.sensor.object.sees_all or self.belief.object.needs_statistics
 
     def planner_uses(self) -> frozenset[str]:
         """Names the inputs that bear on what the planner does in this task, see `Planner.uses`.
@@ -158,8 +162,8 @@ class Condition:
         Raises:
             ConfigError: If the planner does not say it in the words of `INPUTS`.
         """
-        planner, owner = self.make_planner(), f"`uses` of planner {self.planner.label!r}"
-        used = call(owner, planner.uses, {"task": self.make_task()})
+        owner = f"`uses` of planner {self.planner.label!r}"
+        used = call(owner, self.planner.object.uses, {"task": self.task})
         expect(
             isinstance(used, frozenset) and used <= INPUTS,
             f"{owner} to return a frozenset of {', '.join(sorted(INPUTS))}, got {used!r}.",
@@ -180,23 +184,18 @@ class Condition:
     @property
     def rows_id(self) -> str:
         """Digest of what bears on its rows; conditions that differ only in what is not used share it."""
-        stand_ins: dict[str, Any] = {"risk": ANY_RISK, "belief": Part(label=NOT_USED, **KNOWLEDGE["belief"])}
+        stand_ins: dict[str, Any] = {
+            "risk": ANY_RISK,
+            "belief": Part(label=NOT_USED, kind="belief", **KNOWLEDGE["belief"]),
+        }
         return replace(self, **{kind: stand_ins[kind] for kind in self.unused}).id
-
-    def make(self, kind: str) -> Any:
-        """Makes the part of a kind that needs nothing else to be made."""
-        return registry.make(kind, getattr(self, kind))
-
-    def make_planner(self) -> Any:
-        """Makes the planner."""
-        return registry.make("planner", self.planner)
 
 
 def condition_from(about: Mapping[str, Any]) -> Condition:
     """Rebuilds a condition from its `value`, `labels` and `stands_for`, as `run.json` holds them."""
     value, labels = {**KNOWLEDGE, **about["value"]}, about["labels"]
     parts = {
-        kind: Part(part=value[kind]["part"], label=labels[kind], options=value[kind]["options"])
+        kind: Part(part=value[kind]["part"], label=labels[kind], options=value[kind]["options"], kind=kind)
         for kind in PART_KINDS
     }
     return Condition(
@@ -343,7 +342,7 @@ def is_checkpoint(kind: str, source: str) -> bool:
     """Whether a part is a checkpoint, by folder or by name, or with the class that a file or module holds."""
     from benchnav.models.predictor import split_own
 
-    if kind != "model" or source in registry.names("model"):
+    if kind != "model" or source in registry.names("model") or registry.is_object("model", source):
         return False
     return ":" not in source or split_own(source) is not None
 
@@ -370,10 +369,10 @@ def _parts(kind: str, given: Any) -> list[Part]:
         # Lets it refuse its options on one cell, also where no condition uses it.
         cell = torch.full((1, 1, 1, 1), 0.5)
         for one in made:
-            registry.make("risk", one)(TraversabilityMixture(torch.ones_like(cell), cell, cell, (0,)))
+            one.object(TraversabilityMixture(torch.ones_like(cell), cell, cell, (0,)))
     if kind in KNOWLEDGE:
         for one in made:
-            registry.make(kind, one)
+            _ = one.object  # rejects its options
     return made
 
 
@@ -383,15 +382,19 @@ def _as_run_once(condition: Condition) -> Condition:
     What a blind planner is given is not looked at; of λ that is known every measure of risk is λ itself, and nothing is
     left to be learnt; and a belief that does not learn ignores what is sensed of the ground.
     """
-    unused = {kind: Part(label=NOT_USED, **default) for kind, default in KNOWLEDGE.items()}
-    if condition.make_planner().blind or not condition.planner_uses():
-        given: dict[str, Any] = {**unused, "model": Part(part="oracle", label=NOT_USED), "risk": ANY_RISK}
+    unused = {kind: Part(label=NOT_USED, kind=kind, **default) for kind, default in KNOWLEDGE.items()}
+    if condition.planner.object.blind or not condition.planner_uses():
+        given: dict[str, Any] = {
+            **unused,
+            "model": Part(part="oracle", label=NOT_USED, kind="model"),
+            "risk": ANY_RISK,
+        }
         return replace(condition, blind=True, **given)
-    if not condition.make("belief").learns:
+    if not condition.belief.object.learns:
         condition = replace(condition, ground=unused["ground"])
     if condition.model.part != "clairvoyant":
         return condition
-    if condition.make("sensor").sees_all:
+    if condition.sensor.object.sees_all:
         condition = replace(condition, ground=unused["ground"], belief=unused["belief"])
     return replace(condition, risk=ANY_RISK)
 

@@ -180,8 +180,8 @@ def _still_dropped(dropped: Iterable[dict[str, str]], conditions: Conditions) ->
 
 def _notes(condition: Condition) -> dict[str, Any]:
     """What tables say of a condition's planner."""
-    planner = condition.make_planner()
-    task = condition.make_task()
+    planner = condition.planner.object
+    task = condition.task
     merged = [
         f"One row for {kind} {', '.join(labels)}, which the planner does not use here"
         for kind, labels in condition.stands_for.items()

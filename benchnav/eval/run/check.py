@@ -3,7 +3,7 @@
 Nothing is predicted and nothing is planned. Combinations of parts that cannot be run are left out; see `combinations`.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ import torch
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import hint
+from benchnav.core.store import text_digest
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
@@ -144,43 +145,48 @@ def check_split(condition: Condition, maps: int) -> None:
         )
 
 
-def build_each(conditions: Iterable[Condition], seed: int, maps: int) -> list[str]:
-    """Builds conditions on the first map of their splits; what is the same in several is built once.
+def build_each(conditions: Sequence[Condition], seed: int, maps: int) -> list[str]:
+    """Build conditions on the first map of their splits, without a prediction or a plan.
 
     Args:
-        conditions: what is built.
+        conditions: what is built; what several share is built once.
         seed: root seed of the draw of λ.
-        maps: of each split; 0 for all.
+        maps: number of maps of each split; 0 for all.
 
     Returns:
         What readers of the results should know.
 
     Raises:
-        BenchnavError: one cannot be run.
+        BenchnavError: If a condition cannot be run.
     """
     warnings: list[str] = []
-    seen: set[str] = set()
-
-    def is_new(*parts: Any) -> bool:
-        new = repr(parts) not in seen
-        seen.add(repr(parts))
-        return new
-
-    for condition in conditions:
-        dataset, task, world = _open(condition), condition.make_task(), condition.world
-        place = condition.data, condition.split
-        if is_new("ground", *place, world.noise):
-            _check_known_ground(condition, dataset, maps)
-        if is_new("world", *place, world, condition.rules, condition.robot):
-            first = read_maps(dataset, condition.split, [0])
-            noise = noise_key(seed, condition.split, 0)
-            Simulation(first.terrain, task, world, first.places, noise, [0])
-            warnings += _late(condition, task, dataset, maps)
-        if is_new("knowledge", *place, condition.model, *(getattr(condition, kind) for kind in KNOWLEDGE)):
-            _check_knowledge(condition, dataset)
-        if not condition.blind and is_new("model", condition.model, condition.data):
-            warnings += _check_model(condition, dataset)
+    for condition in _distinct(conditions, "data", "scenario", "world"):
+        _check_known_ground(condition, _open(condition), maps)
+    for condition in _distinct(conditions, "data", "scenario", "world", "rules", "robot"):
+        warnings += _check_world(condition, _open(condition), seed, maps)
+    for condition in _distinct(conditions, "data", "scenario", "model", *KNOWLEDGE):
+        if condition.needs_statistics:
+            find_ground_statistics(condition.model, _open(condition))
+    for condition in _distinct([one for one in conditions if not one.blind], "data", "model"):
+        warnings += _check_model(condition, _open(condition))
     return warnings
+
+
+def _distinct(conditions: Sequence[Condition], *names: str) -> list[Condition]:
+    """Return the first condition of each combination of values of some fields."""
+    first: dict[str, Condition] = {}
+    for condition in conditions:
+        value = {**condition.value, "data": condition.data, "scenario": condition.scenario}
+        first.setdefault(text_digest({name: value.get(name) for name in names}), condition)
+    return list(first.values())
+
+
+def _check_world(condition: Condition, dataset: TerrainDataset, seed: int, maps: int) -> list[str]:
+    """Build the simulation on one map, and warn of goals that top speed does not reach within T."""
+    block = read_maps(dataset, condition.split, [0])
+    noise = noise_key(seed, condition.split, 0)
+    Simulation(block.terrain, condition.task, condition.world, block.places, noise, [0])
+    return _late(condition, condition.task, dataset, maps)
 
 
 def _make_all(dataset: TerrainDataset, split: str, maps: int) -> str:
@@ -191,14 +197,6 @@ def _make_all(dataset: TerrainDataset, split: str, maps: int) -> str:
     if whole is None or whole.maps < maps:
         return ""
     return f" All maps of {dataset.id} are made with `benchnav-datagen create {dataset.id}`."
-
-
-def _check_knowledge(condition: Condition, dataset: TerrainDataset) -> None:
-    """Makes what the robot learns by, which may refuse, and looks for the statistics of the ground that it needs."""
-    for kind in KNOWLEDGE:
-        condition.make(kind)
-    if condition.needs_statistics:
-        find_ground_statistics(condition.model, dataset)
 
 
 def _check_known_ground(condition: Condition, dataset: TerrainDataset, maps: int) -> None:

@@ -79,12 +79,12 @@ def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
 
 
 def _unsteered(condition: Condition) -> str:
-    planner, robot = condition.make_planner(), condition.make_task().robot
+    planner, robot = condition.planner.object, condition.task.robot
     return _said(partial(check_steers, planner, robot, condition.planner.label))
 
 
 def _plans_once(condition: Condition) -> str:
-    if condition.blind or not condition.make_planner().plans_once or not condition.learns:
+    if condition.blind or not condition.planner.object.plans_once or not condition.learns:
         return ""
     return (
         f"Expected belief 'static' and sensor 'full' for planner {condition.planner.label!r}, which plans once, got "
@@ -93,7 +93,7 @@ def _plans_once(condition: Condition) -> str:
 
 
 def _given_truth(condition: Condition) -> str:
-    is_given = not condition.blind and condition.make_planner().given_truth
+    is_given = not condition.blind and condition.planner.object.given_truth
     if not is_given or condition.model.part == "clairvoyant":
         return ""
     return (
@@ -112,7 +112,7 @@ def _resampled(condition: Condition) -> str:
 
 
 def _learns_no_class(condition: Condition) -> str:
-    if not _is_single_class(condition) or not condition.make("belief").learns:
+    if not _is_single_class(condition) or not condition.belief.object.learns:
         return ""
     return (
         "Expected a belief that does not learn for the risk setting 'single-class', got "
@@ -140,7 +140,7 @@ def _unprepared(condition: Condition) -> str:
     """Why a shipped planner rejects what only its preparation can tell, such as its bounds."""
     if not registry.find("planner", condition.planner.part).shipped:
         return ""
-    task, planner = condition.make_task(), condition.make_planner()
+    task, planner = condition.task, condition.planner.object
     dataset = TerrainDataset(find_dataset(condition.data))
     ground = torch.full((1, 4, 4), 0.9)
     grid = Grid(4, 4, dataset.grid.resolution_m)

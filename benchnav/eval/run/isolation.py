@@ -120,9 +120,9 @@ def _serve(connection: Connection, condition: Condition) -> None:
             if call == "touched":
                 answer = snapshot()
             elif call == "start":
-                condition.make_task()
-                condition.make("belief")  # whose state a problem holds
-                planner, answer = condition.make_planner(), None
+                # The classes of what a problem holds have to be there before one is read.
+                _ = condition.task, condition.belief.object
+                planner, answer = condition.planner.create(), None
             elif call == "init":
                 problem, seed, state = arguments
                 generator = torch.Generator().manual_seed(seed)

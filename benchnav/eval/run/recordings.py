@@ -186,7 +186,7 @@ def keep_ground(folder: Path) -> None:
     block = read_maps(TerrainDataset(find_dataset(condition.data)), condition.split, [about["map"]])
     noise = noise_key(about["seed"], condition.split, about["realisation"])
     simulation = Simulation(
-        block.terrain, condition.make_task(), condition.world, block.places, noise, [about["map"]]
+        block.terrain, condition.task, condition.world, block.places, noise, [about["map"]]
     )
     Ground(
         about=about,

@@ -85,7 +85,7 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
             built = build(unit, origin, device)
         except KnowledgeError as error:
             budgets = unit.condition.world.budget_s(
-                block.places.reference_time_s, unit.condition.make_task().robot.top_speed_mps
+                block.places.reference_time_s, unit.condition.task.robot.top_speed_mps
             )
             rows = error_rows(unit, block.groups, budgets, error.outcome, str(error))
             write_unit(folder, unit, origin, rows, [str(error)], traceback.format_exc())
@@ -187,7 +187,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
         BenchnavError: the data cannot be read, or are not enough for the world.
     """
     condition = unit.condition
-    block, task = read_block(unit, origin, device), condition.make_task()
+    block, task = read_block(unit, origin, device), condition.task
     noise = noise_key(unit.seed, condition.split, unit.realisation)
     simulation = Simulation(block.terrain, task, condition.world, block.places, noise, unit.maps)
     try:
@@ -227,8 +227,8 @@ def _learner(unit: Unit, origin: Origin, device: torch.device) -> Learner:
     condition, block = unit.condition, read_block(unit, origin, device)
     dataset = TerrainDataset(find_dataset(condition.data))
     world, part = condition.world, condition.model
-    sensor = call(Outcome.SENSOR_ERROR, lambda: condition.make("sensor"))
-    belief = call(Outcome.BELIEF_ERROR, lambda: condition.make("belief"))
+    sensor = call(Outcome.SENSOR_ERROR, condition.sensor.create)
+    belief = call(Outcome.BELIEF_ERROR, condition.belief.create)
     model = call(Outcome.MODEL_ERROR, lambda: _model(_model_key(unit, origin)))
     law = Law(
         grid=block.terrain.grid,
@@ -240,10 +240,10 @@ def _learner(unit: Unit, origin: Origin, device: torch.device) -> Learner:
 
     return Learner(
         sensor=sensor,
-        ground=call(Outcome.SENSOR_ERROR, lambda: condition.make("ground")),
+        ground=call(Outcome.SENSOR_ERROR, condition.ground.create),
         belief=belief,
         law=law,
-        measure=call(Outcome.MODEL_ERROR, lambda: condition.make("risk")),
+        measure=call(Outcome.MODEL_ERROR, condition.risk.create),
         rules=condition.rules,
         predict=partial(predict, model),
     )
@@ -292,7 +292,7 @@ def simulate(unit: Unit, built: Built, settings: Settings, **options: Any) -> tu
             if settings.planner_limit_s:
                 planner = stack.enter_context(closing(IsolatedPlanner(condition, settings.planner_limit_s)))
             else:
-                planner = condition.make_planner()
+                planner = condition.planner.create()
         except (Exception, SystemExit) as error:
             planner = _Unmade(error)
         # Keyed by seed and split, never by the batch.
@@ -309,7 +309,7 @@ def _lower_bounds_s(unit: Unit, built: Built) -> list[float] | None:
     problem, field, condition = built.problem, built.simulation.field, unit.condition
     if field is None or type(problem.robot) not in BOUNDED_ROBOTS or condition.model.part != "clairvoyant":
         return None
-    if not condition.make_planner().given_truth:
+    if not condition.planner.object.given_truth:
         return None
     motion = Motion(
         robot=problem.robot, goal_radius_m=problem.goal_radius_m, immobile=condition.world.immobile

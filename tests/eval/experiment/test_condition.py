@@ -37,7 +37,7 @@ def one(**changes: object) -> Condition:
 
 def test_travel_time_ends_where_the_tasks_goal_begins() -> None:
     for changes, radius_m in (({}, 1.0), ({"task": {"goal_radius_m": 0.3}}, 0.3)):
-        task = one(objectives=("travel_time",), **changes).make_task()
+        task = one(objectives=("travel_time",), **changes).task
         assert (task.objective.goal_radius_m, task.rules.goal_radius_m) == (radius_m, radius_m)
 
 
@@ -106,15 +106,15 @@ def test_every_setting_reaches_its_place() -> None:
     assert (condition.rules.free_space.by, condition.rules.free_space.above) == ("mean", 0.1)
     assert (condition.rules.min_traversability, condition.rules.goal_radius_m) == (0.05, 2.0)
     assert (condition.world.noise, condition.world.time_budget_s) == ("stored", 30.0)
-    assert condition.make_task().robot.dt_s == 0.2
-    assert condition.make_task().rules == condition.rules
-    assert condition.make_planner().after_s == 3.0
+    assert condition.task.robot.dt_s == 0.2
+    assert condition.task.rules == condition.rules
+    assert condition.planner.object.after_s == 3.0
     assert (
         condition.world_label
         == "paper noise=stored time_budget_s=30 by=mean above=0.1 min_traversability=0.05 goal_radius_m=2"
     )
     travel = one(objectives=("travel_time",), robots=({"part": "unicycle", "options": {"dt_s": 0.2}},))
-    assert travel.make_task().objective.robot.dt_s == 0.2  # type: ignore[attr-defined]
+    assert travel.task.objective.robot.dt_s == 0.2  # type: ignore[attr-defined]
 
 
 def test_several_worlds_stand_at_the_top_of_a_suite() -> None:
@@ -244,7 +244,7 @@ def test_two_settings_of_one_part_stand_side_by_side_with_labels() -> None:
         {"part": "mppi", "label": name, "options": {"samples": n}} for name, n in (("few", 8), ("many", 9))
     )
     made = conditions(planners=(few, many), scenarios=("std",))
-    assert [(t.labels["planner"], t.make_planner().config.samples) for t in made] == [("few", 8), ("many", 9)]
+    assert [(t.labels["planner"], t.planner.object.config.samples) for t in made] == [("few", 8), ("many", 9)]
     for first, second in pairwise(made):
         assert first.id != second.id
 
@@ -417,8 +417,8 @@ def test_grounds_and_beliefs_are_crossed_and_their_options_swept() -> None:
     )
     found = {(ground, belief) for _, ground, belief in known(made)}
     assert len(made) == len(found) == 10
-    assert {condition.make("belief").correlation_m for condition in made} == {"world", 1.0}
-    probes = [condition.make("ground") for condition in made if condition.ground.part == "probe"]
+    assert {condition.belief.object.correlation_m for condition in made} == {"world", 1.0}
+    probes = [condition.ground.object for condition in made if condition.ground.part == "probe"]
     chosen = {(probe.radius_m, probe.noise_std) for probe in probes}
     assert (len(probes), chosen) == (8, set(product((1.0, 2.0), (0.1, 0.3))))
     for first, second in pairwise(made):

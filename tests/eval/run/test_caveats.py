@@ -28,7 +28,11 @@ from tests.eval.parts import TwoModes
 FREE, STEERING = "tests.eval.parts:Faulty", "tests.eval.parts:Steering"
 TWO_MODES = "tests.eval.parts:TwoModes"
 HAZARD = {"part": "optimal", "label": "careful", "options": {"hazard": True}}
-LINE = "left out: planner Steering cannot steer robot bicycle"
+LINE = (
+    "left out: planner Steering, robot bicycle: Expected a robot with actions (speed_mps, turn_rate_radps) for planner "
+    "'Steering', got Bicycle with (speed_mps, steering_rad). The planner commands a turn rate; this robot is steered by "
+    "an angle, and turns only while it drives. Take mppi, astar_mppi or straight."
+)
 WARNING = (
     "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within the time budget T"
 )
