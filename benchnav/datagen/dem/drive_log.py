@@ -8,7 +8,7 @@ Letters in shapes: N rows that are used.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -73,10 +73,10 @@ class Drives:
 
 @dataclass(frozen=True, kw_only=True)
 class DriveLog:
-    """What is used of a log.
+    """The used rows of a log.
 
     Args:
-        settings: the file, and what of it is used.
+        settings: the file, and which rows of it are used.
         sha256: of the file.
         names: of its drives.
         is_geographic: whether positions are longitude and latitude; else they are in the elevation model's CRS.
@@ -117,8 +117,8 @@ class DriveLog:
                 f"{sum(left_out.values())}, {', '.join(several)}. Log time, position and both speeds on "
                 "the move."
             )
-        about = {**vars(self), "rows": self.rows[~which].reset_index(drop=True), "left_out": left_out}
-        return DriveLog(**about)
+        rows = self.rows[~which].reset_index(drop=True)
+        return replace(self, rows=rows, left_out=left_out)
 
 
 def read_drives(drives: Drives) -> DriveLog:

@@ -1,4 +1,4 @@
-"""The comparison of a drive log's positions with its speeds, and what is wrong with a log by it.
+"""The comparison of a drive log's positions with its speeds, and the faults that it shows.
 
 Measured speed makes λ, so it must be the speed over ground. Positions are its witness: over spans of two seconds they
 must move as far as the measured speed says. Their distance over that of the command is λ and no fault. Rows whose time
@@ -67,8 +67,8 @@ def compare_motion(log: DriveLog) -> DriveLog:
     is_compared = settings.speed == ""
     by_positions = settings.speed == "positions"
     if by_positions:  # measured speed is compared where there is one
-        known = log.rows["speed"].where(log.rows["speed"].abs() <= MOST_SPEED_M_S)
-        log = replace(log, rows=log.rows.assign(speed=known))
+        comparable = log.rows["speed"].where(log.rows["speed"].abs() <= MOST_SPEED_M_S)
+        log = replace(log, rows=log.rows.assign(speed=comparable))
     log = log.without("doubled", log.rows.duplicated().to_numpy())
     log = _leave_out(log, {"restarted": find_restarted(log.rows)})
     beyond = (log.rows[["commanded", "speed"]].abs() > MOST_SPEED_M_S).any(axis=1).to_numpy()
@@ -78,7 +78,7 @@ def compare_motion(log: DriveLog) -> DriveLog:
         return log.without("slow", is_slow.to_numpy())
     standing = find_standing(track_of(log.rows), settings.least_speed, by_positions=by_positions)
     standing = standing.reindex(log.rows.index)
-    _check_known(log, standing["is_unknown"].to_numpy())
+    _check_rest(log, standing["is_unknown"].to_numpy())
     log = _leave_out(log, {"frozen": standing["is_frozen"].to_numpy()})
     rows = log.rows
     commanded, speed = (rows[name].to_numpy() for name in ("commanded", "speed"))
@@ -157,7 +157,7 @@ def _leave_out(
     return log
 
 
-def _check_known(log: DriveLog, unknown: ndarray) -> None:
+def _check_rest(log: DriveLog, unknown: ndarray) -> None:
     """Reject a log with many rows at rest of which nothing shows whether the robot or the receiver stopped."""
     if unknown.mean() > MAX_FAULTY:
         raise DatasetError(
@@ -234,7 +234,7 @@ def _is_winding(spans: pd.DataFrame) -> bool:
 
 
 def _no_unit(spans: pd.DataFrame) -> str:
-    """Return what stands in messages where no unit is named."""
+    """Return the words of messages where no unit is named."""
     return "no unit that is known" + ", since the track winds between positions" * _is_winding(spans)
 
 
@@ -249,9 +249,9 @@ def _unit_of(spans: pd.DataFrame, is_geographic: bool) -> tuple[str, str]:
         The unit, empty if none fits, and the remedy without a full stop.
     """
     ratio, by_command = (_median_ratio(spans, name) for name in ("measured", "commanded"))
-    unknown = "", "Bring speeds to m/s, times to s and positions to m"
+    remedy = "Bring speeds to m/s, times to s and positions to m"
     if _is_winding(spans):
-        return unknown[0], f"{unknown[1]}, log positions more often"
+        return "", f"{remedy}, log positions more often"
     others = {name: (value, "`time_s`", value) for name, value in _TIMES.items()}
     if not is_geographic:
         others |= {name: (value, "`x_m` and `y_m`", 1 / value) for name, value in _LENGTHS.items()}
@@ -264,7 +264,7 @@ def _unit_of(spans: pd.DataFrame, is_geographic: bool) -> tuple[str, str]:
         if abs(ratio / value - 1) <= _UNIT_TOLERANCE:
             also = f" (`commanded_m_s` too, if it is in {name})"
             return name, f"Multiply `measured_m_s` by {value:.4g}{also}"
-    return unknown
+    return "", remedy
 
 
 def _check_sign(log: DriveLog, is_driven: ndarray) -> None:
@@ -310,7 +310,7 @@ def _off_pace(log: DriveLog, spans: pd.DataFrame) -> tuple[ndarray, str]:
 
 
 def _wheel_ratios(spans: pd.DataFrame) -> tuple[bool, bool]:
-    """Say whether measured over commanded speed stays the same, and whether it stays 1.
+    """Return whether measured over commanded speed stays the same, and whether it stays 1.
 
     Returns:
         Both; false where spans are too few.

@@ -219,7 +219,7 @@ def test_no_ratio_to_the_command_stops_an_import(speed: str) -> None:
 
 
 def skid_steer_log() -> pd.DataFrame:
-    """A log as of a skid-steer robot of 1.08 times its command, in knots.
+    """Return a log of a skid-steer robot at 1.08 times its command, in knots.
 
     The command changes often, and speed follows it with a time constant of 0.5 s, so that a tenth of the rows exceeds
     1.2 times the command. Positions come once a second.
@@ -289,10 +289,10 @@ def stuck_drive() -> pd.DataFrame:
 
 @pytest.mark.parametrize("measured", ["of the drive", "of wheels", "missing"])
 @pytest.mark.parametrize("fix_rows", [1, 5])
-def test_positions_alone_tell_immobility_from_a_frozen_receiver(measured: str, fix_rows: int) -> None:
+def test_positions_separate_immobility_from_a_frozen_receiver(measured: str, fix_rows: int) -> None:
     rows = stuck_drive()
     if measured != "of the drive":
-        rows["speed"] = rows["commanded"] if measured == "of wheels" else np.nan
+        rows["speed"] = 0.8 * rows["commanded"] if measured == "of wheels" else np.nan
     rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
     log = compare_motion(log_of(rows, "positions"))
     assert log.left_out["frozen"] == 0
@@ -302,8 +302,10 @@ def test_positions_alone_tell_immobility_from_a_frozen_receiver(measured: str, f
     assert is_stuck.sum() == 361
     if measured == "missing":
         assert log.motion["standing"] == pytest.approx(400, abs=10)
-    elif measured == "of the drive":
+    else:
         assert log.motion["standing"] == 0
+        left_out = compare_motion(log_of(rows)).left_out  # a measured speed that is used has to agree
+        assert left_out["frozen"] == pytest.approx(400 if measured == "of wheels" else 0, abs=10)
     frozen = rows.copy()  # the robot drives on, and the receiver comes back
     frozen.loc[4000:4300, ["x", "y"]] = frozen.loc[4000, ["x", "y"]].to_numpy()
     log = compare_motion(log_of(frozen, "positions"))
@@ -446,6 +448,18 @@ def test_velocity_is_the_derivative_of_savitzky_and_golay() -> None:
     assert velocity.notna().all()
 
 
+def test_the_error_of_a_velocity_is_that_of_its_noise() -> None:
+    generator = np.random.default_rng(0)
+    for step_s, spread_s2 in ((1.0, 2.0), (0.1, 7.7)):  # Σ t² of three fixes, and of 21
+        time_s = np.arange(2000) * step_s
+        x, y = np.stack([0.8 * time_s, 0 * time_s]) + 0.1 * generator.standard_normal((2, 2000))
+        rows = pd.DataFrame({"x": x, "y": y, "time_s": time_s, "drive": 0})
+        error = velocity_of(track_of(rows), ["x", "y"])["error"][20:-20]
+        expected = 0.1 / np.sqrt(spread_s2)
+        assert error.min() == pytest.approx(expected, rel=0.05)
+        assert expected <= error.median() < 1.1 * expected
+
+
 @pytest.mark.parametrize("fix_rows", [1, 3, 10])
 def test_speed_of_positions_is_that_of_the_drive_forward_and_backward(fix_rows: int) -> None:
     commanded = np.concatenate([np.full(300, 0.8), np.zeros(50), np.full(300, -0.6)])
@@ -456,12 +470,15 @@ def test_speed_of_positions_is_that_of_the_drive_forward_and_backward(fix_rows: 
     np.testing.assert_allclose(speed[steady], 0.75 * commanded[steady], rtol=0.02)
 
 
-@pytest.mark.parametrize("noise_m", [0.02, 0.05, 0.1, 0.3])
-@pytest.mark.parametrize("fix_rows", [1, 5, 10])
+@pytest.mark.parametrize("noise_m", [0.05, 0.1, 0.3])
+@pytest.mark.parametrize("fix_rows", [1, 10])
 def test_noise_does_not_turn_an_immobilised_robot(noise_m: float, fix_rows: int) -> None:
-    for seed in range(12):
+    for seed in range(8):
         generator = np.random.default_rng(seed)
-        rows = drive(np.ones(900), np.repeat([0.8, 0, 0.8], [300, 200, 400]), turn=0.05)
+        turn = np.repeat(
+            [0.05, 0.14 * (seed % 2), 0.05], [300, 200, 400]
+        )  # every second one turns round at rest
+        rows = drive(np.ones(900), np.repeat([0.8, 0, 0.8], [300, 200, 400]), turn)
         rows[["x", "y"]] += noise_m * generator.standard_normal((900, 2))
         rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
         speed = speed_of_positions(track_of(rows), 0.1)
@@ -469,7 +486,7 @@ def test_noise_does_not_turn_an_immobilised_robot(noise_m: float, fix_rows: int)
         assert (speed[moves].dropna() > 0).all(), seed
 
 
-@pytest.mark.parametrize(("noise_m", "rest"), [(0.0, 0), (0.05, 0), (0.05, 15), (0.1, 10)])
+@pytest.mark.parametrize(("noise_m", "rest"), [(0.0, 0), (0.05, 0), (0.05, 25), (0.1, 10)])
 def test_sliding_back_is_seen_through_noise(noise_m: float, rest: int) -> None:
     for seed in range(8):
         generator = np.random.default_rng(seed)
