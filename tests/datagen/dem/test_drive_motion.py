@@ -106,6 +106,12 @@ def test_a_measured_speed_of_no_unit_is_rejected_too() -> None:
             compare_motion(log_of(rows.assign(speed=rows["speed"] * factor)))
 
 
+def test_noise_of_positions_is_no_disagreement() -> None:
+    rows = rough_drive(1200)
+    rows[["x", "y"]] += 0.1 * np.random.default_rng(0).standard_normal((1200, 2))
+    assert compare_motion(log_of(rows)).motion["pace"] == pytest.approx(1, abs=0.02)
+
+
 def test_curves_and_gaps_are_no_disagreement() -> None:
     turning = np.repeat([0, 1.2, -1.2, 0, 1.2], 120)
     log = compare_motion(log_of(drive(np.ones(600), np.full(600, 0.9), turning)))
