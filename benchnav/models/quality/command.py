@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchnav.core.command import Device
-from benchnav.models.quality.output import DPI, FIGURES, check_folder, check_writable
+from benchnav.models.quality.output import DPI, FIGURES, check_folder, check_writable, save_figures
 
 REPORT, CSV, PAGE = "quality.json", "quality.csv", "quality.md"
 
@@ -58,7 +58,6 @@ def evaluate(
     expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
 
     from benchnav.core.device import find_device
-    from benchnav.core.figures import save_twice
     from benchnav.models.predictor import load_model, trained_on
     from benchnav.models.quality.baselines import baselines_of
     from benchnav.models.quality.measure import choose_splits
@@ -111,18 +110,10 @@ def evaluate(
         return
     write_text(folder / REPORT, report)
     write_text(folder / CSV, quality_csv(qualities))
-    for old in (folder / FIGURES).glob("*.p[nd][gf]"):
-        old.unlink()
     name = Path(checkpoint).name if Path(checkpoint).is_dir() else checkpoint
     drawn, absent = quality_figures(f"model {name} on dataset {dataset.id}", model, dataset, qualities, maps)
     paths = [f"{FIGURES}/{figure}.png" for figure in drawn]
-
-    def saved() -> Iterator[tuple[int, int]]:
-        for count, (path, draw) in enumerate(zip(paths, drawn.values(), strict=True), 1):
-            save_twice(draw(), folder / path, dpi=DPI)
-            yield count, len(paths)
-
-    show_progress(saved(), "figures")
+    save_figures(folder, drawn, DPI)
     write_text(folder / PAGE, quality_markdown(title, qualities, notes + absent, paths))
     for line in absent:
         print(line)

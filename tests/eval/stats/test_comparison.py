@@ -5,14 +5,11 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest, wilcoxon
 
-from benchnav.eval.stats.comparison import compare, time_difference
-from benchnav.eval.stats.paired_difference import (
-    maps_needed,
-    smallest_difference,
-    standard_deviation,
-    success_interval,
-)
+from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import Pair
+from benchnav.stats.episodes import time_difference
+from benchnav.stats.intervals import standard_deviation, success_interval
+from benchnav.stats.power import maps_needed, smallest_difference
 
 
 def pair(

@@ -12,7 +12,7 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent
 from benchnav.eval.stats.hypotheses import p_of
 from benchnav.eval.stats.hypotheses import test_hypotheses as run_tests
-from benchnav.eval.stats.paired_difference import success_interval
+from benchnav.stats.intervals import success_interval
 from tests.eval.report.made import condition, row, rows
 
 WORLD = {"time_budget_s": 100.0}
