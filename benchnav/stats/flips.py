@@ -28,38 +28,37 @@ def _signs(maps: int) -> np.ndarray:
     return 1.0 - 2.0 * np.random.default_rng(0).integers(0, 2, (_DRAWN, maps), dtype=np.int8)
 
 
-def flipped_sums(differences: np.ndarray) -> np.ndarray:
-    """Return the sum over maps under each way of flipping their signs.
+def exchange_p(
+    one: np.ndarray, other: np.ndarray, difference: Callable[..., np.ndarray], direction: str = ""
+) -> float:
+    """Return p of no difference in any function of sums over maps: the fraction of ways that are as far out.
 
     Args:
-        differences: by map, shape [M, P].
-
-    Returns:
-        Shape [R, P], the same for any order of maps and for −`differences`.
+        one: parts of the first contestant by map, shape [M, P].
+        other: those of the second.
+        difference: of two sums of parts, each of shape [..., P]: shape [...]; antisymmetric.
+        direction: in which the first is thought to lie, `higher` or `lower`; two-sided if empty.
     """
-    rows = differences[(differences != 0).any(1)]
-    first = (rows != 0).argmax(1)
-    oriented = rows * np.sign(rows[np.arange(len(rows)), first])[:, None]
-    order = np.lexsort(oriented.T[::-1])[::-1]
-    return _signs(len(rows)) @ oriented[order]
-
-
-def share_beyond(ways: np.ndarray, observed: float, maps: int, direction: str = "") -> float:
-    """Return p: the fraction of ways whose statistic is at least as far out as the observed one.
-
-    Args:
-        ways: statistic under each way, antisymmetric in the signs, shape [R].
-        observed: statistic as observed.
-        maps: M that differ, which tells whether `ways` are all.
-        direction: `higher` or `lower` for a one-sided test; two-sided if empty.
-    """
+    gap, total = one - other, (one + other).sum(0)
+    gap = gap[gap.any(1)]
+    first = (gap != 0).argmax(1)
+    oriented = gap * np.sign(gap[np.arange(len(gap)), first])[:, None]
+    gaps = _signs(len(gap)) @ oriented[np.lexsort(oriented.T[::-1])[::-1]]
+    ways = difference(_half(total, gaps), _half(total, -gaps))
+    observed = float(difference(one.sum(0), other.sum(0)))
     tolerance = _ROUNDING * np.abs(ways).max()
     if not direction:
         ways, observed = np.abs(ways), abs(observed)
     elif direction == "lower":
         observed = -observed
     beyond = int((ways >= observed - tolerance).sum())
-    return beyond / len(ways) if maps <= _EXACT else (1 + beyond) / (1 + len(ways))
+    return beyond / len(ways) if len(gap) <= _EXACT else (1 + beyond) / (1 + len(ways))
+
+
+def _half(total: np.ndarray, gap: np.ndarray) -> np.ndarray:
+    """Return half of their sum; what rounding leaves of 0, whose root would be far from 0, is 0."""
+    half = (total + gap) / 2
+    return np.where(np.abs(half) < 1e-12 * np.abs(total), 0, half)
 
 
 def mean_flip_p(differences: np.ndarray, direction: str = "") -> float:
@@ -69,29 +68,8 @@ def mean_flip_p(differences: np.ndarray, direction: str = "") -> float:
         differences: by map, without rounding (see `by_map.alike`), shape [M].
         direction: `higher` or `lower` for a one-sided test; two-sided if empty.
     """
-    sums = flipped_sums(differences[:, None])[:, 0]
-    return share_beyond(sums, float(differences.sum()), int(np.count_nonzero(differences)), direction)
-
-
-def exchange_p(one: np.ndarray, other: np.ndarray, difference: Callable[..., np.ndarray]) -> float:
-    """Return two-sided p of no difference in any function of sums over maps.
-
-    Args:
-        one: parts of the first contestant by map, shape [M, P].
-        other: those of the second.
-        difference: of two sums of parts, each of shape [..., P]: shape [...]; antisymmetric.
-    """
-    gap, total = one - other, (one + other).sum(0)
-    ways = flipped_sums(gap)
-    exchanged = difference(_half(total, ways), _half(total, -ways))
-    observed = float(difference(one.sum(0), other.sum(0)))
-    return share_beyond(exchanged, observed, int(gap.any(1).sum()))
-
-
-def _half(total: np.ndarray, gap: np.ndarray) -> np.ndarray:
-    """Return half of their sum; what rounding leaves of 0, whose root would be far from 0, is 0."""
-    half = (total + gap) / 2
-    return np.where(np.abs(half) < 1e-12 * np.abs(total), 0, half)
+    one = differences[:, None]
+    return exchange_p(one, 0 * one, lambda a, b: (a - b)[..., 0], direction)
 
 
 def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
