@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchnav.core.command import Device
-from benchnav.models.quality.output import DPI, FIGURES, check_folder, check_writable, save_figures
+from benchnav.models.quality.output import DPI, FIGURES, check_folder, check_writable, open_maps, save_figures
 
 REPORT, CSV, PAGE = "quality.json", "quality.csv", "quality.md"
 
@@ -39,8 +39,6 @@ def evaluate(
     from benchnav.core.progress import show_progress
     from benchnav.core.store import write_text
     from benchnav.core.tables import print_table
-    from benchnav.datagen.files.find import find_dataset
-    from benchnav.datagen.files.reader import TerrainDataset
     from benchnav.models.config import check_seed
 
     check_seed(seed)
@@ -54,8 +52,7 @@ def evaluate(
         check_writable(target)
     if out:
         check_folder(folder, overwrite, (REPORT, CSV, PAGE), "an evaluation")
-    dataset = TerrainDataset(find_dataset(data))
-    expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
+    dataset = open_maps(data, splits)
 
     from benchnav.core.device import find_device
     from benchnav.models.predictor import load_model, trained_on

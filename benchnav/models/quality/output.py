@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from benchnav.core.tables import Table
+    from benchnav.datagen.files.reader import TerrainDataset
 
 FIGURES = "figures"
 DPI = 300
@@ -29,6 +30,25 @@ def check_folder(out: Path, overwrite: bool, files: Collection[str], what: str) 
 
     refuse_taken(out, overwrite, partial(_foreign, files={*files, FIGURES}, what=what))
     check_writable(out / next(iter(files)))
+
+
+def open_maps(data: str, splits: Sequence[str] | None) -> "TerrainDataset":
+    """Open the dataset that models are measured on.
+
+    Args:
+        data: its path or id.
+        splits: which of its splits; None for every test split.
+
+    Raises:
+        ConfigError: If `splits` is empty.
+    """
+    from benchnav.core.errors import expect
+    from benchnav.datagen.files.find import find_dataset
+    from benchnav.datagen.files.reader import TerrainDataset
+
+    dataset = TerrainDataset(find_dataset(data))
+    expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
+    return dataset
 
 
 def check_writable(path: Path) -> None:

@@ -122,25 +122,6 @@ def test_a_difference_of_time_knows_what_failures_cost() -> None:
     assert (low + high) / 2 == pytest.approx(5)
 
 
-@pytest.mark.parametrize("maps", [8, 20])
-def test_intervals_of_a_difference_of_time_cover_it_on_few_maps(maps: int) -> None:
-    generator = np.random.default_rng(8)
-    held, count, rates = 0, 150, (0.85, 0.95)
-    for _ in range(count):
-        hard, noise = generator.standard_normal(maps), generator.random(maps)
-        taken = [
-            np.where(
-                noise < rate,
-                np.minimum(33 * np.exp(0.2 * hard + 0.2 * generator.standard_normal(maps)), 99),
-                100,
-            )
-            for rate in rates
-        ]
-        _, low, high = time_difference(pair(*(list(times) for times in taken)).episodes)
-        held += low <= 0.1 * (100 - 33 * np.exp(0.04)) <= high
-    assert held >= 135  # 93 % of 150 are 139.5
-
-
 def test_a_group_of_maps_is_one_number() -> None:
     given = pair(A, B)
     grouped = replace(given, episodes=given.episodes.assign(group=np.arange(8) // 2))

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchnav.core.command import Device
-from benchnav.models.quality.output import DPI, check_folder, save_figures
+from benchnav.models.quality.output import DPI, check_folder, open_maps, save_figures
 
 if TYPE_CHECKING:
     import torch
@@ -40,19 +40,15 @@ def compare(
         device: Where the models are measured and timed; auto takes CUDA where there is a GPU.
     """
     from benchnav import __version__
-    from benchnav.core.errors import expect
     from benchnav.core.progress import show_progress
     from benchnav.core.tables import print_table
-    from benchnav.datagen.files.find import find_dataset
-    from benchnav.datagen.files.reader import TerrainDataset
     from benchnav.models.config import check_seed
 
     check_seed(seed)
     folder = Path(out)
     if out:
         check_folder(folder, overwrite, (REPORT, CSV, DIFFERENCES, PAGE), "a comparison")
-    dataset = TerrainDataset(find_dataset(data))
-    expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
+    dataset = open_maps(data, splits)
 
     from benchnav.core.device import find_device, gpu_name
     from benchnav.models.quality.compare.candidates import find_candidates
