@@ -133,3 +133,9 @@ def test_a_class_that_is_nowhere_true_has_no_share_in_the_miou() -> None:
     sums = {name: np.array([own], dtype=float) for name, own in counts.items()}
     assert SCORES["accuracy"].value(sums) == pytest.approx(14 / 20)
     assert SCORES["miou"].value(sums) == pytest.approx((8 / 14 + 6 / 10) / 2)
+
+
+def test_gaps_of_the_tail_do_not_cancel() -> None:
+    sums = {"cells": [100], "under_80": [15], "under_90": [13], "under_95": [5]}
+    value = SCORES["tail_error"].value({name: np.array(own, dtype=float) for name, own in sums.items()})
+    assert value == pytest.approx((0.05 + 0.03 + 0) / 3)
