@@ -18,16 +18,11 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import beta, binomtest, bootstrap, norm, t
 
-from benchnav.eval.stats.best import best_set_p
-from benchnav.eval.stats.comparison import ALPHA
-from benchnav.eval.stats.paired_difference import (
-    alike,
-    sign_flip_p,
-    signed_rank_p,
-    success_interval,
-    total_time_interval,
-)
-from benchnav.eval.stats.summary import design_effect, wilson_interval
+from benchnav.stats.best import best_set_p
+from benchnav.stats.by_map import alike
+from benchnav.stats.flips import sign_flip_p, signed_rank_p
+from benchnav.stats.holm import ALPHA
+from benchnav.stats.intervals import design_effect, success_interval, total_time_interval, wilson_interval
 
 # Of the studies of few, large groups: rates of two conditions, correlation within a group, and what they share.
 GROUPS, IN_A_GROUP = (5, 8, 12), (20, 60)

@@ -29,7 +29,6 @@ import numpy as np
 import pandas as pd
 from scipy.stats import fisher_exact, t, ttest_ind_from_stats
 
-from benchnav.core.resampling import holm
 from benchnav.core.tables import Table, to_markdown
 from benchnav.eval.compare import read_conditions
 from benchnav.eval.experiment.condition import NOT_USED
@@ -37,7 +36,8 @@ from benchnav.eval.folder.run_folder import EPISODES, open_run
 from benchnav.eval.report.write import read_report
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import Compared, Pair, check_maps, find_pairs, side_by_side
-from benchnav.eval.stats.summary import wilson_interval
+from benchnav.stats.holm import holm
+from benchnav.stats.intervals import wilson_interval
 
 # MPPI under CVaR at 0.9; Endo, Honda and Ishigami (2024), Table I: success, mean and standard deviation of T_total.
 PAPER_EPISODES = 20

@@ -14,8 +14,9 @@ from rich.table import Table
 from scipy.stats import kendalltau, t
 
 from benchnav.core.figures import save, styled
-from benchnav.core.resampling import holm, sign_flips
-from benchnav.eval.stats.paired_difference import mean_interval
+from benchnav.stats.flips import mean_flip_p
+from benchnav.stats.holm import holm
+from benchnav.stats.intervals import mean_interval
 
 RISKS, SPLIT = ("expected-time", "cvar:0.8"), "test/std"
 SCORES = ("rmse_expected", "nll", "crps", "pinball", "tail_error", "ause")  # of each the least is the best
@@ -60,7 +61,7 @@ def report_doses(out: Path, rows: pd.DataFrame, loss: pd.Series, models: list[Do
     found = {
         "models": len(loss), "maps": len(slopes), "episodes": len(rows),
         "slope_points_per_0.001": 0.1 * float(mean[0]), "interval": [0.1 * float(low[0]), 0.1 * float(high[0])],
-        "p_one_sided": flipped(slopes, -1), "hypothesis_sha256": digest,
+        "p_one_sided": mean_flip_p(slopes, "lower"), "hypothesis_sha256": digest,
     }  # fmt: skip
     (out / "hypothesis.json").write_text(json.dumps(found, indent=1))
     print(json.dumps(found, indent=1))
@@ -68,7 +69,7 @@ def report_doses(out: Path, rows: pd.DataFrame, loss: pd.Series, models: list[Do
         own = slopes_by_map(loss[chosen].to_numpy(), table.loc[chosen].to_numpy())
         mean, low, high = mean_interval(own[None])
         said = f"{0.1 * mean[0]:+.3f} ({0.1 * low[0]:+.3f} to {0.1 * high[0]:+.3f}) points per 0.001"
-        print(f"exploratory: {label}, {len(chosen)} models: {said}, two-sided p = {flipped(own, 0):.4f}")
+        print(f"exploratory: {label}, {len(chosen)} models: {said}, two-sided p = {mean_flip_p(own):.4f}")
     for one, other in contrasts(models):
         labels = [
             [dose.label for dose in models if (dose.size, dose.what, dose.dose) == key]
@@ -76,7 +77,7 @@ def report_doses(out: Path, rows: pd.DataFrame, loss: pd.Series, models: list[Do
         ]
         gain = 100 * (table.loc[labels[0]].mean(0) - table.loc[labels[1]].mean(0)).to_numpy()
         mean, low, high = mean_interval(gain[None])
-        said = f"{mean[0]:+.1f} points ({low[0]:+.1f} to {high[0]:+.1f}), p = {flipped(gain, 0):.4f}"
+        said = f"{mean[0]:+.1f} points ({low[0]:+.1f} to {high[0]:+.1f}), p = {mean_flip_p(gain):.4f}"
         print(
             f"exploratory: {one} − {other}: {said}; loss {loss[labels[0]].mean() - loss[labels[1]].mean():+.4f}"
         )
@@ -84,12 +85,6 @@ def report_doses(out: Path, rows: pd.DataFrame, loss: pd.Series, models: list[Do
     every.to_csv(out / "doses.csv", index=False)
     print_frame("success and time against dose, over seeds", every)
     save(draw_doses(every), out / "zoo-doses.png", "png", dpi=200)
-
-
-def flipped(values: np.ndarray, sign: int) -> float:
-    """p of a mean over maps by flipping signs: of one as low (−1), or as far from 0 (0)."""
-    drawn, seen = sign_flips(len(values)) @ values, values.sum()
-    return float((drawn <= seen + 1e-12 if sign < 0 else abs(drawn) >= abs(seen) - 1e-12).mean())
 
 
 def exploratory(models: list[Dose]) -> Iterator[tuple[str, list[str]]]:
@@ -131,7 +126,7 @@ def success_table(rows: pd.DataFrame, groups: dict[Key, list[str]], first: Key) 
                 f"success {risk}": 100 * under["success"].mean(),
                 f"T_total {risk}": under["total_time_s"].mean(),
             }
-        lines[key] = {**cells, "gain": gained, "low": least, "high": most, "p": flipped(gain, 0)}
+        lines[key] = {**cells, "gain": gained, "low": least, "high": most, "p": mean_flip_p(gain)}
     found = pd.DataFrame(lines).T
     others = [key != first for key in groups]
     found.loc[others, "p"] = holm(found.loc[others, "p"].to_numpy())

@@ -16,8 +16,8 @@ from scipy.stats import binomtest, fisher_exact
 from statsmodels.stats.proportion import confint_proportions_2indep
 
 from benchmarks.cai.published import PUBLISHED, PUBLISHED_PAIRS, TRIALS
-from benchnav.core.resampling import holm
-from benchnav.eval.stats.summary import wilson_interval
+from benchnav.stats.holm import holm
+from benchnav.stats.intervals import wilson_interval
 
 # What is compared on the same trials; of the first the log of theirs is counted too.
 PAIRS = (("cvar:0.8", "mean"), ("cost-cvar:0.6", "cost"), ("cost-cvar:0.6", "cvar:0.6"))

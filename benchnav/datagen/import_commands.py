@@ -154,6 +154,16 @@ def _sum_up(about: Mapping[str, Any]) -> str:
             f"{beyond['below_0']} rows have λ below 0 (sliding back, or noise) and {beyond['above_1']} above 1 (faster "
             "than the command); they are stored as 0 and 1"
         )
+    if over := beyond["above_1.2"]:
+        lines.append(
+            f"{over} rows exceed 1.2 times the command: if steady driving on flat, firm terrain does, scale "
+            "`commanded_m_s`"
+        )
+    if about["standing"]:
+        lines.append(
+            f"{about['standing']} rows have a position that stays the same under command, and no measured speed; the "
+            "robot counts as immobilised there"
+        )
     return "\n  ".join(lines)
 
 

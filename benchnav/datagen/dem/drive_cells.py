@@ -1,4 +1,4 @@
-"""What drives say of the cells of the ground, and which split each drive belongs to.
+"""Traversability of the cells that drives cross, and the split that each drive belongs to.
 
 Splits have strips of the ground, with ground between them that no map shows (`tiling`). A drive belongs to the split on
 whose strip most of its rows lie, and its rows on the strip of another are left out. So no cell and no drive tells two
@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from benchnav.core.errors import DatasetError
-from benchnav.datagen.dem.drive_log import REASONS, DriveLog
+from benchnav.datagen.dem.drive_log import OVER_SPEED, PLACES, REASONS, DriveLog
 from benchnav.datagen.dem.raster import Layer, Raster, transformed
 from benchnav.datagen.dem.tiling import Tiling
 from benchnav.datagen.schema import Json
@@ -24,6 +24,7 @@ from benchnav.datagen.schema import Json
 BANDS = ("traversability", "drive_count", "drive_std")
 RATIO_LIMITS = (0.0, 1.0)  # that the ratio of a row is clipped to when it is stored
 _BLOCK_CELLS = 64  # rows of cells that are read at once
+_PROJECT = "Give x_m and y_m in that CRS, or longitude_deg and latitude_deg."
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class DrivenCells:
     width: int
 
     def read(self, rows: range, columns: range) -> ndarray:
-        """Reads cells.
+        """Read cells.
 
         Args:
             rows: counted northward.
@@ -52,15 +53,17 @@ class DrivenCells:
         """
         read = np.full((3, len(rows), len(columns)), np.nan)
         read[1] = 0
-        some = slice(*np.searchsorted(self.cells, [rows.start * self.width, rows.stop * self.width]))
-        row, column = np.divmod(self.cells[some], self.width)
-        own = (column >= columns.start) & (column < columns.stop)
-        read[:, row[own] - rows.start, column[own] - columns.start] = self.values[:, some][:, own]
+        in_rows = slice(*np.searchsorted(self.cells, [rows.start * self.width, rows.stop * self.width]))
+        row, column = np.divmod(self.cells[in_rows], self.width)
+        is_read = (column >= columns.start) & (column < columns.stop)
+        read[:, row[is_read] - rows.start, column[is_read] - columns.start] = self.values[:, in_rows][
+            :, is_read
+        ]
         return read
 
 
 def lay_out(log: DriveLog, ground: Raster, crs: Any, bounds: Any) -> DriveLog:
-    """Moves positions into the CRS of the maps, as metres from the south-west corner of the elevation model.
+    """Move positions into the CRS of the maps, as metres from the south-west corner of the elevation model.
 
     Args:
         log: with positions as they were logged.
@@ -72,33 +75,46 @@ def lay_out(log: DriveLog, ground: Raster, crs: Any, bounds: Any) -> DriveLog:
         The log with the rows that lie on it.
 
     Raises:
-        DatasetError: none does, or the log is in a CRS that is not in metres.
+        DatasetError: If none does, or the log is in a CRS that is not in metres.
     """
-    own, path = ground.file.crs, log.settings.file
-    if not log.is_geographic and not (own.is_projected and own.linear_units_factor[1] == 1):
+    ground_crs, path = ground.file.crs, log.settings.file
+    if not log.is_geographic and not (ground_crs.is_projected and ground_crs.linear_units_factor[1] == 1):
         raise DatasetError(
             f"Expected positions as longitude_deg and latitude_deg in {path}, since the CRS of {ground.name}, "
-            f"{own.to_string()[:80]}, is not in metres, got x_m and y_m. Log them in WGS 84."
+            f"{ground_crs.to_string()[:80]}, is not in metres, got x_m and y_m. Log them in WGS 84."
         )
-    there = transformed("EPSG:4326" if log.is_geographic else own, crs, log.rows["x"], log.rows["y"])
-    x, y = there - np.array([[bounds.left], [bounds.bottom]])
-    off = ~((x >= 0) & (y >= 0) & (x < bounds.right - bounds.left) & (y < bounds.top - bounds.bottom))
+    source_crs = "EPSG:4326" if log.is_geographic else ground_crs
+    corner = np.array([[bounds.left], [bounds.bottom]])
+    x, y = positions = transformed(source_crs, crs, log.rows["x"], log.rows["y"]) - corner
+    off = ~_is_within(positions, bounds)
     if off.all():
         left, bottom, right, top = ground.file.bounds
         (west, east), (south, north) = (log.rows[name].agg(["min", "max"]) for name in ("x", "y"))
+        names = PLACES["WGS 84" if log.is_geographic else "crs"]
+        columns = " and ".join(f"`{name}`" for name in names)
+        remedy = f"Convert {columns} to degrees in WGS 84." if log.is_geographic else _PROJECT
+        swapped = transformed(source_crs, crs, log.rows["y"], log.rows["x"]) - corner
+        if _is_within(swapped, bounds).any():
+            remedy = f"Swap {columns}."
         raise DatasetError(
             f"Expected positions on {ground.name}, which covers x {left:.9g} to {right:.9g} and y {bottom:.9g} to "
-            f"{top:.9g} of {own.to_string()[:80]}, got x {west:.9g} to {east:.9g} and y {south:.9g} to {north:.9g} in "
-            f"{path}. Give x_m and y_m in that CRS, or longitude_deg and latitude_deg."
+            f"{top:.9g} of {ground_crs.to_string()[:80]}, got {names[0]} {west:.9g} to {east:.9g} and {names[1]} "
+            f"{south:.9g} to {north:.9g} in {path}. {remedy}"
         )
     return replace(log, rows=log.rows.assign(x=x, y=y)).without("off_dem", off)
 
 
+def _is_within(positions_m: ndarray, bounds: Any) -> ndarray:
+    """Return whether positions from the south-west corner lie on the elevation model, bool, shape [N]."""
+    size = np.array([[bounds.right - bounds.left], [bounds.top - bounds.bottom]])
+    return np.all((positions_m >= 0) & (positions_m < size), axis=0)
+
+
 def check_enough(log: DriveLog, splits: Sequence[str]) -> None:
-    """Refuses a log of fewer drives than splits.
+    """Require a drive for each split.
 
     Raises:
-        DatasetError: it is.
+        DatasetError: If the log has fewer drives.
     """
     drives = log.rows["drive"].nunique()
     if drives < len(splits):
@@ -124,15 +140,15 @@ def elevation_under(log: DriveLog, layer: Layer, row: ndarray, column: ndarray) 
     elevation_m = np.full(len(row), np.nan)
     block = np.floor(np.clip(row, 0, height - 1) / _BLOCK_CELLS).astype(np.int64)
     for start in np.unique(block) * _BLOCK_CELLS:
-        own = block == start // _BLOCK_CELLS
+        is_in_block = block == start // _BLOCK_CELLS
         cells = layer.read(range(start, min(start + _BLOCK_CELLS, height)), range(width))[0]
-        places = row[own] - start + 1, column[own] + 1  # of cells that are framed by one
-        elevation_m[own] = ndimage.map_coordinates(cells, places, order=1, cval=np.nan)
+        positions = row[is_in_block] - start + 1, column[is_in_block] + 1  # cells are padded by one
+        elevation_m[is_in_block] = ndimage.map_coordinates(cells, positions, order=1, cval=np.nan)
     return elevation_m
 
 
 def drive_over(log: DriveLog, tiling: Tiling, row: ndarray, column: ndarray) -> tuple[DriveLog, DrivenCells]:
-    """Gives each drive to a split and takes the mean of λ over the rows on each cell.
+    """Assign each drive to a split and take the mean of λ over the rows on each cell.
 
     Args:
         log: the drives.
@@ -144,7 +160,7 @@ def drive_over(log: DriveLog, tiling: Tiling, row: ndarray, column: ndarray) -> 
         The log with the rows that are used, and what they say of the cells.
 
     Raises:
-        DatasetError: no drive is left for a split.
+        DatasetError: If no drive is left for a split.
     """
     rows = log.rows.assign(row=row, column=column, split=tiling.split_of(row, column))
     log = replace(log, rows=rows)
@@ -161,31 +177,34 @@ def drive_over(log: DriveLog, tiling: Tiling, row: ndarray, column: ndarray) -> 
 
 
 def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
-    """What the manifest says of the log that `drive_over` gives: what of it was used and left out."""
-    own = {split: log.rows[log.rows["split"] == place] for place, split in enumerate(splits)}
+    """Return the manifest's entry on a log from `drive_over`: what was used and what was left out."""
+    by_split = {split: log.rows[log.rows["split"] == index] for index, split in enumerate(splits)}
     return {
         "file": Path(log.settings.file).name,
         "sha256": log.sha256,
         "least_speed_m_s": log.settings.least_speed,
         "ratio_limits": list(RATIO_LIMITS),
         "rows": len(log.rows) + sum(log.left_out.values()),
-        "used": {split: len(rows) for split, rows in own.items()},
+        "used": {split: len(rows) for split, rows in by_split.items()},
         "left_out": {reason: log.left_out[reason] for reason in REASONS if reason in log.left_out},
         "beyond": {
             "below_0": int((log.rows["traversability"] < 0).sum()),
             "above_1": int((log.rows["traversability"] > 1).sum()),
+            "above_1.2": int((log.rows["traversability"] > OVER_SPEED).sum()),
         },
         "drives": {
-            split: [log.names[one] for one in np.unique(rows["drive"])] for split, rows in own.items()
+            split: [log.names[drive] for drive in np.unique(rows["drive"])]
+            for split, rows in by_split.items()
         },
         "speed": log.settings.speed,
         "pace": log.motion.get("pace"),
         "commanded_pace": log.motion.get("commanded_pace"),
+        "standing": log.motion.get("standing", 0),
     }
 
 
 def _owners(log: DriveLog, splits: Sequence[str]) -> ndarray:
-    """The split of each drive, index into the splits, shape [D]: as many rows as can be used, and none without a drive.
+    """Return the split of each drive, index into the splits, shape [D].
 
     Every split gets a drive for which the fewest rows are lost by that; the others go where most of their rows lie.
     """

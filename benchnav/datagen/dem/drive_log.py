@@ -8,7 +8,7 @@ Letters in shapes: N rows that are used.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +24,8 @@ LEAST_SPEED_M_S = 0.1
 MOST_SPEED_M_S = 15.0  # off-road robots are slower, unless they are logged in km/h or cm/s
 TOP_RATIO = 1.5  # of a speed to the top command, which no robot exceeds (choice)
 _MOVES = ("commanded_m_s", "measured_m_s")
-_PLACES = {"crs": ("x_m", "y_m"), "WGS 84": ("longitude_deg", "latitude_deg")}
+OVER_SPEED = 1.2  # of the command; noise and downhill driving seldom exceed it (choice)
+PLACES = {"crs": ("x_m", "y_m"), "WGS 84": ("longitude_deg", "latitude_deg")}
 
 # Why rows are left out, in the order of the checks.
 REASONS = {
@@ -58,7 +59,7 @@ class Drives:
     speed: Literal["", "positions", "measured"] = ""
 
     def __post_init__(self) -> None:
-        """Checks the settings."""
+        """Validate the settings."""
         expect(
             self.file.endswith(ENDINGS),
             f"`drives` to end in one of {', '.join(ENDINGS)}, got {self.file!r}. Write such a table, with a header.",
@@ -72,10 +73,10 @@ class Drives:
 
 @dataclass(frozen=True, kw_only=True)
 class DriveLog:
-    """What is used of a log.
+    """The used rows of a log.
 
     Args:
-        settings: the file, and what of it is used.
+        settings: the file, and which rows of it are used.
         sha256: of the file.
         names: of its drives.
         is_geographic: whether positions are longitude and latitude; else they are in the elevation model's CRS.
@@ -99,14 +100,14 @@ class DriveLog:
         return self.rows[["y", "x"]].to_numpy()
 
     def without(self, reason: str, which: ndarray) -> "DriveLog":
-        """Leaves rows out.
+        """Leave rows out.
 
         Args:
             reason: why, one of `REASONS`.
             which: bool, shape [N].
 
         Raises:
-            DatasetError: all that were left.
+            DatasetError: If no row is left.
         """
         left_out = {**self.left_out, reason: int(which.sum())}
         if which.all():
@@ -116,8 +117,8 @@ class DriveLog:
                 f"{sum(left_out.values())}, {', '.join(several)}. Log time, position and both speeds on "
                 "the move."
             )
-        about = {**vars(self), "rows": self.rows[~which].reset_index(drop=True), "left_out": left_out}
-        return DriveLog(**about)
+        rows = self.rows[~which].reset_index(drop=True)
+        return replace(self, rows=rows, left_out=left_out)
 
 
 def read_drives(drives: Drives) -> DriveLog:
@@ -126,16 +127,16 @@ def read_drives(drives: Drives) -> DriveLog:
     With `speed` of `positions` the log needs no measured speed.
 
     Raises:
-        DatasetError: there is no such file, it cannot be read, lacks a column, holds what is no number, has speeds of
+        DatasetError: If the file is missing, cannot be read, lacks a column, contains what is no number, has speeds in
             another unit, or no row is left.
     """
     path = Path(drives.file)
     rows = read_log(path)
-    kind = "WGS 84" if set(_PLACES["WGS 84"]) <= set(rows) and not set(_PLACES["crs"]) <= set(rows) else "crs"
+    kind = "WGS 84" if set(PLACES["WGS 84"]) <= set(rows) and not set(PLACES["crs"]) <= set(rows) else "crs"
     moves = _MOVES[:1] if drives.speed == "positions" else _MOVES
-    columns = ("time_s", *_PLACES[kind], *moves)
+    columns = ("time_s", *PLACES[kind], *moves)
     remedy = "Name positions x_m and y_m, or longitude_deg and latitude_deg for WGS 84."
-    if set(_PLACES[kind]) <= set(rows):
+    if set(PLACES[kind]) <= set(rows):
         remedy = (
             "Log speed over ground, or pass --speed positions."
             if set(_MOVES) - set(rows) == {"measured_m_s"}
@@ -143,7 +144,10 @@ def read_drives(drives: Drives) -> DriveLog:
         )
     require_columns(rows, columns, path, remedy)
     limits = {"longitude_deg": (-180.0, 360.0), "latitude_deg": (-90.0, 90.0)}
-    values = {name: read_numbers(rows, name, path, limits.get(name, (-np.inf, np.inf))) for name in columns}
+    remedy = "Swap `longitude_deg` and `latitude_deg`, or convert to degrees."
+    values = {}
+    for name in columns:
+        values[name] = read_numbers(rows, name, path, limits.get(name, (-np.inf, np.inf)), remedy)
     for name in moves:
         moving = np.abs(values[name])
         usual = pd.Series(moving[moving >= drives.least_speed]).median()
@@ -155,7 +159,7 @@ def read_drives(drives: Drives) -> DriveLog:
     names, drive = np.array([path.name]), np.zeros(len(rows), dtype=np.int64)
     if "drive" in rows:
         names, drive = np.unique(read_names(rows, "drive", path), return_inverse=True)
-    x, y = (values[name] for name in _PLACES[kind])
+    x, y = (values[name] for name in PLACES[kind])
     unmeasured = np.full(len(rows), np.nan)
     if drives.speed == "positions" and "measured_m_s" in rows:  # only for the comparison
         unmeasured = read_numbers(rows, "measured_m_s", path, (-np.inf, np.inf))

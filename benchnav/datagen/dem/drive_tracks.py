@@ -3,6 +3,7 @@
 A *track* is the rows of a log, ordered by drive and time. A *segment* is a part of it without a gap. A *fix* is its
 rows of one position, since logs repeat a position until the receiver gives the next. Distances are horizontal, in
 metres.
+
 Letters in shapes: N rows.
 """
 
@@ -19,6 +20,8 @@ _GAP_S = 1.0  # without a row, after which nothing is said of the motion between
 _FREEZE_FIXES = 3  # periods of positions that one may stay the same (choice)
 _STRAIGHT_COS = 0.9  # between neighbouring spans, so that a chord is at most 1 % shorter than its arc
 _SLIDES_COS = -0.5  # between rows of one command; no robot turns by over 120° at once (choice)
+_CLEAR_ERRORS = 5.0  # standard errors of a velocity whose direction counts (choice)
+_MAX_REST_WINDOWS = 2.0  # without such a velocity, after which a robot may have turned (choice)
 _ROWS_AT_ONCE = 4096
 
 
@@ -47,6 +50,9 @@ def _length_m(rows: pd.DataFrame) -> pd.Series:
 def track_of(rows: pd.DataFrame) -> pd.DataFrame:
     """Order rows by drive and time.
 
+    Args:
+        rows: of a log.
+
     Returns:
         The rows with their index, and with `step_s` since the row before (0 after a gap), `segment` and `fix`.
     """
@@ -64,31 +70,61 @@ def _fixes(track: pd.DataFrame) -> pd.DataFrame:
     return grouped.first().assign(rows=grouped.size())
 
 
-def find_frozen(track: pd.DataFrame, speed: str, least_speed: float) -> pd.Index:
-    """Find rows of a position that stays the same for more than three fixes while the robot moves.
+def _period_s(fixes: pd.DataFrame) -> pd.Series:
+    """Return the usual time between fixes of the drive of each fix, 0 for a drive of one fix."""
+    drive = fixes["drive"]
+    return fixes.groupby("drive")["time_s"].diff().groupby(drive).transform("median").fillna(0)
 
+
+def _knots(track: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows at which a position is measured: the first of each fix and segment, and repeats of a long fix.
+
+    A position that stays the same for more than three fixes is that of a robot at rest, measured once a period.
+    """
+    fixes = _fixes(track)
+    period_s = _period_s(fixes)[track["fix"]].to_numpy()
+    since_s = track["time_s"] - fixes["time_s"][track["fix"]].to_numpy()
+    is_long = since_s.groupby(track["fix"]).transform("max") > np.maximum(_FREEZE_FIXES * period_s, _GAP_S)
+    repeat = np.floor(since_s / np.where(period_s > 0, period_s, 1e-9) + 1e-6).where(is_long, 0)
+    return track[~track[["segment", "fix"]].assign(repeat=repeat).duplicated()]
+
+
+def find_standing(track: pd.DataFrame, least_speed: float, *, by_positions: bool) -> pd.DataFrame:
+    """Find rows of a position that stays the same for more than three fixes under a command.
+
+    The receiver is frozen if the robot moves on. Measured speed says so, and so does a next position that is far away.
     A robot that stands still under its command is immobilised, which is no fault.
 
     Args:
-        track: as of `track_of`.
-        speed: column of the speed by which the robot moves.
+        track: from `track_of`; `speed` is NaN where it was not measured.
         least_speed: m/s, of commands that count and of a robot that moves.
+        by_positions: whether the next position must be far away too.
 
     Returns:
-        Their labels, without the first row of each such fix.
+        Masks by the track's index, without the first row of each such fix: `is_frozen`; `is_unmeasured`, immobilised by
+        positions only; `is_unknown`, the part of them without a next position either.
     """
     fixes = _fixes(track)
-    by_drive = fixes.groupby("drive")
-    period_s = by_drive["time_s"].diff().groupby(fixes["drive"]).transform("median").fillna(0)
+    by_drive, period_s = fixes.groupby("drive"), _period_s(fixes)
     step_m = np.hypot(by_drive["x"].diff(), by_drive["y"].diff())
-    step_m = step_m.groupby(fixes["drive"]).transform("median").fillna(0)
+    usual_m = step_m.groupby(fixes["drive"]).transform("median").fillna(0)
     repeats = track["fix"].diff() == 0
     counts = repeats & (track["commanded"].abs() >= least_speed)
     still_s = track["step_s"].where(counts, 0).groupby(track["fix"]).sum()
-    by_speed_m = (track[speed] * track["step_s"]).where(counts, 0).groupby(track["fix"]).sum().abs()
-    is_frozen = still_s > np.maximum(_FREEZE_FIXES * period_s, _GAP_S)
-    is_frozen &= by_speed_m >= np.maximum(_FREEZE_FIXES * step_m, least_speed * still_s)
-    return track.index[repeats.to_numpy() & is_frozen[track["fix"]].to_numpy()]
+    distance_m = (track["speed"] * track["step_s"]).where(counts)
+    measured_m = distance_m.groupby(track["fix"]).sum(min_count=1).abs()
+    next_m = step_m.groupby(fixes["drive"]).shift(-1)
+    moving_m = np.maximum(_FREEZE_FIXES * usual_m, least_speed * still_s)
+    is_still = still_s > np.maximum(_FREEZE_FIXES * period_s, _GAP_S)
+    is_unmeasured = is_still & measured_m.isna()
+    is_unknown = is_unmeasured & next_m.isna()
+    is_frozen = is_still & ~is_unknown & ~(measured_m < moving_m)
+    if by_positions:
+        is_frozen &= ~(next_m < moving_m)
+    masks = pd.DataFrame(
+        {"is_frozen": is_frozen, "is_unmeasured": is_unmeasured & ~is_frozen, "is_unknown": is_unknown}
+    )
+    return masks.loc[track["fix"]].set_axis(track.index).where(repeats, False)
 
 
 def find_jumped(track: pd.DataFrame, limit_m_s: float) -> pd.Index:
@@ -98,37 +134,37 @@ def find_jumped(track: pd.DataFrame, limit_m_s: float) -> pd.Index:
     of the last right one. Over less than a second noise may exceed the reach, so that a second counts.
 
     Args:
-        track: as of `track_of`.
+        track: from `track_of`.
         limit_m_s: speed that a robot cannot exceed.
 
     Returns:
         Their labels.
     """
     fixes, jumped = _fixes(track), []
-    for _, own in fixes.groupby("drive"):
-        time, x, y = (own[name].to_numpy() for name in ("time_s", "x", "y"))
+    for _, drive in fixes.groupby("drive"):
+        time, x, y = (drive[name].to_numpy() for name in ("time_s", "x", "y"))
         reach_m = limit_m_s * np.maximum(np.diff(time), _GAP_S)
         breaks = np.hypot(np.diff(x), np.diff(y)) > reach_m
         if not breaks.any():
             continue
         stretch = np.concatenate([[0], np.cumsum(breaks)])
-        is_right = stretch == np.bincount(stretch, own["rows"]).argmax()
+        is_right = stretch == np.bincount(stretch, drive["rows"]).argmax()
         first, last = np.flatnonzero(is_right)[[0, -1]]
-        for anchor, others in ((last, range(last + 1, len(own))), (first, range(first - 1, -1, -1))):
+        for anchor, others in ((last, range(last + 1, len(drive))), (first, range(first - 1, -1, -1))):
             right = anchor
             for fix in others:
                 away_m = math.hypot(x[fix] - x[right], y[fix] - y[right])
                 if away_m <= limit_m_s * max(abs(time[fix] - time[right]), _GAP_S):
                     is_right[fix], right = True, fix
-        jumped.append(own.index[~is_right])
+        jumped.append(drive.index[~is_right])
     return track.index[track["fix"].isin(np.concatenate(jumped))] if jumped else track.index[:0]
 
 
 def spans_of(track: pd.DataFrame, least_speed: float) -> pd.DataFrame:
-    """Sum up motion under command over spans of two seconds, longer where positions come more seldom.
+    """Sum up motion under command over spans of two seconds, or from fix to fix where those are more seldom.
 
     Args:
-        track: as of `track_of`; with `z`, elevation in metres, too for slopes.
+        track: from `track_of`; with `z`, elevation in metres, too for slopes.
         least_speed: m/s, of the command of spans that count.
 
     Returns:
@@ -136,32 +172,34 @@ def spans_of(track: pd.DataFrame, least_speed: float) -> pd.DataFrame:
         `commanded` (metres by speed), `is_moving`, `is_straight`, `is_steady` (one command), perhaps `slope_deg` along
         the track.
     """
-    period_s = _fixes(track).groupby("drive")["time_s"].diff().median()
+    knots = _knots(track)
+    period_s = knots.groupby("segment")["time_s"].diff().median()
     times = track.groupby("drive")["time_s"]
     longest_s = (times.max() - times.min()).max()
-    window_s = max(WINDOW_S, 4 * period_s) if period_s > 0 else WINDOW_S
+    window_s = np.fmax(WINDOW_S, period_s)
     if 0 < longest_s < MIN_SPANS * window_s:  # perhaps hours: their ratio says so
         window_s = longest_s / MIN_SPANS
     sums = {}
     for name, column in (("measured", "speed"), ("commanded", "commanded")):
         sums[name] = (track[column] * track["step_s"]).groupby(track["segment"]).cumsum()
-    table = track.assign(span=np.floor(track["time_s"] / window_s), command=track["commanded"], **sums)
-    grouped = table.groupby(["segment", "span"])
-    # A span reaches from its first row to that of the next one.
-    firsts, commands = grouped.first(), grouped["command"].agg(["min", "max"])
-    ways = firsts[[*sums, "x", "y", "time_s", *{"z"}.intersection(firsts)]].groupby("segment").diff(-1)
-    moved = np.hypot(ways["x"], ways["y"])
-    after = ways.groupby("segment").shift(-1)
-    cosine = (ways["x"] * after["x"] + ways["y"] * after["y"]) / (moved * np.hypot(after["x"], after["y"]))
+    span = np.floor(knots["time_s"] / window_s).reindex(track.index).ffill()  # of the last position
+    table = track.assign(span=span, command=track["commanded"], **sums)
+    # A span reaches from its first measured position to that of the next one.
+    firsts = table.loc[knots.index].groupby(["segment", "span"]).first()
+    commands = table.groupby(["segment", "span"])["command"].agg(["min", "max"])
+    steps = firsts[[*sums, "x", "y", "time_s", *{"z"}.intersection(firsts)]].groupby("segment").diff(-1)
+    moved = np.hypot(steps["x"], steps["y"])
+    after = steps.groupby("segment").shift(-1)
+    cosine = (steps["x"] * after["x"] + steps["y"] * after["y"]) / (moved * np.hypot(after["x"], after["y"]))
     before = cosine.groupby("segment").shift(1)
-    spans = pd.DataFrame({"drive": firsts["drive"], "duration_s": -ways["time_s"], "moved": moved})
-    spans = spans.assign(**{name: ways[name].abs() for name in sums})
+    spans = pd.DataFrame({"drive": firsts["drive"], "duration_s": -steps["time_s"], "moved": moved})
+    spans = spans.assign(**{name: steps[name].abs() for name in sums})
     least_m = least_speed * spans["duration_s"]
     spans["is_moving"] = np.fmax(moved, spans["measured"]) >= least_m
     spans["is_straight"] = (cosine.fillna(1) > _STRAIGHT_COS) & (before.fillna(1) > _STRAIGHT_COS)
     spans["is_steady"] = commands["min"] == commands["max"]
-    if "z" in ways:
-        spans["slope_deg"] = np.degrees(np.arctan2(-ways["z"], moved))
+    if "z" in steps:
+        spans["slope_deg"] = np.degrees(np.arctan2(-steps["z"], moved))
     return spans[spans["commanded"] >= least_m]
 
 
@@ -172,65 +210,91 @@ def velocity_of(track: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
     simplified least squares procedures".
 
     Args:
-        track: as of `track_of`.
+        track: from `track_of`.
         columns: of coordinates, in metres.
 
     Returns:
-        Derivatives in m/s by the track's index; NaN where fixes do not reach over half of the time.
+        A table by the track's index: derivatives in m/s, NaN where fixes do not reach over half of the time; `error`,
+        their standard error in m/s, from the scatter of these fixes and at least from that of the drive; `window_s`.
     """
-    velocity = pd.DataFrame(np.nan, index=track.index, columns=columns)
-    for _, own in track.groupby("segment"):
-        fixes = _fixes(own)
-        time_s, values = fixes["time_s"].to_numpy(), fixes[columns].to_numpy()
-        period_s = np.median(np.diff(time_s)) if len(time_s) > 1 else 0.0
-        half_s = max(WINDOW_S, 3 * period_s) / 2
-        for start in range(0, len(own), _ROWS_AT_ONCE):
-            rows = own.iloc[start : start + _ROWS_AT_ONCE]
-            now_s = rows["time_s"].to_numpy()
-            slack_s = 1e-6 * half_s  # times are decimal fractions
-            low = np.searchsorted(time_s, now_s - half_s - slack_s)
-            high = np.searchsorted(time_s, now_s + half_s + slack_s)
-            index = low[:, None] + np.arange((high - low).max(initial=1))
-            is_near = index < high[:, None]
-            index = np.minimum(index, len(time_s) - 1)
-            reach_s = time_s[np.maximum(high - 1, 0)] - time_s[np.minimum(low, len(time_s) - 1)]
-            count = is_near.sum(axis=1, keepdims=True).clip(min=1)
-            offset_s = np.where(is_near, time_s[index], 0)
-            offset_s = np.where(is_near, offset_s - offset_s.sum(axis=1, keepdims=True) / count, 0)
-            # The offsets sum to 0, so that a constant of the values does not count; less of it rounds less.
-            near = values[index] - values[index[:, :1]]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                slopes = np.einsum("nk,nkc->nc", offset_s, near)
-                slopes /= np.square(offset_s).sum(axis=1, keepdims=True)
-            velocity.loc[rows.index] = np.where((reach_s >= half_s - slack_s)[:, None], slopes, np.nan)
-    return velocity
+    fits = [pd.DataFrame(columns=[*columns, "error", "window_s"], dtype=float)]
+    marked = track.assign(is_knot=track.index.isin(_knots(track).index))
+    for _, drive in marked.groupby("drive"):
+        fit = pd.concat([_fit(rows, rows[rows["is_knot"]], columns) for _, rows in drive.groupby("segment")])
+        freedom = ((fit["count"] - 2) * len(columns)).where((fit["count"] > 2) & fit["residual"].notna())
+        usual = fit["residual"].sum() / max(freedom.sum(), 1)
+        variance = np.fmax(fit["residual"] / freedom, usual)
+        fits.append(fit.assign(error=np.sqrt(variance / fit["spread_s2"]))[fits[0].columns])
+    return pd.concat(fits[1:] or fits).reindex(track.index)
+
+
+def _fit(rows: pd.DataFrame, knots: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
+    """Fit lines through the knots around each row of a segment.
+
+    Returns:
+        A table by the rows' index: slopes; `count` of knots; `residual`, the sum of squares in m² over the columns;
+        `spread_s2`, the sum of squares of times about their mean; `window_s`.
+    """
+    time_s, values = knots["time_s"].to_numpy(), knots[columns].to_numpy()
+    period_s = np.median(np.diff(time_s)) if len(time_s) > 1 else 0.0
+    half_s = max(WINDOW_S, 3 * period_s) / 2
+    slack_s = 1e-6 * half_s  # times are decimal fractions
+    fits = []
+    for start in range(0, len(rows), _ROWS_AT_ONCE):
+        now_s = rows["time_s"].to_numpy()[start : start + _ROWS_AT_ONCE]
+        low = np.searchsorted(time_s, now_s - half_s - slack_s)
+        high = np.searchsorted(time_s, now_s + half_s + slack_s)
+        index = low[:, None] + np.arange((high - low).max(initial=1))
+        is_near = index < high[:, None]
+        index = np.minimum(index, len(time_s) - 1)
+        reach_s = time_s[np.maximum(high - 1, 0)] - time_s[np.minimum(low, len(time_s) - 1)]
+        count = is_near.sum(axis=1, keepdims=True)
+        offset_s = np.where(is_near, time_s[index], 0)
+        offset_s = np.where(is_near, offset_s - offset_s.sum(axis=1, keepdims=True) / count.clip(min=1), 0)
+        # The offsets sum to 0, so that a constant of the values does not count; less of it rounds less.
+        near = values[index] - values[index[:, :1]]
+        near = np.where(is_near[..., None], near, 0)
+        spread_s2 = np.square(offset_s).sum(axis=1, keepdims=True)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slopes = np.einsum("nk,nkc->nc", offset_s, near) / spread_s2
+        slopes = np.where((reach_s >= half_s - slack_s)[:, None], slopes, np.nan)
+        middle = near.sum(axis=1, keepdims=True) / count.clip(min=1)[..., None]
+        misfit = near - middle - slopes[:, None, :] * offset_s[..., None]
+        residual = np.square(np.where(is_near[..., None], misfit, 0)).sum(axis=(1, 2))
+        fits.append(np.column_stack([slopes, count, residual, spread_s2]))
+    table = pd.DataFrame(np.concatenate(fits), rows.index, [*columns, "count", "residual", "spread_s2"])
+    return table.assign(window_s=2 * half_s)
 
 
 def speed_of_positions(track: pd.DataFrame, least_speed: float) -> pd.Series:
     """Return the speed along the robot from its positions.
 
-    Positions have no heading, so that of the command counts: a robot moves as commanded. Where its track reverses from
-    one row to the next under one command, it slides back until the track reverses again.
+    Positions have no heading, so that of the command counts: a robot moves as commanded. Where its track reverses
+    under one command, it slides back until the track reverses again. Only velocities of at least five standard errors
+    have a direction, since noise turns that of a robot at rest. After a rest of more than two windows of the fit, the
+    robot moves as commanded again.
 
     Args:
-        track: as of `track_of`.
+        track: from `track_of`.
         least_speed: m/s, of commands that count; slower ones may turn the robot round.
 
     Returns:
         Speed in m/s, signed as the command, by the track's index; NaN where `velocity_of` is.
     """
-    sign = np.sign(track["commanded"])
-    toward = velocity_of(track, ["x", "y"]).mul(sign, axis=0)
+    sign, fit = np.sign(track["commanded"]), velocity_of(track, ["x", "y"])
+    toward = fit[["x", "y"]].mul(sign, axis=0)
     speed = np.hypot(toward["x"], toward["y"])
     is_slow = track["commanded"].abs() < least_speed
     block = (is_slow | (track["segment"].diff() != 0)).cumsum()
-    moving = toward[~is_slow & (speed >= least_speed / 2)]
-    unit = moving.div(speed[moving.index], axis=0)
-    own = block[moving.index]
-    turn = (unit * unit.groupby(own).shift(1)).sum(axis=1, min_count=2)
-    backward = ((turn < _SLIDES_COS).groupby(own).cumsum() % 2).astype(bool)
-    # A block may start by sliding, but robots are not logged sliding most of the time.
-    mostly = backward.groupby(own).transform("mean") > 0.5
+    is_clear = ~is_slow & (speed >= np.fmax(least_speed / 2, _CLEAR_ERRORS * fit["error"]))
+    rest_s = track["time_s"][is_clear].diff()
+    starts = (block[is_clear].diff() != 0) | (rest_s > _MAX_REST_WINDOWS * fit["window_s"][is_clear])
+    stretch = starts.cumsum()
+    unit = toward[is_clear].div(speed[is_clear], axis=0)
+    turn = (unit * unit.groupby(stretch).shift(1)).sum(axis=1, min_count=2)
+    backward = ((turn < _SLIDES_COS).groupby(stretch).cumsum() % 2).astype(bool)
+    # A stretch may start by sliding, but robots are not logged sliding most of the time.
+    mostly = backward.groupby(stretch).transform("mean") > 0.5
     is_back = (backward != mostly).reindex(track.index)
     is_back = is_back.groupby(block).ffill().fillna(False).astype(bool)
     return speed * sign * np.where(is_back, -1.0, 1.0)

@@ -22,7 +22,7 @@ _MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
 
 
 def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path, remedy: str = "") -> None:
-    """Check that a log has columns.
+    """Require columns of a log.
 
     Args:
         rows: of the log.
@@ -31,7 +31,7 @@ def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path, re
         remedy: what helps where the name of no other column is near, a sentence.
 
     Raises:
-        DatasetError: If it lacks one.
+        DatasetError: If one is missing.
     """
     names = [str(name) for name in rows.columns]
     if missing := [name for name in columns if name not in names]:
@@ -46,10 +46,10 @@ def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path, re
 
 
 def read_log(path: Path) -> pd.DataFrame:
-    """Reads a log, a file that ends in one of `ENDINGS`.
+    """Read a log, a file that ends in one of `ENDINGS`.
 
     Raises:
-        DatasetError: there is no such file, or it cannot be read.
+        DatasetError: If there is no such file, or it cannot be read.
     """
     try:
         if path.suffix == ".parquet":
@@ -76,42 +76,46 @@ def read_log(path: Path) -> pd.DataFrame:
         ) from error
 
 
-def read_numbers(rows: pd.DataFrame, name: str, path: Path, limits: tuple[float, float]) -> np.ndarray:
-    """Gives the numbers of a column, float64, NaN where missing, shape [N].
+def read_numbers(
+    rows: pd.DataFrame, name: str, path: Path, limits: tuple[float, float], remedy: str = ""
+) -> np.ndarray:
+    """Return the numbers of a column, float64, NaN where missing, shape [N].
 
     Args:
         rows: of a log.
         name: of the column.
         path: of the log.
-        limits: least and greatest value that may be.
+        limits: minimum and maximum.
+        remedy: what helps where all numbers are beyond the limits, a sentence.
 
     Raises:
-        DatasetError: a value is no number, not finite, or beyond the limits.
+        DatasetError: If a value is no finite number, or beyond the limits.
     """
-    column, (least, most) = rows[name], limits
+    column, (minimum, maximum) = rows[name], limits
     text = column if is_numeric_dtype(column) else column.astype("string").str.strip()
     values = pd.to_numeric(text, errors="coerce").to_numpy(np.float64, na_value=np.nan)
-    given = (text.notna() & ~text.isin(_MISSING)).to_numpy(bool)
-    bad = np.flatnonzero(given & ~((values >= least) & (values <= most) & np.isfinite(values)))
-    if len(bad):
-        within = f" within [{least:g}, {most:g}]" if np.isfinite(most) else ""
-        raise DatasetError(
-            f"Expected `{name}` to be numbers{within} in {path}, got {column.iloc[bad[0]]!s} in row "
-            f"{bad[0] + 1} below the header. "
-            + (
-                "Mend that row, or leave the value out."
-                if len(bad) < given.sum()
-                else "Convert the column to numbers."
+    is_given = (text.notna() & ~text.isin(_MISSING)).to_numpy(bool)
+    is_number = np.isfinite(values)
+    is_within = (values >= minimum) & (values <= maximum)
+    for expected, is_good, everywhere in (
+        ("to be numbers", is_number, "Convert the column to numbers."),
+        (f"within [{minimum:g}, {maximum:g}]", ~is_number | is_within, remedy or "Convert the column."),
+    ):
+        bad = np.flatnonzero(is_given & ~is_good)
+        if len(bad):
+            is_everywhere = len(bad) == is_given.sum()
+            raise DatasetError(
+                f"Expected `{name}` {expected} in {path}, got {column.iloc[bad[0]]!s} in row {bad[0] + 1} below the "
+                f"header. {everywhere if is_everywhere else 'Mend that row, or leave the value out.'}"
             )
-        )
     return values
 
 
 def read_names(rows: pd.DataFrame, name: str, path: Path) -> np.ndarray:
-    """Gives the names of a column, such as those of classes or drives, as text, shape [N].
+    """Return the names of a column, such as those of classes or drives, as text, shape [N].
 
     Raises:
-        DatasetError: a row has none.
+        DatasetError: If a row has none.
     """
     text = rows[name].astype("string").str.strip().fillna("")
     absent = text.index[text == ""]

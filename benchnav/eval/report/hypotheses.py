@@ -1,18 +1,19 @@
 """What a run says of the hypotheses that were fixed before it: sentences, and their table."""
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from benchnav.core.resampling import LEAST_MAPS
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.hypotheses import Hypothesis
-from benchnav.eval.report.words import NOT_YET, count_range, p_in_words, p_value, reading_names, signed
-from benchnav.eval.stats.comparison import ALPHA
+from benchnav.eval.report.words import NOT_YET, count_range, p_in_words, reading_names
+from benchnav.stats.bootstrap import LEAST_MAPS
+from benchnav.stats.holm import ALPHA
+from benchnav.stats.tables import Column, p_value, signed, table_of
 
 _TESTS = {
     "difference": "sign-flip test by {unit} (difference)",
@@ -49,34 +50,40 @@ def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
         tests: from `hypotheses.test_hypotheses`.
         unit: of the statistics, from `words.unit_of_statistics`.
     """
-    headings = ("", "hypothesis", f"{unit}s", "values", "difference", "interval", "p", "result")
-    rows = tuple(
-        (
-            str(number),
-            _claim(row),
-            str(row["n_maps"]),
-            f"{_value(row['mean_one'])} : {_value(row['mean_other'])}",
-            _with_unit(row),
-            _interval(row),
-            NOT_USED if np.isnan(row["p_holm"]) else p_value(row["p_holm"]),
-            Bold(_verdict(row)) if row["supported"] else _verdict(row),
-        )
-        for number, row in enumerate(tests.to_dict("records"), start=1)
-    )
     used = "; ".join(words for kind, words in _TESTS.items() if (tests["kind"] == kind).any())
     family = "1 hypothesis" if len(tests) == 1 else f"{len(tests)} hypotheses"
     notes = [
         f"Tests: {used.format(unit=unit)}; p is corrected over {family} (Holm). Supported: p < {ALPHA}.",
         "Intervals are of one difference and not corrected, so that an interval and p can disagree.",
     ]
-    explained = [
-        ("values", "of the first condition and of the second."),
-        (
+    rows = [{**row, "number": number} for number, row in enumerate(tests.to_dict("records"), start=1)]
+    columns = [
+        Column("", lambda row: str(row["number"])),
+        Column("hypothesis", _claim),
+        Column(f"{unit}s", lambda row: str(row["n_maps"])),
+        Column(
+            "values",
+            lambda row: f"{_value(row['mean_one'])} : {_value(row['mean_other'])}",
+            "of the first condition and of the second.",
+        ),
+        Column("difference", _with_unit),
+        Column(
             "interval",
+            _interval,
             "95 % for a difference; 90 % for a margin, where the end beyond the margin decides the test before the "
             f"correction. Under {LEAST_MAPS} {unit}s success alone has an interval.",
         ),
+        Column("p", lambda row: NOT_USED if np.isnan(row["p_holm"]) else p_value(row["p_holm"])),
+        Column("result", lambda row: Bold(_verdict(row)) if row["supported"] else _verdict(row)),
     ]
+    table = table_of(
+        rows,
+        columns,
+        labels=2,
+        notes=tuple(notes),
+        bold_note="supported." if tests["supported"].any() else "",
+    )
+    explained = []
     if ((tests["metric"] == "T_total") & (tests["kind"] == "difference")).any():
         explained.append(
             (
@@ -87,10 +94,7 @@ def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
         )
     if (tests["metric"] == "path_length").any():
         explained.append(("path length", "over the episodes in which both arrived."))
-    return Table(
-        headings=headings, labels=2, rows=rows, notes=tuple(notes), explained=tuple(explained),
-        bold_note="supported." if tests["supported"].any() else "",
-    )  # fmt: skip
+    return replace(table, explained=(*table.explained, *explained))
 
 
 def _claim(row: Mapping[Any, Any]) -> str:

@@ -4,6 +4,7 @@ Source of the first two: Endo, Honda and Ishigami (2024), Table I.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,17 +20,16 @@ from benchnav.eval.report.words import (
     maps_in_words,
     mean_and_std,
     naming_labels,
-    p_value,
     rate_in_words,
     reading_name,
-    short,
-    signed,
-    signed_interval,
     success_interval_in_words,
     unit_of_statistics,
 )
-from benchnav.eval.stats.best import FEWEST_MAPS, PRIVILEGED, competing
-from benchnav.eval.stats.comparison import ALPHA
+from benchnav.eval.stats.best import PRIVILEGED, competing
+from benchnav.stats.best import FEWEST_MAPS
+from benchnav.stats.bootstrap import LEAST_MAPS
+from benchnav.stats.holm import ALPHA
+from benchnav.stats.tables import Column, Row, cell_of, p_value, short, signed, signed_interval, table_of
 
 # What `follows` is where a planner follows the user's objective alone.
 _USERS_OWN = ("", "J")
@@ -55,7 +55,7 @@ _COLUMNS = {
     "Succ. [%]": "share of episodes that reached the goal.",
     "95 % interval": "Wilson's interval of the success rate, with maps as the unit.",
     "T_total [s]": "mean time to the goal, a failure counted as the time budget T, with its 95 % interval in brackets; "
-    f"no interval under {FEWEST_MAPS} maps.",
+    f"no interval under {LEAST_MAPS} maps.",
     "T if success [s]": "time of the episodes that reached the goal, mean ± standard deviation.",
     "λ̄ [%]": "mean observed λ of an episode, mean ± standard deviation over episodes.",
     ALONE: "planning time of a step of one robot alone, on one thread: median (95th percentile, maximum) over at most "
@@ -305,54 +305,75 @@ def _notes(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -
 
 
 def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
-    """Formats a comparison: success in percentage points, times in seconds, p after Holm's correction.
+    """Write a comparison: success in percentage points, times in seconds, p after Holm's correction.
 
     Args:
         table: from `comparison.compare`.
         difference: of success, that `maps_needed` is for.
         by: in what the conditions of a pair differ.
     """
-    shown = [name for name in (*LABELS, "run") if name in table and differ(table[name])]
-    counts = ["n_maps"] if table["n_maps"].nunique() > 1 else []
-    unit = "% of T" if "time_difference_share" in table else "s"
-    headings = (
-        *(*shown, by, "against"),
-        *("maps" for _ in counts),
-        *("Succ. [%]", "Δ [points]", "95 %", "p", "significant", "detectable"),
-        *(f"Δ T_total [{unit}]", "95 %", "p (ranks)"),
-        *("Δ T if both arrive [s]", "95 %", "on maps"),
-    )
-    rows = []
-    for row in table.to_dict("records"):
-        labels = [reading_name(name, row[name]) for name in shown]
-        labels += [reading_name(by, row[name]) for name in ("one", "other")]
-        rows.append((*labels, *(str(row[name]) for name in counts), *_differences(row)))
-    return Table(
-        headings=headings,
-        labels=len(shown) + 2,
-        rows=tuple(rows),
-        notes=_comparison_notes(table, difference),
-        explained=_comparison_columns(unit),
-    )
+    labels = [name for name in (*LABELS, "run") if name in table and differ(table[name])]
+    counts = [Column("maps", cell_of("n_maps", str))] if table["n_maps"].nunique() > 1 else []
+    scale, stored, unit = (100, "share", "% of T") if "time_difference_share" in table else (1, "s", "s")
+    share = "; in shares of each condition's own T, since T differs" if stored == "share" else ""
+    points, times, arrivals = (
+        "Δ [points], 95 %", f"Δ T_total [{unit}], 95 %", "Δ T if both arrive [s], 95 %, on maps"
+    )  # fmt: skip
+    columns = [
+        *(Column(name, cell_of(name, partial(reading_name, name))) for name in labels),
+        Column(by, cell_of("one", partial(reading_name, by))),
+        Column("against", cell_of("other", partial(reading_name, by))),
+        *counts,
+        Column(
+            "Succ. [%]",
+            lambda row: f"{short(100 * row['success_one'])} : {short(100 * row['success_other'])}",
+            "success rates of the two conditions.",
+        ),
+        *_difference_columns(
+            points, "success", "", 100, "difference of success, with the interval of Bonett and Price."
+        ),
+        Column(
+            "p",
+            cell_of("success_p_holm", p_value),
+            "sign-flip test by map (McNemar's exact test with one episode a map), Holm's correction.",
+        ),
+        Column("significant", cell_of("success_p_holm", lambda p: "yes" if p < ALPHA else "no"), f"p < {ALPHA}."),
+        Column(
+            "detectable",
+            cell_of("success_detectable", lambda value: f"{100 * value:.0f}" if value <= 1 else NOT_USED),
+            "minimum detectable difference of success [points] with 80 % power, for which the maps needed are counted "
+            "too; a dash where the maps are too few.",
+        ),
+        *_difference_columns(
+            times, "time", f"_{stored}", scale,
+            f"difference of the mean time, a failure counted as the time budget T{share}; a dash for an interval of "
+            f"fewer than {LEAST_MAPS} maps.",
+        ),
+        Column(
+            "p (ranks)",
+            cell_of("time_p_holm", p_value),
+            "Wilcoxon's signed-rank test of T_total, Holm's correction. It compares ranks and the interval is of the "
+            "mean, so that the two can disagree.",
+        ),
+        *_difference_columns(
+            arrivals, "arrival_time", "_s", 1,
+            "difference of time over the episodes in which both arrived. It is not tested: both conditions decide "
+            "which episodes these are.",
+        ),
+        Column("on maps", cell_of("arrival_time_n_maps", str)),
+    ]  # fmt: skip
+    notes = _comparison_notes(table, difference)
+    return table_of(table.to_dict("records"), columns, labels=len(labels) + 2, notes=notes)
 
 
-def _differences(row: Mapping[Any, Any]) -> tuple[str, ...]:
-    scale, unit = (100, "share") if "time_difference_share" in row else (1, "s")
-    late, low, high = (scale * row[f"time_{value}_{unit}"] for value in ("difference", "low", "high"))
-    return (
-        f"{short(100 * row['success_one'])} : {short(100 * row['success_other'])}",
-        signed(100 * row["success_difference"]),
-        signed_interval(100 * row["success_low"], 100 * row["success_high"]),
-        p_value(row["success_p_holm"]),
-        "yes" if row["success_p_holm"] < ALPHA else "no",
-        f"{100 * row['success_detectable']:.0f}" if row["success_detectable"] <= 1 else NOT_USED,
-        signed(late),
-        signed_interval(low, high),
-        p_value(row["time_p_holm"]),
-        signed(row["arrival_time_difference_s"]),
-        signed_interval(row["arrival_time_low_s"], row["arrival_time_high_s"]),
-        str(row["arrival_time_n_maps"]),
-    )
+def _difference_columns(title: str, name: str, unit: str, scale: float, meaning: str) -> list[Column]:
+    """Return the columns of a difference and of its interval, of one meaning."""
+
+    def ends(row: Row) -> str:
+        return signed_interval(scale * row[f"{name}_low{unit}"], scale * row[f"{name}_high{unit}"])
+
+    shown = cell_of(f"{name}_difference{unit}", lambda value: signed(scale * value))
+    return [Column(title.partition(",")[0], shown, meaning, title), Column("95 %", ends)]
 
 
 def _comparison_notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
@@ -366,34 +387,4 @@ def _comparison_notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]
     return (
         f"Tests by {unit}: signs of the difference (success) and ranks (T_total), p corrected over {pairs} (Holm).",
         f"Intervals are of means and not corrected: they can exclude 0 where p > {ALPHA}. {needed}",
-    )
-
-
-def _comparison_columns(unit: str) -> tuple[tuple[str, str], ...]:
-    share = "; in shares of each condition's own T, since T differs" if unit != "s" else ""
-    return (
-        ("Succ. [%]", "success rates of the two conditions."),
-        ("Δ [points], 95 %", "difference of success, with the interval of Bonett and Price."),
-        ("p", "sign-flip test by map (McNemar's exact test with one episode a map), Holm's correction."),
-        ("significant", f"p < {ALPHA}."),
-        (
-            "detectable",
-            "minimum detectable difference of success [points] with 80 % power, for which the maps needed are counted "
-            "too; a dash where the maps are too few.",
-        ),
-        (
-            f"Δ T_total [{unit}], 95 %",
-            f"difference of the mean time, a failure counted as the time budget T{share}; a dash for an interval of "
-            f"fewer than {FEWEST_MAPS} maps.",
-        ),
-        (
-            "p (ranks)",
-            "Wilcoxon's signed-rank test of T_total, Holm's correction. It compares ranks and the interval is of the "
-            "mean, so that the two can disagree.",
-        ),
-        (
-            "Δ T if both arrive [s], 95 %, on maps",
-            "difference of time over the episodes in which both arrived. It is not tested: both conditions decide "
-            "which episodes these are.",
-        ),
     )

@@ -10,6 +10,7 @@ from benchnav.core.figures import planner_name, risk_name
 from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.stats.best import BLOCK
 from benchnav.planning.world.outcome import FAILURES
+from benchnav.stats.tables import p_value, short
 
 # Columns of the summary that count failures, by how these ended, and what sentences call them.
 FAILURE_COUNTS = {
@@ -122,11 +123,6 @@ def outcome_in_words(outcome: str) -> str:
     return outcome.replace("_", " ")
 
 
-def p_value(p: float) -> str:
-    """Writes a p-value for a table; of drawn sign flips the least there can be is 0.0001."""
-    return "≤ 0.0001" if p <= 1e-4 else f"{p:.2g}"
-
-
 def p_in_words(p: float) -> str:
     """Writes a p-value for a sentence or a figure; one that is NaN is not computed before the run is finished."""
     if np.isnan(p):
@@ -138,23 +134,6 @@ def count_range(counts: Collection[int]) -> str:
     """Counts as one number, or from the least to the most."""
     least, most = min(counts), max(counts)
     return f"{least}" if least == most else f"{least} to {most}"
-
-
-def short(value: float) -> str:
-    """A number with one decimal place, unless that is 0."""
-    return f"{value:.1f}".removesuffix(".0")
-
-
-def signed(value: float, digits: int = 1) -> str:
-    """A difference with its sign; a dash where there is none."""
-    return (
-        NOT_USED if np.isnan(value) else f"{round(value, digits) + 0.0:+.{digits}f}"
-    )  # no minus before a zero
-
-
-def signed_interval(low: float, high: float) -> str:
-    """The ends of an interval of a difference; a dash where there is none."""
-    return NOT_USED if np.isnan(low) else f"{signed(low)} to {signed(high)}"
 
 
 def mean_and_std(mean: float, std: float) -> str:

@@ -1,34 +1,22 @@
 """Tests of the hypotheses that a suite fixed, map by map.
 
-A difference is tested by flipping signs; non-inferiority, superiority and equivalence by a margin by where the interval
-of the difference ends (two one-sided tests). Holm's correction is over the whole list.
-Sources: Schuirmann (1987), "A comparison of the two one-sided tests procedure and the power approach for assessing the
-equivalence of average bioavailability"; Wellek (2010), "Testing Statistical Hypotheses of Equivalence and
-Noninferiority", 1.
+A difference is tested by flipping signs, the others by a margin (`benchnav.stats.margins`). Holm's correction is over
+the whole list.
 """
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.optimize import brentq
 
-from benchnav.core.resampling import holm, sign_flips
 from benchnav.eval.experiment.hypotheses import METRICS, Hypothesis
-from benchnav.eval.stats.comparison import (
-    ALPHA,
-    gain_by_map,
-    mean_differences,
-    summed_differences,
-    time_difference,
-)
-from benchnav.eval.stats.paired_difference import mean_interval, sign_flip_p, success_interval
 from benchnav.eval.stats.pairs import side_by_side
 from benchnav.eval.stats.summary import time_budgets
-
-# Confidence at which a p-value of a margin is looked for, but for what rounds to 0 and 1.
-_MOST = 1 - 1e-12
+from benchnav.stats.episodes import Interval, difference_p, interval_of
+from benchnav.stats.holm import ALPHA, holm
+from benchnav.stats.margins import margin_p
 
 
 def test_hypotheses(
@@ -51,7 +39,7 @@ def test_hypotheses(
         `unit` of all that follows; `n_maps`, of which a group counts as one, and `n_episodes` of each condition;
         `mean_one`, `mean_other`, `difference`, and the ends of its 95 % and 90 % intervals, `low`, `high`, `low_90`,
         `high_90`; `p`, after Holm's correction `p_holm`; and `supported`, true where `p_holm` is under 0.05. Under
-        `core.resampling.LEAST_MAPS` maps a difference of anything but success has no interval.
+        `stats.bootstrap.LEAST_MAPS` maps a difference of anything but success has no interval.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
     made = []
@@ -90,68 +78,21 @@ def _test(test: Hypothesis, rows: pd.DataFrame, is_whole: bool) -> dict[str, Any
     return row | {"p": p_of(test, rows) if is_whole else np.nan}
 
 
-def _interval(rows: pd.DataFrame, metric: str, confidence: float) -> tuple[float, float, float]:
-    """Difference in the metric's unit, with its interval; NaN where there are too few maps."""
-    if metric == "T_total" and len(rows):
-        return time_difference(rows, confidence)
-    if metric == "success":
-        gain, draws = gain_by_map(rows)
-        if len(gain) < 2:
-            return float(100 * gain.sum() / max(len(rows), 1)), np.nan, np.nan
-        found = success_interval(gain, draws, confidence)
-    else:
-        found = mean_interval(mean_differences(rows, METRICS[metric].column), confidence)
-    difference, low, high = (METRICS[metric].scale * float(value) for value in found)
+def _interval(rows: pd.DataFrame, metric: str, confidence: float) -> Interval:
+    """Return the difference in the metric's unit, with its interval; NaN if there are too few maps."""
+    found = interval_of(rows, METRICS[metric].column, confidence)
+    difference, low, high = (METRICS[metric].scale * value for value in found)
     return difference, low, high
 
 
 def p_of(test: Hypothesis, rows: pd.DataFrame) -> float:
-    """p of a hypothesis before any correction; 1 where there are too few maps to tell.
+    """Return p of a hypothesis before any correction; 1 if there are too few maps.
 
     Args:
         test: what is claimed.
         rows: episodes of the two conditions side by side, the other's columns ending in `_other`.
     """
     if test.kind == "difference":
-        return _difference_p(test, rows)
-    sides = {"higher": (-1.0,), "lower": (1.0,)}.get(test.direction, (-1.0, 1.0))
-    margin = -test.margin if test.kind == "superiority" else test.margin
-    return max(_margin_p(test.metric, rows, margin, side) for side in sides)
-
-
-def _difference_p(test: Hypothesis, rows: pd.DataFrame) -> float:
-    if not len(rows):
-        return 1.0
-    if test.metric == "success":
-        return sign_flip_p(gain_by_map(rows)[0].astype(int), test.direction)
-    sums = summed_differences(rows, METRICS[test.metric].column)
-    # Sizes in one order, so that neither the order of maps nor one without a difference matters.
-    sizes = np.sort(np.abs(sums[sums != 0]))[::-1]
-    flipped, seen = sign_flips(len(sizes)) @ sizes, sums.sum()
-    if test.direction == "lower":
-        seen = -seen
-    elif not test.direction:
-        flipped, seen = np.abs(flipped), abs(seen)
-    # Sums are exact to rounding, and ways that tie with what was seen count.
-    return float(np.mean(flipped >= seen - 1e-9 * sizes.sum()))
-
-
-def _margin_p(metric: str, rows: pd.DataFrame, margin: float, side: float) -> float:
-    """p that the difference is beyond a margin, below −margin (side −1) or above it (side 1).
-
-    It is the level at which the end of the one-sided interval comes to lie on the margin.
-    """
-
-    def end(signed: float) -> float:
-        """Of the confidence the end on the margin's side; of a negative one the other end."""
-        _, low, high = _interval(rows, metric, abs(signed))
-        return side * (high if (side > 0) == (signed >= 0) else low)
-
-    if np.isnan(end(0.5)):
-        return 1.0
-    if end(_MOST) < margin:
-        return (1 - _MOST) / 2
-    if end(-_MOST) > margin:
-        return 1.0
-    signed = brentq(lambda confidence: end(confidence) - margin, -_MOST, _MOST)
-    return (1 - float(signed)) / 2
+        return difference_p(rows, METRICS[test.metric].column, test.direction)
+    interval = partial(_interval, rows, test.metric)
+    return margin_p(interval, test.kind, test.direction, test.margin)

@@ -17,10 +17,10 @@ import pandas as pd
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.unit import DRAW
 from benchnav.eval.stats.best import BLOCK, PRIVILEGED
-from benchnav.eval.stats.comparison import gain_by_map, time_difference
-from benchnav.eval.stats.paired_difference import success_interval
+from benchnav.eval.stats.comparison import named
 from benchnav.eval.stats.pairs import side_by_side
 from benchnav.eval.stats.summary import time_budgets
+from benchnav.stats.episodes import interval_of
 
 AGAINST = "near-optimal reference"
 OPTIMAL = "optimal"
@@ -146,16 +146,11 @@ def best_possible(rows: pd.DataFrame) -> dict[str, float]:
 
 
 def _differences(both: pd.DataFrame) -> dict[str, Any]:
-    gain, draws = gain_by_map(both)
-    found: dict[str, Any] = {"n_maps": len(gain), "n_episodes": len(both)}
+    row: dict[str, Any] = {"n_maps": both["group"].nunique(), "n_episodes": len(both)}
     for name, column in (("success", "success"), ("time", "total_time_s")):
-        one, other = (float(both[end].mean()) for end in (column, f"{column}_other"))
-        found |= {f"{name}_one": one, f"{name}_other": other}
-        interval: tuple[Any, Any, Any] = one - other, float("nan"), float("nan")
-        if len(gain) > 1:
-            interval = success_interval(gain, draws) if name == "success" else time_difference(both)
-        found |= {
-            f"{name}_{end}": float(value)
-            for end, value in zip(("difference", "low", "high"), interval, strict=True)
+        row |= {
+            f"{name}_one": float(both[column].mean()),
+            f"{name}_other": float(both[f"{column}_other"].mean()),
         }
-    return found
+        row |= named(name, interval_of(both, column))
+    return row

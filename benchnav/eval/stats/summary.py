@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import norm, t
-from statsmodels.stats.proportion import proportion_confint
 
 from benchnav.eval.experiment.condition import LABELS
-from benchnav.eval.stats.paired_difference import UNSEEN, by_map, total_time_interval
 from benchnav.planning.world.outcome import FAILURES
+from benchnav.stats.by_map import by_map
+from benchnav.stats.intervals import design_effect, total_time_interval, wilson_interval
 
 # Of each column its name in the summary, which the statistic parts, and its unit.
 _QUANTITIES = {
@@ -31,51 +30,6 @@ _QUANTITIES = {
 
 # Columns of episodes that say what robots learnt on their way.
 LEARNT = ("seen_cells", "sensed_cells", "revisions", "ahead_rmse", "ahead_log_score", "learning_ms")
-
-
-def wilson_interval(rate: float, n: float) -> tuple[float, float]:
-    """Wilson's 95 % score interval for a rate. Source: Wilson (1927).
-
-    Args:
-        rate: share of successes, in [0, 1].
-        n: number of independent trials, > 0; an effective number need not be whole.
-
-    Returns:
-        Lower and upper end, in [0, 1].
-    """
-    low, high = proportion_confint(rate * n, n, method="wilson")
-    return float(low), float(high)
-
-
-def design_effect(success: np.ndarray, maps: np.ndarray) -> float:
-    """Return how many episodes tell as much as one on a map of its own would.
-
-    It is the number of episodes over n = M·k, with k the variance of one episode, p(1 − p), over that of the rates of
-    maps, both as if one map in a hundred had shown no more than one episode would. Above 1, k is divided by (t/z)² of
-    M − 1 degrees of freedom, down to 1, since few maps tell their variance badly. With one episode a map, or where all
-    episodes end alike, n is M; twice the same episodes have the same n.
-    Sources: Korn and Graubard (1998), "Confidence intervals for proportions with small expected number of positive
-    counts estimated from survey data", for n and Student's quantile; Cochran (1977), "Sampling Techniques", 6.3, for
-    the variance where maps have unequally many episodes. How often the interval covers the truth:
-    `benchmarks/statistics_studies.py`, parts `intervals` and `groups`.
-
-    Args:
-        success: bool, shape [N].
-        maps: which map each episode was on, any labels, shape [N].
-
-    Returns:
-        Above 0, N on one map.
-    """
-    _, member, episodes = np.unique(maps, return_inverse=True, return_counts=True)
-    count, rate = len(episodes), success.mean()
-    if count == 1:
-        return float(len(success))
-    size = episodes / episodes.mean()
-    residual = size * (np.bincount(member, weights=success) / episodes - rate)
-    gain = (rate * (1 - rate) + UNSEEN) / ((residual**2).mean() + UNSEEN * (size**2).mean())
-    if gain > 1:
-        gain = max(gain * (norm.ppf(0.975) / t.ppf(0.975, count - 1)) ** 2, 1.0)
-    return float(len(success) / (count * gain))
 
 
 def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
@@ -108,7 +62,7 @@ def total_time_mean(episodes: pd.DataFrame, world: Mapping[str, Any]) -> tuple[f
         world: of the condition, as `run.json` holds it.
 
     Returns:
-        Mean and ends in seconds; the ends are NaN where there are fewer than `core.resampling.LEAST_MAPS` maps.
+        Mean and ends in seconds; the ends are NaN where there are fewer than `stats.bootstrap.LEAST_MAPS` maps.
     """
     success, maps = episodes["success"].to_numpy(dtype=bool), episodes["group"].to_numpy()
     taken, budgets = episodes["total_time_s"].to_numpy(), time_budgets(episodes, world)

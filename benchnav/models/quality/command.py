@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchnav.core.command import Device
-from benchnav.models.quality.output import DPI, FIGURES, check_folder, check_writable
+from benchnav.models.quality.output import DPI, FIGURES, check_folder, check_writable, open_maps, save_figures
 
 REPORT, CSV, PAGE = "quality.json", "quality.csv", "quality.md"
 
@@ -39,8 +39,6 @@ def evaluate_command(
     from benchnav.core.progress import show_progress
     from benchnav.core.store import write_text
     from benchnav.core.tables import print_table
-    from benchnav.datagen.files.find import find_dataset
-    from benchnav.datagen.files.reader import TerrainDataset
     from benchnav.models.config import check_seed
 
     check_seed(seed)
@@ -54,11 +52,9 @@ def evaluate_command(
         check_writable(target)
     if out:
         check_folder(folder, overwrite, (REPORT, CSV, PAGE), "an evaluation")
-    dataset = TerrainDataset(find_dataset(data))
-    expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
+    dataset = open_maps(data, splits)
 
     from benchnav.core.device import find_device
-    from benchnav.core.figures import save_twice
     from benchnav.models.predictor import load_model, trained_on
     from benchnav.models.quality.baselines import baselines_of
     from benchnav.models.quality.measure import choose_splits
@@ -111,18 +107,10 @@ def evaluate_command(
         return
     write_text(folder / REPORT, report)
     write_text(folder / CSV, quality_csv(qualities))
-    for old in (folder / FIGURES).glob("*.p[nd][gf]"):
-        old.unlink()
     name = Path(checkpoint).name if Path(checkpoint).is_dir() else checkpoint
     drawn, absent = quality_figures(f"model {name} on dataset {dataset.id}", model, dataset, qualities, maps)
     paths = [f"{FIGURES}/{figure}.png" for figure in drawn]
-
-    def saved() -> Iterator[tuple[int, int]]:
-        for count, (path, draw) in enumerate(zip(paths, drawn.values(), strict=True), 1):
-            save_twice(draw(), folder / path, dpi=DPI)
-            yield count, len(paths)
-
-    show_progress(saved(), "figures")
+    save_figures(folder, drawn, DPI)
     write_text(folder / PAGE, quality_markdown(title, qualities, notes + absent, paths))
     for line in absent:
         print(line)

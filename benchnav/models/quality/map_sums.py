@@ -1,12 +1,10 @@
-"""Quality by map: sums from which every measure follows, of one map as of any number of them.
+"""Quality by map: sums from which every score follows (`scores_of_maps`), of one map or of any number of them.
 
-A comparison of models draws maps anew and exchanges models on a map, which takes no more than to add these sums
-otherwise. Letters in shapes: B maps of a chunk, M maps of a split, C classes, N cells, *R any leading dimensions.
+Letters in shapes: B maps of a chunk, M maps of a split, C classes, N cells.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,10 +20,9 @@ from benchnav.models.quality.scores import (
     pit_counts,
     sparsification,
 )
+from benchnav.stats.scores import Sums
 
 STEPS = 50  # of a sparsification curve, from no cell left out on
-
-Sums = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,24 +56,27 @@ class MapTally:
     Args:
         classes: number of classes C, 0 of a model without any.
         truth: whether the maps' true distribution of λ is known.
+        quantiles: add up what quantiles of every cell are needed for, which take most of the time.
     """
 
-    def __init__(self, classes: int, truth: bool) -> None:
-        """Starts with no maps."""
-        self.classes, self.truth = classes, truth
+    def __init__(self, classes: int, truth: bool, quantiles: bool = True) -> None:
+        """Start with no maps."""
+        self.classes, self.truth, self.quantiles = classes, truth, quantiles
+        self.names = (*_NAMES, *(_OF_QUANTILES if quantiles else ()))
         self.parts: dict[str, list[np.ndarray]] = {}
         self.pit = np.zeros(PIT_BINS, dtype=np.int64)
         self.ranked = np.zeros((2, STEPS))
 
     def add(self, cells: CellScores | None, count: int) -> None:
         """Adds `count` maps by their observed cells, None where there are none."""
-        sums = {name: torch.zeros(count, dtype=torch.float64) for name in _NAMES}
+        sums = {name: torch.zeros(count, dtype=torch.float64) for name in self.names}
         if cells is not None:
-            loss, width = lower_fifth_and_width(cells.predicted, cells.observed)
-            scores: dict[str, Tensor] = {**cells.scores, "cells": torch.ones_like(loss)}
-            scores |= {"pinball": loss, "width": width, "areas": self._rank(cells, width[0], count)}
+            scores: dict[str, Tensor] = {**cells.scores, "cells": torch.ones_like(cells.observed)}
             scores["inside"] = (cells.transformed - 0.5).abs() <= LEVEL / 2
-            scores |= {_under(level): cells.transformed < 1 - level for level in TAIL_LEVELS}
+            scores |= {f"under_{round(100 * level)}": cells.transformed < 1 - level for level in TAIL_LEVELS}
+            if self.quantiles:
+                loss, width = lower_fifth_and_width(cells.predicted, cells.observed)
+                scores |= {"pinball": loss, "width": width, "areas": self._rank(cells, width[0], count)}
             sums |= {name: _by_map(values, cells.maps, count) for name, values in scores.items()}
             self.pit += pit_counts(cells.transformed).numpy()
             if self.truth:
@@ -129,63 +129,11 @@ def _by_map(values: Tensor, maps: Tensor, count: int) -> Tensor:
     return empty.index_add_(0, maps, values.flatten().double())
 
 
-def _under(level: float) -> str:
-    return f"under_{round(100 * level)}"
-
-
 _NAMES = (
-    *("cells", "squares", "nll", "crps", "pinball", "width", "inside", "areas"),
-    *map(_under, TAIL_LEVELS),
-    *("expected_squares", "labelled"),
+    *("cells", "squares", "nll", "crps", "inside", "expected_squares", "labelled"),
+    *(f"under_{round(100 * level)}" for level in TAIL_LEVELS),
 )
-
-
-def measures_of(sums: Sums) -> dict[str, np.ndarray]:
-    """The measures that follow from sums over cells; not a number where there is none.
-
-    Args:
-        sums: as `MapTally.sums` has them, added up over any maps, of shape [*R], of classes [*R, C].
-
-    Returns:
-        Shape [*R] by name. `tail_error` is the mean over the VaR at 0.8, 0.9 and 0.95 of how far the share of λ under
-        it is from what it should be. `ause` is the mean over maps of the area under each one's sparsification error
-        curve, by their number of cells.
-    """
-    cells: Any = sums["cells"]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rates = {level: sums[_under(level)] / cells for level in TAIL_LEVELS}
-        measures = {
-            "rmse_observed": np.sqrt(sums["squares"] / cells),
-            "rmse_expected": np.sqrt(sums["expected_squares"] / sums["labelled"]),
-            "nll": sums["nll"] / cells,
-            "crps": sums["crps"] / cells,
-            "pinball": sums["pinball"] / cells,
-            "coverage": sums["inside"] / cells,
-            "width": sums["width"] / cells,
-            **{f"tail_rate_{round(100 * level)}": rate for level, rate in rates.items()},
-            "tail_error": sum(abs(rate - (1 - level)) for level, rate in rates.items()) / len(rates),
-            "ause": sums["areas"] / cells,
-        }
-        if "true" in sums:
-            hits, true = sums["hits"], sums["true"]
-            union = true + sums["found"] - hits
-            overlap = np.where(true > 0, hits / np.where(union > 0, union, 1), 0.0)
-            measures["accuracy"] = hits.sum(-1) / true.sum(-1)
-            measures["miou"] = overlap.sum(-1) / (true > 0).sum(-1)
-    return measures
-
-
-def added(sums: Sums, weights: np.ndarray) -> dict[str, np.ndarray]:
-    """Adds sums by map up.
-
-    Args:
-        sums: of shape [M], of classes [M, C].
-        weights: of each map, shape [*R, M].
-
-    Returns:
-        Shape [*R], of classes [*R, C].
-    """
-    return {name: weights @ values for name, values in sums.items()}
+_OF_QUANTILES = ("pinball", "width", "areas")
 
 
 def by_group(sums: Sums, groups: np.ndarray) -> dict[str, np.ndarray]:

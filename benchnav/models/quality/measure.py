@@ -5,11 +5,8 @@ themselves stand in `scores`. Letters in shapes: B maps, H×W cells, C classes, 
 cells of all maps.
 """
 
-import math
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,7 +25,6 @@ from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import class_mismatch
 from benchnav.models.quality.map_sums import CellScores, MapTally
 from benchnav.models.quality.scores import (
-    PIT_BINS,
     ErrorRanking,
     LookAlikeQuality,
     LookAlikeTally,
@@ -36,13 +32,14 @@ from benchnav.models.quality.scores import (
     brier_score,
     calibration_error,
     class_scores,
-    coverage,
     mutual_information,
     pit,
-    pit_counts,
     predictive_entropy,
-    tail_rate,
 )
+from benchnav.models.quality.scores_of_maps import SCORES
+
+# Scores of `TraversabilityQuality` that it has by their own names.
+_OF_CELLS = ("rmse_observed", "rmse_expected", "nll", "crps", "coverage")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,40 +232,31 @@ def measure(
         by_map: keep what a comparison needs, which takes quantiles of every cell.
         classes: measure the model's classes, where it tells any.
     """
-    maps, histogram = 0, torch.zeros(PIT_BINS, dtype=torch.int64)
-    sums: dict[str, float] = defaultdict(float)
+    maps = 0
     tally = _ClassTally(len(model.class_names) if classes else 0, alike)
-    kept = MapTally(tally.count, truth) if by_map else None
+    kept = MapTally(tally.count, truth, quantiles=by_map)
     for terrain in chunks:
         predicted, members = _predict(model, terrain)
-        cells = _score_cells(predicted, terrain, generator, isinstance(model, PrivilegedModel))
-        if cells is not None:
-            for name, score in _summed(cells).items():
-                sums[name] += score
-            histogram += pit_counts(cells.transformed)
+        kept.add(
+            _score_cells(predicted, terrain, generator, isinstance(model, PrivilegedModel)), len(terrain)
+        )
         maps += len(terrain)
         if tally.count:
             probabilities = predicted.class_probabilities(tally.count)
             tally.add(probabilities, members, terrain.class_id, terrain.slope_deg)
-        if kept:
-            kept.add(cells, len(terrain))
-        if kept and tally.count:
-            kept.add_classes(probabilities, terrain.class_id)
-    total = sums["cells"]
-    if not total:
+            if by_map:
+                kept.add_classes(probabilities, terrain.class_id)
+    sums = kept.sums() if maps else {}
+    if not maps or not sums["cells"].any():
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
-    means: Any = {name: sums[name] / total for name in ("nll", "crps", "coverage", "tail_rate")}
-    known = truth and sums["labelled"]
+    values = {name: SCORES[name].value(sums) for name in _OF_CELLS}
     return Quality(
         maps=maps,
         traversability=TraversabilityQuality(
-            rmse_observed=(sums["squares"] / total) ** 0.5,
-            rmse_expected=(sums["expected_squares"] / known) ** 0.5 if known else math.nan,
-            **means,
-            pit=tuple(histogram.tolist()),
+            **values, tail_rate=SCORES["tail_rate_90"].value(sums), pit=tuple(kept.pit.tolist())
         ),
         classes=(tally.quality(),) if tally.confusion.any() else (),
-        by_map=kept,
+        by_map=kept if by_map else None,
     )
 
 
@@ -381,16 +369,3 @@ def _score_cells(
         labelled=labelled,
         expected_squares=(expected - terrain.truth.at(known).mean())[0, labelled].double().square(),
     )
-
-
-def _summed(cells: CellScores) -> dict[str, float]:
-    """What is summed over cells, by name."""
-    count = cells.transformed.numel()
-    return {
-        "cells": float(count),
-        **{name: float(score.sum()) for name, score in cells.scores.items()},
-        "coverage": coverage(cells.transformed) * count,
-        "tail_rate": tail_rate(cells.transformed) * count,
-        "expected_squares": float(cells.expected_squares.sum()),
-        "labelled": float(cells.expected_squares.numel()),
-    }

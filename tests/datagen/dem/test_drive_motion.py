@@ -11,7 +11,7 @@ from scipy.signal import savgol_filter
 
 from benchnav.core.errors import DatasetError
 from benchnav.datagen.dem.drive_cells import elevation_under
-from benchnav.datagen.dem.drive_log import DriveLog, Drives
+from benchnav.datagen.dem.drive_log import OVER_SPEED, DriveLog, Drives
 from benchnav.datagen.dem.drive_motion import compare_motion, compare_slopes
 from benchnav.datagen.dem.drive_tracks import find_jumped, speed_of_positions, track_of, velocity_of
 
@@ -106,6 +106,12 @@ def test_a_measured_speed_of_no_unit_is_rejected_too() -> None:
             compare_motion(log_of(rows.assign(speed=rows["speed"] * factor)))
 
 
+def test_noise_of_positions_is_no_disagreement() -> None:
+    rows = rough_drive(1200)
+    rows[["x", "y"]] += 0.1 * np.random.default_rng(0).standard_normal((1200, 2))
+    assert compare_motion(log_of(rows)).motion["pace"] == pytest.approx(1, abs=0.02)
+
+
 def test_curves_and_gaps_are_no_disagreement() -> None:
     turning = np.repeat([0, 1.2, -1.2, 0, 1.2], 120)
     log = compare_motion(log_of(drive(np.ones(600), np.full(600, 0.9), turning)))
@@ -116,6 +122,41 @@ def test_curves_and_gaps_are_no_disagreement() -> None:
     )  # stands for a minute, and logs nothing
     log = compare_motion(log_of(paused))
     assert (log.motion["pace"], len(log.rows)) == (pytest.approx(1, abs=0.02), 600)
+
+
+@pytest.mark.parametrize("rows", [8, 15, 25])
+def test_short_drives_are_compared_too(rows: int) -> None:
+    parts = [drive(np.ones(rows), np.full(rows, 0.8)).assign(drive=index) for index in range(40)]
+    table = pd.concat(parts, ignore_index=True)
+    for speed in ("", "measured"):
+        assert compare_motion(log_of(table, speed)).motion["pace"] == pytest.approx(1, abs=0.02)
+    with pytest.raises(DatasetError, match="knots"):
+        compare_motion(log_of(table.assign(speed=table["speed"] / 0.5144)))
+
+
+def test_a_log_without_motion_under_one_command_is_not_compared() -> None:
+    commanded = np.tile([1.0, -1.0], 300)
+    rows = drive(commanded, np.full(600, 0.8))
+    with pytest.raises(DatasetError, match=r"got none in drives of up to 59\.9 s"):
+        compare_motion(log_of(rows))
+
+
+@pytest.mark.parametrize("period_s", [1, 2, 5])
+@pytest.mark.parametrize("is_thinned", [True, False])
+def test_positions_that_come_seldom_name_no_false_unit(period_s: int, is_thinned: bool) -> None:
+    rows, step = rough_drive(6000), 10 * period_s
+    if is_thinned:
+        rows = rows.iloc[::step].reset_index(drop=True)
+    else:
+        rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // step * step].to_numpy()
+    log = compare_motion(log_of(rows))
+    assert log.motion["pace"] == pytest.approx(1, abs=0.03)
+    with pytest.raises(DatasetError, match=r"like (knots|no unit that is known, since)"):
+        compare_motion(log_of(rows.assign(speed=rows["speed"] / 0.5144)))
+    winding = drive(np.ones(6000), np.full(6000, 0.9), turn=0.6).iloc[::step].reset_index(drop=True)
+    if period_s > 2:  # chords are much shorter than their arcs
+        with pytest.raises(DatasetError, match="no unit that is known, since"):
+            compare_motion(log_of(winding))
 
 
 def test_the_command_may_be_far_from_positions() -> None:
@@ -136,6 +177,19 @@ def test_a_drive_that_disagrees_among_many_is_left_out_and_counted() -> None:
         compare_motion(log_of(pd.concat(parts, ignore_index=True)))
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1 / 0.5144, "knots"), (3.6, "km/h")])
+def test_the_unit_of_drives_that_disagree_is_named(factor: float, unit: str) -> None:
+    parts = [rough_drive(seed=seed).assign(drive=seed) for seed in range(6)]
+    for index in (1, 4):
+        parts[index]["speed"] *= factor
+    with pytest.raises(DatasetError, match=rf"1200 of 3600 .* like {unit} in drive-1, drive-4") as caught:
+        compare_motion(log_of(pd.concat(parts, ignore_index=True)))
+    for index in (1, 4):
+        parts[index]["speed"] *= float(str(caught.value).split("Multiply `measured_m_s` by ")[1].split()[0])
+    log = compare_motion(log_of(pd.concat(parts, ignore_index=True)))
+    assert log.left_out["off_pace"] == 0
+
+
 def test_sliding_back_and_over_speed_are_kept() -> None:
     traversability = np.full(600, 0.9)
     traversability[100:200], traversability[300:320] = -0.25, 1.3
@@ -152,18 +206,65 @@ def test_sliding_back_and_over_speed_are_kept() -> None:
     assert (actual < 0).sum() > 50
 
 
-def test_too_much_over_speed_and_the_other_sign_are_another_scale() -> None:
-    traversability = np.full(600, 0.9)
-    traversability[:31] = 1.3
-    with pytest.raises(DatasetError, match=r"above 1.2 times .* got 31 of 600, and a median of 0.9 times"):
-        compare_motion(log_of(drive(np.ones(600), traversability)))
+@pytest.mark.parametrize("speed", ["", "positions", "measured"])
+def test_no_ratio_to_the_command_stops_an_import(speed: str) -> None:
+    for ratio in (0.1, 0.9, 1.3, 1.45):
+        log = compare_motion(log_of(drive(np.ones(600), np.full(600, ratio)), speed))
+        assert log.motion["commanded_pace"] == pytest.approx(ratio, abs=0.01)
+        np.testing.assert_allclose(log.rows["traversability"], ratio)
+    double = drive(np.ones(600), np.full(600, 2.0))
+    seldom = double.iloc[::10].reset_index(drop=True)  # at 1 Hz no row is in reach
+    for rows in (seldom, double) if speed == "" else (seldom,):
+        with pytest.raises(
+            DatasetError,
+            match=r"1\.5 times .* positions move 2 times as far as `commanded_m_s` .* scale it by",
+        ):
+            compare_motion(log_of(rows, speed))
+        log = compare_motion(log_of(rows.assign(commanded=2.0), speed))
+        assert len(log.rows) >= len(rows) - 2  # both ends have too few positions around them
+
+
+def skid_steer_log() -> pd.DataFrame:
+    """Return a log of a skid-steer robot at 1.08 times its command, in knots.
+
+    The command changes often, and speed follows it with a time constant of 0.5 s, so that a tenth of the rows exceeds
+    1.2 times the command. Positions come once a second.
+    """
+    generator = np.random.default_rng(4)
+    commanded = generator.choice([0.15, 0.3, 0.45, 0.6], 20).repeat(60)
+    followed = commanded.copy()
+    for row in range(1, len(followed)):
+        followed[row] = followed[row - 1] + (commanded[row] - followed[row - 1]) * STEP_S / 0.5
+    rows = drive(commanded, 1.08 * followed / commanded, turn=0.05)
+    rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // 10 * 10].to_numpy()
+    measured = rows["speed"] + 0.01 * generator.standard_normal(len(rows))
+    return rows.assign(speed=measured / 0.5144)
+
+
+def test_a_log_in_knots_imports_by_its_remedy_though_it_exceeds_its_command() -> None:
+    rows = skid_steer_log()
+    with pytest.raises(DatasetError, match=r"like knots\. Multiply `measured_m_s` by 0\.5144 "):
+        compare_motion(log_of(rows))
+    for mended in (
+        log_of(rows.assign(speed=rows["speed"] * 0.5144)),
+        log_of(rows, "positions"),
+    ):
+        log = compare_motion(mended)
+        assert len(log.rows) >= 0.98 * len(rows)
+        assert log.motion["commanded_pace"] == pytest.approx(1.08, abs=0.03)
+        assert (log.rows["traversability"] > OVER_SPEED).mean() > 0.05
+
+
+def test_a_speed_of_the_other_sign_is_rejected() -> None:
     commanded = np.repeat([1.0, -1.0], 300)
     rows = drive(commanded, np.full(600, 0.9))
+    unsigned = rows.assign(speed=rows["speed"].abs())
     with pytest.raises(
         DatasetError, match=r"sign of .* got the other one in 300 of 300 rows commanded backward"
     ):
-        compare_motion(log_of(rows.assign(speed=rows["speed"].abs())))
-    assert len(compare_motion(log_of(rows.assign(speed=rows["speed"].abs()), "measured")).rows) == 600
+        compare_motion(log_of(unsigned))
+    for speed in ("measured", "positions"):
+        assert len(compare_motion(log_of(unsigned, speed)).rows) == 600
 
 
 # Faulty rows
@@ -184,6 +285,59 @@ def test_an_immobilised_robot_is_no_frozen_receiver() -> None:
         compare_motion(log_of(rows))
 
 
+def stuck_drive() -> pd.DataFrame:
+    """Ten minutes of λ 0.8 with 40 s of immobility, whose positions are exactly the same."""
+    traversability = np.full(6000, 0.8)
+    traversability[2000:2400] = 0
+    rows = drive(np.ones(6000), traversability)
+    return rows.assign(x=rows["x"].round(3), y=rows["y"].round(3))
+
+
+@pytest.mark.parametrize("measured", ["of the drive", "of wheels", "missing"])
+@pytest.mark.parametrize("fix_rows", [1, 5])
+def test_positions_separate_immobility_from_a_frozen_receiver(measured: str, fix_rows: int) -> None:
+    rows = stuck_drive()
+    if measured != "of the drive":
+        rows["speed"] = 0.8 * rows["commanded"] if measured == "of wheels" else np.nan
+    rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+    log = compare_motion(log_of(rows, "positions"))
+    assert log.left_out["frozen"] == 0
+    assert len(log.rows) > 5980
+    is_stuck = log.rows["time_s"].between(202, 238)
+    np.testing.assert_allclose(log.rows["traversability"][is_stuck], 0, atol=1e-9)
+    assert is_stuck.sum() == 361
+    if measured == "missing":
+        assert log.motion["standing"] == pytest.approx(400, abs=10)
+    else:
+        assert log.motion["standing"] == 0
+        left_out = compare_motion(log_of(rows)).left_out  # a measured speed that is used has to agree
+        assert left_out["frozen"] == pytest.approx(400 if measured == "of wheels" else 0, abs=10)
+    frozen = rows.copy()  # the robot drives on, and the receiver comes back
+    frozen.loc[4000:4300, ["x", "y"]] = frozen.loc[4000, ["x", "y"]].to_numpy()
+    log = compare_motion(log_of(frozen, "positions"))
+    assert log.left_out["frozen"] == pytest.approx(300, abs=10)
+    assert (log.rows["traversability"][log.rows["time_s"] > 300] > 0.7).all()
+
+
+def test_a_robot_that_stands_at_the_end_is_immobilised_unless_its_speed_says_no() -> None:
+    rows = drive(np.ones(6000), np.repeat([0.8, 0], [5700, 300]))
+    log = compare_motion(log_of(rows.assign(speed=np.nan), "positions"))
+    assert log.left_out["frozen"] == 0
+    assert log.motion["standing"] == 300
+    assert compare_motion(log_of(rows.assign(speed=0.8), "positions")).left_out["frozen"] == 300
+    short = rows.iloc[5400:].reset_index(drop=True)
+    with pytest.raises(DatasetError, match=r"300 of 600 .* stays the same .* Log `measured_m_s`"):
+        compare_motion(log_of(short.assign(speed=np.nan), "positions"))
+    assert len(compare_motion(log_of(short, "positions")).rows) == 600
+
+
+@pytest.mark.parametrize("speed", ["", "positions", "measured"])
+def test_positions_that_never_change_are_frozen(speed: str) -> None:
+    rows = drive(np.ones(600), np.full(600, 0.9)).assign(x=5.0, y=5.0)
+    with pytest.raises(DatasetError, match="599 of 600 that have a position that stays the same"):
+        compare_motion(log_of(rows, speed))
+
+
 def test_positions_that_repeat_until_the_next_fix_are_not_frozen() -> None:
     rows = rough_drive()
     rows[["x", "y"]] = rows[["x", "y"]].iloc[np.arange(600) // 20 * 20].to_numpy()  # every 2 s
@@ -199,6 +353,15 @@ def test_each_jump_is_out_of_reach_from_the_last_right_position() -> None:
     rows = rough_drive()
     rows.loc[[350, 550], "x"] += 10
     assert set(find_jumped(track_of(rows), 1.5)) == {350, 550}
+
+
+@pytest.mark.parametrize("speed", ["", "positions", "measured"])
+def test_a_wrong_command_does_not_hide_jumps(speed: str) -> None:
+    rows = drive(np.ones(600), np.full(600, 0.9))
+    rows.loc[[300, 450], "x"] += 12
+    rows.loc[[5, 100], "commanded"] = 14.0
+    left_out = compare_motion(log_of(rows, speed)).left_out
+    assert (left_out["jumped"], left_out["implausible"]) == (2, 2)
 
 
 @given(st.sets(st.integers(0, 599), max_size=55), st.floats(3, 1e6), st.integers(0, 2**32))
@@ -291,6 +454,18 @@ def test_velocity_is_the_derivative_of_savitzky_and_golay() -> None:
     assert velocity.notna().all()
 
 
+def test_the_error_of_a_velocity_is_that_of_its_noise() -> None:
+    generator = np.random.default_rng(0)
+    for step_s, spread_s2 in ((1.0, 2.0), (0.1, 7.7)):  # Σ t² of three fixes, and of 21
+        time_s = np.arange(2000) * step_s
+        x, y = np.stack([0.8 * time_s, 0 * time_s]) + 0.1 * generator.standard_normal((2, 2000))
+        rows = pd.DataFrame({"x": x, "y": y, "time_s": time_s, "drive": 0})
+        error = velocity_of(track_of(rows), ["x", "y"])["error"][20:-20]
+        expected = 0.1 / np.sqrt(spread_s2)
+        assert error.min() == pytest.approx(expected, rel=0.05)
+        assert expected <= error.median() < 1.1 * expected
+
+
 @pytest.mark.parametrize("fix_rows", [1, 3, 10])
 def test_speed_of_positions_is_that_of_the_drive_forward_and_backward(fix_rows: int) -> None:
     commanded = np.concatenate([np.full(300, 0.8), np.zeros(50), np.full(300, -0.6)])
@@ -301,10 +476,41 @@ def test_speed_of_positions_is_that_of_the_drive_forward_and_backward(fix_rows: 
     np.testing.assert_allclose(speed[steady], 0.75 * commanded[steady], rtol=0.02)
 
 
+@pytest.mark.parametrize("noise_m", [0.05, 0.1, 0.3])
+@pytest.mark.parametrize("fix_rows", [1, 10])
+def test_noise_does_not_turn_an_immobilised_robot(noise_m: float, fix_rows: int) -> None:
+    for seed in range(8):
+        generator = np.random.default_rng(seed)
+        turn = np.repeat(
+            [0.05, 0.14 * (seed % 2), 0.05], [300, 200, 400]
+        )  # every second one turns round at rest
+        rows = drive(np.ones(900), np.repeat([0.8, 0, 0.8], [300, 200, 400]), turn)
+        rows[["x", "y"]] += noise_m * generator.standard_normal((900, 2))
+        rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+        speed = speed_of_positions(track_of(rows), 0.1)
+        moves = ~rows["time_s"].between(28, 52)
+        assert (speed[moves].dropna() > 0).all(), seed
+
+
+@pytest.mark.parametrize(("noise_m", "rest"), [(0.0, 0), (0.05, 0), (0.05, 25), (0.1, 10)])
+def test_sliding_back_is_seen_through_noise(noise_m: float, rest: int) -> None:
+    for seed in range(8):
+        generator = np.random.default_rng(seed)
+        traversability = np.repeat([0.8, 0, -0.6, 0, 0.8], [300, rest, 100, rest, 200])
+        rows = drive(np.ones(len(traversability)), traversability, turn=0.05)
+        rows[["x", "y"]] += noise_m * generator.standard_normal((len(rows), 2))
+        speed = speed_of_positions(track_of(rows), 0.1)
+        start_s, end_s = (300 + rest) * STEP_S, (400 + rest) * STEP_S
+        assert (speed[rows["time_s"].between(start_s + 1, end_s - 1)] < 0).all(), seed
+        assert (speed[~rows["time_s"].between(start_s - rest / 10 - 1, end_s + rest / 10 + 1)] > 0).all(), (
+            seed
+        )
+
+
 def test_speed_of_positions_goes_along_the_slope() -> None:
     rows = drive(np.ones(600), np.full(600, 0.9))
     log = compare_motion(log_of(rows.drop(columns="speed").assign(speed=np.nan), "positions"))
-    assert log.motion == {"pace": None, "commanded_pace": pytest.approx(0.9)}
+    assert (log.motion["pace"], log.motion["commanded_pace"]) == (None, pytest.approx(0.9))
     height = np.tan(np.radians(20)) * np.hypot(log.rows["x"], log.rows["y"])
     along = compare_slopes(log, height.to_numpy()).rows["traversability"]
     np.testing.assert_allclose(along, 0.9 / np.cos(np.radians(20)), rtol=1e-6)

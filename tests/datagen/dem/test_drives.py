@@ -183,7 +183,7 @@ def test_rows_are_left_out_by_reason_and_kept_beyond_0_and_1(tmp_path: Path) -> 
         log, cut((8, 8), (8, 8), (8, 8), {"train": 1.0}), np.zeros(5, int), np.arange(5) // 4
     )
     np.testing.assert_allclose(driven.values[0], [(0.5 + 0.8 + 1 + 0) / 4, 0.5])
-    assert describe_drives(used, ["train"])["beyond"] == {"below_0": 1, "above_1": 1}
+    assert describe_drives(used, ["train"])["beyond"] == {"below_0": 1, "above_1": 1, "above_1.2": 0}
     for least, rest in ((0.6, 3), (0.05, 7)):
         log = compare_motion(read_drives(Drives(file=str(path), speed="measured", least_speed=least)))
         assert len(log.rows) == rest
@@ -492,8 +492,8 @@ MOVE = "".join(f"{step / 5},{500010 + 0.16 * step},3999910,1,0.8,a\n" for step i
         (HEAD + "0,1,1,1,1,\n", "`drive` in every row.*row 1"),
         (HEAD + "0,1,1,30,30,a\n0,1,1,100,1,a\n", "`commanded_m_s` in m/s.*median of 65.*Divide km/h by 3.6"),
         (HEAD + "0,1,1,1,30,a\n", "`measured_m_s` in m/s.*median of 30"),
-        (HEAD + "0,1,1,1,1,a\n", "covers x 500000 to 500096 and y .*got x 1 to 1 and y 1 to 1 in"),
-        (HEAD + "0,500010,3999910,1,1,a\n", "for more than 2 s .* up to 0 s"),
+        (HEAD + "0,1,1,1,1,a\n", "covers x 500000 to 500096 and y .*got x_m 1 to 1 and y_m 1 to 1 in"),
+        (HEAD + "0,500010,3999910,1,1,a\n", "got none in drives of up to 0 s"),
         (HEAD + MOVE, "a drive for each of the 3 splits .* got 1 in .*--splits"),
         (
             HEAD + "".join(MOVE.replace("a\n", f"{name}\n") for name in "abc"),

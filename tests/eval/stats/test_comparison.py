@@ -5,14 +5,11 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest, wilcoxon
 
-from benchnav.eval.stats.comparison import compare, time_difference
-from benchnav.eval.stats.paired_difference import (
-    maps_needed,
-    smallest_difference,
-    standard_deviation,
-    success_interval,
-)
+from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import Pair
+from benchnav.stats.episodes import time_difference
+from benchnav.stats.intervals import standard_deviation, success_interval
+from benchnav.stats.power import maps_needed, smallest_difference
 
 
 def pair(
@@ -123,25 +120,6 @@ def test_a_difference_of_time_knows_what_failures_cost() -> None:
     difference, low, high = time_difference(pair(late, same).episodes)
     assert difference == pytest.approx(5)
     assert (low + high) / 2 == pytest.approx(5)
-
-
-@pytest.mark.parametrize("maps", [8, 20])
-def test_intervals_of_a_difference_of_time_cover_it_on_few_maps(maps: int) -> None:
-    generator = np.random.default_rng(8)
-    held, count, rates = 0, 150, (0.85, 0.95)
-    for _ in range(count):
-        hard, noise = generator.standard_normal(maps), generator.random(maps)
-        taken = [
-            np.where(
-                noise < rate,
-                np.minimum(33 * np.exp(0.2 * hard + 0.2 * generator.standard_normal(maps)), 99),
-                100,
-            )
-            for rate in rates
-        ]
-        _, low, high = time_difference(pair(*(list(times) for times in taken)).episodes)
-        held += low <= 0.1 * (100 - 33 * np.exp(0.04)) <= high
-    assert held >= 135  # 93 % of 150 are 139.5
 
 
 def test_a_group_of_maps_is_one_number() -> None:

@@ -11,12 +11,15 @@ from hypothesis import strategies as st
 from scipy.stats import wilcoxon
 
 from benchnav.eval.experiment.hypotheses import Hypothesis
-from benchnav.eval.stats.best import against_best, best_set_p
-from benchnav.eval.stats.comparison import compare, summed_differences
+from benchnav.eval.stats.best import against_best
+from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.hypotheses import p_of
-from benchnav.eval.stats.paired_difference import by_map, signed_rank_p
 from benchnav.eval.stats.pairs import Pair
 from benchnav.eval.stats.summary import success_mean, total_time_mean
+from benchnav.stats.best import best_set_p
+from benchnav.stats.by_map import by_map
+from benchnav.stats.episodes import summed_differences
+from benchnav.stats.flips import signed_rank_p
 from tests.eval.report import made
 from tests.eval.stats.test_regret import episodes as regret_episodes
 from tests.eval.stats.test_regret import split

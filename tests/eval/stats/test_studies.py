@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchnav.eval.stats.comparison import time_difference
 from benchnav.eval.stats.summary import total_time_mean
+from benchnav.stats.episodes import time_difference
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "benchmarks"))
 import statistics_studies as studies

@@ -1,102 +1,11 @@
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import binomtest, norm, t
 
-from benchnav.eval.stats.paired_difference import by_map, total_time_interval
-from benchnav.eval.stats.summary import (
-    design_effect,
-    time_budgets,
-    total_time_mean,
-    wilson_interval,
-)
+from benchnav.eval.stats.summary import time_budgets
+from benchnav.stats.intervals import total_time_interval, wilson_interval
 from tests.eval.report import made
 from tests.eval.report.made import condition, row, rows
-
-
-@pytest.mark.parametrize(("successes", "n"), [(0, 20), (18, 20), (20, 20), (7, 13)])
-def test_wilson_interval_is_scipys(successes: int, n: int) -> None:
-    expected = binomtest(successes, n).proportion_ci(0.95, method="wilson")
-    assert wilson_interval(successes / n, n) == pytest.approx((expected.low, expected.high), abs=1e-12)
-
-
-def test_a_fraction_of_an_episode_counts_as_that() -> None:
-    whole, half, more = (wilson_interval(0.8, n) for n in (20, 20.5, 21))
-    assert whole[0] < half[0] < more[0]
-    assert whole[1] > half[1] > more[1]
-
-
-def drawn(
-    generator: np.random.Generator, maps: int, each: int, correlation: float, rate: float
-) -> np.ndarray:
-    """Successes, shape [maps, each], from the beta-binomial of a given intra-class correlation."""
-    size = 1 / correlation - 1
-    chance = generator.beta(rate * size, (1 - rate) * size, size=maps)
-    return generator.random((maps, each)) < chance[:, None]
-
-
-def effect_of(success: np.ndarray) -> float:
-    return design_effect(success.ravel(), np.repeat(np.arange(len(success)), success.shape[1]))
-
-
-@pytest.mark.parametrize(("correlation", "each"), [(0.05, 5), (0.3, 5), (0.6, 3)])
-def test_design_effect_is_that_of_a_simulation(correlation: float, each: int) -> None:
-    generator = np.random.default_rng(1)
-    found = [effect_of(drawn(generator, 300, each, correlation, 0.8)) for _ in range(60)]
-    expected = (1 + (each - 1) * correlation) * 0.16 / each  # variance of a map's rate
-    assert np.mean(found) == pytest.approx(each * (expected + 0.01) / 0.17, rel=0.04)
-
-
-def test_many_maps_have_the_error_of_a_clustered_regression() -> None:
-    """Maps with 1, 2 and 9 episodes; statsmodels' variance by cluster is that of the ratio estimator."""
-    generator = np.random.default_rng(2)
-    size = np.tile([1, 2, 9], 100)
-    success = drawn(generator, len(size), 9, 0.3, 0.7)[np.arange(9) < size[:, None]]
-    maps = np.repeat(np.arange(len(size)), size)
-    import statsmodels.api as sm  # heavy, as all that tests import where they need it
-
-    fit = sm.OLS(success.astype(float), np.ones(len(success))).fit(
-        cov_type="cluster", cov_kwds={"groups": maps, "use_correction": False}
-    )
-    assert by_map(success.astype(float), maps).var() / len(size) == pytest.approx(fit.cov_params()[0, 0])
-    rate, unequal = success.mean(), (size**2).mean() / size.mean() ** 2
-    gain = (rate * (1 - rate) + 0.01) / (len(size) * fit.cov_params()[0, 0] + 0.01 * unequal)
-    student = (t.ppf(0.975, len(size) - 1) / norm.ppf(0.975)) ** 2
-    assert design_effect(success, maps) == pytest.approx(size.mean() / gain * student)
-
-
-def test_design_effect_by_hand() -> None:
-    # Three maps of two episodes with the rates 1, 1/2, 1/2: p(1 − p) = 2/9, variance of maps 1/18.
-    success = np.array([1, 1, 0, 1, 1, 0], dtype=bool)
-    gain = (2 / 9 + 0.01) / (1 / 18 + 0.01) * (norm.ppf(0.975) / t.ppf(0.975, 2)) ** 2
-    assert gain < 1  # few maps do not tell that they are alike
-    assert design_effect(success, np.array([0, 0, 1, 1, 2, 2])) == 2
-    many = np.tile(success, 20), np.repeat(np.arange(60), 2)
-    gain = (2 / 9 + 0.01) / (1 / 18 + 0.01) * (norm.ppf(0.975) / t.ppf(0.975, 59)) ** 2
-    assert design_effect(*many) == pytest.approx(2 / gain)
-
-
-@pytest.mark.parametrize("groups", [5, 12])
-@pytest.mark.parametrize("rate", [0.6, 0.9])
-def test_the_rate_of_few_large_groups_is_covered(groups: int, rate: float) -> None:
-    generator = np.random.default_rng(3)
-    held = 0
-    for _ in range(400):
-        success = drawn(generator, groups, 20, 0.3, rate)
-        low, high = wilson_interval(success.mean(), success.size / effect_of(success))
-        held += low <= rate <= high
-    assert held >= 372  # 93 %; the study measures 95.2 % and more
-
-
-def test_design_effect_at_its_ends() -> None:
-    both = np.array([True, False, True, True])
-    assert design_effect(both, np.arange(4)) == pytest.approx(1)  # each episode on a map of its own
-    assert design_effect(np.repeat(both, 3), np.repeat(np.arange(4), 3)) == pytest.approx(3)  # all alike
-    # What cannot be seen is taken to be as bad as it can be: one map, or nothing but successes.
-    assert design_effect(both, np.zeros(4)) == 4
-    assert design_effect(np.ones(12, dtype=bool), np.repeat(np.arange(4), 3)) == pytest.approx(3)
-    # 8, 1, 1, 1 and 1 episodes are worth 144/68 maps.
-    assert design_effect(np.ones(12, dtype=bool), [*[0] * 8, 1, 2, 3, 4]) == pytest.approx(12 / (144 / 68))
 
 
 def summary_of(*episodes: dict) -> pd.Series:  # type: ignore[type-arg]
@@ -250,30 +159,6 @@ def test_what_never_arrived_has_an_interval_up_to_its_budget() -> None:
     assert found["total_time_low_s"] == pytest.approx(100 * (1 - found["success_high"]))
 
 
-@pytest.mark.parametrize(("maps", "each"), [(8, 1), (20, 1), (20, 3)])
-@pytest.mark.parametrize("rate", [0.8, 0.95, 0.99])
-def test_intervals_of_total_time_cover_it_on_few_maps(maps: int, each: int, rate: float) -> None:
-    generator = np.random.default_rng(5)
-    held, count = 0, 150
-    for _ in range(count):
-        success = drawn(generator, maps, each, 0.3, rate)
-        taken = np.where(
-            success, np.minimum(33 * np.exp(0.3 * generator.standard_normal(success.shape)), 99), 100
-        )
-        table = pd.DataFrame(
-            {
-                "group": np.repeat(np.arange(maps), each),
-                "success": success.ravel(),
-                "total_time_s": taken.ravel(),
-            }
-        )
-        mean, low, high = total_time_mean(table, {"time_budget_s": 100.0})
-        held += low <= rate * 33 * np.exp(0.045) + (1 - rate) * 100 <= high
-        assert mean == pytest.approx(taken.mean())
-    # With 93 % or more covered, fewer than 128 of 150 are seen once in a thousand times; a bootstrap covers 120 to 130.
-    assert held >= 130
-
-
 def test_maps_of_one_group_are_one_unit() -> None:
     """Ten maps of five groups; all maps of a group end alike, so that five is what they tell."""
     labels = condition()
@@ -286,13 +171,3 @@ def test_maps_of_one_group_are_one_unit() -> None:
     assert by_group["success_low"] < by_map["success_low"]
     assert np.isfinite(by_map["total_time_low_s"])
     assert np.isnan(by_group["total_time_low_s"])  # of five there is none
-
-
-def test_interval_holds_near_the_ends_too() -> None:
-    generator = np.random.default_rng(6)
-    held = 0
-    for _ in range(800):
-        success = drawn(generator, 50, 3, 0.6, 0.05)
-        low, high = wilson_interval(success.mean(), success.size / effect_of(success))
-        held += low <= 0.05 <= high
-    assert held / 800 > 0.93

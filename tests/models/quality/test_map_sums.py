@@ -9,9 +9,11 @@ from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.base import TraversabilityModel
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import Oracle
-from benchnav.models.quality.map_sums import MapTally, added, by_group, measures_of
+from benchnav.models.quality.map_sums import MapTally, by_group
 from benchnav.models.quality.measure import Quality, measure
 from benchnav.models.quality.scores import lower_fifth_and_width, sparsification
+from benchnav.models.quality.scores_of_maps import SCORES
+from benchnav.stats.scores import summarise
 from tests.models.stub import ColourModel
 from tests.models.support import linear_table, make_terrain
 
@@ -31,9 +33,8 @@ def measured(model: TraversabilityModel, *chunks: Terrain, truth: bool = True) -
 
 
 def whole(tally: MapTally) -> dict[str, float]:
-    sums = tally.sums()
-    values = measures_of(added(sums, np.ones(len(sums["cells"]))))
-    return {name: float(value) for name, value in values.items()}
+    (row,) = summarise(tuple(SCORES.values()), {"model": tally.sums()}).to_dict("records")
+    return {str(name): value for name, value in row.items()}
 
 
 def holed() -> Terrain:
@@ -128,9 +129,13 @@ def test_a_model_of_other_classes_is_measured_by_its_traversability_alone() -> N
 
 
 def test_a_class_that_is_nowhere_true_has_no_share_in_the_miou() -> None:
-    base = {name: np.ones(()) for name in measured(MODEL, make_terrain())[1].sums()}
     counts = {"true": [10, 10, 0], "found": [12, 6, 2], "hits": [8, 6, 0]}
-    sums = {**base, **{name: np.array(own, dtype=float) for name, own in counts.items()}}
-    found = measures_of(sums)
-    assert float(found["accuracy"]) == pytest.approx(14 / 20)
-    assert float(found["miou"]) == pytest.approx((8 / 14 + 6 / 10) / 2)
+    sums = {name: np.array([own], dtype=float) for name, own in counts.items()}
+    assert SCORES["accuracy"].value(sums) == pytest.approx(14 / 20)
+    assert SCORES["miou"].value(sums) == pytest.approx((8 / 14 + 6 / 10) / 2)
+
+
+def test_gaps_of_the_tail_do_not_cancel() -> None:
+    sums = {"cells": [100], "under_80": [15], "under_90": [13], "under_95": [5]}
+    value = SCORES["tail_error"].value({name: np.array(own, dtype=float) for name, own in sums.items()})
+    assert value == pytest.approx((0.05 + 0.03 + 0) / 3)

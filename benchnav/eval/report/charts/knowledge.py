@@ -32,7 +32,6 @@ from benchnav.core.figures import (
     styled,
 )
 from benchnav.core.grid import outline
-from benchnav.core.resampling import LEAST_MAPS, bootstrap_counts
 from benchnav.eval.folder.steps import AHEAD_COLUMNS, AHEAD_DEG, AHEAD_M, open_steps, rows_of
 from benchnav.eval.recording import KnownMap, Recording
 from benchnav.eval.report.charts.maps import choose_recordings
@@ -49,6 +48,7 @@ from benchnav.eval.report.plan_layers import (
 )
 from benchnav.eval.report.words import NAMING, contender_names, joined, reading_name
 from benchnav.eval.stats.best import BLOCK
+from benchnav.stats.bootstrap import LEAST_MAPS, bootstrap_counts
 
 # Of each column what its panels are called, and which way is better.
 _CALLED = ("RMSE of E[λ] ahead (lower is better)", "log score ahead (higher is better)")

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchnav.core.command import Device
-from benchnav.models.quality.output import DPI, FIGURES, check_folder
+from benchnav.models.quality.output import DPI, check_folder, open_maps, save_figures
 
 if TYPE_CHECKING:
     import torch
@@ -40,19 +40,15 @@ def compare(
         device: Where the models are measured and timed; auto takes CUDA where there is a GPU.
     """
     from benchnav import __version__
-    from benchnav.core.errors import expect
     from benchnav.core.progress import show_progress
     from benchnav.core.tables import print_table
-    from benchnav.datagen.files.find import find_dataset
-    from benchnav.datagen.files.reader import TerrainDataset
     from benchnav.models.config import check_seed
 
     check_seed(seed)
     folder = Path(out)
     if out:
         check_folder(folder, overwrite, (REPORT, CSV, DIFFERENCES, PAGE), "a comparison")
-    dataset = TerrainDataset(find_dataset(data))
-    expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
+    dataset = open_maps(data, splits)
 
     from benchnav.core.device import find_device, gpu_name
     from benchnav.models.quality.compare.candidates import find_candidates
@@ -107,39 +103,35 @@ def _compared(
     qualities: "dict[tuple[str, str], Quality]",
     device: "torch.device",
 ) -> "Comparison":
-    """Compares what was measured, and tells what each model costs."""
+    """Compare what was measured, and say what each model costs."""
     import numpy as np
-    import pandas as pd
 
     from benchnav.models.quality.compare.candidates import count_parameters, prediction_ms
-    from benchnav.models.quality.compare.paired import against_best, compare_pairs, summarise
-    from benchnav.models.quality.compare.report import Comparison
+    from benchnav.models.quality.compare.report import Comparison, compare_sums
     from benchnav.models.quality.map_sums import by_group
 
-    competing = [one.label for one in candidates if not one.privileged]
     tallies = {key: quality.by_map for key, quality in qualities.items() if quality.by_map}
-    summaries, pairs = [], []
+    sums: dict[str, dict[str, Any]] = {}
     for split in splits:
         groups: Any = np.arange(dataset.map_count(split))
         if "group" in dataset.field_names:
             groups = dataset.read(split, fields=("group",))["group"].reshape(-1)
-        sums = {model: by_group(own.sums(), groups) for (of, model), own in tallies.items() if of == split}
-        summaries.append(summarise(split, sums))
-        pairs.append(compare_pairs(split, sums, competing))
-    summary, differences = pd.concat(summaries, ignore_index=True), pd.concat(pairs, ignore_index=True)
+        sums[split] = {
+            model: by_group(own.sums(), groups) for (of, model), own in tallies.items() if of == split
+        }
+    summary, pairs, best = compare_sums(sums, [one.label for one in candidates if not one.privileged])
     terrain = dataset.terrain(splits[0], [0]).to(device)
-    models = {}
-    for one in candidates:
-        if not (summary["model"] == one.label).any():
-            continue
-        models[one.label] = {
+    models = {
+        one.label: {
             "source": one.source,
             "privileged": one.privileged,
             "parameters": None if one.privileged else count_parameters(one.model),
             "prediction_ms": None if one.privileged else prediction_ms(one.model, terrain),
         }
-    best = against_best(summary, differences, competing)
-    return Comparison(models=models, summary=summary, pairs=differences, best=best, tallies=tallies)
+        for one in candidates
+        if (summary["model"] == one.label).any()
+    }
+    return Comparison(models=models, summary=summary, pairs=pairs, best=best, tallies=tallies)
 
 
 def _notes(
@@ -195,8 +187,6 @@ def _notes(
 
 
 def _write(out: str, title: str, about: dict[str, Any], comparison: "Comparison", notes: list[str]) -> None:
-    from benchnav.core.figures import save_twice
-    from benchnav.core.progress import show_progress
     from benchnav.core.store import write_text
     from benchnav.models.quality.compare.report import (
         comparison_csv,
@@ -209,16 +199,8 @@ def _write(out: str, title: str, about: dict[str, Any], comparison: "Comparison"
     write_text(folder / REPORT, comparison_json(about, comparison))
     write_text(folder / CSV, comparison_csv(comparison))
     write_text(folder / DIFFERENCES, comparison.pairs.to_csv(index=False, float_format="%.6g"))
-    for old in (folder / FIGURES).glob("*.p[nd][gf]"):
-        old.unlink()
     drawn = comparison_figures(comparison)
-
-    def saved() -> Iterator[tuple[int, int]]:
-        for count, (name, draw) in enumerate(drawn.items(), 1):
-            save_twice(draw(), folder / FIGURES / f"{name}.png", dpi=DPI)
-            yield count, len(drawn)
-
-    show_progress(saved(), "figures")
+    save_figures(folder, drawn, DPI)
     write_text(folder / PAGE, comparison_markdown(title, comparison, notes, list(drawn)))
     print(f"wrote {REPORT}, {CSV}, {DIFFERENCES}, {PAGE} and {len(drawn)} figures in {out}")
     print(f"columns and figures are explained in {folder / PAGE}")

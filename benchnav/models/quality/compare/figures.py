@@ -23,8 +23,9 @@ from benchnav.core.figures import (
     stack_panels,
     styled,
 )
-from benchnav.models.quality.compare.paired import COVERAGE, HIGHER, LOWER, MEASURES
 from benchnav.models.quality.map_sums import MapTally
+from benchnav.models.quality.scores import LEVEL
+from benchnav.models.quality.scores_of_maps import COMPARED
 
 _GREYS = ("0.35", "0.6")
 _DASHES = ("-", "--", "-.")
@@ -32,7 +33,7 @@ _LEAST_WIDTH_IN = 4.4
 _LINE_IN, _ROW_IN = 0.075, 0.16  # of a mark, and at least of a model
 _AT_SEVERITY = ("crps", "pinball")
 _MARKED_EVERY = 4
-_BETTER = dict.fromkeys(HIGHER, " ↑") | dict.fromkeys(LOWER, " ↓")
+_ARROWS = {"higher": " ↑", "lower": " ↓", "": ""}
 
 Looks = Mapping[str, Mapping[str, Any]]
 Tallies = Mapping[tuple[str, str], MapTally]
@@ -64,20 +65,21 @@ def measures_figure(
     """Draws each measure of each model with its interval, a panel a measure and a mark a split.
 
     Args:
-        summary: from `paired.summarise`.
+        summary: of `Comparison`.
         headings: of the measures.
         looks: from `model_looks`, in the order of the models.
         privileged: those of the models.
     """
-    shown = [name for name in MEASURES if name in summary and summary[name].notna().any()]
+    shown = [score for score in COMPARED if score.name in summary and summary[score.name].notna().any()]
     models, splits = list(looks), list(dict.fromkeys(summary["split"]))
     across = 4 if len(shown) > 6 else 3
     down = -(-len(shown) // across)
     high = len(models) * max(_ROW_IN, _LINE_IN * (len(splits) + 1.5)) + 0.45
     figure = Figure(figsize=(TWO_COLUMNS_IN, down * high + 0.35), layout="constrained")
     panels = [panel for (panel,) in stack_panels(figure, len(shown), across, sharey=True)]
-    for panel, name in zip(panels, shown, strict=True):
-        panel.set_title(headings[name] + _BETTER.get(name, ""), parse_math=False)
+    for panel, score in zip(panels, shown, strict=True):
+        name = score.name
+        panel.set_title(headings[name] + _ARROWS[score.better], parse_math=False)
         for place, split in enumerate(splits):
             rows = summary[summary["split"] == split].set_index("model").reindex(models)
             y = np.arange(len(models)) + 0.7 * ((place + 0.5) / len(splits) - 0.5)
@@ -88,7 +90,7 @@ def measures_figure(
             panel.hlines(y, low, high_end, color=colour, lw=1)
             panel.plot(value, y, MARKERS[place % len(MARKERS)], color=colour, ms=2.8, label=split)
         if name == "coverage":
-            panel.axvline(COVERAGE, color="0.4", lw=0.8, ls="--", zorder=0.5, label="calibrated")
+            panel.axvline(LEVEL, color="0.4", lw=0.8, ls="--", zorder=0.5, label="calibrated")
         panel.grid(axis="x", alpha=0.3)
         panel.margins(x=0.08)
         panel.locator_params(axis="x", nbins=4, steps=[1, 2, 5, 10])
@@ -158,7 +160,7 @@ def severity_figure(
 
     Args:
         all_series: by scenario, its pairs as (severity, split), ascending.
-        summary: from `paired.summarise`.
+        summary: of `Comparison`.
         headings: of the measures.
         looks: from `model_looks`.
     """

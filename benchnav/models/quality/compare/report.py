@@ -1,6 +1,5 @@
-"""A comparison in numbers and words: a table for each kind of file, and what columns and figures mean."""
+"""A comparison of models in numbers and words: a table for each kind of file, and what columns and figures mean."""
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,53 +8,26 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from benchnav.core.resampling import LEAST_MAPS
-from benchnav.core.tables import NOTHING, Bold, Table, to_markdown
+from benchnav.core.tables import NOTHING, Bold, Table
 from benchnav.datagen.recipe.scenario import find_series
-from benchnav.models.quality.compare.paired import ALPHA, MEASURES
 from benchnav.models.quality.map_sums import MapTally
-from benchnav.models.quality.report import COLUMNS
+from benchnav.models.quality.output import json_text, page
+from benchnav.models.quality.scores_of_maps import COMPARED, SCORES, TAIL_RATES
+from benchnav.stats.bootstrap import LEAST_MAPS
+from benchnav.stats.holm import ALPHA
+from benchnav.stats.scores import against_best, compare_pairs, summarise
+from benchnav.stats.tables import Column, Row, cell_of, labels_of, p_value, signed, signed_interval, table_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Of the numbers that are compared: the heading in two lines, and what it means. Those of `evaluate` mean the same here.
-HEADINGS = {
-    name: COLUMNS[name]
-    for name in ("accuracy", "miou", "rmse_expected", "rmse_observed", "nll", "crps", "coverage")
-} | {
-    "pinball": (
-        "pinball\nfifth",
-        "pinball loss of the lower fifth: u·(λ − Q(u)) where λ is at least the quantile Q(u), else (1 − u)·(Q(u) − λ), "
-        "averaged over the levels u = 0.01, 0.02, …, 0.20. It scores the bad end of the prediction; lower is better.",
-    ),
-    "width": (
-        "width\n90 %",
-        "sharpness: mean width Q(0.95) − Q(0.05) of the central 90 % interval; narrower is better where “in 90 %” is "
-        "right.",
-    ),
-    "tail_error": (
-        "tail\nerror",
-        "tail calibration: mean gap between the share of observed λ below VaR₀.₈, VaR₀.₉ and VaR₀.₉₅, and 0.2, 0.1 and "
-        "0.05; 0 is perfect.",
-    ),
-    "ause": (
-        "AUSE\n",
-        "area under the sparsification error curve: cells are removed by uncertainty, and by error; the area between "
-        "the two curves of the mean error |λ − E[λ]| of the rest is averaged over maps. 0 is perfect; noise of the "
-        "ground keeps any model above it.",
-    ),
-    "prediction_ms": (
-        "ms a\nmap",
-        "median time of predicting one map, in milliseconds.",
-    ),
-    "parameters": (
-        "parameters\n",
-        "number of weights of all networks of the model.",
-    ),
-}  # fmt: skip
-ORDER = (*MEASURES, "prediction_ms", "parameters")
+# What a model costs, which stands in the table next to its scores: heading and meaning.
+COSTS = {
+    "prediction_ms": ("ms a\nmap", "median time of predicting one map, in milliseconds."),
+    "parameters": ("parameters\n", "number of weights of all networks of the model."),
+}
 PRIVILEGED_MARK = " †"
+_UNITS = ((1e6, 2, "M"), (1e3, 1, "k"), (1, 0, ""))  # size, decimal places and letter of a number of weights
 
 FIGURES = {
     "measures": (
@@ -88,9 +60,9 @@ class Comparison:
     Args:
         models: by label what is said of it, such as `source`, `privileged`, `parameters`, `prediction_ms`; those that
             compete first.
-        summary: from `paired.summarise` of each split.
-        pairs: from `paired.compare_pairs` of each split.
-        best: from `paired.against_best`.
+        summary: a row a split and model, `split`, `model` and the columns of `scores.summarise`.
+        pairs: of each split, `split` and the columns of `scores.compare_pairs`.
+        best: of each split, `split`, `model` and the columns of `scores.against_best`.
         tallies: by split and model.
     """
 
@@ -107,128 +79,147 @@ class Comparison:
 
     @property
     def numbers(self) -> pd.DataFrame:
-        """The summary with what each model costs."""
-        costs = pd.DataFrame(
-            [
-                {"model": label, **{name: about[name] for name in ("prediction_ms", "parameters")}}
-                for label, about in self.models.items()
-            ]
-        )
-        return self.summary.merge(costs, on="model", how="left")
+        """The summary with what each model costs, and whether it is privileged."""
+        about = pd.DataFrame.from_dict(self.models, orient="index")
+        return self.summary.join(about[["privileged", *COSTS]], on="model")
+
+
+def compare_sums(
+    sums: Mapping[str, Mapping[str, Any]], competing: Sequence[str]
+) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """Compare models by their sums over maps, each split for itself.
+
+    Args:
+        sums: by split and model, from `map_sums.by_group`.
+        competing: the models that compete.
+
+    Returns:
+        `summary`, `pairs` and `best` of `Comparison`.
+    """
+    summaries, pairs, best = {}, {}, {}
+    for split, own in sums.items():
+        summaries[split] = summarise((*COMPARED, *TAIL_RATES), own)
+        pairs[split] = compare_pairs(COMPARED, own, competing, "cells")
+        rivals = summaries[split][summaries[split].index.isin(competing)]
+        best[split] = against_best(COMPARED, rivals, pairs[split])
+    return (
+        pd.concat(summaries, names=["split", "model"]).reset_index(),
+        pd.concat(pairs, names=["split"]).reset_index("split").reset_index(drop=True),
+        pd.concat(best, names=["split", "model"]).reset_index(),
+    )
 
 
 def comparison_table(title: str, comparison: Comparison, whole: bool = False) -> Table:
-    """Formats the numbers, a row a split and model; a number that there is not has a dash.
+    """Write the numbers, a row a split and model; a missing number has a dash.
 
     Args:
         title: over the table.
         comparison: what was measured.
-        whole: with both errors of E[λ]; else that to λ as observed stands where the other is unknown alone.
+        whole: with both errors of E[λ]; else that to observed λ only if the other is unknown.
     """
     numbers = comparison.numbers
-    shown = [name for name in ORDER if name in numbers and numbers[name].notna().any()]
+    known = [name for name in (*SCORES, *COSTS) if name in numbers and numbers[name].notna().any()]
+    hidden = {score.name for score in TAIL_RATES}
     if not whole and numbers.get("rmse_expected", pd.Series([math.nan])).notna().all():
-        shown.remove("rmse_observed")
-    best = comparison.best
-    marked = {(row["split"], row["model"], row["measure"]) for row in best[best["marked"]].to_dict("records")}
-    rows = []
-    for row in numbers.to_dict("records"):
-        privileged = comparison.models[row["model"]]["privileged"]
-        cells = [row["split"], row["model"] + PRIVILEGED_MARK * privileged]
-        for name in shown:
-            text = _cell(name, row[name])
-            cells.append(Bold(text) if (row["split"], row["model"], name) in marked else text)
-        rows.append(tuple(cells))
-    explained = [(" ".join(heading.split()), text) for heading, text in (HEADINGS[name] for name in shown)]
-    return Table(
-        title=title,
-        headings=("split\n", "model\n", *(HEADINGS[name][0] for name in shown)),
-        labels=2,
-        numbers=True,
-        rows=tuple(rows),
-        bold_note=_BOLD if marked else "",
-        explained=(
-            ("split", "split of the dataset."),
-            ("model", "† marks privileged models: references that are given part of the truth and do not compete."),
-            *explained,
+        hidden.add("rmse_observed")
+    best = comparison.best[comparison.best["marked"]]
+    marked = {(row["split"], row["model"], row["measure"]) for row in best.to_dict("records")}
+    columns = [
+        Column("split\n", cell_of("split"), "split of the dataset."),
+        Column(
+            "model\n",
+            lambda row: row["model"] + PRIVILEGED_MARK * row["privileged"],
+            "† marks privileged models: references that are given part of the truth and do not compete.",
         ),
+    ]
+    for name in known:
+        if name not in hidden:
+            heading, meaning = COSTS.get(name) or (SCORES[name].heading, SCORES[name].meaning)
+            columns.append(Column(heading, partial(_cell, name, marked), meaning))
+    note = (
+        "best of its split by this measure, and all without a significant difference from it (permutation test by map, "
+        f"Holm, p ≥ {ALPHA}). Privileged models (†) do not compete."
+    )
+    return table_of(
+        numbers.to_dict("records"), columns, title=title, labels=2, numbers=True, bold_note=note if marked else ""
     )  # fmt: skip
 
 
-_BOLD = (
-    "best of its split by this measure, and all without a significant difference from it (permutation test by map, "
-    f"Holm, p ≥ {ALPHA}). Privileged models (†) do not compete."
-)  # fmt: skip
+def _cell(name: str, marked: set[tuple[str, str, str]], row: Row) -> str:
+    value = row[name]
+    if value is None or math.isnan(value):
+        return NOTHING
+    if name == "prediction_ms":
+        return f"{value:.3g}"
+    if name == "parameters":
+        size, digits, unit = next((known for known in _UNITS if value >= known[0]), _UNITS[-1])
+        return f"{value / size:.{digits}f}{unit}"
+    text = f"{value:.4f}"
+    return Bold(text) if (row["split"], row["model"], name) in marked else text
 
 
 def difference_table(comparison: Comparison) -> Table:
-    """Formats the differences to the best, a row a split, measure and other model that competes."""
-    rows = []
-    for row in comparison.best.to_dict("records"):
-        if row["model"] == row["best"] or math.isnan(row["difference"]):
-            continue
-        interval = NOTHING if math.isnan(row["low"]) else f"{row['low']:+.4f} to {row['high']:+.4f}"
-        p = "≤ 0.0001" if row["p_holm"] <= 1e-4 else f"{row['p_holm']:.2g}"
-        name = " ".join(HEADINGS[row["measure"]][0].split())
-        cells = (row["split"], name, row["best"], row["model"], f"{row['difference']:+.4f}", interval)
-        rows.append((*cells, p if row["alike"] else Bold(p)))
-    return Table(
-        title="Differences to the best",
-        headings=("split", "measure", "best", "model", "difference", "95 % interval", "p (Holm)"),
-        labels=4,
-        rows=tuple(rows),
-        bold_note=f"p under {ALPHA}." if any(isinstance(row[-1], Bold) for row in rows) else "",
-        explained=(
-            ("difference", "the model less the best, by this measure; of “in 90 %” the difference of the distance to "
-             "0.9."),
-            ("95 % interval", f"bootstrap over maps; no interval under {LEAST_MAPS} maps."),
-            ("p (Holm)", "permutation test by map, which exchanges the two models; corrected over all pairs of models "
-             "that compete, within measure and split (Holm)."),
+    """Write the differences to the best, a row a split, measure and other model that competes."""
+    rows = comparison.best[comparison.best["difference"].notna()]
+    columns = [
+        *labels_of("split"),
+        Column("measure", cell_of("measure", lambda name: SCORES[name].title)),
+        *labels_of("best", "model"),
+        Column(
+            "difference",
+            lambda row: signed(row["difference"], 4),
+            "the model less the best, by this measure; of “in 90 %” the difference of the distance to 0.9.",
         ),
-    )  # fmt: skip
+        Column(
+            "95 % interval",
+            lambda row: signed_interval(row["low"], row["high"], 4),
+            f"bootstrap over maps; no interval under {LEAST_MAPS} maps.",
+        ),
+        Column(
+            "p (Holm)",
+            lambda row: p_value(row["p_holm"]) if row["alike"] else Bold(p_value(row["p_holm"])),
+            "permutation test by map, which exchanges the two models; corrected over all pairs of models that compete, "
+            "within measure and split (Holm).",
+        ),
+    ]
+    note = "" if rows["alike"].all() else f"p under {ALPHA}."
+    return table_of(
+        rows.to_dict("records"), columns, title="Differences to the best", labels=4, bold_note=note
+    )
 
 
 def comparison_json(about: Mapping[str, Any], comparison: Comparison) -> str:
-    """Writes everything that was measured as JSON; a number that there is not is null."""
+    """Write everything that was measured as JSON; NaN is null."""
     splits: dict[str, Any] = {}
     for row in comparison.summary.to_dict("records"):
-        split, model = row.pop("split"), row.pop("model")
+        split, model, units = row.pop("split"), row.pop("model"), row.pop("units")
         tally = comparison.tallies[split, model]
-        curves = tally.curves()
-        place = splits.setdefault(split, {"units": row["units"], "models": {}, "pairs": []})
-        place["models"][model] = {
-            **{name: value for name, value in row.items() if name != "units"},
+        own = splits.setdefault(split, {"units": units, "models": {}, "pairs": []})
+        own["models"][model] = {
+            **row,
             "pit": list(tally.pit),
-            "sparsification": dict(zip(("left_out", "by_width", "by_error"), curves.tolist(), strict=True)),
+            "sparsification": dict(
+                zip(("left_out", "by_width", "by_error"), tally.curves().tolist(), strict=True)
+            ),
         }
     for row in comparison.pairs.to_dict("records"):
         splits[row.pop("split")]["pairs"].append(row)
-    all_series = {
-        scenario: [{"severity": severity, "split": split} for severity, split in pairs]
-        for scenario, pairs in find_series(splits).items()
-    }
-    whole = {**about, "models": comparison.models, "splits": splits, "series": all_series}
-    # JSON has no word for what is no number.
-    text = json.loads(json.dumps(whole, default=int), parse_constant=lambda _: None)
-    return json.dumps(text, indent=1) + "\n"
+    return json_text({**about, "models": comparison.models}, splits)
 
 
 def comparison_csv(comparison: Comparison) -> str:
-    """Writes the numbers as CSV, a row a split and model, with the ends of their intervals."""
+    """Write the numbers as CSV, a row a split and model, with the ends of their intervals."""
     numbers = comparison.numbers
-    measured = [name for name in ORDER if name in numbers]
-    singles = [name for name in numbers if name.startswith("tail_rate_")]
-    names = [own for name in measured for own in (name, f"{name}_low", f"{name}_high") if own in numbers]
-    privileged = numbers["model"].map(lambda model: comparison.models[model]["privileged"])
-    table = numbers.assign(privileged=privileged)
-    columns = ["split", "model", "privileged", "units", *names, *singles]
-    return table.to_csv(columns=columns, index=False, float_format="%.6g")
+    names = [own for score in COMPARED for own in (score.name, f"{score.name}_low", f"{score.name}_high")]
+    columns = ["split", "model", "privileged", "units", *names, *COSTS, *(score.name for score in TAIL_RATES)]
+    known = [name for name in columns if name in numbers]
+    return numbers.to_csv(columns=known, index=False, float_format="%.6g")
 
 
 def comparison_markdown(
     title: str, comparison: Comparison, notes: Sequence[str], figures: Sequence[str]
 ) -> str:
-    """Writes the tables as a page with its figures, and what columns and figures mean.
+    """Write the tables as a page with its figures, and what columns and figures mean.
 
     Args:
         title: of the page.
@@ -236,15 +227,9 @@ def comparison_markdown(
         notes: lines under the table.
         figures: names of the figures, of `FIGURES`, whose images are in the folder `figures`.
     """
-    lines = [f"# {title}", "", to_markdown(comparison_table(title, comparison, whole=True)).rstrip()]
-    lines += [text for note in notes for text in ("", note)]
-    differences = difference_table(comparison)
-    if differences.rows:
-        lines += ["", f"## {differences.title}", "", to_markdown(differences).rstrip()]
-    for name in figures:
-        heading, text = FIGURES[name]
-        lines += ["", f"![{heading}](figures/{name}.png)", "", f"**{heading}.** {text}"]
-    return "\n".join([*lines, ""])
+    tables = [comparison_table(title, comparison, whole=True), difference_table(comparison)]
+    captions = [(f"figures/{name}.png", *FIGURES[name]) for name in figures]
+    return page(title, [table for table in tables if table.rows], notes, captions)
 
 
 def comparison_figures(comparison: Comparison) -> "dict[str, Callable[[], Figure]]":
@@ -253,7 +238,7 @@ def comparison_figures(comparison: Comparison) -> "dict[str, Callable[[], Figure
 
     privileged = [label for label, about in comparison.models.items() if about["privileged"]]
     looks = figures.model_looks(list(comparison.models), privileged)
-    headings = {name: " ".join(heading.split()) for name, (heading, _) in HEADINGS.items()}
+    headings = {score.name: score.title for score in COMPARED}
     drawn: dict[str, Callable[[], Figure]] = {
         "measures": partial(figures.measures_figure, comparison.summary, headings, looks, privileged),
         "calibration": partial(figures.calibration_figure, comparison.tallies, looks),
@@ -262,17 +247,3 @@ def comparison_figures(comparison: Comparison) -> "dict[str, Callable[[], Figure
     if all_series := find_series(comparison.splits):
         drawn["severity"] = partial(figures.severity_figure, all_series, comparison.summary, headings, looks)
     return drawn
-
-
-def _cell(name: str, value: float) -> str:
-    if value is None or math.isnan(value):
-        return NOTHING
-    if name == "parameters":
-        return (
-            f"{value / 1e6:.2f}M"
-            if value >= 1e6
-            else f"{value / 1e3:.1f}k"
-            if value >= 1e3
-            else f"{value:.0f}"
-        )
-    return f"{value:.3g}" if name == "prediction_ms" else f"{value:.4f}"

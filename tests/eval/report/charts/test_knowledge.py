@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 
 from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, hatching, robot_marker
 from benchnav.core.grid import outline
-from benchnav.core.resampling import LEAST_MAPS
 from benchnav.eval.folder.sealed import read_sealed
 from benchnav.eval.recording import Recording
 from benchnav.eval.report import write
@@ -22,6 +21,7 @@ from benchnav.eval.report.charts.knowledge import (
     learning_figure,
     read_learning,
 )
+from benchnav.stats.bootstrap import LEAST_MAPS
 from tests.eval.forged import forge_steps
 from tests.eval.report import made
 from tests.eval.report.test_write import run_folder

@@ -147,24 +147,6 @@ def test_a_folder_holds_numbers_differences_page_and_figures(
     assert "Differences" not in (out / "compare.md").read_text()
 
 
-def test_the_order_of_models_turns_the_signs_of_their_differences(
-    dataset: TerrainDataset, tmp_path: Path
-) -> None:
-    found = {}
-    for one, other in (("colours", "vague"), ("vague", "colours")):
-        out = tmp_path / one
-        assert (
-            call("train", "compare", one, other, "--data", dataset.path, "--splits", "[valid]", "--out", out)
-            == 0
-        )
-        rows = json.loads((out / "compare.json").read_text())["splits"]["valid"]["pairs"]
-        found[one] = {row["measure"]: row for row in rows if (row["one"], row["other"]) == (one, other)}
-    assert found["colours"].keys() == found["vague"].keys()
-    for name, row in found["colours"].items():
-        assert row["difference"] == pytest.approx(-found["vague"][name]["difference"]), name
-        assert row["p"] == found["vague"][name]["p"]
-
-
 def test_seed_and_device_reach_the_measurement(
     dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,14 +13,15 @@ from benchnav.models.quality.compare.figures import (
     severity_figure,
     sparsification_figure,
 )
-from benchnav.models.quality.compare.paired import MEASURES, summarise
 from benchnav.models.quality.map_sums import MapTally
 from benchnav.models.quality.measure import measure_split
+from benchnav.models.quality.scores_of_maps import COMPARED
+from benchnav.stats.scores import summarise
 from tests.models.stub import ColourModel
 
 MODELS = ("colours", "oracle")
 SPLITS = ("train", "test/std")
-HEADINGS = {name: name for name in MEASURES}
+HEADINGS = {score.name: score.name for score in COMPARED}
 Tallies = dict[tuple[str, str], MapTally]
 
 
@@ -32,6 +33,15 @@ def tallies(dataset: TerrainDataset) -> Tallies:
         for name, model in (("colours", ColourModel()), ("oracle", Oracle()))
     }
     return {key: tally for key, tally in found.items() if tally}
+
+
+def summary_of(tallies: Tallies) -> pd.DataFrame:
+    splits = dict.fromkeys(split for split, _ in tallies)
+    tables = {
+        split: summarise(COMPARED, {name: own.sums() for (of, name), own in tallies.items() if of == split})
+        for split in splits
+    }
+    return pd.concat(tables, names=["split", "model"]).reset_index()
 
 
 def panel(figure: Figure, title: str) -> Axes:
@@ -47,9 +57,7 @@ def test_models_differ_in_look_and_privileged_ones_are_grey() -> None:
 
 
 def test_marks_and_lines_are_the_measures_and_their_intervals(tallies: Tallies) -> None:
-    summary = pd.concat(
-        [summarise(split, {name: tallies[split, name].sums() for name in MODELS}) for split in SPLITS]
-    )
+    summary = summary_of(tallies)
     figure = measures_figure(summary, HEADINGS, model_looks(MODELS, ["oracle"]), ["oracle"])
     axes = panel(figure, "crps ↓")
     titles = [axes.get_title() for axes in figure.axes]
@@ -95,9 +103,7 @@ def test_sparsification_shows_both_rankings_of_every_split(tallies: Tallies) -> 
 
 
 def test_severity_has_a_line_a_model_and_leaves_out_what_was_not_measured(tallies: Tallies) -> None:
-    tables = [summarise("train", {"colours": tallies["train", "colours"].sums()})]
-    tables.append(summarise("test/std", {name: tallies["test/std", name].sums() for name in MODELS}))
-    summary = pd.concat(tables)
+    summary = summary_of({key: own for key, own in tallies.items() if key != ("train", "oracle")})
     series = {"test/hg": [(0.0, "test/std"), (0.5, "train")]}
     figure = severity_figure(series, summary, HEADINGS, model_looks(MODELS, ["oracle"]))
     for axes, name in zip(figure.axes[:2], ("crps", "pinball"), strict=True):

@@ -1,0 +1,1 @@
+"""Statistics of comparisons: paired differences, intervals, tests, the best set, and their tables."""

@@ -1,0 +1,52 @@
+"""Tests of a difference against a margin: non-inferiority, superiority and equivalence.
+
+Each is decided by where the interval of the difference ends (two one-sided tests).
+Sources: Schuirmann (1987), "A comparison of the two one-sided tests procedure and the power approach for assessing the
+equivalence of average bioavailability"; Wellek (2010), "Testing Statistical Hypotheses of Equivalence and
+Noninferiority", 1.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import brentq
+
+# Largest confidence at which p is searched, but for rounding to 0 and 1.
+_MAX = 1 - 1e-12
+
+
+def margin_p(
+    interval: Callable[[float], tuple[float, float, float]], kind: str, direction: str, margin: float
+) -> float:
+    """Return p of a hypothesis with a margin; 1 if the difference has no interval.
+
+    Args:
+        interval: by confidence the difference and the ends of its interval.
+        kind: `non-inferiority`, `superiority` or `equivalence`.
+        direction: which is better, `higher` or `lower`; empty for equivalence.
+        margin: above 0, in the unit of the difference.
+    """
+    sides = {"higher": (-1.0,), "lower": (1.0,)}.get(direction, (-1.0, 1.0))
+    bound = -margin if kind == "superiority" else margin
+    return max(_side_p(interval, bound, side) for side in sides)
+
+
+def _side_p(interval: Callable[[float], tuple[float, float, float]], margin: float, side: float) -> float:
+    """Return p that the difference is beyond a margin, below −margin (side −1) or above it (side 1).
+
+    It is the level at which the end of the one-sided interval comes to lie on the margin.
+    """
+
+    def end(signed: float) -> float:
+        """Return the end on the margin's side; of a negative confidence the other end."""
+        _, low, high = interval(abs(signed))
+        return side * (high if (side > 0) == (signed >= 0) else low)
+
+    if np.isnan(end(0.5)):
+        return 1.0
+    if end(_MAX) < margin:
+        return (1 - _MAX) / 2
+    if end(-_MAX) > margin:
+        return 1.0
+    signed = brentq(lambda confidence: end(confidence) - margin, -_MAX, _MAX)
+    return (1 - float(signed)) / 2
