@@ -26,7 +26,7 @@ FACES = {
     "load_model measure_margin predict predict_tiles save_checkpoint write_risk_maps",
     "benchnav.planning": "AStarDWA AStarMPPI Appearance Belief Bicycle CLRRT Classes Contact Copula "
     "DifferentialDrive FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Near NearOptimal "
-    "Objective Optimal OptimalBound Places Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensed "
+    "Objective Optimal Places Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensed "
     "Sensor Simulation Static Step Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem CVaR Chance "
     "ExpectedTime Mean RiskMeasure SingleClass TimeCVaR VaR",
     "benchnav.testing": "check_belief check_model check_objective check_planner check_risk check_robot "

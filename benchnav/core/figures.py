@@ -98,7 +98,6 @@ _PLANNERS = {
     "mppi": ("MPPI", GREEN),
     "optimal": ("optimal", AMBER),
     "near_optimal": ("near-optimal", SKY),
-    "optimal_bound": ("near-optimal", SKY),
     "straight": ("straight", BLIND),
 }
 

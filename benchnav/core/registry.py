@@ -37,6 +37,7 @@ from typing import Any
 
 from benchnav.core import touched
 from benchnav.core.errors import ConfigError, check_label, out_of_memory
+from benchnav.core.renamed import PARTS
 from benchnav.core.settings import NO_DEFAULT as NO_DEFAULT
 from benchnav.core.settings import Option as Option
 from benchnav.core.settings import (
@@ -366,7 +367,8 @@ def find(kind: str, source: str) -> Found:
         return _found_in_file(kind, Path(place), name)
     if colon and place:
         return _found_in_module(kind, place, name.partition("[")[0].strip())
-    remedy = hint(source, names(kind))
+    new = PARTS.get((kind, source))
+    remedy = f" It is now {new!r}." if new else hint(source, names(kind))
     if source.endswith(".py"):
         remedy = f" Say which class or function of it: {source}:Name."
     elif Path(f"{source}.py").is_file():

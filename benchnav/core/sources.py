@@ -19,19 +19,9 @@ from types import ModuleType
 from typing import Any
 
 from benchnav.core.errors import BenchnavError, ConfigError, out_of_memory
+from benchnav.core.renamed import IMPORTS
 from benchnav.core.settings import hint, one_line
 from benchnav.core.shipped_files import PACKAGE
-
-# Names of version 1, with those that replace them: what an import did not find is looked up here.
-MOVED = {
-    "benchnav.planning.risk.chance": "benchnav.planning.Chance",
-    "benchnav.planning.risk.cvar": "benchnav.planning.CVaR",
-    "benchnav.planning.risk.expected_time": "benchnav.planning.ExpectedTime",
-    "benchnav.planning.risk.mean": "benchnav.planning.Mean",
-    "benchnav.planning.risk.single_class": "benchnav.planning.SingleClass",
-    "benchnav.planning.risk.time_cvar": "benchnav.planning.TimeCVaR",
-    "benchnav.planning.risk.var": "benchnav.planning.VaR",
-}
 
 
 def moved(error: BaseException) -> str:
@@ -40,7 +30,7 @@ def moved(error: BaseException) -> str:
         return ""
     name = re.search(r"cannot import name '(\w+)'", str(error))
     old = f"{error.name}.{name[1]}" if name else error.name
-    return f". {old} is now {MOVED[old]}." if old in MOVED else ""
+    return f". {old} is now {IMPORTS[old]}." if old in IMPORTS else ""
 
 
 def attribute(module: ModuleType, place: str, name: str) -> Any:

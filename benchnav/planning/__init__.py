@@ -11,7 +11,7 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.planning.planners.astar.astar_mppi": ("AStarMPPI",),
         "benchnav.planning.planners.cl_rrt.cl_rrt": ("CLRRT",),
         "benchnav.planning.planners.mppi": ("MPPI", "MPPIConfig"),
-        "benchnav.planning.planners.optimal.optimal": ("NearOptimal", "Optimal", "OptimalBound"),
+        "benchnav.planning.planners.optimal.optimal": ("NearOptimal", "Optimal"),
         "benchnav.planning.planners.planner": ("LocalPlanner", "Plan", "PlanStatus", "Planner"),
         "benchnav.planning.planners.straight": ("Straight",),
         "benchnav.planning.problem": ("Problem", "Task", "pose_problem"),

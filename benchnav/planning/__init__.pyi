@@ -4,7 +4,7 @@ from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI
 from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig
-from benchnav.planning.planners.optimal.optimal import NearOptimal, Optimal, OptimalBound
+from benchnav.planning.planners.optimal.optimal import NearOptimal, Optimal
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, PlanStatus
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, Task, pose_problem
@@ -48,7 +48,6 @@ __all__ = [
     "NearOptimal",
     "Objective",
     "Optimal",
-    "OptimalBound",
     "Places",
     "Plan",
     "PlanStatus",

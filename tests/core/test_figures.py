@@ -36,8 +36,6 @@ def test_a_planner_has_one_colour_in_whatever_company() -> None:
     assert len(set(others.values())) == 4
     assert others["straight"] == BLIND
     shipped = planner_colours(list(names("planner")))
-    # One planner has two names.
-    assert shipped.pop("optimal_bound") == shipped["near_optimal"]
     assert len(set(shipped.values())) == len(shipped)
 
 

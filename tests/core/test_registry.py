@@ -441,6 +441,7 @@ def test_an_option_given_twice_is_refused() -> None:
     ("name", "expected"),
     [
         ("mpi", "Did you mean 'mppi'?"),
+        ("optimal_bound", "It is now 'near_optimal'."),
         ("mine", "Did you mean './mine.py:Name'?"),
         ("./mine.py", "Say which class or function of it: ./mine.py:Name."),
         ("mine:Planner", "Did you mean './mine.py:Planner'?"),

@@ -12,6 +12,7 @@ import pytest
 from benchnav.core import sources
 from benchnav.core.errors import ConfigError
 from benchnav.core.registry import Part, find, option_files
+from benchnav.core.renamed import IMPORTS
 from benchnav.core.sources import imported_sources
 
 PART = """
@@ -242,7 +243,7 @@ def test_a_name_of_an_earlier_version_is_answered_with_that_of_today(
 
 
 def test_the_new_names_can_be_imported() -> None:
-    for old, new in sources.MOVED.items():
+    for old, new in IMPORTS.items():
         place, _, name = new.rpartition(".")
         assert hasattr(importlib.import_module(place), name) or importlib.util.find_spec(new), old
 

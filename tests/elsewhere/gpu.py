@@ -20,11 +20,7 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is 
 @pytest.mark.parametrize(
     "changes",
     [
-        *(
-            {"planners": (name,)}
-            for name in names("planner")
-            if name not in ("near_optimal", "optimal_bound")
-        ),
+        *({"planners": (name,)} for name in names("planner") if name != "near_optimal"),
         {"planners": ("near_optimal",), "model": "clairvoyant", "world": HOLDS},
         {"planners": ({"part": "optimal", "options": {"hazard": True}},), "world": HOLDS},
         {"planners": ({"part": "mppi", "options": ON_COST},), "world": HOLDS},

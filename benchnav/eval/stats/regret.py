@@ -24,7 +24,7 @@ from benchnav.stats.episodes import interval_of
 
 AGAINST = "near-optimal reference"
 OPTIMAL = "optimal"
-REFERENCES = ("near_optimal", "optimal_bound")  # by its name, and by that of earlier runs
+REFERENCE = "near_optimal"
 _MODELS = ("ideal", "oracle")
 
 
@@ -56,12 +56,11 @@ def find_chains(conditions: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     for condition, value in values.items():
         planner, model = value["planner"]["part"], value["model"]["part"]
         blind = conditions[condition]["labels"]["model"] == NOT_USED
-        if planner in (OPTIMAL, *REFERENCES) or model in PRIVILEGED or blind:
+        if planner in (OPTIMAL, REFERENCE) or model in PRIVILEGED or blind:
             continue
         references = [
             other
-            for part in REFERENCES
-            for other in like(value, ("planner", "model", "risk"), planner=part, model="clairvoyant")
+            for other in like(value, ("planner", "model", "risk"), planner=REFERENCE, model="clairvoyant")
             if values[other]["planner"]["options"].get("levels")
             != 0  # where entry is loss it is no reference
         ]

@@ -14,7 +14,6 @@ from benchnav.planning.planners.optimal.optimal import (
     NearOptimal,
     NearOptimalConfig,
     Optimal,
-    OptimalBound,
     OptimalConfig,
 )
 from benchnav.planning.planners.optimal.value import UNREACHED, Moves, headings_of
@@ -547,15 +546,6 @@ def test_where_there_is_no_way_the_world_ends_the_episode() -> None:
     assert done.outcome[1:].tolist() == [Outcome.SUCCESS, Outcome.IMMOBILISED]
     assert done.outcome[0] != Outcome.SUCCESS
     assert 0.1 * int(done.steps[2]) == pytest.approx(Immobile().for_s)
-
-
-def test_the_earlier_name_warns_and_is_the_same_planner() -> None:
-    with pytest.warns(FutureWarning, match="near-optimal reference"):
-        earlier = OptimalBound()
-    assert earlier.config.levels == 5
-    posed = wide_bar(18.0)
-    assert isinstance(earlier, NearOptimal)
-    assert Optimal.init(earlier, posed, generator()).to_go.value.shape[1] == 5
 
 
 @pytest.mark.parametrize("kind", [Optimal, NearOptimal])

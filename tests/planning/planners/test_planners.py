@@ -19,7 +19,7 @@ from tests.planning.planners.driving import Drive, drive
 FEW = {"samples": 256}
 OPTIONS: dict[str, dict[str, Any]] = {"mppi": FEW, "astar_mppi": {"mppi": FEW}, "cl_rrt": {"expansions": 200}}
 # What is given λ itself has tests of its own.
-NAMES = [name for name in registry.names("planner") if name not in ("near_optimal", "optimal_bound")]
+NAMES = [name for name in registry.names("planner") if name != "near_optimal"]
 # MPPI looks as far as its horizon alone and `straight` not at all; the others have a path over the whole map.
 GLOBAL = sorted(set(NAMES) - {"mppi", "straight"})
 ROBOTS = registry.names("robot")

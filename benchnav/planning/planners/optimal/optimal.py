@@ -9,7 +9,6 @@ Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L level
 """
 
 import math
-import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -77,13 +76,6 @@ class NearOptimalConfig:
             0 <= self.levels <= _MAX_LEVELS,
             f"`levels` from 0 to {_MAX_LEVELS} for {NearOptimal.name}, got {self.levels}.",
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class OptimalBoundConfig(NearOptimalConfig):
-    """Settings of the near-optimal reference by its earlier name, with the defaults of that."""
-
-    levels: int = 5
 
 
 def _check_grid(name: str, headings: int, refine: int) -> None:
@@ -316,26 +308,6 @@ class NearOptimal(Optimal):
             return _on_grid(problem, grid, torch.where(holds, UNREACHED, rate), ~holds)
         costs = _on_grid(problem, grid, rate, ~holds, immobile_s=torch.where(holds, rate, 0.0))
         return replace(costs, lost_after_s=immobile.for_s, levels=self.config.levels)
-
-
-class OptimalBound(NearOptimal):
-    """The near-optimal reference by its earlier name, with a warning.
-
-    Args:
-        config: settings.
-    """
-
-    name = "optimal_bound"
-
-    def __init__(self, config: OptimalBoundConfig | None = None) -> None:
-        """Keeps the settings, and warns of the name."""
-        warnings.warn(
-            "'optimal_bound' names the near-optimal reference, a drive that is feasible, not a bound. Take "
-            "'near_optimal': the name goes with 2.0.",
-            FutureWarning,
-            stacklevel=2,
-        )
-        super().__init__(config or OptimalBoundConfig())
 
 
 def _follow(drive: Drive, taken: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:

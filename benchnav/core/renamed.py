@@ -1,0 +1,15 @@
+"""Names of version 1 and those that replace them since version 2: an old name is answered with the new one."""
+
+# What programs import.
+IMPORTS = {
+    "benchnav.planning.risk.chance": "benchnav.planning.Chance",
+    "benchnav.planning.risk.cvar": "benchnav.planning.CVaR",
+    "benchnav.planning.risk.expected_time": "benchnav.planning.ExpectedTime",
+    "benchnav.planning.risk.mean": "benchnav.planning.Mean",
+    "benchnav.planning.risk.single_class": "benchnav.planning.SingleClass",
+    "benchnav.planning.risk.time_cvar": "benchnav.planning.TimeCVaR",
+    "benchnav.planning.risk.var": "benchnav.planning.VaR",
+}
+
+# Parts, by kind.
+PARTS = {("planner", "optimal_bound"): "near_optimal"}
