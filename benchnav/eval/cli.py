@@ -50,6 +50,7 @@ def run_command(
             differ, name them and end with status 1.
     """
     from benchnav.eval.run.runner import run_suite
+    from benchnav.eval.run.unit import Settings
 
     _check_workers(jobs, backend, scheduler)
     own = read_shard(shard)
@@ -59,9 +60,8 @@ def run_command(
     folder = _own_folder(out)
     if check_determinism and not _repeats(suite, planner_limit_s, device):
         return 1
-    steps = run_suite(
-        suite, folder, jobs, overwrite, planner_limit_s, _say, own, scheduler, device, reuse_code
-    )
+    settings = Settings.on(device, planner_limit_s)
+    steps = run_suite(suite, folder, scheduler or jobs, overwrite, settings, _say, own, reuse_code)
     show_progress(steps, "units")
     if not _is_whole(folder):
         print(f"so far:  {program('benchnav-eval')} report {shlex.quote(str(folder))} --partial")
@@ -110,7 +110,7 @@ def rerun(
     _check_workers(jobs, backend, scheduler)
     original = _own_folder(folder)
     repeated = _own_folder(out or f"{original.resolve()}-rerun")
-    show_progress(rerun.rerun(original, repeated, jobs, scheduler, overwrite, _say), "units")
+    show_progress(rerun.rerun(original, repeated, scheduler or jobs, overwrite, _say), "units")
     same, lines = rerun.compare(original, repeated)
     print("\n".join(lines))
     return 0 if same else 1

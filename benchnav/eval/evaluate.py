@@ -14,6 +14,7 @@ from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.results import Results
 from benchnav.eval.run.runner import run_suite
+from benchnav.eval.run.unit import Settings
 from benchnav.planning.free_space import Rules
 
 _NAMES = {field.name for field in fields(Suite)} - {"data"}
@@ -68,7 +69,8 @@ def evaluate(
         data=_path_of(terrain, place), **{name: _as_tuple(value) for name, value in experiment.items()}
     )
     notes: list[str] = []
-    steps = run_suite(suite, place, jobs, say=print if verbose else notes.append, device=device)
+    settings = Settings.on(device)
+    steps = run_suite(suite, place, jobs, settings=settings, say=print if verbose else notes.append)
     if verbose:
         show_progress(steps, "units")
     else:

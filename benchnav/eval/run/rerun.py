@@ -40,8 +40,7 @@ _SHOWN = 5
 def rerun(
     run_folder: Path,
     folder: Path,
-    jobs: int = 1,
-    scheduler: str = "",
+    jobs: int | str = 1,
     overwrite: bool = False,
     say: Say = lambda line: None,
 ) -> Iterator[Progress]:
@@ -50,8 +49,7 @@ def rerun(
     Args:
         run_folder: what is repeated.
         folder: where to; a rerun that is there is gone on with.
-        jobs: worker processes.
-        scheduler: address of a Dask cluster's scheduler, whose workers are used in place of `jobs`.
+        jobs: number of worker processes, or the address of a Dask cluster's scheduler.
         overwrite: drop the run that is there.
         say: is told what a user should know, a line at a time.
 
@@ -66,7 +64,7 @@ def rerun(
         _check_repeats(run, folder)
     settings = Settings(planner_limit_s=run.about["planner_limit_s"], device=device_of_run(run.about).type)
     _check_there(run)
-    if jobs > 1 or scheduler or settings.planner_limit_s:
+    if jobs != 1 or settings.planner_limit_s:
         check_everywhere(condition for condition, _ in run.conditions.values())
     work = Work(
         suite=run.about["suite"],
@@ -78,7 +76,7 @@ def rerun(
         settings=settings,
     )
     with sole_writer(folder, str(folder)):
-        yield from run_work(work, folder, jobs, scheduler, overwrite, say)
+        yield from run_work(work, folder, jobs, overwrite, say)
 
 
 def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:

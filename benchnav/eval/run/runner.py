@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchnav.core.device import find_device, gpu_name
+from benchnav.core.device import gpu_name
 from benchnav.core.errors import ConfigError
 from benchnav.core.progress import Progress
 from benchnav.core.settings import plain
@@ -45,40 +45,35 @@ from benchnav.eval.run.unit import Settings, run_unit
 def run_suite(
     suite: Suite,
     folder: Path,
-    jobs: int = 1,
+    jobs: int | str = 1,
     overwrite: bool = False,
-    planner_limit_s: float = 0.0,
+    settings: Settings = Settings(),  # noqa: B008
     say: Say = lambda line: None,
     shard: Shard | None = None,
-    scheduler: str = "",
-    device: str = "cpu",
     reuse_code: bool = False,
 ) -> Iterator[Progress]:
-    """Runs what is not finished of a suite, yielding its progress in units; to be iterated to the end.
+    """Run the units of a suite that are not finished, and yield the progress in units; iterate to the end.
 
-    Units of a run that the suite does not name are left as they are. While any of them is not finished, the run has no
-    table; `say` is told of it.
+    Units of a run that the suite does not name stay as they are. While any of them is not finished, the run has no
+    table, which `say` receives as a line.
 
     Args:
         suite: what is evaluated.
         folder: the run folder; it may hold a run, which is resumed or extended.
-        jobs: worker processes.
-        overwrite: drop the run that is there.
-        planner_limit_s: time limit of each call of a planner; 0 for none.
-        say: is told what a user should know, a line at a time.
-        shard: run this shard of the units alone; None for all.
-        scheduler: address of a Dask cluster's scheduler, whose workers are used in place of `jobs`.
-        device: where all is computed: "cpu", "cuda", or "auto" for CUDA where there is a GPU.
-        reuse_code: take finished units that other code has made, and say so.
+        jobs: number of worker processes, or the address of a Dask cluster's scheduler, whose workers are used.
+        overwrite: whether to drop the run that exists.
+        settings: how units are run: device, and time limit of planners.
+        say: receives what a user should know, a line at a time.
+        shard: the shard of the units that is run; None for all.
+        reuse_code: whether to take finished units of other code, and say so.
 
     Raises:
-        ConfigError: the folder holds something else, or the suite cannot be run.
-        DatasetError: the dataset lacks what the suite asks for.
-        BenchnavError: the cluster cannot be reached, or was lost.
+        ConfigError: If the folder holds something else, or the suite cannot be run.
+        DatasetError: If the dataset lacks what the suite asks for.
+        BenchnavError: If the cluster cannot be reached, or is lost.
     """
-    settings = Settings(planner_limit_s=planner_limit_s, device=find_device(device).type)
     with sole_writer(folder, str(folder)):
-        checked = check_suite(suite, elsewhere=jobs > 1 or bool(scheduler) or planner_limit_s > 0)
+        checked = check_suite(suite, elsewhere=jobs != 1 or settings.planner_limit_s > 0)
         for line in caveats(vars(checked)):
             say(line)
         work = Work(
@@ -89,13 +84,12 @@ def run_suite(
             shard=shard,
             reuse_code=reuse_code,
         )
-        yield from run_work(work, folder, jobs, scheduler, overwrite, say)
+        yield from run_work(work, folder, jobs, overwrite, say)
 
 
-def run_work(
-    work: Work, folder: Path, jobs: int, scheduler: str, overwrite: bool, say: Say
-) -> Iterator[Progress]:
-    """Runs what is not finished of some work in a folder that the caller holds; otherwise as `run_suite`."""
+def run_work(work: Work, folder: Path, jobs: int | str, overwrite: bool, say: Say) -> Iterator[Progress]:
+    """Run the units of some work that are not finished in a folder that the caller has locked; see `run_suite`."""
+    jobs, scheduler = (1, jobs) if isinstance(jobs, str) else (jobs, "")
     if scheduler:
         with connected(scheduler):  # else nothing is dropped or written
             pass

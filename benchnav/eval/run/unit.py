@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core import rng
-from benchnav.core.device import CPU, GPU_FAULTS, gpu_failed
+from benchnav.core.device import CPU, GPU_FAULTS, find_device, gpu_failed
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
 from benchnav.core.registry import Part
@@ -58,6 +58,11 @@ class Settings:
 
     planner_limit_s: float = 0.0
     device: str = "cpu"
+
+    @classmethod
+    def on(cls, device: str, planner_limit_s: float = 0.0) -> "Settings":
+        """Choose the settings on a device: "cpu", "cuda", or "auto" for CUDA if there is a GPU."""
+        return cls(planner_limit_s=planner_limit_s, device=find_device(device).type)
 
     def origins(self) -> Origins:
         """Looks up what units come from that are run so."""

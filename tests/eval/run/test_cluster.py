@@ -113,7 +113,7 @@ def test_a_worker_that_is_killed_in_the_middle_loses_nothing_and_doubles_nothing
     log, suite = tmp_path / "log", suite_on(dataset_path, tmp_path / "log")
     victim, other = cluster_of_two.workers
     (tmp_path / "log.hold").write_text(f"{victim.pid} 1")
-    steps = run_suite(suite, tmp_path / "cluster", scheduler=cluster_of_two.address)
+    steps = run_suite(suite, tmp_path / "cluster", jobs=cluster_of_two.address)
     done = 0
     while done < 2 or str(victim.pid) not in log.read_text().splitlines():
         done, total = next(steps)
@@ -143,7 +143,7 @@ def test_a_worker_of_other_code_or_without_the_data_is_named(
         with pytest.raises(
             ConfigError, match=r"tcp://127\.0\.0\.1:\d+: .*got changes: benchnav\.eval\.run\.rollout"
         ):
-            list(run_suite(suite, tmp_path / "run", scheduler=cluster_of_two.address))
+            list(run_suite(suite, tmp_path / "run", jobs=cluster_of_two.address))
     assert not list((tmp_path / "run").glob("units/*/*"))
     # What only a unit can tell: a part's file, and the maps, that are not there when it begins.
     mine, data = tmp_path / "mine.py", shutil.copy(dataset_path, tmp_path / "tiny.h5")
@@ -156,7 +156,7 @@ def test_a_worker_of_other_code_or_without_the_data_is_named(
         ),
         (data.unlink, r"\d+: .*tiny\.h5"),
     ):
-        steps = run_suite(suite, tmp_path / "run", overwrite=True, scheduler=cluster_of_two.address)
+        steps = run_suite(suite, tmp_path / "run", overwrite=True, jobs=cluster_of_two.address)
         next(steps)
         change()
         with pytest.raises(BenchnavError, match=rf"tcp://127\.0\.0\.1:{expected}"):
@@ -169,7 +169,14 @@ def test_planners_with_a_time_limit_have_processes_of_their_own_on_workers_too(
 ) -> None:
     log = tmp_path / "log"
     suite = suite_on(dataset_path, log, risks=("mean",), scenarios=("std",), seeds=(0,))
-    list(run_suite(suite, tmp_path / "cluster", planner_limit_s=PATIENCE_S, scheduler=cluster_of_two.address))
+    list(
+        run_suite(
+            suite,
+            tmp_path / "cluster",
+            settings=Settings(planner_limit_s=PATIENCE_S),
+            jobs=cluster_of_two.address,
+        )
+    )
     begun = log.read_text().split()
     assert len(begun) == 2  # the unit, and one robot alone for its latency
     assert not set(begun) & {str(pid) for pid in (os.getpid(), *(w.pid for w in cluster_of_two.workers))}
@@ -186,7 +193,7 @@ def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(
     gone, worker = cluster_of_two.workers
     gone.kill()
     (tmp_path / "log.hold").write_text(f"{worker.pid} 5")
-    steps = run_suite(suite, tmp_path / "run", scheduler=cluster_of_two.address)
+    steps = run_suite(suite, tmp_path / "run", jobs=cluster_of_two.address)
     while next(steps).done < 4:
         pass
     cluster_of_two.scheduler.kill()
@@ -245,7 +252,7 @@ def test_a_scheduler_that_cannot_be_reached_is_one_line_and_drops_nothing(
 def test_an_address_is_as_dask_writes_it(address: str, dataset_path: Path, tmp_path: Path) -> None:
     suite = suite_on(dataset_path, tmp_path / "log")
     with pytest.raises(ConfigError, match="tcp://HOST:PORT"):
-        list(run_suite(suite, tmp_path / "run", scheduler=address))
+        list(run_suite(suite, tmp_path / "run", jobs=address))
     assert not (tmp_path / "run").exists()
 
 
@@ -256,7 +263,7 @@ def test_parts_of_this_process_alone_are_refused(dataset_path: Path, tmp_path: P
     registry.register("planner", "only_here", Faulty)
     suite = suite_on(dataset_path, tmp_path / "log", planners=("only_here",))
     with pytest.raises(ConfigError, match="scheduler"):
-        list(run_suite(suite, tmp_path / "run", scheduler="tcp://127.0.0.1:1"))
+        list(run_suite(suite, tmp_path / "run", jobs="tcp://127.0.0.1:1"))
 
 
 def worker_of(folder: Path, threads: int = 1) -> Any:

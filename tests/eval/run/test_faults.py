@@ -9,6 +9,7 @@ from benchnav.core.errors import BenchnavError
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.run_folder import ERRORS
 from benchnav.eval.run.runner import run_suite
+from benchnav.eval.run.unit import Settings
 
 
 def run(
@@ -19,7 +20,7 @@ def run(
         "data": str(dataset_path), "models": ("oracle",), "planners": (faulty,), "risks": ("mean",),
         "scenarios": ("std",), "maps": 2, "world": {"noise": "stored", "time_budget_s": 30.0}, "record": "none",
     } | changes  # fmt: skip
-    for _ in run_suite(Suite(**given), folder, jobs, planner_limit_s=limit_s):  # type: ignore[arg-type]
+    for _ in run_suite(Suite(**given), folder, jobs, settings=Settings(planner_limit_s=limit_s)):  # type: ignore[arg-type]
         pass
     return pd.read_parquet(folder / "episodes.parquet")
 

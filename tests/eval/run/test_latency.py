@@ -15,6 +15,7 @@ from benchnav.eval.report.write import read_report
 from benchnav.eval.run import latency
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.runner import run_suite
+from benchnav.eval.run.unit import Settings
 from tests.eval.conftest import MOST_STEPS
 
 MAPS = 3
@@ -99,7 +100,11 @@ def test_the_planner_is_run_as_its_episodes_are(limit: float, dataset_path: Path
     folder = tmp_path / "pids"
     folder.mkdir()
     held = {"part": "tests.eval.parts:Held", "options": {"log": str(folder / "log")}}
-    list(run_suite(suite_on(dataset_path, held, maps=1), tmp_path / "run", planner_limit_s=limit))
+    list(
+        run_suite(
+            suite_on(dataset_path, held, maps=1), tmp_path / "run", settings=Settings(planner_limit_s=limit)
+        )
+    )
     processes = (folder / "log").read_text().split()
     assert len(processes) == 2
     assert processes.count(str(os.getpid())) == (0 if limit else 2)

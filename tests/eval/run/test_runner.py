@@ -425,7 +425,10 @@ def test_units_under_another_time_limit_or_compiler_are_not_used(
 ) -> None:
     suite = quick(dataset_path, scenarios=("std",), risks=("mean",))
     finish(suite, tmp_path / "run")
-    assert unused(suite, tmp_path / "run", planner_limit_s=9.0) == "planner_limit_s (0.0 to 9.0)"
+    assert (
+        unused(suite, tmp_path / "run", settings=Settings(planner_limit_s=9.0))
+        == "planner_limit_s (0.0 to 9.0)"
+    )
     monkeypatch.setattr(provenance, "can_compile", lambda: None)
     assert unused(suite, tmp_path / "run").startswith("compiles (")
 
@@ -443,20 +446,20 @@ def test_every_unit_is_run_on_the_device_that_is_asked_for(
     monkeypatch.setattr(runner, "run_unit", run_here)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a GPU")
-    finish(suite, tmp_path / "cuda", device="auto")
+    finish(suite, tmp_path / "cuda", settings=Settings.on("auto"))
     assert set(given) == {"cuda"}
     assert open_run(tmp_path / "cuda").about["device"] == "cuda"
     assert open_run(tmp_path / "cuda").about["gpu"] == "a GPU"
     given.clear()
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "another")
-    assert unused(suite, tmp_path / "cuda", device="cuda") == "device (a GPU to another)"
+    assert unused(suite, tmp_path / "cuda", settings=Settings.on("cuda")) == "device (a GPU to another)"
     given.clear()
-    finish(suite, tmp_path / "cpu", device="cpu")
+    finish(suite, tmp_path / "cpu", settings=Settings.on("cpu"))
     assert set(given) == {"cpu"}
     assert open_run(tmp_path / "cpu").about["gpu"] is None
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="GPU"):
-        finish(suite, tmp_path / "none", device="cuda")
+        finish(suite, tmp_path / "none", settings=Settings.on("cuda"))
     assert not (tmp_path / "none").exists()
 
 

@@ -19,6 +19,7 @@ from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.folder.sealed import metadata
 from benchnav.eval.run import runner
 from benchnav.eval.run.runner import run_suite
+from benchnav.eval.run.unit import Settings
 
 CACHES: tuple[Any, ...] = (sources.installed_folders, _is_own, _is_installed)
 
@@ -104,7 +105,15 @@ def run(own: Path, dataset: Path, name: str, planner_limit_s: float = 0.0, **opt
         scenarios=("std",), maps=2, world={"time_budget_s": 2.0}, record="none",
     )  # fmt: skip
     lines: list[str] = []
-    list(run_suite(suite, own.parent / name, planner_limit_s=planner_limit_s, say=lines.append, **options))
+    list(
+        run_suite(
+            suite,
+            own.parent / name,
+            settings=Settings(planner_limit_s=planner_limit_s),
+            say=lines.append,
+            **options,
+        )
+    )
     return [line for line in lines if not line.startswith("warning: ")]
 
 
