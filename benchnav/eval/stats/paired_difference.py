@@ -96,7 +96,7 @@ def success_interval(
     was seen.
     Sources: Bonett and Price (2012), "Adjusted Wald confidence interval for a difference of binomial proportions
     based on paired data"; Cochran (1977), "Sampling Techniques", 6.3, for the ratio. How often the interval covers the
-    truth on few, large groups: `benchmarks/statistics_studies.py`, part `groups`.
+    truth on few, large groups: `studies/statistics`, part `groups`.
 
     Args:
         gain: successes of the one condition less those of the other by map, whole numbers, shape [..., M], M ≥ 2.

@@ -57,7 +57,7 @@ def design_effect(success: np.ndarray, maps: np.ndarray) -> float:
     Sources: Korn and Graubard (1998), "Confidence intervals for proportions with small expected number of positive
     counts estimated from survey data", for n and Student's quantile; Cochran (1977), "Sampling Techniques", 6.3, for
     the variance where maps have unequally many episodes. How often the interval covers the truth:
-    `benchmarks/statistics_studies.py`, parts `intervals` and `groups`.
+    `studies/statistics`, parts `intervals` and `groups`.
 
     Args:
         success: bool, shape [N].
