@@ -76,10 +76,10 @@ def test_on_new_maps_the_arms_are_those_of_the_maps_to_develop_on() -> None:
         ]
 
     left_out = {(f"{planner} map held", "stakes-v1", "mean") for planner in ("mppi", "astar_mppi")}
-    new = [*named("primary"), *named("frontier")]
+    new = [*named("primary"), *named("frontier50")]
     assert len(new) == len({*new})
     assert {*new} == {*named("levels")} - left_out
-    for part in ("primary", "frontier"):
+    for part in ("primary", "frontier50"):
         options = {each.labels["planner"]: each.planner for each in conditions("cost", "levels")}
         assert all(each.planner == options[each.labels["planner"]] for each in conditions("cost", part))
 
@@ -92,21 +92,25 @@ def test_the_hypotheses_of_risk_on_the_cost_are_eight() -> None:
     assert own.maps == 200
 
 
+# Parts by the names of their runs.
+PARTS = {"cost-primary": "primary", "cost-frontier": "frontier50", "cost-own": "own50"}
+
+
 def table_of_arms(
-    part: str,
+    name: str,
     arrived: dict[tuple[str, str], int],
     folder: Path,
     monkeypatch: pytest.MonkeyPatch,
     other_maps: str = "",
 ) -> dict[tuple[str, str], list[str]]:
-    """Rows of a part where arms arrive on so many of 40 maps, in 30 s, and all others on 35, 2 s later.
+    """Rows of a run where arms arrive on so many of 40 maps, in 30 s, and all others on 35, 2 s later.
 
     Planners of `other_maps` drove on maps with other digests.
     """
 
     def conditions_in(name: str) -> list[Compared]:
         found = []
-        for each in conditions("cost", name):
+        for each in conditions("cost", PARTS[name]):
             arm = (each.labels["planner"], each.labels["risk"])
             success = np.arange(40) < arrived.get(arm, 35)
             episodes = pd.DataFrame({
@@ -123,15 +127,13 @@ def table_of_arms(
             **each.labels, "success_rate": each.episodes["success"].mean(), "success_low": 0.2, "success_high": 0.9,
             "total_time_mean_s": each.episodes["total_time_s"].mean(), "planning_ms_median": 1.5,
         }
-        for each in conditions_in(part)
+        for each in conditions_in(name)
     ]  # fmt: skip
-    run = folder / f"cost-{part}"
+    run = folder / name
     run.mkdir()
     pd.DataFrame(summary).to_csv(run / "summary.csv")
     monkeypatch.setattr(arms, "open_run", lambda run: run)
-    monkeypatch.setattr(
-        arms, "read_conditions", lambda runs: conditions_in(runs[0].name.removeprefix("cost-"))
-    )
+    monkeypatch.setattr(arms, "read_conditions", lambda runs: conditions_in(runs[0].name))
     rows = [list(row) for row in arms.arms(run).rows]
     found = {(row[0], row[1]): row[2:] for row in rows}
     assert len(rows) == len(found) == len(summary)
@@ -142,7 +144,7 @@ def test_the_table_of_arms_sets_each_beside_cvar_of_time_with_its_planner(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     base = {("mppi map", "time-cvar:0.5"): 20, ("astar_mppi map", "time-cvar:0.5"): 30}
-    found = table_of_arms("primary", base, tmp_path, monkeypatch)
+    found = table_of_arms("cost-primary", base, tmp_path, monkeypatch)
     assert found["mppi map", "time-cvar:0.5"][:3] == ["50.0 (20–90)", "60.0", "1.5"]
     assert all(found[arm][3:] == ["", "", ""] for arm in base)
     # All 5 maps that differ speak for an arm of A*+MPPI: 2 / 2⁵; after 8 smaller p of 15, Holm's factor is 7.
@@ -157,14 +159,14 @@ def test_the_table_of_arms_refuses_an_arm_on_other_maps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(ConfigError, match=r"same maps, got mppi cost 0\.8 and mppi map,"):
-        table_of_arms("primary", {}, tmp_path, monkeypatch, other_maps="mppi cost 0.8")
+        table_of_arms("cost-primary", {}, tmp_path, monkeypatch, other_maps="mppi cost 0.8")
 
 
 def test_the_table_of_other_levels_compares_with_the_primary_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     base = {("mppi map", "time-cvar:0.5"): 20, ("astar_mppi map", "time-cvar:0.5"): 30}
-    found = table_of_arms("frontier", base, tmp_path, monkeypatch)
+    found = table_of_arms("cost-frontier", base, tmp_path, monkeypatch)
     for (planner, _), row in found.items():
         assert row[3].startswith("+12.5" if planner.startswith("astar") else "+37.5")
 
@@ -176,7 +178,7 @@ def test_an_arm_with_its_own_time_to_go_stands_beside_itself_with_the_shared_one
         ("mppi map", "cvar:0.8"): 20, ("mppi map", "time-cvar:0.5"): 25, ("astar_mppi map", "cvar:0.8"): 30,
         ("astar_mppi map", "time-cvar:0.5"): 32, ("mppi cost 0.8", "expected-time"): 33,
     }  # fmt: skip
-    found = table_of_arms("own", shared, tmp_path, monkeypatch)
+    found = table_of_arms("cost-own", shared, tmp_path, monkeypatch)
     gains = {arm: row[3].split()[0] for arm, row in found.items()}
     assert gains == {
         ("mppi map own", "cvar:0.8"): "+37.5", ("mppi map own", "time-cvar:0.5"): "+25.0",
@@ -187,7 +189,7 @@ def test_an_arm_with_its_own_time_to_go_stands_beside_itself_with_the_shared_one
 
 def test_own_time_to_go_is_all_that_differs() -> None:
     primary = {each.labels["planner"]: each.planner.options for each in conditions("cost", "primary")}
-    for each in conditions("cost", "own"):
+    for each in conditions("cost", "own50"):
         same = primary[each.labels["planner"].removesuffix(" own")]
         own, other = (dict(options).get("mppi", options) for options in (each.planner.options, same))
         assert {**own, "cost_to_go": "expected-time"} == {**other}

@@ -70,7 +70,7 @@ def test_variants_are_distinguished_by_the_whole_label(tmp_path: Path) -> None:
 
 
 def test_settings_stand_beside_one_another_with_their_success_and_time(tmp_path: Path) -> None:
-    shared = {"data": "d", "scenario": "std", "world": "w", "robot": "r", "model": "m", "planner": "mppi"}
+    shared = dict.fromkeys(tables.NEXT_TO_RISK, "x") | {"planner": "mppi"}
     numbers = ("success_rate", "success_low", "success_high", "total_time_mean_s")
     rows = [
         {**shared, "risk": risk, **dict(zip(numbers, values, strict=True))}

@@ -11,7 +11,7 @@ from benchnav.planning.world.outcome import Outcome
 from tests.planning.planners.test_planners import run
 
 ROOT = Path(__file__).parents[2]
-PARTS = f"{ROOT}/studies.planners.without.py"
+PARTS = f"{ROOT}/studies/planners/without.py"
 
 
 @pytest.mark.parametrize("name", ["NoLines", "NoHalving"])
@@ -22,6 +22,6 @@ def test_a_planner_without_its_part_drives(name: str) -> None:
 
 def test_the_suite_names_planners_that_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    suite = read(Suite, read_yaml(Path("studies.planners.without.yaml")), of("the suite"))
+    suite = read(Suite, read_yaml(Path("studies/planners/without.yaml")), of("the suite"))
     made = [type(registry.make("planner", planner)).__name__ for planner in suite.planners]
     assert made == ["AStarDWA", "NoLines", "CLRRT", "NoHalving"]

@@ -24,7 +24,7 @@ def test_trials_are_stored_and_tabulated_together(tmp_path: Path, monkeypatch: p
         for realisation in range(2):
             yield pd.DataFrame(
                 {
-                    "density": 0.4, "setting": settings, "map": 0, "realisation": realisation,
+                    "density": 0.4, "setting": settings, "map": len(setups), "realisation": realisation,
                     "success": [False, True], "time_s": [float("nan"), 9.0],
                 }
             )  # fmt: skip
@@ -47,7 +47,7 @@ def test_trials_are_stored_and_tabulated_together(tmp_path: Path, monkeypatch: p
     assert changed.risk_map == "histogram"
     both = trials.together(work(tmp_path), folder, ["a", "b"])["trials"]
     assert "| 40 % | +100.0 | 4, 0 |" in both
-    runs = trials.compared(work(tmp_path), folder, {"one": "a", "other": "b"})["runs"]
+    runs = trials.compared(work(tmp_path), folder, {"one": "a", "other": "a"})["runs"]
     assert "won with other alone, with one alone" in runs
 
 
