@@ -4,7 +4,7 @@ Every statistic is a function of means over maps, so that one bootstrap over map
 takes some minutes on one thread. Letters in shapes: B maps, H×W cells, C classes, K numbers a map.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -30,6 +30,7 @@ from studies.scenarios.statistics import (
     SHARE_EDGES,
     SLOPE_EDGES,
     Maps,
+    Statistic,
     excess,
     first,
     histogram,
@@ -55,7 +56,8 @@ PAIRS: dict[str, Any] = {
     "hs-100": {"preset": "hs"},
 }
 
-Columns = Mapping[str, Callable[[Maps], str]]
+# Keys of what is measured, the statistic of it, its scale and its digits.
+Column = tuple[Sequence[str], Statistic, float, int]
 
 
 def measure_maps(model: FusedModel, recipe: Recipe, maps: Maps) -> dict[str, np.ndarray]:
@@ -90,6 +92,7 @@ def _measure_chunk(model: FusedModel, recipe: Recipe, maps: Maps) -> dict[str, n
         "right": (found == classes).double().numpy(),
         "darker": (found < classes).numpy(),
         "confusion": histogram((classes * count + found).numpy(), np.arange(count**2 + 1) - 0.5),
+        "wet clay": (found == [c.name for c in recipe.classes].index("wet_clay")).numpy(),
     }
     sources = {"predicted": predicted.weights, "true": own, "none": torch.full_like(own, 1 / count)}
     for name, weights in sources.items():
@@ -101,58 +104,60 @@ def _measure_chunk(model: FusedModel, recipe: Recipe, maps: Maps) -> dict[str, n
     return result
 
 
-def by_scenario(pairs: Mapping[str, Maps], columns: Columns) -> Table:
+def by_scenario(pairs: Mapping[str, Maps], columns: Mapping[str, Column]) -> Table:
     """Return a table with a row a scenario."""
-    rows = [[name, *(column(maps) for column in columns.values())] for name, maps in pairs.items()]
+    rows = [
+        [name, *(show([maps[key] for key in keys], *how) for keys, *how in columns.values())]
+        for name, maps in pairs.items()
+    ]
     return table(("scenario", *columns), rows)
 
 
-def ground_columns(steepest: float) -> Columns:
-    """The ground itself, whatever model looks at it."""
-    return {
-        "relief [m]": lambda m: show([m["relief"]], first, digits=2),
-        "median slope [°]": lambda m: show([m["slope"]], quantile(0.5, SLOPE_EDGES)),
-        "95 % [°]": lambda m: show([m["slope"]], quantile(0.95, SLOPE_EDGES)),
-        "beyond [10⁻⁵]": lambda m: show([m["slope_deg"] > steepest], first, 1e5, 0),
-        "E[λ]": lambda m: show([m["expected"]], first, digits=3),
-        "λ, 5 %": lambda m: show([m["lambda"]], quantile(0.05, SHARE_EDGES), digits=2),
-        "stuck [%]": lambda m: show([m["stuck"]], first, 100),
-        "time [s]": lambda m: show([m["time"]], first),
-        "rejected": lambda m: f"{m['rejected_draws'].sum()}",
-    }
+# The ground itself, whatever model looks at it.
+GROUND: Mapping[str, Column] = {
+    "relief [m]": (["relief"], first, 1, 2),
+    "median slope [°]": (["slope"], quantile(0.5, SLOPE_EDGES), 1, 1),
+    "95 % [°]": (["slope"], quantile(0.95, SLOPE_EDGES), 1, 1),
+    "beyond [10⁻⁵]": (["beyond"], first, 1e5, 0),
+    "E[λ]": (["expected"], first, 1, 3),
+    "λ, 5 %": (["lambda"], quantile(0.05, SHARE_EDGES), 1, 2),
+    "stuck [%]": (["stuck"], first, 100, 1),
+    "time [s]": (["time"], first, 1, 1),
+}
+# The light, what the classifier gets right, and the error of E[λ] by where the classes come from.
+PREDICTION: Mapping[str, Column] = {
+    "brightness": (["brightness"], first, 1, 2),
+    "accuracy [%]": (["right"], first, 100, 1),
+    "mIoU [%]": (["confusion"], mean_iou, 100, 1),
+    "too dark [%]": (["darker"], first, 100, 1),
+    "no class": (["square none"], rms, 1000, 1),
+    "predicted": (["square predicted"], rms, 1000, 1),
+    "true": (["square true"], rms, 1000, 1),
+    "predicted − true": (["square predicted", "square true"], excess, 1000, 1),
+}
+# How often realised λ lies in the central 90 % interval, and under VaR 0.9, by source of classes.
+CALIBRATION: Mapping[str, Column] = {
+    "coverage, predicted": (["held predicted"], first, 100, 2),
+    "coverage, true": (["held true"], first, 100, 2),
+    "tail, predicted": (["tail predicted"], first, 100, 2),
+    "tail, true": (["tail true"], first, 100, 2),
+    "bias [10⁻³]": (["error predicted"], first, 1000, 1),
+    "found wet clay": (["wet clay"], first, 100, 1),
+}
+# Changes from std on the same maps, and whether ground or picture brings them about.
+CHANGES: Mapping[str, Column] = {
+    "E[λ]": (["expected"], first, 1, 3),
+    "stuck [%]": (["stuck"], first, 100, 1),
+    "accuracy [%]": (["right"], first, 100, 1),
+    "both": (["both", "before"], excess, 1000, 1),
+    "ground alone": (["ground", "before"], excess, 1000, 1),
+    "picture alone": (["picture", "before"], excess, 1000, 1),
+    "true classes": (["square true", "true before"], excess, 1000, 1),
+}
 
 
-def model_columns() -> Columns:
-    """The light, what the classifier gets right, and the error of E[λ] by where the classes come from."""
-    return {
-        "brightness": lambda m: show([m["brightness"]], first, digits=2),
-        "accuracy [%]": lambda m: show([m["right"]], first, 100),
-        "mIoU [%]": lambda m: show([m["confusion"]], mean_iou, 100),
-        "too dark [%]": lambda m: show([m["darker"]], first, 100),
-        "no class": lambda m: show([m["square none"]], rms, 1000),
-        "predicted": lambda m: show([m["square predicted"]], rms, 1000),
-        "true": lambda m: show([m["square true"]], rms, 1000),
-        "predicted − true": lambda m: show([m["square predicted"], m["square true"]], excess, 1000),
-    }
-
-
-def calibration_columns(recipe: Recipe) -> Columns:
-    """How often realised λ lies in the central 90 % interval, and under VaR 0.9, by source of classes."""
-    count, clay = len(recipe.classes), [c.name for c in recipe.classes].index("wet_clay")
-    return {
-        "coverage, predicted": lambda m: show([m["held predicted"]], first, 100, 2),
-        "coverage, true": lambda m: show([m["held true"]], first, 100, 2),
-        "tail, predicted": lambda m: show([m["tail predicted"]], first, 100, 2),
-        "tail, true": lambda m: show([m["tail true"]], first, 100, 2),
-        "bias [10⁻³]": lambda m: show([m["error predicted"]], first, 1000),
-        "found wet clay": lambda m: show(
-            [m["confusion"][:, clay::count].sum(1) / m["rgb"][0, 0].size], first, 100
-        ),
-    }
-
-
-def paired_columns(model: FusedModel, std: Maps) -> Columns:
-    """Changes from std on the same maps, and whether ground or picture brings them about."""
+def changes(model: FusedModel, maps: Maps, std: Maps) -> Maps:
+    """Return what changes from std on the same maps, with squared errors by where ground and picture come from."""
 
     def squares(seen: Maps, ground: Maps) -> np.ndarray:
         layers = (
@@ -163,16 +168,11 @@ def paired_columns(model: FusedModel, std: Maps) -> Columns:
         found = torch.cat([TraversabilityMixture(*chunk).mean() for chunk in chunks])
         return (found.numpy() - ground["expected"]) ** 2
 
-    before = squares(std, std)
     return {
-        "E[λ]": lambda m: show([m["expected"] - std["expected"]], first, digits=3),
-        "stuck [%]": lambda m: show([m["stuck"] - std["stuck"]], first, 100),
-        "accuracy [%]": lambda m: show([m["right"] - std["right"]], first, 100),
-        "both": lambda m: show([squares(m, m), before], excess, 1000),
-        "ground alone": lambda m: show([squares(std, m), before], excess, 1000),
-        "picture alone": lambda m: show([squares(m, std), before], excess, 1000),
-        "true classes": lambda m: show([m["square true"], std["square true"]], excess, 1000),
-    }
+        **{key: maps[key] - std[key] for key in ("expected", "stuck", "right")},
+        "before": squares(std, std), "both": squares(maps, maps), "ground": squares(std, maps),
+        "picture": squares(maps, std), "square true": maps["square true"], "true before": std["square true"],
+    }  # fmt: skip
 
 
 def slope_table(std: Maps, hg: Maps) -> Table:
@@ -205,10 +205,10 @@ def colour_table(recipe: Recipe) -> Table:
     return table(["class", "colour", "as the next darker", "as the second", "as the third"], rows)
 
 
-def measure_series(model: FusedModel, recipe: Recipe) -> dict[str, Maps]:
+def measure_series(model: FusedModel, recipe: Recipe) -> dict[str, dict[str, np.ndarray]]:
     """Measures the splits of shift-v1 and, made alike, a severity beyond each end, by name of the scenario."""
     data = recipe.to_dict()
-    series: dict[str, Maps] = {}
+    series: dict[str, dict[str, np.ndarray]] = {}
     splits = {f"test/{name}": {"scenario": name, "maps": 100, "solvable": True} for name in BEYOND}
     data |= {"scenarios": data["scenarios"] | BEYOND, "splits": data["splits"] | splits}
     longer = recipe_from_dict(data, "of the study")
@@ -237,12 +237,16 @@ def measure(work: Work, folder: Path) -> dict[str, Table | Figure]:
     model = FusedModel.from_checkpoint(checkpoint)
     steepest = max(checkpoint.part("gp").config["steepest_deg"])
     series, pairs = measure_series(model, recipe), measure_pairs(model, recipe)
-    changed = {name: pair for name, pair in pairs.items() if name != "std"}
+    series = {name: maps | {"beyond": maps["slope_deg"] > steepest} for name, maps in series.items()}
+    changed = {name: changes(model, maps, pairs["std"]) for name, maps in pairs.items() if name != "std"}
+    ground = by_scenario(series, GROUND)
+    rejected = (f"{maps['rejected_draws'].sum()}" for maps in series.values())
+    rows = [(*row, count) for row, count in zip(ground.rows, rejected, strict=True)]
     return {
-        "ground": by_scenario(series, ground_columns(steepest)),
-        "model": by_scenario(series, model_columns()),
-        "calibration": by_scenario(series, calibration_columns(recipe)),
-        "pairs": by_scenario(changed, paired_columns(model, pairs["std"])),
+        "ground": table((*ground.headings, "rejected"), rows),
+        "model": by_scenario(series, PREDICTION),
+        "calibration": by_scenario(series, CALIBRATION),
+        "pairs": by_scenario(changed, CHANGES),
         "slopes": slope_table(series["std"], series["hg-100"]),
         "colours": colour_table(recipe),
         "examples": draw_examples(pairs, recipe.grid.extent_m),

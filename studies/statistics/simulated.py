@@ -6,14 +6,11 @@ the chance is low, and a failure counts as T = 100 s. Tables have how often an i
 a family of comparisons in which nothing differs finds a difference.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations, product
-from pathlib import Path
 
 import numpy as np
-import pandas as pd
-from rich.progress import track
-from scipy.stats import beta, binomtest, bootstrap, norm, t
+from scipy.stats import beta, bootstrap, norm, t
 
 from benchnav.eval.stats.best import best_set_p
 from benchnav.eval.stats.comparison import ALPHA
@@ -25,15 +22,9 @@ from benchnav.eval.stats.paired_difference import (
     total_time_interval,
 )
 from benchnav.eval.stats.summary import design_effect, wilson_interval
-from studies.study import Work
 
-# Of the studies of few, large groups: rates of two conditions, correlation within a group, and what they share.
-GROUPS, IN_A_GROUP = (5, 8, 12), (20, 60)
-GROUP_RATES, GROUP_LIKENESS = ((0.99, 0.9), (0.8, 0.6)), tuple(product((0.1, 0.3, 0.5), (0.0, 0.5)))
 _MAPS_WITHIN = 0.2  # correlation within a map of a group, about the group's chance
 RATES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
-MAPS = (50, 100, 200)
-DRAWS = (1, 3)
 # Correlation within a map, and the share of chances and noise that two conditions have in common.
 LIKENESS = ((0.1, 0.3), (0.3, 0.7), (0.6, 0.9))
 TIME_BUDGET_S = 100.0
@@ -99,19 +90,24 @@ def drives(
     return success, times(generator, success, hardness(chance, given, like[0]))
 
 
+def rate_cover(success: np.ndarray, rate: float) -> float:
+    """How often Wilson's interval over the design effect holds the rate; success of shape [studies, maps, draws]."""
+    maps, draws = success.shape[1:]
+    member = np.repeat(np.arange(maps), draws)
+    held = 0
+    for study in success:
+        low, high = wilson_interval(study.mean(), study.size / design_effect(study.ravel(), member))
+        held += low <= rate <= high
+    return held / len(success)
+
+
 def cover_of_success(
     generator: np.random.Generator, studies: int, maps: int, draws: int, rates: Sequence[float] = RATES
 ) -> Iterator[float]:
     """For each rate and likeness, how often Wilson's interval over the design effect holds the rate."""
-    member = np.repeat(np.arange(maps), draws)
     for rate, (within, common) in product(rates, LIKENESS):
         chance = chances(generator, np.array([rate]), (studies, maps), within, common)
-        held = 0
-        for study in outcomes(generator, chance, draws, common)[:, 0]:
-            effect = design_effect(study.ravel(), member)
-            low, high = wilson_interval(study.mean(), study.size / effect)
-            held += low <= rate <= high
-        yield held / studies
+        yield rate_cover(outcomes(generator, chance, draws, common)[:, 0], rate)
 
 
 def cover_of_differences(
@@ -270,15 +266,8 @@ def cover_of_groups(
         "cover_t": float(np.mean(np.abs(mean - truth) <= half)),
         "half_t": float(half.mean()),
     }
-    member = np.repeat(np.arange(groups), episodes)
     for place, rate in enumerate(rates):
-        held = 0
-        for own in wins[:, place]:
-            success = np.arange(episodes) < own[:, None]
-            effect = design_effect(success.ravel(), member)
-            low_rate, high_rate = wilson_interval(success.mean(), success.size / effect)
-            held += low_rate <= rate <= high_rate
-        found[f"cover_{place}"] = held / len(wins)
+        found[f"cover_{place}"] = rate_cover(np.arange(episodes) < wins[:, place, :, None], rate)
     return found
 
 
@@ -306,116 +295,3 @@ def called_worse(wins: np.ndarray, draws: int) -> np.ndarray:
         draws: episodes a map.
     """
     return np.array([best_set_p(study.T, draws)[0] < ALPHA for study in wins])
-
-
-def _as_table(
-    rows: Callable[[int, int], Iterator[dict[str, object]]],
-) -> Callable[..., dict[str, pd.DataFrame]]:
-    """Make a script of a function that yields rows from the number of studies of each condition and a seed."""
-
-    def script(work: Work, folder: Path, studies: int = 2000, seed: int = 0) -> dict[str, pd.DataFrame]:
-        return {"rows": pd.DataFrame(track(rows(studies, seed), rows.__name__))}
-
-    return script
-
-
-@_as_table
-def study_intervals(studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """Cover of the intervals of success and of its difference, and how often `compare` errs."""
-    for maps, draws in product(MAPS, DRAWS):
-        generator = np.random.default_rng([seed, maps, draws])
-        row: dict[str, object] = {"maps": maps, "episodes a map": draws}
-        for name, cover in (("success", cover_of_success), ("difference", cover_of_differences)):
-            found = list(cover(generator, studies, maps, draws))
-            row[name] = f"{100 * np.mean(found):.1f}, {100 * np.min(found):.1f}"
-        false = 100 * np.array(list(false_findings(generator, studies // 5, maps, draws)))
-        for place, name in enumerate(("false: success", "false: T_total")):
-            row[name] = f"{false[:, place].mean():.1f}, {false[:, place].max():.1f}"
-        yield row
-
-
-@_as_table
-def study_times(studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """Cover and width of the intervals of T_total and of its difference, beside those of a bootstrap."""
-    for maps, draws, rate in product((8, 20, 30), DRAWS, (0.8, 0.95, 0.99)):
-        generator = np.random.default_rng([seed, maps, draws, round(100 * rate)])
-        row: dict[str, object] = {"maps": maps, "episodes a map": draws, "success": rate}
-        found = cover_of_times(generator, studies // 3, maps, draws, (rate, rate - 0.1), studies // 20)
-        for name, words in (("time", "T_total"), ("difference", "ΔT_total")):
-            for how, by in (("", ""), ("_bootstrap", ", bootstrap")):
-                cover, width = found[f"{name}_cover{how}"], found[f"{name}_width{how}"]
-                row[words + by] = f"{100 * cover:.1f} ({width:.1f} s)"
-        yield row
-
-
-@_as_table
-def study_groups(studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """Cover and width of the intervals of success and of its difference on few, large groups."""
-    for groups, episodes, like in product(GROUPS, IN_A_GROUP, GROUP_LIKENESS):
-        generator = np.random.default_rng([seed, groups, episodes, *(round(100 * value) for value in like)])
-        row: dict[str, object] = {
-            "groups": groups,
-            "episodes": episodes,
-            "correlation": like[0],
-            "shared": like[1],
-        }
-        covers: dict[str, object] = {}
-        for rates in GROUP_RATES:
-            found = cover_of_groups(generator, studies, groups, episodes, rates, like)
-            one, other = (f"{rate:g}" for rate in rates)
-            row[f"{one} − {other}"] = f"{100 * found['cover']:.1f} ({found['half']:.2f})"
-            row[f"{one} − {other}, t"] = f"{100 * found['cover_t']:.1f} ({found['half_t']:.2f})"
-            covers |= {name: f"{100 * found[f'cover_{i}']:.1f}" for i, name in enumerate((one, other))}
-        yield row | covers
-
-
-@_as_table
-def study_best(studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """How often a condition that is as good as the best is called worse, and one that is 10 or 20 points worse."""
-    for settings, maps, draws in product((6, 12), (20, *MAPS), DRAWS):
-        generator = np.random.default_rng([seed, settings, maps, draws])
-        row: dict[str, object] = {"settings": settings, "maps": maps, "episodes a map": draws}
-
-        half = settings // 2
-        cases = {f"all tied, {rate:g}": [rate] * settings for rate in (0.8, 0.95)}
-        for words, rates in (cases | {"half tied": [0.8] * half + [0.7] * half}).items():
-            success, _ = drives(generator, rates, (studies, maps), draws, LIKENESS[1])
-            tied = np.array(rates) == max(rates)
-            row[words] = _share(called_worse(success.sum(-1), draws)[:, tied].any(1))
-        for words, same_maps in (("unlike", False), ("unlike, same maps", True)):
-            wins = unlike(generator, studies, settings, maps, draws, same_maps)
-            row[words] = _share(called_worse(wins, draws).any(1))
-        for points in (10, 20):
-            rates = [0.8] * (settings - 1) + [0.8 - points / 100]
-            success, _ = drives(generator, rates, (studies, maps), draws, LIKENESS[1])
-            called = called_worse(success.sum(-1), draws)
-            row[f"power, {points} points"] = f"{100 * called[:, -1].mean():.0f}"
-        yield row
-
-
-@_as_table
-def study_hypotheses(studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """How often a single hypothesis is shown where it is false: no difference, or one as large as the margin."""
-    for maps, draws, rate in product((20, 50, 200), DRAWS, (0.8, 0.95)):
-        generator = np.random.default_rng([seed, maps, draws, round(100 * rate), 1])
-        row: dict[str, object] = {"maps": maps, "episodes a map": draws, "success": rate}
-        one, other, like = rate - 0.1, rate, LIKENESS[1]
-        success, taken = drives(generator, (other, other), (studies, maps), draws, like)
-        wins = success[:, 0].sum(-1) - success[:, 1].sum(-1)
-        row["difference, success"] = _share(np.array([sign_flip_p(gain) < ALPHA for gain in wins]))
-        _, far = drives(generator, (one, other), (1, 400_000), 1, like)
-        success, taken = drives(generator, (one, other), (studies, maps), draws, like)
-        wins = success[:, 0].sum(-1) - success[:, 1].sum(-1)
-        _, low, _ = success_interval(wins, draws, 1 - 2 * ALPHA)
-        row["non-inferiority, success"] = _share(low > -0.1)
-        _, low, high = time_intervals(success, taken, 1 - 2 * ALPHA)["difference"]
-        margin = (far[0, 0] - far[0, 1]).mean()
-        row["non-inferiority, T_total"] = _share(high < margin)
-        row["equivalence, T_total"] = _share((high < margin) & (low > -margin))
-        yield row
-
-
-def _share(found: np.ndarray) -> str:
-    """A share in per cent with its 95 % interval of Clopper and Pearson."""
-    ends = binomtest(int(found.sum()), len(found)).proportion_ci()
-    return f"{100 * found.mean():.1f} ({100 * ends.low:.1f}–{100 * ends.high:.1f})"
