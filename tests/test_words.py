@@ -34,7 +34,7 @@ def _joined(path: Path) -> str:
 
 
 def test_old_words_are_gone() -> None:
-    folders = ("benchnav", "benchmarks", "docs", "examples", "tests", "datasets", "checkpoints")
+    folders = ("benchnav", "benchmarks", "studies", "docs", "examples", "tests", "datasets", "checkpoints")
     files = [
         path
         for folder in folders

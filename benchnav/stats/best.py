@@ -7,7 +7,7 @@ does not, and on two the reverse. Without them a condition that fails wholly on 
 seems sure. The test does not assume that differences are symmetric, as flipping signs would. It goes step by step, as
 the model confidence set does: the condition that another beats by most is set aside, and the rest are compared again.
 So the chance that any condition which is as good as the best is called worse is at most about 5 % however many there
-are and whatever their shapes (`benchmarks/statistics_studies.py`).
+are and whatever their shapes (`studies/statistics`).
 Sources: Efron and Tibshirani (1993), "An Introduction to the Bootstrap", 12.5 and 16.4; Silverman and Young (1987),
 "The bootstrap: to smooth or not to smooth?"; Romano and Wolf (2005), "Exact and approximate stepdown methods for
 multiple hypothesis testing"; Hansen, Lunde and Nason (2011), "The model confidence set", for the order.

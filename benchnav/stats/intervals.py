@@ -37,7 +37,7 @@ def design_effect(success: np.ndarray, maps: np.ndarray) -> float:
     Sources: Korn and Graubard (1998), "Confidence intervals for proportions with small expected number of positive
     counts estimated from survey data", for n and Student's quantile; Cochran (1977), "Sampling Techniques", 6.3, for
     the variance where maps have unequally many episodes. How often the interval covers the truth:
-    `benchmarks/statistics_studies.py`, parts `intervals` and `groups`.
+    `studies/statistics`, parts `intervals` and `groups`.
 
     Args:
         success: bool, shape [N].
@@ -71,7 +71,7 @@ def success_interval(
     was seen.
     Sources: Bonett and Price (2012), "Adjusted Wald confidence interval for a difference of binomial proportions
     based on paired data"; Cochran (1977), "Sampling Techniques", 6.3, for the ratio. How often the interval covers the
-    truth on few, large groups: `benchmarks/statistics_studies.py`, part `groups`.
+    truth on few, large groups: `studies/statistics`, part `groups`.
 
     Args:
         gain: successes of the one condition less those of the other by map, whole numbers, shape [..., M], M ≥ 2.

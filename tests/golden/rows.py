@@ -20,14 +20,16 @@ import pandas as pd
 import torch
 import yaml
 
+from studies.study import Study, Work
+
 ROOT = Path(__file__).parents[2]
 STORED = Path(__file__).parent / "rows.json"
 
-# Each suite with what is changed in it.
-SUITES: Mapping[str, tuple[str, dict[str, Any]]] = {
-    "paper": ("benchnav/eval/suites/paper.yaml", {}),
-    "risk": ("benchnav/eval/suites/risk.yaml", {"maps": 100}),
-    "knowledge": ("docs/knowledge/primary.yaml", {"maps": 50}),
+# Each suite by its study and part, with what is changed in it.
+SUITES: Mapping[str, tuple[str, str, dict[str, Any]]] = {
+    "paper": ("results", "paper", {}),
+    "risk": ("risk", "risk", {"maps": 100}),
+    "knowledge": ("knowledge", "primary", {"maps": 50}),
 }
 DATASETS = {
     "paper-v1": ["paper-v1"],
@@ -108,9 +110,9 @@ def run(work: Path, jobs: int) -> dict[str, pd.DataFrame]:
             splits = SPLITS.get(name, "[test/std]")
             _command("benchnav-datagen", "create", *words, "--splits", splits, "--out", str(path))
     tables = {}
-    for name, (path, changes) in SUITES.items():
-        suite = {**yaml.safe_load((ROOT / path).read_text()), **changes}
-        suite["data"] = str(maps_in / f"{suite['data']}.h5")
+    for name, (study, part, changes) in SUITES.items():
+        suite = Study.load(study).suite(part, Work(out=work, maps_in=maps_in)) | changes
+        suite["data"] = str(maps_in / f"{Path(suite['data']).stem}.h5")
         # Hypotheses do not bear on rows.
         suite.pop("hypotheses", None)
         config = work / f"{name}.yaml"

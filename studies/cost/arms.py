@@ -1,0 +1,110 @@
+"""Arms of risk on the cost: the table of their differences, and success over time through their levels."""
+
+from collections.abc import Mapping
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from benchnav.core.figures import TWO_COLUMNS_IN, legend_outside, styled
+from benchnav.core.tables import Table
+from benchnav.eval.compare import read_conditions
+from benchnav.eval.folder.run_folder import open_run
+from benchnav.eval.stats.comparison import compare
+from benchnav.eval.stats.pairs import Compared, Pair, check_maps, side_by_side
+from studies.curves import draw_curve
+from studies.tables import success, table
+
+ARMS = ("CVaR of λ", "CVaR of time", "CVaR of the cost")
+# Each planner of the study with its name in the figure.
+FAMILIES = {"mppi": "MPPI", "astar_mppi": "A*+MPPI"}
+_MEASURES = ("success", "total_time_s", "time_budget_s")
+_HEADINGS = (
+    "planner", "risk", "success [%] (95 %)", "T_total [s]", "ms a step", "Δ success [points] (95 %)", "p",
+    "Δ time where both arrive [s] (95 %)",
+)  # fmt: skip
+
+
+def arms(run: Path) -> Table:
+    """Return success, time and computing of each arm, and what it gains on another.
+
+    The other is CVaR of time on the map with the same planner, or the same arm with the shared time to go; both may be
+    in the run `cost-primary` next to this one. p is after Holm's correction over all rows that have one.
+    """
+    arms_of_run = _by_arm(run)
+    others = arms_of_run
+    if any(_compared_with(*arm) not in arms_of_run for arm in arms_of_run):
+        others = arms_of_run | _by_arm(run.with_name("cost-primary"))
+    pairs = {}
+    for (planner, risk), one in arms_of_run.items():
+        other = others[_compared_with(planner, risk)]
+        if one is not other:  # the two may differ in planner and risk setting alike
+            check_maps(one, other, f"{planner} and {other.labels['planner']}")
+            both = side_by_side(one.episodes, other.episodes, _MEASURES)
+            pairs[planner, risk] = Pair(one=planner, other=other.labels["planner"], shared={}, episodes=both)
+    compared = dict(zip(pairs, compare(list(pairs.values())).to_dict("records"), strict=True))
+    rows = []
+    for row in pd.read_csv(run / "summary.csv").to_dict("records"):
+        arm, differences = (row["planner"], row["risk"]), ["", "", ""]
+        if found := compared.get(arm):
+            points = [100 * found[f"success_{end}"] for end in ("difference", "low", "high")]
+            seconds = [found[f"arrival_time_{end}_s"] for end in ("difference", "low", "high")]
+            differences = [_interval(points), f"{found['success_p_holm']:.2g}", _interval(seconds)]
+        times = f"{row['total_time_mean_s']:.1f}", f"{row['planning_ms_median']:.1f}"
+        rows.append([*arm, success(row), *times, *differences])
+    return table(_HEADINGS, rows, 2)
+
+
+def _by_arm(run: Path) -> dict[tuple[str, str], Compared]:
+    conditions = read_conditions([open_run(run)])
+    return {(each.labels["planner"], each.labels["risk"]): each for each in conditions}
+
+
+def _interval(values: list[float]) -> str:
+    return "{:+.1f} ({:.1f} to {:.1f})".format(*values)
+
+
+def _compared_with(planner: str, risk: str) -> tuple[str, str]:
+    if planner.endswith(" own"):
+        return planner.removesuffix(" own"), "expected-time" if "cost" in planner else risk
+    return f"{planner.split()[0]} map", "time-cvar:0.5"
+
+
+def arm_of(row: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return planner, arm and level of a condition, and whether it has entrapment; other conditions have no arm."""
+    part, _, kind = row["planner"].partition(" ")
+    name, _, level = row["risk"].partition(":")
+    found = {"planner": FAMILIES.get(part, ""), "held": "held" in kind, "arm": "", "level": 0.0}
+    if part not in FAMILIES or row["model"] == "clairvoyant":
+        return found
+    if "cost" in kind:
+        return found | {"arm": "CVaR of the cost", "level": float(kind.split()[1])}
+    arm = "CVaR of λ" if name in ("cvar", "mean") else "CVaR of time"
+    return found | {"arm": arm, "level": float(level or 0)}
+
+
+@styled()
+def frontier(summary: pd.DataFrame) -> Figure:
+    """Draw success over the time to the goal, a curve an arm through its levels; markers grow with the level.
+
+    A panel a planner; in the row below with entrapment.
+    """
+    rows = summary.assign(**pd.DataFrame([arm_of(row) for row in summary.to_dict("records")], summary.index))
+    rows = rows[rows["arm"] != ""]
+    planners = list(dict.fromkeys(rows["planner"]))
+    figure = Figure(figsize=(TWO_COLUMNS_IN, 4.6), layout="constrained")
+    axes = figure.subplots(2, len(planners), sharex="row", sharey=True, squeeze=False)
+    handles = {}
+    for (held, planner), panel in zip(product((False, True), planners), axes.flat, strict=True):
+        in_panel = rows[(rows["planner"] == planner) & (rows["held"] == held)].sort_values("level")
+        for place, arm in enumerate(ARMS):
+            curve = in_panel[in_panel["arm"] == arm]
+            sizes = (3 + 5 * curve["level"]) ** 2
+            handles[arm] = draw_curve(panel, curve["success_time_mean_s"], curve, place, sizes=sizes)
+            handles[arm].set_label(arm)
+        panel.set_title(f"{planner}, entrapment" if held else planner)
+        panel.set_xlabel("mean time of those that arrive [s]" if held else "")
+    legend_outside(figure, list(handles.values()), len(ARMS))
+    return figure

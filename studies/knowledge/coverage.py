@@ -1,0 +1,204 @@
+"""Coverage of the intervals of a belief, with `oracle` and a trained model.
+
+Robots drive by A*+DWA under `expected-time` and learn by `copula`. At four times of each episode, drawn beforehand, the
+belief is asked of all cells within 2ℓ of the robot whose λ was not sensed: does λ lie in the central 90 % of what is
+believed of it? Where λ has an atom, a rank in it is drawn (randomised PIT). The table has the fraction of cells with
+its 95 % interval by maps (of a ratio of sums over maps), the fractions under and over the interval, and the mean log
+score next to that of the prediction.
+
+In the world `stakes` draws of λ without a feasible path are rejected, which the covariance model does not know.
+`no draw rejected` rejects none, and immobilises no robot. The table `rejection` says what rejection changes of λ: over
+40 draws of each map, the differences of E[λ] and P(λ < 0.1) between accepted draws and all, near the straight line from
+start to goal (3 m) and elsewhere.
+
+Sums of each unit are stored in the run's folder, so that a run that was interrupted resumes. Delete the folder when the
+code has changed. 25 minutes of a core with 400 maps' first 200, and 15 with the fine maps.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.progress import track
+from torch import Tensor
+
+from benchnav.core import rng
+from benchnav.core.copula import correlated_normal
+from benchnav.core.tables import Table
+from benchnav.eval.experiment.condition import conditions_of
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Extent, Unit, units
+from benchnav.eval.run.knowledge import Knowing
+from benchnav.eval.run.unit import Built, Settings, read_block, simulate
+from benchnav.planning.world.realisation import joined
+from studies.study import Work
+from studies.tables import table
+from studies.units import build_unit, one_unit, stakes_suite
+
+MODELS = ("oracle", "stakes-v1")
+GROUNDS = ("contact", "probe:1", "probe:2")
+TIMES, LATEST_S = 4, 40.0
+NEAR_M = 3.0  # 2ℓ
+LAW = {"preset": "stakes", "immobile": None}
+DRAWS = 40  # of each map, of the table on rejection
+NAMES = ("inside", "under", "over", "log_score", "log_score_of_prediction")
+
+
+class Coverage:
+    """What was found in the episodes of a unit: sums by map, shape [B, 6], the first of them of cells."""
+
+    def __init__(self, unit: Unit, built: Built) -> None:
+        """Draws the times."""
+        assert built.learning is not None
+        assert built.simulation.field is not None
+        self._built, self._learner, self._field = built, built.learning.learner, built.simulation.field
+        maps = np.array(unit.maps)
+        every = round(unit.condition.rules.replan_every_s / built.problem.dt_s)
+        drawn = rng.uniform(rng.stream_key(0, "coverage"), maps, (TIMES,))
+        self._steps = torch.from_numpy(every * np.ceil(drawn * LATEST_S / built.problem.dt_s / every)).long()
+        self._rank = torch.from_numpy(rng.uniform(rng.stream_key(0, "rank"), maps, built.problem.grid.shape))
+        self.sums = torch.zeros(len(maps), 1 + len(NAMES), dtype=torch.float64)
+
+    def __call__(self, step: int, knowing: Knowing) -> None:
+        """Asks what is believed where a time was drawn; of robots that are left."""
+        known, members = knowing.known, knowing.members
+        asked = (self._steps[members] == step).any(1) & known.reached.flatten(1).any(1)
+        cells = _near(known.reached, self._built.problem.grid.resolution_m) & ~known.ever_sensed
+        cells &= asked[:, None, None]
+        if not bool(cells.any()):
+            return
+        value, member = self._field[members][cells][None], members[cells.nonzero()[:, 0]]
+        believed = self._learner.distribution(known).at(cells)
+        low, high = believed.cdf_limits(value)
+        pit = torch.lerp(low.double(), high.double(), self._rank[members][cells][None])
+        predicted = self._built.problem.distribution.select(members).at(cells)
+        told = (
+            torch.ones_like(pit), (pit - 0.5).abs() <= 0.45, pit < 0.05, pit > 0.95,
+            believed.log_prob(value).clamp(min=-10), predicted.log_prob(value).clamp(min=-10),
+        )  # fmt: skip
+        self.sums.index_add_(0, member, torch.stack([part[0].double() for part in told], 1))
+
+
+def _near(reached: Tensor, resolution_m: float) -> Tensor:
+    """Cells within `NEAR_M` of the middle of those that sensors told of, bool, shape [B, H, W]."""
+    row, column = (torch.arange(size, dtype=torch.float64) for size in reached.shape[1:])
+    count = reached.flatten(1).sum(1).clamp(min=1)
+    middle = [(reached.sum(axis) * line).sum(1) / count for axis, line in ((2, row), (1, column))]
+    down = (row - middle[0][:, None])[:, :, None]
+    across = (column - middle[1][:, None])[:, None]
+    return torch.hypot(down, across) * resolution_m <= NEAR_M
+
+
+def suite_of(data: Path, models: Sequence[str] = MODELS) -> Suite:
+    """Return who learns by what, in which world."""
+    common: dict[str, Any] = {"grounds": list(GROUNDS), "beliefs": ("copula",)}
+    return stakes_suite(
+        data, planners=("astar_dwa",), risks=("expected-time",), seeds=(), world="paper",
+        conditions=(
+            {"models": list(models), "world": "stakes", **common},
+            {"models": ["oracle"], "world": LAW, **common},
+        ),
+    )  # fmt: skip
+
+
+def sums_of(unit: Unit, settings: Settings, out: Path) -> Tensor:
+    """Sums of the episodes of a unit, read if they are stored, shape [B, 6]."""
+    path = out / f"{unit.condition.id}-{unit.maps[0]}-{unit.maps[-1]}.npy"
+    if not path.exists():
+        built = build_unit(unit)
+        coverage = Coverage(unit, built)
+        simulate(unit, built, settings, witness=coverage)
+        part = path.with_suffix(".part.npy")
+        np.save(part, coverage.sums.numpy())
+        part.replace(path)
+    return torch.from_numpy(np.load(path))
+
+
+def measured(suite: Suite, maps: int, out: Path) -> Table:
+    """Coverage of each condition."""
+    conditions = {
+        condition.id: (condition, Extent.product((0,), 1, maps))
+        for condition in conditions_of(suite, lambda data: ["std"])
+    }
+    settings, found = Settings(), dict[str, list[Tensor]]()
+    for unit in track(units(conditions), "units"):
+        found.setdefault(unit.condition.id, []).append(sums_of(unit, settings, out))
+    rows = []
+    for key, parts in found.items():
+        labels, sums = conditions[key][0].labels, torch.cat(parts).numpy()
+        cells = sums[:, 0].sum()
+        shares = sums[:, 1:].sum(0) / cells
+        # A ratio of sums over maps: its error by the residuals of the maps.
+        left = sums[:, 1] - shares[0] * sums[:, 0]
+        error = 1.96 * np.sqrt((left**2).sum()) / cells
+        inside = f"{shares[0]:.3f} ({shares[0] - error:.3f} to {shares[0] + error:.3f})"
+        law = "no draw rejected" if "immobile" in labels["world"] else "with rejection"
+        under, over, *scores = shares[1:]
+        rows.append((
+            labels["model"], law, labels["ground"], f"{cells:.0f}", inside, f"{under:.3f}", f"{over:.3f}",
+            *(f"{score:.2f}" for score in scores),
+        ))  # fmt: skip
+    headings = ("model", "λ", "ground", "cells", "inside 90 % (95 % interval)", "under", "over")
+    return table((*headings, "log score", "of the prediction"), rows, 3)
+
+
+def rejection(data: Path, maps: int) -> Table:
+    """What rejection of draws changes of λ."""
+    suite = suite_of(data)
+    unit = one_unit(suite, maps)
+    condition = unit.condition
+    changes, rejected, drawn = [], 0, 0
+    for first in track(range(0, maps, 50), "draws"):
+        block = read_block(
+            Unit(condition=condition, seed=0, realisation=0, maps=tuple(range(first, min(first + 50, maps)))),
+            Settings().origins().of(unit),
+        )
+        world, grid, truth = condition.world, block.terrain.grid, block.terrain.truth
+        assert world.immobile is not None
+        sums = torch.zeros(2, 3, *truth.shape, dtype=torch.float64)
+        for draw in range(DRAWS):
+            scores = correlated_normal(
+                rng.stream_key(draw, "rejection"), np.arange(first, first + truth.shape[0]), grid.shape,
+                world.correlation_m / grid.resolution_m,
+            )  # fmt: skip
+            field = truth.from_normal(torch.from_numpy(scores).float()).double()
+            kept = joined(field >= world.immobile.below, grid, block.places)
+            told = torch.stack((torch.ones_like(field), field, (field < world.immobile.below).double()))
+            sums[0] += told
+            sums[1] += told * kept[:, None, None]
+            rejected, drawn = rejected + int((~kept).sum()), drawn + len(kept)
+        # Maps of which no draw is kept tell nothing.
+        all_draws, kept_draws = (part[1:] / part[0].clamp(min=1) for part in sums)
+        some = sums[1, 0].flatten(1).amax(1) > 0
+        near = _on_the_way(block.places.start_m, block.places.goal_m, grid)
+        for own in some.nonzero()[:, 0].tolist():
+            away = (kept_draws - all_draws)[:, own]
+            changes.append([*away[:, near[own]].mean(1), *away[:, ~near[own]].mean(1)])
+    means = np.array(changes).mean(0)
+    places = zip(("near the straight line", "elsewhere"), means.reshape(2, 2), strict=True)
+    rows = [
+        (f"{rejected / drawn:.1%}", name, f"{mean:+.4f}", f"{probability:+.4f}")
+        for name, (mean, probability) in places
+    ]
+    return table(("draws rejected", "cells", "change of E[λ]", f"of P(λ < {world.immobile.below:g})"), rows)
+
+
+def _on_the_way(start_m: Tensor, goal_m: Tensor, grid: Any) -> Tensor:
+    """Cells within `NEAR_M` of the straight line from start to goal, bool, shape [B, H, W]."""
+    row, column = (torch.arange(size) for size in grid.shape)
+    x, y = grid.centre_of(row[:, None], column[None, :])
+    x, y = torch.broadcast_tensors(x, y)
+    at = torch.stack((x, y), -1)[None].double()
+    start, way = start_m.double()[:, None, None], (goal_m - start_m).double()[:, None, None]
+    part = (((at - start) * way).sum(-1) / way.square().sum(-1)).clamp(0, 1)
+    return torch.linalg.vector_norm(at - start - part[..., None] * way, dim=-1) <= NEAR_M
+
+
+def coverage(
+    work: Work, folder: Path, data: str, maps: int, models: Sequence[str] = MODELS
+) -> dict[str, Table]:
+    """Return coverage of the belief on the first maps of a dataset, and what rejection of draws changes."""
+    path = work.maps_in / f"{data}.h5"
+    return {"rejection": rejection(path, maps), "coverage": measured(suite_of(path, models), maps, folder)}

@@ -1,0 +1,213 @@
+"""Two planners that sample action sequences otherwise than MPPI does, to be compared at equal computing.
+
+Smooth MPPI: Kim, Park, Choi and Ha (2022), "Smooth model predictive path integral control without smoothing". iCEM:
+Pinneri et al. (2020), "Sample-efficient cross-entropy method for real-time planning", algorithm 1. Letters in shapes
+are those of `benchnav/planning/planners/mppi.py`, and E elites.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchnav.core import rng
+from benchnav.core.errors import expect
+from benchnav.planning import MPPI, MPPIConfig
+from benchnav.planning.free_space import PENALTY
+from benchnav.planning.planners.astar import astar
+from benchnav.planning.planners.compilation import Fused
+from benchnav.planning.planners.mppi import MPPIState, roll_out
+from benchnav.planning.planners.noise_bank import NoiseBank, perturb
+from benchnav.planning.planners.planner import Plan
+from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
+from benchnav.planning.robots import component_wise
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmoothConfig(MPPIConfig):
+    """Settings of Smooth MPPI.
+
+    Args:
+        noise_share: standard deviation of what each step adds to an action, as a share of its range.
+        smoothness: weight of the squared changes of actions from step to step, each as a share of its range.
+    """
+
+    noise_share: float = 0.1
+    smoothness: float = 1.0
+
+
+@dataclass(frozen=True)
+class _Summed(NoiseBank):
+    def at(self, step: int) -> Tensor:
+        return super().at(step).cumsum(0)
+
+
+def refuse_others(config: MPPIConfig, own: type[MPPIConfig], unused: tuple[str, ...]) -> None:
+    """Refuses options of MPPI that a planner has no use for, where they are not at their default."""
+    for name in ("risk_on", "entrapment", "control_cost", *unused):
+        given = getattr(config, name)
+        expect(given == getattr(own(), name), f"no `{name}` for {own.__name__}, got {given!r}.")
+
+
+class SmoothMPPI(MPPI):
+    """MPPI that samples the changes of actions, and takes large ones for costly."""
+
+    def __init__(self, config: SmoothConfig | None = None) -> None:
+        super().__init__(config or SmoothConfig())
+        refuse_others(self.config, SmoothConfig, ())
+
+    def init(self, problem: Problem, generator: torch.Generator) -> MPPIState:
+        state = super().init(problem, generator)
+        return replace(state, noise=_Summed(**vars(state.noise)))
+
+    def plan_toward(
+        self, step: Any, plan_state: MPPIState, target_m: Tensor
+    ) -> tuple[Tensor, MPPIState, Plan]:
+        problem, mean, config = plan_state.problem, plan_state.mean, self.config
+        noise, (low, high) = plan_state.noise.at(plan_state.step), problem.action_bounds
+        states, cost, _ = roll_out(problem, step.state, mean, noise, target_m, self._advance)
+        changes = perturb(mean[..., None], noise, low, high).diff(dim=1) / (high - low)[:, None]
+        cost = cost + config.smoothness * changes.square().sum((1, 2))
+        _, updated = self._weigh(
+            states, cost, mean, noise, low, high, problem.padded_ground, target_m[:, None].contiguous(), problem.grid,
+            problem.objective, config.temperature, config.temperature_share, 1, 0.0, None, plan_state.to_go,
+        )  # fmt: skip
+        shifted = torch.cat((updated[:, 1:], updated[:, -1:]), dim=1)
+        after = replace(plan_state, mean=shifted, step=plan_state.step + 1)
+        return updated[:, 0], after, Plan.empty(len(problem), step.state.device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ICEMConfig(MPPIConfig):
+    """Settings of iCEM; `samples` are those of the first iteration.
+
+    Args:
+        iterations: of a step.
+        elites: sequences to which the distribution is fitted.
+        kept: share of them that the next iteration, and the next step, tries again.
+        decay: by which each iteration has fewer samples than the one before.
+        momentum: weight of the distribution before.
+        colour: exponent β of the noise's spectrum, 1 / f^β.
+    """
+
+    iterations: int = 3
+    elites: int = 10
+    kept: float = 0.3
+    decay: float = 1.25
+    momentum: float = 0.1
+    colour: float = 2.0
+
+
+@dataclass(frozen=True)
+class Coloured:
+    """Noise of variance 1, of which each iteration takes a part, shape [T, A, 4K]."""
+
+    values: Tensor
+
+    def take(self, key: int, count: int) -> Tensor:
+        """So many sequences from a place that is named by a key, shape [T, A, count]."""
+        first = key % (self.values.shape[2] - count + 1)
+        return self.values[..., first : first + count]
+
+
+@dataclass(frozen=True)
+class ICEMState(MPPIState):
+    """What iCEM carries from step to step, beside what MPPI does.
+
+    Args:
+        elites: sequences that are tried again, shape [B, T, A, E].
+        coloured: the noise.
+    """
+
+    elites: Tensor
+    coloured: Coloured
+
+
+class ICEM(MPPI):
+    """The improved cross-entropy method: coloured noise, and the best sequences are kept."""
+
+    def __init__(self, config: ICEMConfig | None = None) -> None:
+        super().__init__(config or ICEMConfig())
+        refuse_others(self.config, ICEMConfig, ("noise", "temperature", "temperature_share"))
+        self._roll = Fused(_advance, self.config.samples, self.worth_compiling, batched=(0, 1, 2, 3, 4))
+
+    @property
+    def _kept(self) -> int:
+        return max(1, round(self.config.kept * self.config.elites))
+
+    def init(self, problem: Problem, generator: torch.Generator) -> ICEMState:
+        base, config = super().init(problem, generator), self.config
+        horizon, actions = base.mean.shape[1:]
+        own = rng.generator(rng.stream_key(base.key, "coloured"))
+        coloured = coloured_noise(horizon, (actions, 4 * config.samples), config.colour, own).to(base.mean)
+        elites = base.mean[..., None].expand(-1, -1, -1, self._kept)
+        return ICEMState(**vars(base), elites=elites, coloured=Coloured(coloured))
+
+    def plan_toward(self, step: Any, plan_state: Any, target_m: Tensor) -> tuple[Tensor, Any, Plan]:
+        problem, config, mean = plan_state.problem, self.config, plan_state.mean
+        low, high = problem.action_bounds
+        std = (config.noise_share * (high - low)).expand_as(mean)
+        tried = plan_state.elites
+        for iteration in range(config.iterations):
+            count = max(2 * config.elites, int(config.samples / config.decay**iteration))
+            key = rng.stream_key(plan_state.key, plan_state.step, iteration)
+            noise = plan_state.coloured.take(key, count)
+            samples = torch.clamp(mean[..., None] + std[..., None] * noise, low[:, None], high[:, None])
+            last = [mean[..., None]] if iteration == config.iterations - 1 else []
+            samples = torch.cat((samples, tried, *last), dim=3)
+            cost = self._cost(problem, step.state, samples, target_m, plan_state.to_go)
+            best = cost.topk(config.elites, dim=1, largest=False).indices
+            elites = samples.gather(3, best[:, None, None].expand(-1, *samples.shape[1:3], -1))
+            mean = config.momentum * mean + (1 - config.momentum) * elites.mean(3)
+            std = config.momentum * std + (1 - config.momentum) * elites.std(3)
+            tried = elites[..., : self._kept]
+        shifted, kept = (torch.cat((each[:, 1:], each[:, -1:]), dim=1) for each in (mean, tried))
+        after = replace(plan_state, mean=shifted, elites=kept, step=plan_state.step + 1)
+        return elites[:, 0, :, 0], after, Plan.empty(len(problem), step.state.device)
+
+    def _cost(
+        self, problem: Problem, state: Tensor, samples: Tensor, target_m: Tensor, to_go: Tensor | None
+    ) -> Tensor:
+        """What sequences cost, shape [B, K]."""
+        target = target_m[:, None].contiguous()
+        states = component_wise(state[:, None].expand(-1, samples.shape[3], -1))
+        cost = state.new_zeros(states.shape[:2])
+        rules = problem.task.rules.min_traversability
+        for chunk in samples.split(10, dim=1):
+            states, cost = self._roll(
+                states, cost, chunk.contiguous(), problem.padded_ground, target, problem.grid, problem.robot,
+                problem.objective, rules,
+            )  # fmt: skip
+        ground = problem.grid.lookup(problem.padded_ground, states[..., 0], states[..., 1])
+        if to_go is None:
+            return cost + terminal_cost(problem.objective, states, ground, target)
+        paths = astar.cost_at(problem.grid, to_go, states[..., 0], states[..., 1])
+        return cost + paths + PENALTY * (ground <= 0)
+
+
+def _advance(
+    states: Tensor, cost: Tensor, actions: Tensor, ground: Tensor, target: Tensor, grid: Any, robot: Any,
+    objective: Any, least: float,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    for step in range(actions.shape[1]):
+        action = actions[:, step].movedim(1, 2)
+        here = grid.lookup(ground, states[..., 0], states[..., 1])
+        cost = cost + stage_cost(objective, states, action, here, target)
+        states = robot(states, action, motion_traversability(here, least))
+    return component_wise(states), cost
+
+
+def coloured_noise(steps: int, shape: tuple[int, ...], colour: float, generator: torch.Generator) -> Tensor:
+    """Normal noise of mean 0 and variance 1 whose spectrum over time falls as 1 / f^colour, shape [steps, *shape].
+
+    Source: Timmer and König (1995), "On generating power law noise".
+    """
+    frequencies = torch.fft.rfftfreq(steps)
+    frequencies[0] = frequencies[1]  # as the lowest that a sequence of this length can tell
+    scale = frequencies ** (-colour / 2)
+    real, imaginary = torch.randn((2, len(scale), *shape), generator=generator)
+    imaginary[0] = 0
+    spectrum = torch.complex(real, imaginary) * scale.view(-1, *(1 for _ in shape))
+    noise = torch.fft.irfft(spectrum, n=steps, dim=0)
+    return noise / noise.std(dim=(0, -1), keepdim=True)

@@ -1,0 +1,180 @@
+"""Tightness of the lower bound of the time to the goal, and a search for planners that are earlier than it.
+
+`gap` takes λ fields of the shipped test maps in the world `stakes`, and the near-optimal reference. The gap between the
+two is split by bounds that leave a cause out: the excess of slopes that W is divided by; that a step reaches from quick
+cells into slow ones; that robots may dip into immobilising terrain. The rest are turns, dwell time, and what the
+reference loses. `walls` draws small worlds with a wall of slow cells across, some of which immobilise a robot before it
+is over, and drives planners that are given λ.
+"""
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from numpy import ndarray
+
+from benchnav.core import rng
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.registry import make, read_part
+from benchnav.core.tables import Table
+from benchnav.core.terrain import Observation, Terrain
+from benchnav.eval.run.rollout import run_episodes
+from benchnav.planning.free_space import FreeSpace, Immobile, Rules
+from benchnav.planning.objective import TravelTime
+from benchnav.planning.problem import Task, pose_problem
+from benchnav.planning.robots import Unicycle
+from benchnav.planning.world import lower_bound
+from benchnav.planning.world.lower_bound import Mesh, Motion, lower_bound_s
+from benchnav.planning.world.outcome import Outcome
+from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.world import Places, World
+from studies.planners.optimal import drive
+from studies.study import Work
+from studies.tables import table
+
+DATA = Path("datasets/stakes-v1-test.h5")
+REFERENCE = "near_optimal"
+PLANNERS: dict[str, dict[str, Any]] = {
+    "straight": {},
+    "astar_dwa": {},
+    REFERENCE: {},
+    "cl_rrt": {},
+    "mppi": {"samples": 512, "cost_to_go": "map"},
+}
+_BLOCK = 10  # worlds of one wall
+_LIMIT_S = 60.0
+
+
+# --- the gap on shipped fields ------------------------------------------------------------------------
+
+
+@contextmanager
+def without(**changes: Any) -> Iterator[None]:
+    """Exchange parts of the bound, which then holds for a robot that is less able."""
+    with ExitStack() as stack:
+        for name, value in changes.items():
+            stack.enter_context(patch.object(Mesh if name == "excess" else lower_bound, name, value))
+        yield
+
+
+def no_reach(fine: ndarray, squares: Grid, step_m: float, error_m: float) -> ndarray:
+    """λ⁺ of a robot that reads λ all along a step."""
+    return fine
+
+
+def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Table]:
+    """Return fractions of the reference's time between it and the bound, by cause."""
+    times_s, built = drive(DATA, REFERENCE, maps, world={"preset": "stakes"}, task={})
+    problem, field = built.problem, built.simulation.field
+    assert field is not None
+    motion = Motion(robot=problem.robot, goal_radius_m=problem.goal_radius_m, immobile=problem.immobile)
+    found, seconds = [], 0.0
+    for number in range(maps):
+        if not math.isfinite(times_s[number]):
+            continue
+        ends = problem.start[number, :2].numpy(), problem.goal_m[number].numpy()
+        given = field[number].numpy(), problem.grid, motion, *ends
+        begun = time.process_time()
+        least = lower_bound_s(*given)
+        seconds += time.process_time() - begun
+        with without(excess=lambda mesh, value: 1.0, _CHECK_EVERY=lower_bound._MOST_STEPS):
+            converged = lower_bound_s(*given)
+        with without(_reached=no_reach):
+            reads = lower_bound_s(*given)
+        with without(_reached=no_reach, _deepest_m=lambda motion, immobile: -1.0):
+            dry = lower_bound_s(*given)
+        whole = times_s[number]
+        steps = (least, converged, max(converged, reads), min(max(reads, dry), whole), whole)
+        found.append(np.diff(steps) / whole)
+    parts = np.array(found)
+    names = (
+        "slopes in excess", "steps reach into slow cells", "dips into immobilising terrain", "turns, and the reference",
+    )  # fmt: skip
+    rows = [
+        (name, f"{np.median(fractions):.1%}", f"{np.quantile(fractions, 0.9):.1%}")
+        for name, fractions in (*zip(names, parts.T, strict=True), ("all", parts.sum(1)))
+    ]
+    print(f"{len(parts)} fields, {seconds / len(parts):.1f} CPU-s each")
+    return {"gap": table(("cause", "median", "90th percentile"), rows)}
+
+
+# --- planners in worlds with walls --------------------------------------------------------------------
+
+
+def walled(generator: np.random.Generator, grid: Grid, count: int) -> tuple[ndarray, Immobile]:
+    """λ of worlds with a wall that takes 0.5 to 1.2 of the time that immobilises a robot, with gaps at times."""
+    fields = generator.choice([0.6, 0.8, 0.95], (count, *grid.shape))
+    thickness, slow = int(generator.integers(1, 5)), float(generator.uniform(0.1, 0.9))
+    first = int(generator.integers(6, grid.width - 10))
+    fields[:, :, first : first + thickness] = slow
+    holes = generator.random(fields.shape) < generator.choice([0.0, 0.02, 0.1])
+    fields[holes] = 0.95
+    crossing_s = thickness * grid.resolution_m / slow
+    immobile = Immobile(below=min(1.0, slow * 1.05), for_s=crossing_s / float(generator.uniform(0.5, 1.2)))
+    return fields, immobile
+
+
+def drive_worlds(fields: ndarray, immobile: Immobile, grid: Grid, name: str) -> ndarray:
+    """Seconds to the goal of a planner that is given λ, infinite where it does not arrive, shape [B]."""
+    ground, count, robot = torch.from_numpy(fields).float(), len(fields), Unicycle()
+    rules = Rules(free_space=FreeSpace(by="mean", above=0.05), min_traversability=0.02)
+    task = Task(robot=robot, objective=TravelTime(robot, rules.goal_radius_m), rules=rules)
+    level = ground[:, None]
+    known = TraversabilityMixture(torch.ones_like(level), level, torch.zeros_like(level), (0,))
+    rgb, zero = torch.zeros(count, 3, *grid.shape, dtype=torch.uint8), torch.zeros_like(ground)
+    start_m, goal_m = (torch.from_numpy(end).float().repeat(count, 1) for end in ends_of(grid))
+    seen = Observation(rgb, zero, zero, grid)
+    problem = pose_problem(task, seen, known, ground, start_m, goal_m, _LIMIT_S, immobile=immobile)
+    terrain = Terrain(
+        rgb=rgb, class_id=zero.long(), elevation_m=zero, slope_deg=zero, truth=known, traversability=ground, grid=grid
+    )  # fmt: skip
+    places = Places(start_m=start_m, goal_m=goal_m, reference_time_s=torch.full((count,), torch.nan))
+    world = World(noise="stored", immobile=immobile, time_budget_s=_LIMIT_S)
+    simulation = Simulation(terrain, task, world, places, 1, range(count))
+    planner = make("planner", read_part("planner", {"part": name, "options": PLANNERS[name]}))
+    episodes = run_episodes(planner, problem, simulation, rng.generator(0))
+    seconds = episodes.steps.double().numpy() * robot.dt_s
+    return np.where(episodes.outcome.numpy() == Outcome.SUCCESS, seconds, np.inf)
+
+
+def ends_of(grid: Grid) -> tuple[ndarray, ndarray]:
+    """Start and goal, on both sides of the wall."""
+    middle = grid.height // 2 * grid.resolution_m + 0.25
+    return np.array([1.25, middle]), np.array([grid.extent_m[0] - 1.75, middle])
+
+
+def walls(work: Work, folder: Path, maps: int = 500) -> dict[str, Table]:
+    """Return whether a planner is earlier than the bound in worlds with walls, or arrives where it is infinite."""
+    grid, generator = Grid(13, 26, 0.5), np.random.default_rng(0)
+    blocks = [walled(generator, grid, _BLOCK) for _ in range(max(1, maps // _BLOCK))]
+    motions = [
+        Motion(robot=Unicycle(), goal_radius_m=Rules().goal_radius_m, immobile=each) for _, each in blocks
+    ]
+    least = np.array(
+        [
+            lower_bound_s(field, grid, motion, *ends_of(grid))
+            for (fields, _), motion in zip(blocks, motions, strict=True)
+            for field in fields
+        ]
+    )
+    print(f"{len(least)} worlds; in {np.isinf(least).sum()} the bound is infinite")
+    rows = []
+    for name in PLANNERS:
+        times = np.concatenate([drive_worlds(*block, grid, name) for block in blocks])
+        arrived = np.isfinite(times)
+        both = arrived & np.isfinite(least)
+        rows.append((
+            name, f"{arrived.sum()}", f"{(times[both] < least[both]).sum()}", f"{(arrived & np.isinf(least)).sum()}",
+            f"{np.median(least[both] / times[both]):.3f}",
+        ))  # fmt: skip
+    headings = (
+        "planner, given λ", "arrived", "earlier than the bound", "where it is infinite", "bound over its time: median",
+    )  # fmt: skip
+    return {"walls": table(headings, rows)}

@@ -1,0 +1,112 @@
+"""Optimism of MPPI with risk on the cost: chosen actions cost more on fresh fields of λ than on its own.
+
+MPPI chooses actions that cost little on the M fields that it drew, so that they could cost more on others (the optimism
+of a chosen minimum). Robots begin on maps of `stakes-v1 --seed 1` under the prediction of `stakes-v1`, with the time to
+go of `expected-time`, and drive on the mean of the prediction. After 0, 2 and 4 seconds the chosen actions are rolled
+out on 1 024 fresh fields. The table has the mean of fresh less own cost over maps and moments with its 95 % interval by
+maps (Student's t), in seconds, and how long a solve takes for one robot of a batch. CVaR of few fields is too low for
+any actions: so it has the same of those of the step before, which these fields did not choose.
+"""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.stats import t
+from torch import Tensor
+
+from benchnav.core import rng
+from benchnav.core.tables import Table
+from benchnav.planning.planners.astar import astar
+from benchnav.planning.planners.cost_risk import framed_fields, tail_cost
+from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, advance_chunk, roll_out
+from benchnav.planning.problem import Problem
+from benchnav.planning.sensing.sensor import Step
+from studies.study import Work
+from studies.tables import table as tabled
+from studies.units import build_unit, one_unit, stakes_suite
+
+MOMENTS, FRESH, AT_ONCE = (0, 20, 40), 1024, 512
+CASES = ((0.0, (1, 4, 16, 64, 256)), (0.5, (20, 64, 256)), (0.8, (50, 64, 128, 256)))
+
+
+def costs_on(problem: Problem, state: Tensor, actions: Tensor, ground: Tensor, to_go: Tensor) -> Tensor:
+    """What a sequence of actions [B, T, A] costs on each of M fields, [B·M, N], shape [B, M]."""
+    noise = actions.new_zeros(actions.shape[1], actions.shape[2], 1)
+    states, cost, _ = roll_out(problem, state, actions, noise, problem.goal_m, advance_chunk, ground)
+    ends = states.unflatten(0, (len(problem), -1))[:, :, 0]
+    paths = astar.cost_at(problem.grid, to_go, ends[..., 0], ends[..., 1])
+    return cost.view(len(problem), -1) + paths
+
+
+def optimism(problem: Problem, level: float, count: int, samples: int) -> tuple[np.ndarray, float]:
+    """Fresh less own cost in seconds, of what was chosen and of the step before, [B, moments, 2]; ms of a solve."""
+    planner = MPPI(
+        MPPIConfig(risk_on="cost", level=level, fields=count, samples=samples, cost_to_go="expected-time")
+    )
+    plan_state: MPPIState = planner.init(problem, rng.generator(rng.stream_key(0, "cost risk")))
+    assert plan_state.to_go is not None
+    state, found, took = problem.start, [], []
+    observed = torch.full_like(state[:, 0], torch.nan)
+    for step in range(MOMENTS[-1] + 1):
+        # The fields that it is about to draw.
+        ground = framed_fields(
+            problem, problem.sample_fields(count, rng.stream_key(plan_state.key, plan_state.step))
+        )
+        begun = time.perf_counter()
+        now = Step(state=state, traversability=observed, time_s=step * problem.dt_s)
+        action, after, _ = planner.plan(now, plan_state)
+        took.append(time.perf_counter() - begun)
+        if step in MOMENTS:
+            chosen = torch.cat((action[:, None], after.mean[:, :-1]), 1)
+            found.append(torch.zeros(len(problem), 2))
+            for place, actions in enumerate((chosen, plan_state.mean)):
+                own = costs_on(problem, state, actions, ground, plan_state.to_go)
+                fresh = [
+                    costs_on(
+                        problem, state, actions,
+                        framed_fields(
+                            problem, problem.sample_fields(AT_ONCE, rng.stream_key(7, "fresh", step, part))
+                        ),
+                        plan_state.to_go,
+                    )
+                    for part in range(FRESH // AT_ONCE)
+                ]  # fmt: skip
+                costs = (torch.cat(fresh, 1), own)
+                fresh_cost, own_cost = (tail_cost(cost[..., None], level)[:, 0] for cost in costs)
+                found[-1][:, place] = fresh_cost - own_cost
+        mean = problem.distribution.mean().to(state)
+        padded = problem.grid.pad(mean, outside=0.0)
+        met = problem.grid.lookup(padded, state[:, 0], state[:, 1])
+        state, plan_state = problem.robot(state, action, met), after
+    return torch.stack(found, 1).double().numpy(), 1000 * float(np.median(took)) / len(problem)
+
+
+def with_interval(values: np.ndarray) -> str:
+    """The mean of maps, with its 95 % interval by Student's t."""
+    mean, error = values.mean(), t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
+    return f"{mean:+.2f} ({mean - error:+.2f} to {mean + error:+.2f})"
+
+
+def table(work: Work, folder: Path, maps: int = 20, samples: int = 1024) -> dict[str, Table]:
+    """Return what chosen actions cost more on fresh fields, by level and number of fields."""
+    suite = stakes_suite(
+        work.maps_in / "stakes-v1-seed1.h5",
+        planners=("mppi",),
+        models=("stakes-v1",),
+        risks=("expected-time",),
+    )
+    problem = build_unit(one_unit(suite, maps)).problem
+    rows = []
+    for level, counts in CASES:
+        for count in counts:
+            gaps, solve_ms = optimism(problem, level, count, samples)
+            chosen, before = gaps.mean(1).T
+            intervals = map(with_interval, (chosen, before, chosen - before))
+            rows.append((f"{level:g}", f"{count}", *intervals, f"{solve_ms:.1f}"))
+    headings = (
+        "level", "fields", "fresh less own cost [s] (95 %)", "the same of the actions of the step before",
+        "chosen less before", "ms a solve",
+    )  # fmt: skip
+    return {"optimism": tabled(headings, rows, 2)}

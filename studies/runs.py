@@ -1,0 +1,143 @@
+"""Making the maps of a study, and running its parts."""
+
+import contextlib
+import hashlib
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+from matplotlib.figure import Figure
+
+from benchnav.core.errors import expect
+from benchnav.core.figures import save
+from benchnav.core.store import replacing, write_text
+from benchnav.core.tables import Table, to_markdown
+from benchnav.datagen import TerrainDataset
+from benchnav.eval.run.unit import one_thread
+from studies.study import ROOT, Study, Work
+
+ESTIMATED_MAPS, DEVELOPED_MAPS = 10, 200
+
+
+def command(program: str, *words: object) -> None:
+    """Run one of our commands from the root of the repository, where paths of parts begin."""
+    started = time.perf_counter()
+    if code := subprocess.run(
+        [Path(sys.executable).with_name(program), *map(str, words)], cwd=ROOT
+    ).returncode:
+        sys.exit(code)  # it has said why
+    print(f"-- {program} {' '.join(map(str, words[:3]))}: {time.perf_counter() - started:.0f} s", flush=True)
+
+
+def make_maps(study: Study, work: Work) -> None:
+    """Make the maps that are missing, and check the digests of all.
+
+    Raises:
+        ConfigError: If maps have another digest than the study was fixed with.
+    """
+    work.maps_in.mkdir(parents=True, exist_ok=True)
+    for name, maps in study.maps.items():
+        path = work.maps_in / f"{name}.h5"
+        if not path.exists():
+            splits = f"[{','.join(maps.splits)}]"
+            command("benchnav-datagen", "create", *maps.create, "--splits", splits, "--out", path)
+        digest = TerrainDataset(path).splits[maps.splits[0]]["digest"]
+        expect(
+            digest == (maps.digest or digest),
+            f"maps of digest {maps.digest} in {path}, got {digest}. Delete the file, or use another `--maps_in`.",
+        )
+        print(f"{name}: {digest}")
+
+
+def run(study: Study, parts: list[str], work: Work) -> None:
+    """Run parts, one after another."""
+    for part in parts:
+        if study.parts[part].script:
+            _run_script(study, part, work)
+        else:
+            drive(study.suite(part, work), work.out / study.run_of(part), work.jobs)
+
+
+def drive(suite: dict[str, Any], folder: Path, jobs: int) -> None:
+    """Run a suite into a folder, or the units that are missing there."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    config = folder.with_name(f"{folder.name}.yaml")
+    config.write_text(yaml.safe_dump(suite, sort_keys=False, allow_unicode=True))
+    command("benchnav-eval", "run", "--config", config, "--out", folder, "--jobs", jobs)
+
+
+def _run_script(study: Study, part: str, work: Work) -> None:
+    """Call the function of a part, and store each result as NAME.md, NAME.csv or NAME.png; text is Markdown."""
+    folder, about = work.out / study.run_of(part), study.parts[part]
+    folder.mkdir(parents=True, exist_ok=True)
+    options = {**about.options, **({"maps": work.maps} if work.maps else {})}
+    # Shipped maps and models are found from the root.
+    with contextlib.chdir(ROOT), one_thread():
+        results = study.function(about.script)(work, folder, **options)
+    for name, result in results.items():
+        path = folder / name
+        if isinstance(result, Figure):
+            with replacing(path.with_suffix(".png")) as partial:
+                save(result, partial, "png", dpi=200)
+            continue
+        if isinstance(result, pd.DataFrame):
+            write_text(path.with_suffix(".csv"), result.to_csv(index=False))
+            result = table_of(result)
+        text = result if isinstance(result, str) else to_markdown(result)
+        write_text(path.with_suffix(".md"), text)
+        print(f"{name}\n{text}", flush=True)
+
+
+def table_of(rows: pd.DataFrame) -> Table:
+    """Return rows as a table, numbers with four digits."""
+    cells = (
+        tuple(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row)
+        for row in rows.itertuples(index=False)
+    )
+    return Table(headings=tuple(map(str, rows.columns)), rows=tuple(cells))
+
+
+def estimate(study: Study, parts: list[str], work: Work) -> None:
+    """Print how long parts take, by some maps of each condition."""
+    maps = work.maps or ESTIMATED_MAPS
+    for part in parts:
+        suite = study.suite(part, work)
+        whole = yaml.safe_load(study.suite_of(part).read_text())
+        started = time.perf_counter()
+        drive(
+            suite | {"maps": maps, "realisations": 1, "hypotheses": []},
+            work.out / f"estimate-{study.run_of(part)}",
+            work.jobs,
+        )
+        seconds = time.perf_counter() - started
+        hours = seconds * whole["maps"] * whole.get("realisations", 1) / maps / 3600
+        print(
+            f"{part}: {seconds:.0f} s for {maps} maps; {hours:.1f} hours of {work.jobs} processes in all",
+            flush=True,
+        )
+
+
+def develop(study: Study, work: Work) -> None:
+    """Run the conditions of the hypotheses on the maps that they were developed on.
+
+    Raises:
+        ConfigError: If the study names no such maps.
+    """
+    expect(study.develop, f"a study with maps to develop on, got {study.name}.")
+    suite = study.suite("primary", work)
+    on = {"data": str(work.maps_in / f"{study.develop}.h5"), "seed": study.seed}
+    drive(suite | on | {"maps": min(DEVELOPED_MAPS, suite["maps"])}, developed(study, work), work.jobs)
+
+
+def developed(study: Study, work: Work) -> Path:
+    """Return the folder of the run on maps to develop on."""
+    return work.out / f"{study.name}-developed"
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,255 @@
+"""The series of shifts `shift-v1`, measured for docs/studies/scenarios.md.
+
+Every statistic is a function of means over maps, so that one bootstrap over maps gives the standard error of each. It
+takes some minutes on one thread. Letters in shapes: B maps, H×W cells, C classes, K numbers a map.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from benchnav.core import rng
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.tables import Table
+from benchnav.core.terrain import Observation
+from benchnav.datagen.recipe.latent import latent_mean, latent_std
+from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict
+from benchnav.datagen.synth.generate import generate
+from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models.fused import FusedModel
+from benchnav.models.predictor import find_checkpoint
+from benchnav.models.quality.measure import pit
+from studies.scenarios.figures import draw_distributions, draw_examples, draw_series
+from studies.scenarios.statistics import (
+    SHARE_EDGES,
+    SLOPE_EDGES,
+    Maps,
+    Statistic,
+    excess,
+    first,
+    histogram,
+    mean_iou,
+    quantile,
+    ratio,
+    rms,
+    show,
+)
+from studies.study import Work
+from studies.tables import table
+
+MODEL = "paper-v1"
+PAIRED_MAPS, CHUNK_MAPS = 200, 20
+BEYOND: dict[str, Any] = {f"{preset}-150": {"preset": preset, "severity": 1.5} for preset in ("hg", "hs")}
+PAIRS: dict[str, Any] = {
+    "std": {"preset": "std"},
+    "hg-050": {"preset": "hg", "severity": 0.5},
+    "hg-100": {"preset": "hg"},
+    "hg-100, craters alone": {"preset": "hg", "relief_m": [1.4, 1.7]},
+    "hg-100, relief alone": {"preset": "hg", "crater_count": [0, 0]},
+    "hs-050": {"preset": "hs", "severity": 0.5},
+    "hs-100": {"preset": "hs"},
+}
+
+# Keys of what is measured, the statistic of it, its scale and its digits.
+Column = tuple[Sequence[str], Statistic, float, int]
+
+
+def measure_maps(model: FusedModel, recipe: Recipe, maps: Maps) -> dict[str, np.ndarray]:
+    """Measures ground and prediction: numbers a map by name, shape [B], [B, K] or [B, *, H, W]."""
+    pieces = []
+    for start in range(0, len(maps["rgb"]), CHUNK_MAPS):
+        chunk = {name: values[start : start + CHUNK_MAPS] for name, values in maps.items()}
+        pieces.append(_measure_chunk(model, recipe, chunk))
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+
+def _measure_chunk(model: FusedModel, recipe: Recipe, maps: Maps) -> dict[str, np.ndarray]:
+    slope, ids, count = maps["slope_deg"].astype(np.float64), maps["class_id"], len(recipe.classes)
+    latent = latent_mean(ids, slope, recipe.classes), latent_std(ids, recipe.classes)
+    mean, std = (torch.from_numpy(values)[:, None] for values in latent)
+    expected = TraversabilityMixture(torch.ones_like(mean), mean, std).mean()
+    rgb, elevation, inclination = (torch.from_numpy(maps[k]) for k in ("rgb", "elevation_m", "slope_deg"))
+    predicted = model.predict(Observation(rgb, elevation, inclination, recipe.grid))
+    classes, found = torch.from_numpy(ids.astype(np.int64)), predicted.weights.argmax(1)
+    own = torch.nn.functional.one_hot(classes, count).movedim(-1, 1).to(predicted.weights)
+    result = {
+        "rgb": maps["rgb"],
+        "brightness": maps["rgb"].sum(1) / np.array([sum(c.colour) for c in recipe.classes])[ids],
+        "relief": np.ptp(maps["elevation_m"], axis=(1, 2)),
+        "slope": histogram(slope, SLOPE_EDGES),
+        "slope_deg": slope,
+        "lambda": histogram(maps["traversability"], SHARE_EDGES),
+        "expected": expected.numpy(),
+        "stuck": (expected <= recipe.stuck_threshold).double().numpy(),
+        "time": maps["reference_time_s"],
+        "weights": predicted.weights.numpy(),
+        "right": (found == classes).double().numpy(),
+        "darker": (found < classes).numpy(),
+        "confusion": histogram((classes * count + found).numpy(), np.arange(count**2 + 1) - 0.5),
+        "wet clay": (found == [c.name for c in recipe.classes].index("wet_clay")).numpy(),
+    }
+    sources = {"predicted": predicted.weights, "true": own, "none": torch.full_like(own, 1 / count)}
+    for name, weights in sources.items():
+        mixture, draws = replace(predicted, weights=weights), rng.generator(rng.stream_key(0, "docs", "pit"))
+        place = pit(mixture, torch.from_numpy(maps["traversability"]), draws).numpy()
+        result[f"held {name}"], result[f"tail {name}"] = np.abs(place - 0.5) <= 0.45, place < 0.1
+        result[f"error {name}"] = (mixture.mean() - expected).numpy()
+        result[f"square {name}"] = result[f"error {name}"] ** 2
+    return result
+
+
+def by_scenario(pairs: Mapping[str, Maps], columns: Mapping[str, Column]) -> Table:
+    """Return a table with a row a scenario."""
+    rows = [
+        [name, *(show([maps[key] for key in keys], *how) for keys, *how in columns.values())]
+        for name, maps in pairs.items()
+    ]
+    return table(("scenario", *columns), rows)
+
+
+# The ground itself, whatever model looks at it.
+GROUND: Mapping[str, Column] = {
+    "relief [m]": (["relief"], first, 1, 2),
+    "median slope [°]": (["slope"], quantile(0.5, SLOPE_EDGES), 1, 1),
+    "95 % [°]": (["slope"], quantile(0.95, SLOPE_EDGES), 1, 1),
+    "beyond [10⁻⁵]": (["beyond"], first, 1e5, 0),
+    "E[λ]": (["expected"], first, 1, 3),
+    "λ, 5 %": (["lambda"], quantile(0.05, SHARE_EDGES), 1, 2),
+    "stuck [%]": (["stuck"], first, 100, 1),
+    "time [s]": (["time"], first, 1, 1),
+}
+# The light, what the classifier gets right, and the error of E[λ] by where the classes come from.
+PREDICTION: Mapping[str, Column] = {
+    "brightness": (["brightness"], first, 1, 2),
+    "accuracy [%]": (["right"], first, 100, 1),
+    "mIoU [%]": (["confusion"], mean_iou, 100, 1),
+    "too dark [%]": (["darker"], first, 100, 1),
+    "no class": (["square none"], rms, 1000, 1),
+    "predicted": (["square predicted"], rms, 1000, 1),
+    "true": (["square true"], rms, 1000, 1),
+    "predicted − true": (["square predicted", "square true"], excess, 1000, 1),
+}
+# How often realised λ lies in the central 90 % interval, and under VaR 0.9, by source of classes.
+CALIBRATION: Mapping[str, Column] = {
+    "coverage, predicted": (["held predicted"], first, 100, 2),
+    "coverage, true": (["held true"], first, 100, 2),
+    "tail, predicted": (["tail predicted"], first, 100, 2),
+    "tail, true": (["tail true"], first, 100, 2),
+    "bias [10⁻³]": (["error predicted"], first, 1000, 1),
+    "found wet clay": (["wet clay"], first, 100, 1),
+}
+# Changes from std on the same maps, and whether ground or picture brings them about.
+CHANGES: Mapping[str, Column] = {
+    "E[λ]": (["expected"], first, 1, 3),
+    "stuck [%]": (["stuck"], first, 100, 1),
+    "accuracy [%]": (["right"], first, 100, 1),
+    "both": (["both", "before"], excess, 1000, 1),
+    "ground alone": (["ground", "before"], excess, 1000, 1),
+    "picture alone": (["picture", "before"], excess, 1000, 1),
+    "true classes": (["square true", "true before"], excess, 1000, 1),
+}
+
+
+def changes(model: FusedModel, maps: Maps, std: Maps) -> Maps:
+    """Return what changes from std on the same maps, with squared errors by where ground and picture come from."""
+
+    def squares(seen: Maps, ground: Maps) -> np.ndarray:
+        layers = (
+            torch.from_numpy(seen["weights"]),
+            *model.table.lookup(torch.from_numpy(ground["slope_deg"])),
+        )
+        chunks = zip(*(layer.split(CHUNK_MAPS) for layer in layers), strict=True)
+        found = torch.cat([TraversabilityMixture(*chunk).mean() for chunk in chunks])
+        return (found.numpy() - ground["expected"]) ** 2
+
+    return {
+        **{key: maps[key] - std[key] for key in ("expected", "stuck", "right")},
+        "before": squares(std, std), "both": squares(maps, maps), "ground": squares(std, maps),
+        "picture": squares(maps, std), "square true": maps["square true"], "true before": std["square true"],
+    }  # fmt: skip
+
+
+def slope_table(std: Maps, hg: Maps) -> Table:
+    """Where on the slopes of hg-100 the errors are made."""
+    rows = []
+    for low, high in pairwise((0, 10, 15, 20, 25, 90)):
+        of_std, of_hg = ((low < m["slope_deg"]) & (m["slope_deg"] <= high) for m in (std, hg))
+        inside = {name: [hg[name] * of_hg, of_hg] for name in hg if hg[name].shape == of_hg.shape}
+        cells = [show([of_std], first, 100, 2), show([of_hg], first, 100, 2)]
+        errors = [show(inside[f"square {source}"], rms, 1000) for source in ("predicted", "true")]
+        shares = [
+            show(inside[key], ratio, k)
+            for key, k in (("right", 100), ("error true", 1000), ("tail true", 100))
+        ]
+        rows.append([f"{low}–{high}", *cells, shares[0], *errors, *shares[1:]])
+    head = ("slope [°]", "of std [%]", "of hg-100 [%]", "accuracy [%]")
+    return table([*head, "predicted", "true", "bias, true", "tail, true [%]"], rows)
+
+
+def colour_table(recipe: Recipe) -> Table:
+    """At which brightness a class looks as the next darker ones: the scale of least squared difference."""
+    rows, colours = [], np.array([c.colour for c in recipe.classes], dtype=np.float64)
+    for i, (terrain, colour) in enumerate(zip(recipe.classes, colours, strict=True)):
+        row = [terrain.name.replace("_", " "), ", ".join(map(str, terrain.colour))]
+        for target in (i - 1, i - 2, i - 3):
+            scale = colours[target] @ colour / (colour @ colour)
+            left = np.abs(scale * colour - colours[target]).max()
+            row.append(f"{scale:.2f} (off by {left:.0f})" if target >= 0 else "")
+        rows.append(row)
+    return table(["class", "colour", "as the next darker", "as the second", "as the third"], rows)
+
+
+def measure_series(model: FusedModel, recipe: Recipe) -> dict[str, dict[str, np.ndarray]]:
+    """Measures the splits of shift-v1 and, made alike, a severity beyond each end, by name of the scenario."""
+    data = recipe.to_dict()
+    series: dict[str, dict[str, np.ndarray]] = {}
+    splits = {f"test/{name}": {"scenario": name, "maps": 100, "solvable": True} for name in BEYOND}
+    data |= {"scenarios": data["scenarios"] | BEYOND, "splits": data["splits"] | splits}
+    longer = recipe_from_dict(data, "of the study")
+    for split in ["test/std", *sorted(set(longer.splits) - {"test/std"})]:
+        spec = longer.splits[split]
+        unasked = replace(longer, splits={split: replace(spec, solvable=False)})
+        maps, drawn_first = (generate(made, split, np.arange(spec.maps)) for made in (longer, unasked))
+        rejected_draws = (maps["elevation_m"] != drawn_first["elevation_m"]).any(axis=(1, 2))
+        series[spec.scenario] = measure_maps(model, longer, maps) | {"rejected_draws": rejected_draws}
+    return series
+
+
+def measure_pairs(model: FusedModel, recipe: Recipe) -> dict[str, Maps]:
+    """Measures the same maps under several scenarios: all are drawn on the random streams of test/std."""
+    pairs: dict[str, Maps] = {}
+    for name, entry in PAIRS.items():
+        split = {"test/std": {"scenario": name, "maps": PAIRED_MAPS}}
+        one = recipe_from_dict(recipe.to_dict() | {"scenarios": {name: entry}, "splits": split}, name)
+        pairs[name] = measure_maps(model, one, generate(one, "test/std", np.arange(PAIRED_MAPS)))
+    return pairs
+
+
+def measure(work: Work, folder: Path) -> dict[str, Table | Figure]:
+    """Return the tables and the figures of the page."""
+    recipe, checkpoint = load_recipe("shift-v1"), load_checkpoint(find_checkpoint(MODEL))
+    model = FusedModel.from_checkpoint(checkpoint)
+    steepest = max(checkpoint.part("gp").config["steepest_deg"])
+    series, pairs = measure_series(model, recipe), measure_pairs(model, recipe)
+    series = {name: maps | {"beyond": maps["slope_deg"] > steepest} for name, maps in series.items()}
+    changed = {name: changes(model, maps, pairs["std"]) for name, maps in pairs.items() if name != "std"}
+    ground = by_scenario(series, GROUND)
+    rejected = (f"{maps['rejected_draws'].sum()}" for maps in series.values())
+    rows = [(*row, count) for row, count in zip(ground.rows, rejected, strict=True)]
+    return {
+        "ground": table((*ground.headings, "rejected"), rows),
+        "model": by_scenario(series, PREDICTION),
+        "calibration": by_scenario(series, CALIBRATION),
+        "pairs": by_scenario(changed, CHANGES),
+        "slopes": slope_table(series["std"], series["hg-100"]),
+        "colours": colour_table(recipe),
+        "examples": draw_examples(pairs, recipe.grid.extent_m),
+        "distributions": draw_distributions(series, steepest),
+        "severity": draw_series(series),
+    }

@@ -1,0 +1,158 @@
+"""Driving the trials: a loop of its own, in which two independent fields move the robot.
+
+None of the simulation of `benchnav` is used. Letters in shapes: B trials.
+"""
+
+import torch
+from torch import Tensor
+
+from benchnav.core import rng
+from benchnav.core.grid import Grid
+from benchnav.planning.free_space import PENALTY
+from benchnav.planning.objective import distance
+from benchnav.planning.planners.compilation import Fused
+from benchnav.planning.planners.cost_risk import framed_fields
+from benchnav.planning.planners.mppi import MPPI, OF_EPISODES, MPPIConfig, MPPIState
+from benchnav.planning.planners.noise_bank import perturb
+from benchnav.planning.problem import Problem, motion_traversability
+from benchnav.planning.robots import Robot, component_wise
+from benchnav.planning.sensing.sensor import Step
+from studies.validation.task import GOAL_M, GOAL_RADIUS_M, STEPS, Setup, TimeAndDistance
+
+# λ of ground off the map that is free: a rollout stays there, at the `min_traversability` of the setup.
+_STILL = 1e-30
+
+
+class ManyTrialsMPPI(MPPI):
+    """MPPI that is compiled even at few samples: hundreds of trials of one shape share the compiling.
+
+    Args:
+        config: settings.
+        setup: how rollouts see the ground: `motions` and `off_map`.
+    """
+
+    worth_compiling = 0
+
+    def __init__(self, config: MPPIConfig, setup: Setup) -> None:
+        super().__init__(config)
+        self._is_paired = setup.motions == "two" and config.risk_on == "cost"
+        self._is_still = setup.off_map == "still"
+        if self._is_paired:
+            self._advance = Fused(
+                advance_pair, config.samples * config.fields, self.worth_compiling, batched=OF_EPISODES
+            )
+
+    def _ground(self, plan_state: MPPIState, state: Tensor) -> Tensor:
+        """Return what rollouts are on in this step, shape [B·M, N], of pairs of fields [B·M, 2·N]."""
+        if self._is_paired:
+            problem = plan_state.problem
+            key = rng.stream_key(plan_state.key, plan_state.step)
+            fields = framed_fields(problem, problem.sample_fields(2 * self.config.fields, key))
+            ground = fields.unflatten(0, (-1, 2)).flatten(1)
+        else:
+            ground = super()._ground(plan_state, state)
+        return torch.where(ground == 0, _STILL, ground) if self._is_still else ground
+
+
+def advance_pair(
+    states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
+    padded_ground: Tensor, target: Tensor, grid: Grid, robot: Robot, objective: TimeAndDistance,
+    min_traversability: float,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Roll samples out as `mppi.advance_chunk` does, where one field scales v and another ω.
+
+    The motion of `ROVER` and the cost of `TimeAndDistance` are written out, with x, y and θ apart: by `robot` and
+    `objective`, which take whole states, a step takes three times as long.
+
+    Args:
+        padded_ground: a linear field and then an angular one, shape [B·M, 2·N]; the others are those of `mppi`.
+    """
+    x, y, heading = states.unbind(-1)
+    away = distance(states, target)
+    fields, angular = padded_ground.flatten(), padded_ground.shape[1] // 2
+    first = torch.arange(len(padded_ground), dtype=torch.int32, device=states.device)[:, None] * (2 * angular)
+    for step in range(mean.shape[1]):
+        speed, turn_rate = perturb(mean[:, step, :, None], noise[step], low, high).unbind(1)
+        row, column = (
+            (position / grid.resolution_m + 1).clamp(0, size + 1).int()
+            for position, size in ((y, grid.height), (x, grid.width))
+        )
+        cell = first + row * (grid.width + 2) + column
+        ground = fields[cell]
+        going = away > GOAL_RADIUS_M
+        cost = cost + torch.where(going, robot.dt_s + away**objective.power, 0) + PENALTY * (ground <= 0)
+        advance, turn = (
+            going * robot.dt_s * motion_traversability(each, min_traversability)
+            for each in (ground, fields[cell + angular])
+        )
+        x = x + advance * speed * torch.cos(heading)
+        y = y + advance * speed * torch.sin(heading)
+        heading = heading + turn * turn_rate
+        away = torch.sqrt((x - target[..., 0]) ** 2 + (y - target[..., 1]) ** 2)
+    return component_wise(torch.stack((x, y, heading), dim=-1)), cost
+
+
+def drive(planner: MPPI, problem: Problem, traction: Tensor, generator: torch.Generator) -> Tensor:
+    """Drives B trials until they have arrived or their time is over.
+
+    Args:
+        planner: is asked once a step; its computing takes no time of the trial's.
+        problem: with what is predicted.
+        traction: true linear and angular λ, shape [B, 2, H, W].
+        generator: the planner's randomness, the same for all B.
+
+    Returns:
+        Time of arrival in seconds, infinite where there was none, shape [B].
+    """
+    arrival_s = torch.full((len(problem),), torch.inf)
+    state, observed = problem.start, torch.full((len(problem),), torch.nan)
+    plan_state = planner.init(problem, generator)
+    for step in range(STEPS):
+        action, plan_state, _ = planner.plan(
+            Step(state=state, traversability=observed, time_s=step * problem.dt_s), plan_state
+        )
+        observed = traction_at(state, traction)[:, 0]
+        running = arrival_s.isinf()
+        state = torch.where(running[:, None], move(state, action, traction, problem.dt_s), state)
+        arrival_s[running & has_arrived(state)] = (step + 1) * problem.dt_s
+        if not arrival_s.isinf().any():
+            break
+    return arrival_s
+
+
+def move(state: Tensor, action: Tensor, traction: Tensor, dt_s: float) -> Tensor:
+    """Moves robots for one step.
+
+    Args:
+        state: (x, y, θ), shape [B, 3].
+        action: (v, ω), shape [B, 2].
+        traction: linear and angular λ, shape [B, 2, H, W].
+        dt_s: time step.
+
+    Returns:
+        The next states, shape [B, 3].
+    """
+    linear, angular = traction_at(state, traction).unbind(1)
+    heading, advance = state[:, 2], dt_s * linear * action[:, 0]
+    return torch.stack(
+        (
+            state[:, 0] + advance * torch.cos(heading),
+            state[:, 1] + advance * torch.sin(heading),
+            heading + dt_s * angular * action[:, 1],
+        ),
+        dim=1,
+    )
+
+
+def traction_at(state: Tensor, traction: Tensor) -> Tensor:
+    """Linear and angular λ in the cells of 1 m where robots stand, 0 off the map, shape [B, 2]."""
+    height, width = traction.shape[2:]
+    column, row = state[:, 0].floor().long(), state[:, 1].floor().long()
+    on_map = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    here = traction[torch.arange(len(state)), :, row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    return torch.where(on_map[:, None], here, 0.0)
+
+
+def has_arrived(state: Tensor) -> Tensor:
+    """Tells which robots are at the goal, bool, shape [B]."""
+    return torch.hypot(state[:, 0] - GOAL_M[0], state[:, 1] - GOAL_M[1]) <= GOAL_RADIUS_M

@@ -1,0 +1,143 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from benchnav.core.errors import ConfigError
+from studies.validation.ground import DIRT, VEGETATION
+from studies.validation.task import ROVER, Setup, planner_config, pose, predict, tail_share
+from studies.validation.world import draw_vegetation
+from tests.planning.planners.driving import rollout_cost
+
+VEGETATED = draw_vegetation(0, np.arange(2), 0.4)
+
+
+@pytest.mark.parametrize(("setting", "tail"), [("mean", 1.0), ("cvar:0.4", 0.6), ("cvar:0.8", 0.2)])
+def test_risk_maps_are_the_tail_means_of_the_ground(setting: str, tail: float) -> None:
+    cells = round(100 * tail)
+    expected = np.where(VEGETATED, VEGETATION.slices()[:cells].mean(), DIRT.slices()[:cells].mean())
+    np.testing.assert_allclose(pose(VEGETATED, [setting], Setup()).risk_map, expected, atol=1e-5)
+
+
+def test_the_prediction_has_the_distribution_of_the_world() -> None:
+    mixture = predict(VEGETATED)
+    for value in (0.1, 0.5, 0.7):
+        at = np.array(value)
+        expected = np.where(VEGETATED, VEGETATION.cdf(at), DIRT.cdf(at))
+        np.testing.assert_allclose(mixture.cdf(value), expected, atol=0.01)
+
+
+def test_trials_are_ordered_by_map_then_setting() -> None:
+    settings = ["mean", "cvar:0.8"]
+    both = pose(VEGETATED, settings, Setup()).risk_map
+    for k, setting in enumerate(settings):
+        torch.testing.assert_close(both[k::2], pose(VEGETATED, [setting], Setup()).risk_map)
+
+
+def test_the_whole_map_is_free_and_nothing_else() -> None:
+    problem = pose(VEGETATED, ["cvar:0.99"], Setup())
+    assert bool(problem.free.all())
+    assert not bool(problem.free_at(torch.tensor([[[-0.1, 4.0, 0.0]], [[4.0, 9.1, 0.0]]])).any())
+
+
+def test_min_traversability_bounds_what_motion_is_given() -> None:
+    problem = pose(VEGETATED, ["cvar:0.8"], Setup(min_traversability=0.3))
+    assert float(problem.traversability.min()) == pytest.approx(0.3)
+    assert float(problem.risk_map.min()) < 0.05
+    assert float(pose(VEGETATED, ["cvar:0.8"], Setup()).traversability.min()) < 0.05
+
+
+def test_the_robot_heads_for_the_goal_and_stays_there() -> None:
+    start = pose(VEGETATED, ["mean"], Setup()).start[0]
+    assert start.tolist() == pytest.approx([0.5, 0.5, math.pi / 4])
+    at_goal, action = torch.tensor([[8.2, 8.2, 0.0], [7.9, 8.2, 0.0]]), torch.tensor([[3.0, math.pi]] * 2)
+    after = ROVER(at_goal, action, torch.ones(2))
+    torch.testing.assert_close(after[0], at_goal[0])
+    torch.testing.assert_close(after[1], torch.tensor([8.2, 8.2, 0.1 * math.pi]))
+
+
+def cost_of(actions: np.ndarray, risk_map: np.ndarray, power: int) -> float:
+    """Their cost of a rollout, written down from its description: steps are counted after the move."""
+    x, y, heading = 0.5, 0.5, math.pi / 4
+    cost = 0.0
+    for speed, turn_rate in actions:
+        traversability = risk_map[math.floor(y), math.floor(x)]
+        x, y = (
+            x + 0.1 * traversability * speed * math.cos(heading),
+            y + 0.1 * traversability * speed * math.sin(heading),
+        )
+        heading += 0.1 * traversability * turn_rate
+        away = math.hypot(8.5 - x, 8.5 - y)
+        cost += 0.1 + away**power
+        if away <= 0.5:
+            return cost
+    return cost + away / (0.01 + 1e-6)
+
+
+@pytest.mark.parametrize("power", [1, 2])
+def test_costs_of_rollouts_are_theirs(power: int) -> None:
+    problem = pose(VEGETATED[:1], ["mean"], Setup(distance_power=power))
+    noise = np.random.default_rng(0)
+    actions = np.stack((noise.uniform(1.5, 3, (100, 6)), noise.normal(0, 0.02, (100, 6))), axis=1)
+    actions[:, 0, 3:] /= 5  # these never arrive
+    costs = rollout_cost(
+        problem, problem.start, torch.zeros(1, 100, 2), torch.from_numpy(actions).float(), problem.goal_m
+    )[0]
+    expected = [cost_of(actions[..., k], problem.risk_map[0].numpy(), power) for k in range(6)]
+    assert 2 * max(expected[:3]) < min(expected[3:])
+    start = 0.1 + math.hypot(8, 8) ** power  # counted by us alone, of every rollout
+    np.testing.assert_allclose(costs.numpy() - start, expected, rtol=2e-4)
+
+
+def test_histograms_give_their_risk_maps() -> None:
+    problem = pose(VEGETATED, ["cvar:0.8"], Setup(risk_map="histogram"))
+    expected = np.where(VEGETATED, VEGETATION.histogram_cvar(0.2), DIRT.histogram_cvar(0.2))
+    np.testing.assert_allclose(problem.risk_map, expected)
+
+
+def test_histograms_give_their_fields() -> None:
+    fields = pose(VEGETATED, ["cost", "mean"], Setup(risk_map="histogram")).sample_fields(2000, 0)
+    assert fields.shape == (4, 2000, 9, 9)
+    expected = np.where(VEGETATED, VEGETATION.histogram_atoms().mean(), DIRT.histogram_atoms().mean())
+    np.testing.assert_allclose(fields[::2].mean(1), expected, atol=0.04)
+    np.testing.assert_allclose(fields[1::2].mean(1), expected, atol=0.04)
+    np.testing.assert_array_equal(np.unique((100 * fields[0]).round() % 5), [0, 2])
+
+
+def test_shares_of_the_tail() -> None:
+    assert [tail_share(setting) for setting in ("mean", "cvar:0.4", "cvar:0.8")] == [1.0, 0.6, 0.2]
+    with pytest.raises(ConfigError, match="Expected `mean`, `cvar:LEVEL`, `cost` or `cost-cvar:LEVEL`"):
+        tail_share("var:0.9")
+
+
+def test_objectives_of_ours_are_found_by_name() -> None:
+    problem = pose(VEGETATED, ["mean"], Setup(objective="goal_distance"))
+    state = torch.tensor([[[0.5, 0.5, 0.0]]] * 2)
+    cost = problem.objective.stage(state, torch.zeros(2, 1, 2), torch.ones(2, 1), problem.goal_m[:, None])
+    assert cost[0].item() == pytest.approx(math.hypot(8, 8))
+
+
+def test_two_fields_have_only_their_objective() -> None:
+    with pytest.raises(ConfigError, match="Expected `objective` 'theirs' with `motions` 'two'"):
+        Setup(motions="two", objective="travel_time")
+
+
+def test_their_alpha_is_the_share_of_the_worst_costs() -> None:
+    cost, tail = (planner_config(setting, Setup()) for setting in ("cost", "cost-cvar:0.6"))
+    assert (cost.risk_on, cost.level, cost.fields) == ("cost", 0.0, 64)
+    assert (tail.risk_on, tail.level) == ("cost", 0.6)
+    assert replace(tail, risk_on="map", level=0.0) == planner_config("cvar:0.8", Setup()) == Setup().mppi
+
+
+def test_fields_have_the_distribution_of_each_cell_and_cells_are_independent() -> None:
+    problem = pose(VEGETATED[:1], ["cost", "cost-cvar:0.6"], Setup(), [7])
+    drawn = problem.sample_fields(4000, 3)
+    assert torch.equal(drawn[0], drawn[1])
+    mean = problem.distribution.mean()[0]
+    assert float((drawn[0].mean(0) - mean).abs().max()) < 0.03
+    cells = drawn[0].flatten(1)[:, :6]
+    assert float((torch.corrcoef(cells.T) - torch.eye(6)).abs().max()) < 0.06
+    assert torch.equal(drawn, pose(VEGETATED, ["cost"], Setup(), [7, 8]).sample_fields(4000, 3)[[0, 0]])
+    assert not torch.equal(drawn, pose(VEGETATED[:1], ["cost"], Setup(), [8]).sample_fields(4000, 3)[[0, 0]])
