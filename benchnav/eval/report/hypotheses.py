@@ -7,12 +7,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchnav.core.quantity import Quantity
 from benchnav.core.resampling import LEAST_MAPS
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.hypotheses import Hypothesis
+from benchnav.eval.experiment.metrics import further_quantities, quantities
 from benchnav.eval.report.words import NOT_YET, count_range, p_in_words, p_value, reading_names, signed
 from benchnav.eval.stats.comparison import ALPHA
+from benchnav.metrics.shipped import QUANTITIES, TOTAL_TIME
 
 _TESTS = {
     "difference": "sign-flip test by {unit} (difference)",
@@ -34,26 +37,28 @@ def hypothesis_findings(tests: pd.DataFrame, about: Mapping[str, Any], unit: str
     Returns:
         Sentences by the title over them.
     """
+    known = quantities(further_quantities(about))
     said = [
-        f"{number}. {_capital(_claim(row))}: {_verdict(row)} ({_numbers(row, unit)})."
+        f"{number}. {_capital(_claim(row, known))}: {_verdict(row)} ({_numbers(row, unit)})."
         for number, row in enumerate(tests.to_dict("records"), start=1)
     ]
     title = f"Hypotheses, fixed before the first unit was run (digest {about['hypotheses']['digest']})"
     return {title: [*said, *_extended(about)]}
 
 
-def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
+def hypothesis_table(tests: pd.DataFrame, unit: str, known: Mapping[str, Quantity] = QUANTITIES) -> Table:
     """Formats the tests, a row a hypothesis; bold where it is supported.
 
     Args:
         tests: from `hypotheses.test_hypotheses`.
         unit: of the statistics, from `words.unit_of_statistics`.
+        known: what conditions are compared by, by name.
     """
     headings = ("", "hypothesis", f"{unit}s", "values", "difference", "interval", "p", "result")
     rows = tuple(
         (
             str(number),
-            _claim(row),
+            _claim(row, known),
             str(row["n_maps"]),
             f"{_value(row['mean_one'])} : {_value(row['mean_other'])}",
             _with_unit(row),
@@ -77,7 +82,7 @@ def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
             f"correction. Under {LEAST_MAPS} {unit}s success alone has an interval.",
         ),
     ]
-    if ((tests["metric"] == "T_total") & (tests["kind"] == "difference")).any():
+    if ((tests["metric"] == TOTAL_TIME.name) & (tests["kind"] == "difference")).any():
         explained.append(
             (
                 "T_total",
@@ -85,18 +90,20 @@ def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
                 "the interval holds 0.",
             )
         )
-    if (tests["metric"] == "path_length").any():
-        explained.append(("path length", "over the episodes in which both arrived."))
+    for quantity in known.values():
+        if quantity.of_arrivals and (tests["metric"] == quantity.name).any():
+            explained.append((quantity.words, "over the episodes in which both arrived."))
     return Table(
         headings=headings, labels=2, rows=rows, notes=tuple(notes), explained=tuple(explained),
         bold_note="supported." if tests["supported"].any() else "",
     )  # fmt: skip
 
 
-def _claim(row: Mapping[Any, Any]) -> str:
+def _claim(row: Mapping[Any, Any], known: Mapping[str, Quantity]) -> str:
     """The hypothesis with the names that tables and figures have for the two conditions."""
     test = Hypothesis(**{name.name: row[name.name] for name in fields(Hypothesis)})
-    return test.claim(*map(reading_names, row["names"]))
+    one, other = map(reading_names, row["names"])
+    return test.claim(one, other, known[test.metric])
 
 
 def _verdict(row: Mapping[Any, Any]) -> str:
@@ -155,4 +162,4 @@ def _value(value: float) -> str:
 
 def _capital(text: str) -> str:
     # Symbols such as λ̄ stay as they are.
-    return text[0].upper() + text[1:] if text.startswith(("success", "score", "path")) else text
+    return text[0].upper() + text[1:] if text[0].isascii() else text
