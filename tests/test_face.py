@@ -20,6 +20,7 @@ FACES = {
     "load_recipe recipe_from_dict shipped_recipes",
     "benchnav.env": "EgocentricEnv EgocentricVectorEnv OffRoadEnv OffRoadVectorEnv PolicyPlanner",
     "benchnav.eval": "Condition Suite compare_runs open_run read_report read_steps run_suite write_report",
+    "benchnav.metrics": "Energy Episode Learnt Metric MetricError SHIPPED",
     "benchnav.models": "Checkpoint ModelFamily Part TrainOptions TrainableModel TrainingConfig "
     "TraversabilityModel Window evaluate_model find_checkpoint fit_model list_checkpoints load_checkpoint "
     "load_model measure_margin predict predict_tiles save_checkpoint write_risk_maps",
@@ -27,7 +28,7 @@ FACES = {
     "DifferentialDrive FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Near NearOptimal "
     "Objective Optimal OptimalBound Places Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensed "
     "Sensor Simulation Static Step Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem",
-    "benchnav.testing": "check_belief check_model check_objective check_planner check_risk check_robot "
+    "benchnav.testing": "check_belief check_metric check_model check_objective check_planner check_risk check_robot "
     "check_sensor",
 }
 EACH = pytest.mark.parametrize("name", FACES)

@@ -198,7 +198,7 @@ def measure(metric: Metric, episode: Episode) -> float:
         value = metric.value(episode)
     except Exception as error:
         raise out_of_memory(error) or _no_number(metric, fault(error)) from error
-    if not isinstance(value, Real) or math.isinf(value):
+    if not isinstance(value, Real | np.bool_) or math.isinf(value):
         raise _no_number(metric, repr(value))
     return float(value)
 

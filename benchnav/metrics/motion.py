@@ -9,7 +9,7 @@ from benchnav.metrics.base import Episode, Metric
 
 
 class Traversability(Metric):
-    """λ̄: the mean observed λ."""
+    """Mean observed λ."""
 
     name = column = "traversability"
     words = "λ̄"

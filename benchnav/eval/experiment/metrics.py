@@ -55,7 +55,7 @@ def read_metrics(given: Sequence[PartSpec], robots: Iterable[Robot]) -> tuple[Na
     Raises:
         ConfigError: If there is no such metric, it breaks its contract, or two have one name or column.
     """
-    episodes = [episode for robot in robots for episode in sample_episodes(robot)]
+    episodes = [episode for robot in robots for episode in sample_episodes(robot)] if given else []
     named: list[NamedMetric] = []
     for spec in given:
         part = registry.complete("metric", registry.read_part("metric", spec))

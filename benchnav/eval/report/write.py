@@ -21,7 +21,7 @@ from benchnav.core.tables import Table, markdown, print_table, to_latex, to_mark
 from benchnav.eval.experiment.condition import KNOWLEDGE
 from benchnav.eval.experiment.metrics import further_quantities, quantities
 from benchnav.eval.folder.checksums import note_checksums
-from benchnav.eval.folder.provenance import command_lines
+from benchnav.eval.folder.provenance import METRICS, command_lines
 from benchnav.eval.folder.results import read_results
 from benchnav.eval.folder.run_folder import ERRORS, caveats
 from benchnav.eval.recording import MAP, Ground, Recording, read_recordings
@@ -486,6 +486,8 @@ def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
         maps = ", ".join(f"{split} {len(digests)}" for split, digests in known["maps"].items())
         lines.append((f"dataset {data}", f"{known['id']}; maps: {maps}"))
     lines += dict.fromkeys(part for code in codes for part in code["parts"].items())
+    metrics = [entry for code in codes for entry in code.get(METRICS, {}).items()]
+    lines += dict.fromkeys((f"metric {column}", own["digest"]) for column, own in metrics)
     seeds = dict.fromkeys(seed for condition in about["conditions"].values() for seed in condition["seeds"])
     lines.append(("seeds", ", ".join(map(str, seeds))))
     return [(name, value) for name, value in lines if value]

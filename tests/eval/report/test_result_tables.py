@@ -6,7 +6,8 @@ import pytest
 
 from benchnav.core.tables import to_latex, to_markdown, to_terminal
 from benchnav.eval.experiment.condition import LABELS
-from benchnav.eval.report.result_tables import comparison_table, learning_table, paper_table, result_table
+from benchnav.eval.report.comparison_tables import comparison_table
+from benchnav.eval.report.result_tables import learning_table, paper_table, result_table
 from benchnav.eval.stats.comparison import compare
 from tests.eval.report import made
 from tests.eval.stats.test_comparison import A, B, pair
