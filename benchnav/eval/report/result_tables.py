@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from benchnav.core.quantity import Quantity
+from benchnav.core.resampling import LEAST_MAPS
 from benchnav.core.tables import Bold, Table, to_latex
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.report.words import (
@@ -140,7 +141,7 @@ def result_table(
 
 def _explain(quantity: Quantity) -> str:
     return (
-        f"{quantity.meaning}: mean over episodes, with its 95 % interval in brackets; no interval under {FEWEST_MAPS} "
+        f"{quantity.meaning}: mean over episodes, with its 95 % interval in brackets; no interval under {LEAST_MAPS} "
         "maps; n is the number of episodes that have it, if not all have."
     )
 
