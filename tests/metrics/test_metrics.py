@@ -67,6 +67,20 @@ def test_a_shipped_metric_is_its_closed_form(
     assert values == [pytest.approx(value, nan_ok=True) for value in (success, failure, at_once)]
 
 
+@pytest.mark.filterwarnings("error")
+def test_an_episode_of_one_step_gives_no_warning() -> None:
+    short = episode([0.5], learnt=replace(LEARNT, ahead=AHEAD[1:2]))
+    values = {column: metric.value(short) for column, metric in BY_COLUMN.items()}
+    undefined = {column for column, value in values.items() if math.isnan(value)}
+    assert {
+        "roughness_radps2",
+        "planning_ms",
+        "planning_ms_p95",
+        "ahead_rmse",
+        "ahead_log_score",
+    } <= undefined
+
+
 def test_every_shipped_metric_has_a_closed_form() -> None:
     (mark,) = test_a_shipped_metric_is_its_closed_form.pytestmark  # type: ignore[attr-defined]
     assert [column for column, *_ in mark.args[1]] == list(BY_COLUMN)
