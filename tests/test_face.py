@@ -21,6 +21,7 @@ FACES = {
     "benchnav.env": "EgocentricEnv EgocentricVectorEnv OffRoadEnv OffRoadVectorEnv PolicyPlanner",
     "benchnav.eval": "Comparison Condition Results Suite compare_runs evaluate open_run read_report read_steps "
     "run_suite write_report",
+    "benchnav.metrics": "Energy Episode Learnt Metric MetricError SHIPPED",
     "benchnav.models": "Checkpoint ModelFamily Part TrainOptions TrainableModel TrainingConfig "
     "TraversabilityModel Window evaluate_model find_checkpoint fit_model list_checkpoints load_checkpoint "
     "load_model measure_margin predict predict_tiles save_checkpoint write_risk_maps",
@@ -29,7 +30,7 @@ FACES = {
     "Objective Optimal Places Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensed "
     "Sensor Simulation Static Step Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem CVaR Chance "
     "ExpectedTime Mean RiskMeasure SingleClass TimeCVaR VaR",
-    "benchnav.testing": "check_belief check_model check_objective check_planner check_risk check_robot "
+    "benchnav.testing": "check_belief check_metric check_model check_objective check_planner check_risk check_robot "
     "check_sensor",
 }
 EACH = pytest.mark.parametrize("name", FACES)
@@ -139,7 +140,7 @@ def test_no_public_name_is_that_of_a_commands_function(name: str) -> None:
     assert not functions & set(face(name).__all__)
 
 
-EXAMPLES = [*ROOT.glob("examples/**/*.py"), ROOT / "docs" / "risk" / "off_by.py"]
+EXAMPLES = [*ROOT.glob("examples/**/*.py"), ROOT / "studies" / "risk" / "off_by.py"]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]
 
 

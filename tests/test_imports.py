@@ -1,4 +1,4 @@
-"""Imports go one way: core → stats → datagen → planning and models → env → eval, and so do folders within them."""
+"""Imports go one way: core, stats, datagen, planning and models, env and metrics, eval; so do folders within them."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -52,15 +52,16 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "planning/sensing/knowledge.py": (*PLANNING, "planning.sensing", "planning.world"),
     "planning/sensing/appearance.py": ("planning.sensing", "datagen.synth", "datagen.schema"),
     "planning/planners": (*PLANNING, "planning.sensing", "planning.planners"),
+    "metrics": ("metrics", *PLANNING),
     "env": ("env", "models", "planning", "datagen"),
-    "testing": ("testing", "models", "planning", "datagen"),
-    "eval": ("eval", "models", "planning", "datagen"),
-    "eval/experiment": ("eval.experiment", "models", "planning", "datagen"),
+    "testing": ("testing", "metrics", "models", "planning", "datagen"),
+    "eval": ("eval", "metrics", "models", "planning", "datagen"),
+    "eval/experiment": ("eval.experiment", "metrics", "models", "planning", "datagen"),
     "eval/folder": ("eval.folder", *VALUES_OF_EVAL, "models", "planning", "datagen"),
     "eval/recording.py": ("eval.folder", "planning"),
-    "eval/run": ("eval.run", *WRITTEN, *VALUES_OF_EVAL, "models", "planning", "datagen"),
-    "eval/stats": ("eval.stats", "eval.experiment", "planning"),
-    "eval/report": ("eval.report", "eval.stats", *WRITTEN, *VALUES_OF_EVAL, "planning", "datagen"),
+    "eval/run": ("eval.run", *WRITTEN, *VALUES_OF_EVAL, "metrics", "models", "planning", "datagen"),
+    "eval/stats": ("eval.stats", "eval.experiment", "metrics", "planning"),
+    "eval/report": ("eval.report", "eval.stats", *WRITTEN, *VALUES_OF_EVAL, "metrics", "planning", "datagen"),
 }
 
 
@@ -150,6 +151,9 @@ def test_no_modules_import_one_another_in_a_circle() -> None:
         ("planning/planners/cl_rrt/tree.py", "benchnav.planning.planners.planner", True),
         ("planning/planners/cl_rrt/tree.py", "benchnav.planning.world.outcome", False),
         ("planning/planners/mppi.py", "benchnav.eval.experiment.condition", False),
+        ("metrics/base.py", "benchnav.planning.robots", True),
+        ("metrics/energy.py", "benchnav.planning.world.simulation", False),
+        ("metrics/energy.py", "benchnav.eval.run.rollout", False),
         ("eval/run/rollout.py", "benchnav.planning.world.simulation", True),
         ("eval/run/rollout.py", "benchnav.eval.report.result_tables", False),
         ("eval/stats/summary.py", "benchnav.eval.run.rows", False),

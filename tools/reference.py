@@ -1,8 +1,9 @@
-"""Writes the pages of the three commands for the documentation, from their parsers.
+"""Writes the pages of the three commands for the documentation, from their parsers, and that of the metrics.
 
     python tools/reference.py docs/reference/commands
 
-A page a command, a section a subcommand, a row an option, as `--help` has them.
+A page a command, a section a subcommand, a row an option, as `--help` has them; and a row a metric, as its object has
+them.
 """
 
 import inspect
@@ -14,9 +15,11 @@ from typing import Any
 import yaml
 from docstring_parser import parse
 
+from benchnav.core import registry
 from benchnav.core.command import Command
 from benchnav.core.settings import NO_DEFAULT, Option, dataclass_in, in_words, list_options, plain
 from benchnav.core.store import write_text
+from benchnav.metrics import SHIPPED
 
 PROGRAMS = {"datagen": "benchnav.datagen.cli", "train": "benchnav.models.cli", "eval": "benchnav.eval.cli"}
 
@@ -69,6 +72,29 @@ def section(program: str, name: str, command: Command) -> str:
     return "\n".join([f"## {name}", "", f"`{program} {name}`: {text}", "", *head, *rows, ""])
 
 
+def metrics_page() -> str:
+    """The page of the metrics: those of every run in the order of columns, then those that a suite can name."""
+    every = [metric.name for metric in SHIPPED]
+    head = [line("name", "column", "unit", "better", "meaning"), "|---|---|---|---|---|"]
+    parts = []
+    for title, names in (
+        ("In every run", every),
+        ("By name, in `metrics`", [name for name in registry.names("metric") if name not in every]),
+    ):
+        rows = []
+        for name in names:
+            own = registry.make("metric", name).quantity
+            better = "" if own.better == "neither" else own.better
+            rows.append(line(f"`{name}`", f"`{own.column}`", own.unit, better, own.meaning))
+        parts.append("\n".join([f"## {title}", "", *head, *rows, ""]))
+    said = (
+        "A metric is one number for each episode: a column of `episodes.parquet`. Hypotheses and `compare --metric` "
+        "take its name; the unit is that of differences and margins. "
+        "[A metric of your own](../../how-to/own-parts.md#metric) is a class in a file."
+    )
+    return "\n".join(["# Metrics of episodes", "", said, "", *parts])
+
+
 def main() -> None:
     """Writes the pages."""
     folder = Path(sys.argv[1])
@@ -78,6 +104,7 @@ def main() -> None:
         commands: dict[str, Command] = import_module(module).COMMANDS
         sections = [section(program, own, command) for own, command in commands.items()]
         write_text(folder / f"{name}.md", f"# {program}\n\n" + "\n".join(sections))
+    write_text(folder / "metrics.md", metrics_page())
 
 
 if __name__ == "__main__":

@@ -139,10 +139,11 @@ def verify(folder: str) -> int:
 
 
 def list_command(kinds: list[str]) -> None:
-    """List planners, models, risk measures, robots, objectives, sensors, beliefs and worlds with their options.
+    """List parts of each kind, metrics and worlds, with their options.
 
     Args:
-        kinds: Some of planner, model, risk, robot, objective, sensor, ground, belief and world; all when none is named.
+        kinds: Some of planner, model, risk, robot, objective, sensor, ground, belief, metric and world; all when none
+            is named.
     """
     from benchnav.eval.catalogue import print_catalogue
 
@@ -168,6 +169,7 @@ def compare(
     against: str = "",
     by: str = "",
     points: float = 5.0,
+    metric: str = "",
     allow_different: Literal["nothing", "code"] = "nothing",
     out: str = "",
 ) -> None:
@@ -181,6 +183,7 @@ def compare(
             ground, belief, world or run. When not given: the kind of `against`; run where runs share conditions; else
             risk.
         points: Difference of success in percentage points; a note tells how many maps it needs.
+        metric: Name of the metric to compare, such as path_length or energy; if empty, success and T_total.
         allow_different: code also compares conditions made by different code, and says so under the table.
         out: Path without a suffix, to which .csv, .md and .tex are added.
     """
@@ -190,7 +193,8 @@ def compare(
     if out and (out.endswith(os.sep) or Path(out).name in ("", "..")):
         raise ConfigError(f"Expected `out` as the path of files without a suffix, got the folder {out}.")
     runs = [Path(folder) for folder in folders]
-    table, shown = compare_runs(runs, by, against, labels.asked, points / 100, allow_different == "code")
+    different = allow_different == "code"
+    table, shown = compare_runs(runs, by, against, labels.asked, points / 100, different, metric)
     print_table(shown)
     if out:
         print("written:", ", ".join(map(str, write_comparison(Path(out), table, shown))))

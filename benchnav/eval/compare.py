@@ -14,10 +14,12 @@ from typing import Any
 import pandas as pd
 
 from benchnav.core.errors import ConfigError
+from benchnav.core.quantity import Quantity
 from benchnav.core.settings import check_known
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, to_latex, to_markdown
 from benchnav.eval.experiment.condition import LABELS, NOT_USED, label_words
+from benchnav.eval.experiment.metrics import further_quantities, quantities
 from benchnav.eval.experiment.unit import DRAW
 from benchnav.eval.folder.provenance import code_differences
 from benchnav.eval.folder.run_folder import (
@@ -29,8 +31,9 @@ from benchnav.eval.folder.run_folder import (
     open_run,
     read_table,
 )
-from benchnav.eval.report.result_tables import comparison_table
+from benchnav.eval.report.comparison_tables import comparison_table, metric_table
 from benchnav.eval.report.words import reading_name
+from benchnav.eval.stats.by_metric import compare_by
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import (
     Compared,
@@ -43,9 +46,7 @@ from benchnav.eval.stats.pairs import (
 )
 from benchnav.eval.stats.summary import time_budgets
 
-_CAPTION = (
-    "Differences of success and of time between conditions that met the same maps with the same draws of λ."
-)
+_CAPTION = "Differences between conditions that met the same maps with the same draws of λ."
 _LISTED, _NAMED = 8, 3
 _MIN_DIFFERENCE = 1e-5  # of success; a run has 10⁸ episodes at most
 # From so many pairs on their time is announced, from that of a few.
@@ -60,6 +61,7 @@ def compare_runs(
     asked: Mapping[str, Sequence[str]],
     difference: float,
     allow_different_code: bool = False,
+    metric: str = "",
 ) -> tuple[pd.DataFrame, Table]:
     """Compares the conditions of runs pair by pair.
 
@@ -71,6 +73,7 @@ def compare_runs(
         difference: of success, for which the maps needed are counted.
         allow_different_code: compare what other code made too, and say so in the table. Runs that are compared with
             each other always are.
+        metric: name of the metric that is compared; if empty, success and T_total are.
 
     Returns:
         The numbers, and the table that is shown.
@@ -83,6 +86,7 @@ def compare_runs(
     if not _MIN_DIFFERENCE <= difference <= 1:
         raise ConfigError(f"Expected `points` in [{100 * _MIN_DIFFERENCE:g}, 100], got {100 * difference:g}.")
     runs = [open_run(folder) for folder in folders]
+    quantity = _find_quantity(runs, metric) if metric else None
     conditions = _chosen(read_conditions(runs), asked)
     check_one_value_each(conditions)
     by = by_what(conditions, by, against)
@@ -99,14 +103,31 @@ def compare_runs(
             f"Expected conditions that differ in their {by} alone, got conditions made by different code: "
             f"{'; '.join(lines)}. Run them with one code, or pass --allow-different code, which names it in the table."
         )
-    table = compare(pairs, difference).assign(different_code=["; ".join(found) for found in unlike])
-    shown = comparison_table(table, difference, by)
+    if quantity is None:
+        table = compare(pairs, difference)
+        shown = comparison_table(table, difference, by)
+    else:
+        table = compare_by(pairs, quantity)
+        shown = metric_table(table, quantity, by)
+    table = table.assign(different_code=["; ".join(found) for found in unlike])
     notes = (*_about(pairs, table), *_left_out(pairs, by), *_no_partner(conditions, pairs, by), *shown.notes)
     notes += tuple(f"Different code: {line}." for line in lines)
     notes += tuple(
         dict.fromkeys(line for run in runs for line in caveats(_concerning(conditions, run.about)))
     )
     return table, replace(shown, notes=notes)
+
+
+def _find_quantity(runs: Sequence[Run], name: str) -> Quantity:
+    """What is compared, which every run must have.
+
+    Raises:
+        ConfigError: If a run does not have it.
+    """
+    for run in runs:
+        known = quantities(further_quantities(run.about))
+        check_known(f"`metric`, of {run.folder},", name, known)
+    return known[name]
 
 
 def write_comparison(stem: Path, table: pd.DataFrame, shown: Table) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Checks for the tests of whoever writes a planner, model, robot, objective, risk measure, sensor or belief."""
+"""Checks for the tests of whoever writes a planner, model, robot, objective, risk measure, sensor, belief or metric."""
 
 from benchnav.core.public_names import face
 
@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = face(
     {
         "benchnav.testing.belief": ("check_belief",),
         "benchnav.testing.functions": ("check_objective", "check_risk", "check_robot"),
+        "benchnav.testing.metric": ("check_metric",),
         "benchnav.testing.model": ("check_model",),
         "benchnav.testing.planner": ("check_planner",),
         "benchnav.testing.sensor": ("check_sensor",),

@@ -8,40 +8,15 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from benchnav.core.errors import ConfigError
+from benchnav.core.quantity import Quantity
 from benchnav.core.settings import check_known, of, read
 from benchnav.core.store import text_digest
 from benchnav.eval.experiment.condition import LABELS, NOT_USED, Condition, label_words
 from benchnav.eval.experiment.unit import Conditions
-
-
-class Metric(NamedTuple):
-    """What two conditions are compared by.
-
-    Args:
-        column: of the table of episodes.
-        name: in text.
-        unit: of a difference and of a margin.
-        scale: that unit over the column's.
-        better: which way is better, higher or lower.
-    """
-
-    column: str
-    name: str
-    unit: str
-    scale: float
-    better: Literal["higher", "lower"]
-
-
-METRICS = {
-    "success": Metric("success", "success", "points", 100, "higher"),
-    "T_total": Metric("total_time_s", "T_total", "s", 1, "lower"),
-    "score": Metric("score", "score", "", 1, "higher"),
-    "traversability": Metric("traversability", "λ̄", "points", 100, "higher"),
-    "path_length": Metric("path_length_m", "path length", "m", 1, "lower"),
-}
+from benchnav.metrics.shipped import QUANTITIES, TOTAL_TIME
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +26,7 @@ class Hypothesis:
     Args:
         one: the condition that the claim is about, by labels in a suite, by its id in a test.
         other: the condition that it is compared with, as well.
-        metric: of `METRICS`.
+        metric: name of a metric.
         kind: what is claimed of the difference.
         direction: of a difference, where `one` lies, or either way if empty; of non-inferiority and superiority, which
             way is better, the metric's if empty.
@@ -60,25 +35,30 @@ class Hypothesis:
 
     one: Any
     other: Any
-    metric: Literal["success", "T_total", "score", "traversability", "path_length"]
+    metric: str
     kind: Literal["difference", "non-inferiority", "superiority", "equivalence"] = "difference"
     direction: Literal["", "higher", "lower"] = ""
     margin: float = 0.0
 
-    def claim(self, one: str, other: str) -> str:
-        """The hypothesis as a sentence without its full stop, with what text calls the two."""
-        metric = METRICS[self.metric]
-        margin = f"{self.margin:g} {metric.unit}".rstrip()
+    def claim(self, one: str, other: str, quantity: Quantity) -> str:
+        """The hypothesis as a sentence without its full stop.
+
+        Args:
+            one: what text calls the condition that the claim is about.
+            other: what it calls the other.
+            quantity: that the two are compared by.
+        """
+        margin = f"{self.margin:g} {quantity.unit}".rstrip()
         if self.kind == "equivalence":
-            return f"{metric.name} of {one} and of {other} differs by less than {margin}"
+            return f"{quantity.words} of {one} and of {other} differs by less than {margin}"
         if self.kind == "non-inferiority":
             worse = "lower" if self.direction == "higher" else "higher"
-            return f"{metric.name} of {one} is less than {margin} {worse} than that of {other}"
+            return f"{quantity.words} of {one} is less than {margin} {worse} than that of {other}"
         if self.kind == "superiority":
-            return f"{metric.name} of {one} is more than {margin} {self.direction} than that of {other}"
+            return f"{quantity.words} of {one} is more than {margin} {self.direction} than that of {other}"
         if self.direction:
-            return f"{metric.name} of {one} is {self.direction} than that of {other}"
-        return f"{metric.name} of {one} differs from that of {other}"
+            return f"{quantity.words} of {one} is {self.direction} than that of {other}"
+        return f"{quantity.words} of {one} differs from that of {other}"
 
 
 def digest_of_tests(tests: Sequence[Mapping[str, Any]]) -> str:
@@ -86,12 +66,17 @@ def digest_of_tests(tests: Sequence[Mapping[str, Any]]) -> str:
     return text_digest(tests)[:16]
 
 
-def fix_hypotheses(given: Sequence[Mapping[str, Any]], conditions: Conditions) -> dict[str, Any]:
+def fix_hypotheses(
+    given: Sequence[Mapping[str, Any]],
+    conditions: Conditions,
+    quantities: Mapping[str, Quantity] = QUANTITIES,
+) -> dict[str, Any]:
     """Reads the hypotheses of a suite, for `run.json`.
 
     Args:
         given: as the suite lists them.
         conditions: its conditions by id, with how often each is to be run.
+        quantities: what they may be compared by, by name.
 
     Returns:
         `tests`, each as plain data: the fields of `Hypothesis`, `names`, what text calls the two, and `claim`; `digest`
@@ -102,7 +87,9 @@ def fix_hypotheses(given: Sequence[Mapping[str, Any]], conditions: Conditions) -
     """
     every = [condition for condition, _ in conditions.values()]
     tests = [
-        test for place, one in enumerate(given, start=1) for test in _read(one, f"hypothesis {place}", every)
+        test
+        for place, one in enumerate(given, start=1)
+        for test in _read(one, f"hypothesis {place}", every, quantities)
     ]
     if not tests:
         return {}
@@ -117,26 +104,37 @@ def fix_hypotheses(given: Sequence[Mapping[str, Any]], conditions: Conditions) -
     }
 
 
-def _read(given: Mapping[str, Any], where: str, conditions: Sequence[Condition]) -> list[dict[str, Any]]:
+def _read(
+    given: Mapping[str, Any],
+    where: str,
+    conditions: Sequence[Condition],
+    quantities: Mapping[str, Quantity],
+) -> list[dict[str, Any]]:
     """A hypothesis of a suite: one test for each pair of conditions that it names."""
     asked = read(Hypothesis, given, of(where))
-    metric, kind, margin = METRICS[asked.metric], asked.kind, asked.margin
-    most = 100 if metric.unit == "points" else math.inf
+    check_known(f"`metric` of {where}", asked.metric, quantities)
+    quantity, kind, margin = quantities[asked.metric], asked.kind, asked.margin
+    most = 100 if quantity.unit == "points" else math.inf
     if kind == "difference" and margin:
         raise ConfigError(f"Expected no `margin` of {where}, a difference, got {margin:g}. Leave it out.")
     if kind != "difference" and not 0 < margin < most:
         raise ConfigError(
-            f"Expected `margin` of {where}, a test of {kind}, above 0 and below {most} {metric.unit}, got {margin:g}."
+            f"Expected `margin` of {where}, a test of {kind}, above 0 and below {most} {quantity.unit}, got {margin:g}."
         )
     if kind == "equivalence" and asked.direction:
         raise ConfigError(f"Expected no `direction` of {where}, an equivalence, got {asked.direction!r}.")
     if kind in ("non-inferiority", "superiority") and not asked.direction:
-        asked = replace(asked, direction=metric.better)
+        if quantity.better == "neither":
+            raise ConfigError(
+                f"Expected `direction` of {where}, a test of {kind}, since no way is better for {asked.metric!r}, got "
+                "none. Say higher or lower."
+            )
+        asked = replace(asked, direction=quantity.better)
     one, ones = _named(asked.one, "one", where, conditions)
     other, others = _named(asked.other, "other", where, conditions)
     unnamed = [name for name in LABELS if name not in {**one, **other}]
     pairs = _pairs(ones, others, unnamed, where)
-    if asked.metric == "T_total" and any(
+    if asked.metric == TOTAL_TIME.name and any(
         first.robot != second.robot and first.world.time_budget_ratio is not None for first, second in pairs
     ):
         raise ConfigError(
@@ -154,7 +152,7 @@ def _read(given: Mapping[str, Any], where: str, conditions: Sequence[Condition])
         ]
         test = replace(asked, one=first.id, other=second.id)
         about = {"one": first.id, "other": second.id, "names": names, **asdict(test)}
-        tests.append({**about, "claim": test.claim(*names)})
+        tests.append({**about, "claim": test.claim(*names, quantity)})
     return tests
 
 

@@ -69,9 +69,10 @@ class Suite:
             each condition's first map; of failures; of all episodes.
         conditions: Several products: mappings of the keys above. A key that a mapping lacks has its value above.
         hypotheses: Hypotheses, fixed before the first unit is run: mappings of `one` and `other`, conditions by
-            their labels, such as {planner: mppi, risk: mean}; `metric`: success, T_total, score, traversability or
-            path_length; `kind`: difference, non-inferiority, superiority or equivalence; `direction`: higher or lower;
-            `margin`.
+            their labels, such as {planner: mppi, risk: mean}; `metric`: success, T_total, score, traversability,
+            path_length or the name of another metric; `kind`: difference, non-inferiority, superiority or equivalence;
+            `direction`: higher or lower; `margin`.
+        metrics: Metrics of episodes besides those that every run has, such as energy:120.
     """
 
     __repr__ = short_repr
@@ -96,6 +97,7 @@ class Suite:
     record: Record = "first"
     conditions: tuple[dict[str, Any], ...] = ()
     hypotheses: tuple[dict[str, Any], ...] = ()
+    metrics: tuple[PartSpec, ...] = ()
 
     def __post_init__(self) -> None:
         """Describe objects as plain data, and reject a suite without conditions."""

@@ -2,9 +2,10 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from benchnav.core.registry import Part
 from benchnav.core.store import Shard
 from benchnav.eval.experiment.condition import Condition, condition_names
 from benchnav.eval.experiment.suite import Record
@@ -66,6 +67,7 @@ class Unit:
         record: what is kept beside rows: the `steps` of all episodes; recordings of the `first` map of the condition,
             of `failures`, or of `all`.
         leads: the unit begins its condition, so that its first map is the condition's.
+        metrics: metrics that its rows have besides those that every run has.
     """
 
     condition: Condition
@@ -74,6 +76,7 @@ class Unit:
     maps: tuple[int, ...]
     record: Record = "none"
     leads: bool = False
+    metrics: tuple[Part, ...] = ()
 
     @property
     def block(self) -> int:
@@ -132,7 +135,7 @@ def steps_path(condition_id: str, name: str) -> Path:
     return Path("steps", f"condition={condition_id}", f"{name}.parquet")
 
 
-def units(conditions: Conditions, record: Record = "none") -> list[Unit]:
+def units(conditions: Conditions, record: Record = "none", metrics: Sequence[Part] = ()) -> list[Unit]:
     """Cuts conditions into units of work, those that share a prediction next to one another.
 
     Those that look at no prediction are the shortest and come last of their block: a worker's memory is measured
@@ -141,8 +144,13 @@ def units(conditions: Conditions, record: Record = "none") -> list[Unit]:
     Args:
         conditions: what is run.
         record: what is kept beside rows.
+        metrics: metrics that rows have besides those that every run has.
     """
-    made = [unit for condition, extent in conditions.values() for unit in _blocks(condition, extent, record)]
+    made = [
+        replace(unit, metrics=tuple(metrics))
+        for condition, extent in conditions.values()
+        for unit in _blocks(condition, extent, record)
+    ]
     order = {condition_id: place for place, condition_id in enumerate(conditions)}
     return sorted(
         made,

@@ -25,6 +25,7 @@ import torch
 import benchnav
 from benchnav.core import registry
 from benchnav.core.device import gpu_name
+from benchnav.core.registry import Part
 from benchnav.core.shipped_files import PACKAGE
 from benchnav.core.sources import digest_of, package_modules
 from benchnav.core.store import text_digest
@@ -44,6 +45,7 @@ _UNIT = "benchnav.eval.run.unit"
 _MOST_NAMED = 3
 
 Code = dict[str, dict[str, Any]]
+METRICS = "metrics"  # the group of code that rows with further metrics have
 TOUCHED = "touched"  # beside the groups of code: what parts touched, which is known only when they have run
 
 
@@ -53,7 +55,8 @@ class Origin:
 
     Args:
         code: `environment` (versions, processor, device, time limit of planners), `modules` of this package with their
-            digests, and `parts`, the digests of code and files that are not of it.
+            digests, `parts`, the digests of code and files that are not of it, and, if rows have further metrics,
+            `metrics`, see `describe_metrics`.
         maps: digest of what the split's maps mean, and that of each map.
     """
 
@@ -96,14 +99,16 @@ class Origins:
     def of(self, unit: Unit) -> Origin:
         """The origin of a unit that is made now."""
         condition = unit.condition
-        if condition.id not in self._codes:
-            self._codes[condition.id] = {"environment": self._environment, **describe_parts(condition)}
+        known_by = f"{condition.id} {unit.metrics}"
+        if known_by not in self._codes:
+            metrics = {METRICS: describe_metrics(unit.metrics)} if unit.metrics else {}
+            self._codes[known_by] = {"environment": self._environment, **describe_parts(condition), **metrics}
         place = condition.data, condition.split, unit.maps
         if place not in self._maps:
             dataset = TerrainDataset(find_dataset(condition.data))
             digests = map_digests(dataset, condition.split, unit.maps)
             self._maps[place] = (dataset.about_digest(condition.split), *digests)
-        return Origin(code=self._codes[condition.id], maps=self._maps[place])
+        return Origin(code=self._codes[known_by], maps=self._maps[place])
 
 
 def describe_parts(condition: Condition) -> Code:
@@ -136,9 +141,35 @@ def describe_parts(condition: Condition) -> Code:
     return {"modules": package_modules(modules), "parts": parts}
 
 
-def touches(condition: Condition) -> Touches:
-    """Return what the user's own parts of a condition have touched in this process; see `benchnav.core.touched`."""
-    targets = []
+def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
+    """Return part, options and digest of each metric's code and files, by its column."""
+    described = {}
+    for part in metrics:
+        found = registry.find("metric", part.part)
+        known = package_modules([found.target.__module__]) if found.shipped else [found.origin, found.digest]
+        files = registry.option_files("metric", part)
+        described[registry.make("metric", part).column] = {
+            "part": part.part,
+            "options": dict(part.options),
+            "digest": text_digest([known, files]),
+        }
+    return described
+
+
+def lacks_metrics(code: Mapping[str, Any], wanted: Code) -> list[str]:
+    """Return the columns of further metrics that rows of some code do not have.
+
+    Args:
+        code: that made the rows.
+        wanted: of rows that have them.
+    """
+    return [column for column in wanted.get(METRICS, {}) if column not in code.get(METRICS, {})]
+
+
+def touches(condition: Condition, metrics: Iterable[Part] = ()) -> Touches:
+    """Return what the user's own parts of a unit have touched in this process; see `benchnav.core.touched`."""
+    every = [registry.find("metric", part.part) for part in metrics]
+    targets = [found.target for found in every if not found.shipped]
     for kind in PART_KINDS:
         part = getattr(condition, kind)
         if not is_checkpoint(kind, part.part):
@@ -177,8 +208,12 @@ def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
         now: as well.
     """
     differing = {
-        group: [name for name, value in earlier[group].items() if now[group].get(name, value) != value]
-        for group in ("modules", "environment", "parts")
+        group: [
+            name
+            for name, value in earlier.get(group, {}).items()
+            if now.get(group, {}).get(name, value) != value
+        ]
+        for group in ("modules", "environment", "parts", METRICS)
     }
     modules = differing["modules"]
     more = f" and {len(modules) - _MOST_NAMED} more of its modules" if len(modules) > _MOST_NAMED else ""
@@ -186,6 +221,7 @@ def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
         *([f"{', '.join(modules[:_MOST_NAMED])}{more}"] if modules else []),
         *(f"{n} ({earlier['environment'][n]} to {now['environment'][n]})" for n in differing["environment"]),
         *differing["parts"],
+        *(f"metric {column}" for column in differing[METRICS]),
         *unlike(earlier.get(TOUCHED, {}), now.get(TOUCHED, {})),
     ]
 

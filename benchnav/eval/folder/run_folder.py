@@ -26,7 +26,7 @@ from benchnav.core.store import Shard, replacing, seal, unseal, write_text
 from benchnav.eval.experiment.condition import NOT_USED, Condition, condition_from
 from benchnav.eval.experiment.suite import RECORDS
 from benchnav.eval.experiment.unit import DRAW, Extent, Unit, steps_path
-from benchnav.eval.folder.provenance import TOUCHED, Origin, code_digest, touches
+from benchnav.eval.folder.provenance import METRICS, TOUCHED, Origin, code_digest, touches
 from benchnav.eval.folder.sealed import CONTENT, DamageError, metadata, read_sealed, with_metadata
 
 FORMAT, FORMAT_VERSION = "benchnav-run", 6
@@ -175,6 +175,11 @@ class Finished:
         """The run folder."""
         return self.path.parents[2]
 
+    @property
+    def metrics(self) -> set[str]:
+        """Columns of its rows besides those that every run has."""
+        return set(self.about["code"].get(METRICS, ()))
+
     def has(self, unit: Unit) -> bool:
         """Whether it was recorded as a unit is now to be, and what was recorded is still of its making."""
         if RECORDS.index(self.about["record"]) < RECORDS.index(unit.record):
@@ -253,7 +258,7 @@ def write_unit(
         "made": secrets.token_hex(8),
         "traceback": traceback,
         "errors": list(errors),
-        TOUCHED: touches(unit.condition),
+        TOUCHED: touches(unit.condition, unit.metrics),
         "steps": metadata(folder / unit.steps_path).get(CONTENT, ""),
         "recordings": {
             path.as_posix(): digest for path in recordings if (digest := digest_of_path(folder / path))

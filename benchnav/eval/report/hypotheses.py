@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchnav.core.quantity import Quantity
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.hypotheses import Hypothesis
+from benchnav.eval.experiment.metrics import further_quantities, quantities
 from benchnav.eval.report.words import NOT_YET, count_range, p_in_words, reading_names
+from benchnav.metrics.shipped import QUANTITIES, TOTAL_TIME
 from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA
 from benchnav.stats.tables import Column, p_value, signed, table_of
@@ -35,20 +38,22 @@ def hypothesis_findings(tests: pd.DataFrame, about: Mapping[str, Any], unit: str
     Returns:
         Sentences by the title over them.
     """
+    known = quantities(further_quantities(about))
     said = [
-        f"{number}. {_capital(_claim(row))}: {_verdict(row)} ({_numbers(row, unit)})."
+        f"{number}. {_capital(_claim(row, known))}: {_verdict(row)} ({_numbers(row, unit)})."
         for number, row in enumerate(tests.to_dict("records"), start=1)
     ]
     title = f"Hypotheses, fixed before the first unit was run (digest {about['hypotheses']['digest']})"
     return {title: [*said, *_extended(about)]}
 
 
-def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
+def hypothesis_table(tests: pd.DataFrame, unit: str, known: Mapping[str, Quantity] = QUANTITIES) -> Table:
     """Formats the tests, a row a hypothesis; bold where it is supported.
 
     Args:
         tests: from `hypotheses.test_hypotheses`.
         unit: of the statistics, from `words.unit_of_statistics`.
+        known: what conditions are compared by, by name.
     """
     used = "; ".join(words for kind, words in _TESTS.items() if (tests["kind"] == kind).any())
     family = "1 hypothesis" if len(tests) == 1 else f"{len(tests)} hypotheses"
@@ -59,7 +64,7 @@ def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
     rows = [{**row, "number": number} for number, row in enumerate(tests.to_dict("records"), start=1)]
     columns = [
         Column("", lambda row: str(row["number"])),
-        Column("hypothesis", _claim),
+        Column("hypothesis", lambda row: _claim(row, known)),
         Column(f"{unit}s", lambda row: str(row["n_maps"])),
         Column(
             "values",
@@ -84,7 +89,7 @@ def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
         bold_note="supported." if tests["supported"].any() else "",
     )
     explained = []
-    if ((tests["metric"] == "T_total") & (tests["kind"] == "difference")).any():
+    if ((tests["metric"] == TOTAL_TIME.name) & (tests["kind"] == "difference")).any():
         explained.append(
             (
                 "T_total",
@@ -92,15 +97,17 @@ def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
                 "the interval holds 0.",
             )
         )
-    if (tests["metric"] == "path_length").any():
-        explained.append(("path length", "over the episodes in which both arrived."))
+    for quantity in known.values():
+        if quantity.of_arrivals and (tests["metric"] == quantity.name).any():
+            explained.append((quantity.words, "over the episodes in which both arrived."))
     return replace(table, explained=(*table.explained, *explained))
 
 
-def _claim(row: Mapping[Any, Any]) -> str:
+def _claim(row: Mapping[Any, Any], known: Mapping[str, Quantity]) -> str:
     """The hypothesis with the names that tables and figures have for the two conditions."""
     test = Hypothesis(**{name.name: row[name.name] for name in fields(Hypothesis)})
-    return test.claim(*map(reading_names, row["names"]))
+    one, other = map(reading_names, row["names"])
+    return test.claim(one, other, known[test.metric])
 
 
 def _verdict(row: Mapping[Any, Any]) -> str:
@@ -159,4 +166,4 @@ def _value(value: float) -> str:
 
 def _capital(text: str) -> str:
     # Symbols such as λ̄ stay as they are.
-    return text[0].upper() + text[1:] if text.startswith(("success", "score", "path")) else text
+    return text[0].upper() + text[1:] if text[0].isascii() else text

@@ -1,15 +1,15 @@
-"""The tables of a run: a row a condition, and, for a paper, settings down and scenarios across; and of a comparison.
+"""The tables of a run: a row a condition, and, for a paper, settings down and scenarios across.
 
-Source of the first two: Endo, Honda and Ishigami (2024), Table I.
+Source: Endo, Honda and Ishigami (2024), Table I.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from benchnav.core.quantity import Quantity
 from benchnav.core.tables import Bold, Table, to_latex
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.report.words import (
@@ -26,14 +26,18 @@ from benchnav.eval.report.words import (
     unit_of_statistics,
 )
 from benchnav.eval.stats.best import PRIVILEGED, competing
+from benchnav.metrics import shipped
+from benchnav.metrics.base import Metric
 from benchnav.stats.best import FEWEST_MAPS
 from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA
-from benchnav.stats.tables import Column, Row, cell_of, p_value, short, signed, signed_interval, table_of
 
 # What `follows` is where a planner follows the user's objective alone.
 _USERS_OWN = ("", "J")
 _ALWAYS = ("scenario", "planner", "risk")
+_SUCCESS = shipped.SUCCESS.quantity
+_TOTAL_TIME = shipped.TOTAL_TIME.quantity
+_MET = shipped.TRAVERSABILITY.quantity
 ALONE, IN_BATCH = "one robot [ms]", "per episode of a batch [ms]"
 LATENCIES = ("median_ms", "p95_ms", "max_ms")
 # What columns hold, by heading; only those that are shown are explained.
@@ -52,12 +56,12 @@ _COLUMNS = {
     "groups": "number of groups of maps; the group is the statistical unit.",
     "maps": "number of maps.",
     "episodes": "number of episodes.",
-    "Succ. [%]": "share of episodes that reached the goal.",
+    _SUCCESS.heading: f"{_SUCCESS.meaning}.",
     "95 % interval": "Wilson's interval of the success rate, with maps as the unit.",
-    "T_total [s]": "mean time to the goal, a failure counted as the time budget T, with its 95 % interval in brackets; "
+    _TOTAL_TIME.heading: f"mean {_TOTAL_TIME.meaning}, with its 95 % interval in brackets; "
     f"no interval under {LEAST_MAPS} maps.",
     "T if success [s]": "time of the episodes that reached the goal, mean ± standard deviation.",
-    "λ̄ [%]": "mean observed λ of an episode, mean ± standard deviation over episodes.",
+    _MET.heading: f"{_MET.meaning}, mean ± standard deviation over episodes.",
     ALONE: "planning time of a step of one robot alone, on one thread: median (95th percentile, maximum) over at most "
     "100 steps.",
     IN_BATCH: "planning time of a step of a batch, divided by its episodes, on one thread: median (95th percentile) "
@@ -66,16 +70,12 @@ _COLUMNS = {
 }
 # Of the columns that not every run has, that of the summary which says so.
 _TIMES = {ALONE: "latency_median_ms", IN_BATCH: "planning_ms_median"}
-_RESULTS = ("Succ. [%]", "95 % interval", "T_total [s]", "T if success [s]", "λ̄ [%]")
-_PAPER = ("Succ. [%]", "T_total [s]", "λ̄ [%]")
+_PAPER = (_SUCCESS.heading, _TOTAL_TIME.heading, _MET.heading)
+_RESULTS = (_SUCCESS.heading, "95 % interval", _TOTAL_TIME.heading, "T if success [s]", _MET.heading)
+_LEARNT_COUNTS = (shipped.SEEN_CELLS, shipped.SENSED_CELLS, shipped.REVISIONS)
+_LEARNT_METRICS = (*_LEARNT_COUNTS, *shipped.AHEAD, shipped.LEARNING_TIME)
 _LEARNT = {
-    "cells seen": "cells whose appearance a robot saw, mean over episodes.",
-    "cells sensed": "cells whose λ it sensed, mean over episodes.",
-    "revisions": "how often its planner was given another map, mean over episodes.",
-    "RMSE ahead": "root mean square error of the believed E[λ] over the cells ahead of the robot of which λ was not "
-    "sensed, mean over updates and episodes.",
-    "log score ahead": "mean log score of the belief over these cells, at least −10 a cell; higher is better.",
-    "belief [ms]": "time of a step for sensing and belief, of a batch divided by its episodes.",
+    **{metric.heading: f"{metric.meaning}, mean over episodes." for metric in _LEARNT_METRICS},
     "planning [ms]": "time of a step for planning, likewise: median over steps.",
 }
 _TO_FULL = {
@@ -87,7 +87,9 @@ _MOST_ACROSS = 3
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -> Table:
+def result_table(
+    summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]], further: Sequence[Quantity] = ()
+) -> Table:
     """Formats a summary: rates and λ̄ in per cent; bold what is not significantly worse than the best.
 
     Columns of labels that are the same for all conditions are left out, but for scenario, planner and risk; so
@@ -96,6 +98,7 @@ def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, An
     Args:
         summary: from `summary.summarise`, joined with `best.against_best` and perhaps with latencies.
         conditions: by id what `run.json` knows of them: `follows` and `remarks` become notes.
+        further: quantities that the run has besides those of every run, a column each.
     """
     labels = [name for name in LABELS if name in _ALWAYS or differ(summary[name])]
     counts = [
@@ -104,15 +107,18 @@ def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, An
         if summary[f"n_{name}"].nunique() > 1 and (name != "groups" or unit_of_statistics(summary) == "group")
     ]
     times = [heading for heading, name in _TIMES.items() if name in summary and summary[name].notna().any()]
-    headings = (*labels, *counts, *_RESULTS, *times, "failures")
+    own = {quantity.heading: quantity for quantity in further}
+    explained = {**_COLUMNS, **{heading: _explain(quantity) for heading, quantity in own.items()}}
+    headings = (*labels, *counts, *_RESULTS, *own, *times, "failures")
     marks, notes = _notes(summary, conditions)
     rows = []
     for row, mark in zip(summary.to_dict("records"), marks, strict=True):
         cells = {name: reading_name(name, str(row[name])) for name in labels}
         cells |= {name: str(row[f"n_{name}"]) for name in counts}
         cells |= {"planner": cells["planner"] + mark, **_results(row)}
+        cells |= {heading: _mean_in_words(quantity, row) for heading, quantity in own.items()}
         if row["best_marked"]:
-            cells["Succ. [%]"] = Bold(cells["Succ. [%]"])
+            cells[_SUCCESS.heading] = Bold(cells[_SUCCESS.heading])
         rows.append(tuple(cells[heading] for heading in headings))
     if any("¶" in cell for row in rows for cell in row):
         notes.append("¶ The planner ran as compiled code.")
@@ -130,8 +136,27 @@ def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, An
         rows=tuple(rows),
         notes=tuple(notes),
         bold_note=bold_note(summary),
-        explained=tuple((heading, _COLUMNS[heading]) for heading in headings),
+        explained=tuple((heading, explained[heading]) for heading in headings),
     )
+
+
+def _explain(quantity: Quantity) -> str:
+    return (
+        f"{quantity.meaning}: mean over episodes, with its 95 % interval in brackets; no interval under {LEAST_MAPS} "
+        "maps; n is the number of episodes that have it, if not all have."
+    )
+
+
+def _mean_in_words(quantity: Quantity, row: Mapping[Any, Any]) -> str:
+    """The mean of a further quantity with its interval, in the quantity's unit."""
+    mean, low, high = (
+        quantity.scale * row[quantity.summary_column(name)] for name in ("mean", "low", "high")
+    )
+    if np.isnan(mean):
+        return NOT_USED
+    count = row[f"{quantity.column.removesuffix(quantity.suffix)}_n"]
+    words = f"{mean:.4g}" if np.isnan(low) else f"{mean:.4g} ({low:.4g}–{high:.4g})"
+    return f"{words} (n = {count})" if count < row["n_episodes"] else words
 
 
 def learning_table(summary: pd.DataFrame) -> Table | None:
@@ -150,9 +175,9 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
     rows = [
         (
             *(reading_name(name, str(row[name])) for name in labels),
-            *(f"{row[f'{name}_mean']:.0f}" for name in ("seen_cells", "sensed_cells", "revisions")),
-            *(_number(row[f"{name}_mean"]) for name in ("ahead_rmse", "ahead_log_score")),
-            *(_times(row[name]) for name in ("learning_ms_mean", "planning_ms_median")),
+            *(f"{row[_mean_of(metric)]:.0f}" for metric in _LEARNT_COUNTS),
+            *(_number(row[_mean_of(metric)]) for metric in shipped.AHEAD),
+            *(_times(row[name]) for name in (_mean_of(shipped.LEARNING_TIME), "planning_ms_median")),
             *(_lost(row, full.get(_but_sensor(row))) if compared else ()),
         )
         for row in learnt.to_dict("records")
@@ -165,6 +190,10 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
         explained=tuple(explained.items()),
         title="What robots learnt on their way",
     )
+
+
+def _mean_of(metric: Metric) -> str:
+    return metric.quantity.summary_column("mean")
 
 
 def _but_sensor(row: Mapping[Any, Any]) -> tuple[str, ...]:
@@ -265,11 +294,11 @@ def _results(row: Mapping[Any, Any]) -> dict[str, str]:
     if not np.isnan(row["total_time_low_s"]):
         total += f" ({row['total_time_low_s']:.1f}–{row['total_time_high_s']:.1f})"
     return {
-        "Succ. [%]": rate_in_words(row),
+        _SUCCESS.heading: rate_in_words(row),
         "95 % interval": success_interval_in_words(row),
-        "T_total [s]": total,
+        _TOTAL_TIME.heading: total,
         "T if success [s]": mean_and_std(row["success_time_mean_s"], row["success_time_std_s"]),
-        "λ̄ [%]": met,
+        _MET.heading: met,
         ALONE: _times(*(row.get(f"latency_{name}", np.nan) for name in LATENCIES)),
         IN_BATCH: _times(row["planning_ms_median"], row["planning_ms_p95_median"]) + compiled,
         "failures": failures_in_words(row),
@@ -302,89 +331,3 @@ def _notes(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -
         ]
         marks.append(",".join(own))
     return marks, [f"{number} {text}" for text, number in numbers.items()]
-
-
-def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
-    """Write a comparison: success in percentage points, times in seconds, p after Holm's correction.
-
-    Args:
-        table: from `comparison.compare`.
-        difference: of success, that `maps_needed` is for.
-        by: in what the conditions of a pair differ.
-    """
-    labels = [name for name in (*LABELS, "run") if name in table and differ(table[name])]
-    counts = [Column("maps", cell_of("n_maps", str))] if table["n_maps"].nunique() > 1 else []
-    scale, stored, unit = (100, "share", "% of T") if "time_difference_share" in table else (1, "s", "s")
-    share = "; in shares of each condition's own T, since T differs" if stored == "share" else ""
-    points, times, arrivals = (
-        "Δ [points], 95 %", f"Δ T_total [{unit}], 95 %", "Δ T if both arrive [s], 95 %, on maps"
-    )  # fmt: skip
-    columns = [
-        *(Column(name, cell_of(name, partial(reading_name, name))) for name in labels),
-        Column(by, cell_of("one", partial(reading_name, by))),
-        Column("against", cell_of("other", partial(reading_name, by))),
-        *counts,
-        Column(
-            "Succ. [%]",
-            lambda row: f"{short(100 * row['success_one'])} : {short(100 * row['success_other'])}",
-            "success rates of the two conditions.",
-        ),
-        *_difference_columns(
-            points, "success", "", 100, "difference of success, with the interval of Bonett and Price."
-        ),
-        Column(
-            "p",
-            cell_of("success_p_holm", p_value),
-            "sign-flip test by map (McNemar's exact test with one episode a map), Holm's correction.",
-        ),
-        Column("significant", cell_of("success_p_holm", lambda p: "yes" if p < ALPHA else "no"), f"p < {ALPHA}."),
-        Column(
-            "detectable",
-            cell_of("success_detectable", lambda value: f"{100 * value:.0f}" if value <= 1 else NOT_USED),
-            "minimum detectable difference of success [points] with 80 % power, for which the maps needed are counted "
-            "too; a dash where the maps are too few.",
-        ),
-        *_difference_columns(
-            times, "time", f"_{stored}", scale,
-            f"difference of the mean time, a failure counted as the time budget T{share}; a dash for an interval of "
-            f"fewer than {LEAST_MAPS} maps.",
-        ),
-        Column(
-            "p (ranks)",
-            cell_of("time_p_holm", p_value),
-            "Wilcoxon's signed-rank test of T_total, Holm's correction. It compares ranks and the interval is of the "
-            "mean, so that the two can disagree.",
-        ),
-        *_difference_columns(
-            arrivals, "arrival_time", "_s", 1,
-            "difference of time over the episodes in which both arrived. It is not tested: both conditions decide "
-            "which episodes these are.",
-        ),
-        Column("on maps", cell_of("arrival_time_n_maps", str)),
-    ]  # fmt: skip
-    notes = _comparison_notes(table, difference)
-    return table_of(table.to_dict("records"), columns, labels=len(labels) + 2, notes=notes)
-
-
-def _difference_columns(title: str, name: str, unit: str, scale: float, meaning: str) -> list[Column]:
-    """Return the columns of a difference and of its interval, of one meaning."""
-
-    def ends(row: Row) -> str:
-        return signed_interval(scale * row[f"{name}_low{unit}"], scale * row[f"{name}_high{unit}"])
-
-    shown = cell_of(f"{name}_difference{unit}", lambda value: signed(scale * value))
-    return [Column(title.partition(",")[0], shown, meaning, title), Column("95 %", ends)]
-
-
-def _comparison_notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
-    pairs = "1 pair" if len(table) == 1 else f"{len(table)} pairs"
-    unit = "group" if (table["n_groups"] < table["n_maps"]).any() else "map"
-    needed = f"{100 * difference:g} points need {count_range(table['maps_needed'])} maps."
-    if np.isinf(table["success_detectable"]).any():
-        needed = (
-            f"These {unit}s are too few for any difference to be significant, and to tell how many it needs."
-        )
-    return (
-        f"Tests by {unit}: signs of the difference (success) and ranks (T_total), p corrected over {pairs} (Holm).",
-        f"Intervals are of means and not corrected: they can exclude 0 where p > {ALPHA}. {needed}",
-    )

@@ -19,8 +19,9 @@ from benchnav.core.figures import planner_name, save_twice
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
 from benchnav.eval.experiment.condition import KNOWLEDGE
+from benchnav.eval.experiment.metrics import further_quantities, quantities
 from benchnav.eval.folder.checksums import note_checksums
-from benchnav.eval.folder.provenance import command_lines
+from benchnav.eval.folder.provenance import METRICS, command_lines
 from benchnav.eval.folder.results import read_results
 from benchnav.eval.folder.run_folder import ERRORS, caveats
 from benchnav.eval.recording import MAP, Ground, Recording, read_recordings
@@ -104,7 +105,8 @@ class Report:
     @property
     def hypotheses(self) -> Table:
         """The table of `tests`."""
-        return self.marked(hypothesis_table(self.tests, unit_of_statistics(self.summary)))
+        known = quantities(further_quantities(self.about))
+        return self.marked(hypothesis_table(self.tests, unit_of_statistics(self.summary), known))
 
     def marked(self, table: Table) -> Table:
         """A table that says so where the run is not finished."""
@@ -131,9 +133,10 @@ def read_report(folder: Path, record_driven: RecordDriven | None = None, partial
     results = read_results(folder, partial)
     about, episodes = results.run.about, results.episodes
     worlds = {condition: entry["value"]["world"] for condition, entry in about["conditions"].items()}
-    summary = summarise(episodes, worlds)
+    further = further_quantities(about)
+    summary = summarise(episodes, worlds, further)
     tests = (
-        test_hypotheses(about["hypotheses"], episodes, worlds, not results.is_partial)
+        test_hypotheses(about["hypotheses"], episodes, worlds, not results.is_partial, quantities(further))
         if "hypotheses" in about
         else pd.DataFrame()
     )
@@ -168,7 +171,7 @@ def read_report(folder: Path, record_driven: RecordDriven | None = None, partial
             *_bracket(episodes, about["conditions"], worlds),
         ),
         findings=said,
-        table=result_table(summary, about["conditions"]),
+        table=result_table(summary, about["conditions"], further),
         warnings=tuple(warnings),
         summary=summary,
         tests=tests,
@@ -256,7 +259,7 @@ def run_figures(
             "forest",
             "Paired differences of the hypotheses that were fixed before the run. Filled points are supported "
             "(p < 0.05 after Holm's correction). Lines are 90 % (thick) and 95 % (thin) intervals of one difference.",
-            forest_figure(report.tests),
+            forest_figure(report.tests, quantities(further_quantities(report.about))),
         )
     yield (
         "success",
@@ -483,6 +486,8 @@ def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
         maps = ", ".join(f"{split} {len(digests)}" for split, digests in known["maps"].items())
         lines.append((f"dataset {data}", f"{known['id']}; maps: {maps}"))
     lines += dict.fromkeys(part for code in codes for part in code["parts"].items())
+    metrics = [entry for code in codes for entry in code.get(METRICS, {}).items()]
+    lines += dict.fromkeys((f"metric {column}", own["digest"]) for column, own in metrics)
     seeds = dict.fromkeys(seed for condition in about["conditions"].values() for seed in condition["seeds"])
     lines.append(("seeds", ", ".join(map(str, seeds))))
     return [(name, value) for name, value in lines if value]

@@ -14,6 +14,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.registry import NO_DEFAULT, Part
 from benchnav.core.store import Shard
 from benchnav.eval.experiment.condition import Condition, check_labels, differences, merge
+from benchnav.eval.experiment.metrics import add_metric, metrics_of_run
 from benchnav.eval.experiment.suite import Record
 from benchnav.eval.experiment.unit import Conditions
 from benchnav.eval.folder import provenance
@@ -51,11 +52,12 @@ class Work(Checked):
     reuse_code: bool = False
 
 
-def begin(work: Work, folder: Path, say: Say) -> tuple[Conditions, Conditions]:
+def begin(work: Work, folder: Path, say: Say) -> tuple[Conditions, Conditions, tuple[Part, ...]]:
     """Writes `run.json`, or extends the one that is there.
 
     Returns:
-        What the command asks for, and all conditions of the run.
+        What the command asks for, all conditions of the run, and the metrics that its rows have besides those that
+        every run has.
 
     Raises:
         ConfigError: the folder holds something else, or a run that this one cannot extend.
@@ -67,9 +69,19 @@ def begin(work: Work, folder: Path, say: Say) -> tuple[Conditions, Conditions]:
                 "another `out`."
             )
         write_run(folder, _about({}, work, work.conditions))
-        return work.conditions, work.conditions
+        return work.conditions, work.conditions, tuple(metric.part for metric in work.metrics)
     earlier = open_run(folder)
     _check_extends(work, earlier)
+    metrics = list(metrics_of_run(earlier.about))
+    n_metrics = len(metrics)
+    for metric in work.metrics:
+        metrics = add_metric(metrics, metric)
+    work = replace(work, metrics=tuple(metrics))
+    if new_names := [metric.quantity.name for metric in metrics[n_metrics:]]:
+        say(
+            f"{folder} is extended by {'metric' if len(new_names) == 1 else 'metrics'} {', '.join(new_names)}"
+        )
+        (folder / EPISODES).unlink(missing_ok=True)
     conditions, asked = dict(earlier.conditions), {}
     # What differs from an earlier condition only in what is not used is run as that one.
     rows_ids = {condition.rows_id: name for name, (condition, _) in reversed(conditions.items())}
@@ -87,7 +99,7 @@ def begin(work: Work, folder: Path, say: Say) -> tuple[Conditions, Conditions]:
     now = _about(earlier.about, work, conditions)
     if now != earlier.about:
         write_run(folder, now)
-    return asked, conditions
+    return asked, conditions, tuple(metric.part for metric in metrics)
 
 
 def drop(folder: Path) -> None:
@@ -155,6 +167,7 @@ def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> di
         **({"shard": asdict(work.shard)} if work.shard else {}),
         "suite": dict(work.suite),
         **({"hypotheses": fixed} if (fixed := earlier.get("hypotheses", work.hypotheses)) else {}),
+        **({"metrics": [metric.about for metric in work.metrics]} if work.metrics else {}),
         "conditions": entries,
         "dropped": _still_dropped([*earlier.get("dropped", ()), *work.dropped], conditions),
         "warnings": provenance.join(earlier.get("warnings", ()), work.warnings),

@@ -12,6 +12,7 @@ import torch
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
+from benchnav.core.quantity import Quantity
 from benchnav.core.settings import hint
 from benchnav.core.store import text_digest
 from benchnav.datagen.files.find import find_dataset
@@ -19,6 +20,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
 from benchnav.eval.experiment.condition import KNOWLEDGE, PART_KINDS, Condition, conditions_of, is_checkpoint
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
+from benchnav.eval.experiment.metrics import NamedMetric, quantities, read_metrics
 from benchnav.eval.experiment.suite import Suite, check_size
 from benchnav.eval.experiment.unit import BLOCK_MAPS, Conditions, Extent
 from benchnav.eval.folder import provenance
@@ -42,12 +44,14 @@ class Checked:
         dropped: combinations that cannot be run: the labels that do not go together, by column, and the `reason`.
         warnings: what readers of the results should know.
         hypotheses: from `fix_hypotheses`.
+        metrics: that rows have besides those that every run has.
     """
 
     conditions: dict[str, tuple[Condition, Extent]]
     dropped: tuple[dict[str, str], ...]
     warnings: tuple[str, ...]
     hypotheses: dict[str, Any]
+    metrics: tuple[NamedMetric, ...] = ()
 
 
 def check_suite(suite: Suite, elsewhere: bool) -> Checked:
@@ -75,10 +79,13 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
     kept = [condition for condition in conditions if condition.id not in left_out]
     if not kept:
         raise ConfigError(next(iter(left_out.values())).reason)
+    robots = {condition.robot.label: condition.task.robot for condition in kept}
+    metrics = read_metrics(suite.metrics, robots.values())
     if elsewhere:
-        check_everywhere(kept)
+        check_everywhere(kept, metrics)
     extents = {condition.id: _extent(condition, suite) for condition in conditions}
-    hypotheses = _fix_hypotheses(suite, {c.id: (c, extents[c.id]) for c in conditions}, left_out)
+    known = quantities(metric.quantity for metric in metrics)
+    hypotheses = _fix_hypotheses(suite, {c.id: (c, extents[c.id]) for c in conditions}, left_out, known)
     warnings = build_each(kept, suite.all_seeds[0], suite.maps)
     for condition in kept:
         warnings += _doubts(condition, _open(condition))
@@ -90,6 +97,7 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         dropped=tuple(provenance.join(one.entry for one in left_out.values())),
         warnings=tuple(dict.fromkeys(warnings)),
         hypotheses=hypotheses,
+        metrics=metrics,
     )
 
 
@@ -98,7 +106,12 @@ def _extent(condition: Condition, suite: Suite) -> Extent:
     return Extent.product(suite.all_seeds, suite.realisations, maps)
 
 
-def _fix_hypotheses(suite: Suite, conditions: Conditions, left_out: Mapping[str, LeftOut]) -> dict[str, Any]:
+def _fix_hypotheses(
+    suite: Suite,
+    conditions: Conditions,
+    left_out: Mapping[str, LeftOut],
+    known: Mapping[str, Quantity],
+) -> dict[str, Any]:
     """Fixes the hypotheses of a suite on the conditions that are run.
 
     Raises:
@@ -106,7 +119,7 @@ def _fix_hypotheses(suite: Suite, conditions: Conditions, left_out: Mapping[str,
     """
     kept = {i: entry for i, entry in conditions.items() if i not in left_out}
     try:
-        tests = fix_hypotheses(suite.hypotheses, conditions).get("tests", ())
+        tests = fix_hypotheses(suite.hypotheses, conditions, known).get("tests", ())
     except ConfigError:  # perhaps of a combination that is left out
         tests = ()
     for test in tests:
@@ -116,7 +129,7 @@ def _fix_hypotheses(suite: Suite, conditions: Conditions, left_out: Mapping[str,
                 f"Expected hypotheses on conditions that can be run, got {test['claim']!r}, which names one that "
                 f"cannot: {lost[0].reason}"
             )
-    return fix_hypotheses(suite.hypotheses, kept)
+    return fix_hypotheses(suite.hypotheses, kept, known)
 
 
 def _open(condition: Condition) -> TerrainDataset:
@@ -235,21 +248,21 @@ def _check_model(condition: Condition, dataset: TerrainDataset) -> list[str]:
     return [line] if line else []
 
 
-def check_everywhere(conditions: Iterable[Condition]) -> None:
+def check_everywhere(conditions: Iterable[Condition], metrics: Iterable[NamedMetric] = ()) -> None:
     """Refuses parts that other processes would not find.
 
     Raises:
         ConfigError: there are such.
     """
-    for condition in conditions:
-        for kind in PART_KINDS:
-            source = getattr(condition, kind).part
-            if not is_checkpoint(kind, source) and not registry.find(kind, source).everywhere:
-                raise ConfigError(
-                    f"Expected a {kind} that other processes can load (for `jobs` > 1, `scheduler` or "
-                    f"`planner_limit_s`), got {source!r}, which only this process has. Write its class into a file, "
-                    "and import it from there or name it as path/to/file.py:Name."
-                )
+    parts = [(kind, getattr(condition, kind).part) for condition in conditions for kind in PART_KINDS]
+    parts += [("metric", metric.part.part) for metric in metrics]
+    for kind, source in parts:
+        if not is_checkpoint(kind, source) and not registry.find(kind, source).everywhere:
+            raise ConfigError(
+                f"Expected a {kind} that other processes can load (for `jobs` > 1, `scheduler` or "
+                f"`planner_limit_s`), got {source!r}, which only this process has. Write its class into a file, "
+                "and import it from there or name it as path/to/file.py:Name."
+            )
 
 
 def _doubts(condition: Condition, dataset: TerrainDataset) -> list[str]:

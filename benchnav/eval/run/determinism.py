@@ -52,8 +52,9 @@ def check_determinism(
         BenchnavError: If the suite cannot be run.
     """
     settings = Settings(planner_limit_s=planner_limit_s, device=find_device(device).type)
-    conditions = check_suite(suite, elsewhere=True).conditions
-    chosen = [units({name: known})[0] for name, known in conditions.items()]
+    checked = check_suite(suite, elsewhere=True)
+    metrics = [metric.part for metric in checked.metrics]
+    chosen = [units({name: known}, metrics=metrics)[0] for name, known in checked.conditions.items()]
     say(f"checking that {len(chosen)} conditions repeat, each by its unit of {len(chosen[0].maps)} maps")
     first = _run_fresh(chosen, settings)
     backwards = [replace(unit, maps=unit.maps[::-1]) for unit in chosen[::-1]]

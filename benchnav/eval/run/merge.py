@@ -15,6 +15,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard, new_folder, replacing, sole_writer, take_place
 from benchnav.core.touched import unlike
 from benchnav.eval.experiment.condition import label_words
+from benchnav.eval.experiment.metrics import metrics_of_run
 from benchnav.eval.experiment.unit import Unit, in_table_order, units
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.checksums import note_checksums
@@ -145,14 +146,18 @@ def _unlike(first: Run, other: Run) -> list[str]:
     if any(set(one.draws) != set(another.draws) for (_, one), (_, another) in both):
         lines.append("seeds, realisations or maps")
     lines += provenance.dataset_differences(first.about["datasets"], other.about["datasets"])
-    if other.about.get("hypotheses") != first.about.get("hypotheses"):
-        lines.append("hypotheses")
+    lines += [name for name in ("hypotheses", "metrics") if other.about.get(name) != first.about.get(name)]
     return lines
 
 
 def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
     """A finished unit of some runs, the newest of each; refuses one that came out differently in two."""
-    found = [makings[0] for run in runs if (makings := find_units(run.folder, unit))]
+    columns = {one.quantity.column for one in metrics_of_run(runs[0].about)}
+    found = [
+        makings[0]
+        for run in runs
+        if (makings := [one for one in find_units(run.folder, unit) if columns <= one.metrics])
+    ]
     for making in found:
         if damage := making.damage():
             raise ConfigError(

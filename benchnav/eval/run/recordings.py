@@ -19,7 +19,6 @@ from benchnav.eval.folder.run_folder import EPISODES, KEYS, Run, find_units, ope
 from benchnav.eval.folder.steps import LAST_COLUMN, open_steps, read_steps
 from benchnav.eval.recording import GROUND, MAP, Ground, Recording
 from benchnav.eval.run.recorder import Recorder
-from benchnav.eval.run.rows import path_length_m
 from benchnav.eval.run.unit import (
     Built,
     Settings,
@@ -30,6 +29,7 @@ from benchnav.eval.run.unit import (
     read_maps,
     simulate,
 )
+from benchnav.metrics.motion import path_length_m
 from benchnav.planning.world.simulation import Simulation
 
 

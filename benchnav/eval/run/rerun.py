@@ -3,7 +3,7 @@
 What is repeated are the conditions of `run.json`, each as often as it was run, whatever commands they came by.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.progress import Progress
 from benchnav.core.store import sole_writer
 from benchnav.eval.experiment.condition import Condition
+from benchnav.eval.experiment.metrics import metrics_of_run
 from benchnav.eval.experiment.unit import Unit, units
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.run_folder import (
@@ -64,14 +65,16 @@ def rerun(
         _check_repeats(run, folder)
     settings = Settings(planner_limit_s=run.about["planner_limit_s"], device=device_of_run(run.about).type)
     _check_there(run)
+    metrics = metrics_of_run(run.about)
     if jobs != 1 or settings.planner_limit_s:
-        check_everywhere(condition for condition, _ in run.conditions.values())
+        check_everywhere((condition for condition, _ in run.conditions.values()), metrics)
     work = Work(
         suite=run.about["suite"],
         conditions=run.conditions,
         dropped=tuple(run.about["dropped"]),
         warnings=tuple(run.about["warnings"]),
         hypotheses=run.about.get("hypotheses", {}),
+        metrics=metrics,
         record="none",
         settings=settings,
     )
@@ -135,12 +138,16 @@ def _makings(folder: Path, every: Sequence[Unit]) -> set[str]:
 def _check_there(run: Run) -> None:
     """Refuses a run of which something is no longer there, with all that is not."""
     lacking: dict[str, None] = {}
+    parts = [metric.part for metric in metrics_of_run(run.about)]
+    checks: list[Callable[[], Any]] = [partial(provenance.describe_metrics, parts)]
     for condition, extent in run.conditions.values():
-        for check in (partial(check_split, maps=extent.maps), provenance.describe_parts):
-            try:
-                check(condition)
-            except BenchnavError as error:
-                lacking[str(error)] = None
+        checks.append(partial(check_split, condition, maps=extent.maps))
+        checks.append(partial(provenance.describe_parts, condition))
+    for check in checks:
+        try:
+            check()
+        except BenchnavError as error:
+            lacking[str(error)] = None
     if lacking:
         raise ConfigError(f"Expected all that {run.folder} was made with, got a lack: {' '.join(lacking)}")
     conditions = [condition for condition, _ in run.conditions.values()]

@@ -44,7 +44,8 @@ class Episodes:
         states: shape [B, N + 1, S].
         actions: shape [B, N, A].
         traversability: λ that the robot met at each step, shape [B, N].
-        turn_rate_radps: turn rate that each action would give on ground of λ = 1, shape [B, N].
+        speed_mps: speed that each action would give on ground of λ = 1, shape [B, N].
+        turn_rate_radps: turn rate, likewise, shape [B, N].
         outcome: `Outcome`, shape [B].
         steps: steps to the end, shape [B].
         begin_s: wall time of what the planner prepared for the whole batch.
@@ -64,6 +65,7 @@ class Episodes:
     states: Tensor
     actions: Tensor
     traversability: Tensor
+    speed_mps: Tensor
     turn_rate_radps: Tensor
     outcome: Tensor
     steps: Tensor
@@ -150,6 +152,7 @@ class _Log:
             states=track.cpu(),
             actions=actions.cpu(),
             traversability=met.cpu(),
+            speed_mps=(driven / self.dt_s).cpu(),
             turn_rate_radps=turned.cpu(),
             outcome=tell_standstill(now.outcome, now.step, track[..., :2], driven, self.dt_s).cpu(),
             steps=now.step.cpu(),

@@ -22,7 +22,7 @@ from benchnav.core.workers import connected, run_calls
 from benchnav.eval.experiment.suite import RECORDS, Record, Suite
 from benchnav.eval.experiment.unit import Conditions, Unit, in_table_order, unit_names, units
 from benchnav.eval.folder.checksums import note_checksums
-from benchnav.eval.folder.provenance import TOUCHED, Origin, Origins, code_differences
+from benchnav.eval.folder.provenance import TOUCHED, Origin, Origins, code_differences, lacks_metrics
 from benchnav.eval.folder.run_folder import (
     EPISODES,
     ERRORS,
@@ -97,8 +97,8 @@ def run_work(work: Work, folder: Path, jobs: int | str, overwrite: bool, say: Sa
         say(f"running on {gpu_name(work.settings.device)}")
     if overwrite:
         drop(folder)
-    asked, conditions = begin(work, folder, say)
-    every = units(conditions, work.record)
+    asked, conditions, metrics = begin(work, folder, say)
+    every = units(conditions, work.record, metrics)
     own = [unit for unit in every if work.shard is None or unit.shard(work.shard.of) == work.shard]
     named, others = _parted(own, asked)
     origins = work.settings.origins()
@@ -212,8 +212,9 @@ def _missing(
         say: is told how many units are run again, and why.
         is_here: units are run on this machine, so that what parts read can be compared with what is here.
     """
-    missing, again, unused, stale = [], 0, 0, 0
+    missing, again, unused, stale, unmeasured = [], 0, 0, 0, 0
     other: dict[str, None] = {}
+    lacking: dict[str, None] = {}
     changed: dict[str, None] = {}
     damage: list[str] = []
     for unit in own:
@@ -222,6 +223,10 @@ def _missing(
         if lines := _damage(folder, unit, origin, counts):
             missing.append((replace(unit, record=_richest(unit, counts)), origin))
             damage.append(lines[0])
+        elif counts is None and known and (columns := _unmeasured(known[0], origin)):
+            missing.append((replace(unit, record=_richest(unit, known[0])), origin))
+            unmeasured += 1
+            lacking |= dict.fromkeys(columns)
         elif counts is None:
             missing.append((unit, origin))
             if known:
@@ -238,6 +243,10 @@ def _missing(
         say(f"{done} of {len(own)} units were there already")
     if again:
         say(f"{again} of {len(own)} units are run again for recordings or steps that they lack")
+    if unmeasured:
+        say(
+            f"{unmeasured} of {len(own)} units are run again for metrics that they lack ({', '.join(lacking)})"
+        )
     if damage:
         say(f"{len(damage)} of {len(own)} units are damaged and are run again; the first: {damage[0]}")
     if stale:
@@ -271,7 +280,12 @@ def _counting(known: list[Finished], unit: Unit, origin: Origin, reuse_code: boo
     counting = [
         finished
         for finished in known
-        if finished.about["key"] == key or (reuse_code and finished.about["digests"] == maps)
+        if finished.about["key"] == key
+        or (
+            reuse_code
+            and finished.about["digests"] == maps
+            and not lacks_metrics(finished.about["code"], origin.code)
+        )
     ]
     return max(counting, key=lambda finished: finished.about["key"] == key, default=None)
 
@@ -279,6 +293,11 @@ def _counting(known: list[Finished], unit: Unit, origin: Origin, reuse_code: boo
 def _counted(unit: Unit, origins: Origins, folder: Path, reuse_code: bool) -> Finished | None:
     """The making of a unit that counts now; None where it is not finished."""
     return _counting(find_units(folder, unit), unit, origins.of(unit), reuse_code)
+
+
+def _unmeasured(finished: Finished, origin: Origin) -> list[str]:
+    """Columns of the metrics that a finished unit lacks, if it differs in nothing else from what is to be run."""
+    return [] if _differences(finished, origin) else lacks_metrics(finished.about["code"], origin.code)
 
 
 def _differences(finished: Finished, origin: Origin) -> list[str]:

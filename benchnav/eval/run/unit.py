@@ -33,7 +33,7 @@ from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.knowledge import Learning
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rollout import Episodes, run_episodes
-from benchnav.eval.run.rows import episode_rows, error_rows, step_table
+from benchnav.eval.run.rows import Draws, episode_rows, finished_episodes, step_table, unbegun_episodes
 from benchnav.models.base import predict
 from benchnav.models.predictor import Clairvoyant, find_ground_statistics, load_model, nugget_of
 from benchnav.planning.planners.planner import Plan, Planner
@@ -89,10 +89,10 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
         try:
             built = build(unit, origin, device)
         except KnowledgeError as error:
-            budgets = unit.condition.world.budget_s(
-                block.places.reference_time_s, unit.condition.task.robot.top_speed_mps
-            )
-            rows = error_rows(unit, block.groups, budgets, error.outcome, str(error))
+            task, places = unit.condition.task, block.places
+            budgets = unit.condition.world.budget_s(places.reference_time_s, task.robot.top_speed_mps)
+            unbegun = unbegun_episodes(task, places, budgets, error.outcome)
+            rows = episode_rows(unit, block.groups, unbegun, [str(error)] * len(unbegun), compiled=False)
             write_unit(folder, unit, origin, rows, [str(error)], traceback.format_exc())
             return
         problem, simulation = built.problem, built.simulation
@@ -106,9 +106,13 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
         recorder.recording(episodes, member).save(folder / unit.recording_path(member))
     if unit.record != "none":
         write_steps(folder, unit, origin.key(unit), step_table(unit, problem, episodes))
-    reference = block.places.reference_time_s.cpu().numpy()
-    rejected_draws = (simulation.attempts - 1).tolist()
-    rows = episode_rows(unit, block.groups, problem, episodes, reference, rejected_draws, compiled, least_s)
+    draws = Draws(
+        reference_time_s=block.places.reference_time_s.cpu().numpy(),
+        rejected_draws=(simulation.attempts - 1).tolist(),
+        lower_bound_s=least_s or (),
+    )
+    finished = finished_episodes(problem, episodes, draws)
+    rows = episode_rows(unit, block.groups, finished, episodes.errors, compiled)
     errors = sorted({error for error in episodes.errors if error})
     write_unit(folder, unit, origin, rows, errors, episodes.traceback)
 

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.experiment.hypotheses import METRICS, Hypothesis
+from benchnav.core.quantity import Quantity
+from benchnav.eval.experiment.hypotheses import Hypothesis
 from benchnav.eval.stats.pairs import side_by_side
 from benchnav.eval.stats.summary import time_budgets
+from benchnav.metrics.shipped import QUANTITIES
 from benchnav.stats.episodes import Interval, difference_p, interval_of
 from benchnav.stats.holm import ALPHA, holm
 from benchnav.stats.margins import margin_p
@@ -24,6 +26,7 @@ def test_hypotheses(
     episodes: pd.DataFrame,
     worlds: Mapping[str, Mapping[str, Any]],
     is_whole: bool = True,  # noqa: PT028
+    quantities: Mapping[str, Quantity] = QUANTITIES,  # noqa: PT028
 ) -> pd.DataFrame:
     """Tests the hypotheses of a run.
 
@@ -33,6 +36,7 @@ def test_hypotheses(
         worlds: by condition what λ did.
         is_whole: the run is finished. Of a part of it differences and intervals are computed on common episodes, and
             `p`, `p_holm` are NaN: a test is made once.
+        quantities: what conditions are compared by, by name.
 
     Returns:
         A row a hypothesis, of which `difference` is of `one` less `other`: all fields of `Hypothesis` and `claim`;
@@ -50,49 +54,72 @@ def test_hypotheses(
             for condition in (test.one, test.other)
             for own in [rows.get(condition, episodes.iloc[:0])]
         )
-        # Episodes of which the metric is known; of a path, where both arrived.
-        column = METRICS[test.metric].column
-        both = side_by_side(
-            one, other, [*dict.fromkeys(["success", "total_time_s", "time_budget_s", column])]
-        )
-        if test.metric == "path_length":
-            both = both[both["success"] & both["success_other"]]
-        made.append({**plain, **_test(test, both.dropna(subset=[column, f"{column}_other"]), is_whole)})
+        quantity = quantities[test.metric]
+        both = comparable(one, other, quantity)
+        p = p_of(test, both, quantities) if is_whole else np.nan
+        made.append({**plain, **describe_pair(quantity, both), "p": p})
     table = pd.DataFrame(made)
     table["p_holm"] = holm(table["p"].to_numpy()) if is_whole else np.nan
     return table.assign(supported=table["p_holm"] < ALPHA)
 
 
-def _test(test: Hypothesis, rows: pd.DataFrame, is_whole: bool) -> dict[str, Any]:
-    metric = METRICS[test.metric]
+def comparable(one: pd.DataFrame, other: pd.DataFrame, quantity: Quantity) -> pd.DataFrame:
+    """Return the episodes in which two conditions can be compared by a quantity, side by side.
+
+    Args:
+        one: rows of a condition, with T of each as `time_budget_s`.
+        other: rows of the other, as well.
+        quantity: what is compared.
+
+    Returns:
+        The episodes of which both have a value and, for a quantity `of_arrivals`, in which both reached the goal; see
+        `side_by_side`.
+    """
+    column = quantity.column
+    measures = dict.fromkeys(["success", "total_time_s", "time_budget_s", column])
+    both = side_by_side(one, other, [*measures])
+    if quantity.of_arrivals:
+        both = both[both["success"] & both["success_other"]]
+    return both.dropna(subset=[column, f"{column}_other"])
+
+
+def describe_pair(quantity: Quantity, rows: pd.DataFrame) -> dict[str, Any]:
+    """Return `unit`, counts, means and the difference with its 95 % and 90 % intervals; see `test_hypotheses`.
+
+    Args:
+        quantity: what is compared.
+        rows: from `comparable`.
+    """
     row: dict[str, Any] = {
-        "unit": metric.unit,
+        "unit": quantity.unit,
         "n_maps": rows["group"].nunique(),
         "n_episodes": len(rows),
-        "mean_one": metric.scale * rows[metric.column].mean(),
-        "mean_other": metric.scale * rows[f"{metric.column}_other"].mean(),
+        "mean_one": quantity.scale * rows[quantity.column].mean(),
+        "mean_other": quantity.scale * rows[f"{quantity.column}_other"].mean(),
     }
     for suffix, confidence in (("_90", 0.9), ("", 0.95)):
-        difference, low, high = _interval(rows, test.metric, confidence)
+        difference, low, high = _interval(rows, quantity, confidence)
         row |= {"difference": difference, f"low{suffix}": low, f"high{suffix}": high}
-    return row | {"p": p_of(test, rows) if is_whole else np.nan}
+    return row
 
 
-def _interval(rows: pd.DataFrame, metric: str, confidence: float) -> Interval:
-    """Return the difference in the metric's unit, with its interval; NaN if there are too few maps."""
-    found = interval_of(rows, METRICS[metric].column, confidence)
-    difference, low, high = (METRICS[metric].scale * value for value in found)
+def _interval(rows: pd.DataFrame, quantity: Quantity, confidence: float) -> Interval:
+    """Return the difference in the quantity's unit, with its interval; NaN if there are too few maps."""
+    found = interval_of(rows, quantity.column, confidence)
+    difference, low, high = (quantity.scale * value for value in found)
     return difference, low, high
 
 
-def p_of(test: Hypothesis, rows: pd.DataFrame) -> float:
+def p_of(test: Hypothesis, rows: pd.DataFrame, quantities: Mapping[str, Quantity] = QUANTITIES) -> float:
     """Return p of a hypothesis before any correction; 1 if there are too few maps.
 
     Args:
         test: what is claimed.
         rows: episodes of the two conditions side by side, the other's columns ending in `_other`.
+        quantities: what conditions are compared by, by name.
     """
+    quantity = quantities[test.metric]
     if test.kind == "difference":
-        return difference_p(rows, METRICS[test.metric].column, test.direction)
-    interval = partial(_interval, rows, test.metric)
+        return difference_p(rows, quantity.column, test.direction)
+    interval = partial(_interval, rows, quantity)
     return margin_p(interval, test.kind, test.direction, test.margin)

@@ -5,31 +5,32 @@ realisations, have much in common, so that a hundred of them on twenty maps tell
 design effect says how much less.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from benchnav.core.quantity import Quantity
 from benchnav.eval.experiment.condition import LABELS
+from benchnav.metrics import shipped
+from benchnav.metrics.base import Metric
 from benchnav.planning.world.outcome import FAILURES
 from benchnav.stats.by_map import by_map
-from benchnav.stats.intervals import design_effect, total_time_interval, wilson_interval
+from benchnav.stats.intervals import design_effect, mean_interval, total_time_interval, wilson_interval
 
-# Of each column its name in the summary, which the statistic parts, and its unit.
-_QUANTITIES = {
-    "total_time_s": ("total_time", "_s"),
-    "success_time_s": ("success_time", "_s"),
-    "traversability": ("traversability", ""),
-    "time_ratio": ("time_ratio", ""),
-    "score": ("score", ""),
-    "path_length_m": ("path_length", "_m"),
-    "stuck_share": ("stuck_share", ""),
-    "roughness_radps2": ("roughness", "_radps2"),
-}
-
-# Columns of episodes that say what robots learnt on their way.
-LEARNT = ("seen_cells", "sensed_cells", "revisions", "ahead_rmse", "ahead_log_score", "learning_ms")
+# Metrics with mean and standard deviation, those with a median, and those of what robots learnt, with a mean.
+_SPREAD: tuple[Metric, ...] = (shipped.TRAVERSABILITY, shipped.TIME_RATIO, shipped.SCORE)
+_SPREAD += (shipped.PATH_LENGTH, shipped.STUCK_SHARE, shipped.ROUGHNESS)
+_MEDIANS: tuple[Metric, ...] = shipped.PLANNING
+_LEARNT: tuple[Metric, ...] = (
+    shipped.SEEN_CELLS,
+    shipped.SENSED_CELLS,
+    shipped.REVISIONS,
+    *shipped.AHEAD,
+    shipped.LEARNING_TIME,
+)
 
 
 def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
@@ -75,12 +76,15 @@ def total_time_mean(episodes: pd.DataFrame, world: Mapping[str, Any]) -> tuple[f
     return float(mean), float(np.maximum(low_s, 0.0)), float(np.minimum(high_s, budgets.max()))
 
 
-def summarise(episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
+def summarise(
+    episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]], further: Sequence[Quantity] = ()
+) -> pd.DataFrame:
     """Summarises each condition, in the order in which conditions first appear.
 
     Args:
         episodes: rows of episodes.
         worlds: by condition what λ did, as `run.json` holds it.
+        further: quantities that the episodes have besides those of every run.
 
     Returns:
         A row a condition: `condition` and its labels; `n_episodes`, `n_maps`, and `n_groups`, which is the number of
@@ -90,31 +94,63 @@ def summarise(episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]]) -
         counted as T; time of the successes alone; observed λ; time over the reference time; score; path length;
         share of stuck steps; roughness. `total_time_low_s`, `total_time_high_s`, the 95 % interval of its mean,
         from `total_time_interval`. `planning_ms_median`, and so for `planning_ms_p95` and `planning_start_ms`;
-        `NAME_mean` of what `LEARNT` names, NaN where robots learn nothing; `compiled_share`; and `OUTCOME_count` of
-        each failure.
+        `NAME_mean` of what robots learnt, NaN where they learn nothing; `compiled_share`; and `OUTCOME_count` of
+        each failure. Of each further quantity mean, standard deviation and number of episodes that have it, as above,
+        and `NAME_low`, `NAME_high`, Student's 95 % interval of the mean by map.
     """
     groups = episodes.groupby("condition", sort=False)
-    return pd.DataFrame([_summarise_condition(group, worlds[str(condition)]) for condition, group in groups])
+    return pd.DataFrame(
+        [_summarise_condition(group, worlds[str(condition)], further) for condition, group in groups]
+    )
 
 
-def _summarise_condition(group: pd.DataFrame, world: Mapping[str, Any]) -> dict[str, object]:
+def _summarise_condition(
+    group: pd.DataFrame, world: Mapping[str, Any], further: Sequence[Quantity]
+) -> dict[str, object]:
     success = group["success"].to_numpy(dtype=bool)
     effect = design_effect(success, group["group"].to_numpy())
     rate, low, high = success_mean(group)
     row: dict[str, object] = {name: group[name].iloc[0] for name in ("condition", *LABELS)}
     row |= {"n_episodes": len(group), "n_maps": group["map"].nunique(), "n_groups": group["group"].nunique()}
     row |= {"success_rate": rate, "success_low": low, "success_high": high, "design_effect": effect}
-    columns = group.assign(success_time_s=group["total_time_s"].where(success))
-    for column, (name, unit) in _QUANTITIES.items():
-        values = columns[column]
-        row |= {f"{name}_mean{unit}": values.mean(), f"{name}_std{unit}": values.std()}
-        row[f"{name}_n"] = int(values.notna().sum())
-        if name == "total_time":
-            _, row["total_time_low_s"], row["total_time_high_s"] = total_time_mean(group, world)
-    for name in ("planning_ms", "planning_ms_p95", "planning_start_ms"):
-        row[f"{name}_median"] = group[name].median()
-    for name in LEARNT:
-        row[f"{name}_mean"] = group[name].mean() if name in group else np.nan
+    total_time = shipped.TOTAL_TIME.quantity
+    taken = group[total_time.column]
+    row |= _spread(total_time, taken)
+    _, row["total_time_low_s"], row["total_time_high_s"] = total_time_mean(group, world)
+    row |= _spread(replace(total_time, column="success_time_s"), taken.where(success))
+    for metric in _SPREAD:
+        row |= _spread(metric.quantity, group[metric.column])
+    for metric in _MEDIANS:
+        row[metric.quantity.summary_column("median")] = group[metric.column].median()
+    for metric in _LEARNT:
+        mean = group[metric.column].mean() if metric.column in group else np.nan
+        row[metric.quantity.summary_column("mean")] = mean
     row["compiled_share"] = group["compiled"].astype(float).mean()
     outcomes = [outcome.name.lower() for outcome in FAILURES]
-    return row | {f"{name}_count": int((group["outcome"] == name).sum()) for name in outcomes}
+    row |= {f"{name}_count": int((group["outcome"] == name).sum()) for name in outcomes}
+    for quantity in further:
+        row |= _mean_with_interval(quantity, group)
+    return row
+
+
+def _spread(quantity: Quantity, values: pd.Series) -> dict[str, object]:
+    """Mean and standard deviation of a quantity, and how many episodes have it."""
+    stem = quantity.column.removesuffix(quantity.suffix)
+    return {
+        quantity.summary_column("mean"): values.mean(),
+        quantity.summary_column("std"): values.std(),
+        f"{stem}_n": int(values.notna().sum()),
+    }
+
+
+def _mean_with_interval(quantity: Quantity, group: pd.DataFrame) -> dict[str, object]:
+    """As `_spread`, with Student's 95 % interval of the mean by map; of a part of a run the column may be missing."""
+    values = group[quantity.column] if quantity.column in group else pd.Series(np.nan, index=group.index)
+    known = values.notna()
+    by_unit = by_map(values[known].to_numpy(dtype=float), group.loc[known, "group"].to_numpy())
+    _, low, high = mean_interval(by_unit)
+    return {
+        **_spread(quantity, values),
+        quantity.summary_column("low"): float(low),
+        quantity.summary_column("high"): float(high),
+    }

@@ -6,8 +6,14 @@ import pytest
 
 from benchnav.core.tables import to_latex, to_markdown, to_terminal
 from benchnav.eval.experiment.condition import LABELS
-from benchnav.eval.report.result_tables import comparison_table, learning_table, paper_table, result_table
+from benchnav.eval.report.comparison_tables import comparison_table, metric_table
+from benchnav.eval.report.result_tables import learning_table, paper_table, result_table
+from benchnav.eval.stats.by_metric import compare_by
 from benchnav.eval.stats.comparison import compare
+from benchnav.eval.stats.pairs import Compared, Pair
+from benchnav.eval.stats.summary import summarise
+from benchnav.metrics import Energy
+from benchnav.metrics.shipped import STUCK_SHARE
 from tests.eval.report import made
 from tests.eval.stats.test_comparison import A, B, pair
 
@@ -418,3 +424,51 @@ def test_what_is_lost_to_a_robot_that_sees_all_stands_beside_what_it_learnt() ->
         for row in table.rows
     }
     assert lost == {"near:4static": ("-50.0", "+50.0"), "fullcopula": ("–", "–"), "near:8copula": ("–", "–")}
+
+
+def test_a_further_metric_has_a_column_in_its_unit_with_its_meaning() -> None:
+    episodes = made.rows(
+        made.row(made.condition(), i, energy_j=np.nan if i == 9 else 100.0 * i) for i in range(10)
+    )
+    further = [Energy().quantity, STUCK_SHARE.quantity]
+    worlds = {str(episodes["condition"][0]): made.PAPER["world"]}
+    summary = made.summary(episodes).drop(columns=["stuck_share_mean", "stuck_share_std", "stuck_share_n"])
+    own = summarise(episodes, worlds, further)
+    summary = summary.join(own[[name for name in own if name not in summary]])
+    table = result_table(summary, made.conditions(episodes), further)
+    cells = dict(zip(table.headings, table.rows[0], strict=True))
+    low, high = own[["energy_low_j", "energy_high_j"]].iloc[0]
+    assert cells["energy [J]"] == f"400 ({low:.4g}–{high:.4g}) (n = 9)"
+    assert cells["stuck steps [%]"] == "10 (10–10)"
+    assert dict(table.explained)["energy [J]"].startswith("energy ∫ P/λ dt that the drive draws")
+
+
+def test_a_comparison_by_a_metric_is_in_its_unit_over_the_episodes_that_both_have() -> None:
+    labels = [made.condition(risk=risk) for risk in ("cvar", "mean")]
+    sides = []
+    for side, own in enumerate(labels):
+        episodes = made.rows(
+            # Neither the last map, without a value, nor the first, where the mean fails, counts.
+            made.row(
+                own, i, 30.0 if i + side != 1 else None, energy_j=np.nan if i == 9 else 100.0 * i + 50 * side
+            )
+            for i in range(10)
+        )
+        sides.append(Compared(labels=own, value={}, maps=(), episodes=episodes.assign(time_budget_s=100.0)))
+    given = Pair(
+        one="cvar", other="mean", shared={"planner": "mppi"}, episodes=pd.DataFrame(), members=tuple(sides)
+    )
+    (row,) = compare_by([given], Energy().quantity).to_dict("records")
+    assert (row["n_maps"], row["n_episodes"], row["unit"]) == (7, 7, "J")
+    assert (row["mean_one"], row["mean_other"], row["difference"]) == (500, 550, -50)
+    # All seven differences have one sign: 2 of the 2^7 ways to flip are as far.
+    assert row["p"] == row["p_holm"] == pytest.approx(2 / 2**7)
+    table = metric_table(compare_by([given], Energy().quantity), Energy().quantity, "risk")
+    cells = dict(zip(table.headings, table.rows[0], strict=True))
+    assert (cells["energy [J]"], cells["Δ [J]"], cells["95 %"], cells["significant"]) == (
+        "500 : 550", "-50", "–", "yes",
+    )  # fmt: skip
+    assert (
+        "lower is better. Over the episodes in which both reached the goal."
+        in dict(table.explained)["energy [J]"]
+    )

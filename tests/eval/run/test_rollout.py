@@ -99,6 +99,26 @@ def test_a_planner_is_told_the_time_by_the_steps_of_its_robot(dt_s: float) -> No
     assert planner.told == pytest.approx([dt_s * step for step in range(round(1 / dt_s))])
 
 
+class Steady(Watch):
+    """Commands 0.6 m/s and 0.2 rad/s."""
+
+    def plan(self, step: Step, plan_state: None) -> Any:
+        return torch.tensor([[0.6, 0.2]] * BATCH), plan_state, Plan.empty(BATCH)
+
+
+def test_commanded_speed_and_turn_rate_are_those_of_undisturbed_motion() -> None:
+    ground, robot = torch.full((BATCH, 16, 16), 0.5), Unicycle(dt_s=0.25)
+    problem = factories.problem(ground, robot=robot, time_budget_s=1.0)
+    goals = factories.places(torch.tensor([[6.75, 6.75]] * BATCH))
+    simulation = Simulation(
+        factories.terrain(ground), factories.task(robot), World(time_budget_s=1.0), goals, 0, range(BATCH)
+    )
+    planner: Any = Steady()
+    episodes = rollout.run_episodes(planner, problem, simulation, torch.Generator())
+    torch.testing.assert_close(episodes.speed_mps, torch.full((BATCH, 4), 0.6))
+    torch.testing.assert_close(episodes.turn_rate_radps, torch.full((BATCH, 4), 0.2))
+
+
 class Homing(Planner[Problem]):
     """Drives at the goal by what it kept of the problem; notes for which goals it was asked."""
 

@@ -109,7 +109,7 @@ def test_the_digest_is_that_of_all_that_is_claimed(change: dict[str, Any]) -> No
     [
         (
             {"metric": "sucess"},
-            r"Expected `metric` of hypothesis 1 as 'success' or .*Did you mean 'success'\?",
+            r"Expected `metric` of hypothesis 1 among success, .*Did you mean 'success'\?",
         ),
         (
             {"kind": "equal"},

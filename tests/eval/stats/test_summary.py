@@ -1,8 +1,10 @@
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import t
 
-from benchnav.eval.stats.summary import time_budgets
+from benchnav.eval.stats.summary import summarise, time_budgets
+from benchnav.metrics import Energy
 from benchnav.stats.intervals import total_time_interval, wilson_interval
 from tests.eval.report import made
 from tests.eval.report.made import condition, row, rows
@@ -171,3 +173,26 @@ def test_maps_of_one_group_are_one_unit() -> None:
     assert by_group["success_low"] < by_map["success_low"]
     assert np.isfinite(by_map["total_time_low_s"])
     assert np.isnan(by_group["total_time_low_s"])  # of five there is none
+
+
+def test_a_further_metric_has_students_interval_over_maps_and_counts_those_that_have_it() -> None:
+    # Ten maps with two episodes each; of map 9 neither episode has a value.
+    energies = np.arange(20.0) ** 2
+    energies[18:] = np.nan
+    episodes = rows(
+        row(condition(), i // 2, realisation=i % 2, energy_j=energy) for i, energy in enumerate(energies)
+    )
+    worlds = {str(episodes["condition"][0]): made.PAPER["world"]}
+    (found,) = summarise(episodes, worlds, [Energy().quantity]).to_dict("records")
+    by_hand = energies[:18].reshape(9, 2).mean(1)
+    half = t.ppf(0.975, 8) * by_hand.std(ddof=1) / 3
+    assert found["energy_mean_j"] == pytest.approx(by_hand.mean())
+    assert (found["energy_low_j"], found["energy_high_j"]) == pytest.approx(
+        (by_hand.mean() - half, by_hand.mean() + half)
+    )
+    assert found["energy_std_j"] == pytest.approx(energies[:18].std(ddof=1))
+    assert found["energy_n"] == 18
+    # Where a part of a run does not have the column yet, nothing is known of it.
+    (found,) = summarise(episodes.drop(columns="energy_j"), worlds, [Energy().quantity]).to_dict("records")
+    assert np.isnan([found["energy_mean_j"], found["energy_low_j"]]).all()
+    assert found["energy_n"] == 0

@@ -4,7 +4,7 @@ All but the last have a panel a block and a row a setting. Any number of planner
 since their names stand on the left.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,8 +30,8 @@ from benchnav.core.figures import (
     stack_panels,
     styled,
 )
+from benchnav.core.quantity import Quantity
 from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
-from benchnav.eval.experiment.hypotheses import METRICS
 from benchnav.eval.report.words import (
     NOT_YET,
     blocks,
@@ -40,6 +40,7 @@ from benchnav.eval.report.words import (
     reading_names,
     with_names,
 )
+from benchnav.metrics.shipped import QUANTITIES
 
 # From what the ground did to what the code did; success is light, each failure has a colour of its own.
 OUTCOME_COLOURS = {
@@ -222,21 +223,22 @@ def _draw_dots(panel: Axes, rows: pd.DataFrame, episodes: pd.DataFrame, name: st
 
 
 @styled()
-def forest_figure(tests: pd.DataFrame) -> Figure:
+def forest_figure(tests: pd.DataFrame, known: Mapping[str, Quantity] = QUANTITIES) -> Figure:
     """Draws each hypothesis as its difference, with the 95 % interval thin and the 90 % interval thick.
 
     Filled points are of hypotheses that are supported; the band is where a margin wants the difference to lie.
 
     Args:
         tests: from `hypotheses.test_hypotheses`.
+        known: what conditions are compared by, by name; panels are in this order.
     """
     numbered = tests.assign(number=range(1, len(tests) + 1))
-    panels = [numbered[numbered["metric"] == name] for name in METRICS if (tests["metric"] == name).any()]
-    heights = [_METRIC_IN + _TEST_IN * len(rows) for rows in panels]
+    panels = {name: numbered[numbered["metric"] == name] for name in known if (tests["metric"] == name).any()}
+    heights = [_METRIC_IN + _TEST_IN * len(rows) for rows in panels.values()]
     figure = Figure(figsize=(TWO_COLUMNS_IN, sum(heights) + 0.3), layout="constrained")
     axes = figure.subplots(len(panels), squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
-    for panel, rows in zip(axes, panels, strict=True):
-        _draw_tests(panel, rows)
+    for panel, (name, rows) in zip(axes, panels.items(), strict=True):
+        _draw_tests(panel, rows, known[name])
     point: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 0}
     is_tested = tests["p_holm"].notna().all()
     looks: dict[str, Any] = {
@@ -252,8 +254,7 @@ def forest_figure(tests: pd.DataFrame) -> Figure:
     return figure
 
 
-def _draw_tests(panel: Axes, rows: pd.DataFrame) -> None:
-    metric = METRICS[rows["metric"].iloc[0]]
+def _draw_tests(panel: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:
     # Where no episode tells anything, a row has no numbers.
     ends = rows[["low", "high", "difference", "margin"]].astype(float).abs()
     reach = max(ends.max().max(), 1e-9) * 1.08
@@ -278,8 +279,9 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame) -> None:
     panel.set_yticks(range(len(rows)), names)
     panel.tick_params(axis="y", length=0)
     panel.grid(axis="x", color="0.93", zorder=0)
-    unit = f" [{metric.unit}]" if metric.unit else ""
-    panel.set(xlabel=f"Δ {metric.name}{unit}", axisbelow=True)
+    unit = f" [{quantity.unit}]" if quantity.unit else ""
+    panel.set(xlabel=f"Δ {quantity.words}{unit}", axisbelow=True)
     # Which way is better, at the end of the axis where it lies.
-    place, side, words = (1, "right", "better →") if metric.better == "higher" else (0, "left", "← better")
-    panel.annotate(words, (place, 1), xycoords="axes fraction", va="bottom", ha=side, color="0.35")
+    place, side, words = (1, "right", "better →") if quantity.better == "higher" else (0, "left", "← better")
+    if quantity.better != "neither":
+        panel.annotate(words, (place, 1), xycoords="axes fraction", va="bottom", ha=side, color="0.35")
