@@ -35,6 +35,7 @@ from benchnav.core.errors import CheckpointError, ConfigError, TrainingError, ex
 from benchnav.core.settings import check_known, one_line
 from benchnav.core.store import MAX_JOBS, replacing, sole_writer, write_text
 from benchnav.models.config import TrainOptions
+from benchnav.models.training.best import KeepBest, measured
 from benchnav.models.training.trackers import described, make_callbacks, make_loggers
 
 STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
@@ -146,8 +147,8 @@ def fit(
 
     Raises:
         CheckpointError: the interrupted training is damaged or has other settings.
-        ConfigError: a callback changes the weights after training.
-        TrainingError: a loss is no finite number.
+        ConfigError: If a callback changes the weights after training.
+        TrainingError: If a loss is not finite.
         KeyboardInterrupt: the user has stopped it.
     """
     folder = options.folder / part if options.folder else None
@@ -161,7 +162,7 @@ def fit(
     if in_terminal:
         callbacks.append(RichProgressBar(console_kwargs={"stderr": True}))
     loggers = options.make_loggers(folder)
-    kept: dict[str, Any] = {"logger": False, "enable_checkpointing": _keeps_checkpoints(callbacks)}
+    trainer_settings: dict[str, Any] = {"logger": False}
     with quietly(), held:
         if folder:
             trainers = {f"trainer.{name}": value for name, value in options.trainer_settings.items()}
@@ -170,12 +171,14 @@ def fit(
                 folder, Path(STATE).stem, save_on_train_epoch_end=True, enable_version_counter=False
             )
             callbacks.append(last)
-            kept = {"logger": TensorBoardLogger(folder, name="", version=""), "plugins": [WholeFiles()]}
+            events = TensorBoardLogger(folder, name="", version="")
+            trainer_settings = {"logger": events, "plugins": [WholeFiles()]}
         if loggers is not None:
-            kept["logger"] = loggers
+            trainer_settings["logger"] = loggers
             for logger in loggers:
                 logger.log_hyperparams({"part": part, **settings})
-        trainer = make_trainer(callbacks, **kept, **options.chosen(**usual))
+        callbacks += [callback.guard for callback in callbacks if isinstance(callback, KeepBest)]
+        trainer = make_trainer(callbacks, **trainer_settings, **options.chosen(**usual))
         handler = signal.getsignal(signal.SIGINT)
         devices = [options.place] if options.place.type == "cuda" else []
         try:
@@ -193,11 +196,6 @@ def fit(
                 f"{state} is damaged: {type(error).__name__} {error}. Pass --overwrite to restart."
             ) from error
         return measured(trainer)
-
-
-def _keeps_checkpoints(callbacks: list[Callback]) -> bool:
-    """Tells whether a user's callback writes checkpoints, which Lightning asks for leave to do."""
-    return any(isinstance(callback, Checkpoint) for callback in callbacks)
 
 
 say = rank_zero_only(print)
@@ -270,6 +268,7 @@ def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Traine
     try:
         return lightning.Trainer(
             callbacks=callbacks,
+            enable_checkpointing=any(isinstance(callback, Checkpoint) for callback in callbacks),
             enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
             enable_model_summary=False,
             num_sanity_val_steps=0,
@@ -292,60 +291,6 @@ def quietly() -> Iterator[None]:
         yield
 
 
-class KeepBest(Callback):
-    """Keeps the weights of the epoch with the lowest validation loss, or of the last, and restores them at the end.
-
-    They are part of what a training goes on from. Lightning's `ModelCheckpoint` would put them into a second file,
-    which a kill could leave of another epoch than the first, and knows the loss alone of all that was measured.
-
-    Args:
-        last: keep the last epoch's whose loss is finite.
-    """
-
-    def __init__(self, last: bool = False) -> None:
-        """Starts with none."""
-        self.last = last
-        self.trained: dict[str, torch.Tensor] = {}
-        self.best: dict[str, Any] = {"loss": float("inf"), "metrics": {}, "weights": {}}
-        self.validated = False
-
-    def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Copies the weights when they are to be kept."""
-        self.validated = True
-        metrics = {name: value for name, value in measured(trainer).items() if name.startswith("valid_")}
-        limit = float("inf") if self.last else self.best["loss"]
-        if metrics["valid_loss"] < limit:
-            metrics["epoch"] = trainer.current_epoch + 1
-            self.best = {"loss": metrics["valid_loss"], "metrics": metrics, "weights": _copied(module)}
-
-    def on_train_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Copies the weights, before callbacks of a user can change them."""
-        self.trained = _copied(module)
-
-    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Puts the best weights back."""
-        _refuse_changed(self.trained, module, trainer, "on_train_end")
-        if not self.best["weights"]:
-            raise ConfigError(
-                "Expected a finite validation loss, got none. Train with a lower `learning_rate`."
-                if self.validated
-                else "Expected `trainer` to measure the split valid, got none: training ended before the first "
-                "validation. Train for longer, or validate more often."
-            )
-        module.load_state_dict(self.best["weights"])
-        # The trainer's own metrics are what comes back from processes that it has started.
-        metrics = self.best["metrics"].items()
-        trainer.callback_metrics.update({name: torch.tensor(value) for name, value in metrics})
-
-    def state_dict(self) -> dict[str, Any]:
-        """Gives what `load_state_dict` takes."""
-        return self.best
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from an earlier state."""
-        self.best = state
-
-
 @dataclass(eq=False)
 class History(Callback):
     """Writes what was measured to a table, a row an epoch, and says it on standard error.
@@ -364,26 +309,20 @@ class History(Callback):
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Adds a row."""
-        found, epoch = measured(trainer), trainer.current_epoch + 1
+        measures, epoch = measured(trainer), trainer.current_epoch + 1
         rate = float(trainer.optimizers[0].param_groups[0]["lr"])
-        self.rows.append({"epoch": epoch, "step": trainer.global_step, "learning_rate": rate, **found})
+        self.rows.append({"epoch": epoch, "step": trainer.global_step, "learning_rate": rate, **measures})
         if self.path and trainer.is_global_zero:
             write_text(self.path, pd.DataFrame(self.rows).to_csv(index=False))
         if self.part and trainer.is_global_zero:
-            told = in_words(found, "valid_") or in_words(found)
-            tell(f"{self.part}: epoch {epoch}/{trainer.max_epochs}, {told}")
-        for name, value in found.items():
+            text = in_words(measures, "valid_") or in_words(measures)
+            tell(f"{self.part}: epoch {epoch}/{trainer.max_epochs}, {text}")
+        for name, value in measures.items():
             if name in _LOSSES and not math.isfinite(value):
                 raise TrainingError(
                     f"{name} became {value} in epoch {epoch}. Train with a lower `learning_rate`, or mend the loss. "
                     "Nothing was kept of this epoch."
                 )
-
-    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Refuses callbacks of a user, which come before, that have changed the best weights."""
-        for callback in trainer.callbacks:  # type: ignore[attr-defined]
-            if isinstance(callback, KeepBest):
-                _refuse_changed(callback.best["weights"], module, trainer, "on_fit_end")
 
     def state_dict(self) -> dict[str, Any]:
         """Gives what `load_state_dict` takes."""
@@ -404,44 +343,6 @@ class WholeFiles(TorchCheckpointIO):
         """Writes it beside its name, then renames it."""
         with replacing(Path(path), durable=False) as partial:
             torch.save(checkpoint, partial)
-
-
-def _copied(module: lightning.LightningModule) -> dict[str, torch.Tensor]:
-    return {name: value.detach().clone() for name, value in module.state_dict().items()}
-
-
-def _refuse_changed(
-    wanted: Mapping[str, torch.Tensor],
-    module: lightning.LightningModule,
-    trainer: lightning.Trainer,
-    hook: str,
-) -> None:
-    """Refuses a training whose weights were changed after it, by callbacks that have a hook.
-
-    Raises:
-        ConfigError: the weights are not those that are wanted.
-    """
-    there = {name: value.cpu() for name, value in module.state_dict().items()}
-    same = wanted.keys() == there.keys() and all(
-        torch.equal(value.cpu(), there[name]) for name, value in wanted.items()
-    )
-    if same or not wanted:
-        return
-    names = [
-        type(owner).__name__
-        for owner in (*trainer.callbacks, module)  # type: ignore[attr-defined]
-        if not getattr(type(owner), hook).__module__.startswith(("lightning.", __name__))
-    ]
-    raise ConfigError(
-        f"Expected callbacks that leave the trained weights as they are, got weights that `{hook}` of "
-        f"{' or '.join(names) or 'a callback'} changed. What is exported are the weights of the best epoch. "
-        "Leave the callback out."
-    )
-
-
-def measured(trainer: lightning.Trainer) -> dict[str, float]:
-    """What was measured so far, by name."""
-    return {name: float(value) for name, value in trainer.callback_metrics.items()}
 
 
 def in_words(metrics: Mapping[str, float], prefix: str = "") -> str:

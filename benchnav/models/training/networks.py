@@ -34,6 +34,7 @@ from benchnav.models.config import (
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.trainable import TrainableModel
+from benchnav.models.training.best import KeepBest
 from benchnav.models.training.check import Trainable, check_network, class_names, fields_of
 from benchnav.models.training.conformal import check_valid, conformal_table, stopping_every
 from benchnav.models.training.data import (
@@ -46,7 +47,6 @@ from benchnav.models.training.data import (
 )
 from benchnav.models.training.fit import (
     FitOptions,
-    KeepBest,
     fit,
     in_words,
     interrupted,

@@ -52,15 +52,15 @@ def make_callbacks(given: Any) -> list[Callback]:
     Raises:
         ConfigError: as of `make_loggers`; or if what a callback does to weights or rates would be undone.
     """
-    made = [_made("callbacks", item, None) for item in _listed(given)]
+    callbacks = [_made("callbacks", item, None) for item in _listed(given)]
     for name, remedy in _UNDONE.items():
-        for callback in made:
+        for callback in callbacks:
             expect(
                 not isinstance(callback, getattr(lightning_callbacks, name)),
                 f"`trainer.callbacks` that leave weights and rates as they are, got {type(callback).__name__}, "
                 f"whose effect would be undone. {remedy}",
             )
-    return made
+    return callbacks
 
 
 def described(given: Any) -> list[dict[str, Any]]:
