@@ -59,7 +59,7 @@ def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
 
 
 def has_display() -> bool:
-    """Whether Matplotlib may find a display, or `MPLBACKEND` names a backend that needs none."""
+    """Return whether Matplotlib may find a display, or `MPLBACKEND` names a backend that needs none."""
     return sys.platform != "linux" or any(
         os.environ.get(name) for name in ("MPLBACKEND", "DISPLAY", "WAYLAND_DISPLAY")
     )

@@ -69,7 +69,7 @@ class FitOptions(TrainOptions):
     folder: Path | None = None
 
     def __post_init__(self) -> None:
-        """Checks the settings by name."""
+        """Check the settings by name."""
         expect(0 <= self.workers <= MAX_JOBS, f"`workers` in 0–{MAX_JOBS}, got {self.workers}.")
         asked = self.trainer or {}
         expect(
@@ -103,12 +103,12 @@ class FitOptions(TrainOptions):
         return json.loads(json.dumps(chosen, default=str, sort_keys=True))
 
     def make_loggers(self, folder: Path | None) -> list[Logger] | None:
-        """Makes the loggers that are asked for, to write in a folder; None where nothing is said of them."""
+        """Make the requested loggers, which write in a folder; None for the default."""
         asked = (self.trainer or {}).get("logger")
         return None if asked is None or asked is True else make_loggers(asked, folder)
 
     def make_callbacks(self) -> list[Callback]:
-        """Makes the callbacks that are asked for."""
+        """Make the requested callbacks."""
         asked = (self.trainer or {}).get("callbacks")
         return [] if asked is None else make_callbacks(asked)
 
@@ -129,7 +129,7 @@ def fit(
     data: Mapping[str, Any],
     **usual: Any,
 ) -> dict[str, float]:
-    """Trains a module in place.
+    """Train a module in place.
 
     Args:
         module: what to train.
@@ -203,28 +203,28 @@ say = rank_zero_only(print)
 
 
 def is_first_process() -> bool:
-    """Tells whether this process is alone, or the first of those that train together."""
+    """Return whether this process is the only one, or the first of those that train together."""
     return not getattr(rank_zero_only, "rank", 0)
 
 
 def interrupted(options: FitOptions, parts: Sequence[str]) -> list[str]:
-    """Names the parts whose training was interrupted in the folder of some options."""
+    """Return the parts whose training was interrupted in the folder of some options."""
     return [part for part in parts if options.folder and (options.folder / part / STATE).exists()]
 
 
 def forget(options: FitOptions, part: str) -> None:
-    """Drops what was kept to go on with a part's training; its logs stay."""
+    """Remove what a part's training would resume from; its logs stay."""
     if options.folder and is_first_process():
         _drop(options.folder / part, STATE, _PARTIAL)
 
 
-def differing(wanted: Mapping[str, Any], there: Mapping[str, Any]) -> str:
-    """Names the settings in which two trainings differ, such as "another `seed`"; empty where there are none."""
-    one, other = (json.loads(json.dumps(settings, default=str)) for settings in (wanted, there))
-    for settings in (one, other):
-        settings |= settings.pop("config", {})  # a network's own, each by its name
-    others = sorted(name for name in {**one, **other} if one.get(name) != other.get(name))
-    return f"another {' and '.join(f'`{name}`' for name in others)}" if others else ""
+def differing(expected: Mapping[str, Any], stored: Mapping[str, Any]) -> str:
+    """Return the settings in which two trainings differ, such as "another `seed`"; empty where there are none."""
+    a, b = (json.loads(json.dumps(settings, default=str)) for settings in (expected, stored))
+    for settings in (a, b):
+        settings |= settings.pop("config", {})  # those of a network, each by its name
+    names = sorted(name for name in {**a, **b} if a.get(name) != b.get(name))
+    return f"another {' and '.join(f'`{name}`' for name in names)}" if names else ""
 
 
 def default_precision(accelerator: str) -> str:
@@ -237,7 +237,7 @@ def default_precision(accelerator: str) -> str:
 
 
 def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | None:
-    """Makes the folder; gives the state to go on from, if any."""
+    """Make the folder; return the state to resume from, if any."""
     folder.mkdir(parents=True, exist_ok=True)
     state, described = folder / STATE, json.dumps(settings, default=str, indent=1) + "\n"
     if resume and state.exists():
@@ -260,7 +260,7 @@ def _drop(folder: Path, *patterns: str) -> None:
 
 
 def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Trainer:
-    """Makes Lightning's trainer.
+    """Make Lightning's trainer.
 
     Raises:
         ConfigError: it does not take the settings.
@@ -285,7 +285,7 @@ def _unusable(error: Exception) -> ConfigError:
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Keeps Lightning's hints to its developers out of a user's terminal."""
+    """Keep Lightning's hints to its developers out of a user's terminal."""
     with quiet("lightning.pytorch", "lightning.fabric"), warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"lightning\..*")
         yield
@@ -293,7 +293,7 @@ def quietly() -> Iterator[None]:
 
 @dataclass(eq=False)
 class History(Callback):
-    """Writes what was measured to a table, a row an epoch, and says it on standard error.
+    """A callback that writes what was measured to a table, a row an epoch, and prints it on standard error.
 
     Lightning's `CSVLogger` writes training and validation to rows of their own, and begins anew when it is resumed.
 
@@ -308,7 +308,7 @@ class History(Callback):
     rows: list[dict[str, float]] = field(default_factory=list)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Adds a row."""
+        """Add a row; reject a loss that is not finite."""
         measures, epoch = measured(trainer), trainer.current_epoch + 1
         rate = float(trainer.optimizers[0].param_groups[0]["lr"])
         self.rows.append({"epoch": epoch, "step": trainer.global_step, "learning_rate": rate, **measures})
@@ -325,22 +325,22 @@ class History(Callback):
                 )
 
     def state_dict(self) -> dict[str, Any]:
-        """Gives what `load_state_dict` takes."""
+        """Return what `load_state_dict` takes."""
         return {"rows": self.rows}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from an earlier state."""
+        """Resume from an earlier state."""
         self.rows = list(state["rows"])
 
 
 class WholeFiles(TorchCheckpointIO):
-    """Writes a Lightning checkpoint whole or not at all.
+    """A writer of Lightning checkpoints, each whole or not at all.
 
     Lightning's own way moves a temporary file, which is no one step where these are on another disk.
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Writes it beside its name, then renames it."""
+        """Write it next to its name, then rename it."""
         with replacing(Path(path), durable=False) as partial:
             torch.save(checkpoint, partial)
 

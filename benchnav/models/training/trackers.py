@@ -34,7 +34,7 @@ _LIGHTNING = {"logger": (lightning_loggers, Logger), "callbacks": (lightning_cal
 
 
 def make_loggers(given: Any, folder: Path | None) -> list[Logger]:
-    """Makes the loggers that a user asks for.
+    """Make the loggers that a user asks for.
 
     Args:
         given: one or a list, as text, mapping or object; False for none.
@@ -47,10 +47,10 @@ def make_loggers(given: Any, folder: Path | None) -> list[Logger]:
 
 
 def make_callbacks(given: Any) -> list[Callback]:
-    """Makes the callbacks that a user asks for.
+    """Make the callbacks that a user asks for.
 
     Raises:
-        ConfigError: as of `make_loggers`; or if what a callback does to weights or rates would be undone.
+        ConfigError: As in `make_loggers`, or if what a callback does to weights or rates would be undone.
     """
     callbacks = [_made("callbacks", item, None) for item in _listed(given)]
     for name, remedy in _UNDONE.items():
