@@ -112,7 +112,11 @@ def check_actions(actions: np.ndarray, acting: np.ndarray) -> None:
 
 
 def warn_of_default_world(world: str | Mapping[str, Any] | World) -> None:
-    """Warn of a world without stakes that was not chosen, neither by a preset nor by `immobile`."""
+    """Warn of a world without stakes that was not chosen.
+
+    A user who names the preset `paper`, sets `immobile` or passes a `World` has chosen it, and is not warned. A mapping
+    of other changes leaves the default preset unchosen, and warns.
+    """
     is_chosen = not {"preset", "immobile"}.isdisjoint(world) if isinstance(world, Mapping) else world != ""
     if not is_chosen:
         warn(

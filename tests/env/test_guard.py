@@ -136,6 +136,32 @@ def test_an_action_that_is_not_finite_raises_and_changes_nothing(
 
 
 @EACH
+def test_invalid_actions_leave_ended_sub_environments_as_they_are(dataset_path: Path, name: str) -> None:
+    ahead, still = np.tile(AHEAD, (3, 1)), np.zeros((3, 2), np.float32)
+    faulty = ahead.copy()
+    faulty[1, 0] = np.nan
+    seen = []
+    for actions in ((), (faulty, ahead[:2])):
+        vector = make_vector(name, dataset_path)
+        vector.reset(seed=0)
+        vector.step(ahead)
+        vector.reset(options={"reset_mask": np.array([False, True, True])})
+        for _ in range(2):
+            *_, truncated, _ = vector.step(still)
+        assert truncated.tolist() == [True, False, False]
+        for invalid in actions:
+            with pytest.raises(ConfigError):
+                vector.step(invalid)
+        seen += [vector.step(ahead), vector.step(ahead)]
+    for expected, step in zip(seen[:2], seen[2:], strict=True):
+        assert step[4]["map"].tolist() == expected[4]["map"].tolist()
+        for values, others in zip(step[1:4], expected[1:4], strict=True):
+            np.testing.assert_array_equal(values, others)
+        for key in expected[0]:
+            np.testing.assert_array_equal(step[0][key], expected[0][key])
+
+
+@EACH
 def test_a_step_after_the_end_raises_until_a_reset(dataset_path: Path, name: str) -> None:
     for changes in ({}, {"goal_radius_m": 500.0}):  # a time-out after 3 steps, and the goal after one
         env = make(name, dataset_path, **changes)
