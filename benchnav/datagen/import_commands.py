@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from benchnav import datagen
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.progress import show_progress
-from benchnav.datagen.dem.raster import MAX_MAPS, Rasters
+from benchnav.datagen.dem.raster import GroundOptions, Rasters
 
 if TYPE_CHECKING:
     from benchnav.datagen.dem.extent import GroundError
@@ -30,10 +30,6 @@ class ImportOptions:
         stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
         solvable: Keep only maps whose goal can be reached, and store the grid reference time.
         overwrite: Replace what is there.
-        dem_unit: Unit of elevations: m, ft, us-ft, or metres in a unit; if empty, what the raster declares.
-        origin: Where the first map's south-west corner lies, [X,Y] in the coordinate reference system of the maps.
-        max_maps: Most maps; ground of more stops the import, with a command that makes fewer.
-        coarse: Allow an elevation model whose cells are three times as wide as the maps', or wider.
     """
 
     out: str
@@ -42,14 +38,11 @@ class ImportOptions:
     stride: float | None = None
     solvable: bool = False
     overwrite: bool = False
-    dem_unit: str = ""
-    origin: tuple[float, float] | None = None
-    max_maps: int = MAX_MAPS
-    coarse: bool = False
 
 
 def import_dem(
     rasters: Rasters,
+    ground: GroundOptions,
     options: ImportOptions,
     dem: str,
     overrides: list[str],
@@ -62,13 +55,14 @@ def import_dem(
 
     Args:
         rasters: What there is of the ground beside its elevation.
+        ground: How the elevation model is read and cut.
         options: What is made of it.
         dem: Raster of elevations, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
         splits: Splits and their shares of the maps, such as train:0.7,valid:0.1,test/site:0.2; no two of them touch.
         scenario: Which of the recipe's scenarios lights the maps.
     """
-    made = _import(options, overrides, splits, dem=dem, rasters=rasters, scenario=scenario)
+    made = _import(options, overrides, splits, dem=dem, ground=ground, rasters=rasters, scenario=scenario)
     for split, entry in made.splits.items():
         left_out = entry["parts"][0]["source"]["left_out"]
         between = left_out.pop("between_splits")
@@ -81,6 +75,7 @@ def import_dem(
 
 
 def import_drives(
+    ground: GroundOptions,
     options: ImportOptions,
     drives: str,
     dem: str,
@@ -98,6 +93,7 @@ def import_drives(
     Traversability is measured over commanded speed, of each cell the mean. Rasters are as for import-dem.
 
     Args:
+        ground: How the elevation model is read and cut.
         options: What is made of them.
         drives: Log, a file .csv, .tsv, one of these with .gz, or .parquet, with the columns time_s, x_m and y_m (in the
             coordinate reference system of the elevation model) or longitude_deg and latitude_deg, commanded_m_s,
@@ -122,7 +118,7 @@ def import_drives(
     )
     rasters = Rasters(photo=photo, classes=classes, class_ids=class_ids, layer=layer, unlabelled=not classes)
     log = Drives(file=drives, least_speed=least_speed, speed=speed)
-    made = _import(options, overrides, splits, dem=dem, rasters=rasters, drives=log)
+    made = _import(options, overrides, splits, dem=dem, ground=ground, rasters=rasters, drives=log)
     sources = {split: entry["parts"][0]["source"] for split, entry in made.splits.items()}
     about = next(iter(sources.values()))["drives"]
     print(_sum_up(about))
@@ -203,8 +199,7 @@ def _import(
         chosen = replace(chosen, id=name)
     steps = import_maps(
         out=path, recipe=chosen, shares=read_shares(splits), stride_m=options.stride,
-        solvable=options.solvable, overwrite=options.overwrite, dem_unit=options.dem_unit, origin_m=options.origin,
-        max_maps=options.max_maps, coarse=options.coarse, announce=print, **settings,
+        solvable=options.solvable, overwrite=options.overwrite, announce=print, **settings,
     )  # fmt: skip
     try:
         show_progress(steps, "maps")
@@ -215,20 +210,19 @@ def _import(
 
 def _with_command(error: "GroundError", overrides: Sequence[str]) -> ConfigError:
     """Return an error whose message ends in the user's command with settings that fit the ground."""
-    if not error.changes and error.stride_m is None:
+    if not error.settings and error.stride_m is None:
         return ConfigError(f"{error.problem} Or take a larger raster.")
-    changed = {change.partition("=")[0] for change in error.changes}
-    kept = [text for text in overrides if text.partition("=")[0] not in changed]
-    words, rest = [], [word for word in sys.argv[1:] if word not in overrides]
-    while rest:
-        word = rest.pop(0)
+    unchanged = [text for text in overrides if text.partition("=")[0] not in error.changes]
+    words, remaining = [], [word for word in sys.argv[1:] if word not in overrides]
+    while remaining:
+        word = remaining.pop(0)
         if word == "--stride":
-            rest.pop(0)
+            remaining.pop(0)
         elif not word.startswith("--stride="):
             words.append(word)
     stride = [] if error.stride_m is None else ["--stride", f"{error.stride_m:.10g}"]
-    command = shlex.join([Path(sys.argv[0]).name, *words, *kept, *error.changes, *stride])
-    return ConfigError(f"{error.problem} Or fit the maps to the raster: {command}")
+    command = shlex.join([Path(sys.argv[0]).name, *words, *unchanged, *error.settings, *stride])
+    return ConfigError(error.advise(command))
 
 
 def _tell_unlabelled(made: "datagen.TerrainDataset", split: str) -> None:
