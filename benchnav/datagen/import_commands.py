@@ -62,14 +62,14 @@ def import_dem(
         splits: Splits and their shares of the maps, such as train:0.7,valid:0.1,test/site:0.2; no two of them touch.
         scenario: Which of the recipe's scenarios lights the maps.
     """
-    made = _import(options, overrides, splits, dem=dem, ground=ground, rasters=rasters, scenario=scenario)
-    for split, entry in made.splits.items():
+    dataset = _import(options, overrides, splits, dem=dem, ground=ground, rasters=rasters, scenario=scenario)
+    for split, entry in dataset.splits.items():
         left_out = entry["parts"][0]["source"]["left_out"]
         between = left_out.pop("between_splits")
         reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in left_out.items())
         print(f"  left out of {split}: {reasons}")
-        _tell_unlabelled(made, split)
-        _tell_groups(made, split)
+        _tell_unlabelled(dataset, split)
+        _tell_groups(dataset, split)
     if between:
         print(f"  left out between splits: {between}")
 
@@ -118,8 +118,8 @@ def import_drives(
     )
     rasters = Rasters(photo=photo, classes=classes, class_ids=class_ids, layer=layer, unlabelled=not classes)
     log = Drives(file=drives, least_speed=least_speed, speed=speed)
-    made = _import(options, overrides, splits, dem=dem, ground=ground, rasters=rasters, drives=log)
-    sources = {split: entry["parts"][0]["source"] for split, entry in made.splits.items()}
+    dataset = _import(options, overrides, splits, dem=dem, ground=ground, rasters=rasters, drives=log)
+    sources = {split: entry["parts"][0]["source"] for split, entry in dataset.splits.items()}
     about = next(iter(sources.values()))["drives"]
     print(_sum_up(about))
     for split, source in sources.items():
@@ -129,8 +129,8 @@ def import_drives(
         if reasons:
             print(f"  left out of {split}: {', '.join(reasons)}")
         if classes:
-            _tell_unlabelled(made, split)
-        _tell_groups(made, split)
+            _tell_unlabelled(dataset, split)
+        _tell_groups(dataset, split)
 
 
 def _sum_up(about: Mapping[str, Any]) -> str:
@@ -225,9 +225,9 @@ def _with_command(error: "GroundError", overrides: Sequence[str]) -> ConfigError
     return ConfigError(error.advise(command))
 
 
-def _tell_unlabelled(made: "datagen.TerrainDataset", split: str) -> None:
+def _tell_unlabelled(dataset: "datagen.TerrainDataset", split: str) -> None:
     """Print how many cells of maps have no class."""
-    entry, grid = made.splits[split], made.grid
+    entry, grid = dataset.splits[split], dataset.grid
     counts = [count for part in entry["parts"] for count in part["source"]["unlabelled"]]
     if any(counts):
         maps = sum(count > 0 for count in counts)
@@ -235,11 +235,11 @@ def _tell_unlabelled(made: "datagen.TerrainDataset", split: str) -> None:
         print(f"  unlabelled in {split}: {sum(counts)} of {cells} cells, on {maps} of {len(counts)} maps")
 
 
-def _tell_groups(made: "datagen.TerrainDataset", split: str) -> None:
+def _tell_groups(dataset: "datagen.TerrainDataset", split: str) -> None:
     """Says how many units of statistics there are where maps overlap."""
-    if "group" in made.fields:
-        groups = len(set(made.read(split, fields=["group"])["group"].tolist()))
+    if "group" in dataset.fields:
+        groups = len(set(dataset.read(split, fields=["group"])["group"].tolist()))
         print(
-            f"  {made.map_count(split)} maps of {split} overlap and form {groups} group(s), the statistical unit. "
+            f"  {dataset.map_count(split)} maps of {split} overlap and form {groups} group(s), the statistical unit. "
             "Leave --stride out of test splits, so that their maps do not overlap"
         )

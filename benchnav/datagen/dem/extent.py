@@ -230,16 +230,16 @@ class Extent:
 
     def _has_maps(self, laid: Laid, step: float) -> bool:
         """Return whether each split has a map whose elevation is whole; it reads until there is one."""
-        layer, wanted = self.raster.laid(self.frame(laid, step), [1], laid.how), set(self.shares)
+        layer, without_map = self.raster.laid(self.frame(laid, step), [1], laid.how), set(self.shares)
         (north, east), (height, width) = laid.tiling.stride, laid.tiling.shape
         with layer.warped:
             for run in laid.tiling.runs(1):
-                if run.split in wanted:
+                if run.split in without_map:
                     south, west = run.row * north, run.columns[0] * east
                     heights_m = layer.read(range(south, south + height), range(west, west + width))
                     if np.ptp(heights_m[:, 1:-1, 1:-1]) <= MAX_RELIEF_M:  # NaN is not
-                        wanted.remove(run.split)
-                if not wanted:
+                        without_map.remove(run.split)
+                if not without_map:
                     return True
         return False
 
