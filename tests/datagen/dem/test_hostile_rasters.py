@@ -252,7 +252,7 @@ CASES: dict[str, Case] = {
         fixes=("rio calc --profile nodata=-999 '(read 1)'",),
         maps=4,
     ),
-    "a sea below a cliff of 100 m": Case(np.maximum(step(12, 99.8) - 900, 0), profile={"nodata": -9999}),
+    "a sea below a cliff of 97 m": Case(holed(803) - np.float32(803), profile={"nodata": -9999}),
     "a map of -9999": Case(
         np.where(np.arange(100) < 32, -9999, plane(**HIGH, cell=0.5)), fixes=(f"{DECLARE}-9999",), maps=4
     ),
@@ -337,8 +337,8 @@ CASES: dict[str, Case] = {
     "an origin too far north-east": Case(words=corner(49, 34), fixes=("--origin '[",), maps=1),
     "an origin too far for three splits": Case(
         plane(140, 200, 0.5),
-        words=f"{corner(10, 60)} --stride 8 --splits train:0.6,valid:0.2,test/x:0.2",
-        fixes=("--origin '[",),
+        words=f"{corner(30, 60)} --stride 8 --splits train:0.6,valid:0.2,test/x:0.2",
+        fixes=(f"--origin '[{WEST + 20:.0f},{SOUTH + 54:.0f}]'",),
         maps=0,
     ),
     "an origin elsewhere": Case(words="--origin [0,0]", fixes=("Expected `origin` on `dem`",), maps=0),

@@ -33,13 +33,14 @@ def terrains(draw: Any) -> np.ndarray:
     return heights_m + draw(st.floats(-500, 8000))
 
 
-@given(terrains(), st.sampled_from(NATURAL), st.booleans(), st.booleans())
+@given(terrains(), st.sampled_from(NATURAL), st.booleans(), st.booleans(), st.sampled_from([0, 50]))
 def test_no_height_of_natural_ground_stands_for_missing(
-    heights_m: np.ndarray, value: float, is_low: bool, declares: bool
+    heights_m: np.ndarray, value: float, is_low: bool, declares: bool, cliff_m: float
 ) -> None:
-    """Also where the lowest or highest is at a common value, and level."""
+    """Also where the lowest or highest is at a common value, level, and below or above a cliff."""
     ends = [heights_m.min(), heights_m.max()]
     heights_m = heights_m - ends[not is_low] + value
+    heights_m += np.where(heights_m == value, 0, cliff_m if is_low else -cliff_m)
     if value < -500:  # below which level ground at a common value is taken for missing
         heights_m[0, 0] += 0.5
     for height_m in (heights_m.min(), heights_m.max()):
