@@ -476,6 +476,32 @@ def test_speed_of_positions_is_that_of_the_drive_forward_and_backward(fix_rows: 
     np.testing.assert_allclose(speed[steady], 0.75 * commanded[steady], rtol=0.02)
 
 
+@pytest.mark.parametrize(
+    ("rate", "fix_rows", "noise_m"), [(0.5, 1, 0.02), (1.0, 1, 0.0), (-1.0, 5, 0.0), (0.6, 10, 0.0)]
+)
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_speed_of_positions_is_that_along_an_arc(
+    rate: float, fix_rows: int, noise_m: float, direction: float
+) -> None:
+    """Oracle: the arc of a circle of 0.8 m at 1 rad/s, on which a fitted line is 10 % shorter."""
+    rows = drive(np.full(900, direction), np.full(900, 0.8), turn=rate)
+    rows[["x", "y"]] += noise_m * np.random.default_rng(0).standard_normal((900, 2))
+    rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+    log = compare_motion(log_of(rows, "positions"))
+    assert log.rows["traversability"][30:-30].mean() == pytest.approx(0.8, abs=0.01)
+    assert log.motion["pace"] == pytest.approx(1, abs=0.02)
+    assert len(compare_motion(log_of(rows)).rows) == 900
+
+
+@pytest.mark.parametrize("fix_rows", [10, 20])
+def test_a_turn_between_fixes_is_no_slide(fix_rows: int) -> None:
+    """A skid-steer robot turns by half a circle at 2 rad/s, slowly, which at 1 Hz looks like a reversal."""
+    turns = np.tile(np.repeat([0.0, 2.0], [84, 16]), 12)
+    rows = drive(np.where(turns > 0, 0.15, 1.0), np.full(1200, 0.8), turns)
+    rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+    assert (compare_motion(log_of(rows, "positions")).rows["traversability"] >= 0).all()
+
+
 @pytest.mark.parametrize("noise_m", [0.05, 0.1, 0.3])
 @pytest.mark.parametrize("fix_rows", [1, 10])
 def test_noise_does_not_turn_an_immobilised_robot(noise_m: float, fix_rows: int) -> None:
