@@ -18,6 +18,10 @@ from benchnav.datagen.dem.raster import GroundOptions, Rasters
 if TYPE_CHECKING:
     from benchnav.datagen.dem.extent import GroundError
 
+_MOST_BACK = 0.1  # of the rows (choice)
+_FEW_REVERSES = 0.01  # of the rows, which noise may show (choice)
+_COARSE_M = 0.2  # resolution that is too coarse for speeds of 2 s (choice)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImportOptions:
@@ -160,7 +164,33 @@ def _sum_up(about: Mapping[str, Any]) -> str:
             f"{about['standing']} rows have a position that stays the same under command, and no measured speed; the "
             "robot counts as immobilised there"
         )
-    return "\n  ".join(lines)
+    return "\n  ".join([*lines, *_doubts(about)])
+
+
+def _doubts(about: Mapping[str, Any]) -> list[str]:
+    """Say what of a log's positions may be wrong, in sentences."""
+    from benchnav.datagen.dem.drive_tracks import MAX_PERIOD_S
+
+    doubts, by_positions = [], about["speed"] == "positions"
+    below, period_s = about["beyond"]["below_0"], about["period_s"] or 0
+    if by_positions and below > _MOST_BACK * sum(about["used"].values()):
+        doubts.append(
+            f"more than {_MOST_BACK:.0%} of rows slide back by their positions, which looks wrong: a robot that "
+            "turned on the spot under its command looks the same. Log a command of 0 there"
+        )
+    if by_positions and period_s > MAX_PERIOD_S:
+        doubts.append(
+            f"positions come every {period_s:g} s, too seldom to distinguish sliding back from turning, so that "
+            "rows that slide back have λ above 0"
+        )
+    if not by_positions and about["reverses"] > _FEW_REVERSES * sum(about["used"].values()):
+        doubts.append(
+            f"positions reverse in {about['reverses']} rows in which measured_m_s does not: where the robot did not "
+            "turn round, it slid back, and speed has to be negative"
+        )
+    if about["resolution_m"] > _COARSE_M:
+        doubts.append(f"positions are multiples of {about['resolution_m']:g} m: log more decimals")
+    return doubts
 
 
 def _say_motion(about: Mapping[str, Any]) -> str:

@@ -78,6 +78,11 @@ def _period_s(fixes: pd.DataFrame) -> pd.Series:
     return fixes.groupby("drive")["time_s"].diff().groupby(drive).transform("median").fillna(0)
 
 
+def period_of(track: pd.DataFrame) -> float:
+    """Return the usual time between fixes of all drives, in seconds to three digits, 0 for single fixes."""
+    return float(f"{_period_s(_fixes(track)).median():.3g}")
+
+
 def _knots(track: pd.DataFrame) -> pd.DataFrame:
     """Return the rows at which a position is measured: the first of each fix and segment, and repeats of a long fix.
 
@@ -162,23 +167,24 @@ def find_jumped(track: pd.DataFrame, limit_m_s: float) -> pd.Index:
     return track.index[track["fix"].isin(np.concatenate(jumped))] if jumped else track.index[:0]
 
 
-def spans_of(track: pd.DataFrame, least_speed: float) -> pd.DataFrame:
-    """Sum up motion under command over spans of two seconds, or from fix to fix where those are more seldom.
+def spans_of(track: pd.DataFrame, least_speed: float, span_s: float = WINDOW_S) -> pd.DataFrame:
+    """Sum up motion under command over spans of a time, or from fix to fix where those are more seldom.
 
     Args:
         track: from `track_of`; with `z`, elevation in metres, too for slopes.
         least_speed: m/s, of the command of spans that count.
+        span_s: of a span.
 
     Returns:
         A table with a row for each span: `drive`, `duration_s`, `moved` (metres along the arc between positions),
-        `measured` and `commanded` (metres by speed), `is_moving`, `is_straight`, `is_steady` (one command), perhaps `slope_deg` along
-        the track.
+        `measured` and `commanded` (metres by speed), `is_moving`, `is_straight`, `is_steady` (one command), perhaps
+        `slope_deg` along the track.
     """
     knots = _knots(track)
     period_s = knots.groupby("segment")["time_s"].diff().median()
     times = track.groupby("drive")["time_s"]
     longest_s = (times.max() - times.min()).max()
-    window_s = np.fmax(WINDOW_S, period_s)
+    window_s = np.fmax(span_s, period_s)
     if 0 < longest_s < MIN_SPANS * window_s:  # perhaps hours: their ratio says so
         window_s = longest_s / MIN_SPANS
     sums = {}
