@@ -138,11 +138,11 @@ class EnvBatch:
             hold: sub-environments whose actions are not used, bool, shape [B]; none when not given.
 
         Raises:
-            ConfigError: If the actions are of another shape, or not finite.
+            ConfigError: If the actions are of another type or shape, or not finite.
             ResetNeeded: If no episode has begun.
         """
         self._current()
-        read, space = np.asarray(actions, np.float32), self.action_space
+        read, space = guard.read_numbers(actions), self.action_space
         expected = (len(self._map), *space.shape)
         expect(read.shape == expected, f"actions of shape {list(expected)}, got {list(read.shape)}.")
         guard.check_actions(read, np.ones(len(read), dtype=bool) if hold is None else ~hold)

@@ -120,7 +120,9 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Takes one time step; see the class."""
-        reward, terminated, truncated, met = self._batch.step(np.asarray(action)[None])
+        reward, terminated, truncated, met = self._batch.step(
+            guard.read_numbers(action, self.action_space.shape)[None]
+        )
         observation, info = _only(*self._batch.observe(met))
         return observation, reward.item(), terminated.item(), truncated.item(), info
 

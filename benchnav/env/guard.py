@@ -91,6 +91,28 @@ def read_options(options: Any, known: Collection[str], maps: int) -> dict[str, A
     return checked
 
 
+def read_numbers(actions: object, single_shape: tuple[int, ...] | None = None) -> np.ndarray:
+    """Return actions as float32.
+
+    Args:
+        actions: of a policy.
+        single_shape: of the action of a single environment, which is checked; None for several.
+
+    Raises:
+        ConfigError: If the actions are no real numbers, or the one action is of another shape.
+    """
+    try:
+        array = np.asarray(actions)
+        numbers = None if array.dtype.kind in "cUSmM" else array.astype(np.float32)
+    except (TypeError, ValueError):
+        numbers = None
+    if numbers is None:
+        raise ConfigError(f"Expected actions of real numbers, got {actions!r:.80}. Pass an array of floats.")
+    if single_shape is not None and numbers.shape != single_shape:
+        raise ConfigError(f"Expected an action of shape {list(single_shape)}, got {list(numbers.shape)}.")
+    return numbers
+
+
 def check_actions(actions: np.ndarray, acting: np.ndarray) -> None:
     """Raise where an action is NaN or infinite.
 

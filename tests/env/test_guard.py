@@ -111,6 +111,33 @@ def test_an_environment_with_a_checkpoint_is_pickled_in_the_midst_of_an_episode(
 # --- actions ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("action", "why"),
+    [
+        (np.zeros(3), r"an action of shape \[2\], got \[3\]"),
+        (np.zeros((1, 2)), r"an action of shape \[2\], got \[1, 2\]"),
+        (np.ones(2) + 1j, "real numbers, got array"),
+        ("ahead", "real numbers, got 'ahead'"),
+        (["1", "0"], "real numbers"),
+        ([1.0, [2.0]], "real numbers"),
+        (None, "an action of shape|real numbers"),
+    ],
+)
+@EACH
+def test_an_action_of_another_type_or_shape_raises(
+    dataset_path: Path, name: str, action: Any, why: str
+) -> None:
+    env, vector = make(name, dataset_path), make_vector(name, dataset_path)
+    env.reset(seed=0)
+    with pytest.raises(ConfigError, match=why) as caught:
+        env.step(action)
+    assert "\n" not in str(caught.value)
+    vector.reset(seed=0)
+    with pytest.raises(ConfigError, match=r"real numbers|of shape \[3, 2\]"):
+        vector.step(action)
+    env.step([1, 0])
+
+
 @EACH
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_an_action_that_is_not_finite_raises_and_changes_nothing(

@@ -201,12 +201,17 @@ class Survey:
             for odd, heights in zip((low, high), ends, strict=True):
                 if is_missing(self.layers["dem"].raster, odd, heights, self.cliff_m):
                     raise self._out_of_range("dem", "elevations of `dem` without stand-ins", low, high, odd)
-            gap_m, declared_m = zero_gap_m(ends[0]), widest_gap_m(self.cliff_m)
-            if gap_m > (declared_m if self.layers["dem"].raster.declares_missing else self.cliff_m):
-                expected = "elevations of `dem` without a gap next to 0"
-                is_sea = gap_m <= declared_m
-                other = "Where 0 is a height, declare a value that does not occur, such as -9999." * is_sea
-                raise self._out_of_range("dem", expected, low, high, 0, other)
+            declared_m = widest_gap_m(self.cliff_m)
+            for value in (0, -1):
+                gap_m = zero_gap_m(ends[0] - value)
+                if gap_m > (declared_m if self.layers["dem"].raster.declares_missing else self.cliff_m):
+                    expected = f"elevations of `dem` without a gap next to {value}"
+                    is_sea = gap_m <= declared_m
+                    other = (
+                        f"Where {value} is a height, declare a value that does not occur, such as -9999."
+                        * is_sea
+                    )
+                    raise self._out_of_range("dem", expected, low, high, value, other)
             own["dem"][:, ~rows[south:][: height + 2]] = np.nan
             own["dem"][:, :, ~columns[west:][: width + 2]] = np.nan
         if "traversability" in framed:

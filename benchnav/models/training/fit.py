@@ -190,6 +190,8 @@ def fit(
         except MisconfigurationException as error:
             raise _unusable(error) from error
         except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
+            if "conditioned on metric" in str(error):  # of a callback that monitors what is not measured
+                raise _unusable(error) from error
             if state is None or trainer.global_step:
                 raise
             raise CheckpointError(

@@ -212,6 +212,9 @@ CASES: dict[str, Case] = {
     "feet declared of metres": Case(edit=unit("US survey foot"), fixes=("--dem-unit m",)),
     # values that stand for missing
     "-9999": Case(holed(-9999), fixes=(f"{DECLARE}-9999",), maps=5),
+    "-1 in low ground": Case(
+        np.where(holed(np.nan) > 0, holed(0) - 940, -1), fixes=(f"{DECLARE}-1",), maps=5, atol=np.inf
+    ),
     "-999 in low ground": Case(holed(-999), fixes=(f"{DECLARE}-999",), maps=5),
     "-32768": Case(
         holed(-32768, "int16", 0.1), edit=scale(0.1), fixes=(f"{DECLARE}-32768",), maps=5, atol=0.5

@@ -96,6 +96,16 @@ def test_what_cannot_be_made_is_refused_before_training(trainer: dict[str, Any],
     assert "\n" not in str(refused.value)
 
 
+def test_a_metric_that_is_not_measured_is_named_with_those_that_are(
+    dataset: TerrainDataset, tmp_path: Path
+) -> None:
+    for kind in ("EarlyStopping", "ModelCheckpoint"):
+        stop = {"class_path": kind, "init_args": {"monitor": "valid/loss"}}
+        with pytest.raises(ConfigError, match=r"valid/loss.*valid_loss") as refused:
+            train(dataset, tmp_path / kind, callbacks=[stop])
+        assert "\n" not in str(refused.value)
+
+
 def test_a_missing_package_is_named_with_its_command() -> None:
     mlflow = pytest.importorskip("lightning.pytorch.loggers.mlflow")
     if mlflow._MLFLOW_AVAILABLE:
