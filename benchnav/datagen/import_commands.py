@@ -185,8 +185,8 @@ def _doubts(about: Mapping[str, Any]) -> list[str]:
         )
     if not by_positions and about["reverses"] > _FEW_REVERSES * sum(about["used"].values()):
         doubts.append(
-            f"positions reverse in {about['reverses']} rows in which measured_m_s does not: where the robot did not "
-            "turn round, it slid back, and speed has to be negative"
+            f"positions reverse in {about['reverses']} rows, measured_m_s never does: where the robot did not turn "
+            "round, it slid back, and speed has to be negative"
         )
     if about["resolution_m"] > _COARSE_M:
         doubts.append(f"positions are multiples of {about['resolution_m']:g} m: log more decimals")

@@ -105,10 +105,10 @@ def compare_motion(log: DriveLog) -> DriveLog:
     if settings.speed != "measured":
         positions = speed_of_positions(track_of(rows[~(jumped | implausible)]), settings.least_speed)
         positions = positions.reindex(rows.index).to_numpy()
-        reverses = (
-            (positions * commanded < 0) & (speed * commanded > 0) & (np.abs(speed) > settings.least_speed)
-        )
-        log = replace(log, motion={**log.motion, "reverses": int((reverses & ~slow).sum())})
+        is_driven = ~(slow | jumped | implausible)
+        is_signed = bool((is_driven & (speed * commanded < 0)).any())
+        reverses = is_driven & (positions * commanded < 0) & (np.abs(speed) > settings.least_speed)
+        log = replace(log, motion={**log.motion, "reverses": 0 if is_signed else int(reverses.sum())})
     if by_positions:
         speed = positions
         masks["missing"] = np.isnan(speed)
