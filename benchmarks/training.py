@@ -24,8 +24,9 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.training.best import KeepBest
 from benchnav.models.training.data import MapData
-from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
+from benchnav.models.training.fit import FitOptions, default_precision, fit
 
 EPOCHS = 2
 

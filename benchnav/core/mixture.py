@@ -339,17 +339,17 @@ class TraversabilityMixture(TraversabilityDistribution):
         narrowness, wide = 1 / (stds * math.sqrt(2)), torch.where(narrow, 0, weights)
         squared = torch.zeros_like(weights[0])
         total = wide.sum(0)
-        for node, share in _legendre(_CRPS_NODES):
+        for node, weight in _legendre(_CRPS_NODES):
             weighted = torch.erf_((node - means) * narrowness).mul_(wide)
-            squared += share * (0.5 * (total + weighted.sum(0))) ** 2
+            squared += weight * (0.5 * (total + weighted.sum(0))) ** 2
         squared = squared.double()
         for index in narrow.flatten(1).any(1).nonzero().flatten().tolist():
             later = torch.arange(len(stds), device=stds.device).view(-1, *[1] * squared.ndim) > index
-            own = stds[index]
-            wider = ~narrow | (stds > own) | ((stds == own) & later)
+            std = stds[index]
+            wider = ~narrow | (stds > std) | ((stds == std) & later)
             factor = torch.where(wider, 2 * weights, 0).double()
             factor[index] = weights[index]
-            added = _product_integral(means[index], own, means, stds, factor)
+            added = _product_integral(means[index], std, means, stds, factor)
             squared += torch.where(narrow[index], weights[index] * added, 0)
         return squared
 
@@ -409,10 +409,10 @@ def _expected_time(cells: Cells, floor: float, most: Tensor | float) -> Tensor:
     low, high = ((cells.means + way).clamp(min=floor).clamp(max=most) for way in (-reach, reach))
     start, span = low.log(), high.log() - low.log()
     time = 1 / most + (1 / high - 1 / most)
-    for node, share in _legendre(nodes):
+    for node, weight in _legendre(nodes):
         value = (start + span * node).exp_()
         below = torch.erf((value - cells.means).mul_(cells.scales)).add_(1)
-        time.addcmul_(span * (0.5 * share), below.div_(value))
+        time.addcmul_(span * (0.5 * weight), below.div_(value))
     return added(cells.weights * time).clamp(min=1)
 
 
@@ -446,10 +446,10 @@ def _product_integral(mean: Tensor, std: Tensor, means: Tensor, stds: Tensor, fa
     low, high = ((end - mean) / std for end in (0.0, 1.0))
     total = integral(torch.ones_like(mean)) * _probability(high)
     low, high = low.clamp(-_REACH, _REACH), high.clamp(-_REACH, _REACH)
-    for node, share in _legendre(_NARROW_NODES):
+    for node, weight in _legendre(_NARROW_NODES):
         z = low + (high - low) * node
         density = torch.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
-        total = total - share * (high - low) * density * integral(mean + std * z)
+        total = total - weight * (high - low) * density * integral(mean + std * z)
     return total
 
 

@@ -13,10 +13,14 @@ from typing import TYPE_CHECKING, Any, Literal
 from benchnav import datagen
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.progress import show_progress
-from benchnav.datagen.dem.raster import MAX_MAPS, Rasters
+from benchnav.datagen.dem.raster import GroundOptions, Rasters
 
 if TYPE_CHECKING:
     from benchnav.datagen.dem.extent import GroundError
+
+_MOST_BACK = 0.1  # of the rows (choice)
+_FEW_REVERSES = 0.01  # of the rows, which noise may show (choice)
+_COARSE_M = 0.2  # resolution that is too coarse for speeds of 2 s (choice)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,10 +34,6 @@ class ImportOptions:
         stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
         solvable: Keep only maps whose goal can be reached, and store the grid reference time.
         overwrite: Replace what is there.
-        dem_unit: Unit of elevations: m, ft, us-ft, or metres in a unit; if empty, what the raster declares.
-        origin: Where the first map's south-west corner lies, [X,Y] in the coordinate reference system of the maps.
-        max_maps: Most maps; ground of more stops the import, with a command that makes fewer.
-        coarse: Allow an elevation model whose cells are three times as wide as the maps', or wider.
     """
 
     out: str
@@ -42,14 +42,11 @@ class ImportOptions:
     stride: float | None = None
     solvable: bool = False
     overwrite: bool = False
-    dem_unit: str = ""
-    origin: tuple[float, float] | None = None
-    max_maps: int = MAX_MAPS
-    coarse: bool = False
 
 
 def import_dem(
     rasters: Rasters,
+    ground: GroundOptions,
     options: ImportOptions,
     dem: str,
     overrides: list[str],
@@ -62,25 +59,27 @@ def import_dem(
 
     Args:
         rasters: What there is of the ground beside its elevation.
+        ground: How the elevation model is read and cut.
         options: What is made of it.
         dem: Raster of elevations, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
         splits: Splits and their shares of the maps, such as train:0.7,valid:0.1,test/site:0.2; no two of them touch.
         scenario: Which of the recipe's scenarios lights the maps.
     """
-    made = _import(options, overrides, splits, dem=dem, rasters=rasters, scenario=scenario)
-    for split, entry in made.splits.items():
+    dataset = _import(options, overrides, splits, dem=dem, ground=ground, rasters=rasters, scenario=scenario)
+    for split, entry in dataset.splits.items():
         left_out = entry["parts"][0]["source"]["left_out"]
         between = left_out.pop("between_splits")
         reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in left_out.items())
         print(f"  left out of {split}: {reasons}")
-        _tell_unlabelled(made, split)
-        _tell_groups(made, split)
+        _tell_unlabelled(dataset, split)
+        _tell_groups(dataset, split)
     if between:
         print(f"  left out between splits: {between}")
 
 
 def import_drives(
+    ground: GroundOptions,
     options: ImportOptions,
     drives: str,
     dem: str,
@@ -98,6 +97,7 @@ def import_drives(
     Traversability is measured over commanded speed, of each cell the mean. Rasters are as for import-dem.
 
     Args:
+        ground: How the elevation model is read and cut.
         options: What is made of them.
         drives: Log, a file .csv, .tsv, one of these with .gz, or .parquet, with the columns time_s, x_m and y_m (in the
             coordinate reference system of the elevation model) or longitude_deg and latitude_deg, commanded_m_s,
@@ -122,8 +122,8 @@ def import_drives(
     )
     rasters = Rasters(photo=photo, classes=classes, class_ids=class_ids, layer=layer, unlabelled=not classes)
     log = Drives(file=drives, least_speed=least_speed, speed=speed)
-    made = _import(options, overrides, splits, dem=dem, rasters=rasters, drives=log)
-    sources = {split: entry["parts"][0]["source"] for split, entry in made.splits.items()}
+    dataset = _import(options, overrides, splits, dem=dem, ground=ground, rasters=rasters, drives=log)
+    sources = {split: entry["parts"][0]["source"] for split, entry in dataset.splits.items()}
     about = next(iter(sources.values()))["drives"]
     print(_sum_up(about))
     for split, source in sources.items():
@@ -133,8 +133,8 @@ def import_drives(
         if reasons:
             print(f"  left out of {split}: {', '.join(reasons)}")
         if classes:
-            _tell_unlabelled(made, split)
-        _tell_groups(made, split)
+            _tell_unlabelled(dataset, split)
+        _tell_groups(dataset, split)
 
 
 def _sum_up(about: Mapping[str, Any]) -> str:
@@ -164,7 +164,33 @@ def _sum_up(about: Mapping[str, Any]) -> str:
             f"{about['standing']} rows have a position that stays the same under command, and no measured speed; the "
             "robot counts as immobilised there"
         )
-    return "\n  ".join(lines)
+    return "\n  ".join([*lines, *_doubts(about)])
+
+
+def _doubts(about: Mapping[str, Any]) -> list[str]:
+    """Say what of a log's positions may be wrong, in sentences."""
+    from benchnav.datagen.dem.drive_tracks import MAX_PERIOD_S
+
+    doubts, by_positions = [], about["speed"] == "positions"
+    below, period_s = about["beyond"]["below_0"], about["period_s"] or 0
+    if by_positions and below > _MOST_BACK * sum(about["used"].values()):
+        doubts.append(
+            f"more than {_MOST_BACK:.0%} of rows slide back by their positions, which looks wrong: a robot that "
+            "turned on the spot under its command looks the same. Log a command of 0 there"
+        )
+    if by_positions and period_s > MAX_PERIOD_S:
+        doubts.append(
+            f"positions come every {period_s:g} s, too seldom to distinguish sliding back from turning, so that "
+            "rows that slide back have λ above 0"
+        )
+    if not by_positions and about["reverses"] > _FEW_REVERSES * sum(about["used"].values()):
+        doubts.append(
+            f"positions reverse in {about['reverses']} rows, measured_m_s never does: where the robot did not turn "
+            "round, it slid back, and speed has to be negative"
+        )
+    if about["resolution_m"] > _COARSE_M:
+        doubts.append(f"positions are multiples of {about['resolution_m']:g} m: log more decimals")
+    return doubts
 
 
 def _say_motion(about: Mapping[str, Any]) -> str:
@@ -203,8 +229,7 @@ def _import(
         chosen = replace(chosen, id=name)
     steps = import_maps(
         out=path, recipe=chosen, shares=read_shares(splits), stride_m=options.stride,
-        solvable=options.solvable, overwrite=options.overwrite, dem_unit=options.dem_unit, origin_m=options.origin,
-        max_maps=options.max_maps, coarse=options.coarse, announce=print, **settings,
+        solvable=options.solvable, overwrite=options.overwrite, announce=print, **settings,
     )  # fmt: skip
     try:
         show_progress(steps, "maps")
@@ -215,25 +240,24 @@ def _import(
 
 def _with_command(error: "GroundError", overrides: Sequence[str]) -> ConfigError:
     """Return an error whose message ends in the user's command with settings that fit the ground."""
-    if not error.changes and error.stride_m is None:
+    if not error.settings and error.stride_m is None:
         return ConfigError(f"{error.problem} Or take a larger raster.")
-    changed = {change.partition("=")[0] for change in error.changes}
-    kept = [text for text in overrides if text.partition("=")[0] not in changed]
-    words, rest = [], [word for word in sys.argv[1:] if word not in overrides]
-    while rest:
-        word = rest.pop(0)
+    unchanged = [text for text in overrides if text.partition("=")[0] not in error.changes]
+    words, remaining = [], [word for word in sys.argv[1:] if word not in overrides]
+    while remaining:
+        word = remaining.pop(0)
         if word == "--stride":
-            rest.pop(0)
+            remaining.pop(0)
         elif not word.startswith("--stride="):
             words.append(word)
     stride = [] if error.stride_m is None else ["--stride", f"{error.stride_m:.10g}"]
-    command = shlex.join([Path(sys.argv[0]).name, *words, *kept, *error.changes, *stride])
-    return ConfigError(f"{error.problem} Or fit the maps to the raster: {command}")
+    command = shlex.join([Path(sys.argv[0]).name, *words, *unchanged, *error.settings, *stride])
+    return ConfigError(error.advise(command))
 
 
-def _tell_unlabelled(made: "datagen.TerrainDataset", split: str) -> None:
+def _tell_unlabelled(dataset: "datagen.TerrainDataset", split: str) -> None:
     """Print how many cells of maps have no class."""
-    entry, grid = made.splits[split], made.grid
+    entry, grid = dataset.splits[split], dataset.grid
     counts = [count for part in entry["parts"] for count in part["source"]["unlabelled"]]
     if any(counts):
         maps = sum(count > 0 for count in counts)
@@ -241,11 +265,11 @@ def _tell_unlabelled(made: "datagen.TerrainDataset", split: str) -> None:
         print(f"  unlabelled in {split}: {sum(counts)} of {cells} cells, on {maps} of {len(counts)} maps")
 
 
-def _tell_groups(made: "datagen.TerrainDataset", split: str) -> None:
+def _tell_groups(dataset: "datagen.TerrainDataset", split: str) -> None:
     """Says how many units of statistics there are where maps overlap."""
-    if "group" in made.fields:
-        groups = len(set(made.read(split, fields=["group"])["group"].tolist()))
+    if "group" in dataset.fields:
+        groups = len(set(dataset.read(split, fields=["group"])["group"].tolist()))
         print(
-            f"  {made.map_count(split)} maps of {split} overlap and form {groups} group(s), the statistical unit. "
+            f"  {dataset.map_count(split)} maps of {split} overlap and form {groups} group(s), the statistical unit. "
             "Leave --stride out of test splits, so that their maps do not overlap"
         )

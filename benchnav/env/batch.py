@@ -130,32 +130,47 @@ class EnvBatch:
         self._simulation.exchange_(index, fresh)
         self._now = map_tensors(self._now, lambda now, new: now.index_copy(0, index, new), start)
 
+    def read_actions(self, actions: np.ndarray, hold: np.ndarray | None = None) -> np.ndarray:
+        """Return actions as float32, clipped to the bounds; nothing else is changed.
+
+        Args:
+            actions: shape [B, A].
+            hold: sub-environments whose actions are not used, bool, shape [B]; none when not given.
+
+        Raises:
+            ConfigError: If the actions are of another type or shape, or not finite.
+            ResetNeeded: If no episode has begun.
+        """
+        self._current()
+        read, space = guard.read_numbers(actions), self.action_space
+        expected = (len(self._map), *space.shape)
+        expect(read.shape == expected, f"actions of shape {list(expected)}, got {list(read.shape)}.")
+        guard.check_actions(read, np.ones(len(read), dtype=bool) if hold is None else ~hold)
+        return read.clip(space.low, space.high)
+
     def step(
         self, actions: np.ndarray, hold: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Takes a time step in all sub-environments but those on hold.
 
         Args:
-            actions: shape [B, A]; clipped to the bounds.
+            actions: shape [B, A], see `read_actions`.
             hold: bool, shape [B]; none when not given.
 
         Returns:
             Reward, terminated, truncated, and observed λ, each of shape [B].
 
         Raises:
-            ConfigError: the actions are of another shape, or not finite.
-            ResetNeeded: an episode has ended, or none has begun.
+            ConfigError: If the actions are of another shape, or not finite.
+            ResetNeeded: If an episode has ended, or none has begun.
         """
         guard.limit_threads()
+        commanded = self.read_actions(actions, hold)
         simulation, now = self._current()
-        given, space = np.asarray(actions, np.float32), self.action_space
-        expected = (len(self._map), *space.shape)
-        expect(given.shape == expected, f"actions of shape {list(expected)}, got {list(given.shape)}.")
         waits = torch.zeros_like(now.running) if hold is None else torch.from_numpy(hold)
-        guard.check_actions(given, ~waits.numpy())
         if bool((~now.running & ~waits).any()):
             raise gymnasium.error.ResetNeeded("The episode has ended. Call reset() before the next step().")
-        action = self._command(torch.from_numpy(given.clip(space.low, space.high)))
+        action = self._command(torch.from_numpy(commanded))
         moved, met = simulation.step(now, action)
         self._now = map_tensors(
             now, lambda old, new: torch.where(waits[:, None] if new.ndim > 1 else waits, old, new), moved

@@ -120,7 +120,9 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Takes one time step; see the class."""
-        reward, terminated, truncated, met = self._batch.step(np.asarray(action)[None])
+        reward, terminated, truncated, met = self._batch.step(
+            guard.read_numbers(action, self.action_space.shape)[None]
+        )
         observation, info = _only(*self._batch.observe(met))
         return observation, reward.item(), terminated.item(), truncated.item(), info
 
@@ -181,11 +183,12 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def step(
         self, actions: np.ndarray
     ) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Takes one time step, or starts anew where the last one ended an episode."""
-        again = self._ended
-        if again.any():
-            self._batch.reset(self._generators, again, None)
-        reward, terminated, truncated, met = self._batch.step(actions, hold=again)
+        """Take one time step, or reset where the last one ended an episode; raise before anything is reset."""
+        ended = self._ended
+        actions = self._batch.read_actions(actions, ended)
+        if ended.any():
+            self._batch.reset(self._generators, ended, None)
+        reward, terminated, truncated, met = self._batch.step(actions, hold=ended)
         self._ended = terminated | truncated
         observations, info = self._batch.observe(met)
         return observations, reward, terminated, truncated, info

@@ -59,7 +59,7 @@ def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
 
 
 def has_display() -> bool:
-    """Whether Matplotlib may find a display, or `MPLBACKEND` names a backend that needs none."""
+    """Return whether Matplotlib may find a display, or `MPLBACKEND` names a backend that needs none."""
     return sys.platform != "linux" or any(
         os.environ.get(name) for name in ("MPLBACKEND", "DISPLAY", "WAYLAND_DISPLAY")
     )
@@ -91,6 +91,28 @@ def read_options(options: Any, known: Collection[str], maps: int) -> dict[str, A
     return checked
 
 
+def read_numbers(actions: object, single_shape: tuple[int, ...] | None = None) -> np.ndarray:
+    """Return actions as float32.
+
+    Args:
+        actions: of a policy.
+        single_shape: of the action of a single environment, which is checked; None for several.
+
+    Raises:
+        ConfigError: If the actions are no real numbers, or the one action is of another shape.
+    """
+    try:
+        array = np.asarray(actions)
+        numbers = None if array.dtype.kind in "cUSmM" else array.astype(np.float32)
+    except (TypeError, ValueError):
+        numbers = None
+    if numbers is None:
+        raise ConfigError(f"Expected actions of real numbers, got {actions!r:.80}. Pass an array of floats.")
+    if single_shape is not None and numbers.shape != single_shape:
+        raise ConfigError(f"Expected an action of shape {list(single_shape)}, got {list(numbers.shape)}.")
+    return numbers
+
+
 def check_actions(actions: np.ndarray, acting: np.ndarray) -> None:
     """Raise where an action is NaN or infinite.
 
@@ -112,7 +134,11 @@ def check_actions(actions: np.ndarray, acting: np.ndarray) -> None:
 
 
 def warn_of_default_world(world: str | Mapping[str, Any] | World) -> None:
-    """Warn of a world without stakes that was not chosen, neither by a preset nor by `immobile`."""
+    """Warn of a world without stakes that was not chosen.
+
+    A user who names the preset `paper`, sets `immobile` or passes a `World` has chosen it, and is not warned. A mapping
+    of other changes leaves the default preset unchosen, and warns.
+    """
     is_chosen = not {"preset", "immobile"}.isdisjoint(world) if isinstance(world, Mapping) else world != ""
     if not is_chosen:
         warn(

@@ -7,6 +7,7 @@ in an evaluation what it was trained on. The robot's frame has x ahead and y to 
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -51,7 +52,10 @@ class View:
 
     def __post_init__(self) -> None:
         """Refuses crops that hold nothing, or not the robot."""
-        expect(self.cells >= 2, f"`crop_cells` of at least 2, got {self.cells}.")
+        is_count = isinstance(self.cells, int | np.integer) and not isinstance(self.cells, bool)
+        expect(
+            is_count and self.cells >= 2, f"`crop_cells` as a whole number of at least 2, got {self.cells!r}."
+        )
         expect(0 <= self.behind < 1, f"`crop_behind` in [0, 1), got {self.behind}.")
 
     def reach_m(self, grid: Grid) -> float:

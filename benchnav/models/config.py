@@ -83,7 +83,8 @@ class TrainingConfig:
             such as vegetation_m; and seen, 1 where a cell was seen and 0 elsewhere.
         jitter: largest relative change of brightness, contrast and saturation of a training map. At 0
             low light stays unseen in training.
-        symmetries: turn and mirror training maps at random; false for photos, whose light comes from one direction.
+        symmetries: turn and mirror training maps at random. Maps with a photo, whose light comes from one direction,
+            are turned only with `--symmetries true`; `--settings.symmetries true` does not turn them.
         crop: cells of a side of the squares that maps are cut to; 0 takes whole maps.
         learning_rate: highest rate of the one-cycle schedule.
         weight_decay: of AdamW.

@@ -306,9 +306,10 @@ def test_the_most_likely_class_of_components_that_are_none_is_refused() -> None:
         replace(random_mixture(), group=(0, 1, 2))
 
 
-WEIGHTS = 0.3, 0.7
-# Two components: where both are wide, one is narrow, both are, and one is a point.
-PAIRS = [
+WEIGHTS = {2: (0.3, 0.7), 4: (0.1, 0.4, 0.2, 0.3)}
+Components = tuple[tuple[float, float], ...]  # means and standard deviations
+# Where all are wide, one is narrow, several are, and one is a point.
+COMPONENTS: list[Components] = [
     ((0.3, 0.04), (0.6, 0.2)),
     ((0.497, 0.0735), (0.01, 0.001)),
     ((0.4, 0.001), (0.41, 0.003)),
@@ -318,13 +319,15 @@ PAIRS = [
     ((-0.01, 0.01), (1.002, 0.001)),
     ((0.5, 0.002), (0.5, 0.002)),
     ((0.25, 1e-9), (0.7, 0.15)),
+    ((0.3, 0.004), (0.31, 0.1), (0.29, 0.02), (0.8, 0.001)),
 ]
 
 
-def exactly(pair: tuple[tuple[float, float], ...], work: str, at: float) -> float:
+def exactly(components: Components, work: str, at: float) -> float:
     """`expected_time` with a floor, or `crps` of an observation, by quadrature with 30 digits."""
     with mpmath.workdps(30):
-        parts = [(weight, mpmath.mpf(m), mpmath.mpf(s)) for weight, (m, s) in zip(WEIGHTS, pair, strict=True)]
+        weights = WEIGHTS[len(components)]
+        parts = [(w, mpmath.mpf(m), mpmath.mpf(s)) for w, (m, s) in zip(weights, components, strict=True)]
 
         def cdf(x: Any) -> Any:
             return sum(weight * mpmath.ncdf(x, m, s) for weight, m, s in parts)
@@ -342,27 +345,38 @@ def exactly(pair: tuple[tuple[float, float], ...], work: str, at: float) -> floa
         return float(sum(mpmath.quad(squared, [a, b]) for a, b in pairwise(edges)))
 
 
-def pair_of(pair: tuple[tuple[float, float], ...]) -> TraversabilityMixture:
-    values = WEIGHTS, *zip(*pair, strict=True)
-    weights, means, stds = (torch.tensor(each, dtype=torch.float64).view(2, 1, 1) for each in values)
+def mixture_of(components: Components, dtype: torch.dtype = torch.float64) -> TraversabilityMixture:
+    values = WEIGHTS[len(components)], *zip(*components, strict=True)
+    weights, means, stds = (torch.tensor(row, dtype=dtype).view(-1, 1, 1) for row in values)
     return TraversabilityMixture(weights, means, stds)
 
 
-@pytest.mark.parametrize("pair", PAIRS)
-def test_the_expected_time_is_exact_to_a_millionth_for_small_floors(
-    pair: tuple[tuple[float, float], ...],
-) -> None:
+@pytest.mark.parametrize("components", COMPONENTS)
+def test_the_expected_time_is_exact_to_a_millionth_for_small_floors(components: Components) -> None:
     for floor in (0.001, 0.01, 0.05, 0.5):
-        wanted = exactly(pair, "expected_time", floor)
-        assert pair_of(pair).expected_time(floor).item() == pytest.approx(wanted, abs=1e-6, rel=0)
+        expected = exactly(components, "expected_time", floor)
+        time = mixture_of(components).expected_time(floor).item()
+        assert time == pytest.approx(expected, abs=1e-6, rel=0)
 
 
-@pytest.mark.parametrize("pair", PAIRS)
-def test_the_crps_is_exact_for_narrow_components(pair: tuple[tuple[float, float], ...]) -> None:
+@pytest.mark.parametrize("components", COMPONENTS)
+def test_the_crps_is_exact_for_narrow_components(components: Components) -> None:
     for observed in (0.0, 0.4, 0.997):
-        wanted = exactly(pair, "crps", observed)
-        found = pair_of(pair).crps(torch.tensor([[observed]], dtype=torch.float64)).item()
-        assert found == pytest.approx(wanted, abs=1e-5, rel=0)
+        expected = exactly(components, "crps", observed)
+        score = mixture_of(components).crps(torch.tensor([[observed]], dtype=torch.float64)).item()
+        assert score == pytest.approx(expected, abs=1e-5, rel=0)
+
+
+def test_float32_parameters_lose_no_more_than_their_rounding() -> None:
+    components, eps = COMPONENTS[-1], torch.finfo(torch.float32).eps
+    rounded = mixture_of(components, torch.float32)
+    read = tuple(zip(rounded.means.flatten().tolist(), rounded.stds.flatten().tolist(), strict=True))
+    expected = exactly(read, "expected_time", 0.001)
+    time = rounded.expected_time(0.001)
+    assert time.dtype == torch.float32
+    assert time.item() == pytest.approx(expected, abs=1e-6, rel=2 * eps)
+    score = rounded.crps(torch.tensor([[0.4]])).item()
+    assert score == pytest.approx(exactly(read, "crps", 0.4), abs=1e-5, rel=0)
 
 
 @pytest.mark.parametrize("floor", [0.02, 0.05, 0.5, 1.0])
@@ -383,7 +397,7 @@ def test_the_expected_time_is_that_of_an_adaptive_integrator(floor: float) -> No
             assert single(mean, std).expected_time(floor).item() == pytest.approx(time, rel=1e-6)
 
 
-@pytest.mark.parametrize("floor", [0.02, 0.3, 1.0])
+@pytest.mark.parametrize("floor", [0.001, 0.02, 0.3, 1.0])
 @pytest.mark.parametrize("level", [0.3, 0.8, 0.99])
 def test_the_tail_of_the_time_is_that_of_an_adaptive_integrator_over_ranks(
     level: float, floor: float

@@ -111,6 +111,33 @@ def test_an_environment_with_a_checkpoint_is_pickled_in_the_midst_of_an_episode(
 # --- actions ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("action", "why"),
+    [
+        (np.zeros(3), r"an action of shape \[2\], got \[3\]"),
+        (np.zeros((1, 2)), r"an action of shape \[2\], got \[1, 2\]"),
+        (np.ones(2) + 1j, "real numbers, got array"),
+        ("ahead", "real numbers, got 'ahead'"),
+        (["1", "0"], "real numbers"),
+        ([1.0, [2.0]], "real numbers"),
+        (None, "an action of shape|real numbers"),
+    ],
+)
+@EACH
+def test_an_action_of_another_type_or_shape_raises(
+    dataset_path: Path, name: str, action: Any, why: str
+) -> None:
+    env, vector = make(name, dataset_path), make_vector(name, dataset_path)
+    env.reset(seed=0)
+    with pytest.raises(ConfigError, match=why) as caught:
+        env.step(action)
+    assert "\n" not in str(caught.value)
+    vector.reset(seed=0)
+    with pytest.raises(ConfigError, match=r"real numbers|of shape \[3, 2\]"):
+        vector.step(action)
+    env.step([1, 0])
+
+
 @EACH
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_an_action_that_is_not_finite_raises_and_changes_nothing(
@@ -133,6 +160,32 @@ def test_an_action_that_is_not_finite_raises_and_changes_nothing(
         *_, truncated, _ = vector.step(np.tile(AHEAD, (3, 1)))
     assert truncated.all()
     vector.step(np.full((3, 2), value, np.float32))
+
+
+@EACH
+def test_invalid_actions_leave_ended_sub_environments_as_they_are(dataset_path: Path, name: str) -> None:
+    ahead, still = np.tile(AHEAD, (3, 1)), np.zeros((3, 2), np.float32)
+    faulty = ahead.copy()
+    faulty[1, 0] = np.nan
+    seen = []
+    for actions in ((), (faulty, ahead[:2])):
+        vector = make_vector(name, dataset_path)
+        vector.reset(seed=0)
+        vector.step(ahead)
+        vector.reset(options={"reset_mask": np.array([False, True, True])})
+        for _ in range(2):
+            *_, truncated, _ = vector.step(still)
+        assert truncated.tolist() == [True, False, False]
+        for invalid in actions:
+            with pytest.raises(ConfigError):
+                vector.step(invalid)
+        seen += [vector.step(ahead), vector.step(ahead)]
+    for expected, step in zip(seen[:2], seen[2:], strict=True):
+        assert step[4]["map"].tolist() == expected[4]["map"].tolist()
+        for values, others in zip(step[1:4], expected[1:4], strict=True):
+            np.testing.assert_array_equal(values, others)
+        for key in expected[0]:
+            np.testing.assert_array_equal(step[0][key], expected[0][key])
 
 
 @EACH

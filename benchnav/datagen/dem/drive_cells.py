@@ -200,6 +200,9 @@ def describe_drives(log: DriveLog, splits: Sequence[str]) -> Json:
         "pace": log.motion.get("pace"),
         "commanded_pace": log.motion.get("commanded_pace"),
         "standing": log.motion.get("standing", 0),
+        "reverses": log.motion.get("reverses", 0),
+        "period_s": log.motion.get("period_s"),
+        "resolution_m": log.motion.get("resolution_m", 0),
     }
 
 

@@ -24,6 +24,7 @@ LEAST_SPEED_M_S = 0.1
 MOST_SPEED_M_S = 15.0  # off-road robots are slower, unless they are logged in km/h or cm/s
 TOP_RATIO = 1.5  # of a speed to the top command, which no robot exceeds (choice)
 _MOVES = ("commanded_m_s", "measured_m_s")
+_METRES_A_DEGREE = 111_320  # of latitude
 OVER_SPEED = 1.2  # of the command; noise and downhill driving seldom exceed it (choice)
 PLACES = {"crs": ("x_m", "y_m"), "WGS 84": ("longitude_deg", "latitude_deg")}
 
@@ -83,7 +84,7 @@ class DriveLog:
         rows: a table of N rows: `x`, `y`, `time_s`, `commanded` and `speed` (m/s, signed), `drive` (index into
             `names`) and, once speeds are compared with positions, `traversability` (speed over commanded).
         left_out: rows that are not, by reason.
-        motion: what the comparison of positions with speeds gave.
+        motion: what the comparison of positions with speeds gave, and the resolution of positions, 0 if it is fine.
     """
 
     settings: Drives
@@ -111,11 +112,12 @@ class DriveLog:
         """
         left_out = {**self.left_out, reason: int(which.sum())}
         if which.all():
-            several = [f"{count} {REASONS[name]}" for name, count in left_out.items() if count] or ["none"]
+            several = [f"{count} {REASONS[name]}" for name, count in left_out.items() if count]
+            why = f": of {sum(left_out.values())}, {', '.join(several)}" if several else " below the header"
+            speeds = "commanded speed" if self.settings.speed == "positions" else "both speeds"
             raise DatasetError(
-                f"Expected rows of drives to learn from in {self.settings.file}, got none: of "
-                f"{sum(left_out.values())}, {', '.join(several)}. Log time, position and both speeds on "
-                "the move."
+                f"Expected rows of drives to learn from in {self.settings.file}, got none{why}. Log time, position and "
+                f"{speeds} on the move."
             )
         rows = self.rows[~which].reset_index(drop=True)
         return replace(self, rows=rows, left_out=left_out)
@@ -147,14 +149,17 @@ def read_drives(drives: Drives) -> DriveLog:
     remedy = "Swap `longitude_deg` and `latitude_deg`, or convert to degrees."
     values = {}
     for name in columns:
-        values[name] = read_numbers(rows, name, path, limits.get(name, (-np.inf, np.inf)), remedy)
+        number = "Convert the column to numbers."
+        if name == "time_s":
+            number = "Convert clock times to seconds, such as those since the start of the drive."
+        values[name] = read_numbers(rows, name, path, limits.get(name, (-np.inf, np.inf)), remedy, number)
     for name in moves:
         moving = np.abs(values[name])
         usual = pd.Series(moving[moving >= drives.least_speed]).median()
         if usual > MOST_SPEED_M_S:
             raise DatasetError(
                 f"Expected `{name}` in m/s in {path}, got a median of {usual:.4g} while moving, which looks like "
-                "another unit. Divide km/h by 3.6 and cm/s by 100."
+                "another unit. Divide km/h by 3.6, cm/s by 100 and mm/s by 1000."
             )
     names, drive = np.array([path.name]), np.zeros(len(rows), dtype=np.int64)
     if "drive" in rows:
@@ -178,5 +183,17 @@ def read_drives(drives: Drives) -> DriveLog:
                 "drive": drive,
             }
         ),
+        motion={"resolution_m": _resolution_m(x, y, is_geographic=kind == "WGS 84")},
     )
     return log.without("missing", np.isnan(np.stack([*values.values()])).any(axis=0))
+
+
+def _resolution_m(x: ndarray, y: ndarray, *, is_geographic: bool) -> float:
+    """Return the step of which all positions are multiples, to three digits, 0 below some centimetres."""
+    most = 6 if is_geographic else 2
+    for decimals in range(most):
+        scaled = np.stack([x, y]) * 10.0**decimals
+        scaled = scaled[:, np.isfinite(scaled).all(axis=0)]
+        if scaled.size and (np.abs(scaled - np.rint(scaled)) < 1e-3).all():
+            return float(f"{10.0**-decimals * (_METRES_A_DEGREE if is_geographic else 1):.3g}")
+    return 0.0

@@ -18,32 +18,28 @@ from benchnav.core.errors import DatasetError
 from benchnav.datagen.dem.drive_log import MOST_SPEED_M_S, OVER_SPEED, REASONS, TOP_RATIO, DriveLog
 from benchnav.datagen.dem.drive_tracks import (
     MIN_SPANS,
+    WINDOW_S,
     find_jumped,
     find_restarted,
     find_standing,
+    period_of,
     spans_of,
     speed_of_positions,
     track_of,
     velocity_of,
 )
+from benchnav.datagen.dem.drive_units import is_coarse, median_ratio, no_unit, unit_of, unit_of_command
 
 # Thresholds that are someone's choice are marked (choice).
 PACE_LIMITS = (0.85, 1.15)  # of the distance of positions to that of the measured speed (choice)
 _TOP_QUANTILE = 0.99  # of commands, since single ones may be wrong (choice)
 MAX_AGAINST = 0.05  # of the rows, with a measured speed of the other sign (choice)
 MAX_FAULTY = 0.1  # of the rows, with faults of one kind (choice)
-_UNIT_TOLERANCE = 0.08  # of a ratio to that of a unit (choice)
-_PLAUSIBLE = (0.05, 1.3)  # λ of a whole log (choice)
 _STEADY = 0.02  # spread of measured over commanded speed that no terrain leaves (choice)
 _MIN_WHEEL_SPANS = 10  # 20 s (choice)
 _WHEEL_PACE = 0.05  # that positions may differ from wheels that equal the command (choice)
 _VARIED_SLOPE_DEG = 10.0  # from the 5 % to the 95 % quantile along a track, so that λ varies too (choice)
 _STEEPEST = 1.0  # of a track; steeper cells of a surface model are trees and walls (choice)
-
-# The ratio of positions to measured speed that each unit gives.
-_SPEEDS = {"knots": 0.5144, "km/h": 1 / 3.6, "mph": 1 / 2.237, "ft/s": 1 / 3.281, "cm/s": 0.01}
-_TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "minutes": 60.0, "hours": 3600.0}
-_LENGTHS = {"feet": 3.281, "centimetres": 100.0, "millimetres": 1000.0}
 
 _REMEDIES = {
     "restarted": "Sort the rows by time, or name each session in a column `drive`.",
@@ -91,18 +87,30 @@ def compare_motion(log: DriveLog) -> DriveLog:
     is_jumpy = jumped.mean() > MAX_FAULTY
     # Where most rows are at fault, it is by a unit, which spans of all of them show.
     is_faulty = (jumped & (not is_jumpy)) | (implausible & (implausible.mean() <= MAX_FAULTY))
-    spans = spans_of(track_of(rows[~is_faulty]), settings.least_speed)
-    log = replace(log, motion=_sum_up(spans) | {"standing": int(standing["is_unmeasured"].sum())})
-    _check_pace(log, spans, is_jumpy=is_jumpy)
+    track = track_of(rows[~is_faulty])
+    spans = spans_of(track, settings.least_speed)
+    motion = _sum_up(spans) | {"period_s": period_of(track), "standing": int(standing["is_unmeasured"].sum())}
+    log = replace(log, motion={**log.motion, **motion})
+    _check_pace(log, rows[~is_faulty], spans, is_jumpy=is_jumpy)
     masks, remedies = {"jumped": jumped}, _remedies_of_scale(log)
+    if is_coarse(spans, _resolution_m(log)):
+        remedies["jumped"] = (
+            f"Log positions with more decimals: they are multiples of {_resolution_m(log):.2g} m."
+        )
     if is_compared:
         off_pace, remedies["off_pace"] = _off_pace(log, spans)
         _check_sign(log, ~(slow | off_pace))
         masks["off_pace"] = off_pace
     masks |= {"slow": slow, "implausible": implausible}
-    if by_positions:
+    if settings.speed != "measured":
         positions = speed_of_positions(track_of(rows[~(jumped | implausible)]), settings.least_speed)
-        speed = positions.reindex(rows.index).to_numpy()
+        positions = positions.reindex(rows.index).to_numpy()
+        is_driven = ~(slow | jumped | implausible)
+        is_signed = bool((is_driven & (speed * commanded < 0)).any())
+        reverses = is_driven & (positions * commanded < 0) & (np.abs(speed) > settings.least_speed)
+        log = replace(log, motion={**log.motion, "reverses": 0 if is_signed else int(reverses.sum())})
+    if by_positions:
+        speed = positions
         masks["missing"] = np.isnan(speed)
     log = _leave_out(replace(log, rows=rows.assign(speed=speed)), masks, remedies)
     return replace(log, rows=log.rows.assign(traversability=log.rows["speed"] / log.rows["commanded"]))
@@ -122,7 +130,7 @@ def compare_slopes(log: DriveLog, elevation_m: ndarray) -> DriveLog:
     """
     track = track_of(log.rows.assign(z=elevation_m))
     if log.settings.speed == "":
-        _check_wheels(log, spans_of(track, log.settings.least_speed))
+        _check_wheels(log, track)
     if log.settings.speed != "positions":
         return log
     climb = velocity_of(track, ["z"])["z"].reindex(log.rows.index).fillna(0.0)
@@ -179,26 +187,23 @@ def _remedies_of_scale(log: DriveLog) -> dict[str, str]:
     return {"jumped": remedy, "implausible": remedy}
 
 
-def _median_ratio(spans: pd.DataFrame, of: str) -> float:
-    """Return the median of the distance of positions over that by a speed, in straight spans where they suffice."""
-    spans = spans[spans["is_moving"] & spans[of].notna()]
-    straight = spans[spans["is_straight"]]
-    chosen = straight if len(straight) >= MIN_SPANS else spans
-    return float((chosen["moved"] / chosen[of]).median())
-
-
 def _sum_up(spans: pd.DataFrame) -> dict[str, float | None]:
     """Return the ratios of positions to both speeds, to three digits; None where they are unknown."""
-    ratios = {"pace": _median_ratio(spans, "measured"), "commanded_pace": _median_ratio(spans, "commanded")}
+    ratios = {"pace": median_ratio(spans, "measured"), "commanded_pace": median_ratio(spans, "commanded")}
     return {name: float(f"{ratio:.3g}") if np.isfinite(ratio) else None for name, ratio in ratios.items()}
 
 
-def _check_pace(log: DriveLog, spans: pd.DataFrame, *, is_jumpy: bool) -> None:
+def _resolution_m(log: DriveLog) -> float:
+    return float(log.motion.get("resolution_m", 0.0))
+
+
+def _check_pace(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame, *, is_jumpy: bool) -> None:
     """Reject a log whose positions and measured speed disagree, and name the unit that explains it.
 
     Args:
         log: the log.
-        spans: of it.
+        rows: of it, without faulty ones.
+        spans: of them.
         is_jumpy: whether positions jump so often that only the ratio of a unit is sure.
     """
     path, speed = log.settings.file, log.settings.speed
@@ -209,13 +214,18 @@ def _check_pace(log: DriveLog, spans: pd.DataFrame, *, is_jumpy: bool) -> None:
             f"drives of up to {(times.max() - times.min()).max():.3g} s. Log `time_s` in seconds, or pass --speed "
             "measured."
         )
-    ratio = _median_ratio(spans, "measured")
+    if speed == "positions" and spans["measured"].isna().all():
+        _check_command(log, rows, spans)
+    ratio = median_ratio(spans, "measured")
     if speed == "measured" or math.isnan(ratio) or PACE_LIMITS[0] <= ratio <= PACE_LIMITS[1]:
         return
-    unit, remedy = _unit_of(spans, log.is_geographic)
-    if unit in _TIMES or unit in _LENGTHS:
+    unit, remedy, is_of_positions = _unit_of(log, rows, spans)
+    if speed == "positions" and not is_of_positions:
+        _check_command(log, rows, spans)
+        return
+    if is_of_positions:
         remedy = f"{remedy}."
-    elif speed == "positions" or (is_jumpy and not unit):
+    elif is_jumpy and not unit:
         return
     else:
         if _wheel_ratios(spans)[1]:
@@ -223,48 +233,25 @@ def _check_pace(log: DriveLog, spans: pd.DataFrame, *, is_jumpy: bool) -> None:
         remedy += ", or pass --speed positions; pass --speed measured if measured_m_s is right and positions are not."
     raise DatasetError(
         f"Expected positions to move {PACE_LIMITS[0]:g} to {PACE_LIMITS[1]:g} times as far as `measured_m_s` says, got "
-        f"{ratio:.3g} times in {path}, which looks like {unit or _no_unit(spans)}. {remedy}"
+        f"{ratio:.3g} times in {path}, which looks like {unit or no_unit(spans, _resolution_m(log))}. {remedy}"
     )
 
 
-def _is_winding(spans: pd.DataFrame) -> bool:
-    """Return whether positions move less far than measured because the track winds between them."""
-    n_straight = int((spans["is_moving"] & spans["is_straight"]).sum())
-    return n_straight < min(MIN_SPANS, len(spans)) and _median_ratio(spans, "measured") < 1
+def _unit_of(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame) -> tuple[str, str, bool]:
+    """Return the unit of rows of a log, see `unit_of`."""
+    least_speed = log.settings.least_speed
+    return unit_of(rows, spans, least_speed, is_geographic=log.is_geographic, resolution_m=_resolution_m(log))
 
 
-def _no_unit(spans: pd.DataFrame) -> str:
-    """Return the words of messages where no unit is named."""
-    return "no unit that is known" + ", since the track winds between positions" * _is_winding(spans)
-
-
-def _unit_of(spans: pd.DataFrame, is_geographic: bool) -> tuple[str, str]:
-    """Name the unit that the ratio of positions to measured speed looks like, and the remedy.
-
-    Args:
-        spans: of a log.
-        is_geographic: whether positions are angles, which have no other unit.
-
-    Returns:
-        The unit, empty if none fits, and the remedy without a full stop.
-    """
-    ratio, by_command = (_median_ratio(spans, name) for name in ("measured", "commanded"))
-    remedy = "Bring speeds to m/s, times to s and positions to m"
-    if _is_winding(spans):
-        return "", f"{remedy}, log positions more often"
-    others = {name: (value, "`time_s`", value) for name, value in _TIMES.items()}
-    if not is_geographic:
-        others |= {name: (value, "`x_m` and `y_m`", 1 / value) for name, value in _LENGTHS.items()}
-    # Times and positions are off against the command too, a measured speed is not.
-    is_plausible = _PLAUSIBLE[0] <= by_command <= _PLAUSIBLE[1]
-    for name, (value, column, factor) in others.items():
-        if abs(ratio / value - 1) <= _UNIT_TOLERANCE and not is_plausible:
-            return name, f"Multiply {column} by {factor:.4g}"
-    for name, value in sorted(_SPEEDS.items(), key=lambda item: abs(ratio / item[1] - 1)):
-        if abs(ratio / value - 1) <= _UNIT_TOLERANCE:
-            also = f" (`commanded_m_s` too, if it is in {name})"
-            return name, f"Multiply `measured_m_s` by {value:.4g}{also}"
-    return "", remedy
+def _check_command(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame) -> None:
+    """Reject positions that move by a fraction of the command that no λ is, where nothing was measured."""
+    of_command = unit_of_command(rows, spans, log.settings.least_speed, is_geographic=log.is_geographic)
+    if of_command is not None:
+        ratio, unit, remedy = of_command
+        raise DatasetError(
+            f"Expected positions in metres and times in seconds in {log.settings.file}, got positions that move "
+            f"{ratio:.3g} times as far as `commanded_m_s` says, which looks like {unit}. {remedy}."
+        )
 
 
 def _check_sign(log: DriveLog, is_driven: ndarray) -> None:
@@ -294,17 +281,19 @@ def _off_pace(log: DriveLog, spans: pd.DataFrame) -> tuple[ndarray, str]:
     """
     is_off = np.zeros(len(log.names), dtype=bool)
     for drive, of_drive in spans.groupby("drive"):
-        ratio = _median_ratio(of_drive, "measured")
+        ratio = median_ratio(of_drive, "measured")
         is_known = of_drive["is_moving"].sum() >= MIN_SPANS and not math.isnan(ratio)
         is_off[int(drive)] = is_known and not PACE_LIMITS[0] <= ratio <= PACE_LIMITS[1]
     off_spans = spans[is_off[spans["drive"].to_numpy(int)]]
-    unit, remedy = _unit_of(off_spans, log.is_geographic)
+    off_rows = log.rows[is_off[log.rows["drive"]]]
+    unit, remedy, _ = _unit_of(log, off_rows, off_spans) if len(off_rows) else ("", "", False)
     names = np.array(log.names)[is_off]
     which = ", ".join(names[:5]) + ", …" * (len(names) > 5)
-    ratio = _median_ratio(off_spans, "measured")
+    ratio = median_ratio(off_spans, "measured")
     remedy = (
         f"Positions move {ratio:.3g} times as far as `measured_m_s` says, which looks like "
-        f"{unit or _no_unit(off_spans)} in {which}. {remedy} there, leave those drives out, or pass --speed positions."
+        f"{unit or no_unit(off_spans, _resolution_m(log))} in {which}. {remedy} there, leave those drives out, or pass "
+        "--speed positions."
     )
     return is_off[log.rows["drive"]], remedy
 
@@ -325,17 +314,25 @@ def _wheel_ratios(spans: pd.DataFrame) -> tuple[bool, bool]:
     return stays, stays and abs(middle - 1) < _STEADY
 
 
-def _check_wheels(log: DriveLog, spans: pd.DataFrame) -> None:
-    """Reject a measured speed that is that of wheels."""
+def _check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
+    """Reject a measured speed that is that of wheels, in the whole log or in stretches of it.
+
+    Shorter spans follow curves that alternate, and noise only adds to the distance of positions.
+    """
+    spans, short = (spans_of(track, log.settings.least_speed, span_s) for span_s in (WINDOW_S, WINDOW_S / 2))
     stays, equals = _wheel_ratios(spans)
     moving = spans[spans["is_moving"]]
-    pace = moving["moved"] / moving["measured"]
-    off = float((~pace.between(*PACE_LIMITS)).mean())
-    disagree = abs(pace.median() - 1) > _WHEEL_PACE or off > MAX_FAULTY
+    pace = max(median_ratio(spans, "measured"), median_ratio(short, "measured"))
+    off = min(_off_stretches(moving), _off_stretches(short[short["is_moving"]]))
     gentle, steep = moving["slope_deg"].quantile([0.05, 0.95])
     reasons = []
-    if equals and disagree:
-        reasons.append(f"equals `commanded_m_s` where positions do not (over 15 % off in {off:.0%} of spans)")
+    if equals and pace < 1 - _WHEEL_PACE:
+        reasons.append(f"equals `commanded_m_s` where positions do not, which move {pace:.3g} times as far")
+    elif off > MAX_FAULTY:
+        reasons.append(
+            f"equals `commanded_m_s` where positions do not (over {1 - PACE_LIMITS[0]:.0%} less far in {off:.0%} "
+            "of spans)"
+        )
     if stays and steep - gentle >= _VARIED_SLOPE_DEG:
         reasons.append(f"follows `commanded_m_s` to {_STEADY:.0%} on slopes of {gentle:.0f}° to {steep:.0f}°")
     if reasons:
@@ -344,3 +341,13 @@ def _check_wheels(log: DriveLog, spans: pd.DataFrame) -> None:
             "as wheel odometry does. Log the speed over ground, or pass --speed positions; pass --speed measured if it "
             "is right."
         )
+
+
+def _off_stretches(moving: pd.DataFrame) -> float:
+    """Return the fraction of spans in stretches whose measured speed equals the command and is too high."""
+    number = moving.groupby("drive").cumcount() // _MIN_WHEEL_SPANS
+    off = 0
+    for _, stretch in moving.groupby([moving["drive"], number]):
+        if _wheel_ratios(stretch)[1] and median_ratio(stretch, "measured") < PACE_LIMITS[0]:
+            off += len(stretch)
+    return off / max(len(moving), 1)

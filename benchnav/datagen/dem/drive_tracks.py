@@ -19,7 +19,9 @@ MIN_SPANS = 5  # that a median needs (choice)
 _GAP_S = 1.0  # without a row, after which nothing is said of the motion between
 _FREEZE_FIXES = 3  # periods of positions that one may stay the same (choice)
 _STRAIGHT_COS = 0.9  # between neighbouring spans, so that a chord is at most 1 % shorter than its arc
+_MAX_BEND = math.radians(150)  # between neighbouring spans of an arc; more is a reversal (choice)
 _SLIDES_COS = -0.5  # between rows of one command; no robot turns by over 120° at once (choice)
+MAX_PERIOD_S = 0.8  # between fixes, in which no robot turns by over 120°, at 2.5 rad/s (choice)
 _CLEAR_ERRORS = 5.0  # standard errors of a velocity whose direction counts (choice)
 _MAX_REST_WINDOWS = 2.0  # without such a velocity, after which a robot may have turned (choice)
 _ROWS_AT_ONCE = 4096
@@ -74,6 +76,11 @@ def _period_s(fixes: pd.DataFrame) -> pd.Series:
     """Return the usual time between fixes of the drive of each fix, 0 for a drive of one fix."""
     drive = fixes["drive"]
     return fixes.groupby("drive")["time_s"].diff().groupby(drive).transform("median").fillna(0)
+
+
+def period_of(track: pd.DataFrame) -> float:
+    """Return the usual time between fixes of all drives, in seconds to three digits, 0 for single fixes."""
+    return float(f"{_period_s(_fixes(track)).median():.3g}")
 
 
 def _knots(track: pd.DataFrame) -> pd.DataFrame:
@@ -160,23 +167,24 @@ def find_jumped(track: pd.DataFrame, limit_m_s: float) -> pd.Index:
     return track.index[track["fix"].isin(np.concatenate(jumped))] if jumped else track.index[:0]
 
 
-def spans_of(track: pd.DataFrame, least_speed: float) -> pd.DataFrame:
-    """Sum up motion under command over spans of two seconds, or from fix to fix where those are more seldom.
+def spans_of(track: pd.DataFrame, least_speed: float, span_s: float = WINDOW_S) -> pd.DataFrame:
+    """Sum up motion under command over spans of a time, or from fix to fix where those are more seldom.
 
     Args:
         track: from `track_of`; with `z`, elevation in metres, too for slopes.
         least_speed: m/s, of the command of spans that count.
+        span_s: of a span.
 
     Returns:
-        A table with a row for each span: `drive`, `duration_s`, `moved` (metres between positions), `measured` and
-        `commanded` (metres by speed), `is_moving`, `is_straight`, `is_steady` (one command), perhaps `slope_deg` along
-        the track.
+        A table with a row for each span: `drive`, `duration_s`, `moved` (metres along the arc between positions),
+        `measured` and `commanded` (metres by speed), `is_moving`, `is_straight`, `is_steady` (one command), perhaps
+        `slope_deg` along the track.
     """
     knots = _knots(track)
     period_s = knots.groupby("segment")["time_s"].diff().median()
     times = track.groupby("drive")["time_s"]
     longest_s = (times.max() - times.min()).max()
-    window_s = np.fmax(WINDOW_S, period_s)
+    window_s = np.fmax(span_s, period_s)
     if 0 < longest_s < MIN_SPANS * window_s:  # perhaps hours: their ratio says so
         window_s = longest_s / MIN_SPANS
     sums = {}
@@ -188,19 +196,28 @@ def spans_of(track: pd.DataFrame, least_speed: float) -> pd.DataFrame:
     firsts = table.loc[knots.index].groupby(["segment", "span"]).first()
     commands = table.groupby(["segment", "span"])["command"].agg(["min", "max"])
     steps = firsts[[*sums, "x", "y", "time_s", *{"z"}.intersection(firsts)]].groupby("segment").diff(-1)
-    moved = np.hypot(steps["x"], steps["y"])
-    after = steps.groupby("segment").shift(-1)
-    cosine = (steps["x"] * after["x"] + steps["y"] * after["y"]) / (moved * np.hypot(after["x"], after["y"]))
-    before = cosine.groupby("segment").shift(1)
+    chord = np.hypot(steps["x"], steps["y"])
+    # On an arc the chords of two neighbours differ in direction by the angle of each.
+    after = _angle_between(steps, steps.groupby("segment").shift(-1))
+    before = after.groupby("segment").shift(1)
+    bends = pd.concat([before, after], axis=1)
+    bend = bends.where(bends.abs() < _MAX_BEND).mean(axis=1).fillna(0)
+    moved = chord / np.sinc(bend / (2 * np.pi))
     spans = pd.DataFrame({"drive": firsts["drive"], "duration_s": -steps["time_s"], "moved": moved})
     spans = spans.assign(**{name: steps[name].abs() for name in sums})
     least_m = least_speed * spans["duration_s"]
     spans["is_moving"] = np.fmax(moved, spans["measured"]) >= least_m
-    spans["is_straight"] = (cosine.fillna(1) > _STRAIGHT_COS) & (before.fillna(1) > _STRAIGHT_COS)
+    spans["is_straight"] = (np.cos(bends.fillna(0)) > _STRAIGHT_COS).all(axis=1)
     spans["is_steady"] = commands["min"] == commands["max"]
     if "z" in steps:
         spans["slope_deg"] = np.degrees(np.arctan2(-steps["z"], moved))
     return spans[spans["commanded"] >= least_m]
+
+
+def _angle_between(vectors: pd.DataFrame, others: pd.DataFrame) -> pd.Series:
+    """Return the signed angle from vectors to others, in (-π, π], from their columns `x` and `y`."""
+    cross = vectors["x"] * others["y"] - vectors["y"] * others["x"]
+    return np.arctan2(cross, vectors["x"] * others["x"] + vectors["y"] * others["y"])
 
 
 def velocity_of(track: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
@@ -215,16 +232,18 @@ def velocity_of(track: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
 
     Returns:
         A table by the track's index: derivatives in m/s, NaN where fixes do not reach over half of the time; `error`,
-        their standard error in m/s, from the scatter of these fixes and at least from that of the drive; `window_s`.
+        their standard error in m/s, from the scatter of these fixes and at least from that of the drive; `window_s`;
+        `reach_s`, half of the time that the fixes take, as if they were dense.
     """
-    fits = [pd.DataFrame(columns=[*columns, "error", "window_s"], dtype=float)]
+    fits = [pd.DataFrame(columns=[*columns, "error", "window_s", "reach_s"], dtype=float)]
     marked = track.assign(is_knot=track.index.isin(_knots(track).index))
     for _, drive in marked.groupby("drive"):
         fit = pd.concat([_fit(rows, rows[rows["is_knot"]], columns) for _, rows in drive.groupby("segment")])
         freedom = ((fit["count"] - 2) * len(columns)).where((fit["count"] > 2) & fit["residual"].notna())
         usual = fit["residual"].sum() / max(freedom.sum(), 1)
         variance = np.fmax(fit["residual"] / freedom, usual)
-        fits.append(fit.assign(error=np.sqrt(variance / fit["spread_s2"]))[fits[0].columns])
+        error, reach_s = np.sqrt(variance / fit["spread_s2"]), np.sqrt(3 * fit["spread_s2"] / fit["count"])
+        fits.append(fit.assign(error=error, reach_s=reach_s)[fits[0].columns])
     return pd.concat(fits[1:] or fits).reindex(track.index)
 
 
@@ -272,7 +291,9 @@ def speed_of_positions(track: pd.DataFrame, least_speed: float) -> pd.Series:
     Positions have no heading, so that of the command counts: a robot moves as commanded. Where its track reverses
     under one command, it slides back until the track reverses again. Only velocities of at least five standard errors
     have a direction, since noise turns that of a robot at rest. After a rest of more than two windows of the fit, the
-    robot moves as commanded again.
+    robot moves as commanded again. Where fixes are seldom, it may have turned between them, and no reversal counts.
+
+    In a curve the fitted line is shorter than the arc, by the rate at which its direction turns.
 
     Args:
         track: from `track_of`.
@@ -292,9 +313,32 @@ def speed_of_positions(track: pd.DataFrame, least_speed: float) -> pd.Series:
     stretch = starts.cumsum()
     unit = toward[is_clear].div(speed[is_clear], axis=0)
     turn = (unit * unit.groupby(stretch).shift(1)).sum(axis=1, min_count=2)
-    backward = ((turn < _SLIDES_COS).groupby(stretch).cumsum() % 2).astype(bool)
+    reverses = (turn < _SLIDES_COS) & (fit["window_s"][is_clear] <= max(WINDOW_S, 3 * MAX_PERIOD_S))
+    backward = (reverses.groupby(stretch).cumsum() % 2).astype(bool)
     # A stretch may start by sliding, but robots are not logged sliding most of the time.
     mostly = backward.groupby(stretch).transform("mean") > 0.5
-    is_back = (backward != mostly).reindex(track.index)
-    is_back = is_back.groupby(block).ffill().fillna(False).astype(bool)
+    is_back = backward != mostly
+    speed *= _arc_over_fit(track, fit["reach_s"], unit.mul(np.where(is_back, -1.0, 1.0), axis=0))
+    is_back = is_back.reindex(track.index).groupby(block).ffill().fillna(False).astype(bool)
     return speed * sign * np.where(is_back, -1.0, 1.0)
+
+
+def _arc_over_fit(track: pd.DataFrame, reach_s: pd.Series, heading: pd.DataFrame) -> pd.Series:
+    """Return the speed on an arc over that of a line fitted to it, 1 where the heading is unknown.
+
+    On an arc of rate ω, fixes within ±T give a line of 3 (sin a - a cos a) / a³ of the speed, a = ω T.
+
+    Args:
+        track: from `track_of`.
+        reach_s: T of each row.
+        heading: unit vectors of the rows of clear velocity.
+    """
+    segment = track["segment"][heading.index]
+    turn = _angle_between(heading.groupby(segment).shift(1), heading)
+    turned = turn.where(np.cos(turn) > _SLIDES_COS, 0).groupby(segment).cumsum()
+    turned = turned.reindex(track.index).interpolate().fillna(0)
+    rate = velocity_of(track.assign(turned=turned), ["turned"])["turned"].abs()
+    a = (rate * reach_s).clip(upper=np.pi / 2)  # a half circle; more is no arc
+    wide = a.clip(lower=0.01)
+    factor = (wide**3 / (3 * (np.sin(wide) - wide * np.cos(wide)))).where(a == wide, 1 + a**2 / 10)
+    return factor[heading.index].reindex(track.index).fillna(1)

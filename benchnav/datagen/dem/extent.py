@@ -5,7 +5,7 @@ Pairs of metres here are northward and eastward, shape [2], from the south-west 
 they are called (x, y).
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -15,14 +15,13 @@ from numpy import ndarray
 from benchnav.core.copula import LONGEST_CORRELATION
 from benchnav.core.errors import BenchnavError, ConfigError, DatasetError, expect
 from benchnav.core.grid import Grid
-from benchnav.datagen.dem.raster import Raster, load_rasterio
-from benchnav.datagen.dem.tiling import Shape, Tiling, cut, cut_around
+from benchnav.datagen.dem.raster import GroundOptions, Raster, load_rasterio
+from benchnav.datagen.dem.tiling import SLACK, Shape, Tiling, cut, cut_around, fewest_cells
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Fields
 
 MAX_RATIO = 3.0  # of a raster's cell to a map's, from which on maps show interpolation rather than ground
 MAX_RELIEF_M = 2048.0  # of a map; float32 holds the schema's steps of 2^-13 m up to here
-_SLACK = 1e-3  # of a cell that an extent may fall short by
 _KERNEL_CELLS = 2.0  # that cubic convolution reaches to either side
 _MIN_SIDE = 8  # cells of a map that a correction may come down to
 
@@ -38,10 +37,18 @@ class GroundError(ConfigError):
 
     def __init__(self, problem: str, changes: Mapping[str, Any], stride_m: float | None) -> None:
         """Keep the parts, from which a command can be put together."""
-        self.problem, self.stride_m = problem, stride_m
-        self.changes = [f"{key}={_text(value)}" for key, value in changes.items()]
-        words = self.changes if stride_m is None else [*self.changes, f"stride_m={stride_m:.10g}"]
-        super().__init__(f"{problem} Or fit the maps to the raster: {' '.join(words)}" if words else problem)
+        self.problem, self.changes, self.stride_m = problem, changes, stride_m
+        words = self.settings if stride_m is None else [*self.settings, f"stride_m={stride_m:.10g}"]
+        super().__init__(self.advise(" ".join(words)) if words else problem)
+
+    @property
+    def settings(self) -> list[str]:
+        """The changes as words of a command."""
+        return [f"{key}={_text(value)}" for key, value in self.changes.items()]
+
+    def advise(self, remedy: str) -> str:
+        """Return the problem with settings or a command that mend it."""
+        return f"{self.problem} Or fit the maps to the raster: {remedy}"
 
 
 class Laid(NamedTuple):
@@ -100,7 +107,7 @@ class Extent:
             stride: Cells from one map to the next, northward and eastward.
 
         Raises:
-            ConfigError: If the origin lies off the elevation model.
+            ConfigError: If the origin lies off the elevation model, or too far north-east on it.
             DatasetError: If the ground is too small.
         """
         step = grid.resolution_m
@@ -113,18 +120,19 @@ class Extent:
             start_m = np.array(self.origin_m[::-1]) - self.corner_m
             west, south, east, north = (f"{value:.10g}" for value in self.bounds)
             expect(
-                ((start_m >= -_SLACK * step) & (start_m < self.size_m)).all(),
+                ((start_m >= -SLACK * step) & (start_m < self.size_m)).all(),
                 f"`origin` on `dem`, x {west} to {east} and y {south} to {north} in {_name_of(self.crs)}, "
                 f"got {list(self.origin_m)}.",
             )
+            self._check_room(start_m, end_m, grid, stride)
         how, reach_m = self._resample(step, start_m)
         size_m = end_m - start_m
-        cells = np.floor(size_m / step + _SLACK).astype(int).tolist()
+        cells = _whole_cells(size_m, step)
         if np.less(cells, grid.shape).any():
             wide, high = grid.extent_m
             raise DatasetError(
                 f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {self.raster.name} of "
-                f"{size_m[1]:g} m × {size_m[0]:g} m. Take a larger raster or a recipe of smaller maps."
+                f"{self.size_m[1]:g} m × {self.size_m[0]:g} m. Take a larger raster or a recipe of smaller maps."
             )
         tiling = cut(cells, grid.shape, stride, self.shares)
         # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
@@ -133,11 +141,49 @@ class Extent:
             tiling, start_m + np.clip((size_m - np.multiply(step, tiling.cells)) / 2, 0, reach_m), how
         )
 
+    def _check_room(self, start_m: ndarray, end_m: ndarray, grid: Grid, stride: Shape) -> None:
+        """Reject an origin too far north-east for a map of each split, where another one leaves room for them.
+
+        Args:
+            start_m: The origin.
+            end_m: North-east corner of the ground.
+            grid: Size and resolution of a map.
+            stride: Cells from one map to the next.
+
+        Raises:
+            ConfigError: If it is, with the largest origin that fits.
+        """
+        step, n_splits = grid.resolution_m, len(self.shares)
+
+        def fits(corner_m: ndarray) -> bool:
+            cells = _whole_cells(end_m - corner_m, step)
+            try:
+                return not np.less(cells, grid.shape).any() and bool(
+                    cut(cells, grid.shape, stride, self.shares)
+                )
+            except DatasetError:
+                return False
+
+        if fits(start_m):
+            return
+        for cells in fewest_cells(grid.shape, stride, n_splits):
+            last_m = end_m - np.multiply(cells, step)
+            for corner_m in (np.minimum(start_m, last_m), last_m):
+                if (corner_m >= -SLACK * step).all() and fits(corner_m):
+                    wide, high = grid.extent_m
+                    maps = "a map" if n_splits == 1 else f"maps of {n_splits} splits"
+                    end = "of `dem`" if self.places_m is None else "of the ground around the drives"
+                    raise ConfigError(
+                        f"Expected `origin` from which {maps} of {wide:g} m × {high:g} m fit up to the "
+                        f"north-east corner {end}, got {list(self.origin_m or ())}. The largest that fits: "
+                        f"--origin '{_origin(self.corner_m + corner_m)}'"
+                    )
+
     def _resample(self, step: float, start_m: ndarray) -> tuple[str, float]:
         """Return how elevation is resampled on cells of a width, and how far that reaches."""
         offset = start_m / self.cell_m
         is_same = np.allclose(self.cell_m, step, rtol=1e-9) and self.bounds == self.raster.file.bounds
-        if is_same and np.abs(offset - np.rint(offset)).max() < _SLACK:
+        if is_same and np.abs(offset - np.rint(offset)).max() < SLACK:
             return "nearest", 0.0
         if max(self.cell_m) <= step / 2 * (1 + 1e-9):
             return "average", 0.0
@@ -157,7 +203,6 @@ class Extent:
             for field in fields.values()
         )
         high, wide = (f"{value:.4g}" for value in self.cell_m)
-        y, x = (self.corner_m + laid.offset_m).tolist()
         taken = {"nearest": "taken as they are", "average": "averaged", "cubic": "interpolated"}[laid.how]
         gigabytes = f"{n_bytes / 1e9:,.2f}" if n_bytes >= 1e7 else "under 0.01"
         maps = f"{tiling.maps:,} map{'s' * (tiling.maps > 1)}"
@@ -166,7 +211,7 @@ class Extent:
             f"{self.raster.name}: {file.height} × {file.width} cells of {wide} m × {high} m on the ground, elevations "
             f"in {self.unit}, {taken}. {maps} of {grid.height} × {grid.width} cells of "
             f"{grid.resolution_m:g} m, one every {tiling.stride[1] * grid.resolution_m:g} m from the south-west corner "
-            f"[{x:.10g},{y:.10g}] on ({place}), in {_name_of(self.crs)}; {gigabytes} GB before "
+            f"{_origin(self.corner_m + laid.offset_m)} on ({place}), in {_name_of(self.crs)}; {gigabytes} GB before "
             "compression."
         )
 
@@ -185,16 +230,16 @@ class Extent:
 
     def _has_maps(self, laid: Laid, step: float) -> bool:
         """Return whether each split has a map whose elevation is whole; it reads until there is one."""
-        layer, wanted = self.raster.laid(self.frame(laid, step), [1], laid.how), set(self.shares)
+        layer, without_map = self.raster.laid(self.frame(laid, step), [1], laid.how), set(self.shares)
         (north, east), (height, width) = laid.tiling.stride, laid.tiling.shape
         with layer.warped:
             for run in laid.tiling.runs(1):
-                if run.split in wanted:
+                if run.split in without_map:
                     south, west = run.row * north, run.columns[0] * east
                     heights_m = layer.read(range(south, south + height), range(west, west + width))
                     if np.ptp(heights_m[:, 1:-1, 1:-1]) <= MAX_RELIEF_M:  # NaN is not
-                        wanted.remove(run.split)
-                if not wanted:
+                        without_map.remove(run.split)
+                if not without_map:
                     return True
         return False
 
@@ -216,28 +261,27 @@ class Extent:
         start_m = np.array([bounds.bottom, bounds.left]) - self.corner_m
         is_on = ((start_m >= 0) & (start_m < self.size_m)).all()
         maps = (start_m - laid.offset_m) / np.multiply(laid.tiling.stride, step)
-        if is_on and np.abs(maps - np.rint(maps)).max() > _SLACK:
+        if is_on and np.abs(maps - np.rint(maps)).max() > SLACK:
             announce(
                 f"`{raster.argument}` begins within a map. To begin the maps where it does, pass "
-                f"--origin '[{bounds.left:.10g},{bounds.bottom:.10g}]'"
+                f"--origin '{_origin((bounds.bottom, bounds.left))}'"
             )
 
-    def check(self, laid: Laid, recipe: Recipe, max_maps: int, coarse: bool) -> None:
+    def check(self, laid: Laid, recipe: Recipe, options: GroundOptions) -> None:
         """Reject ground that makes too many or too smooth maps.
 
         Args:
             laid: The maps.
             recipe: Of the maps.
-            max_maps: Most maps.
-            coarse: Whether the elevation model may be much coarser than the maps.
+            options: Most maps, and whether the elevation model may be much coarser than they are.
 
         Raises:
             GroundError: If it does, with settings that do not.
         """
-        expect(max_maps >= 1, f"`max_maps` ≥ 1, got {max_maps}.")
+        max_maps = options.max_maps
         step, count, name = recipe.resolution_m, laid.tiling.maps, self.raster.name
         ratio = float(max(self.cell_m)) / step
-        is_coarse = ratio >= MAX_RATIO * (1 - 1e-9) and not coarse
+        is_coarse = ratio >= MAX_RATIO * (1 - 1e-9) and not options.coarse
         if not is_coarse and count <= max_maps:
             return
         problem = (
@@ -317,6 +361,17 @@ def _name_of(crs: Any) -> str:
     text, about = crs.to_string(), crs.to_dict(projjson=True)
     name = about.get("source_crs", about).get("name", "unknown")
     return text if len(text) < 60 else "a CRS without a name" if name == "unknown" else str(name)
+
+
+def _whole_cells(size_m: ndarray, step: float) -> list[int]:
+    """Return how many cells of a width fit into a size."""
+    return np.floor(size_m / step + SLACK).astype(int).tolist()
+
+
+def _origin(corner_m: Iterable[float]) -> str:
+    """Return (y, x) in metres as `origin` takes it, to a micrometre."""
+    y, x = (f"{value:.6f}".rstrip("0").rstrip(".") for value in corner_m)
+    return f"[{x},{y}]"
 
 
 def _text(value: Any) -> str:

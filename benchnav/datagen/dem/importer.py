@@ -25,7 +25,7 @@ from benchnav.core.errors import DatasetError, expect
 from benchnav.core.store import building, real_place
 from benchnav.datagen.dem.drive_log import Drives
 from benchnav.datagen.dem.extent import MAX_RELIEF_M
-from benchnav.datagen.dem.raster import MAX_MAPS, Rasters, load_rasterio
+from benchnav.datagen.dem.raster import GroundOptions, Rasters, load_rasterio
 from benchnav.datagen.dem.survey import Survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import SHARD_CELLS
@@ -67,10 +67,7 @@ def import_dem(
     stride_m: float | None = None,
     solvable: bool = False,
     overwrite: bool = False,
-    dem_unit: str = "",
-    origin_m: tuple[float, float] | None = None,
-    max_maps: int = MAX_MAPS,
-    coarse: bool = False,
+    ground: GroundOptions = GroundOptions(),  # noqa: B008
     announce: Callable[[str], object] = str,
 ) -> Iterator[tuple[int, int]]:
     """Makes a dataset from rasters, yielding (maps done, maps in all); to be iterated to the end.
@@ -90,10 +87,7 @@ def import_dem(
         stride_m: from one map to the next; None for maps side by side.
         solvable: keep only maps whose goal can be reached, and store the grid reference time.
         overwrite: replace what is there.
-        dem_unit: of elevations: m, ft, us-ft, or metres in a unit; if empty, what the raster declares, else metres.
-        origin_m: (x, y) of the first map's south-west corner in the CRS of the maps; None for that of the raster.
-        max_maps: most maps; ground of more is rejected.
-        coarse: allow an elevation model whose cells are three times as wide as the maps', or wider.
+        ground: how the elevation model is read and cut.
         announce: is given what will be imported, in sentences, before anything is read.
 
     Raises:
@@ -115,19 +109,16 @@ def import_dem(
     with ExitStack() as stack:
         stack.enter_context(held(out, overwrite))
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
-        ground = Survey(
-            stack, dem, rasters, recipe, shares, stride_m, drives, dem_unit=dem_unit, origin_m=origin_m,
-            max_maps=max_maps, coarse=coarse, announce=announce,
-        )  # fmt: skip
+        survey = Survey(stack, dem, rasters, recipe, shares, stride_m, drives, ground, announce)
         folder = stack.enter_context(building(out))
-        parts = {name: _Part(name, recipe, folder, ground) for name in shares}
+        parts = {name: _Part(name, recipe, folder, survey) for name in shares}
         done = 0
-        for run in ground.tiling.runs(recipe.grid.maps_in(_CELLS_AT_ONCE)):
+        for run in survey.tiling.runs(recipe.grid.maps_in(_CELLS_AT_ONCE)):
             parts[run.split].add(run)
             done += len(run.columns)
-            yield done, ground.tiling.maps
-        for name in set(ground.fields) - ground.valued:
-            raster = ground.layers[f"layer {name}"].raster.name
+            yield done, survey.tiling.maps
+        for name in set(survey.fields) - survey.valued:
+            raster = survey.layers[f"layer {name}"].raster.name
             raise DatasetError(f"Expected `layer {name}` with a value on some map, got none in {raster}.")
         for part in parts.values():
             part.finish()
@@ -137,7 +128,7 @@ def import_dem(
             recipes=[replace(recipe, splits=sizes)],
             splits={name: part.entry() for name, part in parts.items()},
             files={name: [folder / shard.name for shard in part.shards] for name, part in parts.items()},
-            fields=_fields_of(ground),
+            fields=_fields_of(survey),
         )
         assemble(contents, folder, out)
 

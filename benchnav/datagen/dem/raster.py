@@ -24,6 +24,27 @@ _TOLERANCE = 0.01  # of a raster's cell that a place may be off by in another CR
 
 
 @dataclass(frozen=True, kw_only=True)
+class GroundOptions:
+    """How an elevation model is read and cut into maps.
+
+    Args:
+        dem_unit: Unit of elevations: m, ft, us-ft, or metres in a unit; if empty, what the raster declares.
+        origin: Where the first map's south-west corner lies, [X,Y] in the coordinate reference system of the maps.
+        max_maps: Most maps; ground of more stops the import, with a command that makes fewer.
+        coarse: Allow an elevation model whose cells are three times as wide as the maps', or wider.
+    """
+
+    dem_unit: str = ""
+    origin: tuple[float, float] | None = None
+    max_maps: int = MAX_MAPS
+    coarse: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the number of maps."""
+        expect(self.max_maps >= 1, f"`max_maps` ≥ 1, got {self.max_maps}.")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Rasters:
     """What there is of the ground beside its elevation. Where a raster does not cover it, maps are left out.
 
@@ -92,6 +113,11 @@ class Raster(NamedTuple):
     def mask_kinds(self) -> set[str]:
         """How it tells cells without a value, in GDAL's words; `all_valid` alone where it does not."""
         return {flag.name for flags in self.file.mask_flag_enums for flag in flags}
+
+    @property
+    def declares_missing(self) -> bool:
+        """Whether some value, mask or band marks cells without a value."""
+        return self.mask_kinds != {"all_valid"}
 
     def place(self) -> tuple[Any, Any, tuple[float, float]]:
         """Where it lies: a CRS in metres, its bounds there, and the size of its cells northward and eastward.

@@ -28,14 +28,13 @@ from benchnav.datagen.dem.drive_cells import (
 from benchnav.datagen.dem.drive_log import Drives, read_drives
 from benchnav.datagen.dem.drive_motion import compare_motion, compare_slopes
 from benchnav.datagen.dem.extent import Extent
-from benchnav.datagen.dem.raster import MAX_MAPS, Layer, Raster, Rasters, opened
-from benchnav.datagen.dem.sentinel import is_certain, is_missing, looks_missing
-from benchnav.datagen.dem.tiling import Run
+from benchnav.datagen.dem.raster import GroundOptions, Layer, Raster, Rasters, opened
+from benchnav.datagen.dem.sentinel import is_certain, is_missing, looks_missing, widest_gap_m, zero_gap_m
+from benchnav.datagen.dem.tiling import SLACK, Run
 from benchnav.datagen.dem.units import check_metres, in_unit
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import FIELDS, OPTIONAL, Maps
 
-_SLACK = 1e-3  # of a cell that an extent may fall short by
 _CLIFF = 5.67  # of 80°, metres a metre: steeper than natural ground beside cells of height 0
 # Rasters beside the elevation model: what the user calls them, dtypes of their bands, and how they are resampled.
 _OTHERS = (
@@ -58,7 +57,7 @@ class Survey:
         valued: layers of which some value was read.
         known: which rows and columns of all cells, framed by one, lie wholly on the elevation model.
         indices: of classes, by value of their raster; NaN for no label.
-        cliff_m: height over 0 that only cells without a value leave bare; infinite where these are declared.
+        cliff_m: difference of heights that no natural ground has next to a cell.
         source: what the manifest says of the rasters.
     """
 
@@ -71,11 +70,7 @@ class Survey:
         shares: Mapping[str, float],
         stride_m: float | None,
         drives: Drives | None = None,
-        *,
-        dem_unit: str = "",
-        origin_m: tuple[float, float] | None = None,
-        max_maps: int = MAX_MAPS,
-        coarse: bool = False,
+        options: GroundOptions = GroundOptions(),  # noqa: B008
         announce: Callable[[str], object] = str,
     ) -> None:
         """Opens rasters and lays them on the cells of all maps.
@@ -88,10 +83,7 @@ class Survey:
             shares: of the maps, by split.
             stride_m: from one map to the next; None for maps side by side.
             drives: log of drives, around which the ground is cut; None for all of the elevation model.
-            dem_unit: of elevations; if empty, what the raster declares, else metres.
-            origin_m: (x, y) of the first map's south-west corner; None for the default.
-            max_maps: most maps.
-            coarse: whether the elevation model may be much coarser than the maps.
+            options: how the elevation model is read and cut.
             announce: is given what will be imported, in sentences.
 
         Raises:
@@ -104,7 +96,7 @@ class Survey:
         expect(not unknown, f"`class_ids` to name classes of the recipe, {names}, got {unknown}.")
         log = read_drives(drives) if drives else None
         ground = stack.enter_context(opened("dem", dem))
-        ground, unit = in_unit(ground, dem_unit)
+        ground, unit = in_unit(ground, options.dem_unit)
         crs, bounds, cell_m = ground.place()
         stride = recipe.grid.shape
         if stride_m is not None:
@@ -119,7 +111,7 @@ class Survey:
             check_enough(log, list(shares))
         extent = Extent(
             raster=ground, unit=unit, crs=crs, bounds=bounds, cell_m=np.array(cell_m), shares=shares,
-            origin_m=origin_m, places_m=None if log is None else log.places_m,
+            origin_m=options.origin, places_m=None if log is None else log.places_m,
         )  # fmt: skip
         laid = extent.lay(recipe.grid, stride)
         self.fields = {own.name: own.field for own in rasters.layers}
@@ -127,7 +119,7 @@ class Survey:
         self.tiling = tiling
         drive_fields = {name: OPTIONAL[name] for name in BANDS if name in OPTIONAL and log is not None}
         announce(extent.describe(laid, recipe, FIELDS | drive_fields | self.fields))
-        extent.check(laid, recipe, max_maps, coarse)
+        extent.check(laid, recipe, options)
         south_m, west_m = (extent.corner_m + offset_m).tolist()
         height, width = tiling.cells
         frame = extent.frame(laid, step)
@@ -174,7 +166,7 @@ class Survey:
         self.known = []
         for offset, count, size in zip(offset_m, tiling.cells, extent.size_m, strict=True):
             edges = offset + step * np.arange(-1, count + 2)
-            self.known.append((edges[:-1] > -_SLACK * step) & (edges[1:] < size + _SLACK * step))
+            self.known.append((edges[:-1] > -SLACK * step) & (edges[1:] < size + SLACK * step))
         self.indices = {value: np.nan if name is None else names.index(name) for value, name in named.items()}
         self.unlabelled, self.driven = rasters.unlabelled, None
         if log is not None:
@@ -183,7 +175,7 @@ class Survey:
             log, self.driven = drive_over(log, tiling, *np.floor(cells_of).astype(np.int64).T)
             self.source["drives"] = about = describe_drives(log, list(shares))
             self.source["traversability"] = {name: about[name] for name in ("file", "sha256")}
-        self.cliff_m = _CLIFF * max(*cell_m, step) if ground.mask_kinds == {"all_valid"} else np.inf
+        self.cliff_m = _CLIFF * max(*cell_m, step)
 
     def read(self, run: Run) -> tuple[ndarray, Maps]:
         """Reads some maps.
@@ -209,12 +201,17 @@ class Survey:
             for odd, heights in zip((low, high), ends, strict=True):
                 if is_missing(self.layers["dem"].raster, odd, heights, self.cliff_m):
                     raise self._out_of_range("dem", "elevations of `dem` without stand-ins", low, high, odd)
-            heights = np.abs(ends[0])
-            least = np.min(heights, initial=np.inf, where=heights > 0)
-            if (heights == 0).any() and self.cliff_m < least < np.inf:
-                expected = "elevations of `dem` without a gap next to 0"
-                other = "Where 0 is a height, declare a value that does not occur, such as -9999."
-                raise self._out_of_range("dem", expected, low, high, 0, other)
+            declared_m = widest_gap_m(self.cliff_m)
+            for value in (0, -1):
+                gap_m = zero_gap_m(ends[0] - value)
+                if gap_m > (declared_m if self.layers["dem"].raster.declares_missing else self.cliff_m):
+                    expected = f"elevations of `dem` without a gap next to {value}"
+                    is_sea = gap_m <= declared_m
+                    other = (
+                        f"Where {value} is a height, declare a value that does not occur, such as -9999."
+                        * is_sea
+                    )
+                    raise self._out_of_range("dem", expected, low, high, value, other)
             own["dem"][:, ~rows[south:][: height + 2]] = np.nan
             own["dem"][:, :, ~columns[west:][: width + 2]] = np.nan
         if "traversability" in framed:
@@ -229,13 +226,17 @@ class Survey:
                 raise self._out_of_range(
                     f"layer {name}", expected, low, high, low if low < kind.least else high
                 )
+            if low > high:
+                continue
+            self.valued.add(name)
             raster = self.layers[f"layer {name}"].raster
-            if raster.mask_kinds == {"all_valid"} and is_certain(raster, low):
-                expected = f"values of `layer {name}` without stand-ins"
-                other = "Where it is a value, declare one that does not occur."
-                raise self._out_of_range(f"layer {name}", expected, low, high, low, other)
-            if low <= high:
-                self.valued.add(name)
+            for odd, end in ((low, "min"), (high, "max")):
+                if is_certain(raster, odd, framed.get(f"layer {name} {end}", framed[f"layer {name}"])):
+                    expected = f"values of `layer {name}` without stand-ins"
+                    other = "Where it is a value, declare one that does not occur." * (
+                        not raster.declares_missing
+                    )
+                    raise self._out_of_range(f"layer {name}", expected, low, high, odd, other)
         given = {name: framed[name][:, :, 1:-1, 1:-1] for name in self.given}
         if "classes" in given:
             given["classes"] = self._classes(given["classes"])
@@ -260,6 +261,9 @@ class Survey:
             return DatasetError(f"{said} Convert them{how}")
         if raster.file.nodata is None:
             remedy = f"declare it: rio edit-info --nodata {value:.9g} {raster.name}"
+            if raster.declares_missing:  # by a mask, which would hide what is declared
+                joined = f"rio calc --profile nodata={value:.9g} '(read 1)' {raster.name} filled.tif"
+                remedy = f"join it with the mask: {joined}"
         else:
             now = raster.file.nodata
             chosen = f"(where (== (read 1) {value:.9g}) {now:.9g} (read 1))"

@@ -18,7 +18,7 @@ from benchnav.core.errors import DatasetError, expect
 
 Shape = tuple[int, int]  # along y and along x
 
-_SLACK = 1e-3  # of a cell, which arithmetic may be off by
+SLACK = 1e-3  # of a cell, which arithmetic may be off by
 
 
 class Run(NamedTuple):
@@ -131,7 +131,7 @@ def cut(cells: Sequence[int], shape: Shape, stride: Shape, shares: Mapping[str, 
     """
     rows, columns = (np.subtract(cells, shape) // stride + 1).tolist()
     side, lines = (0, rows) if rows > columns else (1, columns)
-    gap = math.ceil(2 * shape[side] / stride[side]) - 1
+    gap = _gap(shape, stride, side)
     usable = lines - gap * (len(shares) - 1)
     if usable < len(shares):
         raise DatasetError(
@@ -147,6 +147,27 @@ def cut(cells: Sequence[int], shape: Shape, stride: Shape, shares: Mapping[str, 
         for place, split in enumerate(shares)
     }
     return Tiling(shape, stride, (rows, columns), strips)
+
+
+def fewest_cells(shape: Shape, stride: Shape, splits: int) -> list[Shape]:
+    """Return the cells of the smallest grounds for some splits, northward and eastward, each way that strips can lie.
+
+    Args:
+        shape: cells of a map, (H, W).
+        stride: cells from one map to the next, northward and eastward.
+        splits: number of splits.
+    """
+    grounds = []
+    for side in (0, 1):
+        cells = list(shape)
+        cells[side] += (splits - 1) * (_gap(shape, stride, side) + 1) * stride[side]
+        grounds.append((cells[0], cells[1]))
+    return grounds
+
+
+def _gap(shape: Shape, stride: Shape, side: int) -> int:
+    """Return the maps between two splits that belong to none, along a side."""
+    return math.ceil(2 * shape[side] / stride[side]) - 1
 
 
 def cut_around(
@@ -166,10 +187,10 @@ def cut_around(
     """
     low_m = np.maximum(places_m.min(axis=0) - cell_m, 0)
     high_m = np.minimum(places_m.max(axis=0) + cell_m, whole_m)
-    more = np.maximum(np.ceil((high_m - low_m - shape_m) / stride_m - _SLACK), 0)
+    more = np.maximum(np.ceil((high_m - low_m - shape_m) / stride_m - SLACK), 0)
     size_m = np.minimum(shape_m + more * stride_m, whole_m)
     edge_m = np.clip((low_m + high_m - size_m) / 2, 0, whole_m - size_m)
-    return np.floor(edge_m / cell_m + _SLACK) * cell_m, size_m
+    return np.floor(edge_m / cell_m + SLACK) * cell_m, size_m
 
 
 def read_shares(text: str) -> dict[str, float]:

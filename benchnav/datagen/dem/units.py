@@ -13,6 +13,9 @@ _SPELLINGS = {
     "us-ft": ("us-ft", "ftus", "us survey foot", "us survey feet", "us_survey_foot", "foot_us", "us foot"),
     "0.1": ("dm", "decimetre", "decimeter", "decimetres", "decimeters"),
     "0.01": ("cm", "centimetre", "centimeter", "centimetres", "centimeters"),
+    "0.001": ("mm", "millimetre", "millimeter", "millimetres", "millimeters"),
+    "0.0254": ("in", "inch", "inches"),
+    "0.9144": ("yd", "yard", "yards"),
     "1000": ("km", "kilometre", "kilometer", "kilometres", "kilometers"),
 }
 
@@ -40,11 +43,11 @@ def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
         )
         instead = f", where the raster declares {declared!r}" if declared else ""
         return dem._replace(metres=metres), f"{unit} as set by `dem_unit`{instead}"
-    if declared.lower() in _SPELLINGS["m"]:
+    name = _known(declared)
+    if name == "m":
         return dem, "metres as the raster declares"
     if declared:
-        near = next((name for name, words in _SPELLINGS.items() if declared.lower() in words), "")
-        option = f"--dem-unit {near}" if near else "--dem-unit with the metres in one, such as 0.01"
+        option = f"--dem-unit {name}" if name else "--dem-unit with the metres in one, such as 0.01"
         raise DatasetError(
             f"Expected elevations of `dem` in metres, got {declared!r} in {dem.name}. To convert them, pass {option}; "
             "if they are metres all the same, pass --dem-unit m."
@@ -52,23 +55,32 @@ def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
     if crs.is_projected and crs.linear_units_factor[1] != 1:
         raise DatasetError(
             f"Expected a unit of the elevations of `dem`, since {dem.name} is in {crs.linear_units_factor[0]} and "
-            "declares none, got neither. Pass --dem-unit us-ft, --dem-unit ft or --dem-unit m, whichever it is."
+            "declares none, got none declared. Pass --dem-unit us-ft, --dem-unit ft or --dem-unit m, whichever it is."
         )
     return dem, "metres (the raster declares no unit: if others, set `dem_unit`)"
 
 
 def check_metres(raster: Raster) -> None:
-    """Reject a raster of metres that declares another unit of length.
+    """Reject a raster of metres that declares another unit.
 
     Raises:
         DatasetError: If it does, with a command that converts it.
     """
     declared = raster.file.units[0] or ""
-    unit = next((name for name, words in _SPELLINGS.items() if declared.lower() in words), "m")
-    if unit != "m":
-        metres = UNITS_M.get(unit) or float(unit)
-        whole = "--not-masked " * (raster.file.nodata is None)
-        raise DatasetError(
-            f"Expected `{raster.argument}` in metres, got {declared!r} in {raster.name}. Convert it: "
-            f"rio calc {whole}-t float32 '(* {metres:.10g} (read 1))' {raster.name} metres.tif"
-        )
+    name = _known(declared)
+    if not declared or name == "m":
+        return
+    factor = f"{UNITS_M.get(name) or float(name):.10g}" if name else "METRES"
+    unmasked = "" if raster.declares_missing else "--not-masked "
+    convert = f"rio calc {unmasked}-t float32 '(* {factor} (read 1))' {raster.name} metres.tif"
+    relabel = f"rio edit-info --bidx 1 --units m {raster.name}"
+    raise DatasetError(
+        f"Expected `{raster.argument}` in metres, got {declared!r} in {raster.name}. If they are metres all the same, "
+        f"declare it: {relabel}. Else convert them{'' if name else ', METRES being those in one'}: {convert}"
+    )
+
+
+def _known(declared: str) -> str:
+    """Return what `dem_unit` takes for a declared unit; empty where it is unknown."""
+    text = declared.strip().lower()
+    return next((name for name, words in _SPELLINGS.items() if text in words), "")

@@ -12,8 +12,8 @@ from benchnav.core.store import unseal
 from benchnav.core.touched import note_file
 from benchnav.datagen import schema
 
-# What HDF5 and h5py raise where a file is damaged, by where the damage lies.
 _TAKEN = (errno.EAGAIN, errno.EACCES)  # of a file that another program has locked
+# What HDF5 and h5py raise where a file is damaged, by where the damage lies.
 READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
 
 FOLDER_MANIFEST = "manifest.json"  # beside the shards of a finished dataset

@@ -125,7 +125,7 @@ class TerrainDataset:
         return schema.layer_names(self.fields)
 
     def truth_of(self, split: str) -> Literal["generated", "unknown"]:
-        """Whether the distribution of λ in each cell of a split is known.
+        """Return whether the distribution of λ in each cell of a split is known.
 
         Returns:
             "generated" where a recipe made all its maps, λ by its class table; "unknown" where some were imported:
@@ -144,12 +144,12 @@ class TerrainDataset:
 
     @property
     def truth(self) -> Literal["generated", "unknown"]:
-        """Whether the distribution of λ in each cell of all splits is known; see `truth_of`."""
+        """Knowledge of the distribution of λ in each cell, over all splits; see `truth_of`."""
         known = all(self.truth_of(name) == "generated" for name in self.splits)
         return "generated" if known else "unknown"
 
     def has_photo(self, split: str) -> bool:
-        """Whether the colours of some maps of a split are those of a photo, which is lit from one direction.
+        """Return whether the colours of some maps of a split are those of a photo, which is lit from one direction.
 
         Raises:
             DatasetError: If there is no such split.

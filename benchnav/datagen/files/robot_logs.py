@@ -37,12 +37,21 @@ def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path, re
     if missing := [name for name in columns if name not in names]:
         near = hint(missing[0], [name for name in names if name not in columns])
         near = near or (remedy and f" {remedy}")
-        if len(names) == 1 and any(separator in names[0] for separator in ";\t| "):
+        if len(names) == 1 and any(separator in names[0] for separator in ",;\t| "):
             near = f" {_SEPARATE}"
+        elif any(_is_number(name) for name in names):
+            near = " Begin the file with a line of column names."
         raise DatasetError(
             f"Expected columns {', '.join(columns)} in {path}, got no {' and no '.join(missing)}. "
             f"It has {', '.join(names) or 'none'}.{near}"
         )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return np.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def read_log(path: Path) -> pd.DataFrame:
@@ -65,19 +74,35 @@ def read_log(path: Path) -> pd.DataFrame:
                 skipinitialspace=True,
                 index_col=False,
             )
-        return rows.rename(columns=str.strip)
+        rows = rows.rename(columns=str.strip)
     except (OSError, EOFError, ValueError, zlib.error, pd.errors.ParserWarning) as error:
         why = [*str(error).strip().splitlines(), type(error).__name__]
         is_text = isinstance(error, pd.errors.ParserWarning | pd.errors.ParserError)
-        remedy = f". {_SEPARATE}" if is_text else ""
+        remedy = f". {_SEPARATE} Remove lines above the column names." if is_text else ""
+        if isinstance(error, UnicodeDecodeError):
+            remedy = ". Save it as UTF-8."
+        elif isinstance(error, pd.errors.EmptyDataError):
+            remedy = ". Write a line of column names and a row for each time."
         raise DatasetError(
             f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got one that cannot be read: "
             f"{why[0].removesuffix('.')}{remedy}"
         ) from error
+    for name in rows.columns:
+        first, dot, number = str(name).rpartition(".")  # pandas numbers the second of two columns of one name
+        if dot and number.isdigit() and first in rows.columns and not _is_number(first):
+            raise DatasetError(
+                f"Expected one column `{first}` in {path}, got several. Rename or remove the others."
+            )
+    return rows
 
 
 def read_numbers(
-    rows: pd.DataFrame, name: str, path: Path, limits: tuple[float, float], remedy: str = ""
+    rows: pd.DataFrame,
+    name: str,
+    path: Path,
+    limits: tuple[float, float],
+    remedy: str = "",
+    number: str = "Convert the column to numbers.",
 ) -> np.ndarray:
     """Return the numbers of a column, float64, NaN where missing, shape [N].
 
@@ -87,6 +112,7 @@ def read_numbers(
         path: of the log.
         limits: minimum and maximum.
         remedy: what helps where all numbers are beyond the limits, a sentence.
+        number: what helps where no value is a number, a sentence.
 
     Raises:
         DatasetError: If a value is no finite number, or beyond the limits.
@@ -98,7 +124,7 @@ def read_numbers(
     is_number = np.isfinite(values)
     is_within = (values >= minimum) & (values <= maximum)
     for expected, is_good, everywhere in (
-        ("to be numbers", is_number, "Convert the column to numbers."),
+        ("to be numbers", is_number, number),
         (f"within [{minimum:g}, {maximum:g}]", ~is_number | is_within, remedy or "Convert the column."),
     ):
         bad = np.flatnonzero(is_given & ~is_good)
@@ -121,6 +147,7 @@ def read_names(rows: pd.DataFrame, name: str, path: Path) -> np.ndarray:
     absent = text.index[text == ""]
     if len(absent):
         raise DatasetError(
-            f"Expected a `{name}` in every row of {path}, got none in row {absent[0] + 1} below the header."
+            f"Expected a `{name}` in every row of {path}, got none in row {absent[0] + 1} below the header. "
+            "Fill it in, or leave the row out."
         )
     return text.to_numpy(str)

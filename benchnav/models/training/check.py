@@ -79,7 +79,7 @@ def check_network(trainable: Trainable, dataset: TerrainDataset, options: FitOpt
     check_maps(dataset, kind.target, config.crop)
     with quietly():
         chosen = options.chosen(max_epochs=config.max_epochs)
-        trainer = make_trainer([], logger=False, enable_checkpointing=False, **chosen)
+        trainer = make_trainer([], logger=False, **chosen)
     every = trainer.check_val_every_n_epoch or 0
     expect(
         every <= config.max_epochs,

@@ -35,6 +35,7 @@ from benchnav.core.errors import CheckpointError, ConfigError, TrainingError, ex
 from benchnav.core.settings import check_known, one_line
 from benchnav.core.store import MAX_JOBS, replacing, sole_writer, write_text
 from benchnav.models.config import TrainOptions
+from benchnav.models.training.best import KeepBest, measured
 from benchnav.models.training.trackers import described, make_callbacks, make_loggers
 
 STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
@@ -68,7 +69,7 @@ class FitOptions(TrainOptions):
     folder: Path | None = None
 
     def __post_init__(self) -> None:
-        """Checks the settings by name."""
+        """Check the settings by name."""
         expect(0 <= self.workers <= MAX_JOBS, f"`workers` in 0–{MAX_JOBS}, got {self.workers}.")
         asked = self.trainer or {}
         expect(
@@ -102,12 +103,12 @@ class FitOptions(TrainOptions):
         return json.loads(json.dumps(chosen, default=str, sort_keys=True))
 
     def make_loggers(self, folder: Path | None) -> list[Logger] | None:
-        """Makes the loggers that are asked for, to write in a folder; None where nothing is said of them."""
+        """Make the requested loggers, which write in a folder; None for the default."""
         asked = (self.trainer or {}).get("logger")
         return None if asked is None or asked is True else make_loggers(asked, folder)
 
     def make_callbacks(self) -> list[Callback]:
-        """Makes the callbacks that are asked for."""
+        """Make the requested callbacks."""
         asked = (self.trainer or {}).get("callbacks")
         return [] if asked is None else make_callbacks(asked)
 
@@ -128,7 +129,7 @@ def fit(
     data: Mapping[str, Any],
     **usual: Any,
 ) -> dict[str, float]:
-    """Trains a module in place.
+    """Train a module in place.
 
     Args:
         module: what to train.
@@ -146,8 +147,8 @@ def fit(
 
     Raises:
         CheckpointError: the interrupted training is damaged or has other settings.
-        ConfigError: a callback changes the weights after training.
-        TrainingError: a loss is no finite number.
+        ConfigError: If a callback changes the weights after training.
+        TrainingError: If a loss is not finite.
         KeyboardInterrupt: the user has stopped it.
     """
     folder = options.folder / part if options.folder else None
@@ -161,7 +162,7 @@ def fit(
     if in_terminal:
         callbacks.append(RichProgressBar(console_kwargs={"stderr": True}))
     loggers = options.make_loggers(folder)
-    kept: dict[str, Any] = {"logger": False, "enable_checkpointing": _keeps_checkpoints(callbacks)}
+    trainer_settings: dict[str, Any] = {"logger": False}
     with quietly(), held:
         if folder:
             trainers = {f"trainer.{name}": value for name, value in options.trainer_settings.items()}
@@ -170,12 +171,14 @@ def fit(
                 folder, Path(STATE).stem, save_on_train_epoch_end=True, enable_version_counter=False
             )
             callbacks.append(last)
-            kept = {"logger": TensorBoardLogger(folder, name="", version=""), "plugins": [WholeFiles()]}
+            events = TensorBoardLogger(folder, name="", version="")
+            trainer_settings = {"logger": events, "plugins": [WholeFiles()]}
         if loggers is not None:
-            kept["logger"] = loggers
+            trainer_settings["logger"] = loggers
             for logger in loggers:
                 logger.log_hyperparams({"part": part, **settings})
-        trainer = make_trainer(callbacks, **kept, **options.chosen(**usual))
+        callbacks += [callback.guard for callback in callbacks if isinstance(callback, KeepBest)]
+        trainer = make_trainer(callbacks, **trainer_settings, **options.chosen(**usual))
         handler = signal.getsignal(signal.SIGINT)
         devices = [options.place] if options.place.type == "cuda" else []
         try:
@@ -187,6 +190,8 @@ def fit(
         except MisconfigurationException as error:
             raise _unusable(error) from error
         except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
+            if "conditioned on metric" in str(error):  # of a callback that monitors what is not measured
+                raise _unusable(error) from error
             if state is None or trainer.global_step:
                 raise
             raise CheckpointError(
@@ -195,38 +200,33 @@ def fit(
         return measured(trainer)
 
 
-def _keeps_checkpoints(callbacks: list[Callback]) -> bool:
-    """Tells whether a user's callback writes checkpoints, which Lightning asks for leave to do."""
-    return any(isinstance(callback, Checkpoint) for callback in callbacks)
-
-
 say = rank_zero_only(print)
 """Prints a line once, also where several processes train together."""
 
 
 def is_first_process() -> bool:
-    """Tells whether this process is alone, or the first of those that train together."""
+    """Return whether this process is the only one, or the first of those that train together."""
     return not getattr(rank_zero_only, "rank", 0)
 
 
 def interrupted(options: FitOptions, parts: Sequence[str]) -> list[str]:
-    """Names the parts whose training was interrupted in the folder of some options."""
+    """Return the parts whose training was interrupted in the folder of some options."""
     return [part for part in parts if options.folder and (options.folder / part / STATE).exists()]
 
 
 def forget(options: FitOptions, part: str) -> None:
-    """Drops what was kept to go on with a part's training; its logs stay."""
+    """Remove what a part's training would resume from; its logs stay."""
     if options.folder and is_first_process():
         _drop(options.folder / part, STATE, _PARTIAL)
 
 
-def differing(wanted: Mapping[str, Any], there: Mapping[str, Any]) -> str:
-    """Names the settings in which two trainings differ, such as "another `seed`"; empty where there are none."""
-    one, other = (json.loads(json.dumps(settings, default=str)) for settings in (wanted, there))
-    for settings in (one, other):
-        settings |= settings.pop("config", {})  # a network's own, each by its name
-    others = sorted(name for name in {**one, **other} if one.get(name) != other.get(name))
-    return f"another {' and '.join(f'`{name}`' for name in others)}" if others else ""
+def differing(expected: Mapping[str, Any], stored: Mapping[str, Any]) -> str:
+    """Return the settings in which two trainings differ, such as "another `seed`"; empty where there are none."""
+    a, b = (json.loads(json.dumps(settings, default=str)) for settings in (expected, stored))
+    for settings in (a, b):
+        settings |= settings.pop("config", {})  # those of a network, each by its name
+    names = sorted(name for name in {**a, **b} if a.get(name) != b.get(name))
+    return f"another {' and '.join(f'`{name}`' for name in names)}" if names else ""
 
 
 def default_precision(accelerator: str) -> str:
@@ -239,7 +239,7 @@ def default_precision(accelerator: str) -> str:
 
 
 def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | None:
-    """Makes the folder; gives the state to go on from, if any."""
+    """Make the folder; return the state to resume from, if any."""
     folder.mkdir(parents=True, exist_ok=True)
     state, described = folder / STATE, json.dumps(settings, default=str, indent=1) + "\n"
     if resume and state.exists():
@@ -262,7 +262,7 @@ def _drop(folder: Path, *patterns: str) -> None:
 
 
 def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Trainer:
-    """Makes Lightning's trainer.
+    """Make Lightning's trainer.
 
     Raises:
         ConfigError: it does not take the settings.
@@ -270,6 +270,7 @@ def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Traine
     try:
         return lightning.Trainer(
             callbacks=callbacks,
+            enable_checkpointing=any(isinstance(callback, Checkpoint) for callback in callbacks),
             enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
             enable_model_summary=False,
             num_sanity_val_steps=0,
@@ -286,69 +287,15 @@ def _unusable(error: Exception) -> ConfigError:
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Keeps Lightning's hints to its developers out of a user's terminal."""
+    """Keep Lightning's hints to its developers out of a user's terminal."""
     with quiet("lightning.pytorch", "lightning.fabric"), warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"lightning\..*")
         yield
 
 
-class KeepBest(Callback):
-    """Keeps the weights of the epoch with the lowest validation loss, or of the last, and restores them at the end.
-
-    They are part of what a training goes on from. Lightning's `ModelCheckpoint` would put them into a second file,
-    which a kill could leave of another epoch than the first, and knows the loss alone of all that was measured.
-
-    Args:
-        last: keep the last epoch's whose loss is finite.
-    """
-
-    def __init__(self, last: bool = False) -> None:
-        """Starts with none."""
-        self.last = last
-        self.trained: dict[str, torch.Tensor] = {}
-        self.best: dict[str, Any] = {"loss": float("inf"), "metrics": {}, "weights": {}}
-        self.validated = False
-
-    def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Copies the weights when they are to be kept."""
-        self.validated = True
-        metrics = {name: value for name, value in measured(trainer).items() if name.startswith("valid_")}
-        limit = float("inf") if self.last else self.best["loss"]
-        if metrics["valid_loss"] < limit:
-            metrics["epoch"] = trainer.current_epoch + 1
-            self.best = {"loss": metrics["valid_loss"], "metrics": metrics, "weights": _copied(module)}
-
-    def on_train_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Copies the weights, before callbacks of a user can change them."""
-        self.trained = _copied(module)
-
-    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Puts the best weights back."""
-        _refuse_changed(self.trained, module, trainer, "on_train_end")
-        if not self.best["weights"]:
-            raise ConfigError(
-                "Expected a finite validation loss, got none. Train with a lower `learning_rate`."
-                if self.validated
-                else "Expected `trainer` to measure the split valid, got none: training ended before the first "
-                "validation. Train for longer, or validate more often."
-            )
-        module.load_state_dict(self.best["weights"])
-        # The trainer's own metrics are what comes back from processes that it has started.
-        metrics = self.best["metrics"].items()
-        trainer.callback_metrics.update({name: torch.tensor(value) for name, value in metrics})
-
-    def state_dict(self) -> dict[str, Any]:
-        """Gives what `load_state_dict` takes."""
-        return self.best
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from an earlier state."""
-        self.best = state
-
-
 @dataclass(eq=False)
 class History(Callback):
-    """Writes what was measured to a table, a row an epoch, and says it on standard error.
+    """A callback that writes what was measured to a table, a row an epoch, and prints it on standard error.
 
     Lightning's `CSVLogger` writes training and validation to rows of their own, and begins anew when it is resumed.
 
@@ -363,85 +310,41 @@ class History(Callback):
     rows: list[dict[str, float]] = field(default_factory=list)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Adds a row."""
-        found, epoch = measured(trainer), trainer.current_epoch + 1
+        """Add a row; reject a loss that is not finite."""
+        measures, epoch = measured(trainer), trainer.current_epoch + 1
         rate = float(trainer.optimizers[0].param_groups[0]["lr"])
-        self.rows.append({"epoch": epoch, "step": trainer.global_step, "learning_rate": rate, **found})
+        self.rows.append({"epoch": epoch, "step": trainer.global_step, "learning_rate": rate, **measures})
         if self.path and trainer.is_global_zero:
             write_text(self.path, pd.DataFrame(self.rows).to_csv(index=False))
         if self.part and trainer.is_global_zero:
-            told = in_words(found, "valid_") or in_words(found)
-            tell(f"{self.part}: epoch {epoch}/{trainer.max_epochs}, {told}")
-        for name, value in found.items():
+            text = in_words(measures, "valid_") or in_words(measures)
+            tell(f"{self.part}: epoch {epoch}/{trainer.max_epochs}, {text}")
+        for name, value in measures.items():
             if name in _LOSSES and not math.isfinite(value):
                 raise TrainingError(
                     f"{name} became {value} in epoch {epoch}. Train with a lower `learning_rate`, or mend the loss. "
                     "Nothing was kept of this epoch."
                 )
 
-    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Refuses callbacks of a user, which come before, that have changed the best weights."""
-        for callback in trainer.callbacks:  # type: ignore[attr-defined]
-            if isinstance(callback, KeepBest):
-                _refuse_changed(callback.best["weights"], module, trainer, "on_fit_end")
-
     def state_dict(self) -> dict[str, Any]:
-        """Gives what `load_state_dict` takes."""
+        """Return what `load_state_dict` takes."""
         return {"rows": self.rows}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from an earlier state."""
+        """Resume from an earlier state."""
         self.rows = list(state["rows"])
 
 
 class WholeFiles(TorchCheckpointIO):
-    """Writes a Lightning checkpoint whole or not at all.
+    """A writer of Lightning checkpoints, each whole or not at all.
 
     Lightning's own way moves a temporary file, which is no one step where these are on another disk.
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Writes it beside its name, then renames it."""
+        """Write it next to its name, then rename it."""
         with replacing(Path(path), durable=False) as partial:
             torch.save(checkpoint, partial)
-
-
-def _copied(module: lightning.LightningModule) -> dict[str, torch.Tensor]:
-    return {name: value.detach().clone() for name, value in module.state_dict().items()}
-
-
-def _refuse_changed(
-    wanted: Mapping[str, torch.Tensor],
-    module: lightning.LightningModule,
-    trainer: lightning.Trainer,
-    hook: str,
-) -> None:
-    """Refuses a training whose weights were changed after it, by callbacks that have a hook.
-
-    Raises:
-        ConfigError: the weights are not those that are wanted.
-    """
-    there = {name: value.cpu() for name, value in module.state_dict().items()}
-    same = wanted.keys() == there.keys() and all(
-        torch.equal(value.cpu(), there[name]) for name, value in wanted.items()
-    )
-    if same or not wanted:
-        return
-    names = [
-        type(owner).__name__
-        for owner in (*trainer.callbacks, module)  # type: ignore[attr-defined]
-        if not getattr(type(owner), hook).__module__.startswith(("lightning.", __name__))
-    ]
-    raise ConfigError(
-        f"Expected callbacks that leave the trained weights as they are, got weights that `{hook}` of "
-        f"{' or '.join(names) or 'a callback'} changed. What is exported are the weights of the best epoch. "
-        "Leave the callback out."
-    )
-
-
-def measured(trainer: lightning.Trainer) -> dict[str, float]:
-    """What was measured so far, by name."""
-    return {name: float(value) for name, value in trainer.callback_metrics.items()}
 
 
 def in_words(metrics: Mapping[str, float], prefix: str = "") -> str:

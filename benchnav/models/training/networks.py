@@ -34,6 +34,7 @@ from benchnav.models.config import (
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.trainable import TrainableModel
+from benchnav.models.training.best import KeepBest
 from benchnav.models.training.check import Trainable, check_network, class_names, fields_of
 from benchnav.models.training.conformal import check_valid, conformal_table, stopping_every
 from benchnav.models.training.data import (
@@ -46,7 +47,6 @@ from benchnav.models.training.data import (
 )
 from benchnav.models.training.fit import (
     FitOptions,
-    KeepBest,
     fit,
     in_words,
     interrupted,
@@ -114,7 +114,7 @@ def _trainable_names() -> list[str]:
 
 
 def is_trainable(name: str) -> bool:
-    """Tells whether a registered model can be trained; one that cannot be imported cannot."""
+    """Return whether a registered model can be trained; one that cannot be imported cannot."""
     try:
         kind = registry.find("model", name).target
     except ConfigError:
@@ -207,7 +207,7 @@ def train_networks(
 
 
 def _is_turned(how: TrainOptions, config: TrainingConfig, dataset: TerrainDataset) -> bool:
-    """Whether training maps are turned and mirrored: maps with a photo only where the user asks for it."""
+    """Return whether training maps are turned and mirrored: those with a photo only where the user asks for it."""
     is_lit = "rgb" in config.inputs and dataset.has_photo(TRAIN)
     if how.symmetries is None and is_lit and config.symmetries:
         say("note: maps with a photo are not turned or mirrored; pass --symmetries true to do so")

@@ -34,7 +34,7 @@ _LIGHTNING = {"logger": (lightning_loggers, Logger), "callbacks": (lightning_cal
 
 
 def make_loggers(given: Any, folder: Path | None) -> list[Logger]:
-    """Makes the loggers that a user asks for.
+    """Make the loggers that a user asks for.
 
     Args:
         given: one or a list, as text, mapping or object; False for none.
@@ -47,20 +47,20 @@ def make_loggers(given: Any, folder: Path | None) -> list[Logger]:
 
 
 def make_callbacks(given: Any) -> list[Callback]:
-    """Makes the callbacks that a user asks for.
+    """Make the callbacks that a user asks for.
 
     Raises:
-        ConfigError: as of `make_loggers`; or if what a callback does to weights or rates would be undone.
+        ConfigError: As in `make_loggers`, or if what a callback does to weights or rates would be undone.
     """
-    made = [_made("callbacks", item, None) for item in _listed(given)]
+    callbacks = [_made("callbacks", item, None) for item in _listed(given)]
     for name, remedy in _UNDONE.items():
-        for callback in made:
+        for callback in callbacks:
             expect(
                 not isinstance(callback, getattr(lightning_callbacks, name)),
                 f"`trainer.callbacks` that leave weights and rates as they are, got {type(callback).__name__}, "
                 f"whose effect would be undone. {remedy}",
             )
-    return made
+    return callbacks
 
 
 def described(given: Any) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ import pytest
 
 from benchnav.core.errors import BenchnavError
 from benchnav.datagen.dem.importer import import_dem
-from benchnav.datagen.dem.raster import Rasters
+from benchnav.datagen.dem.raster import GroundOptions, Rasters
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.reader import TerrainDataset
 from tests.factories import tiny_recipe
@@ -63,7 +63,9 @@ def run(dem: Path | str, out: Path, settings: dict[str, Any]) -> list[tuple[int,
     plain = {
         name: settings.pop(name) for name in ("class_ids", "random_classes", "layer") if name in settings
     }
-    return list(import_dem(str(dem), out, rasters=Rasters(**files, **plain), **settings))
+    ground = {name: settings.pop(name) for name in ("dem_unit", "origin", "max_maps") if name in settings}
+    options = GroundOptions(**ground)
+    return list(import_dem(str(dem), out, rasters=Rasters(**files, **plain), ground=options, **settings))
 
 
 def read(dem: Path | str, folder: Path | None = None, suffix: str = ".h5", **settings: Any) -> TerrainDataset:

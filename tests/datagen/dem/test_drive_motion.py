@@ -1,5 +1,6 @@
 """Positions of drive logs compared with their speeds."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -92,6 +93,66 @@ def test_another_unit_is_named_with_its_factor(
     if "speed" not in columns:  # off against the command as well, so that positions do not help
         with pytest.raises(DatasetError, match=unit):
             compare_motion(log_of(rows, "positions"))
+
+
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("turn", [0.03, 0.5])
+@pytest.mark.parametrize(
+    ("factor", "unit", "remedy"),
+    [
+        (1e3, "milliseconds", 1e-3),
+        (1e6, "microseconds", 1e-6),
+        (1e9, "nanoseconds", 1e-9),
+        (1 / 60, "minutes", 60),
+        (1 / 3600, "hours", 3600),
+    ],
+)
+def test_a_unit_of_time_is_named_in_curves_and_without_measured_speed(
+    factor: float, unit: str, remedy: float, turn: float, measured: bool
+) -> None:
+    rows = drive(np.ones(3000), 0.5 + 0.1 * np.sin(np.arange(3000) / 37), turn)
+    rows = rows.assign(time_s=rows["time_s"] * factor, speed=rows["speed"] if measured else np.nan)
+    for speed in ("", "positions") if measured else ("positions",):
+        with pytest.raises(
+            DatasetError, match=rf"{unit}.* ultiply `time_s` by {remedy:.4g}".replace(" u", "[Mm]u")
+        ):
+            compare_motion(log_of(rows, speed, is_geographic=True))
+
+
+def test_positions_that_no_command_explains_are_rejected_and_slow_ones_are_not() -> None:
+    rows = drive(np.ones(900), np.repeat([0.02, 0.06], [800, 100]))
+    compare_motion(log_of(rows.assign(speed=np.nan), "positions"))
+    compare_motion(
+        log_of(drive(np.ones(900), np.full(900, 4.5)).assign(speed=np.nan, commanded=1.0), "positions")
+    )
+    compare_motion(log_of(rows.assign(speed=0.0), "positions"))  # it is immobilised
+    tenth = drive(np.ones(900), np.full(900, 0.4)).assign(time_s=np.arange(900.0))
+    for speed in (0.4, np.nan):
+        with pytest.raises(
+            DatasetError, match=r"0\.04 times as far as `commanded_m_s` .* no unit .* in seconds"
+        ):
+            compare_motion(log_of(tenth.assign(speed=speed), "positions"))
+
+
+def test_positions_of_few_decimals_name_no_unit() -> None:
+    rows = drive(np.ones(900), np.full(900, 0.3), turn=0.05)
+    log = log_of(rows.assign(x=rows["x"].round(-1), y=rows["y"].round(-1), speed=1.2))
+    with pytest.raises(
+        DatasetError, match=r"no unit that is known, since positions are multiples of 10 m\. Log .* decimals"
+    ):
+        compare_motion(replace(log, motion={"resolution_m": 10.0}))
+
+
+def test_a_slalom_is_not_of_wheels() -> None:
+    turn = 1.2 * np.cos(np.arange(2400) * STEP_S * 2 * np.pi / 6)
+    log = compare_motion(log_of(drive(np.ones(2400), np.ones(2400), turn)))
+    compare_slopes(log, np.zeros(len(log.rows)))
+
+
+def test_few_straight_spans_name_no_unit_of_speed() -> None:
+    rows = drive(np.ones(30), np.full(30, 0.5), turn=np.repeat([0, 6.0, 0], 10)).assign(speed=1.0)
+    with pytest.raises(DatasetError, match="no unit that is known"):
+        compare_motion(log_of(rows))
 
 
 def test_a_measured_speed_of_no_unit_is_rejected_too() -> None:
@@ -404,6 +465,28 @@ def test_a_speed_that_is_the_command_is_of_wheels() -> None:
 
 
 @pytest.mark.parametrize(
+    ("radius_m", "noise_m"), [(np.inf, 0.0), (3.0, 0.0), (0.8, 0.0), (np.inf, 0.3), (3.0, 0.1)]
+)
+def test_a_robot_that_follows_its_command_over_ground_is_not_of_wheels(
+    radius_m: float, noise_m: float
+) -> None:
+    """Curves shorten the chords of spans, and noise lengthens them."""
+    rows = drive(np.ones(1200), np.ones(1200), np.repeat([1, 0, -1], 400) / radius_m)
+    rows[["x", "y"]] += noise_m * np.random.default_rng(0).standard_normal((1200, 2))
+    log = compare_motion(log_of(rows))
+    log = compare_slopes(log, np.zeros(len(log.rows)))
+    assert log.motion["pace"] == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.parametrize("part", [0.2, 0.3])
+def test_wheels_in_a_part_of_a_drive_are_seen(part: float) -> None:
+    rows = drive(np.ones(2400), 0.6 + 0.1 * np.sin(np.arange(2400) / 37), turn=0.1)
+    rows["speed"] = rows["speed"].where(rows.index >= part * 2400, rows["commanded"])
+    with pytest.raises(DatasetError, match=r"over 15% less far in \d\d% of spans\), as wheel"):
+        compare_slopes(compare_motion(log_of(rows)), np.zeros(2400))
+
+
+@pytest.mark.parametrize(
     ("noise", "rise", "is_wheels"), [(0.005, 1, True), (0.05, 1, False), (0.005, 0.2, False)]
 )
 def test_a_speed_that_follows_the_command_up_and_down_is_of_wheels(
@@ -474,6 +557,32 @@ def test_speed_of_positions_is_that_of_the_drive_forward_and_backward(fix_rows: 
     speed = speed_of_positions(track_of(rows), 0.1)
     steady = (rows.index > 30) & (rows.index < 260) | (rows.index > 400) & (rows.index < 620)
     np.testing.assert_allclose(speed[steady], 0.75 * commanded[steady], rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("rate", "fix_rows", "noise_m"), [(0.5, 1, 0.02), (1.0, 1, 0.0), (-1.0, 5, 0.0), (0.6, 10, 0.0)]
+)
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_speed_of_positions_is_that_along_an_arc(
+    rate: float, fix_rows: int, noise_m: float, direction: float
+) -> None:
+    """Oracle: the arc of a circle of 0.8 m at 1 rad/s, on which a fitted line is 10 % shorter."""
+    rows = drive(np.full(900, direction), np.full(900, 0.8), turn=rate)
+    rows[["x", "y"]] += noise_m * np.random.default_rng(0).standard_normal((900, 2))
+    rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+    log = compare_motion(log_of(rows, "positions"))
+    assert log.rows["traversability"][30:-30].mean() == pytest.approx(0.8, abs=0.01)
+    assert log.motion["pace"] == pytest.approx(1, abs=0.02)
+    assert len(compare_motion(log_of(rows)).rows) == 900
+
+
+@pytest.mark.parametrize("fix_rows", [10, 20])
+def test_a_turn_between_fixes_is_no_slide(fix_rows: int) -> None:
+    """A skid-steer robot turns by half a circle at 2 rad/s, slowly, which at 1 Hz looks like a reversal."""
+    turns = np.tile(np.repeat([0.0, 2.0], [84, 16]), 12)
+    rows = drive(np.where(turns > 0, 0.15, 1.0), np.full(1200, 0.8), turns)
+    rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+    assert (compare_motion(log_of(rows, "positions")).rows["traversability"] >= 0).all()
 
 
 @pytest.mark.parametrize("noise_m", [0.05, 0.1, 0.3])

@@ -160,6 +160,10 @@ def wheels(log: pd.DataFrame) -> pd.DataFrame:
     return log.assign(measured_m_s=log["commanded_m_s"])
 
 
+def few_decimals(log: pd.DataFrame) -> pd.DataFrame:
+    return log.assign(x_m=log["x_m"].round(), y_m=log["y_m"].round())
+
+
 def identical(log: pd.DataFrame) -> pd.DataFrame:
     return log
 
@@ -228,7 +232,7 @@ CASES: list[Case] = [
      lambda log, _: scaled(180 / np.pi, "longitude_deg", "latitude_deg")(log)),
     ("other names", swapped("x_m", "east"), "got no x_m", lambda log, _: swapped("east", "x_m")(log)),
     ("clock times", lambda log: log.assign(time_s=pd.to_datetime(log["time_s"], unit="s").astype(str)),
-     "`time_s` to be numbers.*Convert the column to numbers",
+     "`time_s` to be numbers.*Convert clock times to seconds",
      lambda log, _: log.assign(time_s=(pd.to_datetime(log["time_s"]) - pd.Timestamp(0)).dt.total_seconds())),
 ]  # fmt: skip
 
@@ -291,3 +295,50 @@ def test_a_spoilt_log_imports_right_or_stops_with_a_remedy_that_works(
     assert status == 0, said
     assert "positions move" in said
     check_right()
+
+
+def reverses() -> pd.DataFrame:
+    """A drive at 1 m/s that slides back for half of the time."""
+    speed = np.tile(np.repeat([0.8, -0.6], 50), 4)
+    x = WEST + 20 + np.cumsum(speed) / RATE
+    time_s = np.arange(len(x)) / RATE
+    return pd.DataFrame(
+        {"time_s": time_s, "x_m": x, "y_m": SOUTH + 10.0, "commanded_m_s": 1.0, "measured_m_s": np.abs(speed)}
+    )
+
+
+@pytest.mark.parametrize(
+    ("log", "options", "line"),
+    [
+        (
+            reverses(),
+            "",
+            r"positions reverse in 1\d\d rows, measured_m_s never does: where .* has to be negative",
+        ),
+        (
+            reverses(),
+            "--speed positions",
+            "more than 10% of rows slide back by their positions, which looks wrong",
+        ),
+        (clean_log()[::RATE], "--speed positions", "positions come every 1 s, too seldom to distinguish"),
+        (few_decimals(clean_log()), "--speed measured", "positions are multiples of 1 m: log more decimals"),
+        (clean_log(), "", ""),
+        (reverses().assign(measured_m_s=np.tile(np.repeat([0.8, -0.6], 50), 4)), "", ""),
+        (clean_log(), "--speed positions", ""),
+    ],
+)
+def test_what_looks_wrong_of_positions_is_printed(
+    log: pd.DataFrame,
+    options: str,
+    line: str,
+    ground: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(ground)
+    log.to_csv("log.csv", index=False)
+    status, said = run(options, capfd)
+    assert status == 0, said
+    assert re.search(line, said)
+    doubts = ("reverse in", "looks wrong", "too seldom", "multiples")
+    assert sum(doubt in said for doubt in doubts) == bool(line)

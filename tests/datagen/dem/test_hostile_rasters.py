@@ -108,11 +108,15 @@ def unit(name: str) -> Callable[[Any], None]:
     return edit
 
 
-def masked(file: Any) -> None:
-    """Write a mask for the south-western corner."""
-    valid = np.ones(file.shape, dtype=bool)
-    valid[-12:, :12] = False
-    file.write_mask(valid)
+def masked(rows: slice, columns: slice) -> Callable[[Any], None]:
+    """Return an edit that masks cells."""
+
+    def edit(file: Any) -> None:
+        valid = np.ones(file.shape, dtype=bool)
+        valid[rows, columns] = False
+        file.write_mask(valid)
+
+    return edit
 
 
 def step(cells: int, height_m: float) -> np.ndarray:
@@ -132,15 +136,21 @@ def photo(folder: Path) -> None:
     write(folder / "photo.tif", np.full((3, 66, 96), 99, np.uint8), offset=(1, 1))
 
 
-def measured(value: float, scale: float = 1.0) -> Callable[[Path], object]:
+def measured(value: float, scale: float = 1.0, unit: str = "", **profile: Any) -> Callable[[Path], object]:
     """Return a writer of λ of 0.5 with a value in a corner."""
 
-    def make(folder: Path) -> Path:
+    def make(folder: Path) -> None:
         values = np.full((70, 100), 0.5 * scale, np.float32)
         values[-3:, :3] = value
-        return write(folder / "measured.tif", values)
+        with rasterio.open(write(folder / "measured.tif", values, **profile), "r+") as file:
+            file.units = (unit,)
 
     return make
+
+
+def corner(east: float, north: float) -> str:
+    """Return an option of an origin, metres from the south-west corner."""
+    return f"--origin [{WEST + east},{SOUTH + north}]"
 
 
 ARIZONA = ("EPSG:2223", 700_000, 1_000_000)
@@ -159,7 +169,7 @@ CASES: dict[str, Case] = {
     "NaN": Case(holed(np.nan), maps=5, out="1 missing elevation"),
     "infinity": Case(holed(np.inf), maps=5, out="1 missing elevation"),
     "declared": Case(holed(-9999), profile={"nodata": -9999}, maps=5),
-    "mask": Case(edit=masked, maps=5),
+    "mask": Case(edit=masked(slice(-12, None), slice(12)), maps=5),
     "south up": Case(**turned(rasterio.Affine(0.5, 0, WEST, 0, 0.5, SOUTH)), maps=25),
     "rotated": Case(**turned(ROT), maps=14, out="22 missing elevation"),
     "degrees": geographic(),
@@ -196,9 +206,15 @@ CASES: dict[str, Case] = {
     "US feet above the sea": Case(
         plane(**HIGH, cell=0.5) / US_FT, profile={"crs": "EPSG:32654+6360"}, fixes=("--dem-unit us-ft",)
     ),
+    "inches declared": Case(
+        plane(**HIGH, cell=0.5) / 0.0254, edit=unit("Inches"), fixes=("--dem-unit 0.0254",)
+    ),
     "feet declared of metres": Case(edit=unit("US survey foot"), fixes=("--dem-unit m",)),
     # values that stand for missing
     "-9999": Case(holed(-9999), fixes=(f"{DECLARE}-9999",), maps=5),
+    "-1 in low ground": Case(
+        np.where(holed(np.nan) > 0, holed(0) - 940, -1), fixes=(f"{DECLARE}-1",), maps=5, atol=np.inf
+    ),
     "-999 in low ground": Case(holed(-999), fixes=(f"{DECLARE}-999",), maps=5),
     "-32768": Case(
         holed(-32768, "int16", 0.1), edit=scale(0.1), fixes=(f"{DECLARE}-32768",), maps=5, atol=0.5
@@ -218,7 +234,28 @@ CASES: dict[str, Case] = {
         fixes=("--dem-unit ft", f"{DECLARE}-9999"),
         maps=5,
     ),
-    "a second value": Case(holed(-32768), profile={"nodata": -9999}, fixes=("rio calc",), maps=5),
+    "a second value": Case(
+        holed(-32768),
+        profile={"nodata": -9999},
+        fixes=("'(where (== (read 1) -32768) -9999 (read 1))'",),
+        maps=5,
+    ),
+    "a second value near heights": Case(
+        holed(-999) - np.float32(840) * (holed(-999) > 0),
+        profile={"nodata": -9999},
+        fixes=("'(where (== (read 1) -999) -9999 (read 1))'",),
+        maps=5,
+    ),
+    "a second zero": Case(
+        holed(0), profile={"nodata": -9999}, fixes=("'(where (== (read 1) 0) -9999 (read 1))'",), maps=5
+    ),
+    "a value next to a mask": Case(
+        holed(-999),
+        edit=masked(slice(12), slice(-12, None)),
+        fixes=("rio calc --profile nodata=-999 '(read 1)'",),
+        maps=4,
+    ),
+    "a sea below a cliff of 97 m": Case(holed(803) - np.float32(803), profile={"nodata": -9999}),
     "a map of -9999": Case(
         np.where(np.arange(100) < 32, -9999, plane(**HIGH, cell=0.5)), fixes=(f"{DECLARE}-9999",), maps=4
     ),
@@ -229,34 +266,61 @@ CASES: dict[str, Case] = {
     "a layer of -9999": Case(
         others=measured(-9999), words="--layer wet=measured.tif", fixes=(f"{DECLARE}-9999",)
     ),
+    "a layer of a second -9999": Case(
+        others=measured(-9999, nodata=-32768),
+        words="--layer wet=measured.tif",
+        fixes=("'(where (== (read 1) -9999) -32768 (read 1))'",),
+    ),
+    "a layer of an endless value": Case(
+        others=measured(FLOAT_MAX), words="--layer wet=measured.tif", fixes=(f"{DECLARE}3.40282347e+38",)
+    ),
+    "a layer in yards": Case(
+        others=measured(0, unit="yard"),
+        words="--layer vegetation_m=measured.tif",
+        fixes=("'(* 0.9144 (read 1))'",),
+    ),
+    "a layer called kilometres": Case(
+        others=measured(0, unit="km"),
+        words="--layer vegetation_m=measured.tif",
+        fixes=("rio edit-info --bidx 1 --units m measured.tif",),
+    ),
+    "a layer in ells": Case(
+        others=measured(0, unit="ell"),
+        words="--layer vegetation_m=measured.tif",
+        fixes=("'(* METRES (read 1))'",),
+        fill={"METRES": "1.143"},
+    ),
     # too many maps, or too smooth ones
-    "10 m": coarse(10.0, fixes=("benchnav-datagen",), maps=16),
+    "10 m": coarse(10.0, fixes=("o.h5 resolution_m=10 'start_m=[80,80]'",), maps=16),
     "10 m of feet": coarse(
         10.0,
         edit=unit("ft"),
         words="--dem-unit m class_periods_m=[9,4]",
-        fixes=("benchnav-datagen",),
+        fixes=("'class_periods_m=[180,80]'",),
         maps=16,
     ),
     "three splits": coarse(
-        30.0, words="--splits train:0.6,valid:0.2,test/x:0.2 --stride 4", fixes=("benchnav-datagen",), maps=0
+        30.0,
+        words="--splits train:0.6,valid:0.2,test/x:0.2 --stride 4",
+        fixes=("test/x:0.2 resolution_m=15",),
+        maps=0,
     ),
-    "few cells": coarse(30.0, 20, 20, fixes=("benchnav-datagen",), maps=1),
+    "few cells": coarse(30.0, 20, 20, fixes=("o.h5 resolution_m=15",), maps=1),
     "coarse and rotated": Case(
-        **turned(ROT * rasterio.Affine.scale(20), 40), fixes=("benchnav-datagen",), maps=1
+        **turned(ROT * rasterio.Affine.scale(20), 40), fixes=("o.h5 resolution_m=5",), maps=1
     ),
-    "very few cells": coarse(30.0, 10, 10, fixes=("benchnav-datagen",), maps=1),
-    "side by side": coarse(10.0, words="--stride 16", fixes=("benchnav-datagen",), maps=16),
+    "very few cells": coarse(30.0, 10, 10, fixes=("height=16 width=16",), maps=1),
+    "side by side": coarse(10.0, words="--stride 16", fixes=("o.h5 resolution_m=10",), maps=16),
     "too few cells": coarse(30.0, 3, 3, fixes=("Expected cells of `dem`",), maps=0),
     "drawn places": coarse(
         2.0,
         words="--recipe stakes-v1 resolution_m=0.4 places.margin_m=1",
-        fixes=("benchnav-datagen",),
+        fixes=("places.least_distance_m=100 places.margin_m=5",),
         maps=4,
     ),
     "as coarse as it may be": coarse(2.0, 60, 60, words="--coarse", maps=49),
     "more maps than one wants": Case(
-        words="--stride 2 --max-maps 10", fixes=("benchnav-datagen",), maps=8, out="one every 10 m"
+        words="--stride 2 --max-maps 10", fixes=("--max-maps 10 --stride 10",), maps=8, out="one every 10 m"
     ),
     "22 201 maps": Case(
         plane(180, 180, 0.5), words="--stride 0.5", fixes=("Expected at most 20,000 maps",), maps=0
@@ -270,25 +334,41 @@ CASES: dict[str, Case] = {
         fill={"CELL": "0.5", "WEST": f"{WEST}", "NORTH": f"{SOUTH + 35}"},
     ),
     "two bands": Case(np.stack([plane(**HIGH, cell=0.5)] * 2), fixes=("rio stack",)),
+    "an origin too far east": Case(
+        words=corner(40, 3), fixes=(f"--origin '[{WEST + 34:.0f},{SOUTH + 3:.0f}]'",), maps=2
+    ),
+    "an origin too far north-east": Case(words=corner(49, 34), fixes=("--origin '[",), maps=1),
+    "an origin too far for three splits": Case(
+        plane(140, 200, 0.5),
+        words=f"{corner(30, 60)} --stride 8 --splits train:0.6,valid:0.2,test/x:0.2",
+        fixes=(f"--origin '[{WEST + 20:.0f},{SOUTH + 54:.0f}]'",),
+        maps=0,
+    ),
     "an origin elsewhere": Case(words="--origin [0,0]", fixes=("Expected `origin` on `dem`",), maps=0),
     "a unit of no length": Case(words="--dem-unit parsec", fixes=("Expected `dem_unit`",), maps=0),
     "complex numbers": Case(plane(**HIGH, cell=0.5).astype("complex64"), fixes=("rio convert",)),
 }
 
 
-def mended(line: str, case: Case, words: list[str]) -> list[str]:
+def mended(line: str, fix: str, case: Case, words: list[str]) -> list[str]:
     """Apply the remedy of a line: run its command, or add its option.
 
     Returns:
         The words of the next import.
     """
-    option = case.fixes[0]
-    if option.startswith("--"):
-        assert option in line
-        return [*words, *option.split()]
-    if found := re.search(r"benchnav-datagen (import-dem .*)", line):
-        return shlex.split(found[1])
-    command = re.sub(r"^.*?(rio (?:calc|convert|edit-info|stack) )", r"\1", line).partition(". Where")[0]
+    if fix.startswith("--origin"):
+        (origin,) = re.findall(r"--origin '(.*?)'", line)
+        words = words.copy()
+        words[words.index("--origin") + 1] = origin
+        return words
+    if fix.startswith("--") and "benchnav-datagen import" not in line:
+        return [*words, *fix.split()]
+    if fix == "--coarse":
+        return [*words, fix]
+    if corrected := re.search(r"benchnav-datagen (import-dem .*)", line):
+        return shlex.split(corrected[1])
+    command = line[line.rindex("rio ", 0, line.index(fix) + 4) :]
+    command = re.split(r"\. (?:Where|Else) ", command)[0]
     for blank, value in case.fill.items():
         command = command.replace(blank, value)
     _, tool, *arguments = shlex.split(command)
@@ -296,8 +376,8 @@ def mended(line: str, case: Case, words: list[str]) -> list[str]:
     assert ran.exit_code == 0, ran.output
     if tool == "edit-info":
         return words
-    (source,) = (word for word in arguments if word in words)
-    return [arguments[-1] if word == source else word for word in words]
+    source, target = arguments[-2:]
+    return [word.replace(source, target) for word in words]
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -316,15 +396,14 @@ def test_a_raster_is_imported_right_or_stopped_with_a_remedy(
         case.others(tmp_path)
     recipe = [] if "--recipe" in case.words else ["--recipe", "tiny-v1"]
     words = ["import-dem", "dem.tif", *recipe, "--out", "o.h5", *shlex.split(case.words)]
-    for index, fix in enumerate(case.fixes):
+    for fix in case.fixes:
         assert call("datagen", *words) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert fix in line
         assert not Path("o.h5").exists()
         if fix.startswith("Expected"):
             return
-        case.fixes = case.fixes[index:]
-        words = mended(line, case, words)
+        words = mended(line, fix, case, words)
     assert call("datagen", *words) == 0, capsys.readouterr().err
     said = capsys.readouterr().out
     assert case.out in said

@@ -15,7 +15,7 @@ from benchnav.core.errors import BenchnavError, ConfigError, DatasetError
 from benchnav.datagen.dem import importer
 from benchnav.datagen.dem.extent import GroundError
 from benchnav.datagen.dem.importer import import_dem
-from benchnav.datagen.dem.raster import Layer
+from benchnav.datagen.dem.raster import GroundOptions, Layer
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.merge import merge
 from benchnav.datagen.files.reader import TerrainDataset
@@ -428,8 +428,7 @@ def test_the_paragraph_gives_maps_size_unit_and_origin_before_anything_is_read(
         str(dem),
         tmp_path / "o.h5",
         RECIPE,
-        origin_m=(WEST + 1, SOUTH + 2),
-        max_maps=10**6,
+        ground=GroundOptions(origin=(WEST + 1, SOUTH + 2), max_maps=10**6),
         announce=said.append,
     )
     with pytest.raises(pytest.fail.Exception):
@@ -449,10 +448,10 @@ def test_ground_that_does_not_fit_is_rejected_with_settings_that_do(tmp_path: Pa
     dem = write(tmp_path / "dem.tif", np.zeros((100, 100)), 10.0)
     with pytest.raises(GroundError, match=r"--coarse .* resolution_m=10 .*class_periods_m=\[") as caught:
         next(import_dem(str(dem), tmp_path / "o.h5", RECIPE))
-    assert "resolution_m=10" in caught.value.changes
+    assert caught.value.changes["resolution_m"] == 10
     assert caught.value.stride_m is None
     with pytest.raises(ConfigError, match="`max_maps`"):
-        next(import_dem(str(dem), tmp_path / "o.h5", RECIPE, max_maps=0))
+        next(import_dem(str(dem), tmp_path / "o.h5", RECIPE, ground=GroundOptions(max_maps=0)))
 
 
 def test_an_origin_is_the_corner_of_the_first_map_around_drives_too(tmp_path: Path) -> None:
@@ -486,7 +485,7 @@ def test_heights_are_those_of_the_maps_cells_from_the_origin_on(
 ) -> None:
     size = round(40 / cell)
     origin = WEST + 4 * cell + off_m, SOUTH + 6 * cell + off_m
-    dataset = read(write(tmp_path / "dem.tif", plane(size, size, cell), cell), origin_m=origin)
+    dataset = read(write(tmp_path / "dem.tif", plane(size, size, cell), cell), origin=origin)
     source, maps = source_of(dataset), maps_of(dataset)
     assert source["origin_m"] == pytest.approx(origin)
     x, y = (

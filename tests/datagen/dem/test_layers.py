@@ -265,7 +265,7 @@ def test_a_layer_of_metres_that_declares_feet_is_refused_with_a_conversion(
     canopy = write(tmp_path / "canopy.tif", height_ft, nodata=nodata)
     with rasterio.open(canopy, "r+") as file:
         file.units = ("US survey foot",)
-    command = refusal(dem, f"vegetation_m={canopy}").split(": rio ")[1]
+    command = refusal(dem, f"vegetation_m={canopy}").split(": rio ")[-1]
     words = shlex.split(command)
     words[-1] = str(tmp_path / words[-1])
     assert CliRunner().invoke(main_group, words).exit_code == 0

@@ -618,8 +618,12 @@ def test_zeros_for_missing_heights_are_refused_unless_something_is_declared(
     assert "If 0 stands for missing, declare it: rio edit-info --nodata 0" in message
     declared = read(write(tmp_path / "zero.tif", values, cell, nodata=0))
     assert source_of(declared)["left_out"]["missing_elevation"] > 0
-    kept = read(write(tmp_path / "other.tif", values, cell, nodata=-9999))
-    assert maps_of(kept)["slope_deg"].max() > 85  # a cliff at the sea, by their word
+    assert "replace it by what is declared" in refusal(
+        write(tmp_path / "other.tif", values, cell, nodata=-9999)
+    )
+    cliff = np.where(values > 0, values - 940, 0)  # 60 m above the sea, by their word
+    kept = read(write(tmp_path / "cliff.tif", cliff, cell, nodata=-9999))
+    assert maps_of(kept)["slope_deg"].max() > 85
     # Down to the sea by steps of less than a metre.
     sea = write(tmp_path / "sea.tif", np.linspace(0, 30, 64)[:, None].repeat(96, 1).round(), cell)
     assert len(maps_of(read(sea))["rgb"]) >= 1

@@ -14,7 +14,8 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import MeanIoU, TerrainClassifier, build_network
-from benchnav.models.training.fit import FitOptions, KeepBest
+from benchnav.models.training.best import KeepBest
+from benchnav.models.training.fit import FitOptions
 from benchnav.models.training.networks import fit_network
 from tests.models.support import names, scale, trainable
 

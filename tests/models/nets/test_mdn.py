@@ -26,8 +26,9 @@ from benchnav.models.nets import trainable as trainable_module
 from benchnav.models.nets.mdn import MixtureDensityModel, censored_nll
 from benchnav.models.predictor import Oracle, load_model, open_checkpoint
 from benchnav.models.training import networks
+from benchnav.models.training.best import KeepBest
 from benchnav.models.training.data import MapData
-from benchnav.models.training.fit import FitOptions, KeepBest
+from benchnav.models.training.fit import FitOptions
 from benchnav.models.training.networks import fit_network
 from tests.commands import call
 from tests.factories import normal

@@ -25,9 +25,10 @@ from benchnav.models.nets.calibration import fit_temperature, sample_logits
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.training import fit as fit_module
 from benchnav.models.training import networks
+from benchnav.models.training.best import KeepBest
 from benchnav.models.training.check import check_network
 from benchnav.models.training.data import MapData
-from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
+from benchnav.models.training.fit import FitOptions, default_precision, fit
 from benchnav.models.training.networks import fit_network
 from tests.commands import call
 from tests.models.support import names, trainable

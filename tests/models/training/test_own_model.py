@@ -20,8 +20,8 @@ from benchnav.models.cli import main
 from benchnav.models.nets.trainable import Ensemble
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
+from benchnav.models.training.best import KeepBest
 from benchnav.models.training.data import MapDataset
-from benchnav.models.training.fit import KeepBest
 from benchnav.testing import check_model
 from tests.commands import call
 from tests.models.training.conftest import EXAMPLE
@@ -268,6 +268,7 @@ def test_how_maps_are_cut_and_turned_reaches_the_training_and_the_checkpoint(
     [
         ((), False),
         (("--symmetries",), True),
+        (("--settings.symmetries", "true"), False),
         (("--symmetries", "true", "--settings.symmetries", "false"), False),
         (("--settings.inputs", "[slope_deg]"), True),
     ],
@@ -294,7 +295,9 @@ def test_photos_are_turned_only_where_the_user_asks_for_it(
     )
     assert call("train", *command, *words) == 0
     assert load_checkpoint("a").part("CellModel").config["symmetries"] == turned
-    assert ("pass --symmetries true" in capsys.readouterr().out) == (words == ())
+    assert ("pass --symmetries true" in capsys.readouterr().out) == (
+        "--symmetries" not in words and not turned
+    )
 
 
 def test_a_loss_that_is_no_number_ends_training_and_says_the_epoch(

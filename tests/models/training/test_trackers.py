@@ -30,9 +30,9 @@ class Note(Callback):
 """
 
 
-def train(dataset: TerrainDataset, out: Path, **trainer: Any) -> None:
+def train(dataset: TerrainDataset, out: Path, file: Path = OWN, **trainer: Any) -> None:
     options = TrainOptions(device="cpu", trainer={"max_epochs": 2, "precision": "32-true", **trainer})
-    fit_model(options, f"{OWN}:CellModel", str(dataset.path), str(out), {"batch_size": 5, "hidden": 4})
+    fit_model(options, f"{file}:CellModel", str(dataset.path), str(out), {"batch_size": 5, "hidden": 4})
 
 
 def test_loggers_write_what_is_measured_and_change_nothing(dataset: TerrainDataset, tmp_path: Path) -> None:
@@ -96,6 +96,16 @@ def test_what_cannot_be_made_is_refused_before_training(trainer: dict[str, Any],
     assert "\n" not in str(refused.value)
 
 
+def test_a_metric_that_is_not_measured_is_named_with_those_that_are(
+    dataset: TerrainDataset, tmp_path: Path
+) -> None:
+    for kind in ("EarlyStopping", "ModelCheckpoint"):
+        stop = {"class_path": kind, "init_args": {"monitor": "valid/loss"}}
+        with pytest.raises(ConfigError, match=r"valid/loss.*valid_loss") as refused:
+            train(dataset, tmp_path / kind, callbacks=[stop])
+        assert "\n" not in str(refused.value)
+
+
 def test_a_missing_package_is_named_with_its_command() -> None:
     mlflow = pytest.importorskip("lightning.pytorch.loggers.mlflow")
     if mlflow._MLFLOW_AVAILABLE:
@@ -122,22 +132,60 @@ def test_callbacks_whose_effect_would_be_undone_are_refused_by_name(
         FitOptions(device="cpu", trainer={"callbacks": {"class_path": name, "init_args": init_args}})
 
 
+CHANGE = """
+from lightning.pytorch.callbacks import Callback, Checkpoint
+
+
+class Change({base}):
+    def {hook}(self, trainer, module, *_, **__):
+        for value in module.parameters():
+            value.data.mul_(0.5)
+"""
+
+
 @pytest.mark.parametrize(
-    ("hook", "allowed"),
-    [("on_train_end", False), ("on_fit_end", False), ("on_train_epoch_start", True), ("setup", True)],
+    ("hook", "base", "is_allowed"),
+    [
+        ("setup", "Callback", True),
+        ("on_train_epoch_start", "Callback", True),
+        ("on_train_end", "Callback", False),
+        ("on_fit_end", "Callback", False),
+        ("on_fit_end", "Checkpoint", False),  # which Lightning calls after others
+        ("teardown", "Callback", False),
+    ],
 )
 def test_a_callback_that_changes_the_trained_weights_is_refused_by_name(
-    hook: str, allowed: bool, dataset: TerrainDataset, tmp_path: Path
+    hook: str, base: str, is_allowed: bool, dataset: TerrainDataset, tmp_path: Path
 ) -> None:
     file = tmp_path / "change.py"
-    file.write_text(
-        "from lightning.pytorch.callbacks import Callback\n\n\n"
-        f"class Change(Callback):\n    def {hook}(self, trainer, module, *_, **__):\n"
-        "        for value in module.parameters():\n            value.data.mul_(0.5)\n"
-    )
-    if allowed:
+    file.write_text(CHANGE.format(base=base, hook=hook))
+    if is_allowed:
         train(dataset, tmp_path / "out", callbacks=f"{file}:Change")
         return
-    with pytest.raises(ConfigError, match=f"weights that `{hook}` of Change changed"):
+    with pytest.raises(ConfigError, match=f"weights that `{hook}` of Change changed.*callback out"):
         train(dataset, tmp_path / "out", callbacks=f"{file}:Change")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("hook", ["on_fit_end", "on_train_end", "teardown"])
+def test_a_model_may_change_its_weights_after_the_best_are_back(
+    hook: str, dataset: TerrainDataset, tmp_path: Path
+) -> None:
+    """It also has a buffer of NaN, which differs from itself."""
+    file, where = tmp_path / "own.py", "        super().__init__(config)\n"
+    added = f"""        self.register_buffer("empty", torch.full((2,), math.nan))
+
+    def {hook}(self, *_, **__):
+        for value in self.parameters():
+            value.data.fill_(0.25)
+"""
+    file.write_text(OWN.read_text().replace(where, where + added))
+    if hook == "on_train_end":
+        with pytest.raises(
+            ConfigError, match=r"`on_train_end` of CellModel changed.*in `on_fit_end` of the model"
+        ):
+            train(dataset, tmp_path / "out", file)
+        return
+    train(dataset, tmp_path / "out", file)
+    tensors = load_checkpoint(tmp_path / "out").parts["CellModel"].tensors
+    assert tensors["network.0.weight"].eq(0.25).all()

@@ -11,8 +11,8 @@ import torch
 from benchnav.models.config import JoinedConfig
 from benchnav.models.nets.joined import JoinedModel
 from benchnav.models.training import networks
+from benchnav.models.training.best import KeepBest
 from benchnav.models.training.check import Trainable
-from benchnav.models.training.fit import KeepBest
 from benchnav.models.zoo.evidential import EvidentialConfig, EvidentialModel
 from benchnav.models.zoo.mc_dropout import DropoutConfig, DropoutModel
 from benchnav.models.zoo.mean_variance import MeanVarianceConfig, MeanVarianceModel

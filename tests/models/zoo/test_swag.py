@@ -9,8 +9,9 @@ from torch import Tensor
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.training import networks
+from benchnav.models.training.best import KeepBest
 from benchnav.models.training.data import MapData
-from benchnav.models.training.fit import FitOptions, KeepBest
+from benchnav.models.training.fit import FitOptions
 from benchnav.models.training.networks import fit_network
 from tests.models.zoo.support import EXACT, ZOO, make, to_train
 
