@@ -16,8 +16,8 @@ FACES = {
     "benchnav": "Batch BenchnavError CheckpointError ConditionedDistribution ConfigError DatasetError Grid "
     "Observation QuantileDistribution Terrain TrainingError TraversabilityDistribution TraversabilityMixture pool "
     "register",
-    "benchnav.datagen": "Recipe TerrainClass TerrainDataset TerrainMaps create_dataset find_dataset generate "
-    "load_recipe recipe_from_dict shipped_recipes",
+    "benchnav.datagen": "DrawnMaps Layer Recipe Streams TerrainClass TerrainDataset TerrainMaps create_dataset "
+    "find_dataset generate load_recipe recipe_from_dict shipped_recipes",
     "benchnav.env": "EgocentricEnv EgocentricVectorEnv OffRoadEnv OffRoadVectorEnv PolicyPlanner",
     "benchnav.eval": "Condition Suite compare_runs open_run read_report read_steps run_suite write_report",
     "benchnav.models": "Checkpoint ModelFamily Part TrainOptions TrainableModel TrainingConfig "

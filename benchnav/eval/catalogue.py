@@ -23,6 +23,7 @@ TITLES = {
     "sensor": "sensors of appearance: what a robot sees of its map",
     "ground": "sensors of the ground: what a robot senses of λ",
     "belief": "beliefs: what is made of what is sensed",
+    "layer": "layers of recipes",
     "world": "worlds, each with its rules of the task",
 }
 HELP = (

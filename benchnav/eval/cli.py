@@ -139,10 +139,10 @@ def verify(folder: str) -> int:
 
 
 def list_command(kinds: list[str]) -> None:
-    """List planners, models, risk measures, robots, objectives, sensors, beliefs and worlds with their options.
+    """List planners, models, risk measures, robots, objectives, sensors, beliefs, layers and worlds with their options.
 
     Args:
-        kinds: Some of planner, model, risk, robot, objective, sensor, ground, belief and world; all when none is named.
+        kinds: Some of planner, model, risk, robot, objective, sensor, ground, belief, layer and world; all if empty.
     """
     from benchnav.eval.catalogue import print_catalogue
 

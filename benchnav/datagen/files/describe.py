@@ -102,10 +102,13 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
     fields = schema.read_field_table(described["fields"])
     layers = schema.layer_names(fields)
     if layers:
+        code = {layer["name"]: layer["source"] for layer in described["drawn_layers"]}
         yield Table(
             title="layers",
-            headings=("layer", "unit", "meaning"),
-            rows=tuple((name, fields[name].unit, fields[name].meaning) for name in layers),
+            headings=("layer", "unit", "meaning", "drawn by"),
+            rows=tuple(
+                (name, fields[name].unit, fields[name].meaning, code.get(name, "")) for name in layers
+            ),
         )
     extra = [name for name in fields if name not in (*schema.FIELDS, *layers)]
     if extra:
@@ -139,8 +142,7 @@ def _describe_layer(spec: LayerSpec, classes: ClassTable) -> schema.Json:
     return {
         "name": spec.name,
         "words": spec.words,
-        "source": spec.source,
-        "digest": spec.digest,
+        "source": f"{spec.source}, digest {spec.digest[:12]}" if spec.source else "benchnav",
         "classes": {item.name: layer.describe_class(item.name) if layer else "" for item in classes},
     }
 
