@@ -78,7 +78,7 @@ def colour_layers(
 def affect_layers(
     layers: Sequence[Layer], truth: Parameters, values: Mapping[str, ndarray], maps: DrawnMaps
 ) -> Parameters:
-    """Return the true distribution of λ with all layers, in single precision, as it is stored.
+    """Return the true distribution of λ with all layers.
 
     Components without weight, and cells whose class is not known, stay as they are.
 
@@ -107,7 +107,6 @@ def affect_layers(
             new_std = _checked(layer, "stds of `affect`", result[1], std.shape, (1e-6, 1), cells)
             means[:, component] = np.where(cells, new_mean, mean)
             stds[:, component] = np.where(cells, new_std, std)
-    means, stds = (array.astype(np.float32).astype(np.float64) for array in (means, stds))
     return weights, means, stds
 
 

@@ -26,6 +26,7 @@ GRASS = Growth(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
 SHIPPED: dict[str, Layer] = {
     "vegetation": Vegetation(period_m=4.0, classes={"wet_clay": GRASS, "scree": GRASS})
 }
+ON_ICE = {"period_m": 4, "classes": {"ice": plain(GRASS)}}
 MAPS, ONES = np.arange(6), np.ones((2, 32, 32))
 
 
@@ -72,15 +73,15 @@ def test_what_a_layer_does_not_name_stays(recipe: Recipe) -> None:
 
 def test_a_layer_without_effect_leaves_colours_and_lambda_as_they_are() -> None:
     recipe = small_stakes()
-    plain = replace(recipe, layers=(Plain(),))
+    layered = replace(recipe, layers=(Plain(),))
     for split in recipe.splits:
-        maps, without = (generate(each, split, np.arange(3)) for each in (plain, recipe))
+        maps, without = (generate(each, split, np.arange(3)) for each in (layered, recipe))
         for name in FIELDS:
             np.testing.assert_array_equal(maps[name], without[name])
         truth = latent.truth(maps["class_id"], maps["slope_deg"].astype(np.float64), recipe.classes)
         for name, values in zip(TRUTH, truth[1:], strict=True):
             np.testing.assert_array_equal(maps[name], values.astype(np.float32))
-    own, bare = terrain_of(maps, plain), terrain_of(without, recipe)
+    own, bare = terrain_of(maps, layered), terrain_of(without, recipe)
     assert own.look_alikes is not None
     assert bare.look_alikes is not None
     torch.testing.assert_close(own.look_alikes(own).mean(), bare.look_alikes(bare).mean(), rtol=0, atol=1e-6)
@@ -124,10 +125,9 @@ def test_a_solvable_split_goes_by_the_lambda_that_the_layer_makes(tmp_path: Path
 def test_layers_change_colours_and_lambda_in_their_order(tmp_path: Path) -> None:
     """Grass hides wet soil if it is drawn later; the values of both are those of each layer alone."""
     layers = wetness(tmp_path)(), Vegetation(period_m=4.0, classes={"wet_clay": GRASS})
-    recipe = small_stakes(
-        scenarios={"std": replace(small_stakes().scenarios["std"], ambient=1.0)},
-        splits={"train": Split(scenario="std", maps=6)},
-    )
+    bright = replace(small_stakes().scenarios["std"], ambient=1.0)
+    splits = {"train": Split(scenario="std", maps=6)}
+    recipe = small_stakes(scenarios={"std": bright}, splits=splits)
     hidden, shown = (
         generate(replace(recipe, layers=order), "train", MAPS) for order in (layers, layers[::-1])
     )
@@ -213,7 +213,7 @@ def test_a_bad_layer_ends_in_one_line(
         (["nothing"], "Expected a layer among vegetation, package.module:Name"),
         ([{"part": "vegetation", "label": "grass"}], "a layer as NAME or as {part: NAME, options: {…}}"),
         ([{"part": "vegetation", "options": {"period_m": 4, "moss": 1}}], "'moss'"),
-        ([{"part": "vegetation", "options": {"period_m": 4, "classes": {"ice": plain(GRASS)}}}], "classes of layer 'vegetation' among"),
+        ([{"part": "vegetation", "options": ON_ICE}], "classes of layer 'vegetation' among"),
         ([{"part": "tests.datagen.layers.own:Plain"}] * 2, "layers of different names, got 'plain' twice"),
     ],
 )  # fmt: skip

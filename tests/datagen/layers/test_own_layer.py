@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchnav.core import registry
 from benchnav.core.errors import ConfigError
-from benchnav.datagen import TerrainDataset, create_dataset, generate, load_recipe
+from benchnav.datagen import TerrainDataset, create_dataset, generate, load_recipe, recipe_from_dict
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.layers.layer import Layer
-from benchnav.datagen.layers.spec import LayerSpec
 from tests.commands import call
 from tests.datagen.layers.own import PAGE, Plain, write_page
 from tests.datagen.small import small_stakes
@@ -156,25 +156,11 @@ def test_a_recipe_with_a_layer_is_changed_by_its_place_in_the_list(
 def test_a_layer_of_this_process_only_is_not_made_in_two(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from benchnav.core import registry
-    from benchnav.datagen.recipe.recipe import recipe_from_dict
-
     monkeypatch.setattr(registry, "_REGISTERED", {("layer", "mine"): Plain})
     recipe = recipe_from_dict(small_stakes().to_dict() | {"layers": ["mine"]}, "test")
     with pytest.raises(ConfigError, match="one process with layer 'plain'"):
         next(create_dataset(recipe, tmp_path / "d.h5", jobs=2))
     assert generate(recipe, "train", np.arange(1))["plain"].shape == (1, 32, 32)
-
-
-def test_a_spec_says_what_its_class_says() -> None:
-    spec = LayerSpec(part="x", name="plain")
-    assert spec.stored_field == replace_meaning(Plain.field())
-
-
-def replace_meaning(field: object) -> object:
-    from dataclasses import replace
-
-    return replace(field, meaning="")  # type: ignore[type-var]
 
 
 def test_the_base_class_has_no_effect() -> None:
