@@ -13,7 +13,7 @@ from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from tests.datagen.small import small_stakes
 from tests.docs.pages import DOCS, blocks
 
-PAGE = {block.file: block.body for block in blocks(DOCS / "how-to" / "make-datasets.md") if block.file}
+PAGE = {block.file: block.body for block in blocks(DOCS / "how-to" / "own-layer.md") if block.file}
 
 
 def write_page(folder: Path) -> Path:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -10,9 +11,11 @@ import torch
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import plain
+from benchnav.datagen.dem.importer import import_dem
+from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.stored_terrain import terrain_of
 from benchnav.datagen.layers.layer import DrawnMaps, Layer
-from benchnav.datagen.layers.spec import read_layer, shipped_fields
+from benchnav.datagen.layers.spec import overrides_of, read_layer, shipped_fields
 from benchnav.datagen.layers.vegetation import Growth, Vegetation
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import Recipe, Split, recipe_from_dict
@@ -20,6 +23,7 @@ from benchnav.datagen.schema import FIELDS, TRUTH
 from benchnav.datagen.synth.generate import generate
 from tests.datagen.layers.own import Plain, wet, wetness
 from tests.datagen.small import grown, small_stakes
+from tests.factories import tiny_dataset
 
 GRASS = Growth(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
 # A layer of each shipped kind, as a recipe may have it.
@@ -239,3 +243,29 @@ def test_a_class_that_the_recipe_lacks_is_named() -> None:
     maps = DrawnMaps(flat.astype(int), flat, flat, small_stakes().grid, small_stakes().classes)
     with pytest.raises(ConfigError, match="Expected a class of the recipe among basalt"):
         maps.cells_of("ice")
+
+
+def test_layers_scale_with_their_maps_and_name_what_changed() -> None:
+    """Of vegetation by the key of recipes, of others by their place among `layers`."""
+    grass, taller = (read_layer(Vegetation(period_m=m, classes={"scree": GRASS})) for m in (4.0, 1.0))
+    assert grass.scaled(0.5, 0.5).options["period_m"] == 2.0
+    assert grass.scaled(0.25, 1.0).options["period_m"] == 2.0  # two cells at least
+    assert overrides_of((grass,), (grass.scaled(0.5, 0.5),)) == {"vegetation_period_m": 2.0}
+    other = replace(taller, part="file.py:Other")
+    after = replace(other, options={**other.options, "period_m": 3.0})
+    assert overrides_of((grass, other), (grass, after)) == {"layers.0.options.period_m": 3.0}
+
+
+def test_an_import_draws_no_layer_that_changes_lambda(tmp_path: Path) -> None:
+    recipe = replace(small_stakes(), layers=(Plain(),))
+    with pytest.raises(ConfigError, match="`layers` leave λ as it is, since an import draws none, got plain"):
+        next(import_dem("none.tif", tmp_path / "d.h5", recipe))
+
+
+def test_what_does_not_lie_in_the_range_of_a_users_layer_is_a_fault(tmp_path: Path) -> None:
+    path = tiny_dataset(tmp_path / "d.h5", wet(tmp_path))
+    with h5py.File(path, "r+") as file:
+        file["train/wetness"][2, 0, 0] = 1.5
+        file["train/truth_mean"][3, 0, 0, 0] = np.nan
+    found = {(fault.map, fault.field) for fault in find_faults(path) if fault.problem == "is out of range"}
+    assert found == {(2, "wetness"), (3, "truth_mean")}

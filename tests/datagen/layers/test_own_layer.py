@@ -118,7 +118,7 @@ def test_other_code_than_was_recorded_is_rejected(
             ("return rgb *", "return np.nan * rgb *"),
             "colours of `look` of layer 'wetness' in [0, 255], got nan",
         ),
-        (("0.5 + noise", "[0] + noise[0]"), "values of `draw` of layer 'wetness' of shape"),
+        (("return np.clip", "return noise[0]; np.clip"), "values of `draw` of layer 'wetness' of shape"),
         (("np.clip(0.5", "np.slip(0.5"), "`draw` of layer 'wetness' failed: AttributeError"),
         (("class Wetness(Layer)", "class Wetness"), "to be a subclass of benchnav.datagen.Layer"),
     ],
