@@ -269,3 +269,13 @@ def test_what_does_not_lie_in_the_range_of_a_users_layer_is_a_fault(tmp_path: Pa
         file["train/truth_mean"][3, 0, 0, 0] = np.nan
     found = {(fault.map, fault.field) for fault in find_faults(path) if fault.problem == "is out of range"}
     assert found == {(2, "wetness"), (3, "truth_mean")}
+
+
+def test_modes_without_weight_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Broken, "affect", lambda _, mean, std, *__: (mean, 0.5 * std))
+    recipe = replace(small_stakes(), layers=(Broken(),))
+    maps = generate(recipe, "train", MAPS)
+    weights, _, stds = latent.truth(maps["class_id"], maps["slope_deg"].astype(np.float64), recipe.classes)
+    assert (weights == 0).any()
+    expected = np.where(weights > 0, 0.5 * stds, stds).astype(np.float32)
+    np.testing.assert_array_equal(maps["truth_std"], expected)
