@@ -65,4 +65,5 @@ def paint(colours: ndarray, brightness: ndarray) -> ndarray:
     Returns:
         Image, uint8, shape [B, 3, H, W].
     """
-    return np.rint(colours * brightness[:, None]).astype(np.uint8)
+    lit = np.moveaxis(colours, 1, 0) * brightness
+    return np.moveaxis(np.rint(lit, out=lit).astype(np.uint8), 0, 1)

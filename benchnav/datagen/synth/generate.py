@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from benchnav.core import copula, gridgraph, rng
 from benchnav.core.errors import ConfigError
-from benchnav.datagen.layers.layer import DrawnMaps
+from benchnav.datagen.layers.layer import DrawnMaps, Layer
 from benchnav.datagen.layers.spec import LayerSpec
 from benchnav.datagen.layers.stack import affect_layers, colour_layers, draw_layers
 from benchnav.datagen.noise import fractal_perlin
@@ -20,6 +20,7 @@ from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.looks import shown_colours
 from benchnav.datagen.recipe.places import draw_places
 from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
+from benchnav.datagen.recipe.scenario import Scenario
 from benchnav.datagen.schema import TRUTH, Maps, join_maps, quantise
 from benchnav.datagen.synth import appearance, elevation
 
@@ -144,19 +145,15 @@ def complete(
     below = DrawnMaps(class_id, ground[:, 1:-1, 1:-1], slope, recipe.grid, recipe.classes)
     stack = [spec.layer for spec in layers]
     values = draw_layers(stack, recipe.seed, (split, attempt), indices, below)
-    truth = affect_layers(stack, latent.truth(class_id, slope, recipe.classes), values, below)
-    stored_truth = dict(zip(TRUTH, truth[1:], strict=True)) if any(spec.affects for spec in layers) else {}
-    realised = latent.quantile_of(truth, noise)
+    realised, stored_truth = _realise(stack, values, below, noise)
     brightness = appearance.shade(*gradient, light, scenario.ambient)
-    colours = np.moveaxis(np.take(shown_colours(recipe.classes, scenario).T, class_id, axis=1), 0, 1)
-    colours = colour_layers(stack, colours, values, below)
     if recipe.places is None:
         ends = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)
         start_m, goal_m = np.tile(ends[:, None], (1, len(indices), 1))
     else:
         start_m, goal_m = draw_places(recipe.places, recipe.grid, key("places", attempt), indices)
     return {
-        "rgb": appearance.paint(colours, brightness),
+        "rgb": appearance.paint(_colour(stack, values, below, scenario), brightness),
         "class_id": class_id,
         "elevation_m": below.elevation_m,
         "slope_deg": slope,
@@ -167,6 +164,20 @@ def complete(
         **values,
         **stored_truth,
     }
+
+
+def _realise(layers: Sequence[Layer], values: Maps, below: DrawnMaps, noise: ndarray) -> tuple[ndarray, Maps]:
+    """Return λ [B, H, W] by standard normal numbers, and the fields of `schema.TRUTH` if a layer changes λ."""
+    truth = affect_layers(layers, latent.truth(below.class_id, below.slope_deg, below.classes), values, below)
+    is_affected = any(layer.affects() for layer in layers)
+    return latent.quantile_of(truth, noise), dict(zip(TRUTH, truth[1:], strict=True)) if is_affected else {}
+
+
+def _colour(layers: Sequence[Layer], values: Maps, below: DrawnMaps, scenario: Scenario) -> ndarray:
+    """Return the colours of maps in full light, with their layers, shape [B, 3, H, W]."""
+    by_class = shown_colours(below.classes, scenario)
+    colours = np.moveaxis(np.take(by_class.T, below.class_id, axis=1), 0, 1)
+    return colour_layers(layers, colours, values, below)
 
 
 def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
