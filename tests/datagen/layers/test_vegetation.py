@@ -100,18 +100,6 @@ def test_it_hides_the_colour_of_its_cells_alone_and_changes_nothing_else(split: 
     assert is_grown.any()
 
 
-def test_a_map_is_the_same_in_any_batch_and_its_own_in_each_split() -> None:
-    whole = generate(RECIPE, "train", np.arange(8))["vegetation_m"]
-    np.testing.assert_array_equal(generate(RECIPE, "train", np.array([1, 5]))["vegetation_m"], whole[[1, 5]])
-    np.testing.assert_array_equal(generate(RECIPE, "train", np.array([6]))["vegetation_m"][0], whole[6])
-    renamed = replace(RECIPE, splits={"valid": RECIPE.splits["train"]})
-    sibling = generate(replace(RECIPE, seed=5), "train", np.arange(8))["vegetation_m"]
-    grows = (whole > 0).any(axis=(1, 2))
-    for other in (generate(renamed, "valid", np.arange(8))["vegetation_m"], sibling):
-        assert not (other == whole).all(axis=(1, 2))[grows].any()
-    assert grows.sum() > 3
-
-
 def test_seed_split_draw_and_map_each_have_vegetation_of_their_own() -> None:
     """On one class map, so that nothing else differs."""
     class_id, indices = np.ones((2, 32, 32), int), np.arange(2)
