@@ -16,8 +16,8 @@ FACES = {
     "benchnav": "Batch BenchnavError CheckpointError ConditionedDistribution ConfigError DatasetError Grid "
     "Observation QuantileDistribution Results Terrain TrainingError TraversabilityDistribution TraversabilityMixture "
     "evaluate open_run pool register",
-    "benchnav.datagen": "Recipe TerrainClass TerrainDataset TerrainMaps create_dataset find_dataset generate "
-    "load_recipe recipe_from_dict shipped_recipes",
+    "benchnav.datagen": "DrawnMaps Layer Recipe Streams TerrainClass TerrainDataset TerrainMaps create_dataset "
+    "find_dataset generate load_recipe recipe_from_dict shipped_recipes",
     "benchnav.env": "EgocentricEnv EgocentricVectorEnv OffRoadEnv OffRoadVectorEnv PolicyPlanner",
     "benchnav.eval": "Comparison Condition Results Suite compare_runs evaluate open_run read_report read_steps "
     "run_suite write_report",

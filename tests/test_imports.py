@@ -11,7 +11,8 @@ PACKAGE = Path(__file__).parent.parent / "benchnav"
 # The values that the folders of `planning` share, and the shells that Gymnasium is given.
 VALUES = ("free_space", "objective", "problem", "risk", "robots")
 PLANNING = tuple(f"planning.{name}" for name in VALUES)
-SYNTHESIS = ("datagen.synth", "datagen.recipe", "datagen.schema")
+DRAWN = ("datagen.noise", "datagen.schema")  # what all of synthesis shares
+SYNTHESIS = ("datagen.synth", "datagen.recipe", "datagen.layers", *DRAWN)
 # Whatever is known of models beside their training and their quality.
 WHOLE = ("fused", "conformal", "predictor")
 MODELS = tuple(
@@ -28,8 +29,10 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "stats": ("stats",),
     "datagen": ("datagen",),
     "datagen/schema.py": (),
-    "datagen/recipe": ("datagen.recipe", "datagen.schema"),
-    "datagen/synth": ("datagen.synth", "datagen.recipe", "datagen.schema"),
+    "datagen/noise.py": (),
+    "datagen/layers": ("datagen.layers", "datagen.recipe.classes", *DRAWN),
+    "datagen/recipe": ("datagen.recipe", "datagen.layers", *DRAWN),
+    "datagen/synth": SYNTHESIS,
     "datagen/files": ("datagen.files", *SYNTHESIS),
     "datagen/export": ("datagen.export", "datagen.files", *SYNTHESIS),
     "datagen/dem": ("datagen.dem", "datagen.files", *SYNTHESIS),
@@ -170,6 +173,8 @@ def test_no_modules_import_one_another_in_a_circle() -> None:
         ("eval/recording.py", "benchnav.eval.run.recorder", False),
         ("eval/folder/run_folder.py", "benchnav.eval.run.runner", False),
         ("datagen/recipe/recipe.py", "benchnav.datagen.synth.generate", False),
+        ("datagen/layers/vegetation.py", "benchnav.datagen.recipe.classes", True),
+        ("datagen/layers/vegetation.py", "benchnav.datagen.recipe.recipe", False),
         ("datagen/synth/generate.py", "benchnav.datagen.files.reader", False),
         ("datagen/files/reader.py", "benchnav.datagen.dem.importer", False),
         ("models/nets/classifier.py", "benchnav.models.training.fit", False),

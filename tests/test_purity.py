@@ -52,10 +52,10 @@ def test_datagen() -> None:
     z, class_id = np.random.default_rng(0).random((2, 8, 8)), np.zeros((2, 8, 8), dtype=int)
     light = appearance.light_direction(np.zeros(2), np.full(2, 0.5))
     classes = load_recipe("paper-v1").classes
-    colours = np.full((10, 3), 99.0)
+    colours = np.full((2, 3, 8, 8), 99.0)
     same_after(lambda: elevation.inclination_deg(*elevation.horn_gradient(elevation.framed(z), 0.5)), z)
     same_after(lambda: appearance.shade(z, z, light, 0.1), z, light)
-    same_after(lambda: appearance.paint(class_id, colours, z), class_id, colours, z)
+    same_after(lambda: appearance.paint(colours, z), colours, z)
     same_after(lambda: appearance.class_bands(z, np.array([0.5, 0.5])), z)
     same_after(lambda: latent.latent_mean(class_id, z, classes), class_id, z)
     indices = np.array([0, 2, 3])

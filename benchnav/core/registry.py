@@ -1,7 +1,7 @@
 """The one registry: how every replaceable part is named, found, configured and identified.
 
 Parts are planners, models, risk measures, robots, objectives, sensors of appearance (`sensor`) and of the ground
-(`ground`), beliefs, and metrics of episodes. A part is named by one of four forms:
+(`ground`), beliefs, metrics of episodes, and layers of recipes. A part is named by one of four forms:
 
 - a shipped name (`mppi`) or the name of an entry point of the group `benchnav.<kind>s` of an installed
   package; the shipped parts are entry points too;
@@ -65,7 +65,7 @@ from benchnav.core.sources import (
 )
 from benchnav.core.yaml_text import load_yaml
 
-KINDS = ("planner", "model", "risk", "robot", "objective", "sensor", "ground", "belief", "metric")
+KINDS = ("planner", "model", "risk", "robot", "objective", "sensor", "ground", "belief", "metric", "layer")
 
 # What a part of each kind is a subclass of, and where users import that from. A risk measure is any function.
 _BASES = {
@@ -77,6 +77,7 @@ _BASES = {
     "ground": ("benchnav.planning", "Sensor"),
     "belief": ("benchnav.planning", "Belief"),
     "metric": ("benchnav.metrics", "Metric"),
+    "layer": ("benchnav.datagen", "Layer"),
 }
 
 # Parameters that the program gives, so no options.
@@ -182,6 +183,11 @@ def names(kind: str) -> list[str]:
     """Names of a kind that are known here, sorted."""
     registered = {name for known, name in _REGISTERED if known == kind}
     return sorted(registered | {point.name for point in entry_points_of(kind)})
+
+
+def shipped_names(kind: str) -> list[str]:
+    """Names of the parts of a kind that this package ships, sorted; nothing is imported."""
+    return sorted(point.name for point in entry_points_of(kind) if point.value.startswith("benchnav."))
 
 
 def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:

@@ -30,7 +30,7 @@ def of_split(dataset: TerrainDataset, split: str) -> Maps:
     Raises:
         DatasetError: there is no such split, or its data are damaged.
     """
-    fields = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
+    fields = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s", *dataset.truth_names)
     return join_maps([measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, fields)])
 
 
@@ -38,7 +38,8 @@ def measure(maps: Maps, recipe: Recipe) -> Maps:
     """Measures what stands in a robot's way on some maps.
 
     Args:
-        maps: `class_id`, `slope_deg`, `start_m`, `goal_m` and `reference_time_s`, as stored.
+        maps: `class_id`, `slope_deg`, `start_m`, `goal_m` and `reference_time_s`, as stored, and the fields of
+            `schema.TRUTH` where the dataset has them.
         recipe: class table, resolution and λ_stuck.
 
     Returns:
@@ -49,8 +50,7 @@ def measure(maps: Maps, recipe: Recipe) -> Maps:
             straight: whether all cells of the straight line from start to goal have a true E[λ] above λ_stuck.
             reference_times_s: grid reference time, not finite where there is none.
     """
-    slope = maps["slope_deg"].astype(np.float64)
-    truth = latent.truth(maps["class_id"], slope, recipe.classes)
+    truth = latent.stored_truth(maps, recipe.classes)
     stuck = latent.expected_of(truth) <= recipe.stuck_threshold  # not where it is NaN
     spots = truth[0][:, 1:].sum(axis=1)  # weight of the soft spots
     labelled = maps["class_id"] != UNLABELLED

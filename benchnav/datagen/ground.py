@@ -38,7 +38,7 @@ _DIGITS = 6
 # Settings of recipes that say which ground there is; the scenario of `train` is std in all that are shipped.
 _OF_GROUND = (
     "synthesis", "classes", "occupancy", "environments", "class_periods_m", "resolution_m", "correlation_m",
-    "vegetation_period_m",
+    "layers",
 )  # fmt: skip
 _PRIOR_STD = 10.0  # of fields and strength, so that both are finite where classes are never mixed
 

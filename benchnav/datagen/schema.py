@@ -1,4 +1,4 @@
-"""Dataset formats 1.0 to 1.3: fields, manifest and content digests; `docs/reference/format.md` is for readers.
+"""Dataset formats 1.0 to 1.4: fields, manifest and content digests; `docs/reference/format.md` is for readers.
 
 One HDF5 file is one dataset. Groups are splits; each holds the fields that the manifest lists, those of `FIELDS` and
 perhaps others, and the SHA-256 of every entry. The manifest is a JSON text in the dataset `manifest`. A folder of such
@@ -10,13 +10,16 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy import ndarray
 
+from benchnav.core.errors import expect
+
 FORMAT = "benchnav-dataset"
-FORMAT_VERSION = (1, 3)  # the newest that is read
+FORMAT_VERSION = (1, 4)  # the newest that is read
 MANIFEST = "manifest"
 ENTRY_DIGESTS = "entry_digests"
 DIGEST_BYTES = 32
@@ -82,22 +85,49 @@ OPTIONAL: dict[str, Field] = {
     ),
 }
 
-# Layers, what a model may see of the ground beside colour and shape. NaN is where nothing is known.
-LAYERS: dict[str, Field] = {
-    "vegetation_m": Field("<f4", ("H", "W"), "m", 0, 200, "height of the vegetation; 0 on bare ground"),
-}
+# The true distribution of λ where layers of the recipe change it; no model may see it.
+TRUTH = ("truth_mean", "truth_std")
 
-KNOWN = FIELDS | OPTIONAL | LAYERS
+KNOWN = FIELDS | OPTIONAL
 MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
+
+# Names that no layer has: of other arrays of a split, and of what models and environments are given next to layers.
+_TAKEN = (*KNOWN, *TRUTH, ENTRY_DIGESTS, MANIFEST, "map_index", "x_m", "y_m", "state", "goal", "seen")
+
+
+def truth_fields(components: int) -> dict[str, Field]:
+    """Describe the fields of `TRUTH` for a number of components of λ's distribution, K."""
+    mean, std = TRUTH
+    shape = (components, "H", "W")
+    return {
+        mean: Field("<f4", shape, "1", 0, 1, "mean of each component of λ before clipping, with layers"),
+        std: Field("<f4", shape, "1", 0, 1, "standard deviation of each component of λ before clipping"),
+    }
 
 
 def layer_names(fields: Fields) -> tuple[str, ...]:
-    """Names of the layers among fields: those of `LAYERS`, and float32 maps of a dataset's own."""
+    """Names of the layers among fields: float32 maps that are no other field, which a model may see.
+
+    NaN is where nothing is known.
+    """
     return tuple(
         name
         for name, field in fields.items()
-        if name in LAYERS or (name not in KNOWN and (field.dtype, field.shape) == ("<f4", ("H", "W")))
+        if name not in KNOWN and (field.dtype, field.shape) == ("<f4", ("H", "W"))
     )
+
+
+def check_layer_name(what: str, name: str) -> None:
+    """Check a name for a layer.
+
+    Raises:
+        ConfigError: If it is no identifier or that of something else, with `what` in its message.
+    """
+    expect(
+        name.isidentifier() and name.isascii(),
+        f"{what} of letters, digits and '_', not beginning with a digit, got {name!r}.",
+    )
+    expect(name not in _TAKEN, f"{what} to be none of {', '.join(_TAKEN)}, got {name!r}.")
 
 
 def quantise(values: ndarray, bits: int) -> ndarray:
@@ -154,13 +184,15 @@ def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> s
     return hashlib.sha256(text + digests.tobytes()).hexdigest()
 
 
-def version_of(synthesis: Iterable[int], splits: Iterable[Json], fields: Fields) -> str:
-    """The format version of a file: the least that its recipes' synthesis, its splits' entries and its fields need."""
+def version_of(recipes: Sequence[Json], splits: Iterable[Json], fields: Fields) -> str:
+    """The format version of a file: the least that its recipes, its splits' entries and its fields need."""
+    if any("layers" in recipe for recipe in recipes):
+        return "1.4"
     if set(fields) - set(FIELDS):
         return "1.3"
     if any(has_unlabelled(entry) for entry in splits):
         return "1.2"
-    return "1.1" if max(synthesis) > 1 else "1.0"
+    return "1.1" if max(recipe.get("synthesis", 1) for recipe in recipes) > 1 else "1.0"
 
 
 def has_unlabelled(entry: Json) -> bool:
@@ -181,8 +213,12 @@ def field_table(height: int, width: int, fields: Fields) -> Json:
     }
 
 
-def read_field_table(table: Json) -> dict[str, Field]:
+def read_field_table(table: Json, layers: Fields = MappingProxyType({})) -> dict[str, Field]:
     """Gives the fields that a manifest describes, in its order; of those that are not ours any value is allowed.
+
+    Args:
+        table: fields by name, as of a manifest.
+        layers: layers whose range is known.
 
     Raises:
         KeyError, TypeError, ValueError: one of `FIELDS` is not among them, or one is not as it should be.
@@ -191,12 +227,14 @@ def read_field_table(table: Json) -> dict[str, Field]:
     for name in FIELDS:
         if name not in table:
             raise ValueError(f"field {name!r} is not listed")
-    fields = {}
+    fields, known = {}, {**layers, **KNOWN}
     for name, about in table.items():
         dtype, shape = np.dtype(about["dtype"]).str, tuple(about["shape"])
         symbols = (*shape[:-2], "H", "W") if shape[-2:] == (height, width) else shape
         foreign = Field(dtype, symbols, about["unit"], -np.inf, np.inf, about["meaning"])
-        fields[name] = KNOWN.get(name, foreign)
+        if name in TRUTH and len(shape) == 3:
+            known |= truth_fields(shape[0])
+        fields[name] = known.get(name, foreign)
     return fields
 
 

@@ -24,6 +24,7 @@ TITLES = {
     "ground": "sensors of the ground: what a robot senses of λ",
     "belief": "beliefs: what is made of what is sensed",
     "metric": "metrics of episodes",
+    "layer": "layers of recipes",
     "world": "worlds, each with its rules of the task",
 }
 HELP = (

@@ -139,11 +139,11 @@ def verify(folder: str) -> int:
 
 
 def list_command(kinds: list[str]) -> None:
-    """List parts of each kind, metrics and worlds, with their options.
+    """List parts of each kind, metrics, layers and worlds, with their options.
 
     Args:
-        kinds: Some of planner, model, risk, robot, objective, sensor, ground, belief, metric and world; all when none
-            is named.
+        kinds: Some of planner, model, risk, robot, objective, sensor, ground, belief, metric, layer and world; all if
+            empty.
     """
     from benchnav.eval.catalogue import print_catalogue
 

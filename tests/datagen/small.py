@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+from benchnav.datagen.layers.vegetation import Growth, Vegetation
 from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass
 from benchnav.datagen.recipe.places import PlacesRule
 from benchnav.datagen.recipe.recipe import Recipe, Split, load_recipe
@@ -24,6 +25,11 @@ def small_stakes(**changes: Any) -> Recipe:
         },
     }
     return replace(load_recipe("stakes-v1"), **settings | changes)
+
+
+def grown(recipe: Recipe, period_m: float = 4.0, **classes: Growth) -> Recipe:
+    """A recipe with vegetation on some classes."""
+    return replace(recipe, layers=(Vegetation(period_m=period_m, classes=classes),))
 
 
 def terrain_class(name: str, red: int = 100, **changes: Any) -> TerrainClass:

@@ -17,6 +17,7 @@ from benchnav.core.errors import DatasetError
 from benchnav.core.figures import TWO_COLUMNS_IN, hatching, save
 from benchnav.core.grid import outline
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.layers.vegetation import Growth
 from benchnav.datagen.preview import (
     FIELDS,
     class_colours,
@@ -26,9 +27,8 @@ from benchnav.datagen.preview import (
     preview_figure,
     soft_ground,
 )
-from benchnav.datagen.recipe.classes import Vegetation
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe
-from tests.datagen.small import small_stakes
+from tests.datagen.small import grown, small_stakes
 from tests.factories import tiny_dataset, tiny_recipe
 
 BARS = ("elevation_m", "slope_deg", "traversability")
@@ -406,12 +406,9 @@ def test_a_contact_sheet_of_soft_ground_shows_stored_traversability(stakes: Terr
 
 def test_layers_have_a_panel_a_bar_and_a_unit_each(tmp_path: Path) -> None:
     recipe = small_stakes()
-    grass = Vegetation(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
-    grown = ("wet_clay", "gravel", "scree", "packed_soil", "crusted_soil")
-    classes = tuple(
-        replace(item, vegetation=grass if item.name in grown else None) for item in recipe.classes
-    )
-    recipe = replace(recipe, classes=classes, vegetation_period_m=4.0)
+    grass = Growth(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
+    names = ("wet_clay", "gravel", "scree", "packed_soil", "crusted_soil")
+    recipe = grown(small_stakes(), **dict.fromkeys(names, grass))
     dataset = TerrainDataset(tiny_dataset(tmp_path / "grown.h5", recipe))
     figure = preview_figure(dataset, "train", [0, 3])
     check_texts(figure)

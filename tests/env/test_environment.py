@@ -14,14 +14,14 @@ from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.classes import Vegetation
+from benchnav.datagen.layers.vegetation import Growth
 from benchnav.datagen.recipe.recipe import Split
 from benchnav.planning.objective import GoalDistance, TravelTime
 from benchnav.planning.robots import DifferentialDrive, Unicycle
 from benchnav.planning.world.realisation import Realisation
 from benchnav.planning.world.world import World
 from tests import factories
-from tests.datagen.small import small_stakes
+from tests.datagen.small import grown, small_stakes
 
 ID = "benchnav/OffRoad-v0"
 AHEAD = np.array([1.0, 0.0], np.float32)
@@ -366,12 +366,10 @@ def test_maps_without_the_reference_times_that_stakes_need_are_one_line_with_the
 
 
 def test_layers_are_seen_by_their_names(tmp_path: Path) -> None:
-    grass = Vegetation(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
+    grass = Growth(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
     recipe = small_stakes(splits={"train": Split(scenario="std", maps=4)})
-    classes = tuple(replace(item, vegetation=grass if item.soft else None) for item in recipe.classes)
-    path = factories.tiny_dataset(
-        tmp_path / "d.h5", replace(recipe, classes=classes, vegetation_period_m=4.0)
-    )
+    soft = [item.name for item in recipe.classes if item.soft]
+    path = factories.tiny_dataset(tmp_path / "d.h5", grown(recipe, **dict.fromkeys(soft, grass)))
     stored = TerrainDataset(path).read("train")["vegetation_m"]
     env = make(path, world={"time_budget_s": 1.0})
     with warnings.catch_warnings():

@@ -17,6 +17,7 @@ from benchnav.core.errors import BenchnavError, ConfigError, DatasetError, expec
 from benchnav.core.grid import Grid
 from benchnav.datagen.dem.raster import GroundOptions, Raster, load_rasterio
 from benchnav.datagen.dem.tiling import SLACK, Shape, Tiling, cut, cut_around, fewest_cells
+from benchnav.datagen.layers.spec import overrides_of
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Fields
 
@@ -313,7 +314,10 @@ class Extent:
                 except BenchnavError:
                     continue
                 is_default = times == 1 and np.equal(laid.tiling.stride, recipe.grid.shape).all()
-                yield _plain(changes), None if is_default else stride[1] * times * changed.resolution_m
+                yield (
+                    _plain(changes, recipe),
+                    None if is_default else stride[1] * times * changed.resolution_m,
+                )
 
 
 def _scaled(recipe: Recipe, step: float, divisor: int) -> dict[str, Any]:
@@ -340,17 +344,17 @@ def _scaled(recipe: Recipe, step: float, divisor: int) -> dict[str, Any]:
         if (position := getattr(recipe, name)) is not None:
             changes[name] = tuple(scaled(value) for value in position)
     changes["class_periods_m"] = tuple(max(step, scaled(value)) for value in recipe.class_periods_m)
-    if recipe.vegetation_period_m:
-        changes["vegetation_period_m"] = max(2 * step, scaled(recipe.vegetation_period_m))
+    changes["layers"] = tuple(spec.scaled(times, step) for spec in recipe.layers)
     extent_m = step * min(recipe.height // divisor, recipe.width // divisor)
     if recipe.correlation_m > LONGEST_CORRELATION * extent_m:
         changes["correlation_m"] = float(f"{0.9 * LONGEST_CORRELATION * extent_m:.3g}")
     return changes
 
 
-def _plain(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return fields of a recipe as its file has them."""
+def _plain(changes: Mapping[str, Any], recipe: Recipe) -> dict[str, Any]:
+    """Return changed fields of a recipe as its file has them."""
     plain = {name: list(value) if isinstance(value, tuple) else value for name, value in changes.items()}
+    plain |= overrides_of(recipe.layers, plain.pop("layers", recipe.layers))
     if places := plain.pop("places", None):
         plain |= {f"places.{name}": value for name, value in vars(places).items()}
     return plain

@@ -102,6 +102,11 @@ def import_dem(
         not (solvable and rasters.unlabelled),
         "`classes` with `solvable`, which goes by the class table, got none. Leave `solvable` out, or pass --classes.",
     )
+    affecting = [spec.name for spec in recipe.layers if spec.affects]
+    expect(
+        not affecting,
+        f"a recipe whose `layers` leave λ as it is, since an import draws none, got {', '.join(affecting)}.",
+    )
     out = real_place(out)
     shares = {"test/real": 1.0} if shares is None else shares
     splits = {name: Split(scenario=scenario, maps=1, solvable=solvable) for name in shares}

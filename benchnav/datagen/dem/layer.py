@@ -8,6 +8,7 @@ import numpy as np
 from benchnav.core.errors import expect
 from benchnav.core.grid import is_azimuth
 from benchnav.datagen import schema
+from benchnav.datagen.layers.spec import shipped_fields
 
 _UNITS = {"_m": "m", "_deg": "deg", "_s": "s", "_mps": "m/s", "_k": "K"}  # by the end of a layer's name
 
@@ -36,17 +37,8 @@ def read_layer(text: str) -> LayerRaster:
     if not colon or not place or not re.fullmatch(r"[^/\\.]+", unit):
         place, unit = rest, ""
     expect(equals and place, f"`layer` as NAME=RASTER or NAME=RASTER:UNIT, got {text!r}.")
-    expect(
-        name.isidentifier() and name.isascii(),
-        f"the name of a `layer` of letters, digits and '_', got {name!r} in {text!r}.",
-    )
-    taken = [*schema.FIELDS, *schema.OPTIONAL, schema.ENTRY_DIGESTS, "state", "goal"]
-    expect(
-        name not in taken,
-        f"the name of a `layer` to be none of {', '.join(taken)}, got {text!r}. "
-        "Those have other flags, such as --classes, or none.",
-    )
-    field = schema.LAYERS.get(name)
+    schema.check_layer_name(f"the name of a `layer` in {text!r}", name)
+    field = shipped_fields().get(name)
     if field is None:
         unit = unit or next((own for end, own in _UNITS.items() if name.endswith(end)), "1")
         field = schema.Field("<f4", ("H", "W"), unit, -np.inf, np.inf, "imported layer")

@@ -273,19 +273,17 @@ def _maps(dataset: TerrainDataset, split: str, name: str, fields: Sequence[str])
 def _classes(dataset: TerrainDataset) -> Node:
     """The class table, whose numbers give the latent traversability of a cell."""
     rows: list[Node] = []
+    layers = [spec.available for spec in dataset.recipe.layers]
     for number, item in enumerate(dataset.recipe.classes):
         row = {"id": number, **asdict(item), "colour": f"#{bytes(item.colour).hex()}"}
         soft = row.pop("soft") or {}
         row |= {f"soft_{key}": soft.get(key, 0.0) for key in ("weight", "mean", "std")}
-        vegetation = row.pop("vegetation")
-        if dataset.recipe.has_vegetation:
-            low, high = vegetation["height_m"] if vegetation else (0.0, 0.0)
-            row |= {"vegetation_cover": vegetation["cover"] if vegetation else 0.0}
-            row |= {"vegetation_least_m": low, "vegetation_most_m": high}
-            row |= {"vegetation_colour": f"#{bytes(vegetation['colour']).hex()}" if vegetation else ""}
+        for layer in filter(None, layers):
+            row |= layer.class_columns(item.name)
         rows.append({f"classes/{key}": value for key, value in row.items()})
-    kinds = {"id": "sc:Integer", **dict.fromkeys(("name", "colour", "vegetation_colour"), "sc:Text")}
-    fields = [_node("Field", key, dataType=kinds.get(key.rpartition("/")[2], "sc:Float")) for key in rows[0]]
+    kinds = {key: "sc:Text" if isinstance(value, str) else "sc:Float" for key, value in rows[0].items()}
+    kinds["classes/id"] = "sc:Integer"
+    fields = [_node("Field", key, dataType=kind) for key, kind in kinds.items()]
     meaning = (
         "Terrain classes. At a slope of ψ degrees traversability is normal with mean 1 − (scale·10⁻³·ψ^exponent + "
         "offset), clipped to [0, 1], and standard deviation noise; with probability soft_weight it is normal with "

@@ -160,6 +160,6 @@ def _out_of_range(dataset: TerrainDataset, split: str, name: str, values: np.nda
         allowed |= values == schema.UNLABELLED
     # Not asked for; not observed; of one row; what a field that is not ours means by it, it may mean.
     gaps = ("reference_time_s", "traversability", "drive_std")
-    if name in gaps or name not in schema.FIELDS | schema.OPTIONAL:
+    if name in gaps or name not in (*schema.KNOWN, *schema.TRUTH):
         allowed |= np.isnan(values)
     return np.flatnonzero(~allowed.reshape(len(values), -1).all(axis=1)).tolist()

@@ -67,6 +67,8 @@ def create(
     expect(
         shard is None or not is_one_file(path), f"`out` to be a folder, since a shard is made, got {path}."
     )
+    for spec in recipe.layers if jobs > 1 or scheduler else ():
+        spec.check_workers()
     size = recipe.grid.maps_in(shard_cells)
     shards = [
         ShardFile(split, first, min(first + size, spec.maps))
@@ -134,7 +136,7 @@ def make(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, byt
             f"Expected workers with benchnav {version}, got one on {platform.node()} with {benchnav.__version__}."
         )
     maps = generate(recipe, shard.split, np.arange(shard.first, shard.stop))
-    return shard, pack(recipe, shard.split, recipe_entry(recipe, shard), maps)
+    return shard, pack(recipe, shard.split, recipe_entry(recipe, shard), maps, recipe.fields)
 
 
 def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:

@@ -9,7 +9,8 @@ from benchnav.core.tables import Table
 from benchnav.datagen import schema
 from benchnav.datagen.files.manifest import READ_ERRORS, open_file
 from benchnav.datagen.files.reader import TerrainDataset, damage
-from benchnav.datagen.recipe.classes import plain_classes
+from benchnav.datagen.layers.spec import LayerSpec
+from benchnav.datagen.recipe.classes import ClassTable
 
 _DIGESTS = {
     "digest": "content digests",
@@ -20,9 +21,9 @@ _DIGESTS = {
 def describe(dataset: TerrainDataset) -> schema.Json:
     """Gathers what `show` shows, ready for JSON."""
     manifest, recipe = dataset.manifest, dataset.recipe
-    about = plain(recipe) | {"classes": plain_classes(recipe.classes)}
-    made_by = ["environments", "stuck_threshold", "synthesis", "places", "correlation_m", "classes"]
-    made_by[-1:-1] = ["vegetation_period_m"] if recipe.has_vegetation else []
+    about, stored = plain(recipe) | {"classes": recipe.class_rows}, recipe.to_dict()
+    made_by = ("environments", "stuck_threshold", "synthesis", "places", "correlation_m")
+    of_vegetation = {name: stored[name] for name in ("vegetation_period_m",) if name in stored}
     return {
         "path": str(dataset.path),
         "bytes": sum(path.stat().st_size for path in dataset.files),
@@ -32,6 +33,9 @@ def describe(dataset: TerrainDataset) -> schema.Json:
         "generator": manifest["generator"],
         "grid": asdict(dataset.grid),
         **{name: about[name] for name in made_by},
+        **of_vegetation,
+        "classes": about["classes"],
+        "drawn_layers": [_describe_layer(spec, recipe.classes) for spec in recipe.layers],
         "splits": {
             name: {
                 **entry,
@@ -76,8 +80,7 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
             f", start and goal drawn for each map, at least {places['least_distance_m']:g} m apart and "
             f"{places['margin_m']:g} m from the edges"
         )
-    if "vegetation_period_m" in described:
-        making += f", vegetation in patches with a period of {described['vegetation_period_m']:g} m"
+    making += "".join(f", {layer['words']}" for layer in described["drawn_layers"])
     if described["correlation_m"]:
         making += f", λ correlated over {described['correlation_m']:g} m"
     yield making
@@ -99,10 +102,13 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
     fields = schema.read_field_table(described["fields"])
     layers = schema.layer_names(fields)
     if layers:
+        code = {layer["name"]: layer["source"] for layer in described["drawn_layers"]}
         yield Table(
             title="layers",
-            headings=("layer", "unit", "meaning"),
-            rows=tuple((name, fields[name].unit, fields[name].meaning) for name in layers),
+            headings=("layer", "unit", "meaning", "drawn by"),
+            rows=tuple(
+                (name, fields[name].unit, fields[name].meaning, code.get(name, "")) for name in layers
+            ),
         )
     extra = [name for name in fields if name not in (*schema.FIELDS, *layers)]
     if extra:
@@ -111,13 +117,15 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
         yield title
         wide = widest(described["splits"])
         yield from (f"  {name:{wide}} {entry[key]}" for name, entry in described["splits"].items())
-    headings = ["id", "class", "colour", "a", "b", "o", "σ", "soft spots", "vegetation"]
+    columns = {layer["name"]: layer["classes"] for layer in described["drawn_layers"]}
+    headings = ["id", "class", "colour", "a", "b", "o", "σ", "soft spots", *columns]
     rows = []
     for number, item in enumerate(described["classes"]):
         colour = f"#{bytes(item['colour']).hex()}"
         numbers = [f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise")]
         soft = "{weight:.0%} N({mean:g}, {std:g})".format(**item["soft"]) if item["soft"] else ""
-        rows.append((str(number), item["name"], colour, *numbers, soft, _vegetation(item.get("vegetation"))))
+        drawn = (words[item["name"]] for words in columns.values())
+        rows.append((str(number), item["name"], colour, *numbers, soft, *drawn))
     # What no class has is left out.
     shown = [place for place, cells in enumerate(zip(*rows, strict=True)) if any(cells)]
     title = "classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)"
@@ -128,12 +136,15 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
     )
 
 
-def _vegetation(grown: schema.Json | None) -> str:
-    """What grows on a class, in words."""
-    if grown is None:
-        return ""
-    low, high = grown["height_m"]
-    return f"{grown['cover']:.0%} #{bytes(grown['colour']).hex()} {low:g}–{high:g} m"
+def _describe_layer(spec: LayerSpec, classes: ClassTable) -> schema.Json:
+    """Describe a layer of a recipe; what it is on each class only where its code is here."""
+    layer = spec.available
+    return {
+        "name": spec.name,
+        "words": spec.words,
+        "source": f"{spec.source}, digest {spec.digest[:12]}" if spec.source else "benchnav",
+        "classes": {item.name: layer.describe_class(item.name) if layer else "" for item in classes},
+    }
 
 
 def _origin(described: schema.Json, part: schema.Json) -> str:

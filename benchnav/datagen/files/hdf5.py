@@ -59,10 +59,10 @@ class Contents(NamedTuple):
 
     def manifest(self, entry_digests: Mapping[str, ndarray]) -> schema.Json:
         """The manifest, by the digests of all maps' entries, `schema.entry_digests`, of each split."""
-        synthesis, shape = [recipe.synthesis for recipe in self.recipes], self.recipes[0].grid.shape
+        recipes, shape = [recipe.to_dict() for recipe in self.recipes], self.recipes[0].grid.shape
         return {
             "format": schema.FORMAT,
-            "format_version": schema.version_of(synthesis, self.splits.values(), self.fields),
+            "format_version": schema.version_of(recipes, self.splits.values(), self.fields),
             "id": self.id,
             "generator": {"package": "benchnav", "version": benchnav.__version__},
             "fields": schema.field_table(*shape, self.fields),
@@ -70,7 +70,7 @@ class Contents(NamedTuple):
                 name: {**entry, "digest": schema.split_digest(entry_digests[name], *shape, self.fields)}
                 for name, entry in self.splits.items()
             },
-            "recipes": [recipe.to_dict() for recipe in self.recipes],
+            "recipes": recipes,
         }
 
 

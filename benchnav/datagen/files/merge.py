@@ -25,7 +25,7 @@ from benchnav.datagen.recipe.recipe import Recipe, check_name, recipe_from_dict
 # What a map's meaning rests on: alike in all files of a merge.
 _SHARED = (
     "height", "width", "resolution_m", "stuck_threshold", "classes", "environments", "occupancy",
-    "synthesis", "places", "correlation_m", "vegetation_period_m",
+    "synthesis", "places", "correlation_m", "layers",
 )  # fmt: skip
 
 
@@ -164,7 +164,8 @@ def _differences(first: TerrainDataset, second: TerrainDataset) -> Iterator[str]
     ours, theirs = plain(first.recipe), plain(second.recipe)
     for name in _SHARED:
         if ours[name] != theirs[name]:
-            yield f"unlike {name}" + ("" if name == "classes" else f" ({ours[name]} / {theirs[name]})")
+            is_long = name in ("classes", "layers")
+            yield f"unlike {name}" + ("" if is_long else f" ({ours[name]} / {theirs[name]})")
     for split in sorted(set(first.splits) & set(second.splits)):
         if len(_kinds(first, split) | _kinds(second, split)) > 1:
             yield f"unlike scenarios or `solvable` in split {split!r}"

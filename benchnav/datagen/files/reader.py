@@ -1,4 +1,4 @@
-"""Reading datasets of formats 1.0 to 1.3: a file (HDF5), or a folder of such files with one manifest.
+"""Reading datasets of formats 1.0 to 1.4: a file (HDF5), or a folder of such files with one manifest.
 
 All that reads maps goes through `TerrainDataset.read`, which may be passed to other processes. PyTorch is imported
 where Terrain is asked for. Letters in shapes: B maps.
@@ -21,7 +21,7 @@ from benchnav.core.errors import DatasetError
 from benchnav.core.grid import Grid
 from benchnav.datagen import schema
 from benchnav.datagen.files.manifest import READ_ERRORS, open_file, read_manifest
-from benchnav.datagen.recipe.classes import plain_classes
+from benchnav.datagen.layers.spec import shipped_fields
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.schema import Maps
 
@@ -112,7 +112,8 @@ class TerrainDataset:
     @cached_property
     def fields(self) -> dict[str, schema.Field]:
         """What every map has, by name: those of `schema.FIELDS`, and others that this dataset lists."""
-        return schema.read_field_table(self.manifest["fields"])
+        drawn = {spec.name: spec.stored_field for spec in self.recipe.layers}
+        return schema.read_field_table(self.manifest["fields"], shipped_fields() | drawn)
 
     @property
     def field_names(self) -> tuple[str, ...]:
@@ -123,6 +124,11 @@ class TerrainDataset:
     def layer_names(self) -> tuple[str, ...]:
         """Names of the layers among `fields`: what a model may see of the ground beside colour and shape."""
         return schema.layer_names(self.fields)
+
+    @property
+    def truth_names(self) -> tuple[str, ...]:
+        """Names of the fields of `schema.TRUTH` that the dataset has."""
+        return tuple(name for name in schema.TRUTH if name in self.fields)
 
     def truth_of(self, split: str) -> Literal["generated", "unknown"]:
         """Return whether the distribution of λ in each cell of a split is known.
@@ -158,14 +164,18 @@ class TerrainDataset:
         return any(part.get("source", {}).get("photo") for part in self.splits[split]["parts"])
 
     def about_digest(self, split: str) -> str:
-        """SHA-256 of what numbers on a split rest on beside its maps: class table, λ_stuck, resolution, kind of truth.
+        """SHA-256 of what numbers on a split rest on beside its maps.
+
+        These are class table, layers of the recipe, λ_stuck, resolution and kind of truth.
 
         Raises:
             DatasetError: there is no such split.
         """
         recipe = self.recipe
+        drawn = [spec.meaning_of_maps for spec in recipe.layers if not spec.is_vegetation]
         about = {
-            "classes": plain_classes(recipe.classes),
+            **({"layers": drawn} if drawn else {}),
+            "classes": recipe.class_rows,
             "stuck_threshold": recipe.stuck_threshold,
             "resolution_m": recipe.resolution_m,
             "truth": self.truth_of(split),
@@ -342,7 +352,8 @@ class TerrainDataset:
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
         from benchnav.datagen.files.stored_terrain import terrain_of
 
-        return terrain_of(self.read(split, indices, (*schema.MAP_FIELDS, *self.layer_names)), self.recipe)
+        names = (*schema.MAP_FIELDS, *self.layer_names, *self.truth_names)
+        return terrain_of(self.read(split, indices, names), self.recipe)
 
     def map_count(self, split: str) -> int:
         """Number of maps of a split.

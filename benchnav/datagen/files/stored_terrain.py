@@ -7,10 +7,10 @@ import torch
 
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
+from benchnav.datagen.layers.layer import DrawnMaps
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.classes import ClassTable
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.datagen.schema import FIELDS, MAP_FIELDS, OPTIONAL, Maps
+from benchnav.datagen.schema import KNOWN, MAP_FIELDS, TRUTH, Maps
 
 
 def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
@@ -21,27 +21,29 @@ def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
             other fields are layers.
         recipe: by which they were made.
     """
-    slope = maps["slope_deg"].astype(np.float64)
     fields = {name: torch.from_numpy(maps[name]) for name in MAP_FIELDS}
-    layers = [name for name in maps if name not in FIELDS | OPTIONAL]
-    alike = recipe.synthesis > 1 and (len(recipe.units) < len(recipe.classes) or recipe.has_vegetation)
-    truth = latent.truth(maps["class_id"], slope, recipe.classes)
+    layers = [name for name in maps if name not in (*KNOWN, *TRUTH)]
+    is_hidden = len(recipe.units) < len(recipe.classes) or any(spec.hides for spec in recipe.layers)
+    alike = recipe.synthesis > 1 and is_hidden
+    truth = latent.stored_truth(maps, recipe.classes)
     return Terrain(
         **fields | {"class_id": fields["class_id"].long()},
         truth=_mixture(truth, (0,) * len(truth[0][0])),
         grid=recipe.grid,
-        look_alikes=partial(_look_alikes, recipe.classes) if alike else None,
+        look_alikes=partial(_look_alikes, recipe) if alike else None,
         layers={name: torch.from_numpy(maps[name]) for name in layers},
     )
 
 
-def _look_alikes(classes: ClassTable, terrain: Terrain) -> TraversabilityMixture:
-    slope = terrain.slope_deg.cpu().numpy().astype(np.float64)
-    overgrown = None
-    if "vegetation_m" in terrain.layers and any(item.vegetation for item in classes):
-        overgrown = (terrain.layers["vegetation_m"] > 0).cpu().numpy()
-    parameters = latent.look_alikes(terrain.class_id.cpu().numpy(), slope, classes, overgrown)
-    group = (number for number, item in enumerate(classes) for _ in range(2 if item.soft else 1))
+def _look_alikes(recipe: Recipe, terrain: Terrain) -> TraversabilityMixture:
+    elevation_m, slope_deg = (
+        tensor.cpu().numpy().astype(np.float64) for tensor in (terrain.elevation_m, terrain.slope_deg)
+    )
+    maps = DrawnMaps(terrain.class_id.cpu().numpy(), elevation_m, slope_deg, recipe.grid, recipe.classes)
+    specs = [spec for spec in recipe.layers if spec.name in terrain.layers and (spec.hides or spec.affects)]
+    values = {spec.name: terrain.layers[spec.name].cpu().numpy().astype(np.float64) for spec in specs}
+    parameters = latent.look_alikes(maps, [spec.layer for spec in specs], values)
+    group = (number for number, item in enumerate(recipe.classes) for _ in range(2 if item.soft else 1))
     return _mixture(parameters, tuple(group)).to(terrain.class_id.device)
 
 

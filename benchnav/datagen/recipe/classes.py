@@ -1,18 +1,14 @@
 """Terrain classes: their looks, and what their latent traversability (LT) functions are made of.
 
-Beyond the paper, a class may have soft spots, a second mode of λ that neither colour nor slope shows,
-classes may share a colour, and vegetation may hide the colour of the ground.
+Beyond the paper, a class may have soft spots, a second mode of λ that neither colour nor slope shows, and
+classes may share a colour.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from benchnav.core.errors import check_label, expect
-from benchnav.core.settings import plain
-
-LEAST_HEIGHT_M, MOST_HEIGHT_M = 0.01, 100.0  # of vegetation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,32 +35,6 @@ class SoftSpots:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Vegetation:
-    """What grows on some of a class's ground, and hides its colour. λ of the ground stays what it is.
-
-    Args:
-        height_m: least and greatest height, in metres; heights are uniform between them.
-        cover: share of the class's ground that is overgrown, in (0, 1].
-        colour: RGB in full light, 0–255.
-    """
-
-    height_m: tuple[float, float]
-    cover: float
-    colour: tuple[int, int, int]
-
-    def __post_init__(self) -> None:
-        """Refuses what does not grow."""
-        low, high = self.height_m
-        expect(
-            LEAST_HEIGHT_M <= low <= high <= MOST_HEIGHT_M,
-            f"`height_m` of vegetation ordered and within [{LEAST_HEIGHT_M:g}, {MOST_HEIGHT_M:g}], "
-            f"got {list(self.height_m)}.",
-        )
-        expect(0 < self.cover <= 1, f"`cover` of vegetation in (0, 1], got {self.cover}.")
-        _check_colour("vegetation", self.colour)
-
-
-@dataclass(frozen=True, kw_only=True)
 class TerrainClass:
     """A terrain class: its looks and its LT function.
 
@@ -76,7 +46,6 @@ class TerrainClass:
         offset: o_c, loss on flat ground, in [0, 0.1] in the shipped table.
         noise: σ_c, in [0.1, 0.2] in the shipped table.
         soft: its soft spots, if it has any.
-        vegetation: what grows on it, if anything does.
     """
 
     name: str
@@ -86,12 +55,11 @@ class TerrainClass:
     offset: float
     noise: float
     soft: SoftSpots | None = None
-    vegetation: Vegetation | None = None
 
     def __post_init__(self) -> None:
         """Refuses values that make no LT function or no colour."""
         check_label("`name` of a class", self.name)
-        _check_colour(f"class {self.name!r}", self.colour)
+        check_colour(f"class {self.name!r}", self.colour)
         numbers = self.scale, self.exponent, self.offset, self.noise
         expect(
             np.isfinite(numbers).all() and self.scale >= 0 and self.exponent > 0 and self.noise > 0,
@@ -103,16 +71,15 @@ class TerrainClass:
 ClassTable = tuple[TerrainClass, ...]
 
 
-def plain_classes(classes: ClassTable) -> list[dict[str, Any]]:
-    """Gives a class table as plain data; `vegetation` stands only where something grows, so that digests stay."""
-    rows = [plain(item) for item in classes]
-    return [{key: value for key, value in row.items() if key != "vegetation" or value} for row in rows]
-
-
 def look_alike_classes(classes: ClassTable) -> list[tuple[int, ...]]:
     """Classes that share a colour, by class: of each class those that look like it, itself among them."""
     return [tuple(i for i, c in enumerate(classes) if c.colour == own.colour) for own in classes]
 
 
-def _check_colour(of: str, colour: tuple[int, int, int]) -> None:
+def check_colour(of: str, colour: tuple[int, int, int]) -> None:
+    """Check that a colour is one of 8 bits a channel.
+
+    Raises:
+        ConfigError: If it is not, with `of` in its message.
+    """
     expect(all(0 <= value <= 255 for value in colour), f"`colour` of {of} in 0–255, got {colour}.")

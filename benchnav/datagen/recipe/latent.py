@@ -7,15 +7,18 @@ Beyond the paper, a class may have soft spots, a second mode of λ that neither 
 classes may share a colour. Letters in shapes: B maps, H×W cells, K components.
 """
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy import ndarray
 
+from benchnav.datagen.layers.layer import DrawnMaps, Layer
+from benchnav.datagen.layers.stack import Parameters, affect_layers, weigh_layers
 from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes
-from benchnav.datagen.schema import UNLABELLED
+from benchnav.datagen.schema import TRUTH, UNLABELLED, Maps
 
 _BISECTIONS = 24  # leave an error of at most 2⁻²⁵
-
-Parameters = tuple[ndarray, ndarray, ndarray]
 
 
 def latent_mean(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> ndarray:
@@ -55,62 +58,51 @@ def truth(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> Paramet
     return weights, np.where(labelled[:, None], means, np.nan), stds
 
 
+def stored_truth(maps: Maps, classes: ClassTable) -> Parameters:
+    """Return the true distribution of λ of stored maps, as `truth` does.
+
+    Args:
+        maps: `class_id`, `slope_deg` and, where layers change λ, the fields of `schema.TRUTH`.
+        classes: the class table.
+    """
+    weights, means, stds = truth(maps["class_id"], maps["slope_deg"].astype(np.float64), classes)
+    if all(name in maps for name in TRUTH):
+        means, stds = (maps[name].astype(np.float64) for name in TRUTH)
+    return weights, means, stds
+
+
 def look_alikes(
-    class_id: ndarray, slope_deg: ndarray, classes: ClassTable, overgrown: ndarray | None = None
+    maps: DrawnMaps, layers: Sequence[Layer] = (), values: Mapping[str, ndarray] | None = None
 ) -> Parameters:
     """What the colours tell of λ at best: the mixture over all classes that look like a cell's own.
 
-    Classes of one colour are shown together, and which of them takes which ground is drawn anew in each map, so that
-    each weighs the same. An overgrown cell hides its ground. It looks like those of all classes of its map on which
-    the same grows, by its colour, and each weighs as much as it is covered.
-
-    Where classes with one vegetation have one ground colour too, which recipes then give one cover, this is all that
-    a whole picture tells. Where they have not, bare ground beside a patch hints at the ground within, so that a model
-    that looks around can do better than this.
+    Classes of one colour are shown together, and which of them takes which ground is drawn again in each map, so that
+    each weighs the same. Layers may change these weights, and λ of each class; their values are taken as known.
 
     Args:
-        class_id: 255 where not known, shape [B, H, W].
-        slope_deg: shape [B, H, W].
-        classes: the class table.
-        overgrown: where vegetation hides the ground, bool, shape [B, H, W]; None for nowhere.
+        maps: classes and slopes.
+        layers: those that hide colours or affect λ, in their order.
+        values: by layer, shape [B, H, W].
 
     Returns:
         As `truth`, with the components of each class in turn, a second one where it has soft spots.
     """
-    labelled = class_id != UNLABELLED
-    class_id = np.where(labelled, class_id, 0)
-    alike, look = look_alike_classes(classes), class_id
-    shares = [dict.fromkeys(own, 1 / len(own)) for own in alike]
-    if overgrown is not None:
-        look = class_id + len(classes) * overgrown
-        shares += [_covers(number, classes) for number in range(len(classes))]
-        cells = [labelled & (class_id == number) for number in range(len(classes))]
-        shown = np.stack([own.any(axis=(1, 2)) for own in cells], axis=1)
-    pieces, total = [], np.zeros(class_id.shape)
-    for number, item in enumerate(classes):
-        share = np.take([own.get(number, 0.0) for own in shares], look)
-        if overgrown is not None:
-            share = np.where(overgrown & labelled & ~shown[:, number, None, None], 0.0, share)
-        weights, means, stds = (
-            values[:, : 2 if item.soft else 1]
-            for values in truth(np.where(labelled, number, UNLABELLED), slope_deg, classes)
-        )
-        pieces.append((weights, means, stds, np.broadcast_to(share[:, None], weights.shape)))
-        total += share
-    weights, means, stds, share = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
-    return weights * (share if overgrown is None else share / total[:, None]), means, stds
-
-
-def _covers(number: int, classes: ClassTable) -> dict[int, float]:
-    """Covers by class, of the classes with one's vegetation colour; of a class without vegetation itself alone."""
-    own = classes[number].vegetation
-    if own is None:
-        return {number: 1.0}
-    return {
-        other: item.vegetation.cover
-        for other, item in enumerate(classes)
-        if item.vegetation and item.vegetation.colour == own.colour
-    }
+    values, labelled = values or {}, maps.class_id != UNLABELLED
+    alike = look_alike_classes(maps.classes)
+    shares = np.zeros((len(alike), len(alike)))  # of each class, by the cell's own
+    for number, members in enumerate(alike):
+        shares[list(members), number] = 1 / len(members)
+    colour_weights = np.moveaxis(np.take(shares, np.where(labelled, maps.class_id, 0), axis=1), 0, 1)
+    class_weights = weigh_layers(layers, colour_weights, values, maps)
+    class_weights = np.where(labelled[:, None], class_weights, colour_weights)
+    pieces = []
+    for number, item in enumerate(maps.classes):
+        below = replace(maps, class_id=np.where(labelled, number, UNLABELLED))
+        own = affect_layers(layers, truth(below.class_id, maps.slope_deg, maps.classes), values, below)
+        weights, means, stds = (array[:, : 2 if item.soft else 1] for array in own)
+        pieces.append((weights * class_weights[:, number, None], means, stds))
+    weights, means, stds = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
+    return weights, means, stds
 
 
 def expected_of(parameters: Parameters) -> ndarray:

@@ -20,13 +20,16 @@ from benchnav.core.grid import Grid
 from benchnav.core.settings import changed, plain, read
 from benchnav.core.short_repr import short_repr
 from benchnav.core.yaml_text import load_yaml, read_yaml
+from benchnav.datagen.layers import vegetation
+from benchnav.datagen.layers.spec import LayerSpec, read_layers
+from benchnav.datagen.layers.stack import check_layer
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes, plain_classes
+from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes
 from benchnav.datagen.recipe.environments import AlikeClasses, deal_classes, deal_units, never_shown
-from benchnav.datagen.recipe.looks import check_looks
+from benchnav.datagen.recipe.looks import check_tints, shown_colours
 from benchnav.datagen.recipe.places import PlacesRule, check_places
 from benchnav.datagen.recipe.scenario import DEFAULTS, PRESETS, RECIPES, Scenario, load_presets, resolve
-from benchnav.datagen.schema import FIELDS, LAYERS, UNLABELLED, Fields
+from benchnav.datagen.schema import FIELDS, UNLABELLED, Fields, truth_fields
 
 _MOST_CRATERED = 0.4  # share of a map; discs laid at random one by one jam at 0.55
 _LEAST_GAP = 0.3  # between classes of one colour, in E[λ] on flat ground
@@ -75,8 +78,7 @@ class Recipe:
             that look alike, drawn places and correlated λ, and makes the same ground at any size.
         correlation_m: ℓ of stored λ: at distance d the noise of two cells has the correlation exp(−d²/2ℓ²);
             at 0, as in synthesis 1, each cell's is its own.
-        vegetation_period_m: lattice spacing of the noise that vegetation grows by: a patch is about half as wide;
-            0 where no class has vegetation. Synthesis 2 only.
+        layers: what else is drawn, in this order; objects of `Layer` become their specs. Synthesis 2 only.
         closed_corners: whether a diagonal step between two cells that are not free is no way, for solvable maps and
             reference times. False in the shipped recipes and in files of versions before 1.2; in a recipe of synthesis
             2 with an id of its own true, unless it says otherwise. Synthesis 2 only.
@@ -107,11 +109,12 @@ class Recipe:
     synthesis: int = 1
     places: PlacesRule | None = None
     correlation_m: float = 0.0
-    vegetation_period_m: float = 0.0
+    layers: tuple[LayerSpec, ...] = ()
     closed_corners: bool = False
 
     def __post_init__(self) -> None:
         """Refuses recipes that contradict themselves."""
+        object.__setattr__(self, "layers", read_layers(self.layers))
         expect(self.synthesis in (1, 2), f"`synthesis` 1 or 2, got {self.synthesis}.")
         expect(0 <= self.seed < 2**63, f"`seed` in 0–2^63 − 1, got {self.seed}.")
         expect(0 <= self.stuck_threshold < 1, f"`stuck_threshold` in [0, 1), got {self.stuck_threshold}.")
@@ -120,13 +123,13 @@ class Recipe:
         _check_scenarios(self)
         _check_environments(self)
         _check_splits(self)
-        check_looks(self.classes, self.scenarios)
-        _check_vegetation(self)
+        check_tints(self.classes, self.scenarios)
+        _check_layers(self)
         if self.synthesis == 1:
             soft = any(item.soft for item in self.classes)
             asked = {
                 "soft": soft,
-                "vegetation": self.has_vegetation,
+                **{f"layer {spec.name}": True for spec in self.layers},
                 "places": self.places,
                 "correlation_m": self.correlation_m,
                 "closed_corners": self.closed_corners,
@@ -151,14 +154,21 @@ class Recipe:
         return Grid(self.height, self.width, self.resolution_m)
 
     @property
-    def has_vegetation(self) -> bool:
-        """Whether anything grows on some class."""
-        return any(item.vegetation for item in self.classes)
-
-    @property
     def fields(self) -> Fields:
         """What a dataset of the recipe's maps has of each."""
-        return FIELDS | (LAYERS if self.has_vegetation else {})
+        components = 2 if any(item.soft for item in self.classes) else 1
+        truth = truth_fields(components) if any(spec.affects for spec in self.layers) else {}
+        return FIELDS | {spec.name: spec.stored_field for spec in self.layers} | truth
+
+    @property
+    def class_rows(self) -> list[dict[str, Any]]:
+        """The class table as plain data, with what grows on the classes."""
+        return vegetation.write_classes(plain(list(self.classes)), self._vegetation)
+
+    @property
+    def _vegetation(self) -> vegetation.Vegetation | None:
+        grown = [spec.layer for spec in self.layers if spec.is_vegetation]
+        return grown[0] if grown and isinstance(grown[0], vegetation.Vegetation) else None
 
     def cells_of(self, positions_m: ndarray) -> tuple[ndarray, ndarray]:
         """Rows and columns of the cells that positions [B, 2] lie in, read in single precision as stored."""
@@ -189,12 +199,17 @@ class Recipe:
 
     def to_dict(self) -> dict[str, Any]:
         """Gives the recipe as plain data for JSON, fully resolved."""
-        data: dict[str, Any] = plain(self) | {"classes": plain_classes(self.classes)}
+        data: dict[str, Any] = {}
+        for name, value in (plain(self) | {"classes": self.class_rows}).items():
+            if name == "layers" and self._vegetation is not None:
+                data["vegetation_period_m"] = self._vegetation.period_m
+            data[name] = value
+        data["layers"] = plain([spec for spec in self.layers if not spec.is_vegetation])
         for scenario in data["scenarios"].values():
             if not scenario["tints"]:
                 del scenario["tints"]  # as versions without them wrote it
         unused = ["places"] if self.places is None else ["start_m", "goal_m"]
-        unused += [] if self.has_vegetation else ["vegetation_period_m"]
+        unused += [] if data["layers"] else ["layers"]
         unused += [] if self.closed_corners else ["closed_corners"]
         if self.synthesis == 1:
             # As version 0.1 wrote it, so that its files and readers stay as they are.
@@ -281,6 +296,9 @@ def recipe_from_dict(data: Any, origin: str) -> Recipe:
     if isinstance(scenarios, dict):
         scenarios = {name: resolve(entry, presets, name) for name, entry in scenarios.items()}
     try:
+        growth, data = vegetation.read_keys(data)
+        layers = read_layers(data.get("layers", []))
+        data["layers"] = read_layers((*([growth] if growth else []), *layers))
         return read(Recipe, data | {"scenarios": scenarios}, lambda key: f"`{key}`" if key else "a recipe")
     except ConfigError as error:
         raise ConfigError(f"Recipe {origin}: {error}") from error
@@ -396,15 +414,11 @@ def _check_look_alikes(recipe: Recipe) -> None:
         )
 
 
-def _check_vegetation(recipe: Recipe) -> None:
-    period_m, least_m = recipe.vegetation_period_m, 2 * recipe.resolution_m
-    if not recipe.has_vegetation:
-        return expect(
-            period_m == 0,
-            f"`vegetation_period_m` with `vegetation` of a class, got {period_m:g} and none. Leave it out.",
-        )
-    expect(
-        least_m <= period_m < np.inf,
-        f"`vegetation_period_m` of at least two cells, {least_m:g} m, where a class has `vegetation`, "
-        f"got {period_m:g}.",
-    )
+def _check_layers(recipe: Recipe) -> None:
+    colours = {
+        name: np.rint(shown_colours(recipe.classes, scenario)) for name, scenario in recipe.scenarios.items()
+    }
+    for spec in recipe.layers:
+        # Others are of a dataset, whose recipe was checked when it was made.
+        if spec.is_vegetation or spec.is_built:
+            check_layer(spec.layer, recipe.grid, recipe.classes, colours)

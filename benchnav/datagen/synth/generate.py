@@ -4,6 +4,7 @@ Elevation is quantised first; slope, shading and λ are derived from what is sto
 float64. Letters in shapes: B maps, H×W cells.
 """
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -11,12 +12,17 @@ from numpy import ndarray
 
 from benchnav.core import copula, gridgraph, rng
 from benchnav.core.errors import ConfigError
+from benchnav.datagen.layers.layer import DrawnMaps, Layer
+from benchnav.datagen.layers.spec import LayerSpec
+from benchnav.datagen.layers.stack import affect_layers, colour_layers, draw_layers
+from benchnav.datagen.noise import fractal_perlin
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.looks import shown_colours
 from benchnav.datagen.recipe.places import draw_places
 from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
-from benchnav.datagen.schema import Maps, join_maps, quantise
-from benchnav.datagen.synth import appearance, elevation, vegetation
+from benchnav.datagen.recipe.scenario import Scenario
+from benchnav.datagen.schema import TRUTH, Maps, join_maps, quantise
+from benchnav.datagen.synth import appearance, elevation
 
 MOST_ATTEMPTS = 200
 _PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache; of large maps fewer
@@ -71,7 +77,7 @@ def reference_time_s(recipe: Recipe, maps: Maps) -> ndarray:
     Returns:
         Seconds, infinite where no free path joins start and goal, shape [B].
     """
-    expected = latent.expected_of(latent.truth(maps["class_id"], maps["slope_deg"], recipe.classes))
+    expected = latent.expected_of(latent.stored_truth(maps, recipe.classes))
     free = expected > recipe.stuck_threshold
     costs = gridgraph.travel_time_costs(expected, free, recipe.resolution_m, recipe.closed_corners)
     every = np.arange(len(expected))
@@ -88,9 +94,7 @@ def class_map(recipe: Recipe, split: str, indices: ndarray, attempt: int = 0) ->
         Class indices, shape [B, H, W].
     """
     periods = [period / recipe.resolution_m for period in recipe.class_periods_m]
-    noise = appearance.fractal_perlin(
-        recipe.seed, (split, "class", attempt), indices, recipe.grid.shape, periods
-    )
+    noise = fractal_perlin(recipe.seed, (split, "class", attempt), indices, recipe.grid.shape, periods)
     # Which class takes which band differs from map to map, so no two classes are neighbours always.
     order_key = rng.stream_key(recipe.seed, split, "class order", attempt)
     order = rng.permutation(order_key, indices, len(recipe.occupancy))
@@ -107,9 +111,9 @@ def complete(
     class_id: ndarray,
     framed_m: ndarray,
     attempt: int = 0,
-    vegetation_m: ndarray | None = None,
+    layers: Sequence[LayerSpec] = (),
 ) -> Maps:
-    """Derives all else from classes and elevation: slope, colour under a random light, λ.
+    """Derives all else from classes and elevation: slope, layers, colour under a random light, λ.
 
     Args:
         recipe: class table, seed, start and goal.
@@ -119,10 +123,11 @@ def complete(
         framed_m: elevation, with one cell of the ground beyond, NaN where that is not known, shape
             [B, H + 2, W + 2]; it is quantised first, and everything follows what is stored.
         attempt: how many draws of these maps were rejected before.
-        vegetation_m: what grows, 0 where the ground shows, shape [B, H, W]; None where nothing does.
+        layers: those that are drawn.
 
     Returns:
-        The fields of `schema.FIELDS` but `reference_time_s`, and `vegetation_m` where it is given.
+        The fields of `schema.FIELDS` but `reference_time_s`, those of the layers, and those of `schema.TRUTH` if a
+        layer changes λ.
     """
     key = partial(rng.stream_key, recipe.seed, split)
     scenario = recipe.scenarios[recipe.splits[split].scenario]
@@ -137,27 +142,42 @@ def complete(
     else:
         cells = recipe.correlation_m / recipe.resolution_m
         noise = copula.correlated_normal(noise_key, indices, shape, cells)
-    realised = latent.quantile_of(latent.truth(class_id, slope, recipe.classes), noise)
+    below = DrawnMaps(class_id, ground[:, 1:-1, 1:-1], slope, recipe.grid, recipe.classes)
+    stack = [spec.layer for spec in layers]
+    values = draw_layers(stack, recipe.seed, (split, attempt), indices, below)
+    realised, stored_truth = _realise(stack, values, below, noise)
     brightness = appearance.shade(*gradient, light, scenario.ambient)
-    colours, look = shown_colours(recipe.classes, scenario), class_id
-    if vegetation_m is not None:
-        look = class_id + len(recipe.classes) * (vegetation_m > 0)
     if recipe.places is None:
         ends = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)
         start_m, goal_m = np.tile(ends[:, None], (1, len(indices), 1))
     else:
         start_m, goal_m = draw_places(recipe.places, recipe.grid, key("places", attempt), indices)
     return {
-        "rgb": appearance.paint(look, colours, brightness),
+        "rgb": appearance.paint(_colour(stack, values, below, scenario), brightness),
         "class_id": class_id,
-        "elevation_m": ground[:, 1:-1, 1:-1],
+        "elevation_m": below.elevation_m,
         "slope_deg": slope,
         "traversability": quantise(realised, 16),
         "environment": indices % recipe.environments,
         "start_m": start_m,
         "goal_m": goal_m,
-        **({} if vegetation_m is None else {"vegetation_m": vegetation_m}),
+        **values,
+        **stored_truth,
     }
+
+
+def _realise(layers: Sequence[Layer], values: Maps, below: DrawnMaps, noise: ndarray) -> tuple[ndarray, Maps]:
+    """Return λ [B, H, W] by standard normal numbers, and the fields of `schema.TRUTH` if a layer changes λ."""
+    truth = affect_layers(layers, latent.truth(below.class_id, below.slope_deg, below.classes), values, below)
+    is_affected = any(layer.affects() for layer in layers)
+    return latent.quantile_of(truth, noise), dict(zip(TRUTH, truth[1:], strict=True)) if is_affected else {}
+
+
+def _colour(layers: Sequence[Layer], values: Maps, below: DrawnMaps, scenario: Scenario) -> ndarray:
+    """Return the colours of maps in full light, with their layers, shape [B, 3, H, W]."""
+    by_class = shown_colours(below.classes, scenario)
+    colours = np.moveaxis(np.take(by_class.T, below.class_id, axis=1), 0, 1)
+    return colour_layers(layers, colours, values, below)
 
 
 def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
@@ -181,27 +201,7 @@ def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
             *craters, grid.shape, grid.resolution_m, scenario.crater_depth_ratio
         )
     class_id = class_map(recipe, split, indices, attempt)
-    return complete(
-        recipe,
-        split,
-        indices,
-        class_id,
-        elevation.framed(ground),
-        attempt,
-        _vegetation(recipe, split, indices, class_id, attempt),
-    )
-
-
-def _vegetation(
-    recipe: Recipe, split: str, indices: ndarray, class_id: ndarray, attempt: int
-) -> ndarray | None:
-    """What grows on classes [B, H, W], in metres; None where the recipe has no vegetation."""
-    if not recipe.has_vegetation:
-        return None
-    cells = recipe.vegetation_period_m / recipe.resolution_m
-    names, periods = (split, "vegetation", attempt), (cells, cells / 2)
-    noise = appearance.fractal_perlin(recipe.seed, names, indices, recipe.grid.shape, periods)
-    return vegetation.grow(class_id, noise, recipe.classes)
+    return complete(recipe, split, indices, class_id, elevation.framed(ground), attempt, recipe.layers)
 
 
 def _within(limits: tuple[float, float], share: ndarray) -> ndarray:

@@ -136,7 +136,7 @@ def test_layers_go_with_their_maps_where_others_are_left_out_and_maps_overlap(tm
     [
         ("canopy.tif", "`layer` as NAME=RASTER or NAME=RASTER:UNIT, got 'canopy.tif'"),
         ("canopy=", "`layer` as NAME=RASTER"),
-        ("tree height=a.tif", "letters, digits and '_', got 'tree height'"),
+        ("tree height=a.tif", "letters, digits and '_', not beginning with a digit, got 'tree height'"),
         ("2nd=a.tif", "got '2nd'"),
         ("höhe_m=a.tif", "got 'höhe_m'"),
         ("=a.tif", "got ''"),

@@ -24,10 +24,10 @@ from benchnav.datagen.export.export import Publication, export, is_ours
 from benchnav.datagen.files import reader
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.classes import Vegetation
+from benchnav.datagen.layers.vegetation import Growth
 from tests import factories
 from tests.commands import call
-from tests.datagen.small import small_stakes
+from tests.datagen.small import grown, small_stakes
 
 Call = Callable[..., int]
 OWN = ("--license", "CC-BY-4.0", "--creator", "The survey")
@@ -418,7 +418,6 @@ import os
 from pathlib import Path
 from benchnav.datagen.export.export import Publication, export, is_ours
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.classes import Vegetation
 for done, total in export(TerrainDataset({str(dataset_path)!r}), Path({str(tmp_path / "out")!r}), Publication()):
     if done:
         os.kill(os.getpid(), 9)
@@ -443,14 +442,8 @@ def test_a_disk_that_cannot_be_written_is_named(
 
 
 def test_layers_are_columns_and_named(tmp_path: Path) -> None:
-    grass = Vegetation(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
-    recipe = small_stakes()
-    classes = tuple(
-        replace(item, vegetation=grass if item.name == "gravel" else None) for item in recipe.classes
-    )
-    path = factories.tiny_dataset(
-        tmp_path / "d.h5", replace(recipe, classes=classes, vegetation_period_m=4.0)
-    )
+    grass = Growth(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
+    path = factories.tiny_dataset(tmp_path / "d.h5", grown(small_stakes(), gravel=grass))
     out = exported(path, tmp_path / "out")
     stored = TerrainDataset(path).read("train")["vegetation_m"]
     np.testing.assert_array_equal(read_back(out, "train", "vegetation_m").reshape(stored.shape), stored)

@@ -16,22 +16,18 @@ from benchnav.datagen.files.hdf5 import ShardFile, pack, recipe_entry
 from benchnav.datagen.files.maps import TerrainMaps
 from benchnav.datagen.files.merge import merge
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.classes import Vegetation
+from benchnav.datagen.layers.vegetation import Growth
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.synth.generate import generate
 from tests.commands import call
-from tests.datagen.small import small_stakes
+from tests.datagen.small import grown, small_stakes
 from tests.factories import tiny_dataset, tiny_recipe
 
-GRASS = Vegetation(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
+GRASS = Growth(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
 
 
 def overgrown(**changes: object) -> Recipe:
-    classes = tuple(
-        replace(item, vegetation=GRASS if item.name in ("wet_clay", "gravel", "scree") else None)
-        for item in small_stakes().classes
-    )
-    return small_stakes(classes=classes, vegetation_period_m=4.0, **changes)
+    return grown(small_stakes(**changes), wet_clay=GRASS, gravel=GRASS, scree=GRASS)
 
 
 @pytest.fixture(scope="module")
@@ -148,8 +144,8 @@ def test_datasets_with_one_set_of_layers_merge_and_others_are_refused_in_one_lin
         next(merge([path, bare], tmp_path / "no.h5"))
     assert "unlike fields (vegetation_m of one alone)" in str(caught.value)
     assert "\n" not in str(caught.value)
-    other = tiny_dataset(tmp_path / "d.h5", replace(overgrown(seed=6), vegetation_period_m=5.0))
-    with pytest.raises(DatasetError, match=r"unlike vegetation_period_m \(4\.0 / 5\.0\)"):
+    other = tiny_dataset(tmp_path / "d.h5", grown(small_stakes(seed=6), 5.0, wet_clay=GRASS))
+    with pytest.raises(DatasetError, match="have unlike layers"):
         next(merge([path, other], tmp_path / "no.h5"))
 
 
@@ -182,11 +178,8 @@ def test_damaged_and_impossible_values_are_found(path: Path, tmp_path: Path) -> 
 
 def test_what_models_record_covers_what_grows(path: Path, tmp_path: Path) -> None:
     dataset = TerrainDataset(path)
-    taller = [
-        replace(item, vegetation=item.vegetation and replace(item.vegetation, height_m=(0.1, 0.9)))
-        for item in dataset.recipe.classes
-    ]
-    other = TerrainDataset(tiny_dataset(tmp_path / "t.h5", replace(overgrown(), classes=tuple(taller))))
+    taller = grown(overgrown(), wet_clay=replace(GRASS, height_m=(0.1, 0.9)), gravel=GRASS, scree=GRASS)
+    other = TerrainDataset(tiny_dataset(tmp_path / "t.h5", taller))
     assert dataset.about_digest("train") != other.about_digest("train")
 
 

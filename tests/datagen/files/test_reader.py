@@ -99,7 +99,7 @@ def test_foreign_newer_and_missing_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no readable HDF5"):
         TerrainDataset(tmp_path / "text.h5")
     path = tiny_dataset(tmp_path / "d.h5")
-    rewrite(path, {"format_version": "1.4"})
+    rewrite(path, {"format_version": "1.5"})
     with pytest.raises(DatasetError, match="newer benchnav"):
         TerrainDataset(path)
     rewrite(path, {"format": "other"})

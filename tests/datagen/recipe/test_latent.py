@@ -7,9 +7,11 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.datagen.layers.layer import DrawnMaps
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass, look_alike_classes
+from benchnav.datagen.recipe.classes import ClassTable, SoftSpots, TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from tests.datagen.small import SOFT, terrain_class
 
@@ -84,6 +86,12 @@ def test_soft_spots_that_are_no_distribution_are_refused(numbers: dict[str, floa
         SoftSpots(**{"weight": 0.1, "mean": 0.05, "std": 0.05} | numbers)
 
 
+def look_alikes(class_id: np.ndarray, slope_deg: np.ndarray, table: ClassTable) -> latent.Parameters:
+    """What colours tell of maps without layers."""
+    flat = np.zeros(class_id.shape)
+    return latent.look_alikes(DrawnMaps(class_id, flat, slope_deg, Grid(3, 3, 0.5), table))
+
+
 def test_look_alikes_are_classes_of_one_colour() -> None:
     table = tuple(terrain_class(name, red) for name, red in zip("abcdef", (1, 2, 1, 3, 1, 2), strict=True))
     assert look_alike_classes(table) == [(0, 2, 4), (1, 5), (0, 2, 4), (3,), (0, 2, 4), (1, 5)]
@@ -96,7 +104,7 @@ def test_what_looks_alike_is_the_average_over_its_classes() -> None:
         terrain_class("d", 3, soft=SOFT), terrain_class("e", 1, offset=0.8), terrain_class("f", 2, offset=0.5),
     )  # fmt: skip
     class_id, slope = cells(*range(6), slope_deg=6.0)
-    found = latent.look_alikes(class_id, slope, table)
+    found = look_alikes(class_id, slope, table)
     # One component a class, and a second of its soft spots.
     assert all(values.shape == (1, 9, 1, 6) for values in found)
     np.testing.assert_allclose(found[0][0, :, 0, 2], [1 / 3, 0, 0, 0.3, 0.1 / 3, 0, 0, 1 / 3, 0])
@@ -119,7 +127,7 @@ def test_of_a_cell_without_a_class_nothing_is_known() -> None:
     known, slope = cells(0, 1, 2, slope_deg=6.0)
     holed = known.copy()
     holed[..., 1] = UNLABELLED
-    for measure in (latent.truth, latent.look_alikes):
+    for measure in (latent.truth, look_alikes):
         found, wanted = (as_mixture(measure(ids, slope, table)).mean()[0, 0] for ids in (holed, known))
         assert found.isnan().tolist() == [False, True, False]
         assert torch.equal(found[[0, 2]], wanted[[0, 2]])
@@ -128,7 +136,7 @@ def test_of_a_cell_without_a_class_nothing_is_known() -> None:
 
 
 def test_colours_that_all_differ_tell_the_truth() -> None:
-    seen, own = (as_mixture(measure(*cells(0, 1), TABLE)) for measure in (latent.look_alikes, latent.truth))
+    seen, own = (as_mixture(measure(*cells(0, 1), TABLE)) for measure in (look_alikes, latent.truth))
     for value in (0.0, 0.3, 0.9):
         assert torch.equal(seen.cdf(value), own.cdf(value))
 

@@ -10,25 +10,41 @@ import yaml
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.files.stored_terrain import terrain_of
+from benchnav.datagen.layers.layer import DrawnMaps
+from benchnav.datagen.layers.vegetation import Growth, Vegetation
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.classes import TerrainClass, Vegetation
 from benchnav.datagen.recipe.looks import shown_colours
 from benchnav.datagen.recipe.recipe import Recipe, Split, load_recipe, recipe_from_dict
 from benchnav.datagen.recipe.scenario import PRESETS, Scenario, Tint, blend
 from benchnav.datagen.synth.generate import generate
-from tests.datagen.small import small_stakes
+from tests.datagen.small import grown, small_stakes
 from tests.factories import tiny_recipe
 
 SNOW = Tint(colour=(240, 244, 248), share=0.6)
 
 
-def grass(cover: float, low: float = 0.1) -> Vegetation:
-    return Vegetation(height_m=(low, low + 0.1), cover=cover, colour=(60, 110, 30))
+def grass(cover: float, low: float = 0.1) -> Growth:
+    return Growth(height_m=(low, low + 0.1), cover=cover, colour=(60, 110, 30))
 
 
-def overgrown(**by_class: Vegetation) -> Recipe:
-    classes = [replace(item, vegetation=by_class.get(item.name)) for item in small_stakes().classes]
-    return small_stakes(classes=tuple(classes), vegetation_period_m=4.0)
+def overgrown(**by_class: Growth) -> Recipe:
+    return grown(small_stakes(), **by_class)
+
+
+def vegetation_of(recipe: Recipe) -> Vegetation:
+    (spec,) = recipe.layers
+    assert isinstance(spec.layer, Vegetation)
+    return spec.layer
+
+
+def told(
+    recipe: Recipe, class_id: np.ndarray, slope_deg: np.ndarray, height_m: np.ndarray | None = None
+) -> latent.Parameters:
+    """What colours tell of maps, with vegetation where heights are given."""
+    maps = DrawnMaps(class_id, np.zeros(class_id.shape), slope_deg, recipe.grid, recipe.classes)
+    if height_m is None:
+        return latent.look_alikes(maps)
+    return latent.look_alikes(maps, [vegetation_of(recipe)], {"vegetation_m": height_m})
 
 
 def maps_in(scenario: Scenario, recipe: Recipe | None = None) -> dict[str, np.ndarray]:
@@ -151,20 +167,17 @@ def test_a_tint_may_not_give_ground_the_colour_of_vegetation() -> None:
     towards = tuple((colour + 2 * (np.array([60, 110, 30]) - colour)).clip(0, 255).tolist())
     assert towards == (0, 94, 0)  # half way there gravel is (76, 110, 50)
     halved = Tint(classes=("gravel",), colour=(0, 94, 0), share=0.5)
-    grown = replace(grass(0.4), colour=(76, 110, 50))
-    classes = [
-        replace(item, vegetation=grown if item.name == "wet_clay" else None) for item in recipe.classes
-    ]
+    muddy = replace(recipe, scenarios=recipe.scenarios | {"mud": Scenario(tints=(halved,))})
     with pytest.raises(ConfigError, match="on 'wet_clay' of a `colour` that no ground has in scenario 'mud'"):
-        replace(
-            recipe, classes=tuple(classes), scenarios=recipe.scenarios | {"mud": Scenario(tints=(halved,))}
-        )
+        grown(muddy, wet_clay=replace(grass(0.4), colour=(76, 110, 50)))
 
 
 def test_vegetation_keeps_its_colour_under_a_tint() -> None:
     recipe = overgrown(wet_clay=grass(0.4))
+    maps = maps_in(Scenario(tints=(SNOW,), ambient=1.0), recipe)
+    cells = maps["vegetation_m"] > 0
+    assert np.unique(np.moveaxis(maps["rgb"], 1, -1)[cells], axis=0).tolist() == [[60, 110, 30]]
     shown = shown_colours(recipe.classes, Scenario(tints=(SNOW,)))
-    assert shown[len(recipe.classes) + 1].tolist() == [60, 110, 30]
     np.testing.assert_allclose(shown[0], 0.4 * np.array([72, 62, 58]) + 0.6 * np.array([240, 244, 248]))
 
 
@@ -179,10 +192,11 @@ def frequencies(recipe: Recipe, maps: int, number: int, overgrown: bool) -> np.n
     """How often each class lies in cells that look like one class's, bare or overgrown, on maps; shape [C]."""
     made = generate(replace(recipe, splits={"all": Split(scenario="std", maps=maps)}), "all", np.arange(maps))
 
-    def look(item: TerrainClass) -> object:
-        return item.vegetation and item.vegetation.colour if overgrown else item.colour
-
-    alike = np.array([look(item) == look(recipe.classes[number]) for item in recipe.classes])
+    growths = vegetation_of(recipe).classes
+    looks: list[object] = [item.colour for item in recipe.classes]
+    if overgrown:
+        looks = [growths[item.name].colour if item.name in growths else None for item in recipe.classes]
+    alike = np.array([look == looks[number] for look in looks])
     cells = alike[made["class_id"]] & ((made["vegetation_m"] > 0) == overgrown)
     counts = np.bincount(made["class_id"][cells], minlength=len(recipe.classes))
     return counts / counts.sum()
@@ -193,8 +207,8 @@ def test_classes_below_one_vegetation_weigh_as_they_are_covered() -> None:
     recipe = overgrown(packed_soil=grass(0.25), crusted_soil=grass(0.25, 0.5), wet_clay=grass(0.75, 1.0))
     table, (packed, crusted, wet) = recipe.classes, (2, 10, 1)
     class_id = np.array([[[packed, crusted, wet, 0]], [[packed, crusted, packed, 0]]])
-    slope, grown = np.full(class_id.shape, 5.0), np.array([[[True, True, True, False]]] * 2)
-    weights, means, _ = latent.look_alikes(class_id, slope, table, grown)
+    slope, height_m = np.full(class_id.shape, 5.0), np.array([[[0.1, 0.5, 1.0, 0.0]]] * 2)
+    weights, means, _ = told(recipe, class_id, slope, height_m)
     np.testing.assert_allclose(weights.sum(axis=1), 1)
 
     def share(of: int, where: tuple[int, int]) -> float:
@@ -220,9 +234,9 @@ def test_bare_cells_tell_what_they_told_without_vegetation() -> None:
     recipe = overgrown(packed_soil=grass(0.4), crusted_soil=grass(0.4, 0.5))
     maps = generate(recipe, "train", np.arange(6))
     slope = maps["slope_deg"].astype(np.float64)
-    none = latent.look_alikes(maps["class_id"], slope, recipe.classes)
+    none = told(recipe, maps["class_id"], slope)
     bare = maps["vegetation_m"] == 0
-    with_layer = latent.look_alikes(maps["class_id"], slope, recipe.classes, ~bare)
+    with_layer = told(recipe, maps["class_id"], slope, maps["vegetation_m"].astype(np.float64))
     for one, other in zip(none, with_layer, strict=True):
         for cells in (bare, ~bare):  # where look-alikes have one vegetation, below it too
             np.testing.assert_array_equal(

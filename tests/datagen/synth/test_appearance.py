@@ -3,10 +3,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchnav.datagen.noise import fractal_perlin
 from benchnav.datagen.recipe.latent import latent_mean, latent_std
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.datagen.synth import appearance
-from benchnav.datagen.synth.appearance import fractal_perlin
 from benchnav.datagen.synth.elevation import framed, horn_gradient
 
 
@@ -43,10 +43,9 @@ def test_shading_is_lamberts_law() -> None:
     np.testing.assert_allclose(appearance.shade(*plane, grazing, 0.1), 0.1)
 
 
-def test_paint_scales_the_class_colour() -> None:
-    image = appearance.paint(
-        np.array([[[0, 1]]]), np.array([[200.0, 100, 50], [0, 10, 255]]), np.array([[[0.5, 1.0]]])
-    )
+def test_paint_scales_colours() -> None:
+    colours = np.array([[200.0, 100, 50], [0, 10, 255]]).T.reshape(1, 3, 1, 2)
+    image = appearance.paint(colours, np.array([[[0.5, 1.0]]]))
     assert image[0, :, 0].T.tolist() == [[100, 50, 25], [0, 10, 255]]
 
 

@@ -13,7 +13,8 @@ import torch
 
 from benchnav.core.errors import BenchnavError
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.classes import SoftSpots, Vegetation
+from benchnav.datagen.layers.vegetation import Growth
+from benchnav.datagen.recipe.classes import SoftSpots
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.find_episodes import find_episodes
@@ -25,6 +26,7 @@ from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings, build, read_block
 from benchnav.planning.planners.planner import Plan
 from tests import factories
+from tests.datagen.small import grown
 from tests.eval.forged import forge_rows
 from tests.eval.report import made
 
@@ -285,9 +287,8 @@ def test_ground_without_soft_spots_is_not_soft(dataset_path: Path, tmp_path: Pat
 
 def test_a_recording_holds_the_layers_of_its_map_when_run_and_when_run_again(tmp_path: Path) -> None:
     recipe = factories.tiny_recipe(train=1, valid=1, test_std=3, test_hg=1, test_hs=1)
-    grass = Vegetation(height_m=(0.2, 0.9), cover=0.5, colour=(60, 110, 30))
-    classes = tuple(replace(item, vegetation=grass) for item in recipe.classes)
-    recipe = replace(recipe, synthesis=2, classes=classes, vegetation_period_m=4.0)
+    grass = Growth(height_m=(0.2, 0.9), cover=0.5, colour=(60, 110, 30))
+    recipe = grown(replace(recipe, synthesis=2), **{item.name: grass for item in recipe.classes})
     data = factories.tiny_dataset(tmp_path / "grown.h5", recipe)
     folder = run(data, tmp_path / "run", maps=3, seeds=(3,), record="first")
     stored = TerrainDataset(data).read("test/std")["vegetation_m"]

@@ -9,40 +9,50 @@ import pytest
 from scipy import stats
 
 from benchnav.core.errors import ConfigError
-from benchnav.datagen.recipe.classes import Vegetation
+from benchnav.core.grid import Grid
+from benchnav.datagen.layers.layer import DrawnMaps
+from benchnav.datagen.layers.spec import shipped_fields
+from benchnav.datagen.layers.stack import draw_layers
+from benchnav.datagen.layers.vegetation import Growth, Vegetation
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict
-from benchnav.datagen.schema import FIELDS, LAYERS, entry_digests
-from benchnav.datagen.synth.generate import _vegetation as vegetation_of
+from benchnav.datagen.schema import FIELDS, entry_digests
 from benchnav.datagen.synth.generate import class_map, generate
-from benchnav.datagen.synth.vegetation import grow
-from tests.datagen.small import small_stakes, terrain_class
+from tests.datagen.small import grown, small_stakes, terrain_class
 from tests.factories import tiny_recipe
 
 SHIPPED = load_recipe("vegetation-v1")
 STEP = 2.0**-10
 
 
-def overgrown_recipe(period_m: float = 4.0, **by_class: Vegetation) -> Recipe:
-    """Small maps with vegetation on some classes."""
-    classes = [replace(item, vegetation=by_class.get(item.name)) for item in small_stakes().classes]
-    return small_stakes(classes=tuple(classes), vegetation_period_m=period_m)
+def grow(class_id: np.ndarray, noise: np.ndarray, **classes: Growth | None) -> np.ndarray:
+    """Heights on maps of classes in the order given, by a noise."""
+    table = tuple(terrain_class(name, 1 + number) for number, name in enumerate(classes))
+    growths = {name: growth for name, growth in classes.items() if growth is not None}
+    flat, grid = np.zeros(class_id.shape), Grid(*class_id.shape[1:], 0.5)
+    return Vegetation(period_m=4.0, classes=growths).grow(noise, DrawnMaps(class_id, flat, flat, grid, table))
 
 
-def reeds(cover: float = 0.4, low: float = 0.2, high: float = 1.4, green: int = 90) -> Vegetation:
-    return Vegetation(height_m=(low, high), cover=cover, colour=(40, green, 20))
+def growths_of(recipe: Recipe) -> dict[str, Growth]:
+    (spec,) = recipe.layers
+    assert isinstance(spec.layer, Vegetation)
+    return spec.layer.classes
 
 
-RECIPE = overgrown_recipe(wet_clay=reeds(), gravel=reeds(0.7, 2.0, 2.0, 120))
+def reeds(cover: float = 0.4, low: float = 0.2, high: float = 1.4, green: int = 90) -> Growth:
+    return Growth(height_m=(low, high), cover=cover, colour=(40, green, 20))
+
+
+RECIPE = grown(small_stakes(), wet_clay=reeds(), gravel=reeds(0.7, 2.0, 2.0, 120))
 
 
 def test_each_class_is_covered_by_its_share_on_every_map() -> None:
     maps = generate(RECIPE, "train", np.arange(24))
-    grown = maps["vegetation_m"] > 0
+    is_grown = maps["vegetation_m"] > 0
     for number, item in enumerate(RECIPE.classes):
         own = maps["class_id"] == number
-        share = item.vegetation.cover if item.vegetation else 0.0
+        share = growths_of(RECIPE)[item.name].cover if item.name in growths_of(RECIPE) else 0.0
         counts = own.sum(axis=(1, 2))
-        assert np.abs((grown & own).sum(axis=(1, 2)) - share * counts).max() <= 0.5
+        assert np.abs((is_grown & own).sum(axis=(1, 2)) - share * counts).max() <= 0.5
         assert counts.any()
 
 
@@ -62,7 +72,7 @@ def test_the_tallest_stand_where_the_noise_is_greatest() -> None:
     """So heights of a patch go over into one another, from its edge to its middle."""
     generator = np.random.default_rng(1)
     class_id, noise = generator.integers(0, 2, (3, 20, 30)), generator.normal(size=(3, 20, 30))
-    height_m = grow(class_id, noise, (terrain_class("a", vegetation=reeds()), terrain_class("b", 4)))
+    height_m = grow(class_id, noise, a=reeds(), b=None)
     for heights, values, own in zip(height_m, noise, class_id == 0, strict=True):
         order = np.argsort(values[own])
         assert (np.diff(heights[own][order]) >= 0).all()
@@ -71,40 +81,23 @@ def test_the_tallest_stand_where_the_noise_is_greatest() -> None:
 
 @pytest.mark.parametrize("split", RECIPE.splits)
 def test_it_hides_the_colour_of_its_cells_alone_and_changes_nothing_else(split: str) -> None:
-    bare = replace(
-        RECIPE,
-        classes=tuple(replace(item, vegetation=None) for item in RECIPE.classes),
-        vegetation_period_m=0.0,
-    )
-    maps, without = (generate(recipe, split, np.arange(3)) for recipe in (RECIPE, bare))
+    maps, without = (generate(recipe, split, np.arange(3)) for recipe in (RECIPE, replace(RECIPE, layers=())))
     assert list(maps) == [*without, "vegetation_m"]
     for name in set(without) - {"rgb"}:
         np.testing.assert_array_equal(maps[name], without[name])
-    grown = maps["vegetation_m"] > 0
+    is_grown = maps["vegetation_m"] > 0
     image, other = (np.moveaxis(each["rgb"], 1, -1).astype(float) for each in (maps, without))
-    np.testing.assert_array_equal(image[~grown], other[~grown])
+    np.testing.assert_array_equal(image[~is_grown], other[~is_grown])
     ground = np.array([item.colour for item in RECIPE.classes])[maps["class_id"]]
     brightness = other[..., :1] / ground[..., :1]  # of the red, known to within half a level
     for number, item in enumerate(RECIPE.classes):
-        own = grown & (maps["class_id"] == number)
-        if item.vegetation:
-            shaded = np.array(item.vegetation.colour) * brightness[own]
-            error = 0.5 + 0.5 * np.array(item.vegetation.colour) / item.colour[0] + 1e-9
+        own = is_grown & (maps["class_id"] == number)
+        if growth := growths_of(RECIPE).get(item.name):
+            shaded = np.array(growth.colour) * brightness[own]
+            error = 0.5 + 0.5 * np.array(growth.colour) / item.colour[0] + 1e-9
             assert (np.abs(image[own] - shaded) <= error).all()
             assert (image[own] != other[own]).any(axis=1).all()
-    assert grown.any()
-
-
-def test_a_map_is_the_same_in_any_batch_and_its_own_in_each_split() -> None:
-    whole = generate(RECIPE, "train", np.arange(8))["vegetation_m"]
-    np.testing.assert_array_equal(generate(RECIPE, "train", np.array([1, 5]))["vegetation_m"], whole[[1, 5]])
-    np.testing.assert_array_equal(generate(RECIPE, "train", np.array([6]))["vegetation_m"][0], whole[6])
-    renamed = replace(RECIPE, splits={"valid": RECIPE.splits["train"]})
-    sibling = generate(replace(RECIPE, seed=5), "train", np.arange(8))["vegetation_m"]
-    grows = (whole > 0).any(axis=(1, 2))
-    for other in (generate(renamed, "valid", np.arange(8))["vegetation_m"], sibling):
-        assert not (other == whole).all(axis=(1, 2))[grows].any()
-    assert grows.sum() > 3
+    assert is_grown.any()
 
 
 def test_seed_split_draw_and_map_each_have_vegetation_of_their_own() -> None:
@@ -112,9 +105,10 @@ def test_seed_split_draw_and_map_each_have_vegetation_of_their_own() -> None:
     class_id, indices = np.ones((2, 32, 32), int), np.arange(2)
 
     def drawn(recipe: Recipe = RECIPE, split: str = "train", attempt: int = 0) -> np.ndarray:
-        height_m = vegetation_of(recipe, split, indices, class_id, attempt)
-        assert height_m is not None
-        return height_m
+        flat = np.zeros(class_id.shape)
+        below = DrawnMaps(class_id, flat, flat, recipe.grid, recipe.classes)
+        layers = [spec.layer for spec in recipe.layers]
+        return draw_layers(layers, recipe.seed, (split, attempt), indices, below)["vegetation_m"]
 
     several = [drawn(), drawn(replace(RECIPE, seed=5)), drawn(split="test/hg"), drawn(attempt=1)]
     maps = [own for each in several for own in each]
@@ -128,38 +122,31 @@ def test_seed_split_draw_and_map_each_have_vegetation_of_their_own() -> None:
 def test_patches_are_as_large_as_the_period_says() -> None:
     borders = []
     for period_m in (2.0, 4.0, 8.0):
-        grown = (
-            generate(overgrown_recipe(period_m, wet_clay=reeds(0.5)), "train", np.arange(24))["vegetation_m"]
-            > 0
-        )
+        recipe = grown(small_stakes(), period_m, wet_clay=reeds(0.5))
+        is_grown = generate(recipe, "train", np.arange(24))["vegetation_m"] > 0
         wet = generate(RECIPE, "train", np.arange(24))["class_id"] == 1
         both = wet[:, :, 1:] & wet[:, :, :-1]
-        borders.append((grown[:, :, 1:] != grown[:, :, :-1])[both].mean())
+        borders.append((is_grown[:, :, 1:] != is_grown[:, :, :-1])[both].mean())
     assert borders[0] > 1.4 * borders[1] > 1.4 * 1.4 * borders[2]
 
 
 def test_where_it_grows_does_not_tell_look_alikes_apart() -> None:
     """Two look-alikes exchange their ground: the same cells are overgrown, so the picture is the same."""
-    classes = tuple(
-        terrain_class(f"c{number}", vegetation=reeds(0.4, low, low + 0.1))
-        for number, low in enumerate((0.2, 0.8))
-    )
+    growths = {"low": reeds(0.4, 0.2, 0.3), "high": reeds(0.4, 0.8, 0.9)}
     generator = np.random.default_rng(0)
     class_id, noise = generator.integers(0, 2, (4, 20, 30)), generator.normal(size=(4, 20, 30))
-    first, second = grow(class_id, noise, classes), grow(1 - class_id, noise, classes)
+    first, second = grow(class_id, noise, **growths), grow(1 - class_id, noise, **growths)
     np.testing.assert_array_equal(first > 0, second > 0)
-    grown = first > 0
-    assert (first[grown] < 0.4).tolist() == (class_id[grown] == 0).tolist()
-    assert (second[grown] < 0.4).tolist() == (class_id[grown] == 1).tolist()
+    cells = first > 0
+    assert (first[cells] < 0.4).tolist() == (class_id[cells] == 0).tolist()
+    assert (second[cells] < 0.4).tolist() == (class_id[cells] == 1).tolist()
 
 
 def test_a_class_may_be_overgrown_altogether_or_by_less_than_a_cell() -> None:
     class_id, noise = np.zeros((2, 4, 5), int), np.random.default_rng(0).normal(size=(2, 4, 5))
-    assert (grow(class_id, noise, (terrain_class("a", vegetation=reeds(1.0)),)) > 0).all()
-    assert not grow(class_id, noise, (terrain_class("a", vegetation=reeds(0.02)),)).any()
-    assert not grow(
-        class_id + 1, noise, (terrain_class("a", vegetation=reeds(1.0)), terrain_class("b", 4))
-    ).any()
+    assert (grow(class_id, noise, a=reeds(1.0)) > 0).all()
+    assert not grow(class_id, noise, a=reeds(0.02)).any()
+    assert not grow(class_id + 1, noise, a=reeds(1.0), b=None).any()
 
 
 @pytest.mark.parametrize(
@@ -191,29 +178,29 @@ def test_what_does_not_grow_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize(
-    ("changes", "expected"),
+    ("period_m", "expected"),
     [
-        ({"vegetation_period_m": 0.9}, "of at least two cells, 1 m, where a class has `vegetation`, got 0.9"),
-        ({"vegetation_period_m": 0.0}, "of at least two cells"),
-        ({"vegetation_period_m": float("inf")}, "of at least two cells"),
+        (0.9, "of at least two cells, 1 m, where a class has `vegetation`, got 0.9"),
+        (0.0, "of at least two cells"),
+        (float("inf"), "of at least two cells"),
+        ("wide", "Expected `vegetation_period_m` as a number, got 'wide'"),
     ],
 )
-def test_recipes_with_vegetation_say_how_large_its_patches_are(
-    changes: dict[str, float], expected: str
-) -> None:
+def test_recipes_with_vegetation_say_how_large_its_patches_are(period_m: object, expected: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        replace(RECIPE, **changes)
+        recipe_from_dict(RECIPE.to_dict() | {"vegetation_period_m": period_m}, "mine.yaml")
     assert expected in str(caught.value)
+    bare = small_stakes().to_dict() | {"vegetation_period_m": 4}
     with pytest.raises(
         ConfigError, match="`vegetation_period_m` with `vegetation` of a class, got 4 and none"
     ):
-        small_stakes(vegetation_period_m=4.0)
+        recipe_from_dict(bare, "mine.yaml")
 
 
 def test_synthesis_1_has_no_vegetation() -> None:
     classes = [item | {"vegetation": None} for item in tiny_recipe().to_dict()["classes"]]
     classes[1]["vegetation"] = {"height_m": [0.2, 1.4], "cover": 0.4, "colour": [40, 90, 20]}
-    with pytest.raises(ConfigError, match="`synthesis: 2` with `vegetation`, got 1"):
+    with pytest.raises(ConfigError, match="`synthesis: 2` with `layer vegetation_m`, got 1"):
         recipe_from_dict(
             tiny_recipe().to_dict() | {"classes": classes, "vegetation_period_m": 4}, "mine.yaml"
         )
@@ -226,21 +213,19 @@ def test_a_recipe_says_of_vegetation_only_what_it_has() -> None:
     assert {name for name, own in named.items() if own} == {"wet_clay", "gravel"}
     assert not any("vegetation" in item for item in small_stakes().to_dict()["classes"])
     assert "vegetation_period_m" not in small_stakes().to_dict()
-    assert (RECIPE.fields, small_stakes().fields) == (FIELDS | LAYERS, FIELDS)
+    assert (RECIPE.fields, small_stakes().fields) == (FIELDS | shipped_fields(), FIELDS)
 
 
 def test_vegetation_v1_is_stakes_v1_overgrown() -> None:
     stakes = load_recipe("stakes-v1")
-    bare = tuple(replace(item, vegetation=None) for item in SHIPPED.classes)
-    assert bare == stakes.classes
-    same = {"id": stakes.id, "classes": bare, "vegetation_period_m": 0.0}
-    assert replace(SHIPPED, **same) == replace(
+    assert SHIPPED.classes == stakes.classes
+    assert replace(SHIPPED, id=stakes.id, layers=()) == replace(
         stakes,
         splits={name: stakes.splits[name] for name in SHIPPED.splits},
         scenarios={name: stakes.scenarios[name] for name in SHIPPED.scenarios},
     )
     # No two of the classes are as high, whatever the colour.
-    ranges = sorted(item.vegetation.height_m for item in SHIPPED.classes if item.vegetation)
+    ranges = sorted(growth.height_m for growth in growths_of(SHIPPED).values())
     assert len(ranges) == 5
     assert all(one[1] < other[0] for one, other in pairwise(ranges))
 
