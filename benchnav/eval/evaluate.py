@@ -44,7 +44,8 @@ def evaluate(
         verbose: whether to show progress and notes on stderr.
         **experiment: what is evaluated, by the fields of `Suite`: `models`, `planners`, `risks`, `robots`,
             `objectives`, `sensors`, `grounds`, `beliefs`, `world` (such as `World.stakes()`), `task` (or `rules`, a
-            `Rules`), `scenarios`, `maps`, `seed` or `seeds`, `realisations`, `record`, `conditions`, `hypotheses`.
+            `Rules`), `scenarios`, `maps`, `seed` or `seeds`, `realisations`, `record`, `conditions`, `hypotheses`,
+            `metrics` besides those that every run has (such as `Energy(power_w=120)`).
 
     Returns:
         The results of the run.

@@ -13,6 +13,7 @@ import numpy as np
 from benchnav.core.errors import BenchnavError, out_of_memory
 from benchnav.core.quantity import Better, Quantity
 from benchnav.core.settings import fault
+from benchnav.core.specified import Specified
 from benchnav.planning.robots import Robot
 
 
@@ -124,7 +125,7 @@ class MetricError(BenchnavError):
     """A metric failed, or returned what is no number."""
 
 
-class Metric(ABC):
+class Metric(Specified, ABC):
     """A number for each episode: one column of the episodes' table, and what is said of it.
 
     What is listed below is a class attribute, or a property of an object with options. Whatever else a metric needs are

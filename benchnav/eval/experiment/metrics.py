@@ -42,7 +42,13 @@ class NamedMetric:
     @property
     def about(self) -> dict[str, Any]:
         """The entry of `metrics` in `run.json`."""
-        return {**self.spec, "label": self.part.label, "quantity": asdict(self.quantity)}
+        marked = {"unreproducible": True} if self.is_object else {}
+        return {**self.spec, "label": self.part.label, "quantity": asdict(self.quantity), **marked}
+
+    @property
+    def is_object(self) -> bool:
+        """Whether it is an object of this process, which no other process can create."""
+        return registry.is_object("metric", self.part.part)
 
 
 def read_metrics(given: Sequence[PartSpec], robots: Iterable[Robot]) -> tuple[NamedMetric, ...]:

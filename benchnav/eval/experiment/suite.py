@@ -21,6 +21,7 @@ PART_FIELDS = {
     "sensors": "sensor",
     "grounds": "ground",
     "beliefs": "belief",
+    "metrics": "metric",
 }
 
 # What is kept of episodes beside their rows, each with all that stands before it.
@@ -39,7 +40,7 @@ _SEEDS = 2**63  # what a table's column of whole numbers holds
 class Suite:
     """What is evaluated: the product of everything listed, or of each mapping in `conditions`.
 
-    A planner, model, risk measure, robot, objective, sensor or belief is given as NAME, package.module:Name,
+    A planner, model, risk measure, robot, objective, sensor, belief or metric is given as NAME, package.module:Name,
     path/to/file.py:Name, or {part: NAME, label: LABEL, options: {...}}; in a program also as an object, which is
     replaced by the description that creates it again.
 

@@ -138,6 +138,11 @@ def check_resumable(run: Run) -> None:
         ConfigError: If it has such parts.
     """
     parts = [part for entry in run.about["conditions"].values() for part in entry.get("unreproducible", ())]
+    parts += [
+        f"metric {entry['quantity']['name']}"
+        for entry in run.about.get("metrics", ())
+        if "unreproducible" in entry
+    ]
     if parts:
         raise ConfigError(
             f"Expected a run that can be run again, got {run.folder}, whose {parts[0]} was an object of one process. "

@@ -89,9 +89,9 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
     warnings = build_each(kept, suite.all_seeds[0], suite.maps)
     for condition in kept:
         warnings += _doubts(condition, _open(condition))
-        warnings += [
-            f"not reproducible: {part} is an object of one process" for part in condition.unreproducible
-        ]
+    lone = [part for condition in kept for part in condition.unreproducible]
+    lone += [f"metric {metric.quantity.name}" for metric in metrics if metric.is_object]
+    warnings += [f"not reproducible: {part} is an object of one process" for part in lone]
     return Checked(
         conditions={condition.id: (condition, extents[condition.id]) for condition in kept},
         dropped=tuple(provenance.join(one.entry for one in left_out.values())),
