@@ -20,8 +20,8 @@ from mpl_toolkits.mplot3d import Axes3D
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from benchnav.core.figures import MARKS, mark, robot_marker, styled
 from benchnav.eval.recording import Recording
+from benchnav.viz.style import MARKS, mark, robot_marker, styled
 
 FIGURES = Path(__file__).parents[1] / "docs/figures"
 COLOURS, NAMES = ("#D55E00", "#0072B2"), ("mean of λ", "CVaR of λ at 0.8")

@@ -16,11 +16,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich.progress import track
 
-from benchnav.core.figures import LINE_COLOURS, MARKERS, TWO_COLUMNS_IN, legend_outside, save, styled
 from benchnav.core.tables import Table, to_markdown
 from benchnav.eval.experiment.condition import condition_from
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.unit import Settings, build, one_thread, simulate
+from benchnav.viz.style import LINE_COLOURS, MARKERS, TWO_COLUMNS_IN, legend_outside, save, styled
 
 FIGURE = Path(__file__).parents[1] / "docs/figures/performance-matched.png"
 MAPS, SKIPPED = 3, 10

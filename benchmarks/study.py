@@ -33,7 +33,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from scipy.stats import norm
 
-from benchnav.core.figures import (
+from benchnav.core.tables import Table, to_markdown
+from benchnav.datagen import TerrainDataset
+from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.report.write import read_report
+from benchnav.viz.style import (
     LINE_COLOURS,
     MARKERS,
     TWO_COLUMNS_IN,
@@ -42,10 +46,6 @@ from benchnav.core.figures import (
     save,
     styled,
 )
-from benchnav.core.tables import Table, to_markdown
-from benchnav.datagen import TerrainDataset
-from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.report.write import read_report
 
 ROOT = Path(__file__).parents[1]
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchnav.core.figures import frame_map, save, show_map, styled
 from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict
 from benchnav.datagen.synth.generate import generate
+from benchnav.viz.style import frame_map, save, show_map, styled
 
 FIGURE = Path(__file__).parents[1] / "docs/figures/scenarios-tints.png"
 EXAMPLE = 13  # of test/std, as in the other figures of the note

@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.table import Table
 from scipy.stats import kendalltau, t
 
-from benchnav.core.figures import save, styled
 from benchnav.core.resampling import holm, sign_flips
 from benchnav.eval.stats.paired_difference import mean_interval
+from benchnav.viz.style import save, styled
 
 RISKS, SPLIT = ("expected-time", "cvar:0.8"), "test/std"
 SCORES = ("rmse_expected", "nll", "crps", "pinball", "tail_error", "ause")  # of each the least is the best

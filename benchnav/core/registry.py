@@ -1,7 +1,7 @@
 """The one registry: how every replaceable part is named, found, configured and identified.
 
 Parts are planners, models, risk measures, robots, objectives, sensors of appearance (`sensor`) and of the ground
-(`ground`), and beliefs. A part is named by one of four forms:
+(`ground`), beliefs, and figures of a report (`figure`). A part is named by one of four forms:
 
 - a shipped name (`mppi`) or the name of an entry point of the group `benchnav.<kind>s` of an installed
   package; the shipped parts are entry points too;
@@ -62,7 +62,7 @@ from benchnav.core.sources import (
 )
 from benchnav.core.yaml_text import load_yaml
 
-KINDS = ("planner", "model", "risk", "robot", "objective", "sensor", "ground", "belief")
+KINDS = ("planner", "model", "risk", "robot", "objective", "sensor", "ground", "belief", "figure")
 
 # What a part of each kind is a subclass of, and where users import that from. A risk measure is any function.
 _BASES = {
@@ -73,6 +73,7 @@ _BASES = {
     "sensor": ("benchnav.planning", "Sensor"),
     "ground": ("benchnav.planning", "Sensor"),
     "belief": ("benchnav.planning", "Belief"),
+    "figure": ("benchnav.viz", "Figure"),
 }
 
 # Parameters that the program gives, so no options.

@@ -28,7 +28,7 @@ _MOVED = {
     for place, names in {
         "benchnav": "errors grid mixture registry terrain",
         "benchnav.core.": "copula cvar device gridgraph rng",
-        "benchnav.core.figures": "drawing",
+        "benchnav.viz.style": "core.figures drawing",
         "benchnav.core.store": "files",
         "benchnav.datagen": "datagen.create datagen.generate datagen.maps datagen.scenario datagen.store",
         "benchnav.datagen.recipe.": "datagen.latent",

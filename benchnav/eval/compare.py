@@ -30,7 +30,6 @@ from benchnav.eval.folder.run_folder import (
     read_table,
 )
 from benchnav.eval.report.result_tables import comparison_table
-from benchnav.eval.report.words import reading_name
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import (
     Compared,
@@ -42,6 +41,7 @@ from benchnav.eval.stats.pairs import (
     matches,
 )
 from benchnav.eval.stats.summary import time_budgets
+from benchnav.eval.words import reading_name
 
 _CAPTION = (
     "Differences of success and of time between conditions that met the same maps with the same draws of λ."

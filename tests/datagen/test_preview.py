@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from benchnav.core.errors import DatasetError
-from benchnav.core.figures import TWO_COLUMNS_IN, hatching, save
 from benchnav.core.grid import outline
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.preview import (
@@ -28,6 +27,7 @@ from benchnav.datagen.preview import (
 )
 from benchnav.datagen.recipe.classes import Vegetation
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe
+from benchnav.viz.style import TWO_COLUMNS_IN, hatching, save
 from tests.datagen.small import small_stakes
 from tests.factories import tiny_dataset, tiny_recipe
 

@@ -58,6 +58,7 @@ class Suite:
             their labels, such as {planner: mppi, risk: mean}; `metric`: success, T_total, score, traversability or
             path_length; `kind`: difference, non-inferiority, superiority or equivalence; `direction`: higher or lower;
             `margin`.
+        figures: Figures of your own for the report, after the shipped ones.
     """
 
     data: str = "paper-v1"
@@ -80,6 +81,7 @@ class Suite:
     record: Record = "first"
     conditions: tuple[dict[str, Any], ...] = ()
     hypotheses: tuple[dict[str, Any], ...] = ()
+    figures: tuple[PartSpec, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuses suites with nothing in them."""

@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 
 from benchnav.eval.experiment.condition import LABELS
-from benchnav.eval.report.words import FAILURE_COUNTS, blocks, p_in_words, rate_in_words, with_names
 from benchnav.eval.stats.best import BLOCK, FEWEST_MAPS, PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
+from benchnav.eval.words import FAILURE_COUNTS, blocks, p_in_words, rate_in_words, with_names
 
 _MOST_NAMED = 6
 

@@ -11,8 +11,8 @@ from benchnav.core.resampling import LEAST_MAPS
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.hypotheses import Hypothesis
-from benchnav.eval.report.words import NOT_YET, count_range, p_in_words, p_value, reading_names, signed
 from benchnav.eval.stats.comparison import ALPHA
+from benchnav.eval.words import NOT_YET, count_range, p_in_words, p_value, reading_names, signed
 
 _TESTS = {
     "difference": "sign-flip test by {unit} (difference)",

@@ -11,7 +11,9 @@ import pandas as pd
 
 from benchnav.core.tables import Bold, Table, to_latex
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
-from benchnav.eval.report.words import (
+from benchnav.eval.stats.best import FEWEST_MAPS, PRIVILEGED, competing
+from benchnav.eval.stats.comparison import ALPHA
+from benchnav.eval.words import (
     blocks,
     count_range,
     differ,
@@ -28,8 +30,6 @@ from benchnav.eval.report.words import (
     success_interval_in_words,
     unit_of_statistics,
 )
-from benchnav.eval.stats.best import FEWEST_MAPS, PRIVILEGED, competing
-from benchnav.eval.stats.comparison import ALPHA
 
 # What `follows` is where a planner follows the user's objective alone.
 _USERS_OWN = ("", "J")

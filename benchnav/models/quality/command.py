@@ -58,19 +58,19 @@ def evaluate(
     expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
 
     from benchnav.core.device import find_device
-    from benchnav.core.figures import save_twice
     from benchnav.models.predictor import load_model, trained_on
     from benchnav.models.quality.baselines import baselines_of
+    from benchnav.models.quality.figures import QualityData, quality_figures
     from benchnav.models.quality.measure import choose_splits
     from benchnav.models.quality.measure import evaluate as evaluate_model
     from benchnav.models.quality.notes import notes_of_data, notes_of_model
     from benchnav.models.quality.report import (
         quality_csv,
-        quality_figures,
         quality_json,
         quality_markdown,
         quality_table,
     )
+    from benchnav.viz.style import save_twice
 
     place, model = find_device(device), load_model(checkpoint)
     chosen = choose_splits(model, dataset, splits or ())
@@ -114,17 +114,21 @@ def evaluate(
     for old in (folder / FIGURES).glob("*.p[nd][gf]"):
         old.unlink()
     name = Path(checkpoint).name if Path(checkpoint).is_dir() else checkpoint
-    drawn, absent = quality_figures(f"model {name} on dataset {dataset.id}", model, dataset, qualities, maps)
-    paths = [f"{FIGURES}/{figure}.png" for figure in drawn]
+    shown = f"model {name} on dataset {dataset.id}"
+    measured = QualityData(title=shown, model=model, dataset=dataset, qualities=qualities, maps=maps)
+    captions: dict[str, tuple[str, str]] = {}
 
     def saved() -> Iterator[tuple[int, int]]:
-        for count, (path, draw) in enumerate(zip(paths, drawn.values(), strict=True), 1):
-            save_twice(draw(), folder / path, dpi=DPI)
-            yield count, len(paths)
+        figures = quality_figures(measured)
+        for figure in figures:
+            path = f"{FIGURES}/{figure.name}.png"
+            save_twice(figure(measured), folder / path, dpi=DPI)
+            captions[path] = figure.title, figure.caption(measured)
+            yield len(captions), len(figures)
 
     show_progress(saved(), "figures")
-    write_text(folder / PAGE, quality_markdown(title, qualities, notes + absent, paths))
-    for line in absent:
+    write_text(folder / PAGE, quality_markdown(title, qualities, notes + measured.absent, captions))
+    for line in measured.absent:
         print(line)
-    print(f"wrote {REPORT}, {CSV}, {PAGE} and {len(paths)} figures in {out}")
+    print(f"wrote {REPORT}, {CSV}, {PAGE} and {len(captions)} figures in {out}")
     print(f"columns and figures are explained in {folder / PAGE}")

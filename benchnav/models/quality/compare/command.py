@@ -195,15 +195,15 @@ def _notes(
 
 
 def _write(out: str, title: str, about: dict[str, Any], comparison: "Comparison", notes: list[str]) -> None:
-    from benchnav.core.figures import save_twice
     from benchnav.core.progress import show_progress
     from benchnav.core.store import write_text
+    from benchnav.models.quality.compare.figures import comparison_figures
     from benchnav.models.quality.compare.report import (
         comparison_csv,
-        comparison_figures,
         comparison_json,
         comparison_markdown,
     )
+    from benchnav.viz.style import save_twice
 
     folder = Path(out)
     write_text(folder / REPORT, comparison_json(about, comparison))
@@ -211,16 +211,19 @@ def _write(out: str, title: str, about: dict[str, Any], comparison: "Comparison"
     write_text(folder / DIFFERENCES, comparison.pairs.to_csv(index=False, float_format="%.6g"))
     for old in (folder / FIGURES).glob("*.p[nd][gf]"):
         old.unlink()
-    drawn = comparison_figures(comparison)
+    captions: dict[str, tuple[str, str]] = {}
 
     def saved() -> Iterator[tuple[int, int]]:
-        for count, (name, draw) in enumerate(drawn.items(), 1):
-            save_twice(draw(), folder / FIGURES / f"{name}.png", dpi=DPI)
-            yield count, len(drawn)
+        figures = comparison_figures(comparison)
+        for figure in figures:
+            path = f"{FIGURES}/{figure.name}.png"
+            save_twice(figure(comparison), folder / path, dpi=DPI)
+            captions[path] = figure.title, figure.caption(comparison)
+            yield len(captions), len(figures)
 
     show_progress(saved(), "figures")
-    write_text(folder / PAGE, comparison_markdown(title, comparison, notes, list(drawn)))
-    print(f"wrote {REPORT}, {CSV}, {DIFFERENCES}, {PAGE} and {len(drawn)} figures in {out}")
+    write_text(folder / PAGE, comparison_markdown(title, comparison, notes, captions))
+    print(f"wrote {REPORT}, {CSV}, {DIFFERENCES}, {PAGE} and {len(captions)} figures in {out}")
     print(f"columns and figures are explained in {folder / PAGE}")
 
 

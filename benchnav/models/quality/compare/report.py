@@ -2,10 +2,9 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
@@ -15,9 +14,6 @@ from benchnav.datagen.recipe.scenario import find_series
 from benchnav.models.quality.compare.paired import ALPHA, MEASURES
 from benchnav.models.quality.map_sums import MapTally
 from benchnav.models.quality.report import COLUMNS
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 # Of the numbers that are compared: the heading in two lines, and what it means. Those of `evaluate` mean the same here.
 HEADINGS = {
@@ -57,29 +53,6 @@ HEADINGS = {
 ORDER = (*MEASURES, "prediction_ms", "parameters")
 PRIVILEGED_MARK = " †"
 
-FIGURES = {
-    "measures": (
-        "Measures with their intervals",
-        "Each row is a model, each mark a split; lines are 95 % intervals over maps. ↑: higher is better, ↓: lower is "
-        "better. Grey: privileged models, which are given part of the truth.",
-    ),
-    "calibration": (
-        "Calibration of the predicted distributions of λ",
-        "Share of observed λ below a predicted quantile, less the level of the quantile, over that level. 0 is "
-        "calibrated. Above 0 at the left: bad ground is more frequent than predicted.",
-    ),
-    "sparsification": (
-        "Sparsification: uncertainty against error",
-        "Mean error |λ − E[λ]| of the remaining cells over the share of cells removed: the most uncertain first "
-        "(lines), or those of largest error first (dotted). The area between the two is AUSE.",
-    ),
-    "severity": (
-        "Quality over the severity of a shift",
-        "CRPS and pinball loss of the lower fifth over the severity of each scenario: 0 is the training maps, 1 the "
-        "scenario itself. Lines are 95 % intervals over maps.",
-    ),
-}
-
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
@@ -104,6 +77,11 @@ class Comparison:
     def splits(self) -> list[str]:
         """Those that were measured."""
         return list(dict.fromkeys(self.summary["split"]))
+
+    @property
+    def privileged(self) -> list[str]:
+        """Models that are given part of the truth."""
+        return [label for label, about in self.models.items() if about["privileged"]]
 
     @property
     def numbers(self) -> pd.DataFrame:
@@ -226,7 +204,7 @@ def comparison_csv(comparison: Comparison) -> str:
 
 
 def comparison_markdown(
-    title: str, comparison: Comparison, notes: Sequence[str], figures: Sequence[str]
+    title: str, comparison: Comparison, notes: Sequence[str], figures: Mapping[str, tuple[str, str]]
 ) -> str:
     """Writes the tables as a page with its figures, and what columns and figures mean.
 
@@ -234,34 +212,16 @@ def comparison_markdown(
         title: of the page.
         comparison: what was measured.
         notes: lines under the table.
-        figures: names of the figures, of `FIGURES`, whose images are in the folder `figures`.
+        figures: by the path of an image from the page its heading and its caption.
     """
     lines = [f"# {title}", "", to_markdown(comparison_table(title, comparison, whole=True)).rstrip()]
     lines += [text for note in notes for text in ("", note)]
     differences = difference_table(comparison)
     if differences.rows:
         lines += ["", f"## {differences.title}", "", to_markdown(differences).rstrip()]
-    for name in figures:
-        heading, text = FIGURES[name]
-        lines += ["", f"![{heading}](figures/{name}.png)", "", f"**{heading}.** {text}"]
+    for path, (heading, text) in figures.items():
+        lines += ["", f"![{heading}]({path})", "", f"**{heading}.** {text}"]
     return "\n".join([*lines, ""])
-
-
-def comparison_figures(comparison: Comparison) -> "dict[str, Callable[[], Figure]]":
-    """Gives what draws the figures that apply, by name."""
-    from benchnav.models.quality.compare import figures
-
-    privileged = [label for label, about in comparison.models.items() if about["privileged"]]
-    looks = figures.model_looks(list(comparison.models), privileged)
-    headings = {name: " ".join(heading.split()) for name, (heading, _) in HEADINGS.items()}
-    drawn: dict[str, Callable[[], Figure]] = {
-        "measures": partial(figures.measures_figure, comparison.summary, headings, looks, privileged),
-        "calibration": partial(figures.calibration_figure, comparison.tallies, looks),
-        "sparsification": partial(figures.sparsification_figure, comparison.tallies, looks),
-    }
-    if all_series := find_series(comparison.splits):
-        drawn["severity"] = partial(figures.severity_figure, all_series, comparison.summary, headings, looks)
-    return drawn
 
 
 def _cell(name: str, value: float) -> str:

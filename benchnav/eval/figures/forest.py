@@ -1,0 +1,99 @@
+"""The forest plot of the hypotheses that were fixed before the run."""
+
+from typing import Any
+
+import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Drawing
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from benchnav.eval.experiment.hypotheses import METRICS
+from benchnav.eval.figures.data import RunData
+from benchnav.eval.words import NOT_YET, p_in_words, reading_names
+from benchnav.viz.figure import Figure
+from benchnav.viz.panels import GRID, draw_interval
+from benchnav.viz.style import BLUE, TWO_COLUMNS_IN, legend_outside
+
+_TEST_IN, _METRIC_IN = 0.3, 0.55
+_MARGIN = "0.88"
+
+
+class Forest(Figure):
+    """Paired differences of hypotheses with their intervals and margins."""
+
+    name = "forest"
+
+    def needs(self, data: RunData) -> bool:
+        """Return whether the suite held hypotheses."""
+        return not data.tests.empty
+
+    def caption(self, data: RunData) -> str:
+        """Return what points and lines mean."""
+        return (
+            "Paired differences of the hypotheses that were fixed before the run. Filled points are supported "
+            "(p < 0.05 after Holm's correction). Lines are 90 % (thick) and 95 % (thin) intervals of one difference."
+        )
+
+    def draw(self, data: RunData) -> Drawing:
+        """Draw a row a hypothesis, a panel a metric; the band is where a margin wants the difference to lie."""
+        return draw_forest(data.tests)
+
+
+def draw_forest(tests: pd.DataFrame) -> Drawing:
+    """Draw the tests of `hypotheses.test_hypotheses`, as `Forest` does."""
+    numbered = tests.assign(number=range(1, len(tests) + 1))
+    panels = [numbered[numbered["metric"] == name] for name in METRICS if (tests["metric"] == name).any()]
+    heights = [_METRIC_IN + _TEST_IN * len(rows) for rows in panels]
+    figure = Drawing(figsize=(TWO_COLUMNS_IN, sum(heights) + 0.3), layout="constrained")
+    axes = figure.subplots(len(panels), squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
+    for panel, rows in zip(axes, panels, strict=True):
+        _draw_tests(panel, rows)
+    point: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 0}
+    is_tested = tests["p_holm"].notna().all()
+    looks: dict[str, Any] = {
+        **({"supported": point} if is_tested else {}),
+        "not supported" if is_tested else NOT_YET: {**point, "mfc": "white"},
+        "90 % interval": {"lw": 2.6},
+        "95 % interval": {"lw": 0.9},
+    }
+    handles: list[Artist] = [Line2D([], [], color=BLUE, label=label, **look) for label, look in looks.items()]
+    if (tests["margin"] > 0).any():
+        handles.append(Patch(color=_MARGIN, label="allowed by the margin"))
+    legend_outside(figure, handles, 5)
+    return figure
+
+
+def _draw_tests(panel: Axes, rows: pd.DataFrame) -> None:
+    metric = METRICS[rows["metric"].iloc[0]]
+    # A difference without episodes has no numbers.
+    ends = rows[["low", "high", "difference", "margin"]].astype(float).abs()
+    reach = max(ends.max().max(), 1e-9) * 1.08
+    panel.set(xlim=(-reach, reach), ylim=(len(rows) - 0.4, -0.6))
+    panel.axvline(0, color="0.4", lw=0.6, zorder=1)
+    names = []
+    for height, row in enumerate(rows.to_dict("records")):
+        if row["margin"] > 0:
+            inner = -row["margin"] if row["kind"] == "superiority" else row["margin"]
+            low = -reach if row["direction"] == "lower" else -inner
+            high = reach if row["direction"] == "higher" else inner
+            panel.fill_between([low, high], height - 0.36, height + 0.36, color=_MARGIN, lw=0, zorder=0)
+        for suffix, width in (("", 0.9), ("_90", 2.6)):
+            draw_interval(panel, row[f"low{suffix}"], row[f"high{suffix}"], height, BLUE, width)
+        face = BLUE if row["supported"] else "white"
+        panel.plot(row["difference"], height, "o", color=BLUE, ms=4.5, mfc=face, zorder=3)
+        side = panel.get_yaxis_transform()
+        panel.text(1.01, height, p_in_words(row["p_holm"]), transform=side, va="center")
+        one, other = map(reading_names, row["names"])
+        names.append(f"{row['number']}. {one}\n− {other}")
+    panel.set_yticks(range(len(rows)), names)
+    panel.tick_params(axis="y", length=0)
+    panel.grid(axis="x", color=GRID, zorder=0)
+    unit = f" [{metric.unit}]" if metric.unit else ""
+    panel.set(xlabel=f"Δ {metric.name}{unit}", axisbelow=True)
+    # Which way is better, at the end of the axis where it lies.
+    place, side_name, words = (
+        (1, "right", "better →") if metric.better == "higher" else (0, "left", "← better")
+    )
+    panel.annotate(words, (place, 1), xycoords="axes fraction", va="bottom", ha=side_name, color="0.35")
