@@ -23,7 +23,7 @@ TITLES = {
     "sensor": "sensors of appearance: what a robot sees of its map",
     "ground": "sensors of the ground: what a robot senses of λ",
     "belief": "beliefs: what is made of what is sensed",
-    "figure": "figures of the report, which draws the shipped ones of each run that has what they need",
+    "figure": "figures: what a report shows",
     "world": "worlds, each with its rules of the task",
 }
 HELP = (

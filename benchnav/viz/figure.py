@@ -6,6 +6,7 @@ A figure knows no path and writes nothing. `data` is one value for all figures o
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from copy import copy
 from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
@@ -28,6 +29,17 @@ class Figure(ABC):
     def variants(self, data: Any) -> Sequence[Self]:
         """Return the figures to draw, each with a name of its own: itself where `needs` is met, else none."""
         return [self] if self.needs(data) else []
+
+    def variant(self, **changes: Any) -> Self:
+        """Return a copy with other attributes, such as its `name`."""
+        made = copy(self)
+        vars(made).update(changes)
+        return made
+
+    def numbered(self, count: int) -> list[Self]:
+        """Return so many variants with their `place`, named with a number from 1 where there are several."""
+        names = [self.name] if count == 1 else [f"{self.name}-{number}" for number in range(1, count + 1)]
+        return [self.variant(place=place, name=name) for place, name in enumerate(names)]
 
     def needs(self, data: Any) -> bool:
         """Return whether the data hold what it draws."""

@@ -19,7 +19,7 @@ _SPREAD = 0.32  # of a row's height, to either side
 
 
 class Distributions(Figure):
-    """A dot an episode, with median and quartiles: T_total on the left, λ̄ on the right, a line a block."""
+    """A dot an episode with median and quartiles: T_total left, mean observed λ right, a line a block."""
 
     name = "distributions"
 

@@ -23,22 +23,16 @@ _LIGHT = 0.5  # opacity of a map under marks and dark red
 class Failures(Figure):
     """Failures of the best setting of a block and of the worst, a line a condition.
 
-    Args:
+    Attributes:
         place: of the sheet among those of the run.
-        name: of the figure.
     """
 
-    trim = False
-
-    def __init__(self, place: int = 0, name: str = "failures") -> None:
-        """Choose a sheet."""
-        self.name, self.place = name, place
+    name = "failures"
+    place = 0
 
     def variants(self, data: RunData) -> Sequence[Self]:
         """Return a figure a block."""
-        count = len(data.sheets.shown)
-        names = ["failures"] if count == 1 else [f"failures-{number}" for number in range(1, count + 1)]
-        return [type(self)(place, name) for place, name in enumerate(names)]
+        return self.numbered(len(data.sheets.shown))
 
     def caption(self, data: RunData) -> str:
         """Return which failures are shown."""

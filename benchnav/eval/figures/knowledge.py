@@ -32,22 +32,17 @@ _THIN = 0.6  # of the width of lines on a larger map
 class KnowledgeMaps(Figure):
     """E[λ] of the belief of a robot at four moments, and its spread, one for each of at most four conditions.
 
-    Args:
+    Attributes:
         place: of the recording among those that are shown.
-        name: of the figure.
     """
 
+    name = "knowledge"
     trim = True
-
-    def __init__(self, place: int = 0, name: str = "knowledge") -> None:
-        """Choose a recording."""
-        self.name, self.place = name, place
+    place = 0
 
     def variants(self, data: RunData) -> Sequence[Self]:
         """Return a figure a condition."""
-        count = len(_learners(data))
-        names = ["knowledge"] if count == 1 else [f"knowledge-{number}" for number in range(1, count + 1)]
-        return [type(self)(place, name) for place, name in enumerate(names)]
+        return self.numbered(len(_learners(data)))
 
     def caption(self, data: RunData) -> str:
         """Return whose knowledge it is."""

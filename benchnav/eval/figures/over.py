@@ -121,22 +121,24 @@ def sweep_name(number: str) -> str:
 class Over(Figure):
     """Success and T_total over a number in which conditions that are equal in all else differ.
 
-    Args:
-        number: a name from `find_sweeps`; if empty, `variants` finds all of a run.
+    Attributes:
+        number: a name from `find_sweeps`.
         lines: those of the number.
-        name: of the figure.
     """
 
-    def __init__(self, number: str = "", lines: Sequence[Line] = (), name: str = "over") -> None:
-        """Choose a sweep."""
-        self.name, self.number, self.lines = name, number, lines
+    name = "over"
+    number = ""
+    lines: Sequence[Line] = ()
 
     def variants(self, data: RunData) -> Sequence[Self]:
         """Return a figure a sweep."""
         sweeps = find_sweeps(data.about["conditions"])
         counts = Counter(map(sweep_name, sweeps))
         short = {n: sweep_name(n) if counts[sweep_name(n)] == 1 else n.replace(".", "-") for n in sweeps}
-        return [type(self)(number, lines, f"over-{short[number]}") for number, lines in sweeps.items()]
+        return [
+            self.variant(number=number, lines=lines, name=f"over-{short[number]}")
+            for number, lines in sweeps.items()
+        ]
 
     def caption(self, data: RunData) -> str:
         """Return which number it is."""

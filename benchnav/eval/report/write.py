@@ -226,7 +226,7 @@ def _draw_figures(
     captions: dict[Path, str] = {}
     _save_figures(report, figures_of(report), folder, captions)
     faults = []
-    for given in (*report.about["suite"].get("figures", ()), *figures):
+    for given in (*report.about.get("suite", {}).get("figures", ()), *figures):
         name = given if isinstance(given, str) else getattr(given, "name", given)
         try:
             figure = registry.take("figure", given)

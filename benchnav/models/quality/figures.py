@@ -434,22 +434,22 @@ class Latent(QualityFigure):
 class MapSheets(QualityFigure):
     """Maps of a split: observation, truth, prediction, error and uncertainty.
 
-    Args:
+    Attributes:
         split: whose.
     """
 
+    name, split = "maps", ""
     text = (
         "Each row is a map: observation, truth, prediction, error and uncertainty. Observed λ stands for the truth "
         "where the true distribution is unknown. A quantity has one scale in all sheets of an evaluation."
     )
 
-    def __init__(self, split: str = "") -> None:
-        """Choose a split."""
-        self.split, self.name, self.title = split, f"maps-{split.replace('/', '-')}", f"Maps of {split}"
-
     def variants(self, data: QualityData) -> Sequence[Self]:
         """Return a sheet a split."""
-        return [type(self)(split) for split in data.sheets]
+        return [
+            self.variant(split=split, name=f"maps-{split.replace('/', '-')}", title=f"Maps of {split}")
+            for split in data.sheets
+        ]
 
     def draw(self, data: QualityData) -> Drawing:
         """Draw a row a map."""
