@@ -87,8 +87,8 @@ def draw_terrain(panel: Axes3D, pair: Pair) -> None:
         positions.items(), heights(first, np.array(list(positions.values()))), strict=True
     ):
         panel.plot([x_m], [y_m], [top + 0.4], **maps.MARKS[name] | {"ms": 1.3 * maps.MARKS[name]["ms"]})
-    panel.set_box_aspect((1, rows / columns, 0.22), zoom=1.3)
-    panel.view_init(elev=48, azim=-62)
+    panel.set_box_aspect((1, rows / columns, 0.22), zoom=1.15)
+    panel.view_init(elev=50, azim=-62)
     panel.set_axis_off()
 
 
@@ -96,10 +96,7 @@ def draw_predicted(panel: Axes, own: Recording, step: int) -> AxesImage:
     """λ̂ under a risk setting with the cells that immobilise a robot, and the path up to a step; gives the image."""
     _, colour = RISKS[own.about["risk"]]
     image = maps.show_map(panel, own.predicted, own.grid.extent_m, **maps.LAMBDA)
-    hidden = np.ma.masked_equal(own.immobilising, False)
-    maps.show_map(
-        panel, hidden, own.grid.extent_m, cmap=maps.with_lacking(np.array([to_rgb(maps.IMMOBILISING)]))
-    )
+    maps.overlay(panel, own.immobilising, own.grid.extent_m, maps.IMMOBILISING)
     maps.draw_drive(panel, drive_at(own, step), 2.2, 1.2, colour)
     panel.set(xticks=[], yticks=[])
     return image
@@ -108,13 +105,13 @@ def draw_predicted(panel: Axes, own: Recording, step: int) -> AxesImage:
 @styled()
 def draw_hero(pair: Pair) -> Figure:
     """The terrain with both paths, and both maps of λ̂."""
-    figure = Figure(figsize=(10.5, 3.5), layout="constrained")
+    figure = Figure(figsize=(10.5, 3.6), layout="constrained")
     places = figure.add_gridspec(1, 4, width_ratios=(1.45, 1, 1, 0.05))
     terrain = figure.add_subplot(places[0], projection="3d")
     draw_terrain(terrain, pair)
     handles, _ = terrain.get_legend_handles_labels()
     handles.append(Patch(color=maps.IMMOBILISING, label=CAUGHT))
-    terrain.legend(handles=handles, loc="lower left", fontsize=8, bbox_to_anchor=(0, -0.02))
+    terrain.legend(handles=handles, loc="lower left", fontsize=8, bbox_to_anchor=(0, -0.08))
     for place, own in enumerate(pair):
         panel = figure.add_subplot(places[1 + place])
         image = draw_predicted(panel, own, len(own.actions))

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Colormap, ListedColormap
+from matplotlib.colors import Colormap, ListedColormap, to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.patches import Patch
@@ -237,6 +237,14 @@ def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) 
     width, height = map(float, extent_m)
     panel.set(xlim=(0, width), ylim=(0, height))
     return panel.imshow(values, origin="lower", extent=(0, width, 0, height), interpolation="none", **style)
+
+
+def overlay(
+    panel: Axes, region: np.ndarray, extent_m: Iterable[float], colour: Any, opacity: float = 1.0
+) -> Any:
+    """Draw a region of a map, bool of shape [H, W], in one colour over what is there; return the image."""
+    shown = np.ma.masked_equal(np.asarray(region, float), 0)
+    return show_map(panel, shown, extent_m, cmap=ListedColormap([to_rgba(colour, opacity)]))
 
 
 def frame_map(panel: Axes) -> None:

@@ -5,7 +5,6 @@ from typing import Self
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure as Drawing
 
 from benchnav.eval.failures import FailedLine
@@ -81,10 +80,7 @@ def _draw_failure(panel: Axes, recording: Recording) -> None:
     panel.set_visible(True)
     extent_m = recording.grid.extent_m
     maps.show_map(panel, recording.predicted, extent_m, alpha=_LIGHT, **maps.LAMBDA)
-    if recording.immobilising.any():
-        colours = np.zeros((*recording.grid.shape, 4))
-        colours[recording.immobilising] = to_rgba(maps.IMMOBILISING, 0.75)
-        maps.show_map(panel, colours, extent_m)
+    maps.overlay(panel, recording.immobilising, extent_m, maps.IMMOBILISING, 0.75)
     maps.name_immobilising(panel, recording.immobilising)
     maps.draw_drive(panel, drive_at(recording, len(recording.traversability)), 1.1, 0.9, label="driven")
     panel.spines[:].set_visible(False)

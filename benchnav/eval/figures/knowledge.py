@@ -100,9 +100,7 @@ def draw_knowledge(recording: Recording) -> Drawing:
 
 def _draw_known(panel: Axes, known: KnownMap, recording: Recording) -> None:
     """Veil and hatch what was not seen, outline what was sensed, and draw how far the sensors reached."""
-    veil = np.zeros((*known.seen.shape, 4))
-    veil[~known.seen] = (*np.array(bytes_of(maps.UNSEEN)[:3]) / 255, maps.VEIL)
-    maps.show_map(panel, veil, recording.grid.extent_m)
+    maps.overlay(panel, ~known.seen, recording.grid.extent_m, maps.UNSEEN, maps.VEIL)
     panel.add_collection(maps.unseen_layer(known.seen, recording.resolution_m))
     maps.draw_lines(panel, outline(known.sensed, recording.resolution_m), _SENSED_EDGE, 0.5)
     panel.add_line(maps.reach_line(known.outline, _THIN))

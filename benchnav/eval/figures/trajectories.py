@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure as Drawing
 
 from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
@@ -155,8 +154,7 @@ def _draw_predicted(panel: Axes, recording: Recording) -> None:
     predicted, free = recording.given_at(recording.now)
     maps.show_map(panel, predicted, recording.grid.extent_m, **maps.LAMBDA)
     if not free.all():
-        closed = np.where(free, np.nan, 1.0)
-        maps.show_map(panel, closed, recording.grid.extent_m, cmap=ListedColormap([maps.CLOSED]))
+        maps.overlay(panel, ~free, recording.grid.extent_m, maps.CLOSED)
         maps.name_terrain(panel, "not free", color=maps.CLOSED)
     title = "λ̂ given to the planner"
     if recording.about["model"] == NOT_USED:

@@ -311,12 +311,10 @@ class QualityData:
     @cached_property
     def sheets(self) -> dict[str, MapSheet]:
         """Maps of each split with what was predicted."""
+        if not self.maps:
+            return {}
         counts = {split: min(self.maps, self.dataset.map_count(split)) for split in self.qualities}
-        return {
-            split: read_sheet(self.model, self.dataset, split, range(count))
-            for split, count in counts.items()
-            if count
-        }
+        return {split: read_sheet(self.model, self.dataset, split, range(n)) for split, n in counts.items()}
 
     @property
     def absent(self) -> list[str]:

@@ -72,8 +72,8 @@ def test_ground_that_immobilises_a_robot_is_drawn_and_named_where_there_is_such(
     immobilising = np.zeros((8, 12), bool)
     immobilising[3, 4] = True
     figure = draw_failures([shown(rows, immobilising=immobilising)])
-    alpha = np.asarray(figure.axes[0].images[1].get_array())[..., 3]
-    assert (alpha > 0).tolist() == immobilising.tolist()
+    drawn = np.ma.getmaskarray(figure.axes[0].images[1].get_array())
+    assert (~drawn).tolist() == immobilising.tolist()
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == ["immobilises a robot", "driven", "start", "goal", "immobilised"]
     plain = draw_failures([shown(rows)])
