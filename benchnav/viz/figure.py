@@ -19,11 +19,13 @@ class Figure(ABC):
     Attributes:
         name: of its files.
         title: heading over it on a page; if empty, none.
+        text: what it shows, in sentences, where that is the same for all data.
         trim: whether white borders are cut away, as of maps, which keep their shape.
     """
 
     name: str = ""
     title: str = ""
+    text: str = ""
     trim: bool = False
 
     def variants(self, data: Any) -> Sequence[Self]:
@@ -45,9 +47,9 @@ class Figure(ABC):
         """Return whether the data hold what it draws."""
         return True
 
-    @abstractmethod
     def caption(self, data: Any) -> str:
-        """Return what it shows, in sentences."""
+        """Return what it shows, in sentences; `text` unless it depends on the data."""
+        return self.text
 
     @abstractmethod
     def draw(self, data: Any) -> "matplotlib.figure.Figure":

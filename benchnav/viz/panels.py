@@ -193,7 +193,7 @@ class Curves:
 def draw_baseline(panel: Axes, value: float, label: str, horizontal: bool = True) -> None:
     """Draw the value of a calibrated model, or another that all else is seen against, as a dashed line."""
     line = panel.axhline if horizontal else panel.axvline
-    line(value, color="0.4", lw=0.8, ls="--", zorder=0.5, label=label)
+    line(value, color="0.4", lw=0.8, ls="--", zorder=1, label=label)
 
 
 def ticks_of(panel: Axes, axis: Literal["x", "y"], most: int = 4) -> None:

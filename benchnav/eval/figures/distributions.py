@@ -22,10 +22,7 @@ class Distributions(Figure):
     """A dot an episode with median and quartiles: T_total left, mean observed λ right, a line a block."""
 
     name = "distributions"
-
-    def caption(self, data: RunData) -> str:
-        """Return what each dot is."""
-        return "Each dot is an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean observed λ."
+    text = "Each dot is an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean observed λ."
 
     def draw(self, data: RunData) -> Drawing:
         """Draw the episodes of each condition at its height."""

@@ -24,17 +24,14 @@ class Forest(Figure):
     """Paired differences of hypotheses with their intervals and margins."""
 
     name = "forest"
+    text = (
+        "Paired differences of the hypotheses that were fixed before the run. Filled points are supported "
+        "(p < 0.05 after Holm's correction). Lines are 90 % (thick) and 95 % (thin) intervals of one difference."
+    )
 
     def needs(self, data: RunData) -> bool:
         """Return whether the suite held hypotheses."""
         return not data.tests.empty
-
-    def caption(self, data: RunData) -> str:
-        """Return what points and lines mean."""
-        return (
-            "Paired differences of the hypotheses that were fixed before the run. Filled points are supported "
-            "(p < 0.05 after Holm's correction). Lines are 90 % (thick) and 95 % (thin) intervals of one difference."
-        )
 
     def draw(self, data: RunData) -> Drawing:
         """Draw a row a hypothesis, a panel a metric; the band is where a margin wants the difference to lie."""

@@ -3,7 +3,7 @@
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
@@ -38,27 +38,23 @@ class Learning(Figure):
     """RMSE and log score of what is believed ahead of robots, over the seconds of experience."""
 
     name = "learning"
+    text = (
+        f"What robots know of the terrain ahead of them, within {AHEAD_M:g} m and {AHEAD_DEG:g}° to either side, "
+        "where they have not sensed λ: RMSE of E[λ] and mean log score of the belief, over the time since they set "
+        f"out. Means over the maps on which a robot still drives, one for every {_BIN_S:g} s, with 95 % intervals "
+        f"(bootstrap over maps). Times with fewer than {LEAST_MAPS} maps are left out."
+    )
 
-    def needs(self, data: RunData) -> bool:
-        """Return whether robots learnt, steps were kept, and there are enough maps."""
-        return len(_curves(data)) > 0
+    curves = pd.DataFrame()
 
-    def caption(self, data: RunData) -> str:
-        """Return what is averaged over what."""
-        return (
-            f"What robots know of the terrain ahead of them, within {AHEAD_M:g} m and {AHEAD_DEG:g}° to either side, "
-            "where they have not sensed λ: RMSE of E[λ] and mean log score of the belief, over the time since they set "
-            f"out. Means over the maps on which a robot still drives, one for every {_BIN_S:g} s, with 95 % intervals "
-            f"(bootstrap over maps). Times with fewer than {LEAST_MAPS} maps are left out."
-        )
+    def variants(self, data: RunData) -> Sequence[Self]:
+        """Return one figure where robots learnt, steps were kept, and there are enough maps."""
+        curves = read_learning(data.folder, data.episodes) if data.folder else self.curves
+        return [self.variant(curves=curves)] if len(curves) else []
 
     def draw(self, data: RunData) -> Drawing:
         """Draw a line a condition, with its band; where these are many, a panel a model, planner and risk setting."""
-        return draw_learning(_curves(data), data.summary)
-
-
-def _curves(data: RunData) -> pd.DataFrame:
-    return read_learning(data.folder, data.episodes) if data.folder else pd.DataFrame()
+        return draw_learning(self.curves, data.summary)
 
 
 def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:

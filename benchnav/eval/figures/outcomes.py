@@ -33,10 +33,7 @@ class Outcomes(Figure):
     """Fractions of outcomes in one order for all conditions: failures first, then success."""
 
     name = "outcomes"
-
-    def caption(self, data: RunData) -> str:
-        """Return what it shows."""
-        return "Outcomes of the episodes."
+    text = "Outcomes of the episodes."
 
     def draw(self, data: RunData) -> Drawing:
         """Draw a bar a condition."""

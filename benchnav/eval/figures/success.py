@@ -23,14 +23,11 @@ class Success(Figure):
     """The success rate of every condition with its 95 % interval, a panel a block of the run."""
 
     name = "success"
-
-    def caption(self, data: RunData) -> str:
-        """Return what filled points and grey mean."""
-        return (
-            "Success rates with 95 % intervals. Filled points are not significantly worse than the best of their "
-            "panel; all are open where nothing is significantly worse. Grey planners are blind: the dashed line and "
-            "the band carry their rate and its interval through the panel."
-        )
+    text = (
+        "Success rates with 95 % intervals. Filled points are not significantly worse than the best of their "
+        "panel; all are open where nothing is significantly worse. Grey planners are blind: the dashed line and "
+        "the band carry their rate and its interval through the panel."
+    )
 
     def draw(self, data: RunData) -> Drawing:
         """Draw a point a condition; a blind planner is a line through its panel, the baseline of all others."""

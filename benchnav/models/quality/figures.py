@@ -329,21 +329,7 @@ class QualityData:
         return lines
 
 
-class QualityFigure(Figure):
-    """A figure of a model's quality.
-
-    Attributes:
-        text: what it shows.
-    """
-
-    text = ""
-
-    def caption(self, data: QualityData) -> str:
-        """Return what it shows."""
-        return self.text
-
-
-class Confusion(QualityFigure):
+class Confusion(Figure):
     """Which classes are taken for which."""
 
     name, title = "confusion", "Confusion of classes"
@@ -362,7 +348,7 @@ class Confusion(QualityFigure):
         return confusion_figure(data.by_class, [item.name for item in data.dataset.recipe.classes])
 
 
-class Reliability(QualityFigure):
+class Reliability(Figure):
     """Accuracy over the probability of the most likely class."""
 
     name, title = "reliability", "Calibration of the class probabilities"
@@ -377,7 +363,7 @@ class Reliability(QualityFigure):
         return reliability_figure(data.by_class)
 
 
-class PIT(QualityFigure):
+class PIT(Figure):
     """Histograms of the probability integral transform of λ."""
 
     name, title = "pit", "Calibration of the predicted distribution of λ"
@@ -392,7 +378,7 @@ class PIT(QualityFigure):
         return pit_figure({split: quality.traversability for split, quality in data.qualities.items()})
 
 
-class Severity(QualityFigure):
+class Severity(Figure):
     """Quality over the severity of a shift."""
 
     name, title = "severity", "Quality over the severity of a shift"
@@ -408,7 +394,7 @@ class Severity(QualityFigure):
         return severity_figure(find_series(data.qualities), values)
 
 
-class Latent(QualityFigure):
+class Latent(Figure):
     """The Gaussian process over slope of each class."""
 
     name, title = "latent", "What the Gaussian processes have learned"
@@ -429,7 +415,7 @@ class Latent(QualityFigure):
         return latent_figure(data.table, data.dataset.recipe.classes, cells.tolist(), known)
 
 
-class MapSheets(QualityFigure):
+class MapSheets(Figure):
     """Maps of a split: observation, truth, prediction, error and uncertainty.
 
     Attributes:
@@ -456,7 +442,7 @@ class MapSheets(QualityFigure):
         return map_sheet_figure(data.sheets[self.split], scales, classes, data.title)
 
 
-def quality_figures(data: QualityData) -> list[QualityFigure]:
+def quality_figures(data: QualityData) -> list[Figure]:
     """List the figures of a model's quality that apply."""
-    figures = (Confusion(), Reliability(), PIT(), Severity(), Latent(), MapSheets())
+    figures: tuple[Figure, ...] = (Confusion(), Reliability(), PIT(), Severity(), Latent(), MapSheets())
     return [variant for figure in figures for variant in figure.variants(data)]

@@ -184,12 +184,10 @@ def _panels_of_splits(tallies: Tallies) -> tuple[Drawing, dict[str, Axes]]:
 
 class _Measures(Figure):
     name, title = "measures", "Measures with their intervals"
-
-    def caption(self, data: Comparison) -> str:
-        return (
-            "Each row is a model, each mark a split; lines are 95 % intervals over maps. ↑: higher is better, ↓: lower "
-            "is better. Grey: privileged models, which are given part of the truth."
-        )
+    text = (
+        "Each row is a model, each mark a split; lines are 95 % intervals over maps. ↑: higher is better, ↓: lower "
+        "is better. Grey: privileged models, which are given part of the truth."
+    )
 
     def draw(self, data: Comparison) -> Drawing:
         return measures_figure(data.summary, _headings(), _looks(data), data.privileged)
@@ -197,12 +195,10 @@ class _Measures(Figure):
 
 class _Calibration(Figure):
     name, title = "calibration", "Calibration of the predicted distributions of λ"
-
-    def caption(self, data: Comparison) -> str:
-        return (
-            "Fraction of observed λ below a predicted quantile, less the level of the quantile, over that level. 0 is "
-            "calibrated. Above 0 at the left: low λ is more frequent than predicted."
-        )
+    text = (
+        "Fraction of observed λ below a predicted quantile, less the level of the quantile, over that level. 0 is "
+        "calibrated. Above 0 at the left: low λ is more frequent than predicted."
+    )
 
     def draw(self, data: Comparison) -> Drawing:
         return calibration_figure(data.tallies, _looks(data))
@@ -210,12 +206,10 @@ class _Calibration(Figure):
 
 class _Sparsification(Figure):
     name, title = "sparsification", "Sparsification: uncertainty against error"
-
-    def caption(self, data: Comparison) -> str:
-        return (
-            "Mean error |λ − E[λ]| of the remaining cells over the fraction of cells removed: the most uncertain first "
-            "(lines), or those of largest error first (dotted). The area between the two is AUSE."
-        )
+    text = (
+        "Mean error |λ − E[λ]| of the remaining cells over the fraction of cells removed: the most uncertain first "
+        "(lines), or those of largest error first (dotted). The area between the two is AUSE."
+    )
 
     def draw(self, data: Comparison) -> Drawing:
         return sparsification_figure(data.tallies, _looks(data))
@@ -223,15 +217,13 @@ class _Sparsification(Figure):
 
 class _Severity(Figure):
     name, title = "severity", "Quality over the severity of a shift"
+    text = (
+        "CRPS and pinball loss of the lower fifth over the severity of each scenario: 0 is the training maps, 1 "
+        "the scenario itself. Lines are 95 % intervals over maps."
+    )
 
     def needs(self, data: Comparison) -> bool:
         return bool(find_series(data.splits))
-
-    def caption(self, data: Comparison) -> str:
-        return (
-            "CRPS and pinball loss of the lower fifth over the severity of each scenario: 0 is the training maps, 1 "
-            "the scenario itself. Lines are 95 % intervals over maps."
-        )
 
     def draw(self, data: Comparison) -> Drawing:
         return severity_figure(find_series(data.splits), data.summary, _headings(), _looks(data))
