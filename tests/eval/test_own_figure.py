@@ -25,7 +25,7 @@ class Broken(Figure):
     def caption(self, data): return "Nothing."
     def draw(self, data): raise ValueError("no such\\ncolumn")
 
-class Twin(Broken):
+class Double(Broken):
     name = "success"
 
 class Outside(Broken):
@@ -40,7 +40,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_the_command_draws_a_figure_of_one_file(folder: Path) -> None:
     assert len(OWN.read_text().splitlines()) <= 40
-    assert OWN.read_text() in (OWN.parents[1] / "docs/how-to/report.md").read_text()
+    assert OWN.read_text() in (OWN.parents[1] / "docs/how-to/own-figure.md").read_text()
     assert call("eval", "report", str(folder), "--figures", f"{OWN}:WhenFailed") == 0
     assert matplotlib.image.imread(folder / "figures/when-failed.png").size > 10_000
     assert (folder / "figures/when-failed.pdf").is_file()
@@ -66,7 +66,7 @@ def test_a_suite_names_figures_of_its_report(tmp_path: Path) -> None:
     ("name", "why"),
     [
         ("Broken", "the figure broken is missing: ValueError: no such column"),
-        ("Twin", "Expected the name of a figure that no other has, got 'success'."),
+        ("Double", "Expected the name of a figure that no other has, got 'success'."),
         ("Outside", "Expected the name of a figure that no other has, got '../outside'."),
     ],
 )

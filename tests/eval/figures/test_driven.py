@@ -91,16 +91,17 @@ def test_an_end_says_how_it_ended() -> None:
 
 def test_ends_that_coincide_stand_apart_each_joined_to_where_it_is() -> None:
     rows = episodes({1: [False, False, False]})
-    panel, _ = drawn(draw_driven(Driven(ground=ground(), rows=rows, tracks=[track(0)] * 3)))
+    tracks = [track(0) + np.float32(0.1 * place) for place in range(3)]
+    panel, _ = drawn(draw_driven(Driven(ground=ground(), rows=rows, tracks=tracks)))
     ends = [line for line in panel.lines if line.get_marker() is MARKS["out of time"]["marker"]]
     boxes = [line.get_window_extent() for line in ends]
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
-    for end in ends:
+    for end, own in zip(ends, tracks, strict=True):
         (line,) = [
             line for line in panel.lines if line.get_color() == end.get_color() and len(line.get_xdata()) == 2
         ]
         joined = np.array(line.get_data()).T
-        np.testing.assert_allclose(joined, [track(0)[-1], np.ravel(end.get_data())])
+        np.testing.assert_allclose(joined, [own[-1], np.ravel(end.get_data())])
 
 
 def test_the_title_and_the_legend_are_apart_and_planners_go_by_their_names() -> None:
