@@ -6,7 +6,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from benchnav.core.figures import LINE_COLOURS, MARKERS
+from benchnav.viz.style import LINE_COLOURS, MARKERS
 
 # Columns of a summary with their ends, factor and label.
 SUCCESS = (("success_rate", "success_low", "success_high"), 100.0, "success [%]")

@@ -12,9 +12,9 @@ from textwrap import indent
 import pandas as pd
 
 from benchnav.core.errors import expect
-from benchnav.core.figures import save
 from benchnav.core.store import replacing, write_text
 from benchnav.core.tables import to_markdown
+from benchnav.viz.style import save
 from studies import rows
 from studies.power import power
 from studies.runs import developed, digest_of

@@ -13,11 +13,11 @@ import yaml
 from matplotlib.figure import Figure
 
 from benchnav.core.errors import expect
-from benchnav.core.figures import save
 from benchnav.core.store import replacing, write_text
 from benchnav.core.tables import Table, to_markdown
 from benchnav.datagen import TerrainDataset
 from benchnav.eval.run.unit import one_thread
+from benchnav.viz.style import save
 from studies.study import ROOT, Study, Work
 
 ESTIMATED_MAPS, DEVELOPED_MAPS = 10, 200

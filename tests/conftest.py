@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchnav.core import figures
+from benchnav.viz import style as figures
 from tests import factories
 
 # What collection imports stays. To search it for garbage takes seconds, while it is imported and in each test.

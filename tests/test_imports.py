@@ -1,4 +1,4 @@
-"""Imports go one way: core, stats, datagen, planning and models, env and metrics, eval; so do folders within them."""
+"""Imports go one way: core, stats and viz, datagen, planning and models, env and metrics, eval; so do their folders."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -21,13 +21,19 @@ MODELS = tuple(
 VALUES_OF_EVAL = ("eval.experiment",)
 # What running writes and reports read.
 WRITTEN = ("eval.folder", "eval.recording")
+# What figures of runs are drawn from and with.
+FIGURES = (
+    *("eval.figures", "eval.failures", "eval.words", "eval.stats", *WRITTEN, *VALUES_OF_EVAL),
+    *("metrics", "planning", "datagen", "viz"),
+)
 
 # What the modules of a folder may import besides the root's; a name stands for all that is under it.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "": (),
     "core": ("core",),
     "stats": ("stats",),
-    "datagen": ("datagen",),
+    "viz": ("viz",),
+    "datagen": ("datagen", "viz"),
     "datagen/schema.py": (),
     "datagen/noise.py": (),
     "datagen/layers": ("datagen.layers", "datagen.recipe.classes", *DRAWN),
@@ -48,7 +54,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "datagen",
     ),
     "models/training": ("models.training", *MODELS, "datagen"),
-    "models/quality": ("models.quality", *MODELS, "datagen"),
+    "models/quality": ("models.quality", *MODELS, "datagen", "viz"),
     "planning": PLANNING,
     "planning/world": (*PLANNING, "planning.world"),
     "planning/sensing": ("planning.sensing",),
@@ -56,15 +62,18 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "planning/sensing/appearance.py": ("planning.sensing", "datagen.synth", "datagen.schema"),
     "planning/planners": (*PLANNING, "planning.sensing", "planning.planners"),
     "metrics": ("metrics", *PLANNING),
-    "env": ("env", "models", "planning", "datagen"),
+    "env": ("env", "models", "planning", "datagen", "viz"),
     "testing": ("testing", "metrics", "models", "planning", "datagen"),
-    "eval": ("eval", "metrics", "models", "planning", "datagen"),
+    "eval": ("eval", "metrics", "models", "planning", "datagen", "viz"),
     "eval/experiment": ("eval.experiment", "metrics", "models", "planning", "datagen"),
     "eval/folder": ("eval.folder", *VALUES_OF_EVAL, "models", "planning", "datagen"),
     "eval/recording.py": ("eval.folder", "planning"),
     "eval/run": ("eval.run", *WRITTEN, *VALUES_OF_EVAL, "metrics", "models", "planning", "datagen"),
     "eval/stats": ("eval.stats", "eval.experiment", "metrics", "planning"),
-    "eval/report": ("eval.report", "eval.stats", *WRITTEN, *VALUES_OF_EVAL, "metrics", "planning", "datagen"),
+    "eval/words.py": ("eval.stats", *VALUES_OF_EVAL, "planning", "viz"),
+    "eval/failures.py": ("eval.words", "eval.stats", *WRITTEN, *VALUES_OF_EVAL),
+    "eval/figures": FIGURES,
+    "eval/report": ("eval.report", *FIGURES),
 }
 
 
@@ -168,8 +177,14 @@ def test_no_modules_import_one_another_in_a_circle() -> None:
         ("eval/run/runner.py", "benchnav.eval.report.write", False),
         ("eval/run/runner.py", "benchnav.eval.cli", False),
         ("eval/run/recorder.py", "benchnav.eval.recording", True),
-        ("eval/run/recorder.py", "benchnav.eval.report.plan_layers", False),
-        ("eval/recording.py", "benchnav.eval.report.plan_layers", False),
+        ("viz/maps.py", "benchnav.core.grid", True),
+        ("viz/maps.py", "benchnav.datagen.schema", False),
+        ("viz/figure.py", "benchnav.eval.recording", False),
+        ("core/tables.py", "benchnav.viz.style", False),
+        ("datagen/preview.py", "benchnav.viz.sheet", True),
+        ("eval/figures/success.py", "benchnav.eval.report.write", False),
+        ("eval/run/recorder.py", "benchnav.viz.maps", False),
+        ("eval/recording.py", "benchnav.viz.maps", False),
         ("eval/recording.py", "benchnav.eval.run.recorder", False),
         ("eval/folder/run_folder.py", "benchnav.eval.run.runner", False),
         ("datagen/recipe/recipe.py", "benchnav.datagen.synth.generate", False),

@@ -11,11 +11,11 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from benchnav.core import figures
 from benchnav.core.errors import ConfigError
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import load_checkpoint
+from benchnav.viz import style as figures
 from tests.commands import call
 from tests.datagen.dem.rasters import SOUTH, WEST, centres, rough, write
 

@@ -1,10 +1,10 @@
 """Draws the picture and the moving picture of README.md: one map, two risk settings, one robot that was immobilised.
 
-    benchnav-eval run --config demo --record all --out runs/hero
-    python tools/hero.py runs/hero
+    benchnav-eval run --config demo --out runs/demo
+    python tools/hero.py runs/demo
 
-writes docs/figures/hero.png and docs/figures/hero.gif, in a minute. The map is the one on which the first setting is
-immobilised and the second arrives, and the driven paths lie farthest apart.
+writes docs/figures/hero.png and docs/figures/hero.gif. The map is the one on which the first setting is immobilised
+and the second reaches the goal, and the driven paths lie farthest apart.
 """
 
 import argparse
@@ -12,157 +12,133 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.patheffects import Normal, Stroke
+from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d import Axes3D
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from benchnav.core.figures import MARKS, mark, robot_marker, styled
+from benchnav.eval.figures.trajectories import drive_at
+from benchnav.eval.folder.results import read_results
 from benchnav.eval.recording import Recording
+from benchnav.eval.run.recordings import record_driven
+from benchnav.viz import maps
+from benchnav.viz.style import BLUE, ORANGE, save, styled
 
 FIGURES = Path(__file__).parents[1] / "docs/figures"
-COLOURS, NAMES = ("#D55E00", "#0072B2"), ("mean of λ", "CVaR of λ at 0.8")
-EDGE = [Stroke(linewidth=5, foreground="white"), Normal()]
-RISKS = {"mean", "cvar:0.8"}
+RISKS = {"mean": ("mean of λ", ORANGE), "cvar:0.8": ("CVaR of λ at 0.8", BLUE)}
 FRAMES, TICK_MS = 70, 90
+CAUGHT = "immobilises a robot; no image shows it"
+Pair = tuple[Recording, Recording]
 
 
-def find_pair(folder: Path) -> tuple[Recording, Recording]:
+def find_pair(folder: Path) -> Pair:
     """Recordings of the two settings on the map where their paths lie farthest apart and their outcomes differ."""
-    recordings = [Recording.load(path) for path in sorted((folder / "playback").glob("*.npz"))]
-    by_map: dict[int, dict[str, Recording]] = {}
-    for own in recordings:
-        by_map.setdefault(int(own.about["map"]), {})[str(own.about["risk"])] = own
-    pairs = [(both["mean"], both["cvar:0.8"]) for both in by_map.values() if set(both) >= RISKS]
-    telling = [
-        (one, other)
-        for one, other in pairs
-        if (one.about["outcome"], other.about["outcome"]) == ("immobilised", "success")
-    ]
-    return max(telling, key=lambda pair: apart(*(own.track for own in pair)))
+    rows = read_results(folder, False).episodes
+    first, second = (rows[(rows["risk"] == risk) & (rows["planner"] == "astar_dwa")] for risk in RISKS)
+    keys = ["seed", "realisation", "map"]
+    both = first[first["outcome"] == "immobilised"].merge(second[second["success"]], on=keys)[keys]
+    pairs = zip(*(driven(folder, own.merge(both, on=keys)) for own in (first, second)), strict=True)
+    return max(pairs, key=lambda pair: apart(*(own.track for own in pair)))
 
 
-def apart(one: np.ndarray, other: np.ndarray) -> float:
-    """The largest distance of a place on a path to another path, in metres."""
-    return float(np.linalg.norm(one[:, None] - other[None], axis=-1).min(1).max())
+def driven(folder: Path, rows: pd.DataFrame) -> list[Recording]:
+    """Recordings of the episodes of one condition, in order."""
+    return list(record_driven(folder, rows.reset_index(drop=True)))
 
 
-def heights(recording: Recording, places: np.ndarray) -> np.ndarray:
-    """Elevation at places (x, y), smooth from cell to cell."""
-    column, row = (places / recording.resolution_m - 0.5).T
-    return map_coordinates(
-        gaussian_filter(recording.elevation_m, 1.0), (row, column), order=1, mode="nearest"
-    )
+def apart(a: np.ndarray, b: np.ndarray) -> float:
+    """The largest distance of a position on a path to another path, in metres."""
+    return float(np.linalg.norm(a[:, None] - b[None], axis=-1).min(1).max())
 
 
-def draw_ground(panel: Axes3D, pair: tuple[Recording, Recording]) -> None:
-    """The terrain from the side, with both paths."""
-    ground = pair[0]
-    rows, columns = ground.elevation_m.shape
-    x, y = ((np.arange(size) + 0.5) * ground.resolution_m for size in (columns, rows))
-    colours = (np.moveaxis(ground.rgb, 0, -1) / 255) ** 1.4  # which are shaded, and light
+def heights(recording: Recording, positions: np.ndarray) -> np.ndarray:
+    """Elevation at positions (x, y), smooth from cell to cell."""
+    column, row = (positions / recording.resolution_m - 0.5).T
+    smooth = gaussian_filter(recording.elevation_m, 1.0)
+    return map_coordinates(smooth, (row, column), order=1, mode="nearest")
+
+
+def draw_terrain(panel: Axes3D, pair: Pair) -> None:
+    """The terrain from the side, with both paths and the cells that immobilise a robot."""
+    first = pair[0]
+    rows, columns = first.elevation_m.shape
+    x, y = ((np.arange(size) + 0.5) * first.resolution_m for size in (columns, rows))
+    colours = (np.moveaxis(first.rgb, 0, -1) / 255) ** 1.4  # which are shaded, and light
+    colours[first.immobilising] = to_rgb(maps.IMMOBILISING)
     panel.computed_zorder = False
     panel.plot_surface(
-        *np.meshgrid(x, y), ground.elevation_m, facecolors=colours, rstride=1, cstride=1, lw=0, antialiased=False,
+        *np.meshgrid(x, y), first.elevation_m, facecolors=colours, rstride=1, cstride=1, lw=0, antialiased=False,
         shade=False, zorder=1,
     )  # fmt: skip
-    for own, colour, name in zip(pair, COLOURS, NAMES, strict=True):
+    for own, (name, colour) in zip(pair, RISKS.values(), strict=True):
         high = heights(own, own.track) + 0.3
-        panel.plot(
-            *own.track.T,
-            high,
-            color=colour,
-            lw=2.2,
-            label=f"planned on the {name}",
-            zorder=3,
-            path_effects=EDGE,
-        )
-    held = pair[0].track[-1]
-    top = heights(ground, np.array([ground.track[0], ground.goal_m, held])) + 0.4
-    places = {"start": ground.track[0], "goal": ground.goal_m, "immobilised": held}
-    for (name, (x_m, y_m)), height in zip(places.items(), top, strict=True):
-        panel.plot([x_m], [y_m], [height], **MARKS[name] | {"ms": 1.3 * MARKS[name]["ms"], "zorder": 4})
-    panel.set_box_aspect((1, rows / columns, 0.22), zoom=1.18)
-    panel.view_init(elev=42, azim=-62)
+        for edge, width in (("white", 4.2), (colour, 2.2)):
+            label = f"planned on the {name}" if edge == colour else "_edge"
+            panel.plot(*own.track.T, high, color=edge, lw=width, label=label, zorder=3)
+    end = first.track[-1]
+    positions = {"start": first.track[0], "goal": first.goal_m, "immobilised": end}
+    for (name, (x_m, y_m)), top in zip(
+        positions.items(), heights(first, np.array(list(positions.values()))), strict=True
+    ):
+        panel.plot([x_m], [y_m], [top + 0.4], **maps.MARKS[name] | {"ms": 1.3 * maps.MARKS[name]["ms"]})
+    panel.set_box_aspect((1, rows / columns, 0.22), zoom=1.15)
+    panel.view_init(elev=50, azim=-62)
     panel.set_axis_off()
 
 
-def draw_map(panel: Axes, own: Recording, place: int) -> AxesImage:
-    """λ̂ under a risk setting, with the path that was driven on it; gives the image."""
-    width, height = own.grid.extent_m
-    image = panel.imshow(
-        own.predicted, origin="lower", extent=(0, width, 0, height), cmap="viridis", vmin=0, vmax=1
-    )
-    panel.plot(*own.track.T, color=COLOURS[place], lw=2, path_effects=EDGE)
-    mark(panel, "start", own.track[0], 1.2)
-    mark(panel, "goal", own.goal_m, 1.2)
-    arrived = own.about["outcome"] == "success"
-    end = "arrived" if arrived else "immobilised"
-    if not arrived:
-        mark(panel, "immobilised", own.track[-1], 1.2)
-    panel.set_title(f"λ̂ = {NAMES[place]}: {end} after {len(own.actions) * own.dt_s:.0f} s", fontsize=9)
+def draw_predicted(panel: Axes, own: Recording, step: int) -> AxesImage:
+    """λ̂ under a risk setting with the cells that immobilise a robot, and the path up to a step; gives the image."""
+    _, colour = RISKS[own.about["risk"]]
+    image = maps.show_map(panel, own.predicted, own.grid.extent_m, **maps.LAMBDA)
+    maps.overlay(panel, own.immobilising, own.grid.extent_m, maps.IMMOBILISING)
+    maps.draw_drive(panel, drive_at(own, step), 2.2, 1.2, colour)
     panel.set(xticks=[], yticks=[])
     return image
 
 
 @styled()
-def draw_hero(pair: tuple[Recording, Recording]) -> Figure:
-    """The ground with both paths, and both maps of λ̂."""
-    figure = Figure(figsize=(10.5, 3.2), layout="constrained")
+def draw_hero(pair: Pair) -> Figure:
+    """The terrain with both paths, and both maps of λ̂."""
+    figure = Figure(figsize=(10.5, 3.6), layout="constrained")
     places = figure.add_gridspec(1, 4, width_ratios=(1.45, 1, 1, 0.05))
-    ground = figure.add_subplot(places[0], projection="3d")
-    draw_ground(ground, pair)
-    ground.legend(loc="lower left", fontsize=8, frameon=False)
-    images = [draw_map(figure.add_subplot(places[1 + place]), own, place) for place, own in enumerate(pair)]
-    bar = figure.add_subplot(places[3])
-    figure.colorbar(images[0], cax=bar, label="λ̂, share of the commanded speed")
+    terrain = figure.add_subplot(places[0], projection="3d")
+    draw_terrain(terrain, pair)
+    handles, _ = terrain.get_legend_handles_labels()
+    handles.append(Patch(color=maps.IMMOBILISING, label=CAUGHT))
+    terrain.legend(handles=handles, loc="lower left", fontsize=8, bbox_to_anchor=(0, -0.08))
+    for place, own in enumerate(pair):
+        panel = figure.add_subplot(places[1 + place])
+        image = draw_predicted(panel, own, len(own.actions))
+        name, _ = RISKS[own.about["risk"]]
+        panel.set_title(f"λ̂ = {name}: {own.outcome} after {own.end_s:.0f} s", fontsize=9)
+        maps.draw_scale(panel, own.grid.extent_m, 8)
+    figure.colorbar(image, cax=figure.add_subplot(places[3]), label="λ̂, fraction of the commanded speed")
     return figure
 
 
 @styled()
-def frames(pair: tuple[Recording, Recording]) -> Iterator[Image.Image]:
+def frames(pair: Pair) -> Iterator[Image.Image]:
     """Both robots on the λ̂ that their planner was given, over time."""
-    ground = pair[0]
-    assert ground.field is not None
-    width, height = ground.grid.extent_m
-    longest = max(len(own.track) for own in pair)
-    for now in np.linspace(0, longest - 1, FRAMES).round().astype(int):
-        figure = Figure(figsize=(6.4, 3.6), dpi=110, layout="constrained")
-        for place, (panel, own) in enumerate(zip(figure.subplots(1, 2), pair, strict=True)):
-            panel.imshow(
-                own.predicted,
-                origin="lower",
-                extent=(0, width, 0, height),
-                cmap="viridis",
-                vmin=0,
-                vmax=1,
-                alpha=0.8,
-            )
-            driven = own.track[: now + 1]
-            panel.plot(*driven.T, color=COLOURS[place], lw=3, path_effects=EDGE)
-            mark(panel, "start", own.track[0], 1.2)
-            mark(panel, "goal", own.goal_m, 1.2)
-            ended, arrived = now >= len(own.track) - 1, own.about["outcome"] == "success"
-            state = ("arrived" if arrived else "immobilised") if ended else "driving"
-            heading = robot_marker(own.states[min(now, len(own.track) - 1), 2])
-            looks = {} if ended else {"marker": heading}
-            mark(panel, state if ended else "robot", driven[-1], 1.4, **looks)
-            panel.set_title(f"A*+DWA, {NAMES[place]}: {state}", fontsize=8)
-            panel.set(xticks=[], yticks=[])
-        figure.supxlabel(f"{now * ground.dt_s:4.1f} s", fontsize=9)
-        yield rendered(figure)
-
-
-def rendered(figure: Figure) -> Image.Image:
-    """A figure as an image."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    longest = max(len(own.actions) for own in pair)
+    for now in np.linspace(0, longest, FRAMES).round().astype(int):
+        figure = Figure(figsize=(6.4, 3.7), dpi=110, layout="constrained")
+        for panel, own in zip(figure.subplots(1, 2), pair, strict=True):
+            step = min(now, len(own.actions))
+            draw_predicted(panel, own, step)
+            name, _ = RISKS[own.about["risk"]]
+            state = own.outcome if step == len(own.actions) else "drives"
+            panel.set_title(f"A*+DWA, {name}: {state}", fontsize=8)
+            maps.draw_scale(panel, own.grid.extent_m, 8)
+        figure.supxlabel(f"{now * pair[0].dt_s:4.1f} s", fontsize=9)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        yield Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
 
 
 def main() -> None:
@@ -175,7 +151,7 @@ def main() -> None:
     given = parser.parse_args()
     pair = find_pair(given.run)
     print(f"map {pair[0].about['map']}")
-    draw_hero(pair).savefig(given.out / "hero.png", dpi=170)
+    save(draw_hero(pair), given.out / "hero.png", "png", dpi=170)
     # One palette for all, by coverage, which keeps the colours of few pixels: those of the marks.
     images = list(frames(pair))
     palette = images[FRAMES // 2].quantize(256, method=Image.Quantize.MAXCOVERAGE)

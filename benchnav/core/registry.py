@@ -1,7 +1,8 @@
 """The one registry: how every replaceable part is named, found, configured and identified.
 
 Parts are planners, models, risk measures, robots, objectives, sensors of appearance (`sensor`) and of the ground
-(`ground`), beliefs, metrics of episodes, and layers of recipes. A part is named by one of four forms:
+(`ground`), beliefs, metrics of episodes, layers of recipes, and figures of a report. A part is named by one of four
+forms:
 
 - a shipped name (`mppi`) or the name of an entry point of the group `benchnav.<kind>s` of an installed
   package; the shipped parts are entry points too;
@@ -65,7 +66,19 @@ from benchnav.core.sources import (
 )
 from benchnav.core.yaml_text import load_yaml
 
-KINDS = ("planner", "model", "risk", "robot", "objective", "sensor", "ground", "belief", "metric", "layer")
+KINDS = (
+    "planner",
+    "model",
+    "risk",
+    "robot",
+    "objective",
+    "sensor",
+    "ground",
+    "belief",
+    "metric",
+    "layer",
+    "figure",
+)
 
 # What a part of each kind is a subclass of, and where users import that from. A risk measure is any function.
 _BASES = {
@@ -78,6 +91,7 @@ _BASES = {
     "belief": ("benchnav.planning", "Belief"),
     "metric": ("benchnav.metrics", "Metric"),
     "layer": ("benchnav.datagen", "Layer"),
+    "figure": ("benchnav.viz", "Figure"),
 }
 
 # Parameters that the program gives, so no options.

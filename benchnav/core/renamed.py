@@ -2,6 +2,7 @@
 
 # What programs import.
 IMPORTS = {
+    "benchnav.core.figures": "benchnav.viz",
     "benchnav.planning.risk.chance": "benchnav.planning.Chance",
     "benchnav.planning.risk.cvar": "benchnav.planning.CVaR",
     "benchnav.planning.risk.expected_time": "benchnav.planning.ExpectedTime",

@@ -279,8 +279,8 @@ def preview(
         out: Picture to write; preview-SPLIT.png or contact-SPLIT.png when not given.
         contact_sheet: Thumbnails of the split's maps instead; of a large one, of its first 100.
     """
-    from benchnav.core.figures import save
     from benchnav.datagen.preview import contact_sheet_figure, preview_figure
+    from benchnav.viz.style import save
 
     dataset = _opened(file)
     split = split or ("test/std" if "test/std" in dataset.splits else next(iter(dataset.splits)))

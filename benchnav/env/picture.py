@@ -15,24 +15,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.figures import (
-    LACKING,
-    MARKS,
-    TRAVERSABILITY_COLOURS,
-    bytes_of,
-    draw_edged,
-    mark,
-    robot_marker,
-    show_map,
-)
 from benchnav.core.grid import Grid
 from benchnav.env.view import CHANNELS
+from benchnav.viz import maps
+from benchnav.viz.style import bytes_of
 
 SIZE = (640, 480)  # width and height in pixels
 _DPI = 100
 _MAP, _CROP, _MARGIN = 424, 176, 16  # pixels, of squares and between them
 _UNSEEN = 0.35  # of the brightness of ground that was seen
-_SPREAD_COLOURS = "magma"
 _TEXT = 8.5  # points
 _MARKS = 1.3
 
@@ -87,7 +78,7 @@ class Picture:
         self._draw_map(scene)
         known = scene.crop[CHANNELS.index("known")] > 0
         for place, (channel, title, colours) in enumerate(
-            (("risk", "λ̂ ahead", TRAVERSABILITY_COLOURS), ("spread", "spread of λ", _SPREAD_COLOURS))
+            (("risk", "λ̂ ahead", maps.TRAVERSABILITY_COLOURS), ("spread", "spread of λ", maps.SPREAD_COLOURS))
         ):
             self._draw_crop(scene, place, scene.crop[CHANNELS.index(channel)], known, title, colours)
         self._canvas.draw()
@@ -98,16 +89,14 @@ class Picture:
         width, height = (_MAP * size / max(wide, high) for size in (wide, high))
         panel = self._panel(_MARGIN + (_MAP - width) / 2, _MARGIN + (_MAP - height) / 2, width, height)
         light = np.where(scene.seen, 1.0, _UNSEEN)[..., None]
-        show_map(panel, (scene.rgb.transpose(1, 2, 0) * light).astype(np.uint8), (wide, high))
+        maps.show_map(panel, (scene.rgb.transpose(1, 2, 0) * light).astype(np.uint8), (wide, high))
         for colour, line in (("black", 2.4), ("white", 1.2)):
             panel.add_patch(Polygon(scene.corners_m, closed=True, fill=False, ec=colour, lw=line))
-        draw_edged(panel, scene.track, 1.6)
-        mark(panel, "start", scene.track[0], _MARKS)
-        mark(panel, "goal", scene.goal_m, _MARKS)
-        _draw_robot(panel, *scene.state[:3])
-        words = f"t = {scene.time_s:.1f} s    λ = {scene.observed:.2f}"
-        if scene.outcome != "running":
-            words += f"    {scene.outcome.replace('_', ' ')}"
+        outcome = scene.outcome.replace("running", "")
+        track = np.vstack((scene.track, scene.state[:2]))
+        drive = maps.Drive(track=track, goal_m=scene.goal_m, outcome=outcome, heading_rad=scene.state[2])
+        maps.draw_drive(panel, drive, 1.6, _MARKS)
+        words = f"t = {scene.time_s:.1f} s    λ = {scene.observed:.2f}    {outcome.replace('_', ' ')}"
         panel.set_title(words, fontsize=_TEXT + 1, loc="left", pad=5)
 
     def _draw_crop(
@@ -118,7 +107,7 @@ class Picture:
         panel = self._panel(left, bottom, _CROP, _CROP)
         shown = matplotlib.colormaps[colours](values)[..., :3] * np.where(known, 1.0, _UNSEEN)[..., None]
         nothing = ~known & (scene.crop[CHANNELS.index("spread")] == 0) & (scene.crop[0] == 0)
-        shown[nothing] = np.array(bytes_of(LACKING)[:3]) / 255
+        shown[nothing] = np.array(bytes_of(maps.LACKING)[:3]) / 255
         cells = len(values)
         # Ahead is up, and the robot's left is left.
         panel.imshow(
@@ -127,7 +116,8 @@ class Picture:
             extent=(0, cells, 0, cells),
             interpolation="none",
         )
-        _draw_robot(panel, cells / 2, scene.behind * cells, np.pi / 2)
+        ahead = maps.robot_marker(np.pi / 2)
+        maps.mark(panel, "robot", (cells / 2, scene.behind * cells), _MARKS, marker=ahead)
         panel.set_title(title, fontsize=_TEXT, loc="left", pad=4)
         panel.set_title("0     1", fontsize=_TEXT, loc="right", pad=4)
         self._draw_scale(left + _CROP - 29, bottom + _CROP + 7, colours)
@@ -175,8 +165,3 @@ class Window:
     def close(self) -> None:
         """Closes the window; may be called again."""
         self._pyplot.close(self._figure)
-
-
-def _draw_robot(panel: Axes, x: float, y: float, heading_rad: float) -> None:
-    looks = MARKS["robot"]
-    panel.plot([x], [y], **looks | {"ms": _MARKS * looks["ms"], "marker": robot_marker(heading_rad)})

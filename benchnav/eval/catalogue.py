@@ -25,6 +25,7 @@ TITLES = {
     "belief": "beliefs: what is made of what is sensed",
     "metric": "metrics of episodes",
     "layer": "layers of recipes",
+    "figure": "figures: what a report shows",
     "world": "worlds, each with its rules of the task",
 }
 HELP = (

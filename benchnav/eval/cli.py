@@ -4,6 +4,7 @@ import json
 import os
 import shlex
 import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -139,28 +140,30 @@ def verify(folder: str) -> int:
 
 
 def list_command(kinds: list[str]) -> None:
-    """List parts of each kind, metrics, layers and worlds, with their options.
+    """List parts of each kind, metrics, layers, figures and worlds, with their options.
 
     Args:
-        kinds: Some of planner, model, risk, robot, objective, sensor, ground, belief, metric, layer and world; all if
-            empty.
+        kinds: Some of planner, model, risk, robot, objective, sensor, ground, belief, metric, layer, figure and world;
+            all if empty.
     """
     from benchnav.eval.catalogue import print_catalogue
 
     print_catalogue(*kinds)
 
 
-def report(folder: str, out: str = "", partial: bool = False) -> None:
+def report(folder: str, out: str = "", partial: bool = False, figures: tuple[str, ...] = ()) -> int:
     """Write the report of a run again (tables, figures, page), and print it.
 
     Args:
         folder: Run folder.
         out: Folder for them, for a run that cannot be written; if empty, the run folder, or FOLDER/partial.
         partial: Also of a run that is not finished, while it is running too; every table and figure says so.
+        figures: Figures of your own, with commas between, such as path/to/file.py:Name. If one cannot be drawn, the
+            report is written without it, a line says why, and the status is 1.
     """
     if out:
         other_folder(folder, out)
-    _report(Path(folder), Path(out) if out else None, partial)
+    return _report(Path(folder), Path(out) if out else None, partial, figures)
 
 
 def compare(
@@ -222,10 +225,10 @@ def _finish(folder: Path) -> int:
     from benchnav.eval.report.playback.viewer_file import write_viewer_files
 
     write_viewer_files(folder)
-    _report(folder)
+    status = _report(folder)
     _print_recorded(folder)
     _print_replay(folder)
-    return _failed(folder)
+    return _failed(folder) or status
 
 
 def _repeats(suite: Suite, planner_limit_s: float, device: str) -> bool:
@@ -259,17 +262,24 @@ def _is_whole(folder: Path) -> bool:
     return all(own)
 
 
-def _report(folder: Path, out: Path | None = None, unfinished: bool = False) -> None:
+def _report(
+    folder: Path, out: Path | None = None, unfinished: bool = False, figures: Sequence[str] = ()
+) -> int:
+    """Write and print a report; return the exit status: 1 where a figure of the user could not be drawn."""
+    from benchnav.core import registry
     from benchnav.eval.folder.results import read_results
     from benchnav.eval.report.write import PAGE, PARTIAL, print_report, write_report
     from benchnav.eval.run.recordings import record_driven
 
     # What cannot be reported is refused before anything is said.
     mark = read_results(folder, unfinished).mark
+    made = [registry.make("figure", figure) for figure in figures]
     place = out or (folder / PARTIAL if mark else folder)
     _say(f"writing the report{f' ({mark})' if mark else ''}")
-    print_report(write_report(folder, partial(record_driven, folder), place, unfinished))
+    written = write_report(folder, partial(record_driven, folder), place, unfinished, made)
+    print_report(written)
     print(f"report:  {place / PAGE}")
+    return 1 if written.faults else 0
 
 
 def _print_recorded(folder: Path) -> None:

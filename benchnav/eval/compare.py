@@ -32,7 +32,6 @@ from benchnav.eval.folder.run_folder import (
     read_table,
 )
 from benchnav.eval.report.comparison_tables import comparison_table, metric_table
-from benchnav.eval.report.words import reading_name
 from benchnav.eval.stats.by_metric import compare_by
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import (
@@ -45,6 +44,7 @@ from benchnav.eval.stats.pairs import (
     matches,
 )
 from benchnav.eval.stats.summary import time_budgets
+from benchnav.eval.words import reading_name
 
 _CAPTION = "Differences between conditions that met the same maps with the same draws of λ."
 _LISTED, _NAMED = 8, 3

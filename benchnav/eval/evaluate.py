@@ -45,7 +45,8 @@ def evaluate(
         **experiment: what is evaluated, by the fields of `Suite`: `models`, `planners`, `risks`, `robots`,
             `objectives`, `sensors`, `grounds`, `beliefs`, `world` (such as `World.stakes()`), `task` (or `rules`, a
             `Rules`), `scenarios`, `maps`, `seed` or `seeds`, `realisations`, `record`, `conditions`, `hypotheses`,
-            `metrics` besides those that every run has (such as `Energy(power_w=120)`).
+            `metrics` besides those that every run has (such as `Energy(power_w=120)`), and `figures` of your own for
+            the report.
 
     Returns:
         The results of the run.

@@ -9,18 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Drawing
 
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.settings import hint
 from benchnav.core.tables import Table, to_markdown, to_terminal
 from benchnav.eval.compare import compare_runs, write_comparison
 from benchnav.eval.experiment.condition import LABELS
+from benchnav.eval.figures.shipped import figures_of
 from benchnav.eval.folder import results as rows
 from benchnav.eval.folder.run_folder import caveats, is_taken, open_run
 from benchnav.eval.report.playback.viewer_file import write_viewer_files
-from benchnav.eval.report.write import PAGE, Report, read_report, run_figures, write_report
+from benchnav.eval.report.write import PAGE, Report, read_report, write_report
 from benchnav.eval.run.recordings import record_driven
+from benchnav.viz.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,19 +127,20 @@ class Results:
 
     @property
     def plot(self) -> "Plots":
-        """The figures of the report, each as a method that returns a matplotlib figure."""
+        """The figures of the report, each a method that returns a matplotlib figure; see `Plots`."""
         return Plots(self)
 
-    def report(self, folder: str | Path | None = None) -> Path:
+    def report(self, folder: str | Path | None = None, figures: Sequence[Figure] = ()) -> Path:
         """Write the report (page, tables, figures), and return the path of its page.
 
         Args:
             folder: where to; if None, the run folder.
+            figures: of your own, after the shipped ones. One that raises is left out, and the page says why.
         """
         out = Path(folder) if folder else self.folder
         if out == self.folder and not self._rows.is_partial:
             write_viewer_files(self.folder)
-        write_report(self.folder, partial(record_driven, self.folder), out, self._rows.is_partial)
+        write_report(self.folder, partial(record_driven, self.folder), out, self._rows.is_partial, figures)
         return out / PAGE
 
     def save(self, folder: str | Path) -> "Results":
@@ -177,11 +180,32 @@ class Results:
 
 
 class Plots:
-    """Figures of a run, by the names of their files with `_` for `-`."""
+    """Figures of a run, by the names of their files with `_` for `-`; called with a figure, it draws that one."""
 
     def __init__(self, results: Results) -> None:
         """Draw from results."""
         self._results = results
+
+    def __call__(self, figure: Figure) -> Drawing:
+        """Draw a figure of your own; of one with several variants the first.
+
+        Raises:
+            ConfigError: If the run lacks what the figure needs.
+        """
+        variants = figure.variants(self._results._report)
+        if not variants:
+            raise ConfigError(
+                f"Expected a run with what figure {figure.name!r} needs, got {self._results.folder}."
+            )
+        return variants[0](self._results._report)
+
+    def __dir__(self) -> list[str]:
+        """List the figures of the run."""
+        return sorted(self._figures)
+
+    @cached_property
+    def _figures(self) -> dict[str, Figure]:
+        return {figure.name.replace("-", "_"): figure for figure in figures_of(self._results._report)}
 
     def __getattr__(self, name: str) -> Any:
         """Return the function that draws a figure."""
@@ -189,13 +213,11 @@ class Plots:
             raise AttributeError(name)
         return partial(self._draw, name)
 
-    def _draw(self, name: str) -> Figure:
-        results, names = self._results, []
-        for shown, _, figure in run_figures(results.folder, results._report, None):
-            names.append(shown.replace("-", "_"))
-            if names[-1] == name:
-                return figure
-        raise ConfigError(f"Expected a figure among {', '.join(names)}, got {name!r}.{hint(name, names)}")
+    def _draw(self, name: str) -> Drawing:
+        known = self._figures
+        if name not in known:
+            raise ConfigError(f"Expected a figure among {', '.join(known)}, got {name!r}.{hint(name, known)}")
+        return known[name](self._results._report)
 
 
 def open_results(folder: str | Path) -> Results:

@@ -8,12 +8,12 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
-from benchnav.core.figures import TWO_COLUMNS_IN, legend_outside, styled
 from benchnav.core.tables import Table
 from benchnav.eval.compare import read_conditions
 from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import Compared, Pair, check_maps, side_by_side
+from benchnav.viz.style import TWO_COLUMNS_IN, legend_outside, styled
 from studies.curves import draw_curve
 from studies.tables import success, table
 

@@ -6,8 +6,8 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
-from benchnav.core.figures import TWO_COLUMNS_IN, legend_outside, risk_name, styled
 from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.viz.style import TWO_COLUMNS_IN, legend_outside, risk_name, styled
 from studies.curves import draw_curve
 
 # What is known, by sensor of λ and belief, from nothing to all.

@@ -13,11 +13,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich.progress import track
 
-from benchnav.core.figures import TWO_COLUMNS_IN, legend_outside, styled
 from benchnav.core.tables import Table
 from benchnav.eval.experiment.condition import condition_from
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.unit import Settings, simulate
+from benchnav.viz.style import TWO_COLUMNS_IN, legend_outside, styled
 from studies.curves import SUCCESS, TOTAL_TIME, draw_curve
 from studies.study import Work
 from studies.tables import table

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from benchnav.core.figures import styled
+from benchnav.viz.style import styled
 from studies.scenarios.statistics import SHARE_EDGES, SLOPE_EDGES, Maps, estimate, first, histogram, rms
 
 EXAMPLE = 13

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchnav.core.figures import frame_map, show_map, styled
 from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict
 from benchnav.datagen.synth.generate import generate
+from benchnav.viz.maps import frame_map, show_map
+from benchnav.viz.style import styled
 from studies.study import Work
 
 EXAMPLE = 13  # of test/std, as in the other figures of the page

@@ -9,10 +9,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.stats import kendalltau, t
 
-from benchnav.core.figures import styled
 from benchnav.stats.flips import mean_flip_p
 from benchnav.stats.holm import holm
 from benchnav.stats.intervals import mean_interval
+from benchnav.viz.panels import line_looks
+from benchnav.viz.style import risk_name, styled
 
 RISKS, SPLIT = ("expected-time", "cvar:0.8"), "test/std"
 SCORES = ("rmse_expected", "nll", "crps", "pinball", "tail_error", "ause")  # of each the least is the best
@@ -170,16 +171,15 @@ def draw_doses(table: pd.DataFrame) -> Figure:
             },
         }
         for panel, risk in zip(panels, RISKS, strict=True):
-            for (name, own), marker in zip(kinds.items(), "o^vDPX", strict=False):
-                panel.plot(
-                    own["pinball"], own[f"success {risk}"], marker, label=name, markersize=5, alpha=0.8
-                )
+            for (name, own), look in zip(kinds.items(), line_looks(list(kinds)).values(), strict=True):
+                success = own[f"success {risk}"]
+                panel.plot(own["pinball"], success, label=name, alpha=0.8, **{**look, "ls": "none", "ms": 5})
             trained = table[table["dose"] == 1]
             panel.plot(
                 trained["pinball"], trained[f"success {risk}"], "o", markersize=10, markerfacecolor="none",
                 markeredgecolor="0.2", label="as trained",
             )  # fmt: skip
-            panel.set(title=risk, xlabel="pinball loss of the lower fifth")
+            panel.set(title=risk_name(risk), xlabel="pinball loss of the lower fifth")
         panels[0].set_ylabel("success [%]")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", frameon=False)
     return figure

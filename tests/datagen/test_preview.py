@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from benchnav.core.errors import DatasetError
-from benchnav.core.figures import TWO_COLUMNS_IN, hatching, save
 from benchnav.core.grid import outline
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.layers.vegetation import Growth
@@ -23,11 +22,13 @@ from benchnav.datagen.preview import (
     class_colours,
     contact_columns,
     contact_sheet_figure,
-    layer_column,
     preview_figure,
     soft_ground,
 )
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe
+from benchnav.viz.maps import hatching
+from benchnav.viz.sheet import layer_column
+from benchnav.viz.style import TWO_COLUMNS_IN, save
 from tests.datagen.small import grown, small_stakes
 from tests.factories import tiny_dataset, tiny_recipe
 
@@ -225,7 +226,7 @@ def test_unobserved_traversability_is_grey_and_explained(
     dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert legend_names(preview_figure(dataset, "train", [0]))[:2] == ["start", "goal"]
-    assert "not known" not in legend_names(preview_figure(dataset, "train", [0]))
+    assert "unknown" not in legend_names(preview_figure(dataset, "train", [0]))
     hole = np.zeros((32, 32), dtype=bool)
     hole[4:9, 10:30] = True
     with_values(
@@ -235,7 +236,7 @@ def test_unobserved_traversability_is_grey_and_explained(
         reference_time_s=lambda values: np.full_like(values, np.nan),
     )
     figure = preview_figure(dataset, "train", [0])
-    assert legend_names(figure)[:3] == ["start", "goal", "not known"]
+    assert legend_names(figure)[:3] == ["start", "goal", "unknown"]
     image = panels(figure)["traversability 0"].images[0]
     rgba = image.to_rgba(image.get_array())
     grey = figure.legends[0].get_patches()[0].get_facecolor()
@@ -306,7 +307,7 @@ def test_a_contact_sheet_has_every_map_in_order(
 
 def test_a_contact_sheet_stops_at_most(dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "first" not in contact_sheet_figure(dataset, "train").texts[0].get_text()
-    monkeypatch.setattr("benchnav.datagen.preview._MOST_THUMBNAILS", 5)
+    monkeypatch.setattr("benchnav.datagen.preview._MAX_THUMBNAILS", 5)
     figure = contact_sheet_figure(dataset, "train")
     assert len(figure.axes[0].images) == 5
     assert "first 5 of 8 maps" in figure.texts[0].get_text().replace("\n", " ")
@@ -419,7 +420,7 @@ def test_layers_have_a_panel_a_bar_and_a_unit_each(tmp_path: Path) -> None:
         assert image.get_clim() == (0.0, stored.max())
     assert shown["vegetation_m 0"].get_title() == "Vegetation [m]"
     assert "vegetation_m bar" in shown
-    assert "not known" not in legend_names(figure)
+    assert "unknown" not in legend_names(figure)
     assert "vegetation_m 0" not in panels(
         preview_figure(TerrainDataset(tiny_dataset(tmp_path / "b.h5")), "train", [0])
     )

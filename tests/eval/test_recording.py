@@ -17,8 +17,8 @@ from benchnav.eval.recording import (
     read_recordings,
     thinned,
 )
-from benchnav.eval.report.plan_layers import STYLES
 from benchnav.planning.planners.planner import Plan
+from benchnav.viz.maps import STYLES
 from tests.eval.report import made
 
 

@@ -22,6 +22,7 @@ PART_FIELDS = {
     "grounds": "ground",
     "beliefs": "belief",
     "metrics": "metric",
+    "figures": "figure",
 }
 
 # What is kept of episodes beside their rows, each with all that stands before it.
@@ -40,9 +41,9 @@ _SEEDS = 2**63  # what a table's column of whole numbers holds
 class Suite:
     """What is evaluated: the product of everything listed, or of each mapping in `conditions`.
 
-    A planner, model, risk measure, robot, objective, sensor, belief or metric is given as NAME, package.module:Name,
-    path/to/file.py:Name, or {part: NAME, label: LABEL, options: {...}}; in a program also as an object, which is
-    replaced by the description that creates it again.
+    A planner, model, risk measure, robot, objective, sensor, belief, metric or figure is given as NAME,
+    package.module:Name, path/to/file.py:Name, or {part: NAME, label: LABEL, options: {...}}; in a program also as an
+    object, which is replaced by the description that creates it again.
 
     Args:
         data: Path or id of a dataset with splits test/SCENARIO.
@@ -74,6 +75,7 @@ class Suite:
             path_length or the name of another metric; `kind`: difference, non-inferiority, superiority or equivalence;
             `direction`: higher or lower; `margin`.
         metrics: Metrics of episodes besides those that every run has, such as energy:120.
+        figures: Figures of your own for the report, after the shipped ones.
     """
 
     __repr__ = short_repr
@@ -99,6 +101,7 @@ class Suite:
     conditions: tuple[dict[str, Any], ...] = ()
     hypotheses: tuple[dict[str, Any], ...] = ()
     metrics: tuple[PartSpec, ...] = ()
+    figures: tuple[PartSpec, ...] = ()
 
     def __post_init__(self) -> None:
         """Describe objects as plain data, and reject a suite without conditions."""

@@ -8,7 +8,7 @@ import pandas as pd
 from benchnav.core.quantity import Quantity
 from benchnav.core.tables import Table
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
-from benchnav.eval.report.words import count_range, differ, reading_name
+from benchnav.eval.words import count_range, differ, reading_name
 from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA
 from benchnav.stats.tables import Column, Row, cell_of, p_value, short, signed, signed_interval, table_of

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 
 from benchnav.eval.experiment.condition import LABELS
-from benchnav.eval.report.words import FAILURE_COUNTS, blocks, p_in_words, rate_in_words, with_names
 from benchnav.eval.stats.best import BLOCK, PRIVILEGED, competing
+from benchnav.eval.words import FAILURE_COUNTS, blocks, p_in_words, rate_in_words, with_names
 from benchnav.stats.best import FEWEST_MAPS
 from benchnav.stats.holm import ALPHA
 

@@ -12,7 +12,7 @@ from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.hypotheses import Hypothesis
 from benchnav.eval.experiment.metrics import further_quantities, quantities
-from benchnav.eval.report.words import NOT_YET, count_range, p_in_words, reading_names
+from benchnav.eval.words import NOT_YET, count_range, p_in_words, reading_names
 from benchnav.metrics.shipped import QUANTITIES, TOTAL_TIME
 from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA

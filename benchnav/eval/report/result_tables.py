@@ -12,7 +12,8 @@ import pandas as pd
 from benchnav.core.quantity import Quantity
 from benchnav.core.tables import Bold, Table, to_latex
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
-from benchnav.eval.report.words import (
+from benchnav.eval.stats.best import PRIVILEGED, competing
+from benchnav.eval.words import (
     blocks,
     count_range,
     differ,
@@ -25,7 +26,6 @@ from benchnav.eval.report.words import (
     success_interval_in_words,
     unit_of_statistics,
 )
-from benchnav.eval.stats.best import PRIVILEGED, competing
 from benchnav.metrics import shipped
 from benchnav.metrics.base import Metric
 from benchnav.stats.best import FEWEST_MAPS

@@ -2,8 +2,7 @@
 
 import base64
 import json
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,60 +10,45 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-from matplotlib.figure import Figure
 
 import benchnav
-from benchnav.core.errors import BenchnavError
-from benchnav.core.figures import planner_name, save_twice
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
+from benchnav.core.settings import one_line
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
 from benchnav.eval.experiment.condition import KNOWLEDGE
 from benchnav.eval.experiment.metrics import further_quantities, quantities
+from benchnav.eval.failures import RecordDriven, collect_sheets, failures_table
+from benchnav.eval.figures.data import RunData
+from benchnav.eval.figures.shipped import SHIPPED, figures_of
 from benchnav.eval.folder.checksums import note_checksums
 from benchnav.eval.folder.provenance import METRICS, command_lines
 from benchnav.eval.folder.results import read_results
 from benchnav.eval.folder.run_folder import ERRORS, caveats
-from benchnav.eval.recording import MAP, Ground, Recording, read_recordings
-from benchnav.eval.report.charts.conditions import (
-    distribution_figure,
-    forest_figure,
-    outcome_figure,
-    success_figure,
-)
-from benchnav.eval.report.charts.knowledge import draw_knowledge
-from benchnav.eval.report.charts.maps import (
-    MOST_PANELS,
-    choose_recordings,
-    driven_figure,
-    failure_figure,
-    read_driven,
-    trajectory_figure,
-)
-from benchnav.eval.report.charts.regret import MOST_CHAINS, regret_figure
-from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_name
-from benchnav.eval.report.failures import RecordDriven, Sheets, collect_sheets, failures_table
+from benchnav.eval.recording import MAP
 from benchnav.eval.report.findings import findings
 from benchnav.eval.report.hypotheses import hypothesis_findings, hypothesis_table
 from benchnav.eval.report.result_tables import LATENCIES, learning_table, paper_table, result_table
-from benchnav.eval.report.words import NOT_USED, joined, maps_in_words, unit_of_statistics
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
 from benchnav.eval.stats.regret import best_possible, split_regret
 from benchnav.eval.stats.summary import summarise, time_budgets
+from benchnav.eval.words import NOT_USED, joined, maps_in_words, unit_of_statistics
 from benchnav.planning.world.outcome import ERROR_OUTCOMES
+from benchnav.viz.figure import Figure
+from benchnav.viz.style import planner_name, save_twice
 
 PAGE = "report.html"
 PARTIAL = "partial"  # folder of the report of a run that is not finished
 
 _FILES = (PAGE, *(f"summary.{suffix}" for suffix in ("csv", "md", "tex")), "failures.csv", "hypotheses.csv")
 _FILES += ("hypotheses.tex", "regret.csv")
-_MOST_PATHS = 8
-_EPISODE = ("condition", "seed", "realisation", "map")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
-    """What is reported of a run.
+class Report(RunData):
+    """What is reported of a run, and the data behind it.
 
     Args:
         name: of the run.
@@ -72,14 +56,8 @@ class Report:
         findings: what the run says, sentences by the title over them.
         table: a row a condition.
         warnings: lines on what went wrong, or could not be shown.
-        summary: the numbers behind the table.
-        tests: a row a hypothesis, from `hypotheses.test_hypotheses`; none where the suite held none.
-        regret: from `regret.split_regret`; none where the run has no chain.
-        episodes: the rows behind the summary.
-        failures: a row a failed episode.
-        sheets: failures on their ground.
-        about: all of `run.json`; of a run that is not finished with the conditions that have rows.
         mark: what says that the run is not finished; empty where it is.
+        faults: of the warnings those on figures of the user that could not be drawn.
     """
 
     name: str
@@ -87,14 +65,8 @@ class Report:
     findings: Mapping[str, Sequence[str]]
     table: Table
     warnings: tuple[str, ...]
-    summary: pd.DataFrame
-    tests: pd.DataFrame
-    regret: pd.DataFrame
-    episodes: pd.DataFrame
-    failures: pd.DataFrame
-    sheets: Sheets
-    about: Mapping[str, Any]
     mark: str = ""
+    faults: tuple[str, ...] = ()
 
     @property
     def learning(self) -> Table | None:
@@ -180,6 +152,8 @@ def read_report(folder: Path, record_driven: RecordDriven | None = None, partial
         failures=failures,
         sheets=sheets,
         about=about,
+        folder=folder,
+        record_driven=record_driven,
         mark=results.mark,
     )
     return replace(report, table=report.marked(report.table))
@@ -190,6 +164,7 @@ def write_report(
     record_driven: RecordDriven | None = None,
     out: Path | None = None,
     partial: bool = False,
+    figures: Sequence[Figure] = (),
 ) -> Report:
     """Writes `report.html`, `summary.{csv,md,tex}`, `failures.csv` and `figures/` of a run.
 
@@ -199,9 +174,11 @@ def write_report(
             no failure is shown on a map.
         out: where to. If not given, the run folder, and its folder `PARTIAL` for a run that is not finished.
         partial: also of a run that is not finished, of what is there.
+        figures: of the user, drawn after the shipped ones and those that the suite names. One that raises is left out,
+            and a line of `Report.faults` says why.
 
     Returns:
-        What was written of.
+        The report as it was written.
     """
     report = read_report(folder, record_driven, partial)
     out = out or (folder / PARTIAL if report.mark else folder)
@@ -218,16 +195,11 @@ def write_report(
         )
     if not report.regret.empty:
         write_text(out / "regret.csv", report.csv(report.regret))
-    figures = {}
-    for name, caption, figure in run_figures(folder, report, record_driven):
-        path = out / "figures" / f"{name}.png"
-        # These are as wide as their maps: white borders are cut away.
-        is_of_maps = name.partition("-")[0] in ("trajectories", "driven", "knowledge")
-        save_twice(figure, path, trim=is_of_maps, mark=_capital(report.mark))
-        figures[path] = mark + caption
+    captions, faults = _draw_figures(report, figures, out / "figures")
+    report = replace(report, warnings=(*report.warnings, *faults), faults=faults)
     for file in ("summary.md", PAGE):
-        write_text(out / file, render(file, report, figures))
-    drawn = [path.with_suffix(suffix) for path in figures for suffix in (".png", ".pdf")]
+        write_text(out / file, render(file, report, captions))
+    drawn = [path.with_suffix(suffix) for path in captions for suffix in (".png", ".pdf")]
     note_checksums(out, [*drawn, *(path for name in _FILES if (path := out / name).is_file())])
     return report
 
@@ -246,135 +218,39 @@ def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def run_figures(
-    folder: Path, report: Report, record_driven: RecordDriven | None
-) -> Iterator[tuple[str, str, Figure]]:
-    """Gives name, caption and figure of all that is drawn of a run.
-
-    First is what it was to show, how often, and on which map it is seen best.
-    """
-    summary, sheets = report.summary, report.sheets.shown
-    if not report.tests.empty:
-        yield (
-            "forest",
-            "Paired differences of the hypotheses that were fixed before the run. Filled points are supported "
-            "(p < 0.05 after Holm's correction). Lines are 90 % (thick) and 95 % (thin) intervals of one difference.",
-            forest_figure(report.tests, quantities(further_quantities(report.about))),
-        )
-    yield (
-        "success",
-        "Success rates with 95 % intervals. Filled points are not significantly worse than the best of their panel; "
-        "all are open where nothing is significantly worse. Grey planners are blind.",
-        success_figure(summary),
-    )
-    if not report.regret.empty:
-        chains = report.regret["chain"].nunique()
-        shown = f" The first {MOST_CHAINS} of {chains} chains are shown." if chains > MOST_CHAINS else ""
-        yield (
-            "regret",
-            "Regret against the near-optimal reference, a drive on λ itself and no bound: step by step from a planner "
-            "to it, on the episodes that all have in common, paired differences with 95 % intervals. A step may be "
-            "negative, and in another order steps would be others, so that none is "
-            f"a share of the causes.{shown}",
-            regret_figure(report.regret),
-        )
-    driven = read_driven(folder, report.episodes)
-    if driven is not None:
-        yield _driven(*driven)
-    sweeps = find_sweeps(report.about["conditions"])
-    names = Counter(map(sweep_name, sweeps))
-    for number, lines in sweeps.items():
-        short = sweep_name(number)
-        name = short if names[short] == 1 else number.replace(".", "-")
-        caption = f"Success and T_total over {name}, with 95 % intervals."
-        yield f"over-{name}", caption, curve_figure(number, lines, summary)
-    yield "outcomes", "Outcomes of the episodes.", outcome_figure(summary)
-    yield (
-        "distributions",
-        "Each dot is an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean observed λ.",
-        distribution_figure(summary, report.episodes),
-    )
-    for place, (title, sheet) in enumerate(sheets, start=1):
-        yield (
-            "failures" if len(sheets) == 1 else f"failures-{place}",
-            f"Failures of the settings with the highest and the lowest success rate, {title}: predicted λ̂ (colour), "
-            "driven path and its end. λ̂ is that of the cell of the end, observed λ the mean of the last 2 s.",
-            failure_figure(sheet),
-        )
-    recorded = read_recordings(folder)
-    yield from draw_knowledge(folder, report.episodes, summary, recorded)
-    if driven and (chosen := _on_one_map(driven[1], recorded, record_driven)):
-        caption = _trajectories_in_words(chosen) + _chosen_in_words(len(chosen), len(driven[1]))
-        yield "trajectories", caption, trajectory_figure(chosen)
-    elif chosen := choose_recordings(recorded, list(summary["condition"])):
-        yield "trajectories", _trajectories_in_words(chosen), trajectory_figure(chosen)
-
-
-def _trajectories_in_words(chosen: Sequence[Recording]) -> str:
-    """Says what `trajectory_figure` shows."""
-    maps = {(own.about["scenario"], own.about["map"]) for own in chosen}
-    where = " on {}, map {}".format(*maps.pop()) if len(maps) == 1 else ""
-    what = "Plans and driven paths" if any(own.own_plans for own in chosen) else "Driven paths"
-    caption = f"{what}{where}, over the terrain and over the λ̂ that the planner was given."
-    if any(own.field is not None for own in chosen):
-        caption += " Below: the whole driven path over the λ field."
-    return caption
-
-
-def _on_one_map(
-    rows: pd.DataFrame, recorded: Sequence[Recording], record_driven: RecordDriven | None
-) -> list[Recording]:
-    """Recordings of a few conditions on the map on which outcomes differ most, as many that arrived as not.
-
-    Args:
-        rows: an episode a condition on that map.
-        recorded: all there are, which tell what was planned too; the others are made of the steps that were kept.
-        record_driven: makes those.
+def _draw_figures(
+    report: Report, figures: Sequence[Figure], folder: Path
+) -> tuple[dict[Path, str], tuple[str, ...]]:
+    """Write the figures of a run, those of the user last.
 
     Returns:
-        At most `MOST_PANELS`, in the order of the rows; none where one cannot be made.
+        By the path of its PNG what each shows; and a line for each figure of the user that could not be drawn.
     """
-    chosen = rows.iloc[_evenly(rows, MOST_PANELS)]
-    known = {tuple(str(own.about[name]) for name in _EPISODE): own for own in recorded}
-    found = []
-    for place, row in chosen.iterrows():
-        own = known.get(tuple(str(row[name]) for name in _EPISODE))
-        if own is None and record_driven is not None:
-            try:
-                (own,) = record_driven(chosen.loc[[place]])
-            except (BenchnavError, OSError):
-                return []
-        if own is None:
-            return []
-        found.append(own)
-    return found
+    captions: dict[Path, str] = {}
+    _save_figures(report, figures_of(report), folder, captions)
+    faults = []
+    for given in (*report.about.get("suite", {}).get("figures", ()), *figures):
+        name = given["part"] if isinstance(given, Mapping) else getattr(given, "name", given)
+        try:
+            figure = registry.take("figure", given)
+            if type(figure) not in SHIPPED:
+                _save_figures(report, figure.variants(report), folder, captions)
+        except Exception as error:
+            faults.append(f"warning: the figure {name} is missing: {one_line(error)}")
+    return captions, tuple(faults)
 
 
-def _evenly(rows: pd.DataFrame, most: int) -> list[int]:
-    """Places of at most so many episodes in the order of the rows, as many that arrived as not where there are such."""
-    turn = rows.groupby("success", sort=False).cumcount().to_numpy()
-    return sorted(np.argsort(turn, kind="stable")[:most].tolist())
-
-
-def _driven(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarray]) -> tuple[str, str, Figure]:
-    """The figure of whole driven paths, as from `read_driven`."""
-    about, places = ground.about, _evenly(rows, _MOST_PATHS)
-    shown = rows.iloc[places]
-    why = (
-        "On this map outcomes differ most." if rows["success"].nunique() > 1 else "Outcomes differ on no map."
-    )
-    caption = (
-        f"Driven paths on {about['scenario']}, map {about['map']}, seed {about['seed']}, realisation "
-        f"{about['realisation']}. {why}"
-    )
-    caption += _chosen_in_words(len(shown), len(rows))
-    return "driven", caption, driven_figure(ground, shown, [tracks[place] for place in places])
-
-
-def _chosen_in_words(shown: int, known: int) -> str:
-    """Says how conditions were chosen by `_evenly`, where not all are shown."""
-    words = f" Shown are {shown} of {known} conditions, as many that arrived as not where there are such."
-    return words if shown < known else ""
+def _save_figures(report: Report, figures: Iterable[Figure], folder: Path, captions: dict[Path, str]) -> None:
+    mark = f"{_capital(report.mark)}. " if report.mark else ""
+    for figure in figures:
+        path = folder / f"{figure.name}.png"
+        if path in captions or path.parent != folder or not figure.name:
+            raise ConfigError(
+                f"Expected the name of a figure that no other has, got {figure.name!r}. Rename it."
+            )
+        caption = mark + figure.caption(report)
+        save_twice(figure(report), path, trim=figure.trim, mark=_capital(report.mark))
+        captions[path] = caption
 
 
 def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:

@@ -66,6 +66,8 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
             cannot.
         DatasetError: there is no such dataset.
     """
+    for figure in suite.figures:
+        registry.take("figure", figure)
     conditions = conditions_of(suite, scenarios_of)
     if not conditions:
         raise ConfigError(

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchnav.core.command import Device
-from benchnav.models.quality.output import DPI, FIGURES, check_folder, check_writable, open_maps, save_figures
+from benchnav.models.quality.output import check_folder, check_writable, open_maps, save_figures
 
 REPORT, CSV, PAGE = "quality.json", "quality.csv", "quality.md"
 
@@ -57,12 +57,12 @@ def evaluate_command(
     from benchnav.core.device import find_device
     from benchnav.models.predictor import load_model, trained_on
     from benchnav.models.quality.baselines import baselines_of
+    from benchnav.models.quality.figures import QualityData, quality_figures
     from benchnav.models.quality.measure import choose_splits
     from benchnav.models.quality.measure import evaluate as evaluate_model
     from benchnav.models.quality.notes import notes_of_data, notes_of_model
     from benchnav.models.quality.report import (
         quality_csv,
-        quality_figures,
         quality_json,
         quality_markdown,
         quality_table,
@@ -108,11 +108,11 @@ def evaluate_command(
     write_text(folder / REPORT, report)
     write_text(folder / CSV, quality_csv(qualities))
     name = Path(checkpoint).name if Path(checkpoint).is_dir() else checkpoint
-    drawn, absent = quality_figures(f"model {name} on dataset {dataset.id}", model, dataset, qualities, maps)
-    paths = [f"{FIGURES}/{figure}.png" for figure in drawn]
-    save_figures(folder, drawn, DPI)
-    write_text(folder / PAGE, quality_markdown(title, qualities, notes + absent, paths))
-    for line in absent:
+    shown = f"model {name} on dataset {dataset.id}"
+    measured = QualityData(title=shown, model=model, dataset=dataset, qualities=qualities, maps=maps)
+    figures = save_figures(folder, quality_figures(measured), measured)
+    write_text(folder / PAGE, quality_markdown(title, qualities, notes + measured.absent, figures))
+    for line in measured.absent:
         print(line)
-    print(f"wrote {REPORT}, {CSV}, {PAGE} and {len(paths)} figures in {out}")
+    print(f"wrote {REPORT}, {CSV}, {PAGE} and {len(figures)} figures in {out}")
     print(f"columns and figures are explained in {folder / PAGE}")

@@ -5,38 +5,34 @@ beside their colour. A figure has a panel a split, in the order given. Letters i
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
 
 import matplotlib
 import numpy as np
 import pandas as pd
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Drawing
 from matplotlib.ticker import PercentFormatter
 from scipy.stats import binom
 
-from benchnav.core.figures import (
-    BLUE,
-    LINE_COLOURS,
-    MARKERS,
-    ORANGE,
-    SKY,
-    TEXT,
-    TWO_COLUMNS_IN,
-    frame_map,
-    legend_outside,
-    stack_panels,
-    styled,
-)
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.latent import expected_of
 from benchnav.datagen.recipe.latent import truth as true_distribution
-from benchnav.models.quality.measure import ClassQuality, TraversabilityQuality
+from benchnav.datagen.recipe.scenario import find_series
+from benchnav.models.base import TraversabilityModel
+from benchnav.models.quality.map_sheet import MapSheet, map_sheet_figure, read_sheet, shared_scales
+from benchnav.models.quality.measure import ClassQuality, Quality, TraversabilityQuality
+from benchnav.models.quality.report import numbers
 from benchnav.models.quality.scores import CONFIDENCE_BINS, LEVEL, PIT_BINS
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
+from benchnav.viz.figure import Figure
+from benchnav.viz.maps import frame_map
+from benchnav.viz.panels import Curves, draw_baseline, line_looks, panel_grid, ticks_of
+from benchnav.viz.style import BLUE, ORANGE, SKY, TEXT, explain, page_width
 
-_LEAST_WIDTH = 4.4
 _SMALL = 5.5
 _MOST_NUMBERED = 16  # classes; among more, numbers would not fit their cells
 _BAND = "0.82"
@@ -58,8 +54,7 @@ _IDEALS = {"coverage": 0.9, "tail_rate": 0.1}  # that are not an end
 _OF_CLASSES = 4  # the first so many
 
 
-@styled()
-def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]) -> Figure:
+def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]) -> Drawing:
     """Draws which classes are taken for which: shares of each true class, in percent.
 
     Args:
@@ -70,10 +65,13 @@ def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]
     shown = [(f"{split}: accuracy {quality.accuracy:.3f}", quality) for split, quality in qualities.items()]
     ragged = len(shown) > most and len(shown) % most  # panels that end above hold the names of columns too
     high = 2.2 if most == 3 else 3.1
-    figure, panels = _grid(shown, most, high, 1.25 if ragged else 0.7, share_y=True)
+    titles, rest = [title for title, _ in shown], 1.25 if ragged else 0.7
+    figure, panels = panel_grid(
+        titles, most, high, rest, page_width(len(shown), most), sharex=True, sharey=True
+    )
     labels = [name.replace("_", " ") for name in names]
     palette = matplotlib.colormaps["Blues"].with_extremes(bad="0.85")
-    for (panel,), quality in panels:
+    for (panel,), (_, quality) in zip(panels, shown, strict=True):
         counts = np.array(quality.confusion, dtype=np.float64)
         with np.errstate(invalid="ignore"):
             shares = 100 * counts / counts.sum(1, keepdims=True)
@@ -88,22 +86,22 @@ def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]
     figure.supxlabel("most likely class")
     figure.supylabel("true class")
     # Beside the upper right panel, and as high as its square, which is less than the room that it is given.
-    beside = panels[min(len(panels), most) - 1][0][0].inset_axes((1.04, 0, 0.05, 1))
-    figure.colorbar(image, cax=beside, label="share of the true class [%]")
+    beside = panels[min(len(panels), most) - 1][0].inset_axes((1.04, 0, 0.05, 1))
+    figure.colorbar(image, cax=beside, label="fraction of the true class [%]")
     return figure
 
 
-@styled()
-def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
+def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Drawing:
     """Draws how often the most likely class is right against its probability, over how many cells say so.
 
     Args:
         qualities: by split.
     """
-    shown = [(f"{split}: ECE {quality.ece:.3f}", quality) for split, quality in qualities.items()]
-    figure, pairs = _grid(shown, 3, 2.6, 0.35, heights=(3, 1))
+    titles = [f"{split}: ECE {quality.ece:.3f}" for split, quality in qualities.items()]
+    heights, width = [3, 1] * -(-len(titles) // 3), page_width(len(titles), 3)
+    figure, pairs = panel_grid(titles, 3, 2.6, 0.35, width, 2, sharex=True, height_ratios=heights)
     edges = np.linspace(0, 1, CONFIDENCE_BINS + 1)
-    for (upper, lower), quality in pairs:
+    for (upper, lower), quality in zip(pairs, qualities.values(), strict=True):
         cells, confidence, accuracy = map(np.array, quality.reliability.values())
         share, filled = cells / cells.sum(), cells > 0
         often = share >= _RARE
@@ -120,17 +118,16 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
         lower.bar(edges[:-1], share, 1 / CONFIDENCE_BINS, align="edge", color=SKY, ec="white", lw=0.4)
         lower.set(ylim=(0, 1), yticks=[0, 1])
         lower.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-    for (upper, lower), _ in pairs[::3]:
+    for upper, lower in pairs[::3]:
         upper.set_ylabel("accuracy")
         lower.set_ylabel("cells")
     figure.align_ylabels()
     figure.supxlabel("probability of the most likely class")
-    _explain(figure)
+    explain(figure)
     return figure
 
 
-@styled()
-def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
+def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Drawing:
     """Draws the histogram of the PIT of λ as it departs from 1, its height for a calibrated model.
 
     Each panel has a scale of its own, since one bad split would flatten all others. The band holds 90 % of
@@ -139,10 +136,11 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
     Args:
         qualities: by split.
     """
-    figure, panels = _grid(list(qualities.items()), 3, 1.75, 0.45 if len(qualities) > 2 else 0.65)
+    rest, width = 0.45 if len(qualities) > 2 else 0.65, page_width(len(qualities), 3)
+    figure, panels = panel_grid(list(qualities), 3, 1.75, rest, width, sharex=True)
     edges = np.linspace(0, 1, PIT_BINS + 1)
     tail = round((1 - LEVEL) * PIT_BINS)
-    for (panel,), quality in panels:
+    for (panel,), quality in zip(panels, qualities.values(), strict=True):
         counts = np.array(quality.pit)
         level = counts.sum() / PIT_BINS
         density = counts / level
@@ -167,17 +165,16 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
         lowest, highest = min(0.95, *density), max(1.05, *density)
         room = highest - lowest
         panel.set(xlim=(0, 1), ylim=(lowest - 0.1 * room, highest + 0.5 * room), xticks=[0, 0.5, 1])
-        panel.locator_params(axis="y", nbins=5, steps=[1, 2, 5, 10])
+        ticks_of(panel, "y", 5)
     figure.supxlabel("PIT of observed λ")
     figure.supylabel("density")
-    _explain(figure, most=5)
+    explain(figure, 5)
     return figure
 
 
-@styled()
 def severity_figure(
     all_series: Mapping[str, Sequence[tuple[float, str]]], numbers: Mapping[str, Mapping[str, float]]
-) -> Figure:
+) -> Drawing:
     """Draws quality against the severity of a shift, a line a scenario.
 
     Args:
@@ -191,37 +188,40 @@ def severity_figure(
     )
     measured = table.dropna(axis=1)
     quantities = _SEVERITY if "accuracy" in measured else _SEVERITY[_OF_CLASSES:]
-    figure, panels = _grid(quantities, 4, 1.65, 0.45)
-    for (panel,), name in panels:
-        for place, (scenario, own) in enumerate(table.groupby("scenario", sort=False)):
-            look: dict[str, Any] = {
-                "color": LINE_COLOURS[place % len(LINE_COLOURS)], "marker": MARKERS[place % len(MARKERS)],
-                "ms": 3, "lw": 1,
-            }  # fmt: skip
-            panel.plot(own["severity"], own[name], label=scenario, **look)
-            if name == "entropy_auroc" and "mutual_information" in measured:
+    table = table.assign(panel="").rename(columns={"severity": "x", "scenario": "line"})
+    looks = line_looks(list(all_series))
+    measures = {name: title for title, name in quantities}
+    curves = Curves(
+        table=table,
+        measures=measures,
+        looks=looks,
+        x_label="severity of the shift",
+        as_titles=True,
+        width_in=page_width(len(quantities), 4),
+    )
+    figure, panels = curves.draw()
+    for (_, name), panel in panels.items():
+        if name == "entropy_auroc" and "mutual_information" in measured:
+            for scenario, own in table.groupby("line", sort=False):
+                look = {**looks[str(scenario)], "ls": ":", "mfc": "white"}
                 words = "of mutual information; solid: of entropy"
-                others = own["mutual_information_auroc"]
-                panel.plot(own["severity"], others, ls=":", mfc="white", **look, label=words)
+                panel.plot(own["x"], own["mutual_information_auroc"], label=words, **look)
         panel.margins(x=0.05, y=0.12)
         if ideal := _IDEALS.get(name):
-            panel.axhline(ideal, color="0.4", lw=0.8, ls="--", label="calibrated")
+            draw_baseline(panel, ideal, "calibrated")
             low, high = panel.get_ylim()
             panel.set_ylim(min(low, ideal - _NEAR), max(high, ideal + _NEAR))
-        panel.grid(alpha=0.3)
-        panel.locator_params(axis="y", nbins=4, steps=[1, 2, 5, 10])
-    figure.supxlabel("severity of the shift")
-    _explain(figure)
+        ticks_of(panel, "y")
+    explain(figure)
     return figure
 
 
-@styled()
 def latent_figure(
     table: SlopeTable,
     classes: Sequence[TerrainClass],
     slope_cells: Sequence[Sequence[int]],
     truth: bool = True,
-) -> Figure:
+) -> Drawing:
     """Draws each class's GP over slope with its uncertainty, beside the true latent function and E[λ].
 
     Args:
@@ -230,8 +230,9 @@ def latent_figure(
         slope_cells: measured cells by true class and whole degree of slope, [C][90].
         truth: whether they are.
     """
-    shown = [(item.name.replace("_", " "), item) for item in classes]
-    figure, panels = _grid(shown, 5, 1.55, 0.5 if len(shown) > 4 else 1.0, share_y=True)
+    titles = [item.name.replace("_", " ") for item in classes]
+    rest, width = 0.5 if len(titles) > 4 else 1.0, page_width(len(titles), 5)
+    figure, panels = panel_grid(titles, 5, 1.55, rest, width, sharex=True, sharey=True)
     x = table_slopes().numpy()
     x = x[x <= max(10.0, 1.15 * max(_steeper_than(cells, 0) for cells in slope_cells))]
     class_id, slopes = np.broadcast_arrays(np.arange(len(classes))[:, None, None], x)
@@ -240,7 +241,7 @@ def latent_figure(
     true = true_distribution(class_id, slopes, tuple(classes))
     expected, true_expected = expected_of((weights, means, stds)), expected_of(true)
     noise = table.noise_std.double().cpu().numpy()
-    for number, ((panel,), item) in enumerate(panels):
+    for number, ((panel,), item) in enumerate(zip(panels, classes, strict=True)):
         mean, std = means[number, 0, 0], stds[number, 0, 0]
         latent = np.sqrt(np.maximum(std**2 - noise[number] ** 2, 0))
         panel.plot(x, mean, color=BLUE, lw=1.1, label="GP mean")
@@ -268,7 +269,7 @@ def latent_figure(
         panel.set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
     figure.supxlabel(f"slope [°]  (σ: noise{', in brackets the true one' if truth else ''})")
     figure.supylabel("traversability")
-    _explain(figure)
+    explain(figure)
     return figure
 
 
@@ -278,33 +279,170 @@ def _steeper_than(cells: Sequence[int], share: float) -> float:
     return float(np.sum(steeper > share * steeper[0]))
 
 
-def _grid(
-    shown: Sequence[tuple[str, Any]],
-    most: int,
-    high: float,
-    rest: float,
-    heights: Sequence[float] = (1,),
-    share_y: bool = False,
-) -> tuple[Figure, list[tuple[list[Axes], Any]]]:
-    """A figure of places for things by title, at most so many side by side, each so high, and with room for the rest.
+@dataclass(frozen=True, kw_only=True)
+class QualityData:
+    """What figures of a model's quality are drawn from.
 
-    Beside each place stands what it is to show. A place holds panels under each other, whose heights are as given. The
-    figure has the width that its places need, and that of its legend.
+    Args:
+        title: what the map sheets say of model and dataset.
+        model: what was measured.
+        dataset: on what.
+        qualities: by split.
+        maps: how many maps of each split the map sheets show.
     """
-    columns = min(len(shown), most)
-    rows = -(-len(shown) // columns)
-    width = max(TWO_COLUMNS_IN * (columns / most), _LEAST_WIDTH)
-    figure = Figure(figsize=(width, rows * high + rest), layout="constrained")
-    places = stack_panels(
-        figure, len(shown), columns, len(heights), sharex=True, sharey=share_y,
-        height_ratios=[*heights] * rows,
-    )  # fmt: skip
-    for (panel, *_), (title, _) in zip(places, shown, strict=True):
-        panel.set_title(title, parse_math=False)
-    return figure, [(place, item) for place, (_, item) in zip(places, shown, strict=True)]
+
+    title: str
+    model: TraversabilityModel
+    dataset: TerrainDataset
+    qualities: Mapping[str, Quality]
+    maps: int = 0
+
+    @property
+    def by_class(self) -> dict[str, ClassQuality]:
+        """The quality of the classes, of the splits that have it."""
+        return {split: item for split, quality in self.qualities.items() for item in quality.classes}
+
+    @property
+    def table(self) -> SlopeTable | None:
+        """The model's Gaussian processes over slope; None where it has none."""
+        table = getattr(self.model, "table", None)
+        return table if isinstance(table, SlopeTable) else None
+
+    @cached_property
+    def sheets(self) -> dict[str, MapSheet]:
+        """Maps of each split with what was predicted."""
+        if not self.maps:
+            return {}
+        counts = {split: min(self.maps, self.dataset.map_count(split)) for split in self.qualities}
+        return {split: read_sheet(self.model, self.dataset, split, range(n)) for split, n in counts.items()}
+
+    @property
+    def absent(self) -> list[str]:
+        """A line for each figure that is not drawn, with why."""
+        lines = []
+        if len(self.by_class) < len(self.qualities):
+            lines.append("no confusion matrix, reliability diagram or entropy: the model predicts no classes")
+        if self.table is None:
+            lines.append("no latent functions: the model has no Gaussian processes over slope")
+        if not find_series(self.qualities):
+            lines.append("no series of shifts: no splits such as test/hg-050 and test/hg-100 were measured")
+        return lines
 
 
-def _explain(figure: Figure, most: int = 4) -> None:
-    """Lays a legend over the panels, in at most so many columns where the figure is of full width."""
-    columns = most if figure.get_figwidth() == TWO_COLUMNS_IN else 2
-    legend_outside(figure, columns=columns, side="upper center")
+class Confusion(Figure):
+    """Which classes are taken for which."""
+
+    name, title = "confusion", "Confusion of classes"
+    text = (
+        "Rows are true classes, columns the most likely ones, numbers fractions of the row in per cent. A perfect "
+        "model has 100 along the diagonal; no model can tell look-alike classes apart. Grey rows are classes that no "
+        "map of the split shows."
+    )
+
+    def needs(self, data: QualityData) -> bool:
+        """Return whether the model predicts classes."""
+        return bool(data.by_class)
+
+    def draw(self, data: QualityData) -> Drawing:
+        """Draw a panel a split."""
+        return confusion_figure(data.by_class, [item.name for item in data.dataset.recipe.classes])
+
+
+class Reliability(Figure):
+    """Accuracy over the probability of the most likely class."""
+
+    name, title = "reliability", "Calibration of the class probabilities"
+    text = (
+        "Above: accuracy of the most likely class over its probability. Calibrated is on the dashed line; below it the "
+        "model is overconfident. ECE is the mean gap. Below: number of cells with that probability."
+    )
+    needs = Confusion.needs
+
+    def draw(self, data: QualityData) -> Drawing:
+        """Draw a panel a split."""
+        return reliability_figure(data.by_class)
+
+
+class PIT(Figure):
+    """Histograms of the probability integral transform of λ."""
+
+    name, title = "pit", "Calibration of the predicted distribution of λ"
+    text = (
+        "The probability integral transform (PIT) is the place of observed λ in its prediction, from 0 (low end) to 1 "
+        "(high end). Calibrated is flat at 1. High at both ends is overconfident, high in the middle underconfident. "
+        "High at the left (orange): low λ is more frequent than predicted. Panels have scales of their own."
+    )
+
+    def draw(self, data: QualityData) -> Drawing:
+        """Draw a panel a split."""
+        return pit_figure({split: quality.traversability for split, quality in data.qualities.items()})
+
+
+class Severity(Figure):
+    """Quality over the severity of a shift."""
+
+    name, title = "severity", "Quality over the severity of a shift"
+    text = "Measures of the table over the severity of each scenario: 0 is the training maps, 1 the scenario itself."
+
+    def needs(self, data: QualityData) -> bool:
+        """Return whether a series of shifts was measured."""
+        return bool(find_series(data.qualities))
+
+    def draw(self, data: QualityData) -> Drawing:
+        """Draw a panel a measure."""
+        values = {split: numbers(quality) for split, quality in data.qualities.items()}
+        return severity_figure(find_series(data.qualities), values)
+
+
+class Latent(Figure):
+    """The Gaussian process over slope of each class."""
+
+    name, title = "latent", "What the Gaussian processes have learned"
+    text = (
+        "Predicted traversability over slope for each class, with the truth in black where it is known. Few or no "
+        "measured cells are as steep as the grey part."
+    )
+
+    def needs(self, data: QualityData) -> bool:
+        """Return whether the model has such processes, and classes were measured."""
+        return data.table is not None and bool(data.by_class)
+
+    def draw(self, data: QualityData) -> Drawing:
+        """Draw a panel a class."""
+        assert data.table is not None
+        cells = np.sum([quality.slope_cells for quality in data.by_class.values()], 0)
+        known = all(data.dataset.truth_of(split) == "generated" for split in data.qualities)
+        return latent_figure(data.table, data.dataset.recipe.classes, cells.tolist(), known)
+
+
+class MapSheets(Figure):
+    """Maps of a split: observation, truth, prediction, error and uncertainty.
+
+    Attributes:
+        split: whose.
+    """
+
+    name, split = "maps", ""
+    text = (
+        "Each row is a map: observation, truth, prediction, error and uncertainty. Observed λ stands for the truth "
+        "where the true distribution is unknown. A quantity has one scale in all sheets of an evaluation."
+    )
+
+    def variants(self, data: QualityData) -> Sequence[Self]:
+        """Return a sheet a split."""
+        return [
+            self.variant(split=split, name=f"maps-{split.replace('/', '-')}", title=f"Maps of {split}")
+            for split in data.sheets
+        ]
+
+    def draw(self, data: QualityData) -> Drawing:
+        """Draw a row a map."""
+        classes = data.dataset.recipe.classes
+        scales = shared_scales(list(data.sheets.values()), classes)
+        return map_sheet_figure(data.sheets[self.split], scales, classes, data.title)
+
+
+def quality_figures(data: QualityData) -> list[Figure]:
+    """List the figures of a model's quality that apply."""
+    figures: tuple[Figure, ...] = (Confusion(), Reliability(), PIT(), Severity(), Latent(), MapSheets())
+    return [variant for figure in figures for variant in figure.variants(data)]

@@ -11,21 +11,15 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from benchnav.core.figures import TRAVERSABILITY_COLOURS
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.preview import (
-    LACKING_PATCH,
-    SheetColumn,
-    class_colours,
-    class_patches,
-    class_shades,
-    sheet_of_maps,
-)
+from benchnav.datagen.preview import class_colours
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.scores import mutual_information, predictive_entropy
+from benchnav.viz.maps import LAMBDA, TRAVERSABILITY_COLOURS, lacking_handle
+from benchnav.viz.sheet import SheetColumn, class_patches, class_scale, sheet_of_maps
 
 # Of each layer its title, what stands under its colour bar, and its colours; classes and images have no bar.
 _LAYERS: dict[str, tuple[str, str, str]] = {
@@ -107,12 +101,12 @@ def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -
         sheets: at least one.
         classes: of the dataset.
     """
-    kinds = {"cmap": class_shades(class_colours(classes)), "vmin": -0.5, "vmax": len(classes) - 0.5}
+    kinds = class_scale(class_colours(classes))
     scales: dict[str, dict[str, Any]] = {"rgb": {}, "class_true": kinds, "class_found": kinds}
     for name, (_, unit, palette) in _LAYERS.items():
         values = [sheet.layers[name].ravel() for sheet in sheets if name in sheet.layers and unit]
         if unit == "λ":
-            scales[name] = {"cmap": palette, "vmin": 0, "vmax": 1}
+            scales[name] = LAMBDA
         elif values:
             shown = np.abs(np.concatenate(values))
             shown = shown[np.isfinite(shown)]
@@ -154,7 +148,7 @@ def map_sheet_figure(
         [classes[number].name.replace("_", " ") for number in shown], class_colours(classes)[shown]
     )
     if patches and any(bool(np.isnan(layer).any()) for layer in sheet.layers.values()):
-        patches.append(LACKING_PATCH)
+        patches.append(lacking_handle())
     rows = [f"map {index}" for index in sheet.indices]
     return sheet_of_maps(columns, rows, sheet.extent_m, f"{title}, split {sheet.split}", patches)
 

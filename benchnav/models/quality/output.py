@@ -2,16 +2,15 @@
 
 import json
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from benchnav.core.tables import Table
     from benchnav.datagen.files.reader import TerrainDataset
+    from benchnav.viz.figure import Figure
 
 FIGURES = "figures"
 DPI = 300
@@ -106,23 +105,27 @@ def page(
     return "\n\n".join(parts) + "\n"
 
 
-def save_figures(folder: Path, drawn: "Mapping[str, Callable[[], Figure]]", dpi: int = DPI) -> None:
+def save_figures(folder: Path, figures: "Sequence[Figure]", data: Any) -> list[tuple[str, str, str]]:
     """Draw figures into a folder, as PNG and PDF, in place of those that are there.
 
     Args:
         folder: that holds `FIGURES`.
-        drawn: what draws each, by name.
-        dpi: resolution of the PNG.
+        figures: each with a name of its own.
+        data: what they are drawn from.
+
+    Returns:
+        Of each the path of its PNG from the folder, its title and its caption.
     """
-    from benchnav.core.figures import save_twice
     from benchnav.core.progress import show_progress
+    from benchnav.viz.style import save_twice
 
     for old in (folder / FIGURES).glob("*.p[nd][gf]"):
         old.unlink()
 
     def saved() -> Iterator[tuple[int, int]]:
-        for count, (name, draw) in enumerate(drawn.items(), 1):
-            save_twice(draw(), folder / FIGURES / f"{name}.png", dpi=dpi)
-            yield count, len(drawn)
+        for count, figure in enumerate(figures, 1):
+            save_twice(figure(data), folder / FIGURES / f"{figure.name}.png", dpi=DPI)
+            yield count, len(figures)
 
     show_progress(saved(), "figures")
+    return [(f"{FIGURES}/{figure.name}.png", figure.title, figure.caption(data)) for figure in figures]

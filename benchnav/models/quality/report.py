@@ -1,62 +1,19 @@
 """A model's quality in numbers and words: a table for each kind of file, and what columns and figures mean."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
-from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from benchnav.core.tables import NOTHING, Table
-from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.scenario import find_series
-from benchnav.models.base import TraversabilityModel
 from benchnav.models.quality.columns import COLUMNS, FILES_ONLY, LOOK_ALIKES
 from benchnav.models.quality.measure import Quality
 from benchnav.models.quality.output import json_text, page
-from benchnav.models.slope_gp.table import SlopeTable
 from benchnav.stats.tables import Column, cell_of, table_of
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-# Title and explanation by the name of a figure; those of map sheets go on with the split.
-_FIGURES = {
-    "confusion": (
-        "Confusion of classes",
-        "Rows are true classes, columns the most likely ones, numbers shares of the row in per cent. A perfect model "
-        "has 100 along the diagonal; no model can tell look-alike classes apart. Grey rows are classes that no map of "
-        "the split shows.",
-    ),
-    "reliability": (
-        "Calibration of the class probabilities",
-        "Above: accuracy of the most likely class over its probability. Calibrated is on the dashed line; below it the "
-        "model is overconfident. ECE is the mean gap. Below: number of cells with that probability.",
-    ),
-    "pit": (
-        "Calibration of the predicted distribution of λ",
-        "The probability integral transform (PIT) is the place of observed λ in its prediction, from 0 (low end) to 1 "
-        "(high end). Calibrated is flat at 1. High at both ends is overconfident, high in the middle underconfident. "
-        "High at the left (orange): bad ground is more frequent than predicted. Panels have scales of their own.",
-    ),
-    "severity": (
-        "Quality over the severity of a shift",
-        "Measures of the table over the severity of each scenario: 0 is the training maps, 1 the scenario itself.",
-    ),
-    "latent": (
-        "What the Gaussian processes have learned",
-        "Predicted traversability over slope for each class, with the truth in black where it is known. Few or no "
-        "measured cells are as steep as the grey part.",
-    ),
-    "maps": (
-        "Maps of",
-        "Each row is a map: observation, truth, prediction, error and uncertainty. Observed λ stands for the truth "
-        "where the true distribution is unknown. A quantity has one scale in all sheets of an evaluation.",
-    ),
-}
 
 
 def quality_table(title: str, qualities: Mapping[str, Quality], whole: bool = False) -> Table:
@@ -118,7 +75,10 @@ def quality_csv(qualities: Mapping[str, Quality]) -> str:
 
 
 def quality_markdown(
-    title: str, qualities: Mapping[str, Quality], notes: Sequence[str], figures: Sequence[str]
+    title: str,
+    qualities: Mapping[str, Quality],
+    notes: Sequence[str],
+    figures: Sequence[tuple[str, str, str]],
 ) -> str:
     """Writes the numbers as a page with its figures, and what each column and figure means.
 
@@ -126,62 +86,9 @@ def quality_markdown(
         title: of the page.
         qualities: by split.
         notes: lines under the table.
-        figures: paths of images from the page, each named for what it shows.
+        figures: from `output.save_figures`.
     """
-    captions = [(path, *caption(PurePath(path).stem, qualities)) for path in figures]
-    return page(title, [quality_table(title, qualities, whole=True)], notes, captions)
-
-
-def quality_figures(
-    title: str,
-    model: TraversabilityModel,
-    dataset: TerrainDataset,
-    qualities: Mapping[str, Quality],
-    maps: int,
-) -> "tuple[dict[str, Callable[[], Figure]], list[str]]":
-    """Gives what draws the figures that apply, by name; and a line for each of those that do not, with why.
-
-    Args:
-        title: what the map sheets say of model and dataset.
-        model: what was measured.
-        dataset: on what.
-        qualities: by split.
-        maps: how many maps of each split the map sheets show.
-    """
-    from benchnav.models.quality import figures, map_sheet
-
-    drawn: dict[str, Callable[[], Figure]] = {}
-    absent = []
-    by_class = {split: item for split, quality in qualities.items() for item in quality.classes}
-    classes, table = dataset.recipe.classes, getattr(model, "table", None)
-    if by_class:
-        drawn["confusion"] = partial(figures.confusion_figure, by_class, [item.name for item in classes])
-        drawn["reliability"] = partial(figures.reliability_figure, by_class)
-    if len(by_class) < len(qualities):
-        absent.append("no confusion matrix, reliability diagram or entropy: the model predicts no classes")
-    by_cell = {split: quality.traversability for split, quality in qualities.items()}
-    drawn["pit"] = partial(figures.pit_figure, by_cell)
-    if all_series := find_series(qualities):
-        found = {split: numbers(quality) for split, quality in qualities.items()}
-        drawn["severity"] = partial(figures.severity_figure, all_series, found)
-    if not isinstance(table, SlopeTable):
-        absent.append("no latent functions: the model has no Gaussian processes over slope")
-    elif by_class:
-        cells = np.sum([quality.slope_cells for quality in by_class.values()], 0)
-        known = all(dataset.truth_of(split) == "generated" for split in qualities)
-        drawn["latent"] = partial(figures.latent_figure, table, classes, cells.tolist(), known)
-    if not all_series:
-        absent.append("no series of shifts: no splits such as test/hg-050 and test/hg-100 were measured")
-    if maps:
-        sheets = [
-            map_sheet.read_sheet(model, dataset, split, range(min(maps, dataset.map_count(split))))
-            for split in qualities
-        ]
-        scales = map_sheet.shared_scales(sheets, classes)
-        for sheet in sheets:
-            draw = partial(map_sheet.map_sheet_figure, sheet, scales, classes, title)
-            drawn[sheet_name(sheet.split)] = draw
-    return drawn, absent
+    return page(title, [quality_table(title, qualities, whole=True)], notes, figures)
 
 
 def numbers(quality: Quality) -> dict[str, float]:
@@ -197,21 +104,3 @@ def _everything(quality: Quality) -> dict[str, Any]:
         values |= asdict(item)
         values |= values.pop("look_alikes") or {}
     return values | asdict(quality.traversability)
-
-
-def caption(figure: str, splits: Iterable[str]) -> tuple[str, str]:
-    """Gives the title of a figure, and what it shows.
-
-    Args:
-        figure: its name, such as `pit`, or `maps-test-std` of a map sheet.
-        splits: names of those that were measured.
-    """
-    if figure in _FIGURES:
-        return _FIGURES[figure]
-    title, text = _FIGURES["maps"]
-    return f"{title} {next(split for split in splits if sheet_name(split) == figure)}", text
-
-
-def sheet_name(split: str) -> str:
-    """Name of the map sheet of a split."""
-    return f"maps-{split.replace('/', '-')}"

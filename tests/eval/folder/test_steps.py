@@ -15,9 +15,9 @@ from benchnav.core.errors import ConfigError
 from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent, units
+from benchnav.eval.failures import failures_table
 from benchnav.eval.folder.run_folder import EPISODES, open_run, read_table
 from benchnav.eval.folder.steps import align_steps, read_steps
-from benchnav.eval.report.failures import failures_table
 from benchnav.eval.run.rows import step_table
 from benchnav.eval.run.runner import run_suite
 from tests.edits import edit_table

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from benchnav.eval.experiment.hypotheses import digest_of_tests
-from benchnav.eval.report.charts.conditions import forest_figure
+from benchnav.eval.figures.forest import draw_forest
 from benchnav.eval.report.hypotheses import hypothesis_findings, hypothesis_table
 from benchnav.eval.report.write import write_report
 from tests.eval.report import made
@@ -91,7 +91,7 @@ def test_a_forest_has_a_panel_a_metric_with_points_intervals_and_margins() -> No
         a_test(supported=False, kind="superiority", direction="lower"),
         a_test(supported=False, kind="superiority", direction="higher"),
     ]
-    success, time = forest_figure(pd.DataFrame(rows)).axes
+    success, time = draw_forest(pd.DataFrame(rows)).axes
     assert [panel.get_xlabel() for panel in (success, time)] == ["Δ success [points]", "Δ T_total [s]"]
     points = [line for line in time.lines if line.get_marker() == "o"]
     assert [float(point.get_xdata()[0]) for point in points] == [0.1, 2.0, 0.1, 0.1]
@@ -111,7 +111,7 @@ def test_a_forest_has_a_panel_a_metric_with_points_intervals_and_margins() -> No
 
 def test_a_forest_is_drawn_where_no_episode_tells_anything() -> None:
     nothing = dict.fromkeys(("difference", "low", "high", "low_90", "high_90"), np.nan)
-    (panel,) = forest_figure(pd.DataFrame([a_test(kind="difference", margin=0.0, **nothing)])).axes
+    (panel,) = draw_forest(pd.DataFrame([a_test(kind="difference", margin=0.0, **nothing)])).axes
     assert np.isfinite(panel.get_xlim()).all()
 
 

@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 from benchnav.core.tables import Bold, Table
-from benchnav.eval.report.failures import Sheets
+from benchnav.eval.failures import Sheets
 from benchnav.eval.report.write import Report, read_report, render
 from tests.eval.forged import code_with
 from tests.eval.report.test_write import episodes, run_folder

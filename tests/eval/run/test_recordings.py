@@ -14,10 +14,10 @@ import pytest
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
+from benchnav.eval.failures import failures_table
 from benchnav.eval.folder.run_folder import open_run, read_table, write_run
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.recording import GROUND, Ground, Recording
-from benchnav.eval.report.failures import failures_table
 from benchnav.eval.report.write import write_report
 from benchnav.eval.run.recordings import keep_ground, record_driven, telling_map
 from benchnav.eval.run.runner import run_suite

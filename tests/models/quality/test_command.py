@@ -10,7 +10,7 @@ import pytest
 from benchnav.core import registry
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.predictor import Oracle
-from benchnav.models.quality import baselines, map_sheet
+from benchnav.models.quality import baselines, figures
 from benchnav.models.quality.baselines import nearest_colour_accuracy
 from benchnav.models.quality.measure import evaluate
 from tests.commands import call
@@ -71,16 +71,14 @@ def test_a_folder_holds_report_page_and_figures(
     monkeypatch.setattr("benchnav.models.quality.command.DPI", 30)
     out = tmp_path / "new" / "quality"
     asked = ["colours", "--data", dataset.path, "--out", out, "--maps", 1]
-    draw, titles = map_sheet.map_sheet_figure, []
-    monkeypatch.setattr(
-        map_sheet, "map_sheet_figure", lambda *given: titles.append(given[-1]) or draw(*given)
-    )
+    draw, titles = figures.map_sheet_figure, []
+    monkeypatch.setattr(figures, "map_sheet_figure", lambda *given: titles.append(given[-1]) or draw(*given))
     assert call("train", "evaluate", *asked) == 0
     assert titles == ["model colours on dataset tiny-v1"] * 2
     assert {path.name for path in out.iterdir()} == {"quality.json", "quality.csv", "quality.md", "figures"}
-    figures = {path.name for path in (out / "figures").iterdir()}
+    files = {path.name for path in (out / "figures").iterdir()}
     names = {"confusion", "reliability", "pit", "latent", "maps-test-std", "maps-test-hs"}
-    assert figures == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
+    assert files == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
     printed = capfd.readouterr().out
     assert "no series" in printed
     assert printed.splitlines()[-1] == f"columns and figures are explained in {out}/quality.md"

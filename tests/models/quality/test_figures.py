@@ -73,9 +73,9 @@ def test_the_colour_bar_is_as_high_as_the_panel_beside_it(count: int, qualities:
     figure.set_dpi(50)
     figure.draw_without_rendering()
     beside = panel(figure, f"split-{min(count, 3) - 1}")
-    (bar,) = [axes for axes in (*figure.axes, *beside.child_axes) if axes.get_ylabel().startswith("share")][
-        :1
-    ]
+    (bar,) = [
+        axes for axes in (*figure.axes, *beside.child_axes) if axes.get_ylabel().startswith("fraction")
+    ][:1]
     square, drawn = beside.get_window_extent(), bar.get_window_extent()
     assert (drawn.y0, drawn.y1) == pytest.approx((square.y0, square.y1))
     assert drawn.x0 > square.x1

@@ -13,14 +13,13 @@ from benchnav.core.terrain import Observation
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import TraversabilityModel
 from benchnav.models.predictor import Oracle
+from benchnav.models.quality.figures import QualityData, quality_figures
 from benchnav.models.quality.measure import Quality, evaluate
 from benchnav.models.quality.report import (
     COLUMNS,
     LOOK_ALIKES,
-    caption,
     numbers,
     quality_csv,
-    quality_figures,
     quality_json,
     quality_markdown,
     quality_table,
@@ -64,12 +63,12 @@ def test_a_name_too_long_is_folded_rather_than_a_number(qualities: Qualities) ->
 
 def test_what_there_is_not_is_left_out_or_dashed(qualities: Qualities, dataset: TerrainDataset) -> None:
     oracle = dict(evaluate(Oracle(), dataset, ["valid"]))
-    page = quality_markdown("title", oracle, [], [])
+    page = quality_markdown("title", oracle, [], {})
     assert "mIoU" not in page
     assert f"{oracle['valid'].traversability.crps:.4f}" in page
     nameless = replace(qualities["valid"].classes[0], entropy_auroc=float("nan"))
     mixed = {**qualities, "valid": replace(qualities["valid"], classes=(nameless,))}
-    (row,) = [line for line in quality_markdown("title", mixed, [], []).splitlines() if "| valid |" in line]
+    (row,) = [line for line in quality_markdown("title", mixed, [], {}).splitlines() if "| valid |" in line]
     assert "–" in row
 
 
@@ -114,14 +113,13 @@ def test_csv_leaves_a_number_that_there_is_not_empty(qualities: Qualities) -> No
 
 
 def test_the_page_shows_table_notes_and_figures(qualities: Qualities) -> None:
-    figures = ["figures/pit.png", "figures/maps-test-hs-050.png"]
+    figures = {"figures/pit.png": ("PIT", "What it shows."), "figures/maps-a.png": ("Maps of a", "Maps.")}
     lines = quality_markdown("title", qualities, ["a note"], figures).splitlines()
     assert lines[0] == "# title"
     header, rule, *rows = [line for line in lines if line.startswith("|")]
     assert len({line.count("|") for line in (header, rule, *rows)}) == 1
     assert len(rows) == len(qualities)
-    images = ["![Calibration of the predicted distribution of λ](figures/pit.png)"]
-    images.append("![Maps of test/hs-050](figures/maps-test-hs-050.png)")
+    images = ["![PIT](figures/pit.png)", "![Maps of a](figures/maps-a.png)"]
     assert {"a note", *images} <= set(lines)
     for image in images:
         under = lines[lines.index(image) + 2]
@@ -134,18 +132,20 @@ def test_every_column_of_the_page_is_explained_and_no_other(
 ) -> None:
     oracle = dict(evaluate(Oracle(), dataset, ["valid"]))
     for measured in (qualities, oracle):
-        lines = quality_markdown("title", measured, [], []).splitlines()
+        lines = quality_markdown("title", measured, [], {}).splitlines()
         headings = [cell.strip() for cell in lines[2].strip("|").split("|")]
         explained = [line[4:].partition("**: ") for line in lines if line.startswith("- **")]
         assert [heading for heading, _, _ in explained] == [h for h in headings if h != "maps"]
         assert all(sentence.endswith(".") for _, _, sentence in explained)
 
 
-def test_every_figure_has_a_caption(dataset: TerrainDataset, qualities: Qualities) -> None:
-    named, _ = quality_figures("m on d", ColourModel(), dataset, dict(evaluate(ColourModel(), dataset)), 1)
-    assert {"confusion", "reliability", "pit", "latent", "maps-test-std", "maps-test-hs"} == set(named)
-    captions = [caption(name, dataset.splits) for name in (*named, "severity")]
-    assert len({title for title, _ in captions}) == len(captions)
+def test_every_figure_has_a_caption(dataset: TerrainDataset) -> None:
+    measured = dict(evaluate(ColourModel(), dataset))
+    data = QualityData(title="", model=ColourModel(), dataset=dataset, qualities=measured, maps=1)
+    figures = {figure.name: figure for figure in quality_figures(data)}
+    assert {"confusion", "reliability", "pit", "latent", "maps-test-std", "maps-test-hs"} == set(figures)
+    assert len({figure.title for figure in figures.values()}) == len(figures)
+    assert all(figure.caption(data).endswith(".") for figure in figures.values())
 
 
 class Quantiles(TraversabilityModel):
@@ -164,7 +164,7 @@ def test_the_likelihood_of_what_has_no_density_is_a_dash_and_null(dataset: Terra
     assert table.rows[0][table.headings.index(COLUMNS["nll"][0])] == "–"
     assert json.loads(quality_json({}, found))["splits"]["valid"]["nll"] is None
     assert next(csv.DictReader(io.StringIO(quality_csv(found))))["nll"] == ""
-    drawn, _ = quality_figures("title", Quantiles(), dataset, found, 1)
-    assert {"pit", "maps-valid"} <= set(drawn)
-    for draw in drawn.values():
-        draw()
+    data = QualityData(title="title", model=Quantiles(), dataset=dataset, qualities=found, maps=1)
+    assert [figure.name for figure in quality_figures(data)] == ["pit", "maps-valid"]
+    for figure in quality_figures(data):
+        figure(data)

@@ -354,7 +354,7 @@ def test_a_dataset_with_look_alikes_is_measured_with_them_merged(
     row = json.loads(quality_json({}, qualities))["splits"]["test/std"]
     assert {name: row[name] for name in LOOK_ALIKES} == pytest.approx(vars(measured.look_alikes))
     assert f"{measured.look_alikes.look_alike_accuracy:.6g}" in quality_csv(qualities)
-    page = quality_markdown("", qualities, [], [])
+    page = quality_markdown("", qualities, [], {})
     assert "mIoU look-alikes=1" in page
     assert len({row.count("|") for row in page.splitlines() if row.startswith("|")}) == 1
 
@@ -380,7 +380,7 @@ def test_a_dataset_without_look_alikes_has_no_such_numbers(dataset: TerrainDatas
         pass
     qualities = dict(evaluate(ColourModel(), TerrainDataset(tmp_path / "plain.h5")))
     assert qualities["test/std"].classes[0].look_alikes is None
-    assert "look_alikes" not in quality_markdown("", qualities, [], [])
+    assert "look_alikes" not in quality_markdown("", qualities, [], {})
     assert not {*LOOK_ALIKES, "look_alikes"} & set(
         json.loads(quality_json({}, qualities))["splits"]["test/std"]
     )

@@ -13,19 +13,21 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from benchnav.core.figures import MARKS, bytes_of, hatching
 from benchnav.core.grid import outline
+from benchnav.eval.figures.knowledge import known_colours
 from benchnav.eval.recording import Recording, drawing_interval, thinned
-from benchnav.eval.report.plan_layers import (
+from benchnav.viz.maps import (
+    MARKS,
     REACH,
     SOFT,
     STYLES,
     field_colours,
-    known_colours,
+    hatching,
     layer_colours,
     predicted_colours,
     shades,
 )
+from benchnav.viz.style import bytes_of
 
 TIMELINE = "time"
 

@@ -23,37 +23,13 @@ from matplotlib.patches import Patch
 from matplotlib.text import Text
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.figures import (
-    MARKS,
-    TRAVERSABILITY_COLOURS,
-    condition_colours,
-    hatching,
-    line_style,
-    mark,
-    mark_handle,
-    robot_marker,
-    show_map,
-)
 from benchnav.core.store import replacing
 from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.figures.knowledge import known_colours
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.plan_layers import (
-    CLOSED,
-    IMMOBILISING,
-    STYLES,
-    end_cell_handle,
-    end_mark,
-    field_colours,
-    known_colours,
-    mark_end,
-    plan_layer,
-    predicted_colours,
-    reach_line,
-    shades,
-    unseen_handle,
-    unseen_layer,
-)
-from benchnav.eval.report.words import NAMING, condition_name, differ, joined
+from benchnav.eval.words import NAMING, condition_name, differ, joined
+from benchnav.viz import maps
+from benchnav.viz.style import condition_colours, line_style
 
 SIZE = (1280, 720)  # of a frame: width and height in pixels
 FRAMES_A_SECOND = 20
@@ -67,11 +43,9 @@ _MARGIN, _GAP, _TOP, _FOOT, _HEADING = 24, 24, 56, 100, 54  # pixels; the last s
 _BAR = 210  # pixels, of the colour bar and its last number
 _TALLEST = 2.0  # of a map, over its width
 _TEXT, _HEAD, _LARGE = 12.0, 14.0, 16.0  # points
-_MARKS, _PATH, _EDGE = 1.9, 2.6, 5.0  # over those of a printed figure, and widths in points
+_MARKS, _PATH = 1.9, 2.6  # over those of a printed figure, and width in points
 _MOST_IN_TWO = 12  # entries of the legend that two lines have room for
-_LENGTHS_M = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500)  # of scale bars
-_SCALE_SHARE = 0.35  # of a map's width, which a scale bar keeps under
-_ARRIVED, _FAILED = "#00684a", "#a00000"
+_SUCCESS, _FAILED = "#00684a", "#a00000"
 
 
 def frame_times(end_s: float) -> np.ndarray:
@@ -141,26 +115,26 @@ class Frames:
             words = "true mean of λ; the planner uses no map" if blind else words
             _head(panel, names[place], words, colours[place])
             shown = (
-                known_colours(own.known[-1])["risk"] if learns else predicted_colours(own.predicted, own.free)
+                known_colours(own.known[-1])["risk"]
+                if learns
+                else maps.predicted_colours(own.predicted, own.free)
             )
-            image = show_map(panel, shown, first.grid.extent_m)
+            image = maps.show_map(panel, shown, first.grid.extent_m)
             known = _Known(panel, own, image) if learns else None
             state = _over(panel, "", (1, 1), 5, ha="right", weight="bold")
-            driver = _Driver(panel, shown, own, colours[place], line_style(place), state, known)
+            driver = _Driver(panel, own, colours[place], line_style(place), state, known)
             self.drivers.append(driver)
         for panel, places in zip(self.truths, shared, strict=True):
             own = recordings[places[0]]
             words = ", ".join(names[place] for place in places) if len(shared) > 1 else ""
             if own.field is None:
-                shown, heading = shades(own.true_mean), "mean of λ, drawn anew at each step"
+                shown, heading = maps.shades(own.true_mean), "mean of λ, resampled at each step"
             else:
-                shown, heading = field_colours(own.field, own.immobilising), "λ field of the episode"
+                shown, heading = maps.field_colours(own.field, own.immobilising), "λ field of the episode"
             _head(panel, heading, words)
-            show_map(panel, shown, first.grid.extent_m)
+            maps.show_map(panel, shown, first.grid.extent_m)
             for place in places:
-                self.drivers.append(
-                    _Driver(panel, shown, recordings[place], colours[place], line_style(place))
-                )
+                self.drivers.append(_Driver(panel, recordings[place], colours[place], line_style(place)))
         for panel in panels:
             panel.set(aspect="auto", xticks=[], yticks=[])
         about = "{data}, {scenario}, map {map}".format(**first.about)
@@ -207,7 +181,7 @@ class Frames:
     def _explain(self, recordings: Sequence[Recording]) -> None:
         """Draws below all panels a scale bar, what is what, and the colours of λ."""
         width_m, _ = recordings[0].grid.extent_m
-        length_m = max(each for each in _LENGTHS_M if each < max(_SCALE_SHARE * width_m, 1))
+        length_m = maps.scale_length(width_m)
         length = length_m / width_m * self.given[0].get_window_extent().width
         bar = self._axes(_MARGIN, 30, length, 8)
         bar.set(label="scale", xticks=[], yticks=[], facecolor="black")
@@ -219,23 +193,22 @@ class Frames:
             for name, lines in plan.lines.items()
             if lines
         }
-        ends = dict.fromkeys(end_mark(own.about["outcome"]) for own in recordings)
+        ends = dict.fromkeys(maps.end_mark(own.about["outcome"]) for own in recordings)
         handles: list[Artist] = [
-            mark_handle(name, 0.8 * _MARKS) for name in ("start", "goal", "robot", *ends)
+            maps.mark_handle(name, 0.8 * _MARKS) for name in ("start", "goal", "robot", *ends)
         ]
-        handles += [plan_layer(style, scale=_MARKS) for name, style in STYLES.items() if name in layers]
-        handles.append(end_cell_handle(_MARKS))
+        handles += [
+            maps.plan_layer(style, scale=_MARKS) for name, style in maps.STYLES.items() if name in layers
+        ]
         words = "driven" if len(recordings) == 1 else "driven, in the colour of its title"
         handles.append(Line2D([], [], color="black", lw=_PATH, label=words))
         if any(not own.free.all() for own in recordings):
-            handles.append(Patch(color=CLOSED, label="not free"))
+            handles.append(Patch(color=maps.CLOSED, label="not free"))
         if any(own.immobilising.any() for own in recordings):
-            handles.append(Patch(color=IMMOBILISING, label="immobilises a robot"))
+            handles.append(Patch(color=maps.IMMOBILISING, label="immobilises a robot"))
         every = [known for own in recordings for known in own.known]
-        if any(not known.seen.all() for known in every):
-            handles.append(unseen_handle())
-        if any(known.outlines for known in every):
-            handles.append(reach_line(np.empty((0, 2)), _MARKS, "reach of the sensors"))
+        reaches = any(known.outlines for known in every)
+        handles += maps.sensing_handles([known.seen for known in every], reaches, _MARKS)
         lines = 2 if len(handles) <= _MOST_IN_TWO else 3
         columns, between = -(-len(handles) // lines), 0.5 + (length - _BAR) / 2 / SIZE[0]
 
@@ -248,7 +221,7 @@ class Frames:
         if (shrunk := _shrunk(first := legend(_TEXT), SIZE[0] - 2 * _MARGIN - length - _BAR)) < 1:
             first.remove()
             legend(_TEXT * shrunk)
-        shown = ScalarMappable(Normalize(0, 1), TRAVERSABILITY_COLOURS)
+        shown = ScalarMappable(Normalize(0, 1), maps.TRAVERSABILITY_COLOURS)
         bar = self._axes(SIZE[0] - _MARGIN - _BAR, 34, _BAR - 10, 14)
         self._figure.colorbar(shown, cax=bar, orientation="horizontal", ticks=[0, 0.5, 1])
         bar.tick_params(labelsize=_TEXT, length=3)
@@ -314,8 +287,8 @@ class _Known:
     def __init__(self, panel: Axes, recording: Recording, image: AxesImage) -> None:
         self._recording, self._image, self._shown = recording, image, -1
         first = recording.known[0]
-        self._unseen = unseen_layer(first.seen, recording.resolution_m, _MARKS)
-        self._reach = reach_line(first.outline, _MARKS)
+        self._unseen = maps.unseen_layer(first.seen, recording.resolution_m, _MARKS)
+        self._reach = maps.reach_line(first.outline, _MARKS)
         panel.add_collection(self._unseen)
         panel.add_line(self._reach)
         self.moving: list[Artist] = [image, self._unseen, self._reach, *panel.spines.values()]
@@ -327,7 +300,7 @@ class _Known:
             return
         self._shown = known.step
         self._image.set_data(known_colours(known)["risk"])
-        self._unseen.set_segments(list(hatching(~known.seen, self._recording.resolution_m)))
+        self._unseen.set_segments(list(maps.hatching(~known.seen, self._recording.resolution_m)))
         self._reach.set_data(*known.outline.T)
 
 
@@ -336,7 +309,6 @@ class _Driver:
 
     Args:
         panel: which the map is drawn on.
-        shown: colours of the map, uint8 of shape [H, W, 3].
         recording: its episode.
         colour: of its path.
         style: of its path.
@@ -350,7 +322,6 @@ class _Driver:
     def __init__(
         self,
         panel: Axes,
-        shown: np.ndarray,
         recording: Recording,
         colour: str,
         style: Any,
@@ -358,23 +329,19 @@ class _Driver:
         known: _Known | None = None,
     ) -> None:
         self.recording, self.state, self._known = recording, state, known
-        planned = STYLES if state is not None else {}
-        self.layers = {name: plan_layer(look, scale=_MARKS) for name, look in planned.items()}
+        planned = maps.STYLES if state is not None else {}
+        self.layers = {name: maps.plan_layer(look, scale=_MARKS) for name, look in planned.items()}
         for layer in self.layers.values():
             panel.add_collection(layer)
-        self.path = [
-            panel.plot([], [], color="white", lw=_EDGE, solid_capstyle="round")[0],
-            panel.plot([], [], color=colour, lw=_PATH, ls=style, solid_capstyle="round")[0],
-        ]
+        track = recording.track
+        self.path = maps.draw_path(panel, track, _PATH, colour, ls=style, zorder=2)
         places = [
-            mark(panel, "start", recording.track[0], _MARKS),
-            mark(panel, "goal", recording.goal_m, _MARKS),
+            maps.mark(panel, "start", track[0], _MARKS),
+            maps.mark(panel, "goal", recording.goal_m, _MARKS),
         ]
-        looks = MARKS["robot"]
-        (self.robot,) = panel.plot([], [], **looks | {"ms": _MARKS * looks["ms"]})
-        self.end = mark_end(
-            panel, recording.about["outcome"], recording.track, recording.goal_m, recording.resolution_m, _MARKS, shown
-        )  # fmt: skip
+        self.robot = maps.mark(panel, "robot", track[0], _MARKS)
+        drive = maps.Drive(track=track, goal_m=recording.goal_m, outcome=recording.about["outcome"])
+        self.end = maps.mark_end(panel, drive, _MARKS)
         said = [] if state is None else [state]
         self.moving = [
             *(known.moving if known else ()),
@@ -382,7 +349,7 @@ class _Driver:
             *self.path,
             *places,
             self.robot,
-            *self.end,
+            self.end,
             *said,
         ]
 
@@ -398,18 +365,18 @@ class _Driver:
             line.set_data(*own.track[: now + 1].T)
         x, y, heading_rad = own.states[now, :3]
         self.robot.set_data([x], [y])
-        self.robot.set_marker(robot_marker(heading_rad))
-        # It would cover the cell that held it.
+        self.robot.set_marker(maps.robot_marker(heading_rad))
         self.robot.set_visible(not has_ended)
-        for artist in self.end:
-            artist.set_visible(has_ended)
+        self.end.set_visible(has_ended)
         plan = own.plan_at(time_s)
         for name, layer in self.layers.items():
             layer.set_segments([] if has_ended else list(plan.lines.get(name, ())))
         if self.state is None:
             return
         if has_ended:
-            arrived = own.about["outcome"] == "success"
-            self.state.set(text=f"{own.outcome}, {own.end_s:.1f} s", color=_ARRIVED if arrived else _FAILED)
+            is_success = own.about["outcome"] == "success"
+            self.state.set(
+                text=f"{own.outcome}, {own.end_s:.1f} s", color=_SUCCESS if is_success else _FAILED
+            )
         else:
             self.state.set(text=f"observed λ = {own.traversability[now]:.2f}", color="0.25")

@@ -14,16 +14,16 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from benchnav.core.figures import bytes_of, condition_colours, layer_scale
 from benchnav.core.grid import is_azimuth
 from benchnav.core.store import replacing
 from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.checksums import is_as_noted, note_checksums
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.plan_layers import MOST_SPREAD
 from benchnav.eval.report.playback.scene import TIMELINE, Driver, layer_entity, log_driver, log_ground
-from benchnav.eval.report.words import NAMING, contender_names, reading_name
+from benchnav.eval.words import NAMING, contender_names, reading_name
+from benchnav.viz.maps import MAX_SPREAD, layer_scale
+from benchnav.viz.style import bytes_of, condition_colours
 
 APPLICATION = "benchnav"
 
@@ -31,7 +31,7 @@ _ALONE = "#00aa00"
 # Maps of a robot that learns, by what their views are called.
 _LEARNT = {
     "mean": "Belief: mean of λ",
-    "spread": f"Belief: spread of λ, 0 to {MOST_SPREAD:g}",
+    "spread": f"Belief: spread of λ, 0 to {MAX_SPREAD:g}",
     "seen": "Seen light, λ sensed blue",
 }
 _ALL, _PLACES = "/map/overlay/**", "/map/places/**"

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchnav.core.command import Device
-from benchnav.models.quality.output import DPI, check_folder, open_maps, save_figures
+from benchnav.models.quality.output import check_folder, open_maps, save_figures
 
 if TYPE_CHECKING:
     import torch
@@ -188,9 +188,9 @@ def _notes(
 
 def _write(out: str, title: str, about: dict[str, Any], comparison: "Comparison", notes: list[str]) -> None:
     from benchnav.core.store import write_text
+    from benchnav.models.quality.compare.figures import comparison_figures
     from benchnav.models.quality.compare.report import (
         comparison_csv,
-        comparison_figures,
         comparison_json,
         comparison_markdown,
     )
@@ -199,10 +199,9 @@ def _write(out: str, title: str, about: dict[str, Any], comparison: "Comparison"
     write_text(folder / REPORT, comparison_json(about, comparison))
     write_text(folder / CSV, comparison_csv(comparison))
     write_text(folder / DIFFERENCES, comparison.pairs.to_csv(index=False, float_format="%.6g"))
-    drawn = comparison_figures(comparison)
-    save_figures(folder, drawn, DPI)
-    write_text(folder / PAGE, comparison_markdown(title, comparison, notes, list(drawn)))
-    print(f"wrote {REPORT}, {CSV}, {DIFFERENCES}, {PAGE} and {len(drawn)} figures in {out}")
+    figures = save_figures(folder, comparison_figures(comparison), comparison)
+    write_text(folder / PAGE, comparison_markdown(title, comparison, notes, figures))
+    print(f"wrote {REPORT}, {CSV}, {DIFFERENCES}, {PAGE} and {len(figures)} figures in {out}")
     print(f"columns and figures are explained in {folder / PAGE}")
 
 

@@ -1,15 +1,14 @@
 """A comparison of models in numbers and words: a table for each kind of file, and what columns and figures mean."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
 from benchnav.core.tables import NOTHING, Bold, Table
-from benchnav.datagen.recipe.scenario import find_series
 from benchnav.models.quality.map_sums import MapTally
 from benchnav.models.quality.output import json_text, page
 from benchnav.models.quality.scores_of_maps import COMPARED, SCORES, TAIL_RATES
@@ -18,9 +17,6 @@ from benchnav.stats.holm import ALPHA
 from benchnav.stats.scores import against_best, compare_pairs, summarise
 from benchnav.stats.tables import Column, Row, cell_of, labels_of, p_value, signed, signed_interval, table_of
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 # What a model costs, which stands in the table next to its scores: heading and meaning.
 COSTS = {
     "prediction_ms": ("ms a\nmap", "median time of predicting one map, in milliseconds."),
@@ -28,29 +24,6 @@ COSTS = {
 }
 PRIVILEGED_MARK = " †"
 _UNITS = ((1e6, 2, "M"), (1e3, 1, "k"), (1, 0, ""))  # size, decimal places and letter of a number of weights
-
-FIGURES = {
-    "measures": (
-        "Measures with their intervals",
-        "Each row is a model, each mark a split; lines are 95 % intervals over maps. ↑: higher is better, ↓: lower is "
-        "better. Grey: privileged models, which are given part of the truth.",
-    ),
-    "calibration": (
-        "Calibration of the predicted distributions of λ",
-        "Share of observed λ below a predicted quantile, less the level of the quantile, over that level. 0 is "
-        "calibrated. Above 0 at the left: bad ground is more frequent than predicted.",
-    ),
-    "sparsification": (
-        "Sparsification: uncertainty against error",
-        "Mean error |λ − E[λ]| of the remaining cells over the share of cells removed: the most uncertain first "
-        "(lines), or those of largest error first (dotted). The area between the two is AUSE.",
-    ),
-    "severity": (
-        "Quality over the severity of a shift",
-        "CRPS and pinball loss of the lower fifth over the severity of each scenario: 0 is the training maps, 1 the "
-        "scenario itself. Lines are 95 % intervals over maps.",
-    ),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +49,11 @@ class Comparison:
     def splits(self) -> list[str]:
         """Those that were measured."""
         return list(dict.fromkeys(self.summary["split"]))
+
+    @property
+    def privileged(self) -> list[str]:
+        """Models that are given part of the truth."""
+        return [label for label, about in self.models.items() if about["privileged"]]
 
     @property
     def numbers(self) -> pd.DataFrame:
@@ -217,7 +195,7 @@ def comparison_csv(comparison: Comparison) -> str:
 
 
 def comparison_markdown(
-    title: str, comparison: Comparison, notes: Sequence[str], figures: Sequence[str]
+    title: str, comparison: Comparison, notes: Sequence[str], figures: Sequence[tuple[str, str, str]]
 ) -> str:
     """Write the tables as a page with its figures, and what columns and figures mean.
 
@@ -225,25 +203,7 @@ def comparison_markdown(
         title: of the page.
         comparison: what was measured.
         notes: lines under the table.
-        figures: names of the figures, of `FIGURES`, whose images are in the folder `figures`.
+        figures: from `output.save_figures`.
     """
     tables = [comparison_table(title, comparison, whole=True), difference_table(comparison)]
-    captions = [(f"figures/{name}.png", *FIGURES[name]) for name in figures]
-    return page(title, [table for table in tables if table.rows], notes, captions)
-
-
-def comparison_figures(comparison: Comparison) -> "dict[str, Callable[[], Figure]]":
-    """Gives what draws the figures that apply, by name."""
-    from benchnav.models.quality.compare import figures
-
-    privileged = [label for label, about in comparison.models.items() if about["privileged"]]
-    looks = figures.model_looks(list(comparison.models), privileged)
-    headings = {score.name: score.title for score in COMPARED}
-    drawn: dict[str, Callable[[], Figure]] = {
-        "measures": partial(figures.measures_figure, comparison.summary, headings, looks, privileged),
-        "calibration": partial(figures.calibration_figure, comparison.tallies, looks),
-        "sparsification": partial(figures.sparsification_figure, comparison.tallies, looks),
-    }
-    if all_series := find_series(comparison.splits):
-        drawn["severity"] = partial(figures.severity_figure, all_series, comparison.summary, headings, looks)
-    return drawn
+    return page(title, [table for table in tables if table.rows], notes, figures)

@@ -9,9 +9,8 @@ import pytest
 from matplotlib.axes import Axes
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.figures import ROBOT, bytes_of, hatching
+from benchnav.eval.figures.knowledge import known_colours
 from benchnav.eval.recording import KnownMap, Recording
-from benchnav.eval.report.plan_layers import field_colours, known_colours, predicted_colours, shades
 from benchnav.eval.report.playback.video import (
     FRAMES_A_SECOND,
     HOLD_S,
@@ -21,7 +20,9 @@ from benchnav.eval.report.playback.video import (
     frame_times,
     write_video,
 )
-from benchnav.eval.report.words import condition_name
+from benchnav.eval.words import condition_name
+from benchnav.viz.maps import ROBOT, field_colours, hatching, predicted_colours, shades
+from benchnav.viz.style import bytes_of
 from tests.eval.report import made
 
 
@@ -104,13 +105,13 @@ def test_what_moves_is_told_in_words() -> None:
     np.testing.assert_array_equal(np.transpose(driver.path[0].get_data()), recording.track[:21])
     plan = recording.plan_at(2.0).lines["path"][0]
     np.testing.assert_array_equal(driver.layers["path"].get_segments()[0], plan)
-    assert not any(artist.get_visible() for artist in driver.end)
+    assert not driver.end.get_visible()
     assert driver.robot.get_visible()
     frames.draw(99.0)
     assert driver.state.get_text() == "immobilised, 8.0 s"
     assert not driver.layers["path"].get_segments()
     # It gives way to what says how it ended.
-    assert all(artist.get_visible() for artist in driver.end)
+    assert driver.end.get_visible()
     assert not driver.robot.get_visible()
 
 
@@ -136,11 +137,11 @@ def test_λ_hat_stands_beside_λ_as_it_was_which_episodes_share() -> None:
     )
 
 
-def test_where_λ_is_drawn_anew_its_mean_stands_beside() -> None:
+def test_where_λ_is_resampled_its_mean_stands_beside() -> None:
     recording = made.recording(20, plans=())
     frames = Frames([recording])
     np.testing.assert_array_equal(frames.truths[0].images[0].get_array(), shades(recording.true_mean))
-    assert "drawn anew" in words_of(frames.truths[0])
+    assert "resampled at each step" in words_of(frames.truths[0])
 
 
 def words_of(panel: Axes) -> str:
@@ -168,21 +169,12 @@ def test_the_scale_bar_is_as_long_as_it_says(cell_m: float, length_m: float) -> 
     assert f"{length_m:g} m" in [text.get_text() for text in frames._figure.texts]
 
 
-def test_how_an_episode_ended_stands_beside_the_cell_where_it_ended() -> None:
+def test_how_an_episode_ended_stands_where_it_ended() -> None:
     recording = made.held_recording(80)
     frames = Frames([recording])
     frames.draw(99.0)
-    cell_m, panel = recording.resolution_m, frames.truths[0]
-    cell, end = frames.drivers[1].end
-    column, row = np.floor(recording.track[-1] / cell_m).astype(int)
-    np.testing.assert_allclose(cell.get_xy().min(axis=0), cell_m * np.array([column, row]))
-    # The cell keeps the colour that it has on the map.
-    shown = panel.images[0].get_array()[row, column]
-    np.testing.assert_allclose(cell.get_facecolor()[:3], shown / 255)
-    middle = end.get_transform().transform(np.ravel(end.get_data()))
-    half = panel.transData.transform((cell_m, 0))[0] - panel.transData.transform((0, 0))[0]
-    apart = np.linalg.norm(middle - panel.transData.transform(cell_m * np.array([column + 0.5, row + 0.5])))
-    assert apart > half / 2 + end.get_markersize() / 72 * 100 / 2
+    for driver in frames.drivers:
+        np.testing.assert_array_equal(np.ravel(driver.end.get_data()), recording.track[-1])
 
 
 def test_the_legend_names_what_is_there() -> None:
@@ -194,12 +186,12 @@ def test_the_legend_names_what_is_there() -> None:
 
     ground = ["not free", "immobilises a robot"]
     assert named(taken)[:4] == ["start", "goal", "robot", "immobilised"]
-    assert named(taken)[-4:] == ["cell of the end", "driven", *ground]
+    assert named(taken)[-3:] == ["driven", *ground]
     everywhere = np.ones_like(taken.free)
     assert named(replace(taken, free=everywhere, immobilising=~everywhere))[-1] == "driven"
     assert "planned" not in named(replace(taken, plans=()))
     other = replace(taken, about=taken.about | {"outcome": "success", "planner": "other"})
-    assert named(taken, other)[3:5] == ["immobilised", "arrived"]
+    assert named(taken, other)[3:5] == ["immobilised", "success"]
     assert "driven, in the colour of its title" in named(taken, other)
 
 

@@ -5,11 +5,12 @@ import matplotlib
 import numpy as np
 import pytest
 
-from benchnav.core.figures import bytes_of, hatching
 from benchnav.core.grid import outline
+from benchnav.eval.figures.knowledge import known_colours
 from benchnav.eval.recording import MOST_POINTS, DrawnPlan, Recording, thinned
-from benchnav.eval.report.plan_layers import IMMOBILISING, field_colours, known_colours, layer_colours
 from benchnav.eval.report.playback.viewer_file import arrange, describe, drivers_of, map_views, write_rerun
+from benchnav.viz.maps import IMMOBILISING, field_colours, hatching, layer_colours
+from benchnav.viz.style import bytes_of
 from tests.eval.report import made
 from tests.eval.report.playback.rrd import chunks, column, image, read_path, static, verify
 

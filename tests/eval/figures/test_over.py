@@ -5,8 +5,8 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchnav.core.figures import risk_name
-from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_name
+from benchnav.eval.figures.over import draw_sweep, find_sweeps, sweep_name
+from benchnav.viz.style import risk_name
 from tests.eval.report import made
 
 
@@ -101,7 +101,7 @@ def drawn(*conditions: tuple[dict[str, str], int], **changes: Any) -> Figure:
         for labels, _ in conditions
     }
     ((number, lines),) = find_sweeps(known).items()
-    return curve_figure(number, lines, made.summarised(rows))
+    return draw_sweep(number, lines, made.summarised(rows))
 
 
 def shown(figure: Figure) -> list[Axes]:

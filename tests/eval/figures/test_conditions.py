@@ -7,14 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
-from benchnav.eval.report.charts.conditions import (
-    OUTCOME_COLOURS,
-    OUTCOME_HATCHES,
-    SUCCESS_COLOUR,
-    distribution_figure,
-    outcome_figure,
-    success_figure,
-)
+from benchnav.eval.figures.distributions import draw_distributions
+from benchnav.eval.figures.outcomes import LOOKS, SUCCESS_COLOUR, draw_outcomes
+from benchnav.eval.figures.success import draw_success
 from benchnav.planning.world.outcome import FAILURES
 from tests.eval.report import made
 
@@ -46,7 +41,7 @@ def test_each_rate_stands_at_its_name_with_its_interval() -> None:
             shares(made.condition(), 7), shares(made.condition("astar_dwa"), 8),
         )
     )  # fmt: skip
-    (panel,) = panels(success_figure(summary))
+    (panel,) = panels(draw_success(summary))
     expected = {"straight": 20, "A*+DWA, mean": 90, "A*+DWA, CVaR": 80, "MPPI, CVaR": 70}
     assert points(panel) == pytest.approx(expected)
     ends = {tuple(np.round(line.get_xdata(), 6)) for line in panel.lines if line.get_marker() == "None"}
@@ -64,7 +59,7 @@ def test_the_blind_baseline_is_a_line_through_its_own_panel() -> None:
             *(shares(made.condition(scenario=name), 10) for name in ("std", "hg")),
         )
     )
-    drawn = {panel.get_title(): panel for panel in panels(success_figure(summary))}
+    drawn = {panel.get_title(): panel for panel in panels(draw_success(summary))}
     for scenario, rate in (("std", 40), ("hg", 10)):
         (line,) = [line for line in drawn[scenario].lines if line.get_linestyle() == "--"]
         assert list(line.get_xdata()) == [rate, rate]
@@ -80,7 +75,7 @@ def test_any_number_of_planners_risks_and_scenarios_fit(
             for p in range(planners) for r in range(risks) for s in range(scenarios)
         )
     )  # fmt: skip
-    figure = success_figure(summary)
+    figure = draw_success(summary)
     assert len(panels(figure)) == scenarios
     for panel in panels(figure):
         assert len(points(figure.axes[0])) == planners * risks
@@ -98,7 +93,7 @@ def test_models_and_worlds_are_distinguished() -> None:
     several = [
         made.condition(model=model, world=world) for model in ("a", "b") for world in ("paper", "stakes")
     ]
-    figure = success_figure(
+    figure = draw_success(
         made.summarised(made.rows(*(shares(labels, n) for n, labels in enumerate(several))))
     )
     assert [panel.get_title() for panel in panels(figure)] == ["std, paper", "std, stakes"]
@@ -112,7 +107,7 @@ def test_one_that_is_told_λ_itself_is_named_by_its_model_and_is_not_drawn_as_bl
     told = made.condition("astar_dwa", "–", model="clairvoyant")
     for others in ((), (made.condition("astar_dwa", model="oracle"),)):
         labels = [made.condition(**BLIND), told, *others]
-        (panel,) = panels(success_figure(made.summarised(made.rows(*(shares(one, 5) for one in labels)))))
+        (panel,) = panels(draw_success(made.summarised(made.rows(*(shares(one, 5) for one in labels)))))
         named = [label.get_text() for label in panel.get_yticklabels()]
         assert named == ["straight", "A*+DWA, clairvoyant", "A*+DWA, oracle, CVaR"][: len(labels)]
         marked = [line for line in panel.lines if line.get_marker() == "o"]
@@ -124,7 +119,7 @@ def test_one_that_is_told_λ_itself_is_named_by_its_model_and_is_not_drawn_as_bl
 def test_a_setting_that_a_block_lacks_is_said_not_to_have_run() -> None:
     labels = [made.condition(), made.condition(risk="mean"), made.condition(risk="mean", scenario="hs")]
     summary = made.summarised(made.rows(*(shares(one, 5) for one in labels)))
-    for figure in (success_figure(summary), outcome_figure(summary)):
+    for figure in (draw_success(summary), draw_outcomes(summary)):
         names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
         heights = dict(zip(names, figure.axes[0].get_yticks(), strict=True))
         said = {
@@ -144,16 +139,16 @@ def test_points_are_filled_where_they_are_marked() -> None:
         made.rows(shares(made.condition(risk="a"), 9), shares(made.condition(risk="b"), 2))
     )
     first = summary["condition"] == summary["condition"][0]
-    (panel,) = panels(success_figure(summary.assign(best_marked=first)))
+    (panel,) = panels(draw_success(summary.assign(best_marked=first)))
     marked = [line for line in panel.lines if line.get_marker() == "o"]
     assert [to_rgb(line.get_markerfacecolor()) == (1, 1, 1) for line in marked] == [False, True]
 
 
 def test_figures_have_the_width_of_a_column_or_a_page() -> None:
     one = made.summarised(made.rows(shares(made.condition(), 5)))
-    assert success_figure(one).get_figwidth() * 25.4 == pytest.approx(88)
+    assert draw_success(one).get_figwidth() * 25.4 == pytest.approx(88)
     two = made.summarised(made.rows(*(shares(made.condition(scenario=name), 5) for name in ("std", "hg"))))
-    assert success_figure(two).get_figwidth() * 25.4 == pytest.approx(180)
+    assert draw_success(two).get_figwidth() * 25.4 == pytest.approx(180)
 
 
 def bars(panel: Axes) -> dict[float, list[tuple[str, float]]]:
@@ -167,13 +162,12 @@ def bars(panel: Axes) -> dict[float, list[tuple[str, float]]]:
 
 
 def test_every_failure_has_a_colour_of_its_own() -> None:
-    assert set(OUTCOME_COLOURS) == {outcome.name.lower() for outcome in FAILURES}
-    assert len({*OUTCOME_COLOURS.values(), SUCCESS_COLOUR}) == len(OUTCOME_COLOURS) + 1
+    assert set(LOOKS) == {outcome.name.lower() for outcome in FAILURES}
+    assert len({*(colour for colour, _ in LOOKS.values()), SUCCESS_COLOUR}) == len(LOOKS) + 1
 
 
 def test_outcomes_differ_in_grey_by_lightness_or_hatching() -> None:
-    assert OUTCOME_HATCHES.keys() == OUTCOME_COLOURS.keys()
-    looks = [(name, OUTCOME_COLOURS[name], OUTCOME_HATCHES[name]) for name in OUTCOME_COLOURS]
+    looks = [(name, *look) for name, look in LOOKS.items()]
     for (_, one, hatch), (_, other, beside) in itertools.combinations(
         [*looks, ("success", SUCCESS_COLOUR, "")], 2
     ):
@@ -182,16 +176,14 @@ def test_outcomes_differ_in_grey_by_lightness_or_hatching() -> None:
 
 
 def test_bars_are_hatched_as_their_outcomes_are() -> None:
-    rows = made.rows(
-        made.row(made.condition(), i, None, outcome=name) for i, name in enumerate(OUTCOME_HATCHES)
-    )
-    figure = outcome_figure(made.summarised(rows))
+    rows = made.rows(made.row(made.condition(), i, None, outcome=name) for i, name in enumerate(LOOKS))
+    figure = draw_outcomes(made.summarised(rows))
     drawn = {
         to_hex(bar.get_facecolor()).upper(): bar.get_hatch()
         for bar in figure.axes[0].patches
         if bar.get_width()
     }
-    assert drawn == {OUTCOME_COLOURS[name]: hatch for name, hatch in OUTCOME_HATCHES.items()}
+    assert drawn == dict(LOOKS.values())
 
 
 def test_shares_stand_in_one_order_and_fill_the_bar() -> None:
@@ -203,21 +195,21 @@ def test_shares_stand_in_one_order_and_fill_the_bar() -> None:
         (made.row(second, i, None, outcome="stuck") for i in range(1)),
         (made.row(second, i) for i in range(1, 4)),
     )
-    figure = outcome_figure(made.summarised(rows))
+    figure = draw_outcomes(made.summarised(rows))
     above, below = (drawn for _, drawn in sorted(bars(figure.axes[0]).items()))
     expected = [("immobilised", 20), ("stuck", 10), ("timeout", 20)]
     assert above == [
-        *((OUTCOME_COLOURS[name], pytest.approx(share)) for name, share in expected),
+        *((LOOKS[name][0], pytest.approx(share)) for name, share in expected),
         (SUCCESS_COLOUR, 50),
     ]
-    assert below == [(OUTCOME_COLOURS["stuck"], 25), (SUCCESS_COLOUR, 75)]
+    assert below == [(LOOKS["stuck"][0], 25), (SUCCESS_COLOUR, 75)]
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == ["immobilised", "stuck", "timeout", "success"]
 
 
 def test_each_scenario_has_its_panel() -> None:
     rows = made.rows(made.row(made.condition(scenario=name)) for name in ("std", "hg"))
-    figure = outcome_figure(made.summarised(rows))
+    figure = draw_outcomes(made.summarised(rows))
     assert [panel.get_title() for panel in figure.axes] == ["std", "hg"]
     assert figure.get_figwidth() * 25.4 == pytest.approx(180)
 
@@ -245,7 +237,7 @@ def test_every_episode_is_a_dot_under_its_quantity_and_its_condition() -> None:
         ),
         (made.row(made.condition("b"), i, 50.0, traversability=0.9) for i in range(2)),
     )
-    figure = distribution_figure(made.summarised(rows), rows)
+    figure = draw_distributions(made.summarised(rows), rows)
     times, met = figure.axes
     np.testing.assert_allclose(np.concatenate(dots(times)), [20, 30, 100, 50, 50])
     np.testing.assert_allclose(np.concatenate(dots(met)), [0, 0.1, 0.2, 0.9, 0.9], atol=1e-12)
@@ -266,12 +258,12 @@ def test_each_scenario_has_a_line_of_panels() -> None:
     rows = made.rows(
         made.row(made.condition(scenario=name), 0, 20.0 + n) for n, name in enumerate(("std", "hg"))
     )
-    figure = distribution_figure(made.summarised(rows), rows)
+    figure = draw_distributions(made.summarised(rows), rows)
     assert [panel.get_title() for panel in figure.axes] == ["std", "std", "hg", "hg"]
     assert [medians(panel) for panel in figure.axes] == [[20], [0.8], [21], [0.8]]
 
 
 def test_an_episode_that_met_nothing_is_no_dot() -> None:
     rows = made.rows(made.row(made.condition(), 0, None, traversability=np.nan))
-    _, met = distribution_figure(made.summarised(rows), rows).axes
-    assert not met.collections
+    _, met = draw_distributions(made.summarised(rows), rows).axes
+    assert not sum(len(np.asarray(group.get_offsets())) for group in met.collections)

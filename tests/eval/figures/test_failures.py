@@ -5,8 +5,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchnav.eval.report.charts.maps import failure_figure
-from benchnav.eval.report.failures import FailedLine, choose_failures
+from benchnav.eval.failures import FailedLine, choose_failures
+from benchnav.eval.figures.failures import draw_failures
 from tests.eval.report import made
 
 GENERATOR = np.random.default_rng(0)
@@ -28,11 +28,11 @@ def shown(rows: pd.DataFrame, **changes: Any) -> FailedLine:
     } | changes  # fmt: skip
     recordings = [
         replace(
-            made.recording(1),
-            states=np.array([[0.5, 0.5], [x, y]]),
+            made.recording(1, about={**made.condition(), "outcome": outcome}),
+            states=np.array([[0.5, 0.5, 0.0], [x, y, 0.0]], float),
             **ground | {"predicted": ground["predicted"] + GENERATOR.random((8, 12))},
         )
-        for x, y in rows[["x_m", "y_m"]].to_numpy()
+        for x, y, outcome in rows[["x_m", "y_m", "outcome"]].to_numpy()
     ]
     return FailedLine(name="MPPI, mean", failures=rows, recordings=recordings, among=9)
 
@@ -47,7 +47,7 @@ def test_each_outcome_is_shown_before_any_twice() -> None:
 def test_panels_say_where_when_and_why() -> None:
     rows = failures(["immobilised", "out_of_bounds"], x_m=[1.2, 6.5], last_traversability=[0.04, np.nan])
     line = shown(rows)
-    figure = failure_figure([line])
+    figure = draw_failures([line])
     panels = [panel for panel in figure.axes if panel.get_visible() and panel.get_title()]
     told = line.recordings[0].predicted[4, 2]
     assert [panel.get_title() for panel in panels] == [
@@ -59,14 +59,11 @@ def test_panels_say_where_when_and_why() -> None:
         np.testing.assert_array_equal(panel.images[0].get_array(), line.recordings[place].predicted)
         marked = [mark for mark in panel.lines if mark.get_marker() != "None"]
         marks = {mark.get_marker(): mark.get_xydata()[0].tolist() for mark in marked}
-        column, row = (int(rows.loc[place, name] / 0.5) for name in ("x_m", "y_m"))
-        (cell,) = panel.patches
-        np.testing.assert_allclose(cell.get_xy().min(axis=0), [0.5 * column, 0.5 * row])
-        assert ("X", "s")[place] in marks
+        assert marks[("X", "s")[place]] == rows.loc[place, ["x_m", "y_m"]].tolist()
         assert marks["*"] == [3, 3]
         assert marks["o"] == [0.5, 0.5]
     assert figure.get_figwidth() * 25.4 == pytest.approx(88)
-    wide = failure_figure([line, shown(failures(["stuck"] * 3))])
+    wide = draw_failures([line, shown(failures(["stuck"] * 3))])
     assert wide.get_figwidth() * 25.4 == pytest.approx(180)
 
 
@@ -74,10 +71,10 @@ def test_ground_that_immobilises_a_robot_is_drawn_and_named_where_there_is_such(
     rows = failures(["immobilised"])
     immobilising = np.zeros((8, 12), bool)
     immobilising[3, 4] = True
-    figure = failure_figure([shown(rows, immobilising=immobilising)])
-    alpha = np.asarray(figure.axes[0].images[1].get_array())[..., 3]
-    assert (alpha > 0).tolist() == immobilising.tolist()
+    figure = draw_failures([shown(rows, immobilising=immobilising)])
+    drawn = np.ma.getmaskarray(figure.axes[0].images[1].get_array())
+    assert (~drawn).tolist() == immobilising.tolist()
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["immobilises a robot", "driven", "start", "goal", "immobilised", "cell of the end"]
-    plain = failure_figure([shown(rows)])
+    assert names == ["immobilises a robot", "driven", "start", "goal", "immobilised"]
+    plain = draw_failures([shown(rows)])
     assert "immobilises a robot" not in [text.get_text() for text in plain.legends[0].get_texts()]

@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.figures import MARKS, planner_colours, save_twice
-from benchnav.eval.recording import GROUND, Ground
-from benchnav.eval.report import write
-from benchnav.eval.report.charts.maps import driven_figure, read_driven
-from benchnav.eval.report.plan_layers import IMMOBILISING
+from benchnav.eval.figures.data import Driven, RunData, read_driven
+from benchnav.eval.figures.driven import DrivenPaths, draw_driven
+from benchnav.eval.recording import GROUND, Ground, Recording
+from benchnav.viz.maps import IMMOBILISING, MARKS
+from benchnav.viz.style import planner_colours
 from tests.eval.forged import forge_steps
 from tests.eval.report import made
 from tests.eval.report.test_write import run_folder
@@ -61,7 +62,7 @@ def drawn(figure: Any) -> tuple[Axes, dict[str, np.ndarray]]:
 
 def test_every_path_is_drawn_to_its_end_with_its_outcome() -> None:
     rows = episodes({1: [True, False, True]})
-    panel, lines = drawn(driven_figure(ground(), rows, [track(i) for i in range(3)]))
+    panel, lines = drawn(draw_driven(Driven(ground=ground(), rows=rows, tracks=[track(i) for i in range(3)])))
     for place, label in enumerate(
         ("mean: success, 30 s", "CVaR₀.₅: timeout, 100 s", "CVaR₀.₉: success, 32 s")
     ):
@@ -69,11 +70,7 @@ def test_every_path_is_drawn_to_its_end_with_its_outcome() -> None:
     np.testing.assert_array_equal(lines["goal"], [[24, 15]])
     np.testing.assert_array_equal(lines["start"], track(0)[:1])
     (end,) = [line for line in panel.lines if line.get_marker() is MARKS["out of time"]["marker"]]
-    # Beside the cell in which it ended, which is outlined.
-    (cell,) = [patch for patch in panel.patches if len(patch.get_xy()) == 5]
-    np.testing.assert_array_equal(cell.get_xy().min(axis=0), 0.5 * np.floor(track(1)[-1] / 0.5))
-    middle = cell.get_xy()[:4].mean(axis=0)
-    assert np.linalg.norm(np.ravel(end.get_data()) - middle) == pytest.approx(0.35)
+    np.testing.assert_array_equal(np.ravel(end.get_data()), track(1)[-1])
     labelled = [line for line in panel.lines if " s" in line.get_label()]
     assert end.get_color() == labelled[1].get_color()
     assert len({line.get_color() for line in labelled}) == 3
@@ -83,30 +80,35 @@ def test_every_path_is_drawn_to_its_end_with_its_outcome() -> None:
 
 def test_an_end_says_how_it_ended() -> None:
     rows = episodes({1: [False, False, False]}).assign(outcome=["immobilised", "stuck", "planner_error"])
-    figure = driven_figure(ground(), rows, [track(i) for i in range(3)])
-    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    figure = draw_driven(Driven(ground=ground(), rows=rows, tracks=[track(i) for i in range(3)]))
+    names = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     ends = [f"{name}, in the colour of its path" for name in ("immobilised", "out of time", "failed")]
-    assert names[-4:] == [*ends, "cell of the end"]
-    assert names.count("cell of the end") == 1
+    assert names[-3:] == ends
     assert [name for name in names if " s" in name] == names[:3], "paths come first"
     drawn_marks = [line.get_marker() for line in figure.axes[0].lines]
     assert all(MARKS[name]["marker"] in drawn_marks for name in ("immobilised", "out of time", "failed"))
 
 
-def test_ends_that_coincide_are_all_seen() -> None:
+def test_ends_that_coincide_stand_apart_each_joined_to_where_it_is() -> None:
     rows = episodes({1: [False, False, False]})
-    panel, _ = drawn(driven_figure(ground(), rows, [track(0)] * 3))
+    tracks = [track(0) + np.float32(0.1 * place) for place in range(3)]
+    panel, _ = drawn(draw_driven(Driven(ground=ground(), rows=rows, tracks=tracks)))
     ends = [line for line in panel.lines if line.get_marker() is MARKS["out of time"]["marker"]]
-    sizes = [line.get_markersize() for line in ends]
-    assert sizes == sorted(sizes, reverse=True)
-    assert len(set(sizes)) == 3
+    boxes = [line.get_window_extent() for line in ends]
+    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+    for end, own in zip(ends, tracks, strict=True):
+        (line,) = [
+            line for line in panel.lines if line.get_color() == end.get_color() and len(line.get_xdata()) == 2
+        ]
+        joined = np.array(line.get_data()).T
+        np.testing.assert_allclose(joined, [own[-1], np.ravel(end.get_data())])
 
 
 def test_the_title_and_the_legend_are_apart_and_planners_go_by_their_names() -> None:
     rows = made.rows(made.row(made.condition(name, world="stakes"), 1) for name in ("astar_dwa", "mppi"))
-    figure = driven_figure(ground(), rows, [track(0), track(1)])
+    figure = draw_driven(Driven(ground=ground(), rows=rows, tracks=[track(0), track(1)]))
     figure.draw_without_rendering()
-    (legend,) = figure.legends
+    legend = figure.axes[0].get_legend()
     assert not figure.axes[0].title.get_window_extent().overlaps(legend.get_window_extent())
     assert legend.get_texts()[0].get_text() == "A*+DWA: success, 30 s"
     colours = [line.get_color() for line in legend.get_lines()[:2]]
@@ -115,15 +117,19 @@ def test_the_title_and_the_legend_are_apart_and_planners_go_by_their_names() -> 
 
 def test_what_immobilises_a_robot_stands_out_and_resampled_ground_is_faded_terrain() -> None:
     rows = episodes({1: [True]})
-    panel, _ = drawn(driven_figure(ground(), rows, [track(0)]))
+    panel, _ = drawn(draw_driven(Driven(ground=ground(), rows=rows, tracks=[track(0)])))
     shown = np.asarray(panel.images[0].get_array())
     red = np.isclose(shown, np.array(to_rgb(IMMOBILISING))).all(axis=-1)
     np.testing.assert_array_equal(red, ground().immobilising)
     greys = shown[~ground().immobilising]
     assert (np.diff(greys[:, 0]) >= 0).all()
     faded = ground(field=None, immobilising=np.zeros((40, 60), bool))
-    panel, _ = drawn(driven_figure(faded, rows, [track(0)]))
+    panel, _ = drawn(draw_driven(Driven(ground=faded, rows=rows, tracks=[track(0)])))
     np.testing.assert_allclose(np.asarray(panel.images[0].get_array()), 0.6 + 0.4 * 100 / 255)
+
+
+def run_data(folder: Path, rows: pd.DataFrame, **more: Any) -> RunData:
+    return RunData(about={}, summary=made.summarised(rows), episodes=rows, folder=folder, **more)
 
 
 def with_steps(folder: Path, rows: pd.DataFrame) -> None:
@@ -149,15 +155,16 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(tmp_path: Path) -> None:
     ground().save(folder / GROUND)
     driven = read_driven(folder, rows)
     assert driven
-    name, caption, figure = write._driven(*driven)
-    assert name == "driven"
-    assert "std, map 1, seed 0, realisation 0. On this map outcomes differ most." in caption
-    _, own, tracks = driven
-    assert own["map"].tolist() == [1, 1, 1]
-    for place, positions in enumerate(tracks):
+    data = run_data(folder, rows)
+    assert DrivenPaths().needs(data)
+    assert "std, map 1, seed 0, realisation 0. On this map outcomes differ most." in DrivenPaths().caption(
+        data
+    )
+    assert driven.rows["map"].tolist() == [1, 1, 1]
+    for place, positions in enumerate(driven.tracks):
         np.testing.assert_allclose(positions, track(place) + 1)
-    save_twice(figure, tmp_path / "driven.png")
-    assert (tmp_path / "driven.png").stat().st_size > 5000
+    _, lines = drawn(DrivenPaths()(data))
+    np.testing.assert_allclose(lines["CVaR₀.₉: success, 32 s"], track(2) + 1)
 
 
 @pytest.mark.parametrize(("seed", "realisation"), [(0, 0), (0, 1), (7, 0), (7, 1)])
@@ -169,11 +176,10 @@ def test_the_paths_are_those_of_the_maps_own_noise(seed: int, realisation: int, 
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground(about={**ground().about, "seed": seed, "realisation": realisation}).save(folder / GROUND)
-    driven = read_driven(folder, rows)
-    assert driven
-    _, caption, _ = write._driven(*driven)
-    assert f"std, map 1, seed {seed}, realisation {realisation}." in caption
-    _, own, tracks = driven
+    data = run_data(folder, rows)
+    assert f"std, map 1, seed {seed}, realisation {realisation}." in DrivenPaths().caption(data)
+    assert data.driven
+    own, tracks = data.driven.rows, data.driven.tracks
     assert own["risk"].tolist() == list(RISKS)
     assert set(zip(own["seed"], own["realisation"], own["map"], strict=True)) == {(seed, realisation, 1)}
     for place, positions in enumerate(tracks):
@@ -191,8 +197,7 @@ def test_the_paths_are_those_of_the_maps_own_noise(seed: int, realisation: int, 
 def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(
     arrives: Callable[[int], bool], wanted: list[int], tmp_path: Path
 ) -> None:
-    most = write._MOST_PATHS
-    assert most == 8
+    most = 8
     rows = made.rows(
         made.row(
             made.condition(risk=f"cvar:0.{i:02}", world="stakes"), map_index, 30.0 if arrives(i) else None
@@ -203,17 +208,18 @@ def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground().save(folder / GROUND)
-    driven = read_driven(folder, rows)
-    assert driven
-    _, caption, figure = write._driven(*driven)
-    assert f" Shown are {most} of {most + 2} conditions, as many that arrived as not" in caption
-    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    data = run_data(folder, rows)
+    words = f" Shown are {most} of {most + 2} conditions, as many successes as failures"
+    assert words in DrivenPaths().caption(data)
+    figure = DrivenPaths()(data)
+    legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     assert [name.split(":")[0] for name in legend[:most]] == [f"CVaR₀.₀{'₀₁₂₃₄₅₆₇₈₉'[i]}" for i in wanted]
     _, lines = drawn(figure)
     for place, name in zip(wanted, legend, strict=False):
         np.testing.assert_allclose(lines[name], track(place) + 1)
-    _, caption, _ = write._driven(driven[0], driven[1].iloc[:most], driven[2][:most])
-    assert "Shown are" not in caption
+    assert data.driven
+    fewer = rows[rows["condition"].isin(data.driven.rows["condition"][:most])]
+    assert "Shown are" not in DrivenPaths().caption(run_data(folder, fewer))
 
 
 def test_trajectories_are_of_that_map_as_many_that_arrived_as_not() -> None:
@@ -234,14 +240,20 @@ def test_trajectories_are_of_that_map_as_many_that_arrived_as_not() -> None:
         asked.extend(wanted["risk"])
         return [wanted["risk"].iloc[0]]
 
-    assert write._on_one_map(rows, [kept, other], again) == [kept, "cvar:0.1", "cvar:0.4", "cvar:0.5"]
+    def shown(recordings: list[Recording], record: Any) -> list[Any]:
+        data = RunData(about={}, summary=rows, episodes=rows, record_driven=record)
+        # As read of the folder of a run.
+        vars(data).update(recordings=recordings, driven=Driven(ground=ground(), rows=rows, tracks=()))
+        return data.on_one_map
+
+    assert shown([kept, other], again) == [kept, "cvar:0.1", "cvar:0.4", "cvar:0.5"]
     assert asked == ["cvar:0.1", "cvar:0.4", "cvar:0.5"]
-    assert write._on_one_map(rows, [kept], None) == []
+    assert shown([kept], None) == []
 
     def gone(wanted: pd.DataFrame) -> list[Any]:
         raise ConfigError("Expected the maps, got none.")
 
-    assert write._on_one_map(rows, [kept], gone) == []
+    assert shown([kept], gone) == []
 
 
 def test_the_map_comes_back_as_it_was(tmp_path: Path) -> None:

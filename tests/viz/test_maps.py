@@ -1,14 +1,27 @@
 """What the ground looks like, against a model of colour blindness."""
 
+from typing import Any
+
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-from benchnav.core.figures import MARKS, bytes_of
-from benchnav.eval.report.plan_layers import IMMOBILISING, end_mark, field_colours, mark_end
 from benchnav.planning.world.outcome import Outcome
+from benchnav.viz.maps import (
+    IMMOBILISING,
+    MARKS,
+    Drive,
+    draw_drive,
+    draw_scale,
+    end_mark,
+    field_colours,
+    scale_length,
+)
+from benchnav.viz.style import bytes_of
 
 # Machado, Oliveira and Fernandes (2009), full severity, on linear RGB.
 SEEN = {
@@ -55,33 +68,42 @@ def test_cells_have_the_colour_of_their_own_traversability_or_that_of_what_holds
 def test_each_outcome_has_a_mark() -> None:
     marks = {outcome.name.lower(): end_mark(outcome.name.lower()) for outcome in Outcome}
     assert set(marks.values()) <= MARKS.keys()
-    assert [name for name, mark in marks.items() if mark == "arrived"] == ["success"]
+    assert [name for name, mark in marks.items() if mark == "success"] == ["success"]
     assert [name for name, mark in marks.items() if mark == "immobilised"] == ["immobilised"]
     # What stood still until its time was up is out of time too.
     assert [name for name, mark in marks.items() if mark == "out of time"] == ["timeout", "stuck", "stalled"]
 
 
-@pytest.mark.parametrize("goal_m", [(6.0, 4.5), (6.0, 1.5)])
-def test_an_end_is_marked_beside_its_cell_on_the_side_away_from_the_goal(goal_m: tuple[float, float]) -> None:
-    panel = Figure(figsize=(4, 3), dpi=100).add_axes((0, 0, 1, 1))
+def drawn_marks(**changes: Any) -> tuple[Axes, dict[str, Line2D]]:
+    panel = Figure(figsize=(4, 3), dpi=72).add_axes((0, 0, 1, 1))
     panel.set(xlim=(0, 8), ylim=(0, 6))
-    # It came along x, and ended in the cell from (3.5, 3) to (4, 3.5).
     track = np.stack((np.linspace(0.2, 3.8, 37), np.full(37, 3.2)), axis=1)
-    cell, mark = mark_end(panel, "immobilised", track, np.array(goal_m), 0.5, color="red", label="held")
-    assert cell.get_path().get_extents().bounds == (3.5, 3.0, 0.5, 0.5)
-    assert (mark.get_marker(), mark.get_color(), mark.get_label()) == ("X", "red", "held")
-    x, y = mark.get_transform().transform(np.ravel(mark.get_data()))
-    middle_x, middle_y = panel.transData.transform((3.75, 3.25))
-    assert x == pytest.approx(middle_x)
-    assert (y > middle_y) == (goal_m[1] < 3)
-    # 25 pixels are half a metre; a point is 100 / 72 of a pixel.
-    assert abs(y - middle_y) - mark.get_markersize() / 2 * 100 / 72 > 12.5
+    draw_drive(panel, Drive(track=track, goal_m=np.array([4.5, 3.2]), **changes))
+    return panel, {str(line.get_label()): line for line in panel.lines}
 
 
-def test_an_end_off_the_map_or_at_the_start_is_marked_too() -> None:
+def test_an_end_is_marked_where_it_is_and_a_goal_that_was_reached_stays_in_sight() -> None:
+    _, marks = drawn_marks(outcome="immobilised")
+    np.testing.assert_allclose(np.ravel(marks["immobilised"].get_data()), (3.8, 3.2))
+    assert "robot" not in marks
+    panel, marks = drawn_marks(outcome="success")
+    tick = marks["success"]
+    position = tick.get_transform().transform(np.ravel(tick.get_data()))
+    end = panel.transData.transform((3.8, 3.2))
+    # At 72 dots an inch a pixel is a point; the goal lies along x.
+    np.testing.assert_allclose(position - end, (-0.9 * tick.get_markersize(), 0), atol=1e-9)
+
+
+def test_a_robot_that_drives_is_shown_with_its_heading() -> None:
+    _, marks = drawn_marks(heading_rad=1.0)
+    np.testing.assert_allclose(np.ravel(marks["robot"].get_data()), (3.8, 3.2))
+    assert not {"success", "immobilised"} & marks.keys()
+
+
+@pytest.mark.parametrize(("width_m", "length_m"), [(32.0, 10.0), (1.2, 0.5), (500.0, 100.0), (28.0, 5.0)])
+def test_a_scale_bar_is_as_long_as_it_says(width_m: float, length_m: float) -> None:
+    assert scale_length(width_m) == length_m
     panel = Figure().add_axes((0, 0, 1, 1))
-    for track in (np.array([[1.0, 1.0]]), np.array([[1.0, 1.0], [-0.2, 9.0]])):
-        ground = np.zeros((4, 4, 3), np.uint8)
-        cell, mark = mark_end(panel, "timeout", track, np.array([2.0, 2.0]), 0.5, ground=ground)
-        assert np.isfinite(mark.get_xydata()).all()
-        assert cell.get_fill() == (len(track) == 1) or cell.get_facecolor()[3] == 0
+    draw_scale(panel, (width_m, 20.0))
+    assert list(panel.lines[0].get_xdata()) == [0, length_m]
+    assert panel.texts[0].get_text() == f"{length_m:g} m"

@@ -1,4 +1,4 @@
-"""One style for the figures of datasets, models and evaluation: sizes, colours, marks, names, and how they are saved.
+"""One style for the figures of datasets, models, runs and pages: sizes, colours, names, layout, and saving.
 
 Sizes are in inches and points as printed. Colours are distinct to every kind of colour vision. Source: Okabe and
 Ito (2008), "Color universal design".
@@ -6,29 +6,25 @@ Ito (2008), "Color universal design".
 
 import itertools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.colors import Colormap, to_rgba
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
-from matplotlib.lines import Line2D
-from matplotlib.markers import MarkerStyle
-from matplotlib.path import Path as MarkerPath
-from matplotlib.transforms import Affine2D, Bbox, ScaledTranslation
+from matplotlib.transforms import Bbox, ScaledTranslation
 
-from benchnav.core.grid import is_azimuth
 from benchnav.core.store import replacing
 
 # Widths of a journal's column and of a page.
 ONE_COLUMN_IN, TWO_COLUMNS_IN = 88 / 25.4, 180 / 25.4
 TEXT, TITLE = 7.0, 8.0
 _STRIP_IN = 0.2
+_MIN_WIDTH_IN = 4.4  # of a figure with a legend of several columns
 DPI = 200
 
 _STYLE: dict[Any, Any] = {
@@ -52,12 +48,6 @@ COLOURS = (BLUE, ORANGE, GREEN, PINK, AMBER, SKY, "#000000", "#F0E442")
 LINE_COLOURS = COLOURS[:-1]
 BLIND = "0.45"
 
-TRAVERSABILITY_COLOURS = "viridis"
-_LAYER_COLOURS, _DIRECTION_COLOURS = "YlGnBu", "twilight"
-_HATCH_CELLS = 4
-# Of cells of which nothing is known.
-LACKING = "0.7"
-
 MARKERS = "osD^vP*X<"
 # Of paths and curves that lie over each other, which grey tells apart by these.
 LINE_STYLES: tuple[Any, ...] = (
@@ -67,30 +57,6 @@ LINE_STYLES: tuple[Any, ...] = (
     (0, (5, 1.2, 1, 1.2)),
     (0, (5, 1.2, 1, 1.2, 1, 1.2)),
 )
-# A tick, an hourglass and an arrowhead along x; a shape says in grey too how an episode ended.
-_TICK, _HOURGLASS, _ARROWHEAD = (
-    MarkerPath([*corners, corners[0]], closed=True)
-    for corners in (
-        [(-1, 0.05), (-0.62, 0.43), (-0.25, 0.05), (0.66, 0.95), (1, 0.6), (-0.25, -0.75)],
-        [(-0.8, 1), (0.8, 1), (-0.8, -1), (0.8, -1)],
-        [(1, 0), (-0.8, 0.7), (-0.4, 0), (-0.8, -0.7)],
-    )
-)
-ROBOT = "#ff7800"  # as no λ is coloured
-
-# What stands at a place on a map, for `Axes.plot`.
-_WHITE_EDGED: dict[str, Any] = {"ls": "none", "mec": "white", "mew": 0.8, "zorder": 3}
-_END: dict[str, Any] = {**_WHITE_EDGED, "color": "black", "ms": 7, "zorder": 4}
-MARKS: dict[str, dict[str, Any]] = {
-    "start": {**_WHITE_EDGED, "marker": "o", "color": "#e61e1e", "ms": 5},
-    "goal": {**_WHITE_EDGED, "marker": "*", "color": "#ff00ff", "ms": 9},
-    "robot": {**_WHITE_EDGED, "marker": _ARROWHEAD, "color": ROBOT, "mec": "black", "ms": 8, "zorder": 3.5},
-    "arrived": {**_END, "marker": _TICK, "ms": 8},
-    "immobilised": {**_END, "marker": "X"},
-    "out of time": {**_END, "marker": _HOURGLASS},
-    "failed": {**_END, "marker": "s", "ms": 6},
-}
-
 _PLANNERS = {
     "astar_dwa": ("A*+DWA", BLUE),
     "astar_mppi": ("A*+MPPI", PINK),
@@ -169,78 +135,9 @@ def bytes_of(colour: Any) -> tuple[int, ...]:
     return tuple(round(255 * value) for value in to_rgba(colour))
 
 
-def mark(panel: Axes, name: str, place: Any, scale: float = 1.0, **style: Any) -> Line2D:
-    """Marks a place on a map; gives the mark.
-
-    Args:
-        panel: in metres.
-        name: of `MARKS`.
-        place: (x, y).
-        scale: of the mark's size.
-        **style: what differs, as in `Axes.plot`; a legend calls the mark by its name, unless a `label` is there.
-    """
-    looks = MARKS[name] | {"label": name, "ms": scale * MARKS[name]["ms"]}
-    (drawn,) = panel.plot(*place, **looks | style)
-    return drawn
-
-
-def mark_handle(name: str, scale: float = 1.0) -> Line2D:
-    """The entry of a legend for a mark."""
-    return Line2D([], [], **MARKS[name] | {"label": name, "ms": scale * MARKS[name]["ms"]})
-
-
 def line_style(place: int) -> Any:
     """The style of the line that is drawn in this place among others."""
     return LINE_STYLES[place % len(LINE_STYLES)]
-
-
-def robot_marker(heading_rad: float) -> MarkerStyle:
-    """The mark of a robot that heads somewhere, as the `marker` of a line."""
-    return MarkerStyle(_ARROWHEAD, transform=Affine2D().rotate(float(heading_rad)))
-
-
-def draw_edged(panel: Axes, track: Any, width: float, colour: Any = "black", **style: Any) -> None:
-    """Draws a path over a map, on a white edge that parts it from any colour.
-
-    Args:
-        panel: in metres.
-        track: positions, shape [N, 2].
-        width: in points.
-        colour: of the path.
-        **style: of the path, as in `Axes.plot`.
-    """
-    panel.plot(*track.T, color="white", lw=width + 1.4, solid_capstyle="round", zorder=1.9)
-    panel.plot(*track.T, color=colour, lw=width, solid_capstyle="round", **style)
-
-
-def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) -> Any:
-    """Draws a map with its first row at the bottom and its axes in metres, which end where it ends; gives the image.
-
-    Args:
-        panel: where.
-        values: shape [H, W], or [H, W, 3] of colours.
-        extent_m: width and height.
-        **style: as in `Axes.imshow`.
-    """
-    width, height = map(float, extent_m)
-    panel.set(xlim=(0, width), ylim=(0, height))
-    return panel.imshow(values, origin="lower", extent=(0, width, 0, height), interpolation="none", **style)
-
-
-def hatching(region: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Draws diagonals through a region, which tell it from what it surrounds.
-
-    Args:
-        region: bool, shape [H, W].
-        resolution_m: edge length of a cell.
-
-    Returns:
-        Both ends (x, y) of each diagonal of a cell in metres, float32, shape [M, 2, 2].
-    """
-    rows, columns = np.nonzero(region)
-    drawn = (rows - columns) % _HATCH_CELLS == 0
-    corners = np.stack((columns[drawn], rows[drawn]), axis=1)
-    return (np.stack((corners, corners + 1), axis=1) * resolution_m).astype(np.float32)
 
 
 def stack_panels(figure: Figure, count: int, across: int, layers: int = 1, **shared: Any) -> list[Any]:
@@ -258,7 +155,7 @@ def stack_panels(figure: Figure, count: int, across: int, layers: int = 1, **sha
     """
     down = -(-count // across)
     panels = figure.subplots(layers * down, across, squeeze=False, **shared)
-    stacks = [stack for row in np.split(panels, down) for stack in row.T]
+    stacks = [list(stack) for row in np.split(panels, down) for stack in row.T]
     for place in range(count, len(stacks)):
         for panel in stacks[place]:
             panel.remove()
@@ -283,10 +180,15 @@ def legend_outside(
     return figure.legend(handles=[*labelled.values(), *handles], loc="outside " + side, ncols=columns)
 
 
-def frame_map(panel: Axes) -> None:
-    """Gives a map's panel a frame all around, and numbers that are close to it."""
-    panel.tick_params(pad=1.5)
-    panel.spines[:].set_visible(True)
+def explain(figure: Figure, columns: int = 4, handles: Sequence[Artist] = ()) -> None:
+    """Lay a legend over the panels, in at most so many columns where the figure is of full width."""
+    is_full = figure.get_figwidth() >= TWO_COLUMNS_IN
+    legend_outside(figure, handles, columns if is_full else columns - 2, "upper center")
+
+
+def page_width(count: int, across: int) -> float:
+    """Return the width in inches of a figure with some places, of which so many fill both columns of a page."""
+    return max(TWO_COLUMNS_IN * min(count, across) / across, _MIN_WIDTH_IN)
 
 
 def save(
@@ -338,20 +240,3 @@ def save_twice(figure: Figure, path: Path, trim: bool = False, dpi: float = DPI,
     for suffix in (".png", ".pdf"):
         with replacing(path.with_suffix(suffix)) as partial:
             save(figure, partial, suffix[1:], dpi, trim, _STRIP_IN if mark else 0.0)
-
-
-def layer_scale(name: str, values: np.ndarray) -> dict[str, Any]:
-    """How a layer is coloured, as keywords of `imshow`: from 0 or below to its greatest value, or around the compass.
-
-    Args:
-        name: of the layer; one that ends in `_azimuth_deg` holds directions.
-        values: of any shape, NaN where nothing is known.
-    """
-    if is_azimuth(name):
-        return {"cmap": _colour_map(_DIRECTION_COLOURS), "vmin": 0.0, "vmax": 360.0}
-    low, high = (float(end(values[np.isfinite(values)], initial=0.0)) for end in (np.min, np.max))
-    return {"cmap": _colour_map(_LAYER_COLOURS), "vmin": low, "vmax": high if high > low else low + 1.0}
-
-
-def _colour_map(name: str) -> Colormap:
-    return matplotlib.colormaps[name].with_extremes(bad=LACKING)

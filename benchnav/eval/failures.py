@@ -17,8 +17,8 @@ from benchnav.core.errors import BenchnavError
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.steps import open_steps, rows_of
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.words import blocks, with_names
 from benchnav.eval.stats.best import competing
+from benchnav.eval.words import blocks, with_names
 
 # Gives a recording of each of some failures of one condition, rows of `failures_table`.
 RecordDriven = Callable[[pd.DataFrame], Sequence[Recording]]

@@ -10,18 +10,15 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, hatching, robot_marker
 from benchnav.core.grid import outline
+from benchnav.eval.figures.knowledge import draw_knowledge
+from benchnav.eval.figures.learning import METRICS, draw_learning, read_learning
 from benchnav.eval.folder.sealed import read_sealed
 from benchnav.eval.recording import Recording
 from benchnav.eval.report import write
-from benchnav.eval.report.charts.knowledge import (
-    METRICS,
-    knowledge_figure,
-    learning_figure,
-    read_learning,
-)
 from benchnav.stats.bootstrap import LEAST_MAPS
+from benchnav.viz.maps import MARKS, hatching, robot_marker
+from benchnav.viz.style import TWO_COLUMNS_IN
 from tests.eval.forged import forge_steps
 from tests.eval.report import made
 from tests.eval.report.test_write import run_folder
@@ -53,7 +50,7 @@ def names_in_legend(figure: Figure) -> list[str]:
 
 def test_four_moments_from_start_to_end_show_what_was_known_by_then() -> None:
     recording = made.learning_recording(100)
-    figure = knowledge_figure(recording)
+    figure = draw_knowledge(recording)
     assert figure.get_figwidth() == TWO_COLUMNS_IN
     shown = moments(figure)
     for step, panels in zip((0, 33, 67, 100), shown, strict=True):
@@ -64,7 +61,7 @@ def test_four_moments_from_start_to_end_show_what_was_known_by_then() -> None:
             image, veil = panel.get_images()
             np.testing.assert_array_equal(image.get_array(), values)
             assert image.get_clim() == (0, most)
-            np.testing.assert_array_equal(veil.get_array()[..., 3] > 0, ~known.seen)
+            np.testing.assert_array_equal(np.ma.getmaskarray(veil.get_array()), known.seen)
             assert lines_of(panel) == [
                 as_lines(hatching(~known.seen, 0.5)),
                 as_lines(outline(known.sensed, 0.5)),
@@ -81,7 +78,7 @@ def test_four_moments_from_start_to_end_show_what_was_known_by_then() -> None:
 
 def test_the_robot_stands_where_it_was_and_its_end_is_marked() -> None:
     recording = made.learning_recording(100)
-    *before, last = moments(knowledge_figure(recording))
+    *before, last = moments(draw_knowledge(recording))
     for step, panels in zip((0, 33, 67), before, strict=True):
         heading = robot_marker(recording.states[step, 2]).get_transform().get_matrix()
         for panel in panels:
@@ -100,19 +97,19 @@ def test_the_robot_stands_where_it_was_and_its_end_is_marked() -> None:
 def test_the_legend_names_what_there_is_alone() -> None:
     recording = made.learning_recording(100)
     ground = ["edge of where λ was sensed", "not seen", "reach of the sensors"]
-    names = names_in_legend(knowledge_figure(recording))
-    assert names == ["driven", "start", "goal", "robot", "immobilised", "cell of the end", *ground]
+    names = names_in_legend(draw_knowledge(recording))
+    assert names == ["driven", "start", "goal", "robot", "immobilised", *ground]
     bare: list[Any] = [
         {"sensed": np.zeros((40, 60), bool)}, {"seen": np.ones((40, 60), bool)}, {"outline": np.empty((0, 2))}
     ]  # fmt: skip
     for changes, left_out in zip(bare, ground, strict=True):
         known = tuple(replace(each, **changes) for each in recording.known)
-        found = names_in_legend(knowledge_figure(replace(recording, known=known)))
+        found = names_in_legend(draw_knowledge(replace(recording, known=known)))
         assert found == [name for name in names if name != left_out]
 
 
 def test_an_episode_that_ended_at_once_has_one_moment() -> None:
-    (panels,) = moments(knowledge_figure(made.learning_recording(0)))
+    (panels,) = moments(draw_knowledge(made.learning_recording(0)))
     assert panels[0].get_title() == "t = 0.0 s\nimmobilised"
 
 
@@ -214,7 +211,7 @@ def conditions(**several: list[str]) -> pd.DataFrame:
 def test_a_line_a_condition_with_its_band_named_by_what_differs() -> None:
     summary = conditions(ground=["contact", "probe radius_m=1", "probe radius_m=2"])
     curves = curves_of(summary)
-    figure = learning_figure(curves, summary)
+    figure = draw_learning(curves, summary)
     assert names_in_legend(figure) == ["contact", "probe radius_m=1", "probe radius_m=2"]
     looks = set()
     for panel, name in zip(figure.axes, METRICS, strict=True):
@@ -226,8 +223,7 @@ def test_a_line_a_condition_with_its_band_named_by_what_differs() -> None:
             assert heights.min() == pytest.approx(own[f"{name}_low"].min())
             assert heights.max() == pytest.approx(own[f"{name}_high"].max())
             looks.add((line.get_color(), line.get_linestyle()))
-        assert panel.get_xlabel() == "seconds of experience"
-        assert panel.get_ylabel().replace("\n", " ") == METRICS[name]
+        assert panel.get_ylabel() == METRICS[name]
     assert len(looks) == 3
 
 
@@ -236,7 +232,7 @@ def test_where_lines_are_many_panels_are_split_and_lines_look_alike_in_all() -> 
         ground=["contact", "probe"], belief=["static", "copula"], risk=["mean", "cvar:0.8"],
         planner=["mppi", "astar_dwa"], model=["oracle", "m"],
     )  # fmt: skip
-    figure = learning_figure(curves_of(summary), summary)
+    figure = draw_learning(curves_of(summary), summary)
     panels = figure.axes
     # Eight lines of two risk settings are too many still.
     assert len(panels) == 2 * 8
@@ -252,10 +248,10 @@ def test_where_lines_are_many_panels_are_split_and_lines_look_alike_in_all() -> 
     assert len(set(titles)) == 8
     assert "MPPI, mean, oracle" in titles
     fewer = conditions(ground=["contact", "probe"], scenario=["std", "hard"])
-    figure = learning_figure(curves_of(fewer), fewer)
+    figure = draw_learning(curves_of(fewer), fewer)
     assert [panel.get_title() for panel in figure.axes if panel.get_title()] == ["std", "hard"]
     alone = conditions()
-    assert names_in_legend(learning_figure(curves_of(alone), alone)) == ["mean over maps"]
+    assert names_in_legend(draw_learning(curves_of(alone), alone)) == ["mean over maps"]
 
 
 def labelled(recording: Recording, rows: pd.DataFrame, condition: str) -> Recording:
@@ -290,4 +286,4 @@ def test_a_report_holds_what_robots_knew_where_they_learnt(
         assert f"![{name}](figures/{name}.png)" in text
     assert "knowledge-3" not in text
     assert "for every 2 s" in text
-    assert "on its way (A\\*+DWA)" in text
+    assert "during its episode (A\\*+DWA)" in text

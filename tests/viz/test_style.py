@@ -8,26 +8,23 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.figure import Figure
 
-from benchnav.core.figures import (
+from benchnav.core.grid import outline
+from benchnav.core.registry import find, names
+from benchnav.viz.maps import MARKS, hatching, layer_scale, robot_marker
+from benchnav.viz.style import (
     _RISKS,
     BLIND,
     LINE_COLOURS,
     LINE_STYLES,
-    MARKS,
     TWO_COLUMNS_IN,
     condition_colours,
-    hatching,
-    layer_scale,
     line_style,
     planner_colours,
     planner_name,
     risk_name,
-    robot_marker,
     save_twice,
     styled,
 )
-from benchnav.core.grid import outline
-from benchnav.core.registry import find, names
 
 
 def test_a_planner_has_one_colour_in_whatever_company() -> None:

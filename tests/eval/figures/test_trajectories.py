@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, hatching, robot_marker, save_twice
 from benchnav.core.grid import outline
+from benchnav.eval.figures.data import MAX_PANELS, choose_recordings
+from benchnav.eval.figures.trajectories import draw_trajectories
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.charts.maps import MOST_PANELS, choose_recordings, trajectory_figure
-from benchnav.eval.report.plan_layers import field_colours
+from benchnav.viz.maps import MARKS, field_colours, hatching, robot_marker
+from benchnav.viz.style import TWO_COLUMNS_IN, save_twice
 from tests.eval.report import made
 
 
@@ -53,19 +54,19 @@ def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do
 
 def test_no_more_than_can_be_seen() -> None:
     conditions = [f"t{k}" for k in range(12)]
-    assert len(chosen([recording(condition) for condition in conditions], conditions)) == MOST_PANELS
+    assert len(chosen([recording(condition) for condition in conditions], conditions)) == MAX_PANELS
 
 
 def shown(figure: Figure) -> list:  # type: ignore[type-arg]
     return [axes for axes in figure.axes if axes.get_visible() and axes.get_images()]
 
 
-SOFT_WORDS = "soft ground, which does not show"
+SOFT_WORDS = "soft terrain, which no image shows"
 
 
 @pytest.mark.parametrize("count", [1, 3, 6])
 def test_every_episode_has_two_panels_of_its_map(count: int) -> None:
-    figure = trajectory_figure([recording()] * count)
+    figure = draw_trajectories([recording()] * count)
     assert len(shown(figure)) == 2 * count
     for axes in shown(figure):
         assert (axes.get_xlim(), axes.get_ylim()) == ((0, 30), (0, 20))
@@ -79,7 +80,7 @@ def test_every_episode_has_two_panels_of_its_map(count: int) -> None:
 
 def test_what_is_drawn_is_what_was_planned_and_driven_by_then() -> None:
     taken = recording()
-    above, below = shown(trajectory_figure([taken]))
+    above, below = shown(draw_trajectories([taken]))
     now = taken.now
     assert above.get_title() == f"MPPI, CVaR\nt = {now / 10:g} s; out of bounds after {taken.end_s:g} s"
     for panel in (above, below):
@@ -106,7 +107,7 @@ def held(world: str = "stakes", **changes: Any) -> Recording:
 
 def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended() -> None:
     taken = held()
-    above, below, last = shown(trajectory_figure([taken]))
+    above, below, last = shown(draw_trajectories([taken]))
     assert taken.field is not None
     (drawn,) = (image.get_array() for image in last.get_images())
     np.testing.assert_array_equal(drawn, field_colours(taken.field, taken.immobilising))
@@ -119,10 +120,8 @@ def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended()
     assert marks.keys() == {MARKS[name]["marker"] for name in ("start", "goal", "immobilised")}
     for name, place in (("start", taken.track[0]), ("goal", taken.goal_m)):
         np.testing.assert_array_equal(np.ravel(marks[MARKS[name]["marker"]].get_data()), place)
-    (cell,) = [
-        patch for patch in last.patches if np.isfinite(patch.get_xy()).all() and len(patch.get_xy()) == 5
-    ]
-    np.testing.assert_array_equal(cell.get_xy().min(axis=0), 0.5 * np.floor(taken.track[-1] / 0.5))
+    end = marks[MARKS["immobilised"]["marker"]]
+    np.testing.assert_array_equal(np.ravel(end.get_data()), taken.track[-1])
     assert last.get_title() == "whole path, over the λ field"
     # Where it was by the moment of the plan is told by the panels above, and where it headed.
     heading = robot_marker(taken.states[taken.now, 2]).get_transform()
@@ -136,7 +135,7 @@ def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended()
 
 def test_soft_ground_is_marked_on_the_terrain_alone() -> None:
     taken = held()
-    above, below, last = shown(trajectory_figure([taken]))
+    above, below, last = shown(draw_trajectories([taken]))
     drawn = [
         {path.vertices.tobytes() for c in p.collections for path in c.get_paths()}
         for p in (above, below, last)
@@ -149,13 +148,13 @@ def test_soft_ground_is_marked_on_the_terrain_alone() -> None:
 
 def test_a_robot_that_was_not_held_has_no_mark_of_it() -> None:
     taken = held(about=made.recording().about)
-    *_, last = shown(figure := trajectory_figure([taken]))
+    *_, last = shown(figure := draw_trajectories([taken]))
     assert not [line for line in last.lines if (line.get_marker(), line.get_color()) == ("X", "black")]
     assert "immobilised" not in names_in_legend(figure)
 
 
 def test_only_panels_whose_λ_stayed_have_a_third() -> None:
-    figure = trajectory_figure([recording(), held(), recording(), recording(), held()])
+    figure = draw_trajectories([recording(), held(), recording(), recording(), held()])
     titles = [axes.get_title() for axes in shown(figure)]
     assert len(titles) == 5 * 2 + 2
     assert sum("λ field" in title for title in titles) == 2
@@ -169,7 +168,7 @@ def test_only_panels_whose_λ_stayed_have_a_third() -> None:
 def test_ground_is_not_drawn_where_λ_was_resampled() -> None:
     taken = held(field=None)
     bare = replace(taken, soft=np.zeros_like(taken.soft), immobilising=np.zeros_like(taken.immobilising))
-    with_ground, without = (trajectory_figure([one]) for one in (taken, bare))
+    with_ground, without = (draw_trajectories([one]) for one in (taken, bare))
     assert names_in_legend(with_ground) == names_in_legend(without)
     for one, other in zip(shown(with_ground), shown(without), strict=True):
         lines = [sum(len(drawn.get_paths()) for drawn in axes.collections) for axes in (one, other)]
@@ -178,7 +177,7 @@ def test_ground_is_not_drawn_where_λ_was_resampled() -> None:
 
 def test_titles_tell_models_and_worlds_apart_where_they_differ() -> None:
     def titles(*labels: dict[str, str]) -> list[str]:
-        figure = trajectory_figure([recording(**one) for one in labels])
+        figure = draw_trajectories([recording(**one) for one in labels])
         return [axes.get_title().split("\n")[0] for axes in shown(figure) if " after " in axes.get_title()]
 
     blind = {"planner": "straight", "model": "–", "risk": "–"}
@@ -190,14 +189,14 @@ def test_titles_tell_models_and_worlds_apart_where_they_differ() -> None:
 
 
 def test_maps_stand_in_the_titles_where_they_differ() -> None:
-    figure = trajectory_figure([recording(), recording(map_index=3)])
+    figure = draw_trajectories([recording(), recording(map_index=3)])
     titles = [axes.get_title().split("\n")[0] for axes in shown(figure) if " after " in axes.get_title()]
     assert titles == ["MPPI, CVaR, std, map 0", "MPPI, CVaR, std, map 3"]
 
 
 def test_without_a_recorded_plan_the_whole_path_is_shown_and_how_it_ended() -> None:
     taken = replace(held(), plans=())
-    above, below, _ = shown(figure := trajectory_figure([taken]))
+    above, below, _ = shown(figure := draw_trajectories([taken]))
     assert above.get_title() == "MPPI, CVaR\nimmobilised after 17 s"
     (driven,) = [layer for layer in above.collections if layer.get_array() is not None]
     np.testing.assert_array_equal(driven.get_array(), taken.traversability)
@@ -224,30 +223,30 @@ def names_in_legend(figure: Figure) -> list[str]:
 )
 def test_the_legend_names_what_the_ground_has(changes: dict[str, Any], names: list[str]) -> None:
     ground = (SOFT_WORDS, "not free", "immobilised", "immobilises a robot")
-    shown = names_in_legend(trajectory_figure([held(**changes)]))
+    shown = names_in_legend(draw_trajectories([held(**changes)]))
     assert [name for name in shown if name in ground] == names
 
 
 def test_the_legend_names_layers_that_are_there() -> None:
-    names = names_in_legend(trajectory_figure([recording()]))
+    names = names_in_legend(draw_trajectories([recording()]))
     below = ["not free", "driven; above in the colour of the observed λ"]
     assert names == ["samples", "reference path", "planned", "start", "goal", "robot", *below]
     taken = recording()
     everywhere = replace(taken, free=np.ones_like(taken.free))
-    assert "not free" not in names_in_legend(trajectory_figure([everywhere]))
+    assert "not free" not in names_in_legend(draw_trajectories([everywhere]))
 
 
 def test_whose_map_of_λ_it_is_stands_above_it() -> None:
     blind = {"planner": "straight", "model": "–", "risk": "–"}
     learns = recording(belief="copula", ground="probe:1")
-    *_, given, none, first = shown(trajectory_figure([recording(), recording(**blind), learns]))
+    *_, given, none, first = shown(draw_trajectories([recording(), recording(**blind), learns]))
     assert given.get_title() == "λ̂ given to the planner"
     assert none.get_title() == "true E[λ]; the planner uses no map"
     assert first.get_title() == "λ̂ at the start"
 
 
 def test_an_episode_that_ended_at_once_can_be_drawn(tmp_path: Path) -> None:
-    save_twice(trajectory_figure([made.recording(0, plans=())]), tmp_path / "a.png")
+    save_twice(draw_trajectories([made.recording(0, plans=())]), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 1000
 
 
@@ -256,7 +255,7 @@ def test_λ_hat_of_a_robot_that_learns_is_that_known_at_the_moment() -> None:
     known = taken.known_at(taken.now)
     assert known is not None
     assert 0 < known.step < 170
-    _, below, _ = shown(trajectory_figure([taken]))
+    _, below, _ = shown(draw_trajectories([taken]))
     np.testing.assert_array_equal(below.get_images()[0].get_array(), known.predicted)
     closed = below.get_images()[1].get_array()
     np.testing.assert_array_equal(np.isfinite(np.ma.filled(closed, np.nan)), ~known.free)

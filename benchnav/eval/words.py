@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.core.figures import planner_name, risk_name
 from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.stats.best import BLOCK
 from benchnav.planning.world.outcome import FAILURES
 from benchnav.stats.tables import p_value, short
+from benchnav.viz.style import planner_name, risk_name
 
 # Columns of the summary that count failures, by how these ended, and what sentences call them.
 FAILURE_COUNTS = {
@@ -116,6 +116,12 @@ def failures_in_words(row: Mapping[Any, Any]) -> str:
     """
     words = (f"{row[column]} {name}" for column, name in FAILURE_COUNTS.items() if row[column])
     return ", ".join(words) or NOT_USED
+
+
+def chosen_in_words(shown: int, known: int) -> str:
+    """Say how conditions were chosen where not all are shown; empty where all are."""
+    words = f" Shown are {shown} of {known} conditions, as many successes as failures if possible."
+    return words if shown < known else ""
 
 
 def outcome_in_words(outcome: str) -> str:

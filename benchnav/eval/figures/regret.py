@@ -7,24 +7,19 @@ import numpy as np
 import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Drawing
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from benchnav.core.figures import (
-    BLUE,
-    ORANGE,
-    TEXT,
-    TWO_COLUMNS_IN,
-    legend_outside,
-    planner_name,
-    risk_name,
-    styled,
-)
-from benchnav.eval.report.words import joined
+from benchnav.eval.figures.data import RunData
 from benchnav.eval.stats.best import BLOCK
+from benchnav.eval.words import joined
+from benchnav.stats.tables import signed
+from benchnav.viz.figure import Figure
+from benchnav.viz.panels import GRID, draw_interval
+from benchnav.viz.style import BLUE, ORANGE, TEXT, TWO_COLUMNS_IN, legend_outside, planner_name, risk_name
 
-MOST_CHAINS = 6
+MAX_CHAINS = 6
 _ROW_IN = 0.24
 _ENDS = "0.75"
 _BOUND = "0.25"
@@ -32,18 +27,37 @@ _BOUND = "0.25"
 _MEASURES = {"success": ("success [%]", 100.0, False), "time": ("T_total [s]", 1.0, True)}
 
 
-@styled()
-def regret_figure(table: pd.DataFrame) -> Figure:
-    """Draws each chain from its planner, on top, to the near-optimal reference: success left, T_total right.
+class Regret(Figure):
+    """A waterfall of paired differences, from a planner to the near-optimal reference."""
 
-    Args:
-        table: from `regret.split_regret`, at least one row; at most `MOST_CHAINS` chains are drawn, the first.
-    """
-    chains = [rows for _, rows in table.groupby("chain", sort=True)][:MOST_CHAINS]
+    name = "regret"
+
+    def needs(self, data: RunData) -> bool:
+        """Return whether the run has a chain of conditions."""
+        return not data.regret.empty
+
+    def caption(self, data: RunData) -> str:
+        """Return what a step means, and how many chains are shown."""
+        chains = data.regret["chain"].nunique()
+        shown = f" The first {MAX_CHAINS} of {chains} chains are shown." if chains > MAX_CHAINS else ""
+        return (
+            "Regret against the near-optimal reference, a drive on λ itself and no bound: step by step from a planner "
+            "to it, on the episodes that all have in common, paired differences with 95 % intervals. A step may be "
+            "negative, and in another order steps would be others, so that none is "
+            f"a share of the causes.{shown}"
+        )
+
+    def draw(self, data: RunData) -> Drawing:
+        """Draw each chain from its planner, on top, to the reference: success left, T_total right."""
+        return draw_regret(data.regret)
+
+
+def draw_regret(table: pd.DataFrame) -> Drawing:
+    """Draw chains of `regret.split_regret`, one row or more, as `Regret` does."""
+    chains = [rows for _, rows in table.groupby("chain", sort=True)][:MAX_CHAINS]
     steps = 2 + max(len(rows) for rows in chains)
-    figure = Figure(
-        figsize=(TWO_COLUMNS_IN, len(chains) * (_ROW_IN * steps + 0.55) + 0.3), layout="constrained"
-    )
+    height = len(chains) * (_ROW_IN * steps + 0.55) + 0.3
+    figure = Drawing(figsize=(TWO_COLUMNS_IN, height), layout="constrained")
     axes = figure.subplots(len(chains), len(_MEASURES), squeeze=False, sharey="row", sharex="col")
     differing = [name for name in BLOCK if table[name].nunique() > 1]
     for line, rows in zip(axes, chains, strict=True):
@@ -98,8 +112,8 @@ def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
         start, end = means[place - 1], means[place]
         better = difference > 0 if more_is_worse else difference < 0
         panel.barh(place, end - start, left=start, color=ORANGE if better else BLUE, **looks)
-        ends = np.clip([start - high, start - low], 0, None if more_is_worse else factor)
-        panel.plot(ends, [place, place], color="black", lw=0.9)
+        from_x, to_x = np.clip([start - high, start - low], 0, None if more_is_worse else factor)
+        draw_interval(panel, from_x, to_x, place, "black", 0.9)
         words = _signed(-difference)
         if low == low:  # of few maps there is no interval
             words += f" ({_signed(-high)} to {_signed(-low)})"
@@ -109,12 +123,12 @@ def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
     bound = factor * rows[f"{measure}_bound"].iloc[0]
     if bound == bound:
         panel.axvline(bound, color=_BOUND, ls="--", lw=1.1)
-    panel.grid(axis="x", color="0.93")
+    panel.grid(axis="x", color=GRID)
     panel.set_axisbelow(True)
     panel.use_sticky_edges = False
     panel.tick_params(axis="y", length=0)
 
 
 def _signed(value: float) -> str:
-    """A difference with its sign and one decimal; 0 has none."""
-    return f"{value:+.1f}".replace("-", "−") if abs(value) >= 0.05 else "0.0"
+    """Write a difference with its sign and one decimal; 0 has none."""
+    return signed(value).replace("-", "−") if abs(value) >= 0.05 else "0.0"

@@ -1,35 +1,28 @@
 """Sweeps of a run: conditions that are equal in all but one number, which takes three values or more, as curves."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Drawing
 from matplotlib.lines import Line2D
 
 from benchnav.core import registry
-from benchnav.core.figures import (
-    BLIND,
-    LINE_COLOURS,
-    MARKERS,
-    ONE_COLUMN_IN,
-    TWO_COLUMNS_IN,
-    condition_colours,
-    legend_outside,
-    planner_name,
-    risk_name,
-    stack_panels,
-    styled,
-)
 from benchnav.datagen.recipe.scenario import find_series
 from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
-from benchnav.eval.report.words import joined
+from benchnav.eval.figures.data import RunData
+from benchnav.eval.words import joined
 from benchnav.planning.free_space import Rules
+from benchnav.viz.figure import Figure
+from benchnav.viz.panels import Curves, Looks, line_looks
+from benchnav.viz.style import BLIND, LINE_COLOURS, condition_colours, legend_outside, planner_name, risk_name
 
 SEVERITY = "severity"
-LEAST_VALUES = 3
+MIN_VALUES = 3
 
 _LEVEL = "risk.options.level"
 _NAMES = {_LEVEL: "level α", SEVERITY: "severity of the scenario"}
@@ -38,7 +31,7 @@ _MEASURES = {
     "success [%]": ("success_rate", "success_low", "success_high", 100.0),
     "T_total [s]": ("total_time_mean_s", "total_time_low_s", "total_time_high_s", 1.0),
 }
-_MOST_LINES, _MOST_ACROSS = 7, 4
+_MAX_LINES, _MAX_ACROSS = 7, 4
 _SAME = ("data", "scenario", "world", "robot", "objective")
 
 Labels = Mapping[Any, Any]
@@ -91,7 +84,7 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
         table = table[table[number].map(_is_number)]
         rest = table.drop(columns=number)
         for _, alike in table.groupby(rest.astype(str).apply(tuple, axis=1), sort=False):
-            if alike[number].nunique() >= LEAST_VALUES:
+            if alike[number].nunique() >= MIN_VALUES:
                 ordered = alike[number].astype(float).sort_values(kind="stable")
                 line = Line(
                     values=tuple(ordered),
@@ -125,64 +118,99 @@ def sweep_name(number: str) -> str:
     return number.rpartition(".")[2]
 
 
-@styled()
-def curve_figure(number: str, lines: Sequence[Line], summary: pd.DataFrame) -> Figure:
-    """Draws a sweep: success above with Wilson's band, T_total below with the bootstrap's.
+class Over(Figure):
+    """Success and T_total over a number in which conditions that are equal in all else differ.
 
-    A panel a scenario, world, model and what else there is of that kind; where lines are many, a panel a planner
-    too. Over a number of a risk setting, the other settings of the same planner are horizontal lines.
-
-    Args:
+    Attributes:
         number: a name from `find_sweeps`.
         lines: those of the number.
-        summary: of the run.
     """
+
+    name = "over"
+    number = ""
+    lines: Sequence[Line] = ()
+
+    def variants(self, data: RunData) -> Sequence[Self]:
+        """Return a figure a sweep."""
+        sweeps = find_sweeps(data.about["conditions"])
+        counts = Counter(map(sweep_name, sweeps))
+        short = {n: sweep_name(n) if counts[sweep_name(n)] == 1 else n.replace(".", "-") for n in sweeps}
+        return [
+            self.variant(number=number, lines=lines, name=f"over-{short[number]}")
+            for number, lines in sweeps.items()
+        ]
+
+    def caption(self, data: RunData) -> str:
+        """Return which number it is."""
+        return f"Success and T_total over {self.name.removeprefix('over-')}, with 95 % intervals."
+
+    def draw(self, data: RunData) -> Drawing:
+        """Draw success above with Wilson's band, T_total below with the bootstrap's.
+
+        A panel a scenario, world, model and what else there is of that kind; where lines are many, a panel a planner
+        too. Over a number of a risk setting, the other settings of the same planner are horizontal lines.
+        """
+        return draw_sweep(self.number, self.lines, data.summary)
+
+
+def draw_sweep(number: str, lines: Sequence[Line], summary: pd.DataFrame) -> Drawing:
+    """Draw a sweep of `find_sweeps` as `Over` does."""
     rows = summary.set_index("condition", drop=False)
     labels = _label_lines(number, lines, rows)
     planners = labels.drop_duplicates("name").set_index("name")["planner"]
-    colours = dict(zip(planners.index, condition_colours(planners.tolist(), LINE_COLOURS), strict=True))
+    looks = line_looks(planners.index, condition_colours(planners.tolist(), LINE_COLOURS))
     groups = _panels(labels)
-    across = min(len(groups), _MOST_ACROSS)
-    down = -(-len(groups) // across)
-    width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
-    figure = Figure(figsize=(width, 3.3 * down + 0.5), layout="constrained")
-    stacks = stack_panels(figure, len(groups), across, layers=2, sharex=True)
-    for above, below in stacks[1:]:
-        above.sharey(stacks[0][0])
-        below.sharey(stacks[0][1])
-    values = sorted({value for line in lines for value in line.values})
-    swept = [condition for line in lines for condition in line.conditions]
-    others = rows.drop(swept).to_dict("records") if number.startswith("risk.") else []
-    references: dict[str, dict[str, Any]] = {}
-    for place, ((above, below), (title, shown)) in enumerate(zip(stacks, groups, strict=True)):
-        for panel, (measure, (*names, scale)) in zip((above, below), _MEASURES.items(), strict=True):
-            for line_place in shown:
-                line, name = lines[line_place], labels["name"][line_place]
-                own = rows.loc[list(line.conditions)]
-                for label, row in _references(own.iloc[0], others):
-                    blind = row["model"] == NOT_USED
-                    # A pattern of dashes for each setting, with more and more dots between.
-                    dashes = (0, (6, 2, *(1, 1.5) * len(references)))
-                    colour = BLIND if blind else colours[name]
-                    look = references.setdefault(label, {"color": colour, "ls": dashes})
-                    if look["color"] != colour:  # of several planners
-                        look["color"] = "0.2"
-                    panel.axhline(scale * row[names[0]], color=colour, ls=look["ls"], lw=1, zorder=1)
-                rate, low, high = (scale * own[column] for column in names)
-                marker = MARKERS[list(colours).index(name) % len(MARKERS)]
-                places = _places(number, line.values)
-                panel.fill_between(places, low, high, color=colours[name], alpha=0.15, lw=0)
-                panel.plot(places, rate, color=colours[name], marker=marker, ms=3.5, lw=1.2, label=name)
-            panel.grid(axis="y", color="0.9")
-            panel.tick_params(labelleft=place % across == 0)
-            panel.set_ylabel("" if place % across else measure)
-        above.set_title(title)
-        below.tick_params(labelbottom=True)
-        below.set_xlabel(_NAMES.get(number, sweep_name(number)))
-        below.set_xticks(_places(number, values), [f"{value:g}" for value in values])
-    handles = [Line2D([], [], lw=1, label=label, **look) for label, look in references.items()]
+    points = []
+    for title, shown in groups:
+        for index in shown:
+            own = rows.loc[list(lines[index].conditions)]
+            values = {
+                name + end: scale * own[column].to_numpy()
+                for name, (*columns, scale) in _MEASURES.items()
+                for end, column in zip(("", "_low", "_high"), columns, strict=True)
+            }
+            x = _places(number, lines[index].values)
+            points.append(pd.DataFrame({"panel": title, "line": labels["name"][index], "x": x, **values}))
+    across = min(len(groups), _MAX_ACROSS)
+    measures = {name: name for name in _MEASURES}
+    label = _NAMES.get(number, sweep_name(number))
+    curves = Curves(table=pd.concat(points), measures=measures, looks=looks, x_label=label, across=across)
+    figure, panels = curves.draw()
+    ticks = sorted({value for line in lines for value in line.values})
+    for panel in panels.values():
+        panel.set_xticks(_places(number, ticks), [f"{value:g}" for value in ticks])
+    handles = []
+    if number.startswith("risk."):
+        others = rows.drop([condition for line in lines for condition in line.conditions]).to_dict("records")
+        shown_in = [
+            (title, rows.loc[lines[i].conditions[0]], labels["name"][i]) for title, own in groups for i in own
+        ]
+        handles = _draw_references(panels, shown_in, others, looks)
     legend_outside(figure, handles, 2 if across == 1 else 4)
     return figure
+
+
+def _draw_references(
+    panels: Mapping[tuple[str, str], Axes],
+    shown_in: Iterable[tuple[str, Labels, str]],
+    others: Sequence[Labels],
+    looks: Looks,
+) -> list[Line2D]:
+    """Draw settings that have no such number as horizontal lines; return their entries of the legend."""
+    references: dict[str, dict[str, Any]] = {}
+    for title, first, name in shown_in:
+        for label, row in _references(first, others):
+            colour = BLIND if row["model"] == NOT_USED else looks[name]["color"]
+            # A pattern of dashes for each setting, with more and more dots between.
+            dashes = (0, (6, 2, *(1, 1.5) * len(references)))
+            look = references.setdefault(label, {"color": colour, "ls": dashes})
+            for measure, (column, *_, scale) in _MEASURES.items():
+                panels[title, measure].axhline(
+                    scale * row[column], color=colour, ls=look["ls"], lw=1, zorder=1
+                )
+            if look["color"] != colour:  # of several planners
+                look["color"] = "0.2"
+    return [Line2D([], [], lw=1, label=label, **look) for label, look in references.items()]
 
 
 def _label_lines(number: str, lines: Sequence[Line], rows: pd.DataFrame) -> pd.DataFrame:
@@ -228,7 +256,7 @@ def _panels(labels: pd.DataFrame) -> list[tuple[str, list[int]]]:
         beside = numbered[blind].drop(columns=unused).merge(panels, "left", shared)
         every = pd.concat([numbered[~blind], beside.fillna(dict.fromkeys(unused, NOT_USED))])
         groups = every.groupby(columns, sort=False)["line"].agg(list).reset_index()
-        if groups["line"].map(len).max() <= _MOST_LINES:
+        if groups["line"].map(len).max() <= _MAX_LINES:
             break
     differing = [name for name in columns if groups[name].nunique() > 1]
     return [(joined(own[differing]) or own["scenario"], own["line"]) for _, own in groups.iterrows()]

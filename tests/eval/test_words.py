@@ -1,6 +1,6 @@
 import pytest
 
-from benchnav.eval.report.words import contender_names, failures_in_words, p_in_words
+from benchnav.eval.words import contender_names, failures_in_words, p_in_words
 from benchnav.stats.tables import p_value
 from tests.eval.report import made
 

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from benchnav.core.errors import BenchnavError
+from benchnav.eval.failures import Sheets, collect_sheets, failures_table
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.failures import Sheets, collect_sheets, failures_table
 from tests.eval.forged import forge_steps
 from tests.eval.report import made
 

@@ -1,0 +1,36 @@
+"""The figures that every run has, in the order of the report: what it was to show first, then how and where."""
+
+from collections.abc import Sequence
+
+from benchnav.eval.figures.data import RunData
+from benchnav.eval.figures.distributions import Distributions
+from benchnav.eval.figures.driven import DrivenPaths
+from benchnav.eval.figures.failures import Failures
+from benchnav.eval.figures.forest import Forest
+from benchnav.eval.figures.knowledge import KnowledgeMaps
+from benchnav.eval.figures.learning import Learning
+from benchnav.eval.figures.outcomes import Outcomes
+from benchnav.eval.figures.over import Over
+from benchnav.eval.figures.regret import Regret
+from benchnav.eval.figures.success import Success
+from benchnav.eval.figures.trajectories import Trajectories
+from benchnav.viz.figure import Figure
+
+SHIPPED: tuple[type[Figure], ...] = (
+    *(Forest, Success, Regret, DrivenPaths, Over, Outcomes, Distributions),
+    *(Failures, Learning, KnowledgeMaps, Trajectories),
+)
+
+
+def figures_of(data: RunData, more: Sequence[Figure] = ()) -> list[Figure]:
+    """List the figures of a run, each with a name of its own.
+
+    Args:
+        data: of the run.
+        more: figures after the shipped ones; one that is of a shipped class is drawn once.
+
+    Returns:
+        Those whose needs are met.
+    """
+    figures = [cls() for cls in SHIPPED] + [figure for figure in more if type(figure) not in SHIPPED]
+    return [variant for figure in figures for variant in figure.variants(data)]

@@ -1,0 +1,180 @@
+"""Episodes side by side: terrain, the λ̂ that was planned on, and the λ field (after the paper's Fig. 2)."""
+
+import textwrap
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Drawing
+
+from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
+from benchnav.eval.figures.data import RunData, choose_recordings
+from benchnav.eval.recording import Recording
+from benchnav.eval.words import chosen_in_words, condition_name, differ
+from benchnav.viz import maps
+from benchnav.viz.figure import Figure
+from benchnav.viz.style import ONE_COLUMN_IN, TWO_COLUMNS_IN, legend_outside, stack_panels
+
+_PANELS_A_LINE = 4
+_LETTER_IN = 0.048
+
+
+class Trajectories(Figure):
+    """At most four conditions on the map on which outcomes differ most."""
+
+    name = "trajectories"
+    trim = True
+
+    def _shown(self, data: RunData) -> Sequence[Recording]:
+        return data.on_one_map or choose_recordings(data.recordings, list(data.summary["condition"]))
+
+    def needs(self, data: RunData) -> bool:
+        """Return whether there are recordings, or steps that can be recorded again."""
+        return bool(self._shown(data))
+
+    def caption(self, data: RunData) -> str:
+        """Return which map is shown, and how conditions were chosen."""
+        shown = self._shown(data)
+        pairs = {(own.about["scenario"], own.about["map"]) for own in shown}
+        where = " on {}, map {}".format(*pairs.pop()) if len(pairs) == 1 else ""
+        what = "Plans and driven paths" if any(own.own_plans for own in shown) else "Driven paths"
+        caption = f"{what}{where}, over the terrain and over the λ̂ that the planner was given."
+        if any(own.field is not None for own in shown):
+            caption += " Below: the whole driven path over the λ field."
+        if data.on_one_map and data.driven:
+            caption += chosen_in_words(len(shown), len(data.driven.rows))
+        return caption
+
+    def draw(self, data: RunData) -> Drawing:
+        """Draw the terrain above with what was planned, and the map planned on below.
+
+        Where λ did not change during an episode, a third row shows it, with the whole driven path.
+        """
+        return draw_trajectories(self._shown(data))
+
+
+def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
+    """Draw recordings, one or more, as `Trajectories` does."""
+    lines = -(-len(recordings) // _PANELS_A_LINE)
+    across = -(-len(recordings) // lines)  # as full as lines can be
+    layers = 2 if all(recording.field is None for recording in recordings) else 3
+    width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
+    panel_in = (width - 0.9) / across - 0.1
+    tallest = max(recording.grid.height / recording.grid.width for recording in recordings)
+    tall = panel_in * min(max(tallest, 0.3), 2.0) + 0.35
+    figure = Drawing(figsize=(width, (layers * tall + 0.2) * lines + 0.8), layout="compressed")
+    stacks = stack_panels(figure, len(recordings), across, layers)
+    for place, (recording, heading, stack) in enumerate(
+        zip(recordings, _headings(recordings), stacks, strict=True)
+    ):
+        _draw_terrain(stack[0], recording, heading)
+        _draw_predicted(stack[1], recording)
+        if recording.field is not None:
+            _draw_field(stack[2], recording, recording.field)
+        elif len(stack) > 2:
+            stack.pop().remove()
+        for panel in stack:
+            maps.frame_map(panel)
+            panel.tick_params(labelleft=place % across == 0, labelbottom=panel is stack[-1])
+            panel.set_ylabel("y [m]" if place % across == 0 else "")
+            # Broken where it is wider than the panel.
+            title = (
+                textwrap.fill(line, int(panel_in / _LETTER_IN)) for line in panel.get_title().splitlines()
+            )
+            panel.set_title("\n".join(title), fontsize="small")
+        stack[-1].set_xlabel("x [m]")
+    legend_outside(figure, columns=1 if across == 1 else 4)
+    figure.colorbar(
+        stacks[0][0].collections[-1],
+        ax=figure.axes,
+        fraction=0.03,
+        aspect=40,
+        shrink=min(1.0, 4 / figure.get_figheight()),
+        anchor=(0, 1),
+        label="traversability λ",
+    )
+    return figure
+
+
+def _headings(recordings: Sequence[Recording]) -> list[str]:
+    """Name each recording by what differs, and say when it is shown and how it ended."""
+    several = [
+        name
+        for name in ("model", *KNOWLEDGE, "world")
+        if differ(own.about.get(name, NOT_USED) for own in recordings)
+    ]
+    places = [f", {own.about['scenario']}, map {own.about['map']}" for own in recordings]
+    headings = []
+    for own, place in zip(recordings, places, strict=True):
+        moment = f"{own.outcome} after {own.end_s:g} s"
+        if not has_ended(own, own.now):
+            moment = f"t = {own.now * own.dt_s:g} s; {moment}"
+        where = place if len(set(places)) > 1 else ""
+        headings.append(f"{condition_name(own.about, several)}{where}\n{moment}")
+    return headings
+
+
+def has_ended(recording: Recording, step: int) -> bool:
+    """Return whether an episode ended by a step."""
+    return step == len(recording.traversability)
+
+
+def drive_at(recording: Recording, step: int) -> maps.Drive:
+    """Return the path of a recording up to a step."""
+    return maps.Drive(
+        track=recording.track[: step + 1],
+        goal_m=recording.goal_m,
+        outcome=recording.about["outcome"] if has_ended(recording, step) else "",
+        heading_rad=recording.states[step, 2],
+    )
+
+
+def _draw_plan(panel: Axes, recording: Recording) -> None:
+    for name, style in maps.STYLES.items():
+        if len(recording.plan.lines.get(name, ())):
+            panel.add_collection(maps.plan_layer(style, recording.plan.lines[name]))
+
+
+def _draw_terrain(panel: Axes, recording: Recording, title: str) -> None:
+    """Draw the terrain, and the path driven by that moment, coloured by the observed λ."""
+    maps.show_map(panel, np.moveaxis(recording.rgb, 0, -1), recording.grid.extent_m)
+    if recording.field is not None and recording.soft.any():
+        maps.draw_soft(panel, recording.soft, recording.resolution_m)
+        look = {"fc": "0.45", "ec": maps.SOFT, "hatch": "////"}
+        maps.name_terrain(panel, "soft terrain, which no image shows", **look)
+    _draw_plan(panel, recording)
+    drive = drive_at(recording, recording.now)
+    maps.draw_drive(panel, drive, 2)
+    panel.add_collection(maps.driven_colours(drive.track, recording.traversability, 2))
+    panel.set_title(title)
+
+
+def _draw_predicted(panel: Axes, recording: Recording) -> None:
+    """Draw the λ̂ that the planner had by that moment, and the path in black, since the map has the colours of λ."""
+    predicted, free = recording.given_at(recording.now)
+    maps.show_map(panel, predicted, recording.grid.extent_m, **maps.LAMBDA)
+    if not free.all():
+        maps.overlay(panel, ~free, recording.grid.extent_m, maps.CLOSED)
+        maps.name_terrain(panel, "not free", color=maps.CLOSED)
+    title = "λ̂ given to the planner"
+    if recording.about["model"] == NOT_USED:
+        title = "true E[λ]; the planner uses no map"
+    elif recording.known:
+        title = "λ̂ known by then"
+    elif (recording.about.get("sensor", "full"), recording.about.get("belief", "static")) != (
+        "full",
+        "static",
+    ):
+        title = "λ̂ at the start"  # what was learnt was not recorded
+    panel.set_title(title)
+    _draw_plan(panel, recording)
+    words = "driven; above in the colour of the observed λ"
+    maps.draw_drive(panel, drive_at(recording, recording.now), label=words)
+
+
+def _draw_field(panel: Axes, recording: Recording, field: np.ndarray) -> None:
+    """Draw the λ field, and the whole driven path over it."""
+    maps.show_map(panel, maps.field_colours(field, recording.immobilising), recording.grid.extent_m)
+    maps.draw_drive(panel, drive_at(recording, len(recording.traversability)))
+    maps.name_immobilising(panel, recording.immobilising)
+    panel.set_title("whole path, over the λ field")
