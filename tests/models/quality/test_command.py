@@ -68,7 +68,7 @@ def test_a_folder_holds_report_page_and_figures(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("benchnav.models.quality.command.DPI", 30)
+    monkeypatch.setattr("benchnav.models.quality.output.DPI", 30)
     out = tmp_path / "new" / "quality"
     asked = ["colours", "--data", dataset.path, "--out", out, "--maps", 1]
     draw, titles = figures.map_sheet_figure, []
@@ -106,7 +106,7 @@ def test_a_folder_holds_report_page_and_figures(
 def test_a_series_is_drawn_where_there_is_one(
     dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("benchnav.models.quality.command.DPI", 30)
+    monkeypatch.setattr("benchnav.models.quality.output.DPI", 30)
     held = dict(dataset.manifest["splits"])
     monkeypatch.setattr(
         TerrainDataset, "splits", property(lambda self: {**held, "test/hs-100": held["test/hs"]})
@@ -210,7 +210,7 @@ def test_a_model_that_is_right_less_often_than_the_nearest_colour_is_told_so(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("benchnav.models.quality.command.DPI", 30)
+    monkeypatch.setattr("benchnav.models.quality.output.DPI", 30)
     shares = {"test/std": 0.999, "test/hs": 0.0}
     monkeypatch.setattr(baselines, "nearest_colour_accuracy", lambda _, split: shares[split])
     line = "warning: the model's accuracy is below that of the nearest colour on test/std"

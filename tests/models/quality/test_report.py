@@ -113,7 +113,7 @@ def test_csv_leaves_a_number_that_there_is_not_empty(qualities: Qualities) -> No
 
 
 def test_the_page_shows_table_notes_and_figures(qualities: Qualities) -> None:
-    figures = {"figures/pit.png": ("PIT", "What it shows."), "figures/maps-a.png": ("Maps of a", "Maps.")}
+    figures = [("figures/pit.png", "PIT", "What it shows."), ("figures/maps-a.png", "Maps of a", "Maps.")]
     lines = quality_markdown("title", qualities, ["a note"], figures).splitlines()
     assert lines[0] == "# title"
     header, rule, *rows = [line for line in lines if line.startswith("|")]

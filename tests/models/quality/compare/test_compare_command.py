@@ -16,7 +16,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import TraversabilityModel
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality import baselines
-from benchnav.models.quality.compare import candidates, command
+from benchnav.models.quality.compare import candidates
 from benchnav.models.quality.measure import evaluate, measure_split
 from tests.commands import call
 from tests.models.stub import ColourModel
@@ -50,7 +50,7 @@ class Foreign(ColourModel):
 @pytest.fixture(autouse=True)
 def _models(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registry, "_REGISTERED", {})
-    monkeypatch.setattr(command, "DPI", 30)
+    monkeypatch.setattr("benchnav.models.quality.output.DPI", 30)
     for name, model in (
         ("colours", ColourModel), ("vague", Vague), ("quantiles", Quantiles), ("foreign", Foreign),
     ):  # fmt: skip
