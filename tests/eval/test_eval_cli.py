@@ -13,6 +13,7 @@ from benchnav.eval import cli as eval_cli
 from benchnav.eval.cli import SUITES
 from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.run.runner import run_suite
+from benchnav.eval.run.unit import Settings
 from tests.commands import call
 
 SMALL = (
@@ -79,15 +80,17 @@ def test_a_world_is_given_by_name_as_several_or_with_its_fields(
     assert yaml.safe_load(capsys.readouterr().out)["world"] == expected
 
 
+LIMITED = Settings.on("auto", planner_limit_s=2.5)
+
+
 @pytest.mark.parametrize(
     ("words", "changed"),
     [
         ((), {}),
         (("--jobs", "3", "--overwrite"), {"jobs": 3, "overwrite": True}),
-        (("--planner_limit_s", "2.5", "--shard", "2/4"), {"planner_limit_s": 2.5, "shard": Shard(index=2, of=4)}),
-        (("--backend", "dask", "--scheduler", "tcp://a:1"), {"scheduler": "tcp://a:1"}),
-        (("--device", "cpu"), {"device": "cpu"}),
-        (("--device", "cuda"), {"device": "cuda"}),
+        (("--planner_limit_s", "2.5", "--shard", "2/4"), {"settings": LIMITED, "shard": Shard(index=2, of=4)}),
+        (("--backend", "dask", "--scheduler", "tcp://a:1"), {"jobs": "tcp://a:1"}),
+        (("--device", "cpu"), {"settings": Settings.on("cpu")}),
     ],
 )  # fmt: skip
 def test_the_options_of_run_are_those_that_the_suite_is_run_with(
@@ -105,10 +108,8 @@ def test_the_options_of_run_are_those_that_the_suite_is_run_with(
     expected = {
         "jobs": 1,
         "overwrite": False,
-        "planner_limit_s": 0.0,
+        "settings": Settings.on("auto"),
         "shard": None,
-        "scheduler": "",
-        "device": "auto",
     } | changed
     assert {name: told[name] for name in expected} == expected
     assert told["folder"] == tmp_path / "run"
