@@ -217,7 +217,8 @@ def spans_of(track: pd.DataFrame, least_speed: float, span_s: float = WINDOW_S) 
 def _angle_between(vectors: pd.DataFrame, others: pd.DataFrame) -> pd.Series:
     """Return the signed angle from vectors to others, in (-π, π], from their columns `x` and `y`."""
     cross = vectors["x"] * others["y"] - vectors["y"] * others["x"]
-    return np.arctan2(cross, vectors["x"] * others["x"] + vectors["y"] * others["y"])
+    dot = vectors["x"] * others["x"] + vectors["y"] * others["y"]
+    return np.arctan2(cross + 0.0, dot + 0.0)  # of a vector of 0 it is 0, which -0.0 would make π
 
 
 def velocity_of(track: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
