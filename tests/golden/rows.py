@@ -31,7 +31,7 @@ SUITES: Mapping[str, tuple[str, dict[str, Any]]] = {
 }
 DATASETS = {
     "paper-v1": ["paper-v1"],
-    "stakes-v1": ["stakes-v1", "splits.test/std.maps=100"],
+    "stakes-v1": ["stakes-v1", "id=stakes-v1-100", "splits.test/std.maps=100"],
     "stakes-v1-400-seed2026": ["stakes-v1", "id=stakes-v1-400", "splits.test/std.maps=50", "--seed", "2026"],
 }
 SPLITS = {"paper-v1": "[test/std,test/hg,test/hs]"}
