@@ -156,7 +156,7 @@ def main() -> None:
         return
     stored = json.loads(STORED.read_text())
     if stored["machine"] != machine():
-        print(f"frozen on {stored['machine']}, compared on {machine()}: bits may differ for that alone")
+        print(f"frozen on {stored['machine']}, compared on {machine()}: bits may differ only for that reason")
     lines = [
         f"{name}: {line}"
         for name, episodes in tables.items()

@@ -14,7 +14,7 @@ import pandas as pd
 from numpy import ndarray
 
 # Thresholds that are someone's choice are marked (choice).
-WINDOW_S = 2.0  # over which the noise of positions is small beside the distance
+WINDOW_S = 2.0  # over which the noise of positions is small compared with the distance
 MIN_SPANS = 5  # that a median needs (choice)
 _GAP_S = 1.0  # without a row, after which nothing is said of the motion between
 _FREEZE_FIXES = 3  # periods of positions that one may stay the same (choice)
