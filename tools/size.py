@@ -44,7 +44,7 @@ def _docstring_lines(module: ast.Module) -> set[int]:
     for node in ast.walk(module):
         if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             continue
-        # A string that stands alone documents what is above it.
+        # A string by itself documents the statement above it.
         for statement in node.body:
             is_text = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
             if is_text and isinstance(statement.value.value, str):

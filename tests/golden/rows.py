@@ -33,7 +33,7 @@ SUITES: Mapping[str, tuple[str, str, dict[str, Any]]] = {
 }
 DATASETS = {
     "paper-v1": ["paper-v1"],
-    "stakes-v1": ["stakes-v1", "splits.test/std.maps=100"],
+    "stakes-v1": ["stakes-v1", "id=stakes-v1-100", "splits.test/std.maps=100"],
     "stakes-v1-400-seed2026": ["stakes-v1", "id=stakes-v1-400", "splits.test/std.maps=50", "--seed", "2026"],
 }
 SPLITS = {"paper-v1": "[test/std,test/hg,test/hs]"}
@@ -158,7 +158,7 @@ def main() -> None:
         return
     stored = json.loads(STORED.read_text())
     if stored["machine"] != machine():
-        print(f"frozen on {stored['machine']}, compared on {machine()}: bits may differ for that alone")
+        print(f"frozen on {stored['machine']}, compared on {machine()}: bits may differ only for that reason")
     lines = [
         f"{name}: {line}"
         for name, episodes in tables.items()

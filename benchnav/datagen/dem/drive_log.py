@@ -189,7 +189,7 @@ def read_drives(drives: Drives) -> DriveLog:
 
 
 def _resolution_m(x: ndarray, y: ndarray, *, is_geographic: bool) -> float:
-    """Return the step of which all positions are multiples, to three digits, 0 below some centimetres."""
+    """Return the largest step that divides all positions, to three digits; 0 below some centimetres."""
     most = 6 if is_geographic else 2
     for decimals in range(most):
         scaled = np.stack([x, y]) * 10.0**decimals

@@ -166,7 +166,7 @@ def _leave_out(
 
 
 def _check_rest(log: DriveLog, unknown: ndarray) -> None:
-    """Reject a log with many rows at rest of which nothing shows whether the robot or the receiver stopped."""
+    """Reject a log with many rows at rest if nothing shows whether the robot or the receiver stopped."""
     if unknown.mean() > MAX_FAULTY:
         raise DatasetError(
             f"Expected positions that change to the end of the drives of {log.settings.file}, got {unknown.sum()} of "

@@ -14,7 +14,7 @@ import pandas as pd
 from numpy import ndarray
 
 # Thresholds that are someone's choice are marked (choice).
-WINDOW_S = 2.0  # over which the noise of positions is small beside the distance
+WINDOW_S = 2.0  # over which the noise of positions is small compared with the distance
 MIN_SPANS = 5  # that a median needs (choice)
 _GAP_S = 1.0  # without a row, after which nothing is said of the motion between
 _FREEZE_FIXES = 3  # periods of positions that one may stay the same (choice)
@@ -217,7 +217,8 @@ def spans_of(track: pd.DataFrame, least_speed: float, span_s: float = WINDOW_S) 
 def _angle_between(vectors: pd.DataFrame, others: pd.DataFrame) -> pd.Series:
     """Return the signed angle from vectors to others, in (-π, π], from their columns `x` and `y`."""
     cross = vectors["x"] * others["y"] - vectors["y"] * others["x"]
-    return np.arctan2(cross, vectors["x"] * others["x"] + vectors["y"] * others["y"])
+    dot = vectors["x"] * others["x"] + vectors["y"] * others["y"]
+    return np.arctan2(cross + 0.0, dot + 0.0)  # of a vector of 0 it is 0, which -0.0 would make π
 
 
 def velocity_of(track: pd.DataFrame, columns: list[str]) -> pd.DataFrame:

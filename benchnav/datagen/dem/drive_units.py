@@ -12,7 +12,7 @@ _COMMAND_LIMITS = (
     _PLAUSIBLE[0],
     5.0,
 )  # of positions to the command, beyond which a time is in another unit (choice)
-_FASTEST = 0.95  # quantile of the spans of a log of which some may be of an immobilised robot (choice)
+_FASTEST = 0.95  # quantile of the spans of a log, some of which may show an immobilised robot (choice)
 _SLIPS = 0.9  # of measured to commanded speed, which is not that of wheels (choice)
 _COARSE = 0.25  # of a span's distance (choice)
 

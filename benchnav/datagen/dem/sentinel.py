@@ -39,7 +39,7 @@ def is_certain(raster: Raster, value: float, values: ndarray) -> bool:
     Args:
         raster: Whose value it is.
         value: Scaled.
-        values: Lowest or highest values in the map's cells, NaN where there are none. Where the raster declares another
+        values: Lowest or highest values in the map's cells, NaN in cells without one. Where the raster declares another
             value for missing, all others are nearer to 0 by more than half of it.
     """
     raw = raster.raw(value)
@@ -59,7 +59,7 @@ def is_missing(dem: Raster, height_m: float, heights_m: ndarray, cliff_m: float)
     Args:
         dem: Elevation model.
         height_m: The value.
-        heights_m: Lowest or highest values in the map's cells, NaN where there are none.
+        heights_m: Lowest or highest values in the map's cells, NaN in cells without one.
         cliff_m: Difference of heights that no natural ground has next to a cell.
     """
     is_height = _HEIGHTS_M[0] < height_m < _HEIGHTS_M[1]
@@ -80,10 +80,10 @@ def widest_gap_m(cliff_m: float) -> float:
 
 
 def zero_gap_m(heights_m: ndarray) -> float:
-    """Return how far cells of a height of exactly 0 are from all others; 0 where there are none of either kind.
+    """Return how far cells of a height of exactly 0 are from all others; 0 if either kind is missing.
 
     Args:
-        heights_m: Lowest values in the map's cells, NaN where there are none.
+        heights_m: Lowest values in the map's cells, NaN in cells without one.
     """
     apart_m = np.abs(heights_m)
     others = apart_m > 0

@@ -17,7 +17,7 @@ class KeepBest(Callback):
     """A callback that keeps and restores the weights of the epoch with the lowest validation loss, or of the last.
 
     They are part of what a training goes on from. Lightning's `ModelCheckpoint` would put them into a second file,
-    which a kill could leave of another epoch than the first, and knows the loss alone of all that was measured.
+    which a kill could leave from another epoch than the first, and knows only the loss of all that was measured.
 
     Args:
         last: keep the last epoch's whose loss is finite.

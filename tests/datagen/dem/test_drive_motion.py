@@ -150,9 +150,11 @@ def test_a_slalom_is_not_of_wheels() -> None:
 
 
 def test_few_straight_spans_name_no_unit_of_speed() -> None:
-    rows = drive(np.ones(30), np.full(30, 0.5), turn=np.repeat([0, 6.0, 0], 10)).assign(speed=1.0)
-    with pytest.raises(DatasetError, match="no unit that is known"):
-        compare_motion(log_of(rows))
+    turning = drive(np.ones(30), np.full(30, 0.5), turn=np.repeat([0, 6.0, 0], 10)).assign(speed=1.0)
+    standing = drive(np.repeat([0.0, 1.0], [18, 12]), np.full(30, 0.5144))
+    for rows in (turning, standing.assign(speed=standing["commanded"])):
+        with pytest.raises(DatasetError, match="no unit that is known"):
+            compare_motion(log_of(rows))
 
 
 def test_a_measured_speed_of_no_unit_is_rejected_too() -> None:

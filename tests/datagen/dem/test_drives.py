@@ -50,8 +50,8 @@ def drives_over(
         x, y = (start + np.linspace(0, 1, rows)[:, None] * (end - start)).T
         inside = (x > 0) & (x < WIDTH * CELL) & (y > 0) & (y < HEIGHT * CELL)
         x, y = x[inside], y[inside]
-        told = (1 if drive % 3 else -1) * generator.choice([0.5, 1.0], len(x))
-        about = {"x": x, "y": y, "commanded_m_s": told, "drive": f"drive-{drive:02d}"}
+        commanded = (1 if drive % 3 else -1) * generator.choice([0.5, 1.0], len(x))
+        about = {"x": x, "y": y, "commanded_m_s": commanded, "drive": f"drive-{drive:02d}"}
         parts.append(timed(pd.DataFrame(about), noise * generator.standard_normal(len(x))))
     return pd.concat(parts, ignore_index=True)
 

@@ -1,4 +1,4 @@
-"""Values that stand for missing are told from heights, whatever the raster declares."""
+"""Values that stand for missing are distinguished from heights, whatever the raster declares."""
 
 from types import SimpleNamespace
 from typing import Any
