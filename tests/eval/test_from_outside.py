@@ -1,138 +1,82 @@
 """Parts from outside, each in one file, give equal rows from a program and from the command in two processes."""
 
+import runpy
+import shlex
 from collections.abc import Iterator
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 
 from benchnav.core.errors import ConfigError
-from benchnav.datagen import load_recipe
 from benchnav.eval import Results, evaluate, open_run
-from benchnav.metrics import Energy, Episode, Metric
-from benchnav.planning import World
+from benchnav.metrics import Episode, Metric
 from benchnav.viz import Figure
 from tests.commands import call
 from tests.docs.pages import DOCS, blocks
 from tests.eval.test_evaluate import results_of
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
-MODEL = '''"""A model: less traversability on steeper ground."""
-
-import torch
-
-from benchnav import TraversabilityMixture
-from benchnav.models import TraversabilityModel
-
-
-class Steepness(TraversabilityModel):
-    def __init__(self, loss_per_deg: float = 0.02) -> None:
-        self.loss_per_deg = loss_per_deg
-
-    def predict(self, observation):
-        mean = (1 - self.loss_per_deg * observation.slope_deg).clamp(0, 1)
-        mean = mean[:, None]  # one Gaussian
-        return TraversabilityMixture(torch.ones_like(mean), mean, torch.full_like(mean, 0.1))
-'''
-FILES = ("own_metric", "own_planner", "own_figure", "slope_model", "wet")
-RISKS, MAPS = ["mean", "cvar:0.8"], 2
-
-
-def page_file(name: str) -> str:
-    """A file that the page on layers of one's own shows."""
-    return next(block.body for block in blocks(DOCS / "how-to" / "own-layer.md") if block.file == name)
+PAGE = list(blocks(DOCS / "tutorials" / "five-parts.md"))
+FILES = {block.file: block.body for block in PAGE if block.file}
+PARTS = ("wet", "dry", "headings", "lost", "lost_figure")
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A working folder with a file a part, which programs import and commands name."""
+    """A working folder with the files of the tutorial, which its program imports and its commands name."""
     folder = tmp_path_factory.mktemp("outside")
-    for name in ("own_metric.py", "own_planner.py", "own_figure.py"):
-        (folder / name).write_text((EXAMPLES / name).read_text())
-    (folder / "slope_model.py").write_text(MODEL)
-    (folder / "wet.py").write_text(page_file("wet.py"))
+    for name, body in FILES.items():
+        (folder / name).write_text(body)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.syspath_prepend(folder)
         yield folder
 
 
-@pytest.fixture(scope="module")
-def parts(place: Path) -> dict[str, ModuleType]:
-    """The modules of the files, by name."""
-    return {name: import_module(name) for name in FILES}
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_each_part_is_one_file_of_at_most_forty_lines(place: Path, name: str) -> None:
-    code = [line for line in (place / f"{name}.py").read_text().splitlines() if line.strip()]
-    assert len(code) <= 40
+@pytest.mark.parametrize("name", PARTS)
+def test_each_part_is_one_file_of_at_most_forty_lines(name: str) -> None:
+    assert len(FILES[f"{name}.py"].splitlines()) <= 40
 
 
 @pytest.fixture(scope="module")
-def program(parts: dict[str, ModuleType]) -> Results:
-    recipe = yaml.safe_load(page_file("wet.yaml"))
-    layer = parts["wet"].Wetness(**recipe["layers"][0]["options"])
-    Path("wet.yaml").write_text(page_file("wet.yaml"))
-    read = load_recipe("wet.yaml")
-    results = evaluate(
-        replace(read, layers=(layer,)),
-        folder="program",
-        planners=[parts["own_planner"].Fan(arcs=5)],
-        models=[parts["slope_model"].Steepness(loss_per_deg=0.03)],
-        risks=RISKS,
-        metrics=[parts["own_metric"].Detour(), Energy(power_w=120)],
-        figures=[parts["own_figure"].WhenFailed()],
-        world=World.stakes(time_budget_s=20.0),
-        maps=MAPS,
-        verbose=False,
-    )
+def program(place: Path) -> Results:
+    results: Results = runpy.run_path("program.py")["results"]
     assert not any("not reproducible" in note for note in results.notes)
     return results
 
 
+@pytest.fixture(scope="module")
+def figure(place: Path) -> Figure:
+    return import_module("lost_figure").LostOverTime()
+
+
 def test_rows_are_those_of_the_command_in_two_processes(program: Results) -> None:
-    assert call("datagen", "create", "wet.yaml", "--out", "wet.h5") == 0
-    named = {
-        "data": "wet.h5",
-        "model": "{part: 'slope_model.py:Steepness', label: 'Steepness:0.03', options: {loss_per_deg: 0.03}}",
-        "planners": "[{part: 'own_planner.py:Fan', label: 'Fan:5', options: {arcs: 5}}]",
-        "risks": str(RISKS),
-        "metrics": "['own_metric.py:Detour', 'energy:120']",
-        "figures": "['own_figure.py:WhenFailed']",
-        "world": "{preset: stakes, time_budget_s: 20}",
-        "maps": MAPS,
-        "jobs": 2,
-        "out": "command",
-    }
-    assert call("eval", "run", *(word for name, value in named.items() for word in (f"--{name}", value))) == 0
+    (commands,) = (block.body for block in PAGE if block.body.startswith("benchnav-datagen"))
+    for line in commands.replace("\\\n", " ").splitlines():
+        command, *words = shlex.split(line)
+        assert call(command.removeprefix("benchnav-"), *words) == 0
     ours, theirs = (
-        results_of(rows).drop(columns=["data", "condition"])
-        for rows in (program.episodes, open_run("command").episodes)
+        results_of(rows).drop(columns=["data", "condition", "planner", "model"])
+        for rows in (program.episodes, open_run("runs/command").episodes)
     )
-    order = ["scenario", "risk", "map"]
+    order = ["scenario", "risk", "map", "lost_m"]
     pd.testing.assert_frame_equal(
         ours.sort_values(order, ignore_index=True), theirs.sort_values(order, ignore_index=True)
     )
-    assert {"detour", "energy_j"} <= set(ours)
-    assert np.isfinite(ours["energy_j"]).all()
-    assert Path("command/figures/when-failed.png").is_file()
+    assert np.isfinite(ours[["lost_m", "energy_j"]]).all().all()
+    assert Path("runs/command/figures/lost-over-time.png").is_file()
 
 
 def test_a_figure_is_drawn_as_an_object_and_stands_in_the_report(
-    program: Results, parts: dict[str, ModuleType], tmp_path: Path
+    program: Results, figure: Figure, tmp_path: Path
 ) -> None:
-    assert not program.episodes["success"].all()
-    assert program.plot(parts["own_figure"].WhenFailed()).axes
+    assert program.plot(figure).axes
     page = program.report(tmp_path / "suite")
-    assert "failed episodes ended" in page.read_text()
-    renamed = parts["own_figure"].WhenFailed().variant(name="again")
+    assert "lost to slip in 6 episodes" in page.read_text()
+    renamed = figure.variant(name="again")
     program.report(tmp_path / "more", figures=[renamed])
     assert (tmp_path / "more" / "figures" / "again.png").is_file()
     assert "success" in dir(program.plot)
