@@ -49,6 +49,11 @@ def test_the_public_names_are_these(name: str) -> None:
     assert face(name).__all__ == sorted(FACES[name].split())
 
 
+def test_an_old_name_is_answered_with_the_new_one() -> None:
+    with pytest.raises(ImportError, match=r"^benchnav.planning.OptimalBound is now benchnav.planning.NearOptimal.$"):
+        exec("from benchnav.planning import OptimalBound")
+
+
 @EACH
 def test_every_public_name_can_be_had_and_lies_in_its_package(name: str) -> None:
     for public in face(name).__all__:

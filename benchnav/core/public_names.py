@@ -5,6 +5,8 @@ from collections.abc import Callable, Collection, Mapping
 from importlib import import_module
 from typing import Any
 
+from benchnav.core.renamed import IMPORTS
+
 
 def face(
     package: str, modules: Mapping[str, Collection[str]]
@@ -26,6 +28,9 @@ def face(
             places[public or own] = module, own
 
     def find(name: str) -> Any:
+        old = f"{package}.{name}"
+        if old in IMPORTS:  # an ImportError, since `from … import` hides the text of an AttributeError
+            raise ImportError(f"{old} is now {IMPORTS[old]}.")
         if name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module, own = places[name]

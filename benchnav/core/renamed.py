@@ -3,6 +3,7 @@
 # What programs import.
 IMPORTS = {
     "benchnav.core.figures": "benchnav.viz",
+    "benchnav.planning.OptimalBound": "benchnav.planning.NearOptimal",
     "benchnav.planning.risk.chance": "benchnav.planning.Chance",
     "benchnav.planning.risk.cvar": "benchnav.planning.CVaR",
     "benchnav.planning.risk.expected_time": "benchnav.planning.ExpectedTime",
