@@ -232,7 +232,7 @@ BAD: list[tuple[str, str]] = [
     ('eval run --config binary.yaml', "Expected a YAML file, got 'binary.yaml': it is no text."),
     ('eval run --config broken.yaml', "Expected YAML, got broken.yaml, line 3: did not find expected ',' or ']'."),
     ('eval run --config list.yaml', 'Expected list.yaml to hold settings as `name: value`, got list.'),
-    ('eval run --config unknown.yaml', "Expected keys of unknown.yaml among data, scenarios, model, models, planners, risks, robots, objectives, sensors, grounds, beliefs, world, task, maps, seed, seeds, realisations, record, conditions, hypotheses, out, jobs, overwrite, planner_limit_s, shard, backend, scheduler, device, reuse_code, check_determinism, got 'risk'. Did you mean 'risks'?"),
+    ('eval run --config unknown.yaml', "Expected keys of unknown.yaml among data, scenarios, model, models, planners, risks, robots, objectives, sensors, grounds, beliefs, world, task, maps, seed, seeds, realisations, record, conditions, hypotheses, metrics, figures, out, jobs, overwrite, planner_limit_s, shard, backend, scheduler, device, reuse_code, check_determinism, got 'risk'. Did you mean 'risks'?"),
     ('eval run --config null.yaml', 'Expected `maps` of null.yaml as a whole number, got null.'),
     ('eval run --config type.yaml', "Expected `maps` of type.yaml as a whole number, got 'ten'."),
     ('train classifier --config nested.yaml', "Expected keys of `classifier` of nested.yaml among inputs, jitter, symmetries, crop, learning_rate, weight_decay, batch_size, max_epochs, patience, masking, architecture, encoder, pretrained, encoder_depth, decoder_channels, full_resolution, focal, dice, label_smoothing, got 'encodr'. Did you mean 'encoder'?"),
