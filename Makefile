@@ -64,13 +64,11 @@ test-lowest:
 	$(LOWEST)/bin/python -m pytest -n $(JOBS) --dist loadfile
 
 bench: $(STAMP)
-	$(BIN)/python benchmarks/datasets.py
-	$(BIN)/python benchmarks/gps.py
-	$(BIN)/python benchmarks/training.py
-	$(BIN)/python benchmarks/engine.py bench.json
-	$(BIN)/python benchmarks/rollouts.py
-	$(BIN)/python benchmarks/knowledge.py
-	$(BIN)/python benchmarks/risk_parts.py
+	$(BIN)/python -m benchmarks.datasets
+	$(BIN)/python -m benchmarks.training
+	$(BIN)/python -m benchmarks.engine bench.json
+	$(BIN)/python -m benchmarks.parts
+	$(BIN)/python -m benchmarks.knowledge
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -1,6 +1,6 @@
 """How the time of a plan grows: with samples, horizon, episodes and the size of the map.
 
-    python benchmarks/scaling.py OUT.png
+    python -m benchmarks.scaling OUT.png
 
 One thread, medians. Each curve changes one setting of: 5 000 samples, 5 s (50 steps), 20 episodes, a map of 64 × 64
 cells.
@@ -8,23 +8,22 @@ cells.
 
 import sys
 from pathlib import Path
+from typing import Any
 
-import matplotlib.pyplot as plt
+import pandas as pd
 import torch
-from engine import milliseconds
-from rich.console import Console
-from rich.progress import track
 
+from benchmarks.timing import plan_ms, show
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig
-from benchnav.planning.planners.planner import Planner
 from benchnav.planning.problem import Problem, Rules, Task, pose_problem
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing.sensor import Step
+from benchnav.viz.panels import draw_estimates, line_looks, panel_grid
+from benchnav.viz.style import legend_outside, save, styled
 
 SAMPLES = (2000, 5000, 10_000, 20_000, 50_000)
 HORIZONS_S = (1, 2, 5, 10, 20)
@@ -32,53 +31,47 @@ EPISODES = (1, 2, 5, 10, 20, 50, 100)
 SIZES = (64, 128, 256, 512, 1024)
 
 
-def problem_of(episodes: int, size: int) -> Problem:
-    """Uneven ground, the same for all."""
+def problem_of(episodes: int = 20, size: int = 64) -> Problem:
+    """Return a problem on uneven ground, the same for all episodes."""
     generator = torch.Generator().manual_seed(0)
     ground = 0.35 + 0.6 * torch.rand((1, size, size), generator=generator).expand(episodes, -1, -1)
     ones = torch.ones_like(ground).unsqueeze(1)
     mixture = TraversabilityMixture(ones, ground.unsqueeze(1), 0.1 * ones)
-    seen = Observation(
-        torch.zeros(episodes, 3, size, size, dtype=torch.uint8), 0 * ground, 0 * ground, Grid(size, size, 0.5)
-    )
+    rgb = torch.zeros(episodes, 3, size, size, dtype=torch.uint8)
+    seen = Observation(rgb, 0 * ground, 0 * ground, Grid(size, size, 0.5))
     start_m, goal_m = (torch.full((episodes, 2), place) for place in (4.0, size / 2 - 4.0))
     task = Task(robot=Unicycle(), objective=GoalDistance(), rules=Rules())
     return pose_problem(task, seen, mixture, ground, start_m, goal_m, 100.0)
 
 
-def plan_ms(planner: Planner[object], problem: Problem) -> float:
-    """Time of a step, an episode."""
-    state = planner.init(problem, torch.Generator().manual_seed(0))
-    step = Step(state=problem.start, traversability=torch.full((len(problem),), torch.nan), time_s=0.0)
-    _, state, _ = planner.plan(step, state)
-    return milliseconds(lambda: planner.plan(step, state), 11) / len(problem)
-
-
+@styled()
 def main() -> None:
+    """Print the times and draw them."""
     torch.set_num_threads(1)
-    small = problem_of(20, 64)
-    curves = {
-        "samples": {n: plan_ms(MPPI(MPPIConfig(samples=n)), small) for n in track(SAMPLES)},
-        "horizon [s]": {s: plan_ms(MPPI(MPPIConfig(horizon_s=s)), small) for s in track(HORIZONS_S)},
-        "episodes": {n: plan_ms(MPPI(), problem_of(n, 64)) for n in track(EPISODES)},
-        "cells along a side of the map": {n: plan_ms(MPPI(), problem_of(20, n)) for n in track(SIZES)},
-    }
-    guided = {n: plan_ms(AStarDWA(), problem_of(n, 64)) for n in track(EPISODES)}
-    figure, panels = plt.subplots(1, 4, figsize=(11, 2.8), sharey=True, layout="constrained")
-    for panel, (name, curve) in zip(panels, curves.items(), strict=True):
-        panel.plot(list(curve), list(curve.values()), marker="o", label="MPPI")
-        if name == "episodes":
-            panel.plot(list(guided), list(guided.values()), marker="s", label="A*+DWA")
-            panel.legend(frameon=False)
-        panel.set(xscale="log", yscale="log", xlabel=name)
-        panel.set_xticks(list(curve), [f"{n:,}".replace(",", " ") for n in curve], rotation=45)
-        panel.minorticks_off()
-        panel.grid(visible=True, alpha=0.3)
-    panels[0].set_yticks([0.2, 0.5, 1, 2, 5, 10], ["0.2", "0.5", "1", "2", "5", "10"])
-    panels[0].set_ylabel("ms a step and episode")
-    figure.savefig(Path(sys.argv[1]), dpi=150)
-    for name, curve in (*curves.items(), ("episodes, A*+DWA", guided)):
-        Console().print(name, {n: round(ms, 3) for n, ms in curve.items()})
+    cases: list[tuple[str, str, int, Any, Problem]] = [
+        *(("samples", "MPPI", n, MPPI(MPPIConfig(samples=n)), problem_of()) for n in SAMPLES),
+        *(("horizon [s]", "MPPI", s, MPPI(MPPIConfig(horizon_s=s)), problem_of()) for s in HORIZONS_S),
+        *(("episodes", "MPPI", n, MPPI(), problem_of(n)) for n in EPISODES),
+        *(("episodes", "A*+DWA", n, AStarDWA(), problem_of(n)) for n in EPISODES),
+        *(("cells along a side of the map", "MPPI", n, MPPI(), problem_of(size=n)) for n in SIZES),
+    ]
+    rows = [
+        {"setting": setting, "planner": name, "value": value, "ms": plan_ms(planner, problem, 11)}
+        for setting, name, value, planner, problem in cases
+    ]
+    show(rows)
+    table = pd.DataFrame(rows)
+    looks = line_looks(["MPPI", "A*+DWA"])
+    settings = list(dict.fromkeys(table["setting"]))
+    figure, places = panel_grid([""] * len(settings), 4, 1.8, sharey=True)
+    for (panel,), setting in zip(places, settings, strict=True):
+        for name, curve in table[table["setting"] == setting].groupby("planner", sort=False):
+            ms = curve["ms"]
+            draw_estimates(panel, curve["value"], ms, ms, ms, looks[str(name)], str(name))
+        panel.set(xscale="log", yscale="log", xlabel=setting)
+    places[0][0].set_ylabel("ms a step and episode")
+    legend_outside(figure)
+    save(figure, Path(sys.argv[1]), "png", dpi=200)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,12 @@
 """How long a large map takes tile by tile, and how much memory: that of the whole process at its most.
 
-    python benchmarks/tiles.py                       # 4096 × 4096 cells, the shipped checkpoint stakes-v1
-    python benchmarks/tiles.py paper-v1 2048 512     # another checkpoint, side of the map and of a tile
+    python -m benchmarks.tiles                       # 4096 × 4096 cells, the shipped checkpoint stakes-v1
+    python -m benchmarks.tiles paper-v1 2048 512     # another checkpoint, side of the map and of a tile
 
 The map is laid out of shipped maps, drawn at random. What is written is its CVaR at level 0.9 and its mean. Times are
 those of one core.
 """
 
-import resource
 import sys
 import tempfile
 import time
@@ -15,10 +14,9 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
+from benchmarks.timing import peak_gib, show
 from benchnav import Grid, Observation
 from benchnav.datagen import TerrainDataset, find_dataset
 from benchnav.models import load_model, measure_margin, write_risk_maps
@@ -29,13 +27,8 @@ MEASURES: dict[str, Callable[[Any], Tensor]] = {
 }
 
 
-def peak_gib() -> float:
-    # The kernel counts kilobytes on Linux and bytes on macOS.
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
-
-
 def large_map(name: str, side: int) -> Observation:
+    """Lay a map out of shipped maps."""
     dataset = TerrainDataset(find_dataset(f"{name}-test"))
     split = next(iter(dataset.splits))
     maps = dataset.terrain(split).observe()
@@ -51,22 +44,26 @@ def large_map(name: str, side: int) -> Observation:
 
 
 def main(name: str = "stakes-v1", side: str = "4096", tile: str = "1024") -> None:
+    """Print the table."""
     torch.set_num_threads(1)
-    table = Table("work", "time", "peak memory", title=f"{name}, {side} × {side} cells, tiles of {tile}")
-    model = load_model(name)
-    table.add_row("imports and the checkpoint", "", f"{peak_gib():.2f} GiB")
-    observation = large_map(name, int(side))
-    table.add_row("the map", "", f"{peak_gib():.2f} GiB")
-    start = time.process_time()
-    margin = measure_margin(model, observation)
-    took = time.process_time() - start
-    table.add_row(f"measure_margin: {margin} cells", f"{took:.1f} s", f"{peak_gib():.2f} GiB")
-    with tempfile.TemporaryDirectory() as folder:
+    rows: list[dict[str, Any]] = []
+
+    def measured(work: str, call: Callable[[], Any]) -> Any:
         start = time.process_time()
-        write_risk_maps(model, observation, MEASURES, folder, int(tile), margin)
-        took = time.process_time() - start
-        table.add_row("write_risk_maps: CVaR and mean", f"{took:.1f} s", f"{peak_gib():.2f} GiB")
-    Console().print(table)
+        result = call()
+        rows.append({"work": work, "s": time.process_time() - start, "peak memory [GiB]": peak_gib()})
+        return result
+
+    model = measured("imports and the checkpoint", lambda: load_model(name))
+    observation = measured("the map", lambda: large_map(name, int(side)))
+    margin = measured("measure_margin", lambda: measure_margin(model, observation))
+    with tempfile.TemporaryDirectory() as folder:
+        measured(
+            "write_risk_maps: CVaR and mean",
+            lambda: write_risk_maps(model, observation, MEASURES, folder, int(tile), margin),
+        )
+    print(f"{name}, {side} × {side} cells, tiles of {tile}, margin of {margin} cells")
+    show(rows)
 
 
 if __name__ == "__main__":

@@ -1,32 +1,37 @@
-"""How fast the classifier trains, beside a plain PyTorch loop over the same network in the same run.
+"""How fast the classifier trains, next to a plain PyTorch loop over the same network, and the Gaussian processes.
 
-    python benchmarks/training.py [DATASET]
+    python -m benchmarks.training [DATASET]
 
 Without a dataset, paper-v1 is made in a temporary folder. Ours is an epoch of `benchnav-train
 classifier` as it comes: augmentation, schedule, metrics, logs. The whole epoch adds validation and the
-state from which a killed training goes on. The plain loop steps AdamW over the same batches, neither
+state that a killed training resumes from. The plain loop steps AdamW over the same batches, neither
 turned nor measured.
 """
 
+import contextlib
+import io
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from statistics import median
 
 import lightning
 import torch
 from lightning.pytorch.callbacks import Callback
-from rich.console import Console
-from rich.table import Table
 
+from benchmarks.timing import seconds, show
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.models.config import ClassifierConfig
+from benchnav.models.config import ClassifierConfig, LatentGPConfig
 from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.slope_gp.cells import sum_split
 from benchnav.models.training.best import KeepBest
 from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions, default_precision, fit
+from benchnav.models.training.gaussian_processes import fit_gps
 
 EPOCHS = 2
 
@@ -82,31 +87,42 @@ def plain(data: MapData, config: ClassifierConfig, classes: tuple[str, ...], aut
     return len(data.train) / best
 
 
+def time_classifier(dataset: TerrainDataset) -> None:
+    """Print images a second of training the classifier."""
+    classes = tuple(item.name for item in dataset.recipe.classes)
+    config = ClassifierConfig(max_epochs=EPOCHS)
+    data = MapData(dataset, config.batch_size, 0)
+    rows = []
+    for precision in ("32-true", default_precision()):
+        steps, epochs = ours(data, config, precision, classes)
+        base = plain(data, config, classes, precision != "32-true")
+        rows.append({"images/s": precision, "plain loop": base, "steps": steps, "whole epochs": epochs})
+    show(rows)
+
+
+def time_gps(dataset: TerrainDataset) -> None:
+    """Print seconds of reading all cells and of fitting the Gaussian processes of all classes."""
+    sums = sum_split(dataset, "train")
+    works: dict[str, Callable[[], object]] = {
+        "reading and summing all cells": lambda: sum_split(dataset, "train"),
+        "fit_gps, one mode a class": lambda: fit_gps(LatentGPConfig(second_component=False), sums),
+        "fit_gps, looking for second modes": lambda: fit_gps(LatentGPConfig(), sums),
+    }
+    with contextlib.redirect_stderr(io.StringIO()):
+        rows = [{"work": name, "s": median(seconds(work, 5))} for name, work in works.items()]
+    show(rows)
+
+
 def main() -> None:
-    console = Console(highlight=False, width=100)
+    """Print both tables."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(folder) / "paper-v1.h5"
-        if len(sys.argv) < 2:
+        if not path.exists():
             for _ in create(load_recipe("paper-v1"), path, jobs=2):
                 pass
         dataset = TerrainDataset(path)
-        classes = tuple(item.name for item in dataset.recipe.classes)
-        config = ClassifierConfig(max_epochs=EPOCHS)
-        data = MapData(dataset, config.batch_size, 0)
-        table = Table("training, images/s", "32-true", default_precision(), "ratio")
-        threads = torch.get_num_threads()
-        table.title = f"{config.architecture}, {config.encoder}, {len(data.train)} maps, {threads} threads"
-        simple = [plain(data, config, classes, autocast) for autocast in (False, True)]
-        for name, values in (
-            ("plain loop", simple),
-            *zip(
-                ("benchnav-train: steps", "benchnav-train: whole epochs"),
-                zip(*(ours(data, config, p, classes) for p in ("32-true", default_precision())), strict=True),
-                strict=True,
-            ),
-        ):
-            table.add_row(name, *(f"{value:.0f}" for value in values), f"{values[1] / simple[0]:.2f}")
-        console.print(table)
+        time_gps(dataset)
+        time_classifier(dataset)
 
 
 if __name__ == "__main__":

@@ -1,50 +1,50 @@
-"""Curves with intervals, as the figures of the studies show them."""
+"""Curves with intervals over rows of summaries, as the figures of the studies show them."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
+from matplotlib.figure import Figure
 
-from benchnav.viz.style import LINE_COLOURS, MARKERS
+from benchnav.viz.panels import Curves, line_looks
+from benchnav.viz.style import legend_outside
 
 # Columns of a summary with their ends, factor and label.
-SUCCESS = (("success_rate", "success_low", "success_high"), 100.0, "success [%]")
-TOTAL_TIME = (("total_time_mean_s", "total_time_low_s", "total_time_high_s"), 1.0, "T_total [s]")
+SUCCESS = ("success_rate", "success_low", "success_high"), 100.0, "success [%]"
+TOTAL_TIME = ("total_time_mean_s", "total_time_low_s", "total_time_high_s"), 1.0, "T_total [s]"
 
 
-def draw_curve(
-    panel: Axes,
-    x: Any,
-    rows: pd.DataFrame,
-    place: int,
-    label: str = "",
-    sizes: Any = None,
-    measure: Any = SUCCESS,
-) -> Line2D:
-    """Draw a measure of conditions with 95 % intervals, a marker each.
+def in_units(row: Any, measure: Any) -> list[Any]:
+    """Return a measure of a row, or of rows, and the ends of its interval, in the units of its label."""
+    columns, factor, _ = measure
+    return [factor * row[column] for column in columns]
+
+
+def draw_curves(
+    rows: pd.DataFrame, measures: Mapping[str, Any], x_label: str = "", across: int = 2, high_in: float = 2.0
+) -> tuple[Figure, dict[tuple[str, str], Axes]]:
+    """Draw measures of conditions with 95 % intervals, a marker each, and a legend.
 
     Args:
-        panel: where.
-        x: of each condition.
-        rows: a row of a summary each.
-        place: of the curve, by which it has its colour and its marker.
-        label: of the curve.
-        sizes: area of each marker, in points²; all the same where not given.
-        measure: `SUCCESS` or `TOTAL_TIME`.
+        rows: rows of a summary with `panel`, `line` and `x`; a curve joins the rows of a line as they stand.
+        measures: by name, such as `SUCCESS`.
+        x_label: of the axes.
+        across: panels side by side.
+        high_in: height of a panel in inches.
 
     Returns:
-        A handle for a legend.
+        The figure, and its panels by `panel` and measure.
     """
-    columns, factor, ylabel = measure
-    middle, low, high = (factor * rows[column].to_numpy() for column in columns)
-    looks: dict[str, Any] = {"color": LINE_COLOURS[place], "marker": MARKERS[place]}
-    panel.errorbar(
-        x, middle, yerr=[middle - low, high - middle], lw=1.1, elinewidth=0.8, capsize=2, label=label,
-        **looks | {"ms": 4.0 if sizes is None else 0.0},
-    )  # fmt: skip
-    if sizes is not None:
-        panel.scatter(x, middle, s=sizes, zorder=3, lw=0, **looks)
-    panel.grid(axis="y", color="0.93")
-    panel.set_ylabel(ylabel)
-    return Line2D([], [], ms=5, lw=1.1, label=label, **looks)
+    table, labels = rows.copy(), {}
+    for name, measure in measures.items():
+        labels[name] = measure[-1]
+        for end, values in zip(("", "_low", "_high"), in_units(table, measure), strict=True):
+            table[name + end] = values
+    looks = line_looks(list(rows["line"]))
+    curves = Curves(
+        table=table, measures=labels, looks=looks, x_label=x_label, across=across, high_in=high_in, bars=True
+    )
+    figure, panels = curves.draw()
+    legend_outside(figure, columns=len(looks))
+    return figure, panels

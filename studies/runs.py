@@ -84,6 +84,8 @@ def _run_script(study: Study, part: str, work: Work) -> None:
             with replacing(path.with_suffix(".png")) as partial:
                 save(result, partial, "png", dpi=200)
             continue
+        if isinstance(result, list):
+            result = pd.DataFrame(result)
         if isinstance(result, pd.DataFrame):
             write_text(path.with_suffix(".csv"), result.to_csv(index=False))
             result = table_of(result)

@@ -20,6 +20,9 @@ from benchnav.eval.cli import SUITES
 ROOT = Path(__file__).parents[1]
 HOME = ROOT / "studies"
 
+# Rows of a table: cells by heading.
+Rows = list[dict[str, Any]]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Work:

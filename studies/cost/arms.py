@@ -1,7 +1,6 @@
 """Arms of risk on the cost: the table of their differences, and success over time through their levels."""
 
 from collections.abc import Mapping
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +12,14 @@ from benchnav.eval.compare import read_conditions
 from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import Compared, Pair, check_maps, side_by_side
-from benchnav.viz.style import TWO_COLUMNS_IN, legend_outside, styled
-from studies.curves import draw_curve
+from benchnav.viz.style import planner_name, styled
+from studies.curves import SUCCESS, draw_curves
 from studies.tables import success, table
 
 ARMS = ("CVaR of λ", "CVaR of time", "CVaR of the cost")
-# Each planner of the study with its name in the figure.
-FAMILIES = {"mppi": "MPPI", "astar_mppi": "A*+MPPI"}
 _MEASURES = ("success", "total_time_s", "time_budget_s")
+
+
 _HEADINGS = (
     "planner", "risk", "success [%] (95 %)", "T_total [s]", "ms a step", "Δ success [points] (95 %)", "p",
     "Δ time where both arrive [s] (95 %)",
@@ -76,8 +75,8 @@ def arm_of(row: Mapping[Any, Any]) -> dict[str, Any]:
     """Return planner, arm and level of a condition, and whether it has entrapment; other conditions have no arm."""
     part, _, kind = row["planner"].partition(" ")
     name, _, level = row["risk"].partition(":")
-    found = {"planner": FAMILIES.get(part, ""), "held": "held" in kind, "arm": "", "level": 0.0}
-    if part not in FAMILIES or row["model"] == "clairvoyant":
+    found = {"planner": planner_name(part), "held": "held" in kind, "arm": "", "level": 0.0}
+    if not kind or row["model"] == "clairvoyant":
         return found
     if "cost" in kind:
         return found | {"arm": "CVaR of the cost", "level": float(kind.split()[1])}
@@ -87,24 +86,17 @@ def arm_of(row: Mapping[Any, Any]) -> dict[str, Any]:
 
 @styled()
 def frontier(summary: pd.DataFrame) -> Figure:
-    """Draw success over the time to the goal, a curve an arm through its levels; markers grow with the level.
+    """Draw success over the time to the goal, a curve an arm through its levels, which are named at its markers.
 
     A panel a planner; in the row below with entrapment.
     """
     rows = summary.assign(**pd.DataFrame([arm_of(row) for row in summary.to_dict("records")], summary.index))
-    rows = rows[rows["arm"] != ""]
-    planners = list(dict.fromkeys(rows["planner"]))
-    figure = Figure(figsize=(TWO_COLUMNS_IN, 4.6), layout="constrained")
-    axes = figure.subplots(2, len(planners), sharex="row", sharey=True, squeeze=False)
-    handles = {}
-    for (held, planner), panel in zip(product((False, True), planners), axes.flat, strict=True):
-        in_panel = rows[(rows["planner"] == planner) & (rows["held"] == held)].sort_values("level")
-        for place, arm in enumerate(ARMS):
-            curve = in_panel[in_panel["arm"] == arm]
-            sizes = (3 + 5 * curve["level"]) ** 2
-            handles[arm] = draw_curve(panel, curve["success_time_mean_s"], curve, place, sizes=sizes)
-            handles[arm].set_label(arm)
-        panel.set_title(f"{planner}, entrapment" if held else planner)
-        panel.set_xlabel("mean time of those that arrive [s]" if held else "")
-    legend_outside(figure, list(handles.values()), len(ARMS))
+    rows = rows[rows["arm"] != ""].sort_values(["held", "arm", "level"], kind="stable")
+    kind = rows["held"].map({True: ", entrapment", False: ""})
+    rows = rows.assign(panel=rows["planner"] + kind, line=rows["arm"], x=rows["success_time_mean_s"])
+    figure, panels = draw_curves(rows, {"success": SUCCESS}, "mean time of those that arrive [s]")
+    for row in rows.to_dict("records"):
+        place = row["x"], 100 * row["success_rate"]
+        panel = panels[row["panel"], "success"]
+        panel.annotate(f"{row['level']:g}", place, (3, -8), textcoords="offset points", size=6)
     return figure

@@ -6,9 +6,8 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
-from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.viz.style import TWO_COLUMNS_IN, legend_outside, risk_name, styled
-from studies.curves import draw_curve
+from benchnav.viz.style import planner_name, risk_name, styled
+from studies.curves import SUCCESS, draw_curves
 
 # What is known, by sensor of λ and belief, from nothing to all.
 KNOWN = {
@@ -18,7 +17,6 @@ KNOWN = {
     ("probe:2", "copula"): "λ within\n2 m",
 }
 ALL_KNOWN = "all of λ"
-PLANNERS = {"astar_dwa": "A*+DWA", "astar_mppi": "A*+MPPI"}
 
 
 def known_of(row: Mapping[Any, Any]) -> str:
@@ -31,27 +29,24 @@ def known_of(row: Mapping[Any, Any]) -> str:
 @styled()
 def known(summary: pd.DataFrame) -> Figure:
     """Draw the figure from the rows of `known` and `known-mppi`."""
-    rows = summary[(summary["world"] == "stakes") & summary["planner"].isin(PLANNERS)]
+    rows = summary[(summary["world"] == "stakes") & summary["planner"].isin(("astar_dwa", "astar_mppi"))]
     rows = rows.assign(known=[known_of(row) for row in rows.to_dict("records")])
     rows = rows[rows["known"] != ""]
+    # The clairvoyant has one row, which is of all models and risk settings.
+    is_told = rows["model"] == "clairvoyant"
+    settings = rows.loc[~is_told, ["planner", "model", "risk"]].drop_duplicates()
+    rows = pd.concat(
+        [rows[~is_told], rows[is_told].drop(columns=["model", "risk"]).merge(settings, on="planner")]
+    )
     names = [*KNOWN.values(), ALL_KNOWN]
-    pairs = dict.fromkeys(zip(rows["planner"], rows["model"], strict=True))
-    panels = [pair for pair in pairs if pair[1] != "clairvoyant"]
-    down = -(-len(panels) // 2)
-    figure = Figure(figsize=(TWO_COLUMNS_IN, 2.3 * down + 0.4), layout="constrained")
-    axes = figure.subplots(down, 2, sharex=True, sharey=True, squeeze=False).flat
-    risks = [risk for risk in dict.fromkeys(rows["risk"]) if risk != NOT_USED]
-    for panel, (planner, model) in zip(axes, panels, strict=False):
-        in_panel = rows[(rows["planner"] == planner) & rows["model"].isin([model, "clairvoyant"])]
-        for place, risk in enumerate(risks):
-            # The clairvoyant has one row for all risk settings.
-            curve = (
-                in_panel[in_panel["risk"].isin([risk, NOT_USED])].drop_duplicates("known").set_index("known")
-            )
-            curve = curve.reindex([name for name in names if name in curve.index])
-            at = [names.index(name) + 0.1 * (place - (len(risks) - 1) / 2) for name in curve.index]
-            draw_curve(panel, at, curve, place, risk_name(risk))
-        panel.set_title(f"{PLANNERS[planner]}, model {model}")
+    risks = list(dict.fromkeys(rows["risk"]))
+    beside = 0.1 * (rows["risk"].map(risks.index) - (len(risks) - 1) / 2)
+    rows = rows.assign(
+        panel=rows["planner"].map(planner_name) + ", model " + rows["model"],
+        line=rows["risk"].map(risk_name),
+        x=rows["known"].map(names.index) + beside,
+    )
+    figure, panels = draw_curves(rows.sort_values("x"), {"success": SUCCESS}, high_in=2.3)
+    for panel in panels.values():
         panel.set_xticks(range(len(names)), names)
-    legend_outside(figure, columns=len(risks))
     return figure

@@ -13,37 +13,34 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich.progress import track
 
-from benchnav.core.tables import Table
 from benchnav.eval.experiment.condition import condition_from
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.unit import Settings, simulate
-from benchnav.viz.style import TWO_COLUMNS_IN, legend_outside, styled
-from studies.curves import SUCCESS, TOTAL_TIME, draw_curve
-from studies.study import Work
-from studies.tables import table
+from benchnav.viz.style import styled
+from studies.curves import SUCCESS, TOTAL_TIME, draw_curves, in_units
+from studies.study import Rows, Work
 from studies.units import build_unit
 
 MAPS, SKIPPED = 3, 10
 
 
-def computing(work: Work, folder: Path) -> dict[str, Table | Figure]:
+def computing(work: Work, folder: Path) -> dict[str, Rows | Figure]:
     """Return the table and the figure of the run `matched`."""
     run = work.out / "matched"
     conditions = json.loads((run / "run.json").read_text())["conditions"]
     rows = pd.read_csv(run / "summary.csv")
     rows["ms"] = [step_ms(conditions[condition]) for condition in track(rows["condition"], "measuring")]
     rows["family"] = rows["planner"].str.replace(r" \d+( x \d+)?$", "", regex=True)
-    cells = [
-        (
-            row["planner"],
-            f"{row['ms']:.2g}",
-            f"{100 * row['success_rate']:.0f} ({100 * row['success_low']:.0f}–{100 * row['success_high']:.0f})",
-            f"{row['total_time_mean_s']:.1f} ({row['total_time_low_s']:.1f}–{row['total_time_high_s']:.1f})",
-        )
+    table = [
+        {
+            "planner": row["planner"],
+            "ms a step": f"{row['ms']:.2g}",
+            "success [%] (95 %)": "{:.0f} ({:.0f}–{:.0f})".format(*in_units(row, SUCCESS)),
+            "T_total [s] (95 %)": "{:.1f} ({:.1f}–{:.1f})".format(*in_units(row, TOTAL_TIME)),
+        }
         for row in rows.to_dict("records")
     ]
-    headings = ("planner", "ms a step", "success [%] (95 %)", "T_total [s] (95 %)")
-    return {"computing": table(headings, cells), "matched": matched_figure(rows)}
+    return {"computing": table, "matched": matched_figure(rows)}
 
 
 def step_ms(about: dict[str, Any]) -> float:
@@ -59,11 +56,8 @@ def step_ms(about: dict[str, Any]) -> float:
 @styled()
 def matched_figure(rows: pd.DataFrame) -> Figure:
     """Draw success and T_total over the time of a step."""
-    figure = Figure(figsize=(TWO_COLUMNS_IN, 2.6), layout="constrained")
-    for panel, measure in zip(figure.subplots(1, 2), (SUCCESS, TOTAL_TIME), strict=True):
-        for place, (name, family) in enumerate(rows.groupby("family", sort=False)):
-            family = family.sort_values("ms")
-            draw_curve(panel, family["ms"], family, place, str(name), measure=measure)
-        panel.set(xscale="log", xlabel="ms a step of one robot")
-    legend_outside(figure)
+    measures = {"success": SUCCESS, "time": TOTAL_TIME}
+    rows = rows.assign(panel="", line=rows["family"], x=rows["ms"]).sort_values("x")
+    figure, panels = draw_curves(rows, measures, "ms a step of one robot")
+    panels["", "success"].set_xscale("log")
     return figure

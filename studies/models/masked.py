@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from benchnav.core.ground import SEEN
-from benchnav.core.tables import Table
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import TraversabilityModel, predict_observation
@@ -24,8 +23,7 @@ from benchnav.models.predictor import find_ground_statistics, load_model
 from benchnav.models.quality.scores import lower_fifth_and_width
 from benchnav.models.training.map_order import draw_looks
 from benchnav.models.training.masks import RandomMasks
-from studies.study import Work
-from studies.tables import table
+from studies.study import Rows, Work
 
 SPLIT, SEED = "test/std", 0
 RADII_M = (4.0, 8.0, 16.0)
@@ -33,7 +31,7 @@ MODELS = ("stakes-v1", "stakes-v1-masked")
 SCORES = ("NLL", "CRPS", "lower fifth", "class right")
 
 
-def tables(work: Work, folder: Path, models: Sequence[str] = MODELS) -> dict[str, Table]:
+def tables(work: Work, folder: Path, models: Sequence[str] = MODELS) -> dict[str, Rows]:
     """Return the scores of two checkpoints by what is seen of a map, the plain one first."""
     dataset = TerrainDataset(work.maps_in / "stakes-v1.h5")
     loaded = [load_model(name) for name in models]
@@ -47,8 +45,11 @@ def tables(work: Work, folder: Path, models: Sequence[str] = MODELS) -> dict[str
         )
         sums = np.concatenate([measure(loaded, *observation) for observation in observed(dataset, masks)], 1)
         seen = "whole" if radius_m is None else f"{radius_m:g} m"
-        rows += [(seen, name, *row) for name, row in zip((*models, "difference"), lines(sums), strict=True)]
-    return {"masked": table(("seen", "model", *SCORES), rows, 2)}
+        rows += [
+            {"seen": seen, "model": name, **dict(zip(SCORES, row, strict=True))}
+            for name, row in zip((*models, "difference"), lines(sums), strict=True)
+        ]
+    return {"masked": rows}
 
 
 def observed(
@@ -63,13 +64,11 @@ def observed(
         if masks is None:
             yield terrain, whole, torch.ones_like(terrain.class_id, dtype=torch.bool)
             continue
-        maps = {"rgb": whole.rgb, "elevation_m": whole.elevation_m, "slope_deg": whole.slope_deg}
+        maps = {name: getattr(whole, name) for name in ("rgb", "elevation_m", "slope_deg")}
         seen = masks.apply(maps, looks[indices.start : indices.stop])
-        yield (
-            terrain,
-            replace(whole, **{name: seen[name] for name in maps}, layers={SEEN: seen[SEEN]}),
-            seen[SEEN] == 1,
-        )
+        mask = seen[SEEN]
+        shown = {name: seen[name] for name in maps}
+        yield terrain, replace(whole, **shown, layers={SEEN: mask}), mask == 1
 
 
 def measure(

@@ -7,7 +7,6 @@ reference loses. `walls` draws small worlds with a wall of slow cells across, so
 is over, and drives planners that are given λ.
 """
 
-import math
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -23,8 +22,7 @@ from benchnav.core import rng
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.registry import make, read_part
-from benchnav.core.tables import Table
-from benchnav.core.terrain import Observation, Terrain
+from benchnav.core.terrain import Terrain
 from benchnav.eval.run.rollout import run_episodes
 from benchnav.planning.free_space import FreeSpace, Immobile, Rules
 from benchnav.planning.objective import TravelTime
@@ -32,12 +30,10 @@ from benchnav.planning.problem import Task, pose_problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.world import lower_bound
 from benchnav.planning.world.lower_bound import Mesh, Motion, lower_bound_s
-from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import Places, World
-from studies.planners.optimal import drive
-from studies.study import Work
-from studies.tables import table
+from studies.study import Rows, Work
+from studies.units import drive_unit, one_unit, seconds_of, stakes_suite
 
 DATA = Path("datasets/stakes-v1-test.h5")
 REFERENCE = "near_optimal"
@@ -69,16 +65,15 @@ def no_reach(fine: ndarray, squares: Grid, step_m: float, error_m: float) -> nda
     return fine
 
 
-def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Table]:
+def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
     """Return fractions of the reference's time between it and the bound, by cause."""
-    times_s, built = drive(DATA, REFERENCE, maps, world={"preset": "stakes"}, task={})
+    suite = stakes_suite(DATA, planners=(REFERENCE,), models=("clairvoyant",), risks=("mean",))
+    times_s, built = drive_unit(one_unit(suite, maps))
     problem, field = built.problem, built.simulation.field
     assert field is not None
     motion = Motion(robot=problem.robot, goal_radius_m=problem.goal_radius_m, immobile=problem.immobile)
     found, seconds = [], 0.0
-    for number in range(maps):
-        if not math.isfinite(times_s[number]):
-            continue
+    for number in np.flatnonzero(np.isfinite(times_s)):
         ends = problem.start[number, :2].numpy(), problem.goal_m[number].numpy()
         given = field[number].numpy(), problem.grid, motion, *ends
         begun = time.process_time()
@@ -96,13 +91,18 @@ def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Table]:
     parts = np.array(found)
     names = (
         "slopes in excess", "steps reach into slow cells", "dips into immobilising terrain", "turns, and the reference",
+        "all",
     )  # fmt: skip
-    rows = [
-        (name, f"{np.median(fractions):.1%}", f"{np.quantile(fractions, 0.9):.1%}")
-        for name, fractions in (*zip(names, parts.T, strict=True), ("all", parts.sum(1)))
-    ]
     print(f"{len(parts)} fields, {seconds / len(parts):.1f} CPU-s each")
-    return {"gap": table(("cause", "median", "90th percentile"), rows)}
+    rows = [
+        {
+            "cause": name,
+            "median": f"{np.median(fractions):.1%}",
+            "90th percentile": f"{np.quantile(fractions, 0.9):.1%}",
+        }
+        for name, fractions in zip(names, (*parts.T, parts.sum(1)), strict=True)
+    ]
+    return {"gap": rows}
 
 
 # --- planners in worlds with walls --------------------------------------------------------------------
@@ -122,26 +122,25 @@ def walled(generator: np.random.Generator, grid: Grid, count: int) -> tuple[ndar
 
 
 def drive_worlds(fields: ndarray, immobile: Immobile, grid: Grid, name: str) -> ndarray:
-    """Seconds to the goal of a planner that is given λ, infinite where it does not arrive, shape [B]."""
+    """Return seconds to the goal of a planner that is given λ, infinite if it does not arrive, shape [B]."""
     ground, count, robot = torch.from_numpy(fields).float(), len(fields), Unicycle()
     rules = Rules(free_space=FreeSpace(by="mean", above=0.05), min_traversability=0.02)
     task = Task(robot=robot, objective=TravelTime(robot, rules.goal_radius_m), rules=rules)
     level = ground[:, None]
-    known = TraversabilityMixture(torch.ones_like(level), level, torch.zeros_like(level), (0,))
+    truth = TraversabilityMixture(torch.ones_like(level), level, torch.zeros_like(level), (0,))
     rgb, zero = torch.zeros(count, 3, *grid.shape, dtype=torch.uint8), torch.zeros_like(ground)
-    start_m, goal_m = (torch.from_numpy(end).float().repeat(count, 1) for end in ends_of(grid))
-    seen = Observation(rgb, zero, zero, grid)
-    problem = pose_problem(task, seen, known, ground, start_m, goal_m, _LIMIT_S, immobile=immobile)
     terrain = Terrain(
-        rgb=rgb, class_id=zero.long(), elevation_m=zero, slope_deg=zero, truth=known, traversability=ground, grid=grid
+        rgb=rgb, class_id=zero.long(), elevation_m=zero, slope_deg=zero, truth=truth, traversability=ground, grid=grid
     )  # fmt: skip
+    start_m, goal_m = (torch.from_numpy(end).float().repeat(count, 1) for end in ends_of(grid))
     places = Places(start_m=start_m, goal_m=goal_m, reference_time_s=torch.full((count,), torch.nan))
     world = World(noise="stored", immobile=immobile, time_budget_s=_LIMIT_S)
     simulation = Simulation(terrain, task, world, places, 1, range(count))
+    problem = pose_problem(
+        task, terrain.observe(), truth, ground, start_m, goal_m, _LIMIT_S, immobile=immobile
+    )
     planner = make("planner", read_part("planner", {"part": name, "options": PLANNERS[name]}))
-    episodes = run_episodes(planner, problem, simulation, rng.generator(0))
-    seconds = episodes.steps.double().numpy() * robot.dt_s
-    return np.where(episodes.outcome.numpy() == Outcome.SUCCESS, seconds, np.inf)
+    return seconds_of(run_episodes(planner, problem, simulation, rng.generator(0)), robot.dt_s)
 
 
 def ends_of(grid: Grid) -> tuple[ndarray, ndarray]:
@@ -150,31 +149,26 @@ def ends_of(grid: Grid) -> tuple[ndarray, ndarray]:
     return np.array([1.25, middle]), np.array([grid.extent_m[0] - 1.75, middle])
 
 
-def walls(work: Work, folder: Path, maps: int = 500) -> dict[str, Table]:
+def walls(work: Work, folder: Path, maps: int = 500) -> dict[str, Rows]:
     """Return whether a planner is earlier than the bound in worlds with walls, or arrives where it is infinite."""
     grid, generator = Grid(13, 26, 0.5), np.random.default_rng(0)
     blocks = [walled(generator, grid, _BLOCK) for _ in range(max(1, maps // _BLOCK))]
-    motions = [
-        Motion(robot=Unicycle(), goal_radius_m=Rules().goal_radius_m, immobile=each) for _, each in blocks
-    ]
-    least = np.array(
-        [
-            lower_bound_s(field, grid, motion, *ends_of(grid))
-            for (fields, _), motion in zip(blocks, motions, strict=True)
-            for field in fields
-        ]
-    )
+    bounds = []
+    for fields, immobile in blocks:
+        motion = Motion(robot=Unicycle(), goal_radius_m=Rules().goal_radius_m, immobile=immobile)
+        bounds += [lower_bound_s(field, grid, motion, *ends_of(grid)) for field in fields]
+    least = np.array(bounds)
     print(f"{len(least)} worlds; in {np.isinf(least).sum()} the bound is infinite")
     rows = []
     for name in PLANNERS:
         times = np.concatenate([drive_worlds(*block, grid, name) for block in blocks])
-        arrived = np.isfinite(times)
-        both = arrived & np.isfinite(least)
-        rows.append((
-            name, f"{arrived.sum()}", f"{(times[both] < least[both]).sum()}", f"{(arrived & np.isinf(least)).sum()}",
-            f"{np.median(least[both] / times[both]):.3f}",
-        ))  # fmt: skip
-    headings = (
-        "planner, given λ", "arrived", "earlier than the bound", "where it is infinite", "bound over its time: median",
-    )  # fmt: skip
-    return {"walls": table(headings, rows)}
+        has_arrived = np.isfinite(times)
+        both = has_arrived & np.isfinite(least)
+        rows.append({
+            "planner, given λ": name,
+            "arrived": has_arrived.sum(),
+            "earlier than the bound": (times[both] < least[both]).sum(),
+            "where it is infinite": (has_arrived & np.isinf(least)).sum(),
+            "bound over its time: median": f"{np.median(least[both] / times[both]):.3f}",
+        })  # fmt: skip
+    return {"walls": rows}

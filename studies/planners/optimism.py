@@ -10,21 +10,20 @@ any actions: so it has the same of those of the step before, which these fields 
 
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from scipy.stats import t
 from torch import Tensor
 
 from benchnav.core import rng
-from benchnav.core.tables import Table
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.cost_risk import framed_fields, tail_cost
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, advance_chunk, roll_out
 from benchnav.planning.problem import Problem
 from benchnav.planning.sensing.sensor import Step
-from studies.study import Work
-from studies.tables import table as tabled
+from benchnav.stats.intervals import mean_interval
+from studies.study import Rows, Work
 from studies.units import build_unit, one_unit, stakes_suite
 
 MOMENTS, FRESH, AT_ONCE = (0, 20, 40), 1024, 512
@@ -49,64 +48,61 @@ def optimism(problem: Problem, level: float, count: int, samples: int) -> tuple[
     assert plan_state.to_go is not None
     state, found, took = problem.start, [], []
     observed = torch.full_like(state[:, 0], torch.nan)
+
+    def fields(count: int, *key: Any) -> Tensor:
+        return framed_fields(problem, problem.sample_fields(count, rng.stream_key(*key)))
+
     for step in range(MOMENTS[-1] + 1):
         # The fields that it is about to draw.
-        ground = framed_fields(
-            problem, problem.sample_fields(count, rng.stream_key(plan_state.key, plan_state.step))
-        )
+        own_fields = fields(count, plan_state.key, plan_state.step)
         begun = time.perf_counter()
         now = Step(state=state, traversability=observed, time_s=step * problem.dt_s)
         action, after, _ = planner.plan(now, plan_state)
         took.append(time.perf_counter() - begun)
         if step in MOMENTS:
             chosen = torch.cat((action[:, None], after.mean[:, :-1]), 1)
-            found.append(torch.zeros(len(problem), 2))
-            for place, actions in enumerate((chosen, plan_state.mean)):
-                own = costs_on(problem, state, actions, ground, plan_state.to_go)
+            gaps = []
+            for actions in (chosen, plan_state.mean):
+                own = costs_on(problem, state, actions, own_fields, plan_state.to_go)
                 fresh = [
                     costs_on(
-                        problem, state, actions,
-                        framed_fields(
-                            problem, problem.sample_fields(AT_ONCE, rng.stream_key(7, "fresh", step, part))
-                        ),
-                        plan_state.to_go,
+                        problem, state, actions, fields(AT_ONCE, 7, "fresh", step, part), plan_state.to_go
                     )
                     for part in range(FRESH // AT_ONCE)
-                ]  # fmt: skip
-                costs = (torch.cat(fresh, 1), own)
-                fresh_cost, own_cost = (tail_cost(cost[..., None], level)[:, 0] for cost in costs)
-                found[-1][:, place] = fresh_cost - own_cost
+                ]
+                fresh_cost, own_cost = (
+                    tail_cost(cost[..., None], level)[:, 0] for cost in (torch.cat(fresh, 1), own)
+                )
+                gaps.append(fresh_cost - own_cost)
+            found.append(torch.stack(gaps, 1))
         mean = problem.distribution.mean().to(state)
-        padded = problem.grid.pad(mean, outside=0.0)
-        met = problem.grid.lookup(padded, state[:, 0], state[:, 1])
-        state, plan_state = problem.robot(state, action, met), after
+        traversability = problem.grid.lookup(problem.grid.pad(mean, outside=0.0), state[:, 0], state[:, 1])
+        state, plan_state = problem.robot(state, action, traversability), after
     return torch.stack(found, 1).double().numpy(), 1000 * float(np.median(took)) / len(problem)
 
 
 def with_interval(values: np.ndarray) -> str:
-    """The mean of maps, with its 95 % interval by Student's t."""
-    mean, error = values.mean(), t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
-    return f"{mean:+.2f} ({mean - error:+.2f} to {mean + error:+.2f})"
+    """Write the mean of maps with its 95 % interval by Student's t."""
+    mean, low, high = (float(end[0]) for end in mean_interval(values[None]))
+    return f"{mean:+.2f} ({low:+.2f} to {high:+.2f})"
 
 
-def table(work: Work, folder: Path, maps: int = 20, samples: int = 1024) -> dict[str, Table]:
+def table(work: Work, folder: Path, maps: int = 20, samples: int = 1024) -> dict[str, Rows]:
     """Return what chosen actions cost more on fresh fields, by level and number of fields."""
-    suite = stakes_suite(
-        work.maps_in / "stakes-v1-seed1.h5",
-        planners=("mppi",),
-        models=("stakes-v1",),
-        risks=("expected-time",),
-    )
+    data = work.maps_in / "stakes-v1-seed1.h5"
+    suite = stakes_suite(data, planners=("mppi",), models=("stakes-v1",), risks=("expected-time",))
     problem = build_unit(one_unit(suite, maps)).problem
     rows = []
     for level, counts in CASES:
         for count in counts:
             gaps, solve_ms = optimism(problem, level, count, samples)
             chosen, before = gaps.mean(1).T
-            intervals = map(with_interval, (chosen, before, chosen - before))
-            rows.append((f"{level:g}", f"{count}", *intervals, f"{solve_ms:.1f}"))
-    headings = (
-        "level", "fields", "fresh less own cost [s] (95 %)", "the same of the actions of the step before",
-        "chosen less before", "ms a solve",
-    )  # fmt: skip
-    return {"optimism": tabled(headings, rows, 2)}
+            rows.append({
+                "level": f"{level:g}",
+                "fields": count,
+                "fresh less own cost [s] (95 %)": with_interval(chosen),
+                "the same of the actions of the step before": with_interval(before),
+                "chosen less before": with_interval(chosen - before),
+                "ms a solve": f"{solve_ms:.1f}",
+            })  # fmt: skip
+    return {"optimism": rows}

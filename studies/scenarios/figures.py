@@ -1,120 +1,166 @@
 """Figures of the series: examples of maps, distributions of their cells, and curves over severity."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
-from benchnav.viz.style import styled
-from studies.scenarios.statistics import SHARE_EDGES, SLOPE_EDGES, Maps, estimate, first, histogram, rms
+from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict
+from benchnav.datagen.synth.generate import generate
+from benchnav.viz.maps import frame_map, show_map
+from benchnav.viz.panels import draw_estimates, panel_grid
+from benchnav.viz.style import BLUE, ORANGE, legend_outside, styled
+from studies.scenarios.statistics import (
+    SHARE_EDGES,
+    SLOPE_EDGES,
+    Maps,
+    Statistic,
+    estimate,
+    first,
+    histogram,
+    rms,
+)
+from studies.study import Work
 
-EXAMPLE = 13
-COLOURS = {"std": "#222222", "hg": "#D55E00", "hs": "#0072B2"}  # of Okabe and Ito, distinct for everyone
-NOTE: dict[str, Any] = {"fontsize": 7, "color": "0.35"}
+EXAMPLE = 13  # of test/std, in all figures of the page
+COLOURS = {"std": "#222222", "hg": ORANGE, "hs": BLUE}
+# What classes an error is of, with the look of its curve.
+SOURCES = {
+    "none": ("no class known", "", ":"),
+    "predicted": ("classes predicted", "o", "-"),
+    "true": ("true classes", "s", "--"),
+}
+EXAMPLES = {
+    "hg-100": "hg, severity 1", "hg-050": "hg, severity 0.5", "std": "std (severity 0)", "hs-050": "hs, severity 0.5",
+    "hs-100": "hs, severity 1",
+}  # fmt: skip
+LAYERS: dict[str, tuple[str, dict[str, Any]]] = {
+    "slope_deg": ("slope [°]", {"cmap": "cividis", "vmin": 0, "vmax": 25}),
+    "error predicted": ("error of E[λ]", {"cmap": "PuOr", "vmin": -0.4, "vmax": 0.4}),
+}
+RAIN = {
+    "classes": ["wet_clay", "packed_soil", "loose_soil", "fine_sand"],
+    "colour": [36, 30, 26],
+    "share": 0.5,
+}
+TINTS: dict[str, Any] = {
+    "std": {"preset": "std"},
+    "wet": {"preset": "wet"},
+    "tint of soil and sand": {"preset": "std", "tints": [RAIN]},
+    "snow, severity 0.5": {"preset": "snow", "severity": 0.5},
+    "snow": {"preset": "snow"},
+}
+
+
+def _show_row(panels: Iterable[Axes], maps: Iterable[np.ndarray], extent_m: Any, **style: Any) -> Any:
+    """Draw maps in a row of panels; return the last image."""
+    for panel, values in zip(panels, maps, strict=True):
+        image = show_map(panel, values, extent_m, **style)
+        frame_map(panel)
+        panel.set(xticks=(0, 16, 32), yticks=(0, 16, 32))
+    return image
+
+
+def _picture(rgb: np.ndarray) -> np.ndarray:
+    return np.moveaxis(rgb, 0, -1)
 
 
 @styled()
 def draw_examples(pairs: Mapping[str, Maps], extent_m: tuple[float, float]) -> Figure:
-    """One map in hg, std and hs: its picture, its slope, and the error of its predicted E[λ]."""
-    titles = ("hg, severity 1", "hg, severity 0.5", "std (severity 0)", "hs, severity 0.5", "hs, severity 1")
-    names = ("hg-100", "hg-050", "std", "hs-050", "hs-100")
-    looks = {"slope_deg": ("cividis", 0.0, 25.0, "slope [°]", "max")}
-    looks["error predicted"] = ("PuOr", -0.4, 0.4, "error of E[λ]", "both")
+    """Draw one map in hg, std and hs: its picture, its slope, and the error of its predicted E[λ]."""
     figure = Figure(figsize=(7.2, 4.25), layout="compressed")
-    panels = figure.subplots(3, len(names), sharex=True, sharey=True)
-    where: dict[str, Any] = {"extent": (0, extent_m[0], 0, extent_m[1]), "origin": "lower"}
-    for panel, name, title in zip(panels[0], names, titles, strict=True):
-        panel.imshow(np.moveaxis(pairs[name]["rgb"][EXAMPLE], 0, -1), **where)
-        panel.set(title=title, xticks=(0, 16, 32), yticks=(0, 16, 32))
-    for row, (layer, (colours, low, high, label, extend)) in zip(panels[1:], looks.items(), strict=True):
-        for panel, name in zip(row, names, strict=True):
-            image = panel.imshow(pairs[name][layer][EXAMPLE], cmap=colours, vmin=low, vmax=high, **where)
-        figure.colorbar(image, ax=row, label=label, extend=extend, pad=0.015, aspect=14, extendfrac=0.06)
-    for panel in panels[:, 0]:
-        panel.set_ylabel("y [m]")
-    for panel in panels[-1]:
-        panel.set_xlabel("x [m]")
+    panels = figure.subplots(3, len(EXAMPLES), sharex=True, sharey=True)
+    shown = [pairs[name] for name in EXAMPLES]
+    _show_row(panels[0], (_picture(maps["rgb"][EXAMPLE]) for maps in shown), extent_m)
+    for row, (layer, (label, style)) in zip(panels[1:], LAYERS.items(), strict=True):
+        image = _show_row(row, (maps[layer][EXAMPLE] for maps in shown), extent_m, **style)
+        figure.colorbar(image, ax=row, label=label, extend="both", pad=0.015, aspect=14)
+    for panel, title in zip(panels[0], EXAMPLES.values(), strict=True):
+        panel.set_title(title)
+    figure.supxlabel("x [m]")
+    figure.supylabel("y [m]")
     return figure
 
 
 @styled()
+def draw_tints(work: Work, folder: Path) -> dict[str, Figure]:
+    """Draw the picture of one map under the tints that the page shows."""
+    data = load_recipe("shift-v1").to_dict()
+    splits = {"test/std": {"scenario": "one", "maps": EXAMPLE + 1}}
+    pictures = []
+    for title, entry in TINTS.items():
+        recipe = recipe_from_dict(data | {"scenarios": {"one": entry}, "splits": splits}, title)
+        pictures.append(_picture(generate(recipe, "test/std", np.array([EXAMPLE]))["rgb"][0]))
+    figure, places = panel_grid(list(TINTS), len(TINTS), 1.5, 0.25, sharey=True)
+    _show_row([panel for (panel,) in places], pictures, recipe.grid.extent_m)
+    figure.supxlabel("x [m]")
+    return {"tints": figure}
+
+
+@styled()
 def draw_distributions(series: Mapping[str, Maps], steepest: float) -> Figure:
-    """Slope, λ and brightness of all cells in std, hg and hs."""
-    figure, panels = _three_panels(2.5)
-    for name, dashes in (("std", "-"), ("hg-100", "-"), ("hs-100", (0, (4, 1.5)))):
-        maps: Maps = series[name]
-        look: dict[str, Any] = {"color": COLOURS[name.split("-")[0]], "ls": dashes, "lw": 1.3, "label": name}
-        counts = [maps["slope"], maps["lambda"], histogram(maps["brightness"], SHARE_EDGES)]
-        slope, traversability, light = (np.r_[0, c.sum(0).cumsum()] / c.sum() for c in counts)
-        panels[0].plot(SLOPE_EDGES[slope < 1], 1 - slope[slope < 1], **look)
-        panels[1].plot(SHARE_EDGES, traversability, **look)
-        panels[2].plot(SHARE_EDGES, light, **look)
-    panels[0].axvline(steepest, color="0.5", lw=0.8, ls=":")
-    panels[0].text(steepest - 0.4, 0.6, "steepest in training", rotation=90, ha="right", va="top", **NOTE)
-    panels[0].set(xlabel="slope ψ [°]", ylabel="share of cells steeper than ψ", yscale="log")
-    panels[0].set(xlim=(0, 38), ylim=(1e-5, 1))
-    panels[1].set(xlabel="realised traversability λ", ylabel="share of cells at or under λ")
-    panels[2].set(xlabel="brightness [share of full light]", ylabel="share of cells at or under it")
-    for panel, start in zip(panels[1:], (0, 0.2), strict=True):
-        panel.set(xlim=(start, 1), ylim=(0, 1))
-    panels[1].legend(frameon=False, loc="upper left")
+    """Draw which fractions of all cells in std, hg and hs are above each slope, λ and brightness."""
+    labels = ("(a) slope [°]", "(b) realised λ", "(c) brightness (1 is full light)")
+    figure, places = panel_grid(labels, 3, 2.0, sharey=True)
+    panels = [panel for (panel,) in places]
+    for name, dashes in (("std", "-"), ("hg-100", "-"), ("hs-100", "--")):
+        maps = series[name]
+        counts = (
+            (maps["slope"], SLOPE_EDGES),
+            (maps["lambda"], SHARE_EDGES),
+            (histogram(maps["brightness"], SHARE_EDGES), SHARE_EDGES),
+        )
+        for panel, (count, edges) in zip(panels, counts, strict=True):
+            above = 1 - np.r_[0, count.sum(0).cumsum()] / count.sum()
+            panel.plot(edges, above, color=COLOURS[name[:3].strip("-")], ls=dashes, lw=1.3, label=name)
+    panels[0].axvline(steepest, color="0.5", lw=0.8, ls=":", label="steepest in training")
+    panels[0].set(xlim=(0, 38), yscale="log", ylim=(1e-5, 1.1), ylabel="fraction of cells above")
+    legend_outside(figure)
     return figure
 
 
 @styled()
 def draw_series(series: Mapping[str, Maps]) -> Figure:
-    """Accuracy and error over severity, and the accuracy of each map in low light over its brightness."""
-    figure, panels = _three_panels(2.6)
-    sources = {"none": ("no class known", "", ":"), "predicted": ("classes predicted", "o", "-")}
-    sources["true"] = ("true classes", "s", "--")
-    for preset, colour in list(COLOURS.items())[1:]:
-        pairs = {0.0: series["std"]} | {_severity(n): m for n, m in series.items() if n.startswith(preset)}
-        curves = [(panels[0], [estimate([100 * m["right"]], first) for m in pairs.values()], "o", "-")]
-        for source, (_, marker, dashes) in sources.items():
-            values = [estimate([m[f"square {source}"]], rms) for m in pairs.values()]
-            curves.append((panels[1], values, marker, dashes))
-        for panel, values, marker, dashes in curves:
-            look = {"color": colour, "marker": marker, "ls": dashes, "label": preset, "mfc": "white"}
-            panel.errorbar(list(pairs), *zip(*values, strict=True), lw=1.2, ms=3.5, capsize=2, **look)
-    keys = [
-        Line2D([], [], color="0.3", mfc="white", ms=3.5, label=n, marker=m, ls=d)
-        for n, m, d in sources.values()
-    ]
-    panels[0].legend(frameon=False, loc="lower left")
-    panels[1].legend(handles=keys, frameon=False, loc="upper left", handlelength=2.6)
-    dark = [name for name in series if name.startswith("hs")]
-    shades = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 1, len(dark)))
-    for name, shade in zip(dark, shades, strict=True):
-        light, right = (
-            np.median(series[name]["brightness"], axis=(1, 2)),
-            series[name]["right"].mean(axis=(1, 2)),
-        )
-        panels[2].plot(light, 100 * right, "o", ms=2.4, mew=0, color=shade, label=f"{_severity(name):g}")
+    """Draw accuracy and error over severity, and the accuracy of each map in low light over its brightness."""
+    figure, places = panel_grid(["(a)", "(b)", "(c)"], 3, 2.2)
+    accuracy, error, of_maps = (panel for (panel,) in places)
+    for preset in ("hg", "hs"):
+        own = {_severity(name): maps for name, maps in series.items() if name.startswith((preset, "std"))}
+        for source, (words, marker, dashes) in SOURCES.items():
+            look = {"color": COLOURS[preset], "marker": marker, "ls": dashes, "ms": 3.5, "lw": 1.2}
+            _draw_estimates(error, own, f"square {source}", rms, look, f"{preset}, {words}")
+        predicted = {"color": COLOURS[preset], "marker": "o", "ms": 3.5, "lw": 1.2}
+        _draw_estimates(accuracy, own, "right", first, predicted)
+    dark = {_severity(name): maps for name, maps in series.items() if name.startswith("hs")}
+    light = np.concatenate([np.median(maps["brightness"], axis=(1, 2)) for maps in dark.values()])
+    right = np.concatenate([maps["right"].mean(axis=(1, 2)) for maps in dark.values()])
+    severity = np.concatenate([np.full(len(maps["right"]), value) for value, maps in dark.items()])
+    points = of_maps.scatter(light, 100 * right, c=severity, cmap="viridis_r", s=4, lw=0)
+    figure.colorbar(points, ax=of_maps, label="severity of hs")
     lit = np.median(series["std"]["brightness"], axis=(1, 2))
-    panels[2].axvspan(lit.min(), lit.max(), color="0.88", lw=0)
-    panels[2].text(lit.mean(), 4, "light\nof std", ha="center", **NOTE)
-    panels[2].legend(frameon=False, loc="upper left", title="severity of hs", title_fontsize=7)
-    for panel in panels[:2]:
-        panel.set(xlabel="severity", xticks=(0, 0.5, 1, 1.5))
-    panels[0].set(ylabel="pixel accuracy [%]", ylim=(0, 100))
-    panels[1].set(ylabel="RMS error of E[λ]", ylim=(0, 0.15))
-    panels[2].set(xlabel="median brightness of a map", ylabel="pixel accuracy of a map [%]")
-    panels[2].set(xlim=(0, 1), ylim=(-2, 100))
+    of_maps.axvspan(lit.min(), lit.max(), color="0.88", lw=0, zorder=0, label="light of std")
+    accuracy.set(xlabel="severity", ylabel="pixel accuracy [%]", ylim=(0, 100))
+    error.set(xlabel="severity", ylabel="RMS error of E[λ] [%]", ylim=(0, 15))
+    of_maps.set(xlabel="median brightness of a map", ylabel="pixel accuracy of a map [%]", ylim=(-2, 102))
+    legend_outside(figure)
     return figure
 
 
-def _three_panels(height_in: float) -> tuple[Figure, Any]:
-    figure = Figure(figsize=(7.2, height_in), layout="constrained")
-    panels = figure.subplots(1, 3)
-    for panel, letter in zip(panels, "abc", strict=True):
-        panel.set_title(f"({letter})", loc="left")
-        panel.grid(alpha=0.25, lw=0.5)
-        panel.spines[["top", "right"]].set_visible(False)
-    return figure, panels
+def _draw_estimates(
+    panel: Axes,
+    own: Mapping[float, Maps],
+    key: str,
+    statistic: Statistic,
+    look: Mapping[str, Any],
+    label: str = "",
+) -> None:
+    """Draw a statistic in per cent over severity, with standard errors."""
+    value, error = 100 * np.array([estimate([maps[key]], statistic) for maps in own.values()]).T
+    draw_estimates(panel, list(own), value, value - error, value + error, look, label, bars=True)
 
 
 def _severity(name: str) -> float:
-    return int(name[-3:]) / 100
+    return 0.0 if name == "std" else int(name[-3:]) / 100

@@ -10,13 +10,16 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations, product
 
 import numpy as np
+import pandas as pd
 from scipy.stats import beta, bootstrap, norm, t
 
+from benchnav.eval.stats.summary import total_time_mean
 from benchnav.stats.best import best_set_p
 from benchnav.stats.by_map import alike
+from benchnav.stats.episodes import time_difference
 from benchnav.stats.flips import sign_flip_p, signed_rank_p
 from benchnav.stats.holm import ALPHA
-from benchnav.stats.intervals import design_effect, success_interval, total_time_interval, wilson_interval
+from benchnav.stats.intervals import design_effect, success_interval, wilson_interval
 
 _MAPS_WITHIN = 0.2  # correlation within a map of a group, about the group's chance
 RATES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
@@ -26,22 +29,24 @@ TIME_BUDGET_S = 100.0
 _MEDIAN_S, _SPREAD, _STEP_S = 33.0, 0.3, 0.1
 
 
+def chance_at(score: np.ndarray, rate: float, within: float) -> np.ndarray:
+    """Return the chance of success of maps by their normal scores."""
+    size = 1 / within - 1
+    return beta.ppf(norm.cdf(score), rate * size, (1 - rate) * size)
+
+
 def chances(
-    generator: np.random.Generator, rates: np.ndarray, shape: tuple[int, int], within: float, common: float
+    generator: np.random.Generator, rates: Sequence[float], shape: tuple[int, int], like: tuple[float, float]
 ) -> np.ndarray:
-    """Chance of success of each condition on each map, shape [studies, conditions, maps]."""
+    """Draw the chance of success of each condition on each map, shape [studies, conditions, maps]."""
+    within, common = like
     studies, maps = shape
     shared = generator.standard_normal((studies, 1, maps))
     own = generator.standard_normal((studies, len(rates), maps))
     scores = np.sqrt(common) * shared + np.sqrt(1 - common) * own
-    size, grid = 1 / within - 1, np.linspace(-6, 6, 4_001)
-    return np.stack(
-        [
-            np.interp(scores[:, i], grid, beta.ppf(norm.cdf(grid), rate * size, (1 - rate) * size))
-            for i, rate in enumerate(rates)
-        ],
-        axis=1,
-    )
+    grid = np.linspace(-6, 6, 4_001)
+    columns = [np.interp(scores[:, i], grid, chance_at(grid, rate, within)) for i, rate in enumerate(rates)]
+    return np.stack(columns, axis=1)
 
 
 def outcomes(generator: np.random.Generator, chance: np.ndarray, draws: int, common: float) -> np.ndarray:
@@ -60,15 +65,11 @@ def times(generator: np.random.Generator, success: np.ndarray, hardness: np.ndar
     return np.where(success, steps * _STEP_S, TIME_BUDGET_S)
 
 
-def hardness(chance: np.ndarray, rates: np.ndarray, within: float) -> np.ndarray:
-    """Normal scores of maps, the higher the lower their chance; of the shape of `chance`."""
-    size = 1 / within - 1
-    made = np.empty_like(chance)
-    for i, rate in enumerate(rates):
-        grid = np.linspace(-4, 4, 2_001)
-        at = beta.ppf(norm.cdf(grid), rate * size, (1 - rate) * size)
-        made[:, i] = -np.interp(chance[:, i], at, grid)
-    return made
+def hardness(chance: np.ndarray, rates: Sequence[float], within: float) -> np.ndarray:
+    """Return normal scores of maps, the higher the lower their chance; of the shape of `chance`."""
+    grid = np.linspace(-4, 4, 2_001)
+    columns = [-np.interp(chance[:, i], chance_at(grid, rate, within), grid) for i, rate in enumerate(rates)]
+    return np.stack(columns, axis=1)
 
 
 def drives(
@@ -78,119 +79,108 @@ def drives(
     draws: int,
     like: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Success and T_total, both of shape [studies, conditions, maps, draws]."""
-    given = np.array(rates)
-    chance = chances(generator, given, shape, *like)
+    """Draw success and T_total, both of shape [studies, conditions, maps, draws]."""
+    chance = chances(generator, rates, shape, like)
     success = outcomes(generator, chance, draws, like[1])
-    return success, times(generator, success, hardness(chance, given, like[0]))
+    return success, times(generator, success, hardness(chance, rates, like[0]))
 
 
-def rate_cover(success: np.ndarray, rate: float) -> float:
-    """How often Wilson's interval over the design effect holds the rate; success of shape [studies, maps, draws]."""
+def true_difference_s(
+    generator: np.random.Generator, rates: Sequence[float], like: tuple[float, float]
+) -> tuple[float, float]:
+    """Return T_total of the first of two conditions, and how much it is over the other's."""
+    _, far = drives(generator, rates, (1, 400_000), 1, like)
+    return far[0, 0].mean(), (far[0, 0] - far[0, 1]).mean()
+
+
+def covers(ends: np.ndarray, truth: float) -> np.ndarray:
+    """Return which intervals, ends of shape [studies, 2], hold the truth."""
+    return (ends[:, 0] <= truth) & (truth <= ends[:, 1])
+
+
+def rate_intervals(success: np.ndarray) -> np.ndarray:
+    """Return Wilson's intervals over the design effect, [studies, 2], of success [studies, maps, draws]."""
     maps, draws = success.shape[1:]
     member = np.repeat(np.arange(maps), draws)
-    held = 0
-    for study in success:
-        low, high = wilson_interval(study.mean(), study.size / design_effect(study.ravel(), member))
-        held += low <= rate <= high
-    return held / len(success)
+    return np.array([
+        wilson_interval(study.mean(), study.size / design_effect(study.ravel(), member)) for study in success
+    ])  # fmt: skip
+
+
+def difference_intervals(wins: np.ndarray, episodes: int, confidence: float = 0.95) -> np.ndarray:
+    """Return intervals of the difference of success, [studies, 2], of successes by map [studies, 2, maps]."""
+    return np.stack(success_interval(wins[:, 0] - wins[:, 1], episodes, confidence)[1:], axis=1)
 
 
 def cover_of_success(
     generator: np.random.Generator, studies: int, maps: int, draws: int, rates: Sequence[float] = RATES
 ) -> Iterator[float]:
-    """For each rate and likeness, how often Wilson's interval over the design effect holds the rate."""
-    for rate, (within, common) in product(rates, LIKENESS):
-        chance = chances(generator, np.array([rate]), (studies, maps), within, common)
-        yield rate_cover(outcomes(generator, chance, draws, common)[:, 0], rate)
+    """For each rate and likeness, yield how often the interval of success holds the rate."""
+    for rate, like in product(rates, LIKENESS):
+        chance = chances(generator, (rate,), (studies, maps), like)
+        success = outcomes(generator, chance, draws, like[1])[:, 0]
+        yield covers(rate_intervals(success), rate).mean()
 
 
 def cover_of_differences(
     generator: np.random.Generator, studies: int, maps: int, draws: int, rates: Sequence[float] = RATES
 ) -> Iterator[float]:
-    """For each pair of rates and likeness, how often the interval of the difference of success holds it."""
-    for (one, other), (within, common) in product(combinations(rates, 2), LIKENESS):
-        chance = chances(generator, np.array([one, other]), (studies, maps), within, common)
-        wins = outcomes(generator, chance, draws, common).sum(-1)
-        _, low, high = success_interval(wins[:, 0] - wins[:, 1], draws)
-        yield float(np.mean((low <= one - other) & (one - other <= high)))
+    """For each pair of rates and likeness, yield how often the interval of the difference of success holds it."""
+    for pair, like in product(combinations(rates, 2), LIKENESS):
+        chance = chances(generator, pair, (studies, maps), like)
+        wins = outcomes(generator, chance, draws, like[1]).sum(-1)
+        yield covers(difference_intervals(wins, draws), pair[0] - pair[1]).mean()
 
 
-def time_intervals(
-    success: np.ndarray, taken: np.ndarray, confidence: float = 0.95
-) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Intervals of T_total of the first condition and of its difference from the second.
-
-    As `summary.total_time_mean` and `comparison.time_difference` make them, of many studies at once.
-
-    Args:
-        success: bool, shape [studies, 2, maps, draws].
-        taken: T_total in seconds, of the same shape.
-        confidence: coverage asked for; that of T_total itself is 95 %.
-
-    Returns:
-        Mean and ends of `time` and `difference`, each of shape [studies].
-    """
+def episodes_of(success: np.ndarray, total_time_s: np.ndarray) -> Iterator[pd.DataFrame]:
+    """Yield the paired episodes of each study, as the package's statistics read them."""
     maps, draws = success.shape[2:]
-    member = np.repeat(np.arange(maps), draws)
-    arrivals = np.where(success, taken, 0.0).sum((2, 3)), success.sum((2, 3))
-    failed, by_map = 1.0 - success.mean(-1), taken.mean(-1)
-    effects = [design_effect(study.ravel(), member) for study in success[:, 0]]
-    rates = success[:, 0].mean((1, 2))
-    ends = np.array(
-        [wilson_interval(rate, maps * draws / effect) for rate, effect in zip(rates, effects, strict=True)]
-    )
-    penalty_s = TIME_BUDGET_S - arrivals[0][:, 0] / np.maximum(arrivals[1][:, 0], 1)
-    some = success.any(-1)
-    own = total_time_interval(
-        by_map[:, 0], failed[:, 0], (1 - ends[:, 1], 1 - ends[:, 0]), penalty_s, some[:, 0].sum(-1)
-    )
-    gain = success[:, 0].sum(-1) - success[:, 1].sum(-1)
-    _, low, high = success_interval(gain, draws, confidence)
-    penalty_s = TIME_BUDGET_S - arrivals[0].sum(1) / np.maximum(arrivals[1].sum(1), 1)
-    both = some.all(1).sum(-1)
-    late, fewer = by_map[:, 0] - by_map[:, 1], failed[:, 0] - failed[:, 1]
-    difference = total_time_interval(late, fewer, (-high, -low), penalty_s, both, confidence)
-    return {"time": own, "difference": difference}
+    for won, taken in zip(success, total_time_s, strict=True):
+        yield pd.DataFrame({
+            "group": np.repeat(np.arange(maps), draws), "success": won[0].ravel(), "success_other": won[1].ravel(),
+            "total_time_s": taken[0].ravel(), "total_time_s_other": taken[1].ravel(),
+            "time_budget_s": TIME_BUDGET_S, "time_budget_s_other": TIME_BUDGET_S,
+        })  # fmt: skip
 
 
 def cover_of_times(
-    generator: np.random.Generator,
-    studies: int,
-    maps: int,
-    draws: int,
-    rates: tuple[float, float],
+    generator: np.random.Generator, studies: int, shape: tuple[int, int], rates: tuple[float, float],
     resampled: int = 0,
-) -> dict[str, float]:
-    """Cover and mean width of the intervals of T_total and of its difference between two conditions.
+) -> pd.DataFrame:  # fmt: skip
+    """Return cover and mean width of the intervals of T_total and of its difference between two conditions.
 
     Args:
         generator: of all that is drawn.
         studies: how many of each likeness.
-        maps: of a study.
-        draws: episodes a map.
+        shape: maps of a study, and episodes a map.
         rates: of success; T_total is that of the first.
-        resampled: of so many studies also of a bootstrap (BCa) over maps.
+        resampled: number of the studies for which a bootstrap (BCa) over maps is computed too.
+
+    Returns:
+        A row each for `T_total` and `ΔT_total`, and for the bootstrap's; columns `cover` and `width`.
     """
-    found: dict[str, list[np.ndarray]] = {}
+    maps, draws = shape
+    rows = []
     for like in LIKENESS:
-        _, far = drives(generator, rates, (1, 400_000), 1, like)
-        truths = {"time": far[0, 0].mean(), "difference": (far[0, 0] - far[0, 1]).mean()}
+        truths = true_difference_s(generator, rates, like)
         success, taken = drives(generator, rates, (studies, maps), draws, like)
         by_map = taken.mean(-1)
-        values = {"time": by_map[:, 0], "difference": by_map[:, 0] - by_map[:, 1]}
-        for name, interval in time_intervals(success, taken).items():
-            ends = {"": interval[1:]}
+        episodes = list(episodes_of(success, taken))
+        intervals = (
+            [total_time_mean(own, {"time_budget_s": TIME_BUDGET_S})[1:] for own in episodes],
+            [time_difference(own)[1:] for own in episodes],
+        )
+        values = by_map[:, 0], by_map[:, 0] - by_map[:, 1]
+        for name, ends, truth, value in zip(("T_total", "ΔT_total"), intervals, truths, values, strict=True):
+            found = {name: np.array(ends)}
             if resampled:
-                drawn = bootstrap(
-                    (values[name][:resampled],), np.mean, axis=-1, n_resamples=999, rng=generator
-                )
-                ends["_bootstrap"] = (drawn.confidence_interval.low, drawn.confidence_interval.high)
-            for how, (low, high) in ends.items():
-                held = (low <= truths[name]) & (truths[name] <= high)
-                found.setdefault(f"{name}_cover{how}", []).append(held)
-                found.setdefault(f"{name}_width{how}", []).append(high - low)
-    return {name: float(np.concatenate(parts).mean()) for name, parts in found.items()}
+                drawn = bootstrap((value[:resampled],), np.mean, axis=-1, n_resamples=999, rng=generator)
+                found[f"{name}, bootstrap"] = np.stack(drawn.confidence_interval, axis=1)
+            rows += [
+                pd.DataFrame({"name": key, "cover": covers(own, truth), "width": own[:, 1] - own[:, 0]})
+                for key, own in found.items()
+            ]
+    return pd.concat(rows).groupby("name", sort=False).mean()
 
 
 def false_findings(
@@ -199,36 +189,29 @@ def false_findings(
     maps: int,
     draws: int,
     rates: Sequence[float] = (0.05, 0.5, 0.8),
-) -> Iterator[tuple[float, float]]:
-    """For each rate and likeness, how often any two of six settings that are alike differ significantly.
+) -> Iterator[np.ndarray]:
+    """For each rate and likeness, yield how often any two of six equal settings differ significantly.
 
     By success, and by time.
     """
-    settings = 6
+    pairs = list(combinations(range(6), 2))
     for rate, like in product(rates, LIKENESS):
-        success, total_time_s = drives(generator, [rate] * settings, (studies, maps), draws, like)
-        wins, taken = success.sum(-1), total_time_s.mean(-1)
+        success, total_time_s = drives(generator, [rate] * 6, (studies, maps), draws, like)
         found = np.zeros(2)
-        for study in range(studies):
-            pairs = list(combinations(range(settings), 2))
-            by_success = [sign_flip_p(wins[study, i] - wins[study, j]) for i, j in pairs]
-            late = [alike(taken[study, i] - taken[study, j], TIME_BUDGET_S) for i, j in pairs]
-            by_time = [signed_rank_p(values) for values in late]
+        for wins, taken in zip(success.sum(-1), total_time_s.mean(-1), strict=True):
+            by_success = [sign_flip_p(wins[i] - wins[j]) for i, j in pairs]
+            by_time = [signed_rank_p(alike(taken[i] - taken[j], TIME_BUDGET_S)) for i, j in pairs]
             # Holm's correction finds something where its first step does.
             found += [min(p) <= ALPHA / len(pairs) for p in (by_success, by_time)]
-        yield tuple(found / studies)
+        yield found / studies
 
 
 def group_wins(
-    generator: np.random.Generator,
-    rates: Sequence[float],
-    shape: tuple[int, int],
-    episodes: int,
-    like: tuple[float, float],
-    one_map: bool,
-) -> np.ndarray:
-    """Successes by group, shape [studies, conditions, groups], with all episodes on one map or each on its own."""
-    chance = chances(generator, np.array(rates), shape, *like)
+    generator: np.random.Generator, rates: Sequence[float], shape: tuple[int, int], episodes: int,
+    like: tuple[float, float], one_map: bool,
+) -> np.ndarray:  # fmt: skip
+    """Draw successes by group, shape [studies, conditions, groups], all episodes on one map or each on its own."""
+    chance = chances(generator, rates, shape, like)
     if one_map:
         return outcomes(generator, chance, episodes, like[1]).sum(-1)
     size, inside = 1 / _MAPS_WITHIN - 1, np.clip(chance, 1e-9, 1 - 1e-9)[..., None]
@@ -237,32 +220,24 @@ def group_wins(
 
 
 def cover_of_groups(
-    generator: np.random.Generator,
-    studies: int,
-    groups: int,
-    episodes: int,
-    rates: tuple[float, float],
+    generator: np.random.Generator, studies: int, groups: int, episodes: int, rates: tuple[float, float],
     like: tuple[float, float],
-) -> dict[str, float]:
-    """Cover of the intervals of a difference and of each rate, and half-widths, those of a cluster t beside them."""
-    wins = np.concatenate(
-        [
-            group_wins(generator, rates, (studies // 2, groups), episodes, like, one_map)
-            for one_map in (True, False)
-        ]
-    )
-    gain, truth = wins[:, 0] - wins[:, 1], rates[0] - rates[1]
-    mean, low, high = success_interval(gain, episodes)
-    error = (gain / episodes).std(-1, ddof=1) / np.sqrt(groups)
-    half = t.ppf(0.975, groups - 1) * error
-    found = {
-        "cover": float(np.mean((low <= truth) & (truth <= high))),
-        "half": float(np.mean(high - low) / 2),
-        "cover_t": float(np.mean(np.abs(mean - truth) <= half)),
-        "half_t": float(half.mean()),
-    }
+) -> dict[str, float]:  # fmt: skip
+    """Return cover of the intervals of a difference and of each rate, and half-widths; also those of a cluster t."""
+    drawn = [
+        group_wins(generator, rates, (studies // 2, groups), episodes, like, one_map)
+        for one_map in (True, False)
+    ]
+    wins, truth = np.concatenate(drawn), rates[0] - rates[1]
+    shares = (wins[:, 0] - wins[:, 1]) / episodes
+    half = t.ppf(0.975, groups - 1) * shares.std(-1, ddof=1) / np.sqrt(groups)
+    student = shares.mean(-1)[:, None] + np.stack((-half, half), axis=1)
+    found = {}
+    for name, ends in (("", difference_intervals(wins, episodes)), ("_t", student)):
+        found |= {f"cover{name}": covers(ends, truth).mean(), f"half{name}": np.ptp(ends, axis=1).mean() / 2}
     for place, rate in enumerate(rates):
-        found[f"cover_{place}"] = rate_cover(np.arange(episodes) < wins[:, place, :, None], rate)
+        ends = rate_intervals(np.arange(episodes) < wins[:, place, :, None])
+        found[f"cover_{place}"] = covers(ends, rate).mean()
     return found
 
 

@@ -9,9 +9,9 @@ import pandas as pd
 from rich.progress import track
 from scipy.stats import binomtest
 
+from benchnav.stats.episodes import time_difference
 from benchnav.stats.flips import sign_flip_p
 from benchnav.stats.holm import ALPHA
-from benchnav.stats.intervals import success_interval
 from studies.statistics.simulated import (
     LIKENESS,
     called_worse,
@@ -19,9 +19,11 @@ from studies.statistics.simulated import (
     cover_of_groups,
     cover_of_success,
     cover_of_times,
+    difference_intervals,
     drives,
+    episodes_of,
     false_findings,
-    time_intervals,
+    true_difference_s,
     unlike,
 )
 from studies.study import Work
@@ -46,31 +48,33 @@ def _as_table(
 
 @_as_table
 def intervals(studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """Cover of the intervals of success and of its difference, and how often `compare` errs."""
+    """Yield cover of the intervals of success and of its difference, and how often `compare` errs."""
     for maps, draws in product(MAPS, DRAWS):
         generator = np.random.default_rng([seed, maps, draws])
-        row: dict[str, object] = {"maps": maps, "episodes a map": draws}
-        for name, cover in (("success", cover_of_success), ("difference", cover_of_differences)):
-            found = list(cover(generator, studies, maps, draws))
-            row[name] = f"{100 * np.mean(found):.1f}, {100 * np.min(found):.1f}"
-        false = 100 * np.array(list(false_findings(generator, studies // 5, maps, draws)))
-        for place, name in enumerate(("false: success", "false: T_total")):
-            row[name] = f"{false[:, place].mean():.1f}, {false[:, place].max():.1f}"
-        yield row
+        success, difference = (
+            100 * np.array(list(cover(generator, studies, maps, draws)))
+            for cover in (cover_of_success, cover_of_differences)
+        )
+        false = 100 * np.array(list(false_findings(generator, studies // 5, maps, draws))).T
+        yield {
+            "maps": maps,
+            "episodes a map": draws,
+            "success": f"{success.mean():.1f}, {success.min():.1f}",
+            "difference": f"{difference.mean():.1f}, {difference.min():.1f}",
+            "false: success": f"{false[0].mean():.1f}, {false[0].max():.1f}",
+            "false: T_total": f"{false[1].mean():.1f}, {false[1].max():.1f}",
+        }
 
 
 @_as_table
 def times(studies: int, seed: int) -> Iterator[dict[str, object]]:
-    """Cover and width of the intervals of T_total and of its difference, beside those of a bootstrap."""
+    """Yield cover and width of the intervals of T_total and of its difference, and those of a bootstrap."""
     for maps, draws, rate in product((8, 20, 30), DRAWS, (0.8, 0.95, 0.99)):
         generator = np.random.default_rng([seed, maps, draws, round(100 * rate)])
-        row: dict[str, object] = {"maps": maps, "episodes a map": draws, "success": rate}
-        found = cover_of_times(generator, studies // 3, maps, draws, (rate, rate - 0.1), studies // 20)
-        for name, words in (("time", "T_total"), ("difference", "ΔT_total")):
-            for how, by in (("", ""), ("_bootstrap", ", bootstrap")):
-                cover, width = found[f"{name}_cover{how}"], found[f"{name}_width{how}"]
-                row[words + by] = f"{100 * cover:.1f} ({width:.1f} s)"
-        yield row
+        rates = rate, rate - 0.1
+        found = cover_of_times(generator, studies // 3, (maps, draws), rates, studies // 20)
+        cells = {name: f"{100 * row['cover']:.1f} ({row['width']:.1f} s)" for name, row in found.iterrows()}
+        yield {"maps": maps, "episodes a map": draws, "success": rate, **cells}
 
 
 @_as_table
@@ -78,19 +82,17 @@ def groups(studies: int, seed: int) -> Iterator[dict[str, object]]:
     """Cover and width of the intervals of success and of its difference on few, large groups."""
     for groups, episodes, like in product(GROUPS, IN_A_GROUP, GROUP_LIKENESS):
         generator = np.random.default_rng([seed, groups, episodes, *(round(100 * value) for value in like)])
-        row: dict[str, object] = {
-            "groups": groups,
-            "episodes": episodes,
-            "correlation": like[0],
-            "shared": like[1],
-        }
+        row: dict[str, object] = {"groups": groups, "episodes": episodes}
+        row |= {"correlation": like[0], "shared": like[1]}
         covers: dict[str, object] = {}
-        for rates in GROUP_RATES:
-            found = cover_of_groups(generator, studies, groups, episodes, rates, like)
-            one, other = (f"{rate:g}" for rate in rates)
-            row[f"{one} − {other}"] = f"{100 * found['cover']:.1f} ({found['half']:.2f})"
-            row[f"{one} − {other}, t"] = f"{100 * found['cover_t']:.1f} ({found['half_t']:.2f})"
-            covers |= {name: f"{100 * found[f'cover_{i}']:.1f}" for i, name in enumerate((one, other))}
+        for one, other in GROUP_RATES:
+            found = cover_of_groups(generator, studies, groups, episodes, (one, other), like)
+            row[f"{one:g} − {other:g}"] = f"{100 * found['cover']:.1f} ({found['half']:.2f})"
+            row[f"{one:g} − {other:g}, t"] = f"{100 * found['cover_t']:.1f} ({found['half_t']:.2f})"
+            covers |= {
+                f"{one:g}": f"{100 * found['cover_0']:.1f}",
+                f"{other:g}": f"{100 * found['cover_1']:.1f}",
+            }
         yield row | covers
 
 
@@ -102,20 +104,27 @@ def best(studies: int, seed: int) -> Iterator[dict[str, object]]:
         row: dict[str, object] = {"settings": settings, "maps": maps, "episodes a map": draws}
 
         half = settings // 2
-        cases = {f"all tied, {rate:g}": [rate] * settings for rate in (0.8, 0.95)}
-        for words, rates in (cases | {"half tied": [0.8] * half + [0.7] * half}).items():
-            success, _ = drives(generator, rates, (studies, maps), draws, LIKENESS[1])
-            tied = np.array(rates) == max(rates)
-            row[words] = _share(called_worse(success.sum(-1), draws)[:, tied].any(1))
+        rates = {f"all tied, {rate:g}": [rate] * settings for rate in (0.8, 0.95)}
+        rates["half tied"] = [0.8] * half + [0.7] * half
+        for words, own in rates.items():
+            called = _called_worse(generator, own, (studies, maps), draws)
+            row[words] = _share(called[:, np.array(own) == max(own)].any(1))
         for words, same_maps in (("unlike", False), ("unlike, same maps", True)):
             wins = unlike(generator, studies, settings, maps, draws, same_maps)
             row[words] = _share(called_worse(wins, draws).any(1))
         for points in (10, 20):
-            rates = [0.8] * (settings - 1) + [0.8 - points / 100]
-            success, _ = drives(generator, rates, (studies, maps), draws, LIKENESS[1])
-            called = called_worse(success.sum(-1), draws)
+            own = [0.8] * (settings - 1) + [0.8 - points / 100]
+            called = _called_worse(generator, own, (studies, maps), draws)
             row[f"power, {points} points"] = f"{100 * called[:, -1].mean():.0f}"
         yield row
+
+
+def _called_worse(
+    generator: np.random.Generator, rates: list[float], shape: tuple[int, int], draws: int
+) -> np.ndarray:
+    """Draw studies of settings with these rates; return which are called worse, [studies, settings]."""
+    success, _ = drives(generator, rates, shape, draws, LIKENESS[1])
+    return called_worse(success.sum(-1), draws)
 
 
 @_as_table
@@ -123,21 +132,25 @@ def hypotheses(studies: int, seed: int) -> Iterator[dict[str, object]]:
     """How often a single hypothesis is shown where it is false: no difference, or one as large as the margin."""
     for maps, draws, rate in product((20, 50, 200), DRAWS, (0.8, 0.95)):
         generator = np.random.default_rng([seed, maps, draws, round(100 * rate), 1])
-        row: dict[str, object] = {"maps": maps, "episodes a map": draws, "success": rate}
-        one, other, like = rate - 0.1, rate, LIKENESS[1]
-        success, taken = drives(generator, (other, other), (studies, maps), draws, like)
-        wins = success[:, 0].sum(-1) - success[:, 1].sum(-1)
-        row["difference, success"] = _share(np.array([sign_flip_p(gain) < ALPHA for gain in wins]))
-        _, far = drives(generator, (one, other), (1, 400_000), 1, like)
-        success, taken = drives(generator, (one, other), (studies, maps), draws, like)
-        wins = success[:, 0].sum(-1) - success[:, 1].sum(-1)
-        _, low, _ = success_interval(wins, draws, 1 - 2 * ALPHA)
-        row["non-inferiority, success"] = _share(low > -0.1)
-        _, low, high = time_intervals(success, taken, 1 - 2 * ALPHA)["difference"]
-        margin = (far[0, 0] - far[0, 1]).mean()
-        row["non-inferiority, T_total"] = _share(high < margin)
-        row["equivalence, T_total"] = _share((high < margin) & (low > -margin))
-        yield row
+        worse, like = rate - 0.1, LIKENESS[1]
+        success, _ = drives(generator, (rate, rate), (studies, maps), draws, like)
+        equal = success.sum(-1)
+        _, margin_s = true_difference_s(generator, (worse, rate), like)
+        success, taken = drives(generator, (worse, rate), (studies, maps), draws, like)
+        low = difference_intervals(success.sum(-1), draws, 1 - 2 * ALPHA)[:, 0]
+        pairs = episodes_of(success, taken)
+        low_s, high_s = np.array([time_difference(own, 1 - 2 * ALPHA)[1:] for own in pairs]).T
+        yield {
+            "maps": maps,
+            "episodes a map": draws,
+            "success": rate,
+            "difference, success": _share(
+                np.array([sign_flip_p(wins[0] - wins[1]) < ALPHA for wins in equal])
+            ),
+            "non-inferiority, success": _share(low > -0.1),
+            "non-inferiority, T_total": _share(high_s < margin_s),
+            "equivalence, T_total": _share((high_s < margin_s) & (low_s > -margin_s)),
+        }
 
 
 def _share(found: np.ndarray) -> str:

@@ -1,6 +1,5 @@
 """The controls of the study of knowledge: what they tell, and that they drive."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,18 +47,6 @@ def scores(sensed: Sensed, terrain: Terrain) -> Tensor:
     return (
         terrain.truth.at(sensed.mask).to_normal(sensed.traversability[sensed.mask][None])[0].view(BATCH, -1)
     )
-
-
-@pytest.mark.parametrize("radius_m", [1.0, 2.0])
-def test_elsewhere_senses_the_cells_that_a_probe_does_as_well_as_it(
-    radius_m: float, ground: tuple[Terrain, Tensor]
-) -> None:
-    told, probe = (
-        sense(kind, ground)
-        for kind in (elsewhere(radius_m=radius_m, noise_std=0.3), Probe(radius_m, noise_std=0.3))
-    )
-    assert torch.equal(told.mask, probe.mask)
-    assert torch.equal(told.std, probe.std)
 
 
 def test_elsewhere_tells_a_draw_of_the_same_law_that_has_nothing_to_do_with_the_field(
@@ -116,15 +103,3 @@ def test_revising_searches_each_half_second_and_drives_as_if_it_had_not(
     assert torch.equal(driven.states, plain.states)
     steps = driven.actions.shape[1]
     assert searched == [2] * (1 + -(-steps // 5))
-
-
-def test_revising_goes_on_under_the_map_that_it_has() -> None:
-    posed = factories.problem(torch.full((1, 16, 20), 0.85), goal=(8.25, 6.25))
-    planner = registry.make("planner", f"{PARTS}:Revising")
-    from tests.planning.planners.driving import first, generator
-
-    begun = planner.init(posed, generator())
-    _, after, _ = planner.plan(replace(first(posed), state=posed.start + 0.1), begun)
-    assert torch.equal(after.problem.free, posed.free)
-    assert torch.equal(after.problem.start, posed.start + 0.1)
-    assert torch.equal(after.field.cost, begun.field.cost)

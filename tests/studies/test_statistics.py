@@ -1,11 +1,8 @@
 """The simulated studies of statistics, at small size."""
 
 import numpy as np
-import pandas as pd
 import pytest
 
-from benchnav.eval.stats.summary import total_time_mean
-from benchnav.stats.episodes import time_difference
 from studies.statistics import simulated as studies
 
 
@@ -15,41 +12,22 @@ def generator() -> np.random.Generator:
 
 
 @pytest.mark.parametrize("draws", [1, 3])
-def test_intervals_of_success_hold_it(generator: np.random.Generator, draws: int) -> None:
-    cover = list(studies.cover_of_success(generator, 400, 50, draws, (0.05, 0.35, 0.5, 0.65)))
-    assert 0.93 < np.mean(cover) < 0.97
-    assert min(cover) >= 0.9
-
-
-@pytest.mark.parametrize("draws", [1, 3])
-def test_intervals_of_differences_hold_them(generator: np.random.Generator, draws: int) -> None:
-    cover = list(studies.cover_of_differences(generator, 400, 50, draws, (0.1, 0.5, 0.9)))
-    assert 0.93 < np.mean(cover) < 0.97
-    assert min(cover) >= 0.9
+def test_intervals_of_success_and_of_differences_hold_them(
+    generator: np.random.Generator, draws: int
+) -> None:
+    rates, pairs = (0.05, 0.35, 0.5, 0.65), (0.1, 0.5, 0.9)
+    for cover, own in ((studies.cover_of_success, rates), (studies.cover_of_differences, pairs)):
+        found = list(cover(generator, 400, 50, draws, own))
+        assert 0.93 < np.mean(found) < 0.97
+        assert min(found) >= 0.9
 
 
 def test_intervals_of_times_cover_them_where_a_bootstrap_does_not(generator: np.random.Generator) -> None:
-    found = studies.cover_of_times(generator, 200, 20, 1, (0.95, 0.85), 60)
-    assert found["time_cover"] > 0.93
-    assert found["difference_cover"] > 0.93
-    assert found["time_cover_bootstrap"] < found["time_cover"]
-    assert found["time_width_bootstrap"] < found["time_width"] < 25
-
-
-@pytest.mark.parametrize("draws", [1, 3])
-def test_intervals_of_the_study_are_those_of_the_tables(generator: np.random.Generator, draws: int) -> None:
-    success, taken = studies.drives(generator, (0.8, 0.9), (2, 12), draws, (0.3, 0.7))
-    found = studies.time_intervals(success, taken)
-    for study in range(2):
-        rows = pd.DataFrame({"group": np.repeat(np.arange(12), draws)})
-        for place, suffix in enumerate(("", "_other")):
-            rows[f"success{suffix}"] = success[study, place].ravel()
-            rows[f"total_time_s{suffix}"] = taken[study, place].ravel()
-            rows[f"time_budget_s{suffix}"] = 100.0
-        assert total_time_mean(rows, {"time_budget_s": 100.0}) == pytest.approx(
-            [e[study] for e in found["time"]]
-        )
-        assert time_difference(rows) == pytest.approx([ends[study] for ends in found["difference"]])
+    cover, width = studies.cover_of_times(generator, 200, (20, 1), (0.95, 0.85), 60).T.to_numpy()
+    time, by_bootstrap, difference, _ = cover
+    assert min(time, difference) > 0.93
+    assert by_bootstrap < time
+    assert width[1] < width[0] < 25
 
 
 @pytest.mark.parametrize("draws", [1, 3])
@@ -71,21 +49,6 @@ def test_what_is_as_good_as_the_best_is_rarely_called_worse(generator: np.random
     assert half[:, 6:].mean() > 0.95
 
 
-@pytest.mark.parametrize("same_maps", [False, True])
-def test_settings_of_unlike_shape_are_rarely_called_worse(
-    generator: np.random.Generator, same_maps: bool
-) -> None:
-    """Flipping signs calls one of six worse in 22 %, since on twenty maps the rare ones may all be missing."""
-    wins = studies.unlike(generator, 200, 6, 20, 3, same_maps)
-    np.testing.assert_allclose(wins.mean((0, 2)) / 3, 0.9, atol=0.02)
-    assert studies.called_worse(wins, 3).any(1).sum() <= 20  # of 6 % once in a hundred times
-
-
-def test_what_is_much_worse_is_called_so(generator: np.random.Generator) -> None:
-    success, _ = studies.drives(generator, [0.8] * 5 + [0.6], (60, 100), 1, studies.LIKENESS[1])
-    assert studies.called_worse(success.sum(-1), 1)[:, -1].mean() >= 0.8
-
-
 def test_intervals_of_few_large_groups_hold_what_a_cluster_t_does_not(generator: np.random.Generator) -> None:
     found = studies.cover_of_groups(generator, 300, 5, 20, (0.99, 0.9), (0.3, 0.0))
     assert found["cover"] > 0.93 > 0.85 > found["cover_t"]
@@ -94,14 +57,14 @@ def test_intervals_of_few_large_groups_hold_what_a_cluster_t_does_not(generator:
 
 
 def test_what_is_simulated_has_the_rates_and_the_likeness_asked_for(generator: np.random.Generator) -> None:
-    chance = studies.chances(generator, np.array([0.2, 0.7]), (40, 500), 0.3, 0.8)
+    chance = studies.chances(generator, (0.2, 0.7), (40, 500), (0.3, 0.8))
     np.testing.assert_allclose(chance.mean((0, 2)), [0.2, 0.7], atol=0.01)
     # Variance of chances over p(1 − p) is the correlation within a map.
     np.testing.assert_allclose(chance.var((0, 2)), 0.3 * np.array([0.16, 0.21]), rtol=0.05)
     same = np.full((40, 2, 500), 0.5)
     alike = studies.outcomes(generator, same, 1, 0.8)
     assert np.mean(alike[:, 0] == alike[:, 1]) == pytest.approx(0.5 + 0.5 * 0.64, abs=0.01)
-    hard = studies.hardness(chance, np.array([0.2, 0.7]), 0.3)
+    hard = studies.hardness(chance, (0.2, 0.7), 0.3)
     np.testing.assert_allclose((hard.mean((0, 2)), hard.std((0, 2))), ([0, 0], [1, 1]), atol=0.03)
     taken = studies.times(generator, np.ones((*hard.shape, 1), dtype=bool), hard)
     assert taken.mean() == pytest.approx(33 * np.exp(0.045), abs=0.3)

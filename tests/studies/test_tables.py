@@ -36,25 +36,6 @@ def test_the_best_is_told_from_the_worst(tmp_path: Path) -> None:
     assert lines[2].endswith(f"| {3 * 2 / 2**10:.2g} |")
 
 
-def test_the_gain_has_the_sign_of_the_best(tmp_path: Path) -> None:
-    for name, order in (("a", ("mean", "cvar")), ("b", ("cvar", "mean"))):
-        won = {"mean": [True] * 2 + [False] * 10, "cvar": [True] * 9 + [False] * 3}
-        folder = run_folder(tmp_path / name, made(**{risk: won[risk] for risk in order}))
-        text = sweep(folder)[2]
-        assert "cvar − mean +58.3 (+" in text
-
-
-def test_each_variant_has_a_row(tmp_path: Path) -> None:
-    episodes = made(mean=[True] * 12, cvar=[True, False] * 6)
-    other = episodes.assign(
-        model="oracle", condition=episodes["condition"] + "o", success=True, outcome="success"
-    )
-    lines = sweep(run_folder(tmp_path / "run", pd.concat([episodes, other])))
-    assert [line.split(" |")[0] for line in lines[2:4]] == ["| paper-v1", "| oracle"]
-    assert "| 100.0 | 50.0 |" in lines[2]
-    assert "| 100.0 | 100.0 |" in lines[3]
-
-
 def test_variants_are_distinguished_by_the_whole_label(tmp_path: Path) -> None:
     episodes = made(mean=[True] * 12, cvar=[True, False] * 6)
     worlds = [

@@ -29,24 +29,9 @@ def test_cdf_is_that_of_truncated_gaussians(ground: Ground) -> None:
 
 
 @BOTH
-def test_draws_again_have_that_distribution(ground: Ground) -> None:
-    generator = np.random.default_rng(0)
-    component = generator.choice(len(ground.weights), size=200_000, p=ground.weights)
-    drawn = generator.normal(np.array(ground.means)[component], np.array(ground.stds)[component])
-    drawn = drawn[(drawn >= 0) & (drawn <= 1)]
-    values = np.array([0.05, 0.1, 0.2, 0.5, 0.7, 0.9])
-    shares = (drawn[:, None] <= values).mean(0)
-    np.testing.assert_allclose(ground.cdf(values), shares, atol=0.006)
-
-
-@BOTH
 def test_quantile_inverts_the_cdf(ground: Ground) -> None:
     probability = np.array([[0.001, 0.2], [0.43, 0.99]])
     np.testing.assert_allclose(ground.cdf(ground.quantile(probability)), probability, atol=1e-10)
-
-
-def test_share_of_vegetation_that_holds_a_robot() -> None:
-    assert VEGETATION.cdf(np.array(0.3)) == pytest.approx(0.42, abs=0.01)
 
 
 @BOTH
@@ -55,35 +40,6 @@ def test_slices_have_every_tail_mean(ground: Ground, tail: float) -> None:
     exact = quad(lambda u: float(ground.quantile(np.array(u))), 0, tail, epsabs=1e-8)[0] / tail
     slices = ground.slices()
     assert slices[: round(100 * tail)].mean() == pytest.approx(exact, abs=1e-5)
-
-
-def histogram_of_draws(ground: Ground, share: float, draws: np.ndarray) -> float:
-    """As they do it, one bin after the other."""
-    counts, edges = np.histogram(draws, 20, range=(0, 1))
-    centres = edges[:-1] + 0.025
-    total = mean = 0.0
-    for centre, mass in zip(centres, counts / counts.sum(), strict=True):
-        total += mass
-        mean += mass * centre
-        if total >= share and share < 1:
-            break
-    mean /= total
-    for centre in centres:
-        if mean <= centre:
-            return int(100 * centre) / 100
-    raise AssertionError
-
-
-@BOTH
-@pytest.mark.parametrize("share", [0.2, 0.4, 1.0])
-def test_histogram_is_that_of_many_draws(ground: Ground, share: float) -> None:
-    draws = ground.quantile(np.random.default_rng(1).random(100_000))
-    assert ground.histogram_cvar(share) == pytest.approx(histogram_of_draws(ground, share, draws))
-
-
-def test_histogram_rounds_up() -> None:
-    assert VEGETATION.histogram_cvar(1.0) == 0.52
-    assert VEGETATION.slices().mean() < 0.51
 
 
 def sampled_as_they_do(ground: Ground, draws: np.ndarray) -> list[int]:

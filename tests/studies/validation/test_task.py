@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from benchnav.core.errors import ConfigError
 from studies.validation.ground import DIRT, VEGETATION
-from studies.validation.task import ROVER, Setup, planner_config, pose, predict, tail_share
+from studies.validation.task import Setup, planner_config, pose, predict
 from studies.validation.world import draw_vegetation
 from tests.planning.planners.driving import rollout_cost
 
@@ -27,35 +26,6 @@ def test_the_prediction_has_the_distribution_of_the_world() -> None:
         at = np.array(value)
         expected = np.where(VEGETATED, VEGETATION.cdf(at), DIRT.cdf(at))
         np.testing.assert_allclose(mixture.cdf(value), expected, atol=0.01)
-
-
-def test_trials_are_ordered_by_map_then_setting() -> None:
-    settings = ["mean", "cvar:0.8"]
-    both = pose(VEGETATED, settings, Setup()).risk_map
-    for k, setting in enumerate(settings):
-        torch.testing.assert_close(both[k::2], pose(VEGETATED, [setting], Setup()).risk_map)
-
-
-def test_the_whole_map_is_free_and_nothing_else() -> None:
-    problem = pose(VEGETATED, ["cvar:0.99"], Setup())
-    assert bool(problem.free.all())
-    assert not bool(problem.free_at(torch.tensor([[[-0.1, 4.0, 0.0]], [[4.0, 9.1, 0.0]]])).any())
-
-
-def test_min_traversability_bounds_what_motion_is_given() -> None:
-    problem = pose(VEGETATED, ["cvar:0.8"], Setup(min_traversability=0.3))
-    assert float(problem.traversability.min()) == pytest.approx(0.3)
-    assert float(problem.risk_map.min()) < 0.05
-    assert float(pose(VEGETATED, ["cvar:0.8"], Setup()).traversability.min()) < 0.05
-
-
-def test_the_robot_heads_for_the_goal_and_stays_there() -> None:
-    start = pose(VEGETATED, ["mean"], Setup()).start[0]
-    assert start.tolist() == pytest.approx([0.5, 0.5, math.pi / 4])
-    at_goal, action = torch.tensor([[8.2, 8.2, 0.0], [7.9, 8.2, 0.0]]), torch.tensor([[3.0, math.pi]] * 2)
-    after = ROVER(at_goal, action, torch.ones(2))
-    torch.testing.assert_close(after[0], at_goal[0])
-    torch.testing.assert_close(after[1], torch.tensor([8.2, 8.2, 0.1 * math.pi]))
 
 
 def cost_of(actions: np.ndarray, risk_map: np.ndarray, power: int) -> float:
@@ -91,12 +61,6 @@ def test_costs_of_rollouts_are_theirs(power: int) -> None:
     np.testing.assert_allclose(costs.numpy() - start, expected, rtol=2e-4)
 
 
-def test_histograms_give_their_risk_maps() -> None:
-    problem = pose(VEGETATED, ["cvar:0.8"], Setup(risk_map="histogram"))
-    expected = np.where(VEGETATED, VEGETATION.histogram_cvar(0.2), DIRT.histogram_cvar(0.2))
-    np.testing.assert_allclose(problem.risk_map, expected)
-
-
 def test_histograms_give_their_fields() -> None:
     fields = pose(VEGETATED, ["cost", "mean"], Setup(risk_map="histogram")).sample_fields(2000, 0)
     assert fields.shape == (4, 2000, 9, 9)
@@ -104,24 +68,6 @@ def test_histograms_give_their_fields() -> None:
     np.testing.assert_allclose(fields[::2].mean(1), expected, atol=0.04)
     np.testing.assert_allclose(fields[1::2].mean(1), expected, atol=0.04)
     np.testing.assert_array_equal(np.unique((100 * fields[0]).round() % 5), [0, 2])
-
-
-def test_shares_of_the_tail() -> None:
-    assert [tail_share(setting) for setting in ("mean", "cvar:0.4", "cvar:0.8")] == [1.0, 0.6, 0.2]
-    with pytest.raises(ConfigError, match="Expected `mean`, `cvar:LEVEL`, `cost` or `cost-cvar:LEVEL`"):
-        tail_share("var:0.9")
-
-
-def test_objectives_of_ours_are_found_by_name() -> None:
-    problem = pose(VEGETATED, ["mean"], Setup(objective="goal_distance"))
-    state = torch.tensor([[[0.5, 0.5, 0.0]]] * 2)
-    cost = problem.objective.stage(state, torch.zeros(2, 1, 2), torch.ones(2, 1), problem.goal_m[:, None])
-    assert cost[0].item() == pytest.approx(math.hypot(8, 8))
-
-
-def test_two_fields_have_only_their_objective() -> None:
-    with pytest.raises(ConfigError, match="Expected `objective` 'theirs' with `motions` 'two'"):
-        Setup(motions="two", objective="travel_time")
 
 
 def test_their_alpha_is_the_share_of_the_worst_costs() -> None:

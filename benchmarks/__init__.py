@@ -1,0 +1,1 @@
+"""Measurements of speed. Each module prints a table: `python -m benchmarks.engine`."""
