@@ -2,7 +2,6 @@
 
     python -m studies knowledge                    # maps, runs, report
     python -m studies knowledge maps               # make the maps, or check the digests of those there
-    python -m studies knowledge estimate primary   # ten maps a condition: how long the whole takes
     python -m studies knowledge develop            # the hypotheses on maps to develop on; then their power
     python -m studies knowledge power
     python -m studies knowledge run primary known  # resumes if it was interrupted
@@ -21,7 +20,7 @@ from studies import page, rows, runs
 from studies.power import power
 from studies.study import HOME, Study, Work
 
-_WHATS = ("all", "maps", "estimate", "develop", "power", "run", "report", "keep")
+_WHATS = ("all", "maps", "develop", "power", "run", "report", "keep")
 
 
 def main(words: list[str] | None = None) -> int:
@@ -57,8 +56,6 @@ def _do(what: str, study: Study, parts: list[str], work: Work) -> None:
         runs.run(study, parts, work)
     if what in ("all", "report"):
         page.report(study, work)
-    if what == "estimate":
-        runs.estimate(study, parts, work)
     if what == "develop":
         runs.develop(study, work)
     if what in ("develop", "power"):

@@ -4,19 +4,16 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import yaml
 from scipy.stats import norm
 
-from benchnav.core.tables import Table, to_markdown
+from benchnav.core.tables import NOTHING, to_markdown
 from benchnav.eval.report.write import read_report
-from studies.runs import developed
+from studies.runs import developed, table_of
 from studies.study import Study, Work
 
 ALPHA, POWER = 0.05, 0.8
-_HEADINGS = (
-    "", "hypothesis", "found on other maps (95 %)", "power, if so", "power, if no difference",
-    f"smallest difference with a power of {POWER}",
-)  # fmt: skip
 
 
 def power(study: Study, work: Work) -> str:
@@ -27,14 +24,12 @@ def power(study: Study, work: Work) -> str:
     with a power of 0.8 in the first place too.
     """
     maps = yaml.safe_load(study.suite_of("primary").read_text())["maps"]
-    tests = read_report(developed(study, work)).tests
-    rows = tuple(
-        _row(number, test, len(tests), maps) for number, test in enumerate(tests.to_dict("records"), 1)
-    )
-    return to_markdown(Table(headings=_HEADINGS, labels=2, rows=rows))
+    tests = read_report(developed(study, work)).tests.to_dict("records")
+    rows = [{"": number, **_row(test, len(tests), maps)} for number, test in enumerate(tests, 1)]
+    return to_markdown(table_of(pd.DataFrame(rows)))
 
 
-def _row(number: int, test: Mapping[Any, Any], n_tests: int, maps: int) -> tuple[str, ...]:
+def _row(test: Mapping[Any, Any], n_tests: int, maps: int) -> dict[str, str]:
     """Return the cells of a hypothesis, one of `n_tests`, on so many maps."""
     error = (test["high"] - test["low"]) / 2 / norm.ppf(0.975) * np.sqrt(test["n_maps"] / maps)
     places = (ALPHA / n_tests, ALPHA)
@@ -42,14 +37,18 @@ def _row(number: int, test: Mapping[Any, Any], n_tests: int, maps: int) -> tuple
         " to ".join(f"{power_of(test, error, alpha, difference):.2f}" for alpha in places)
         for difference in (test["difference"], 0.0)
     )
-    is_margin = test["kind"] in ("equivalence", "non-inferiority")
     tails = 1 if test["direction"] else 2
     smallest = error * (norm.ppf(1 - places[0] / tails) + norm.ppf(POWER))
-    found = f"{test['difference']:+.2f} ({test['low']:+.1f} to {test['high']:+.1f})"
-    return (
-        str(number), test["claim"], found, if_found, if_none if is_margin else "–",
-        f"{smallest:.1f}" if test["kind"] == "difference" else "–",
-    )  # fmt: skip
+    has_margin = test["kind"] in ("equivalence", "non-inferiority")
+    return {
+        "hypothesis": test["claim"],
+        "found on other maps (95 %)": f"{test['difference']:+.2f} ({test['low']:+.1f} to {test['high']:+.1f})",
+        "power, if so": if_found,
+        "power, if no difference": if_none if has_margin else NOTHING,
+        f"smallest difference with a power of {POWER}": f"{smallest:.1f}"
+        if test["kind"] == "difference"
+        else NOTHING,
+    }
 
 
 def power_of(test: Mapping[Any, Any], error: float, alpha: float, difference: float) -> float:

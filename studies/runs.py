@@ -20,7 +20,7 @@ from benchnav.eval.run.unit import one_thread
 from benchnav.viz.style import save
 from studies.study import ROOT, Study, Work
 
-ESTIMATED_MAPS, DEVELOPED_MAPS = 10, 200
+DEVELOPED_MAPS = 200
 
 
 def command(program: str, *words: object) -> None:
@@ -71,7 +71,7 @@ def drive(suite: dict[str, Any], folder: Path, jobs: int) -> None:
 
 
 def _run_script(study: Study, part: str, work: Work) -> None:
-    """Call the function of a part, and store each result as NAME.md, NAME.csv or NAME.png; text is Markdown."""
+    """Call the function of a part, and store each result as NAME.md, NAME.csv or NAME.png."""
     folder, about = work.out / study.run_of(part), study.parts[part]
     folder.mkdir(parents=True, exist_ok=True)
     options = {**about.options, **({"maps": work.maps} if work.maps else {})}
@@ -84,43 +84,19 @@ def _run_script(study: Study, part: str, work: Work) -> None:
             with replacing(path.with_suffix(".png")) as partial:
                 save(result, partial, "png", dpi=200)
             continue
-        if isinstance(result, list):
-            result = pd.DataFrame(result)
-        if isinstance(result, pd.DataFrame):
-            write_text(path.with_suffix(".csv"), result.to_csv(index=False))
-            result = table_of(result)
-        text = result if isinstance(result, str) else to_markdown(result)
+        text = result
+        if not isinstance(result, str):
+            rows = pd.DataFrame(result)
+            write_text(path.with_suffix(".csv"), rows.to_csv(index=False))
+            text = to_markdown(table_of(rows))
         write_text(path.with_suffix(".md"), text)
         print(f"{name}\n{text}", flush=True)
 
 
 def table_of(rows: pd.DataFrame) -> Table:
     """Return rows as a table, numbers with four digits."""
-    cells = (
-        tuple(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row)
-        for row in rows.itertuples(index=False)
-    )
-    return Table(headings=tuple(map(str, rows.columns)), rows=tuple(cells))
-
-
-def estimate(study: Study, parts: list[str], work: Work) -> None:
-    """Print how long parts take, by some maps of each condition."""
-    maps = work.maps or ESTIMATED_MAPS
-    for part in parts:
-        suite = study.suite(part, work)
-        whole = yaml.safe_load(study.suite_of(part).read_text())
-        started = time.perf_counter()
-        drive(
-            suite | {"maps": maps, "realisations": 1, "hypotheses": []},
-            work.out / f"estimate-{study.run_of(part)}",
-            work.jobs,
-        )
-        seconds = time.perf_counter() - started
-        hours = seconds * whole["maps"] * whole.get("realisations", 1) / maps / 3600
-        print(
-            f"{part}: {seconds:.0f} s for {maps} maps; {hours:.1f} hours of {work.jobs} processes in all",
-            flush=True,
-        )
+    cells = rows.map(lambda value: f"{value:.4g}" if isinstance(value, float) else str(value))
+    return Table(headings=tuple(map(str, rows.columns)), rows=tuple(cells.itertuples(index=False, name=None)))
 
 
 def develop(study: Study, work: Work) -> None:

@@ -48,7 +48,7 @@ class Part:
     Args:
         suite: name of its suite in the study's folder, or of a shipped one; if empty, the part's name.
         script: `MODULE:FUNCTION` of the study's folder, in place of a suite; called with the `Work`, the run's folder
-            and the options, it returns tables and figures by name.
+            and the options, it returns figures, tables (rows or Markdown) by name.
         options: of the script.
         run: name of the run; if empty, `STUDY-PART`.
         maps: number of maps of each condition, the first ones; if 0, as the suite says.

@@ -16,6 +16,7 @@ code has changed. 25 minutes of a core with 400 maps' first 200, and 15 with the
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,14 @@ from torch import Tensor
 
 from benchnav.core import rng
 from benchnav.core.copula import correlated_normal
-from benchnav.core.tables import Table
+from benchnav.core.grid import Grid
 from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent, Unit, units
 from benchnav.eval.run.knowledge import Knowing
 from benchnav.eval.run.unit import Built, Settings, read_block, simulate
 from benchnav.planning.world.realisation import joined
-from studies.study import Work
-from studies.tables import table
+from studies.study import Rows, Work
 from studies.units import build_unit, one_unit, stakes_suite
 
 MODELS = ("oracle", "stakes-v1")
@@ -43,7 +43,6 @@ TIMES, LATEST_S = 4, 40.0
 NEAR_M = 3.0  # 2ℓ
 LAW = {"preset": "stakes", "immobile": None}
 DRAWS = 40  # of each map, of the table on rejection
-NAMES = ("inside", "under", "over", "log_score", "log_score_of_prediction")
 
 
 class Coverage:
@@ -59,7 +58,7 @@ class Coverage:
         drawn = rng.uniform(rng.stream_key(0, "coverage"), maps, (TIMES,))
         self._steps = torch.from_numpy(every * np.ceil(drawn * LATEST_S / built.problem.dt_s / every)).long()
         self._rank = torch.from_numpy(rng.uniform(rng.stream_key(0, "rank"), maps, built.problem.grid.shape))
-        self.sums = torch.zeros(len(maps), 1 + len(NAMES), dtype=torch.float64)
+        self.sums = torch.zeros(len(maps), 6, dtype=torch.float64)
 
     def __call__(self, step: int, knowing: Knowing) -> None:
         """Asks what is believed where a time was drawn; of robots that are left."""
@@ -116,7 +115,7 @@ def sums_of(unit: Unit, settings: Settings, out: Path) -> Tensor:
     return torch.from_numpy(np.load(path))
 
 
-def measured(suite: Suite, maps: int, out: Path) -> Table:
+def measured(suite: Suite, maps: int, out: Path) -> Rows:
     """Coverage of each condition."""
     conditions = {
         condition.id: (condition, Extent.product((0,), 1, maps))
@@ -129,76 +128,76 @@ def measured(suite: Suite, maps: int, out: Path) -> Table:
     for key, parts in found.items():
         labels, sums = conditions[key][0].labels, torch.cat(parts).numpy()
         cells = sums[:, 0].sum()
-        shares = sums[:, 1:].sum(0) / cells
+        inside, under, over, score, of_prediction = sums[:, 1:].sum(0) / cells
         # A ratio of sums over maps: its error by the residuals of the maps.
-        left = sums[:, 1] - shares[0] * sums[:, 0]
-        error = 1.96 * np.sqrt((left**2).sum()) / cells
-        inside = f"{shares[0]:.3f} ({shares[0] - error:.3f} to {shares[0] + error:.3f})"
-        law = "no draw rejected" if "immobile" in labels["world"] else "with rejection"
-        under, over, *scores = shares[1:]
-        rows.append((
-            labels["model"], law, labels["ground"], f"{cells:.0f}", inside, f"{under:.3f}", f"{over:.3f}",
-            *(f"{score:.2f}" for score in scores),
-        ))  # fmt: skip
-    headings = ("model", "λ", "ground", "cells", "inside 90 % (95 % interval)", "under", "over")
-    return table((*headings, "log score", "of the prediction"), rows, 3)
+        residual = sums[:, 1] - inside * sums[:, 0]
+        error = 1.96 * np.sqrt((residual**2).sum()) / cells
+        rows.append({
+            "model": labels["model"],
+            "λ": "no draw rejected" if "immobile" in labels["world"] else "with rejection",
+            "ground": labels["ground"],
+            "cells": f"{cells:.0f}",
+            "inside 90 % (95 % interval)": f"{inside:.3f} ({inside - error:.3f} to {inside + error:.3f})",
+            "under": f"{under:.3f}",
+            "over": f"{over:.3f}",
+            "log score": f"{score:.2f}",
+            "of the prediction": f"{of_prediction:.2f}",
+        })  # fmt: skip
+    return rows
 
 
-def rejection(data: Path, maps: int) -> Table:
-    """What rejection of draws changes of λ."""
-    suite = suite_of(data)
-    unit = one_unit(suite, maps)
-    condition = unit.condition
-    changes, rejected, drawn = [], 0, 0
+def rejection(data: Path, maps: int) -> Rows:
+    """Return what rejection of draws changes of λ."""
+    first_unit = one_unit(suite_of(data), maps)
+    world = first_unit.condition.world
+    assert world.immobile is not None
+    changes, n_rejected = [], 0
     for first in track(range(0, maps, 50), "draws"):
-        block = read_block(
-            Unit(condition=condition, seed=0, realisation=0, maps=tuple(range(first, min(first + 50, maps)))),
-            Settings().origins().of(unit),
-        )
-        world, grid, truth = condition.world, block.terrain.grid, block.terrain.truth
-        assert world.immobile is not None
+        unit = replace(first_unit, maps=tuple(range(first, min(first + 50, maps))))
+        block = read_block(unit, Settings().origins().of(unit))
+        grid, truth = block.terrain.grid, block.terrain.truth
+        length = world.correlation_m / grid.resolution_m
         sums = torch.zeros(2, 3, *truth.shape, dtype=torch.float64)
         for draw in range(DRAWS):
-            scores = correlated_normal(
-                rng.stream_key(draw, "rejection"), np.arange(first, first + truth.shape[0]), grid.shape,
-                world.correlation_m / grid.resolution_m,
-            )  # fmt: skip
+            key = rng.stream_key(draw, "rejection")
+            scores = correlated_normal(key, np.array(unit.maps), grid.shape, length)
             field = truth.from_normal(torch.from_numpy(scores).float()).double()
-            kept = joined(field >= world.immobile.below, grid, block.places)
-            told = torch.stack((torch.ones_like(field), field, (field < world.immobile.below).double()))
-            sums[0] += told
-            sums[1] += told * kept[:, None, None]
-            rejected, drawn = rejected + int((~kept).sum()), drawn + len(kept)
-        # Maps of which no draw is kept tell nothing.
+            is_immobile = field < world.immobile.below
+            is_kept = joined(~is_immobile, grid, block.places)
+            drawn = torch.stack((torch.ones_like(field), field, is_immobile.double()))
+            sums += torch.stack((drawn, drawn * is_kept[:, None, None]))
+            n_rejected += int((~is_kept).sum())
         all_draws, kept_draws = (part[1:] / part[0].clamp(min=1) for part in sums)
-        some = sums[1, 0].flatten(1).amax(1) > 0
-        near = _on_the_way(block.places.start_m, block.places.goal_m, grid)
-        for own in some.nonzero()[:, 0].tolist():
-            away = (kept_draws - all_draws)[:, own]
-            changes.append([*away[:, near[own]].mean(1), *away[:, ~near[own]].mean(1)])
-    means = np.array(changes).mean(0)
-    places = zip(("near the straight line", "elsewhere"), means.reshape(2, 2), strict=True)
-    rows = [
-        (f"{rejected / drawn:.1%}", name, f"{mean:+.4f}", f"{probability:+.4f}")
-        for name, (mean, probability) in places
+        near = _near_line(block.places.start_m, block.places.goal_m, grid)
+        # Maps with no draw that is kept say nothing.
+        for index in sums[1, 0].flatten(1).amax(1).nonzero()[:, 0].tolist():
+            change = (kept_draws - all_draws)[:, index]
+            changes.append([change[:, cells].mean(1).tolist() for cells in (near[index], ~near[index])])
+    return [
+        {
+            "draws rejected": f"{n_rejected / DRAWS / maps:.1%}",
+            "cells": cells,
+            "change of E[λ]": f"{mean:+.4f}",
+            f"of P(λ < {world.immobile.below:g})": f"{probability:+.4f}",
+        }
+        for cells, (mean, probability) in zip(
+            ("near the straight line", "elsewhere"), np.mean(changes, axis=0), strict=True
+        )
     ]
-    return table(("draws rejected", "cells", "change of E[λ]", f"of P(λ < {world.immobile.below:g})"), rows)
 
 
-def _on_the_way(start_m: Tensor, goal_m: Tensor, grid: Any) -> Tensor:
-    """Cells within `NEAR_M` of the straight line from start to goal, bool, shape [B, H, W]."""
-    row, column = (torch.arange(size) for size in grid.shape)
-    x, y = grid.centre_of(row[:, None], column[None, :])
-    x, y = torch.broadcast_tensors(x, y)
-    at = torch.stack((x, y), -1)[None].double()
-    start, way = start_m.double()[:, None, None], (goal_m - start_m).double()[:, None, None]
-    part = (((at - start) * way).sum(-1) / way.square().sum(-1)).clamp(0, 1)
-    return torch.linalg.vector_norm(at - start - part[..., None] * way, dim=-1) <= NEAR_M
+def _near_line(start_m: Tensor, goal_m: Tensor, grid: Grid) -> Tensor:
+    """Return the cells within `NEAR_M` of the straight line from start to goal, bool, shape [B, H, W]."""
+    row, column = torch.meshgrid(*map(torch.arange, grid.shape), indexing="ij")
+    cell = torch.stack(grid.centre_of(row, column), -1)[None].double()
+    start, line = start_m.double()[:, None, None], (goal_m - start_m).double()[:, None, None]
+    part = (((cell - start) * line).sum(-1) / line.square().sum(-1)).clamp(0, 1)
+    return torch.linalg.vector_norm(cell - start - part[..., None] * line, dim=-1) <= NEAR_M
 
 
 def coverage(
     work: Work, folder: Path, data: str, maps: int, models: Sequence[str] = MODELS
-) -> dict[str, Table]:
+) -> dict[str, Rows]:
     """Return coverage of the belief on the first maps of a dataset, and what rejection of draws changes."""
     path = work.maps_in / f"{data}.h5"
     return {"rejection": rejection(path, maps), "coverage": measured(suite_of(path, models), maps, folder)}

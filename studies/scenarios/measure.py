@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml
 from matplotlib.figure import Figure
 
 from benchnav.core import rng
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.tables import Table
 from benchnav.core.terrain import Observation
 from benchnav.datagen.recipe.latent import latent_mean, latent_std
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict
@@ -26,24 +26,11 @@ from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import find_checkpoint
 from benchnav.models.quality.measure import pit
 from studies.scenarios.figures import draw_distributions, draw_examples, draw_series
-from studies.scenarios.statistics import (
-    SHARE_EDGES,
-    SLOPE_EDGES,
-    Maps,
-    Statistic,
-    excess,
-    first,
-    histogram,
-    mean_iou,
-    quantile,
-    ratio,
-    rms,
-    show,
-)
-from studies.study import Work
-from studies.tables import table
+from studies.scenarios.statistics import SHARE_EDGES, SLOPE_EDGES, Maps, histogram, show
+from studies.study import Rows, Work
 
 MODEL = "paper-v1"
+COLUMNS = yaml.safe_load(Path(__file__).with_name("tables.yaml").read_text())
 PAIRED_MAPS, CHUNK_MAPS = 200, 20
 BEYOND: dict[str, Any] = {f"{preset}-150": {"preset": preset, "severity": 1.5} for preset in ("hg", "hs")}
 PAIRS: dict[str, Any] = {
@@ -55,9 +42,6 @@ PAIRS: dict[str, Any] = {
     "hs-050": {"preset": "hs", "severity": 0.5},
     "hs-100": {"preset": "hs"},
 }
-
-# Keys of what is measured, the statistic of it, its scale and its digits.
-Column = tuple[Sequence[str], Statistic, float, int]
 
 
 def measure_maps(model: FusedModel, recipe: Recipe, maps: Maps) -> dict[str, np.ndarray]:
@@ -104,56 +88,16 @@ def _measure_chunk(model: FusedModel, recipe: Recipe, maps: Maps) -> dict[str, n
     return result
 
 
-def by_scenario(pairs: Mapping[str, Maps], columns: Mapping[str, Column]) -> Table:
-    """Return a table with a row a scenario."""
-    rows = [
-        [name, *(show([maps[key] for key in keys], *how) for keys, *how in columns.values())]
-        for name, maps in pairs.items()
+def by_scenario(pairs: Mapping[str, Maps], name: str) -> Rows:
+    """Return a table with a row a scenario and the columns of its name in `tables.yaml`."""
+
+    def cell(maps: Maps, of: Sequence[str], **how: Any) -> str:
+        return show([maps[key] for key in of], **how)
+
+    return [
+        {"scenario": scenario} | {heading: cell(maps, **column) for heading, column in COLUMNS[name].items()}
+        for scenario, maps in pairs.items()
     ]
-    return table(("scenario", *columns), rows)
-
-
-# The ground itself, whatever model looks at it.
-GROUND: Mapping[str, Column] = {
-    "relief [m]": (["relief"], first, 1, 2),
-    "median slope [°]": (["slope"], quantile(0.5, SLOPE_EDGES), 1, 1),
-    "95 % [°]": (["slope"], quantile(0.95, SLOPE_EDGES), 1, 1),
-    "beyond [10⁻⁵]": (["beyond"], first, 1e5, 0),
-    "E[λ]": (["expected"], first, 1, 3),
-    "λ, 5 %": (["lambda"], quantile(0.05, SHARE_EDGES), 1, 2),
-    "stuck [%]": (["stuck"], first, 100, 1),
-    "time [s]": (["time"], first, 1, 1),
-}
-# The light, what the classifier gets right, and the error of E[λ] by where the classes come from.
-PREDICTION: Mapping[str, Column] = {
-    "brightness": (["brightness"], first, 1, 2),
-    "accuracy [%]": (["right"], first, 100, 1),
-    "mIoU [%]": (["confusion"], mean_iou, 100, 1),
-    "too dark [%]": (["darker"], first, 100, 1),
-    "no class": (["square none"], rms, 1000, 1),
-    "predicted": (["square predicted"], rms, 1000, 1),
-    "true": (["square true"], rms, 1000, 1),
-    "predicted − true": (["square predicted", "square true"], excess, 1000, 1),
-}
-# How often realised λ lies in the central 90 % interval, and under VaR 0.9, by source of classes.
-CALIBRATION: Mapping[str, Column] = {
-    "coverage, predicted": (["held predicted"], first, 100, 2),
-    "coverage, true": (["held true"], first, 100, 2),
-    "tail, predicted": (["tail predicted"], first, 100, 2),
-    "tail, true": (["tail true"], first, 100, 2),
-    "bias [10⁻³]": (["error predicted"], first, 1000, 1),
-    "found wet clay": (["wet clay"], first, 100, 1),
-}
-# Changes from std on the same maps, and whether ground or picture brings them about.
-CHANGES: Mapping[str, Column] = {
-    "E[λ]": (["expected"], first, 1, 3),
-    "stuck [%]": (["stuck"], first, 100, 1),
-    "accuracy [%]": (["right"], first, 100, 1),
-    "both": (["both", "before"], excess, 1000, 1),
-    "ground alone": (["ground", "before"], excess, 1000, 1),
-    "picture alone": (["picture", "before"], excess, 1000, 1),
-    "true classes": (["square true", "true before"], excess, 1000, 1),
-}
 
 
 def changes(model: FusedModel, maps: Maps, std: Maps) -> Maps:
@@ -175,34 +119,37 @@ def changes(model: FusedModel, maps: Maps, std: Maps) -> Maps:
     }  # fmt: skip
 
 
-def slope_table(std: Maps, hg: Maps) -> Table:
-    """Where on the slopes of hg-100 the errors are made."""
+def slope_table(std: Maps, hg: Maps) -> Rows:
+    """Return where on the slopes of hg-100 the errors are made."""
     rows = []
     for low, high in pairwise((0, 10, 15, 20, 25, 90)):
-        of_std, of_hg = ((low < m["slope_deg"]) & (m["slope_deg"] <= high) for m in (std, hg))
+        of_std, of_hg = ((low < maps["slope_deg"]) & (maps["slope_deg"] <= high) for maps in (std, hg))
         inside = {name: [hg[name] * of_hg, of_hg] for name in hg if hg[name].shape == of_hg.shape}
-        cells = [show([of_std], first, 100, 2), show([of_hg], first, 100, 2)]
-        errors = [show(inside[f"square {source}"], rms, 1000) for source in ("predicted", "true")]
-        shares = [
-            show(inside[key], ratio, k)
-            for key, k in (("right", 100), ("error true", 1000), ("tail true", 100))
-        ]
-        rows.append([f"{low}–{high}", *cells, shares[0], *errors, *shares[1:]])
-    head = ("slope [°]", "of std [%]", "of hg-100 [%]", "accuracy [%]")
-    return table([*head, "predicted", "true", "bias, true", "tail, true [%]"], rows)
+        rows.append({
+            "slope [°]": f"{low}–{high}",
+            "of std [%]": show([of_std], scale=100, digits=2),
+            "of hg-100 [%]": show([of_hg], scale=100, digits=2),
+            "accuracy [%]": show(inside["right"], "ratio", 100),
+            "predicted": show(inside["square predicted"], "rms", 1000),
+            "true": show(inside["square true"], "rms", 1000),
+            "bias, true": show(inside["error true"], "ratio", 1000),
+            "tail, true [%]": show(inside["tail true"], "ratio", 100),
+        })  # fmt: skip
+    return rows
 
 
-def colour_table(recipe: Recipe) -> Table:
-    """At which brightness a class looks as the next darker ones: the scale of least squared difference."""
-    rows, colours = [], np.array([c.colour for c in recipe.classes], dtype=np.float64)
-    for i, (terrain, colour) in enumerate(zip(recipe.classes, colours, strict=True)):
-        row = [terrain.name.replace("_", " "), ", ".join(map(str, terrain.colour))]
-        for target in (i - 1, i - 2, i - 3):
-            scale = colours[target] @ colour / (colour @ colour)
-            left = np.abs(scale * colour - colours[target]).max()
-            row.append(f"{scale:.2f} (off by {left:.0f})" if target >= 0 else "")
+def colour_table(recipe: Recipe) -> Rows:
+    """Return at which brightness a class looks as the next darker ones: the scale of least squared difference."""
+    rows, colours = [], np.array([kind.colour for kind in recipe.classes], dtype=np.float64)
+    for index, (kind, colour) in enumerate(zip(recipe.classes, colours, strict=True)):
+        row = {"class": kind.name.replace("_", " "), "colour": ", ".join(map(str, kind.colour))}
+        for darker, heading in enumerate(("as the next darker", "as the second", "as the third"), 1):
+            target = colours[index - darker]
+            scale = target @ colour / (colour @ colour)
+            error = np.abs(scale * colour - target).max()
+            row[heading] = f"{scale:.2f} (off by {error:.0f})" if darker <= index else ""
         rows.append(row)
-    return table(["class", "colour", "as the next darker", "as the second", "as the third"], rows)
+    return rows
 
 
 def measure_series(model: FusedModel, recipe: Recipe) -> dict[str, dict[str, np.ndarray]]:
@@ -231,7 +178,7 @@ def measure_pairs(model: FusedModel, recipe: Recipe) -> dict[str, Maps]:
     return pairs
 
 
-def measure(work: Work, folder: Path) -> dict[str, Table | Figure]:
+def measure(work: Work, folder: Path) -> dict[str, Rows | Figure]:
     """Return the tables and the figures of the page."""
     recipe, checkpoint = load_recipe("shift-v1"), load_checkpoint(find_checkpoint(MODEL))
     model = FusedModel.from_checkpoint(checkpoint)
@@ -239,14 +186,12 @@ def measure(work: Work, folder: Path) -> dict[str, Table | Figure]:
     series, pairs = measure_series(model, recipe), measure_pairs(model, recipe)
     series = {name: maps | {"beyond": maps["slope_deg"] > steepest} for name, maps in series.items()}
     changed = {name: changes(model, maps, pairs["std"]) for name, maps in pairs.items() if name != "std"}
-    ground = by_scenario(series, GROUND)
-    rejected = (f"{maps['rejected_draws'].sum()}" for maps in series.values())
-    rows = [(*row, count) for row, count in zip(ground.rows, rejected, strict=True)]
+    rejected = ({"rejected": maps["rejected_draws"].sum()} for maps in series.values())
     return {
-        "ground": table((*ground.headings, "rejected"), rows),
-        "model": by_scenario(series, PREDICTION),
-        "calibration": by_scenario(series, CALIBRATION),
-        "pairs": by_scenario(changed, CHANGES),
+        "ground": [row | more for row, more in zip(by_scenario(series, "ground"), rejected, strict=True)],
+        "model": by_scenario(series, "model"),
+        "calibration": by_scenario(series, "calibration"),
+        "pairs": by_scenario(changed, "pairs"),
         "slopes": slope_table(series["std"], series["hg-100"]),
         "colours": colour_table(recipe),
         "examples": draw_examples(pairs, recipe.grid.extent_m),

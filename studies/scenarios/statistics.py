@@ -33,9 +33,9 @@ def estimate(columns: Sequence[np.ndarray], statistic: Statistic) -> tuple[float
     return float(statistic(numbers.mean(0))), float(statistic(times @ numbers / maps).std(ddof=1))
 
 
-def show(columns: Sequence[np.ndarray], statistic: Statistic, scale: float = 1, digits: int = 1) -> str:
-    """Writes `value ± standard error`, or the value alone where it cannot vary."""
-    value, error = (scale * number for number in estimate(columns, statistic))
+def show(columns: Sequence[np.ndarray], statistic: str = "first", scale: float = 1, digits: int = 1) -> str:
+    """Write `value ± standard error`, or only the value if it cannot vary."""
+    value, error = (scale * number for number in estimate(columns, STATISTICS[statistic]))
     return f"{value:.{digits}f}".replace("-", "−") + (f" ± {error:.{digits}f}" if error > 0 else "")
 
 
@@ -70,3 +70,10 @@ def mean_iou(confusion: np.ndarray) -> np.ndarray:
     square = confusion.reshape(*confusion.shape[:-1], count, count)
     both = np.diagonal(square, axis1=-2, axis2=-1)
     return (both / (square.sum(-1) + square.sum(-2) - both)).mean(-1)
+
+
+STATISTICS: dict[str, Statistic] = {
+    "first": first, "ratio": ratio, "rms": rms, "excess": excess, "mean_iou": mean_iou,
+    "median_slope": quantile(0.5, SLOPE_EDGES), "steep_slope": quantile(0.95, SLOPE_EDGES),
+    "low_traversability": quantile(0.05, SHARE_EDGES),
+}  # fmt: skip
