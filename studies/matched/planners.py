@@ -12,15 +12,12 @@ import torch
 from torch import Tensor
 
 from benchnav.core import rng
-from benchnav.core.errors import expect
 from benchnav.planning import MPPI, MPPIConfig
-from benchnav.planning.free_space import PENALTY
-from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.mppi import MPPIState, roll_out
+from benchnav.planning.planners.mppi import MPPIState, advance_chunk, roll_out, total_cost
 from benchnav.planning.planners.noise_bank import NoiseBank, perturb
 from benchnav.planning.planners.planner import Plan
-from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
+from benchnav.planning.problem import Problem
 from benchnav.planning.robots import component_wise
 
 
@@ -43,19 +40,11 @@ class _Summed(NoiseBank):
         return super().at(step).cumsum(0)
 
 
-def refuse_others(config: MPPIConfig, own: type[MPPIConfig], unused: tuple[str, ...]) -> None:
-    """Refuses options of MPPI that a planner has no use for, where they are not at their default."""
-    for name in ("risk_on", "entrapment", "control_cost", *unused):
-        given = getattr(config, name)
-        expect(given == getattr(own(), name), f"no `{name}` for {own.__name__}, got {given!r}.")
-
-
 class SmoothMPPI(MPPI):
     """MPPI that samples the changes of actions, and takes large ones for costly."""
 
     def __init__(self, config: SmoothConfig | None = None) -> None:
         super().__init__(config or SmoothConfig())
-        refuse_others(self.config, SmoothConfig, ())
 
     def init(self, problem: Problem, generator: torch.Generator) -> MPPIState:
         state = super().init(problem, generator)
@@ -100,28 +89,16 @@ class ICEMConfig(MPPIConfig):
 
 
 @dataclass(frozen=True)
-class Coloured:
-    """Noise of variance 1, of which each iteration takes a part, shape [T, A, 4K]."""
-
-    values: Tensor
-
-    def take(self, key: int, count: int) -> Tensor:
-        """So many sequences from a place that is named by a key, shape [T, A, count]."""
-        first = key % (self.values.shape[2] - count + 1)
-        return self.values[..., first : first + count]
-
-
-@dataclass(frozen=True)
 class ICEMState(MPPIState):
     """What iCEM carries from step to step, beside what MPPI does.
 
     Args:
         elites: sequences that are tried again, shape [B, T, A, E].
-        coloured: the noise.
+        coloured: noise of variance 1, of which each iteration takes a part, shape [T, A, 4K].
     """
 
     elites: Tensor
-    coloured: Coloured
+    coloured: Tensor
 
 
 class ICEM(MPPI):
@@ -129,8 +106,7 @@ class ICEM(MPPI):
 
     def __init__(self, config: ICEMConfig | None = None) -> None:
         super().__init__(config or ICEMConfig())
-        refuse_others(self.config, ICEMConfig, ("noise", "temperature", "temperature_share"))
-        self._roll = Fused(_advance, self.config.samples, self.worth_compiling, batched=(0, 1, 2, 3, 4))
+        self._roll = Fused(_advance, self.config.samples, self.worth_compiling, batched=(0, 1, 2, 5, 6))
 
     @property
     def _kept(self) -> int:
@@ -142,7 +118,7 @@ class ICEM(MPPI):
         own = rng.generator(rng.stream_key(base.key, "coloured"))
         coloured = coloured_noise(horizon, (actions, 4 * config.samples), config.colour, own).to(base.mean)
         elites = base.mean[..., None].expand(-1, -1, -1, self._kept)
-        return ICEMState(**vars(base), elites=elites, coloured=Coloured(coloured))
+        return ICEMState(**vars(base), elites=elites, coloured=coloured)
 
     def plan_toward(self, step: Any, plan_state: Any, target_m: Tensor) -> tuple[Tensor, Any, Plan]:
         problem, config, mean = plan_state.problem, self.config, plan_state.mean
@@ -152,7 +128,8 @@ class ICEM(MPPI):
         for iteration in range(config.iterations):
             count = max(2 * config.elites, int(config.samples / config.decay**iteration))
             key = rng.stream_key(plan_state.key, plan_state.step, iteration)
-            noise = plan_state.coloured.take(key, count)
+            first = key % (plan_state.coloured.shape[2] - count + 1)
+            noise = plan_state.coloured[..., first : first + count]
             samples = torch.clamp(mean[..., None] + std[..., None] * noise, low[:, None], high[:, None])
             last = [mean[..., None]] if iteration == config.iterations - 1 else []
             samples = torch.cat((samples, tried, *last), dim=3)
@@ -169,33 +146,21 @@ class ICEM(MPPI):
     def _cost(
         self, problem: Problem, state: Tensor, samples: Tensor, target_m: Tensor, to_go: Tensor | None
     ) -> Tensor:
-        """What sequences cost, shape [B, K]."""
-        target = target_m[:, None].contiguous()
+        """Return what sequences cost, shape [B, K]."""
+        ground, target = problem.padded_ground, target_m[:, None].contiguous()
         states = component_wise(state[:, None].expand(-1, samples.shape[3], -1))
         cost = state.new_zeros(states.shape[:2])
-        rules = problem.task.rules.min_traversability
         for chunk in samples.split(10, dim=1):
             states, cost = self._roll(
-                states, cost, chunk.contiguous(), problem.padded_ground, target, problem.grid, problem.robot,
-                problem.objective, rules,
+                states, cost, chunk.contiguous(), *problem.action_bounds, ground, target, problem.grid, problem.robot,
+                problem.objective, problem.task.rules.min_traversability,
             )  # fmt: skip
-        ground = problem.grid.lookup(problem.padded_ground, states[..., 0], states[..., 1])
-        if to_go is None:
-            return cost + terminal_cost(problem.objective, states, ground, target)
-        paths = astar.cost_at(problem.grid, to_go, states[..., 0], states[..., 1])
-        return cost + paths + PENALTY * (ground <= 0)
+        return total_cost(states, cost, ground, target, problem.grid, problem.objective, to_go=to_go)[0]
 
 
-def _advance(
-    states: Tensor, cost: Tensor, actions: Tensor, ground: Tensor, target: Tensor, grid: Any, robot: Any,
-    objective: Any, least: float,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    for step in range(actions.shape[1]):
-        action = actions[:, step].movedim(1, 2)
-        here = grid.lookup(ground, states[..., 0], states[..., 1])
-        cost = cost + stage_cost(objective, states, action, here, target)
-        states = robot(states, action, motion_traversability(here, least))
-    return component_wise(states), cost
+def _advance(states: Tensor, cost: Tensor, actions: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
+    """Roll samples out whose actions, [B, T, A, K], differ by episode: as deviations from a mean of 0."""
+    return advance_chunk(states, cost, torch.zeros_like(actions[..., 0]), actions.movedim(1, 0), *rest)
 
 
 def coloured_noise(steps: int, shape: tuple[int, ...], colour: float, generator: torch.Generator) -> Tensor:
