@@ -17,10 +17,9 @@ import numpy as np
 import torch
 
 from benchmarks.timing import per_second, seconds, show
+from benchnav.datagen import Recipe, TerrainDataset, generate, load_recipe
 from benchnav.datagen.files.create import create
-from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import Recipe, Split, load_recipe
-from benchnav.datagen.synth.generate import generate
+from benchnav.datagen.recipe.recipe import Split
 from benchnav.models.training.data import MapDataset
 from benchnav.models.training.map_order import MapSampler
 

@@ -22,15 +22,10 @@ import torch
 from torch import Tensor
 
 from benchmarks.timing import milliseconds, plan_ms, problem_of, show
-from benchnav.core.mixture import TraversabilityMixture
-from benchnav.datagen.files.find import find_dataset
-from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.base import predict
-from benchnav.models.predictor import load_model
-from benchnav.planning.planners.astar.astar_dwa import AStarDWA
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig
-from benchnav.planning.planners.optimal.optimal import Optimal
-from benchnav.planning.problem import Problem
+from benchnav import TraversabilityMixture
+from benchnav.datagen import TerrainDataset, find_dataset
+from benchnav.models import load_model, predict
+from benchnav.planning import MPPI, AStarDWA, MPPIConfig, Optimal, Problem
 
 LEVELS = (0.3, 0.5, 0.7, 0.9, 0.95)
 COMMANDS = (

@@ -19,14 +19,11 @@ import pandas as pd
 import torch
 
 from benchmarks.timing import show
-from benchnav.core.grid import Grid
-from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.terrain import Terrain
+from benchnav import Grid, Terrain, TraversabilityMixture
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.unit import Built, Settings, simulate
-from benchnav.planning.sensing.belief import Law, draw_scores
-from benchnav.planning.sensing.copula import Copula
-from benchnav.planning.sensing.sensor import Moment, Probe
+from benchnav.planning import Copula, Law, Moment, Probe
+from benchnav.planning.sensing.belief import draw_scores
 from studies.units import build_unit, one_unit, stakes_suite
 
 EPISODES, STEPS, TURNS = 50, 100, 3  # steps of 0.1 s

@@ -16,15 +16,12 @@ import torch
 from torch import Tensor
 
 from benchmarks.timing import milliseconds, problem_of, show
+from benchnav import Grid
 from benchnav.core import cvar
-from benchnav.core.grid import Grid
-from benchnav.datagen.files.find import find_dataset
-from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.base import predict
-from benchnav.models.predictor import load_model
-from benchnav.planning.planners.mppi import MPPI, roll_out
-from benchnav.planning.problem import Problem
-from benchnav.planning.robots import Unicycle
+from benchnav.datagen import TerrainDataset, find_dataset
+from benchnav.models import load_model, predict
+from benchnav.planning import MPPI, Problem, Unicycle
+from benchnav.planning.planners.mppi import roll_out
 
 LEVEL = 0.9
 

@@ -14,16 +14,11 @@ import pandas as pd
 import torch
 
 from benchmarks.timing import plan_ms, show
-from benchnav.core.grid import Grid
-from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.terrain import Observation
-from benchnav.planning.objective import GoalDistance
-from benchnav.planning.planners.astar.astar_dwa import AStarDWA
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig
-from benchnav.planning.problem import Problem, Rules, Task, pose_problem
-from benchnav.planning.robots import Unicycle
-from benchnav.viz.panels import draw_estimates, line_looks, panel_grid
-from benchnav.viz.style import legend_outside, save, styled
+from benchnav import Grid
+from benchnav.planning import MPPI, AStarDWA, GoalDistance, MPPIConfig, Problem, Rules, Task, Unicycle
+from benchnav.viz import draw_estimates, legend_outside, line_looks, panel_grid, styled
+from benchnav.viz.style import save
+from studies.units import pose_on
 
 SAMPLES = (2000, 5000, 10_000, 20_000, 50_000)
 HORIZONS_S = (1, 2, 5, 10, 20)
@@ -35,13 +30,9 @@ def problem_of(episodes: int = 20, size: int = 64) -> Problem:
     """Return a problem on uneven ground, the same for all episodes."""
     generator = torch.Generator().manual_seed(0)
     ground = 0.35 + 0.6 * torch.rand((1, size, size), generator=generator).expand(episodes, -1, -1)
-    ones = torch.ones_like(ground).unsqueeze(1)
-    mixture = TraversabilityMixture(ones, ground.unsqueeze(1), 0.1 * ones)
-    rgb = torch.zeros(episodes, 3, size, size, dtype=torch.uint8)
-    seen = Observation(rgb, 0 * ground, 0 * ground, Grid(size, size, 0.5))
-    start_m, goal_m = (torch.full((episodes, 2), place) for place in (4.0, size / 2 - 4.0))
+    ends_m = torch.full((episodes, 2), 4.0), torch.full((episodes, 2), size / 2 - 4.0)
     task = Task(robot=Unicycle(), objective=GoalDistance(), rules=Rules())
-    return pose_problem(task, seen, mixture, ground, start_m, goal_m, 100.0)
+    return pose_on(ground, Grid(size, size, 0.5), ends_m, task, 100.0)[0]
 
 
 @styled()

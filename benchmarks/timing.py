@@ -11,9 +11,8 @@ import pandas as pd
 import torch
 
 from benchnav.core.tables import print_table
-from benchnav.eval.experiment.suite import Suite
-from benchnav.planning.problem import Problem
-from benchnav.planning.sensing.sensor import Step
+from benchnav.eval import Suite
+from benchnav.planning import Problem, Step
 from studies.runs import table_of
 from studies.units import build_unit, one_unit
 

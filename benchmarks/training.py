@@ -22,9 +22,8 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from benchmarks.timing import seconds, show
+from benchnav.datagen import TerrainDataset, load_recipe
 from benchnav.datagen.files.create import create
-from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models.config import ClassifierConfig, LatentGPConfig
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.slope_gp.cells import sum_split

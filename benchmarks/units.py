@@ -19,8 +19,8 @@ from unittest.mock import patch
 import pandas as pd
 
 from benchmarks.timing import peak_gib, show
+from benchnav.eval import Suite
 from benchnav.eval.experiment.condition import conditions_of
-from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent, units
 from benchnav.eval.run import unit as units_of_run
 

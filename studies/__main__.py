@@ -15,7 +15,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from benchnav.core.errors import BenchnavError
+from benchnav import BenchnavError
 from studies import page, rows, runs
 from studies.power import power
 from studies.study import HOME, Study, Work

@@ -7,8 +7,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchnav.viz.panels import Curves, line_looks
-from benchnav.viz.style import legend_outside
+from benchnav.viz import Curves, legend_outside, line_looks
 
 # Columns of a summary with their ends, factor and label.
 SUCCESS = ("success_rate", "success_low", "success_high"), 100.0, "success [%]"
@@ -46,5 +45,5 @@ def draw_curves(
         table=table, measures=labels, looks=looks, x_label=x_label, across=across, high_in=high_in, bars=True
     )
     figure, panels = curves.draw()
-    legend_outside(figure, columns=len(looks))
+    legend_outside(figure, columns=min(len(looks), 4), side="upper center")
     return figure, panels

@@ -9,7 +9,7 @@ import yaml
 from scipy.stats import norm
 
 from benchnav.core.tables import NOTHING, to_markdown
-from benchnav.eval.report.write import read_report
+from benchnav.eval import read_report
 from studies.runs import developed, table_of
 from studies.study import Study, Work
 

@@ -15,10 +15,10 @@ from typing import Any
 import pandas as pd
 
 from benchnav.core.tables import Table
+from benchnav.eval import read_report
 from benchnav.eval.compare import read_conditions
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.run_folder import RUN, open_run
-from benchnav.eval.report.write import read_report
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import Pair, find_pairs
 from studies.rows import SUMMARY

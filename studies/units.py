@@ -4,12 +4,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from benchnav import Grid, Terrain, TraversabilityMixture
+from benchnav.eval import Suite
 from benchnav.eval.experiment.condition import conditions_of
-from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent, Unit, units
 from benchnav.eval.run.rollout import Episodes
 from benchnav.eval.run.unit import Built, Settings, build, simulate
+from benchnav.planning import Problem, Task, pose_problem
 from benchnav.planning.world.outcome import Outcome
 
 # What suites of the studies in the world `stakes` have in common.
@@ -32,6 +36,34 @@ def one_unit(suite: Suite, maps: int) -> Unit:
 def build_unit(unit: Unit) -> Built:
     """Return the problem and the simulation of a unit."""
     return build(unit, Settings().origins().of(unit))
+
+
+def pose_on(
+    ground: Tensor,
+    grid: Grid,
+    ends_m: tuple[Tensor, Tensor],
+    task: Task,
+    time_budget_s: float,
+    **options: Any,
+) -> tuple[Problem, Terrain]:
+    """Return a problem on flat terrain whose λ is known, and the terrain.
+
+    Args:
+        ground: λ, shape [B, H, W].
+        grid: its cells.
+        ends_m: start and goal, shape [B, 2] each.
+        task: of the robots.
+        time_budget_s: of an episode.
+        **options: of `pose_problem`.
+    """
+    level, flat = ground[:, None], torch.zeros_like(ground)
+    truth = TraversabilityMixture(torch.ones_like(level), level, torch.zeros_like(level), (0,))
+    rgb = torch.zeros(len(ground), 3, *grid.shape, dtype=torch.uint8)
+    terrain = Terrain(
+        rgb=rgb, class_id=flat.long(), elevation_m=flat, slope_deg=flat, truth=truth, traversability=ground, grid=grid
+    )  # fmt: skip
+    problem = pose_problem(task, terrain.observe(), truth, ground, *ends_m, time_budget_s, **options)
+    return problem, terrain
 
 
 def seconds_of(episodes: Episodes, dt_s: float) -> np.ndarray:

@@ -12,8 +12,8 @@ from benchnav.eval.compare import read_conditions
 from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import Compared, Pair, check_maps, side_by_side
-from benchnav.viz.style import planner_name, styled
-from studies.curves import SUCCESS, draw_curves
+from benchnav.viz import draw_estimates, legend_outside, line_looks, panel_grid, planner_name, styled
+from studies.curves import SUCCESS, in_units
 from studies.tables import success, table
 
 ARMS = ("CVaR of λ", "CVaR of time", "CVaR of the cost")
@@ -86,17 +86,23 @@ def arm_of(row: Mapping[Any, Any]) -> dict[str, Any]:
 
 @styled()
 def frontier(summary: pd.DataFrame) -> Figure:
-    """Draw success over the time to the goal, a curve an arm through its levels, which are named at its markers.
+    """Draw success over the time to the goal, a curve an arm through its levels; markers grow with the level.
 
     A panel a planner; in the row below with entrapment.
     """
     rows = summary.assign(**pd.DataFrame([arm_of(row) for row in summary.to_dict("records")], summary.index))
     rows = rows[rows["arm"] != ""].sort_values(["held", "arm", "level"], kind="stable")
     kind = rows["held"].map({True: ", entrapment", False: ""})
-    rows = rows.assign(panel=rows["planner"] + kind, line=rows["arm"], x=rows["success_time_mean_s"])
-    figure, panels = draw_curves(rows, {"success": SUCCESS}, "mean time of those that arrive [s]")
-    for row in rows.to_dict("records"):
-        place = row["x"], 100 * row["success_rate"]
-        panel = panels[row["panel"], "success"]
-        panel.annotate(f"{row['level']:g}", place, (3, -8), textcoords="offset points", size=6)
+    rows = rows.assign(panel=rows["planner"] + kind, x=rows["success_time_mean_s"])
+    looks, titles = line_looks(ARMS), list(dict.fromkeys(rows["panel"]))
+    figure, places = panel_grid(titles, 2, 2.0, sharey=True)
+    for title, (panel,) in zip(titles, places, strict=True):
+        for arm, curve in rows[rows["panel"] == title].groupby("arm", sort=False):
+            look, (success_rate, low, high) = looks[arm], in_units(curve, SUCCESS)
+            draw_estimates(panel, curve["x"], success_rate, low, high, look, str(arm), bars=True)
+            sizes = (3 + 5 * curve["level"]) ** 2
+            panel.scatter(curve["x"], success_rate, sizes, look["color"], look["marker"], lw=0, zorder=3)
+        panel.set_xlabel("mean time of those that arrive [s]")
+    places[0][0].set_ylabel(SUCCESS[-1])
+    legend_outside(figure)
     return figure

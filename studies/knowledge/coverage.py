@@ -25,11 +25,11 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
+from benchnav import Grid
 from benchnav.core import rng
 from benchnav.core.copula import correlated_normal
-from benchnav.core.grid import Grid
+from benchnav.eval import Suite
 from benchnav.eval.experiment.condition import conditions_of
-from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent, Unit, units
 from benchnav.eval.run.knowledge import Knowing
 from benchnav.eval.run.unit import Built, Settings, read_block, simulate

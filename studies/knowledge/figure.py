@@ -6,7 +6,7 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
-from benchnav.viz.style import planner_name, risk_name, styled
+from benchnav.viz import planner_name, risk_name, styled
 from studies.curves import SUCCESS, draw_curves
 
 # What is known, by sensor of λ and belief, from nothing to all.

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchnav import Terrain
 from benchnav.core import rng
 from benchnav.core.copula import correlated_normal
-from benchnav.core.terrain import Terrain
 from benchnav.planning import AStarDWA, Moment, Probe, Sensed
 from benchnav.planning.robots import steps_in
 

@@ -16,7 +16,7 @@ from rich.progress import track
 from benchnav.eval.experiment.condition import condition_from
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.unit import Settings, simulate
-from benchnav.viz.style import styled
+from benchnav.viz import styled
 from studies.curves import SUCCESS, TOTAL_TIME, draw_curves, in_units
 from studies.study import Rows, Work
 from studies.units import build_unit
@@ -57,7 +57,7 @@ def step_ms(about: dict[str, Any]) -> float:
 def matched_figure(rows: pd.DataFrame) -> Figure:
     """Draw success and T_total over the time of a step."""
     measures = {"success": SUCCESS, "time": TOTAL_TIME}
-    rows = rows.assign(panel="", line=rows["family"], x=rows["ms"]).sort_values("x")
+    rows = rows.assign(panel="", line=rows["family"], x=rows["ms"]).sort_values(["line", "x"])
     figure, panels = draw_curves(rows, measures, "ms a step of one robot")
     panels["", "success"].set_xscale("log")
     return figure

@@ -12,12 +12,10 @@ import torch
 from torch import Tensor
 
 from benchnav.core import rng
-from benchnav.planning import MPPI, MPPIConfig
+from benchnav.planning import MPPI, MPPIConfig, Plan, Problem
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.mppi import MPPIState, advance_chunk, roll_out, total_cost
 from benchnav.planning.planners.noise_bank import NoiseBank, perturb
-from benchnav.planning.planners.planner import Plan
-from benchnav.planning.problem import Problem
 from benchnav.planning.robots import component_wise
 
 
@@ -89,16 +87,28 @@ class ICEMConfig(MPPIConfig):
 
 
 @dataclass(frozen=True)
+class Coloured:
+    """Noise of variance 1 that all episodes share, of which each iteration takes a part, shape [T, A, 4K]."""
+
+    values: Tensor
+
+    def take(self, key: int, count: int) -> Tensor:
+        """Return so many sequences from an index that a key decides, shape [T, A, count]."""
+        first = key % (self.values.shape[2] - count + 1)
+        return self.values[..., first : first + count]
+
+
+@dataclass(frozen=True)
 class ICEMState(MPPIState):
     """What iCEM carries from step to step, beside what MPPI does.
 
     Args:
         elites: sequences that are tried again, shape [B, T, A, E].
-        coloured: noise of variance 1, of which each iteration takes a part, shape [T, A, 4K].
+        coloured: the noise.
     """
 
     elites: Tensor
-    coloured: Tensor
+    coloured: Coloured
 
 
 class ICEM(MPPI):
@@ -118,7 +128,7 @@ class ICEM(MPPI):
         own = rng.generator(rng.stream_key(base.key, "coloured"))
         coloured = coloured_noise(horizon, (actions, 4 * config.samples), config.colour, own).to(base.mean)
         elites = base.mean[..., None].expand(-1, -1, -1, self._kept)
-        return ICEMState(**vars(base), elites=elites, coloured=coloured)
+        return ICEMState(**vars(base), elites=elites, coloured=Coloured(coloured))
 
     def plan_toward(self, step: Any, plan_state: Any, target_m: Tensor) -> tuple[Tensor, Any, Plan]:
         problem, config, mean = plan_state.problem, self.config, plan_state.mean
@@ -128,8 +138,7 @@ class ICEM(MPPI):
         for iteration in range(config.iterations):
             count = max(2 * config.elites, int(config.samples / config.decay**iteration))
             key = rng.stream_key(plan_state.key, plan_state.step, iteration)
-            first = key % (plan_state.coloured.shape[2] - count + 1)
-            noise = plan_state.coloured[..., first : first + count]
+            noise = plan_state.coloured.take(key, count)
             samples = torch.clamp(mean[..., None] + std[..., None] * noise, low[:, None], high[:, None])
             last = [mean[..., None]] if iteration == config.iterations - 1 else []
             samples = torch.cat((samples, tried, *last), dim=3)

@@ -12,12 +12,10 @@ from typing import Any
 
 import torch
 
+from benchnav import Terrain, TraversabilityMixture
 from benchnav.core import rng
-from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.settings import of, read
-from benchnav.core.terrain import Terrain
-from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.classes import TerrainClass
+from benchnav.datagen import TerrainClass, TerrainDataset
 from benchnav.datagen.recipe.latent import latent_mean, latent_std
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.quality.scores import coverage, pit

@@ -14,12 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchnav import Observation, Terrain
 from benchnav.core.ground import SEEN
-from benchnav.core.terrain import Observation, Terrain
-from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.base import TraversabilityModel, predict_observation
+from benchnav.datagen import TerrainDataset
+from benchnav.models import TraversabilityModel, load_model
+from benchnav.models.base import predict_observation
 from benchnav.models.config import Masking
-from benchnav.models.predictor import find_ground_statistics, load_model
+from benchnav.models.predictor import find_ground_statistics
 from benchnav.models.quality.scores import lower_fifth_and_width
 from benchnav.models.training.map_order import draw_looks
 from benchnav.models.training.masks import RandomMasks

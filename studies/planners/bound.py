@@ -18,22 +18,16 @@ import numpy as np
 import torch
 from numpy import ndarray
 
+from benchnav import Grid
 from benchnav.core import rng
-from benchnav.core.grid import Grid
-from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.registry import make, read_part
-from benchnav.core.terrain import Terrain
 from benchnav.eval.run.rollout import run_episodes
-from benchnav.planning.free_space import FreeSpace, Immobile, Rules
-from benchnav.planning.objective import TravelTime
-from benchnav.planning.problem import Task, pose_problem
-from benchnav.planning.robots import Unicycle
+from benchnav.planning import FreeSpace, Places, Rules, Simulation, Task, TravelTime, Unicycle, World
+from benchnav.planning.free_space import Immobile
 from benchnav.planning.world import lower_bound
 from benchnav.planning.world.lower_bound import Mesh, Motion, lower_bound_s
-from benchnav.planning.world.simulation import Simulation
-from benchnav.planning.world.world import Places, World
 from studies.study import Rows, Work
-from studies.units import drive_unit, one_unit, seconds_of, stakes_suite
+from studies.units import drive_unit, one_unit, pose_on, seconds_of, stakes_suite
 
 DATA = Path("datasets/stakes-v1-test.h5")
 REFERENCE = "near_optimal"
@@ -123,22 +117,14 @@ def walled(generator: np.random.Generator, grid: Grid, count: int) -> tuple[ndar
 
 def drive_worlds(fields: ndarray, immobile: Immobile, grid: Grid, name: str) -> ndarray:
     """Return seconds to the goal of a planner that is given λ, infinite if it does not arrive, shape [B]."""
-    ground, count, robot = torch.from_numpy(fields).float(), len(fields), Unicycle()
+    ground, robot = torch.from_numpy(fields).float(), Unicycle()
     rules = Rules(free_space=FreeSpace(by="mean", above=0.05), min_traversability=0.02)
     task = Task(robot=robot, objective=TravelTime(robot, rules.goal_radius_m), rules=rules)
-    level = ground[:, None]
-    truth = TraversabilityMixture(torch.ones_like(level), level, torch.zeros_like(level), (0,))
-    rgb, zero = torch.zeros(count, 3, *grid.shape, dtype=torch.uint8), torch.zeros_like(ground)
-    terrain = Terrain(
-        rgb=rgb, class_id=zero.long(), elevation_m=zero, slope_deg=zero, truth=truth, traversability=ground, grid=grid
-    )  # fmt: skip
-    start_m, goal_m = (torch.from_numpy(end).float().repeat(count, 1) for end in ends_of(grid))
-    places = Places(start_m=start_m, goal_m=goal_m, reference_time_s=torch.full((count,), torch.nan))
+    start_m, goal_m = (torch.from_numpy(end).float().repeat(len(ground), 1) for end in ends_of(grid))
+    problem, terrain = pose_on(ground, grid, (start_m, goal_m), task, _LIMIT_S, immobile=immobile)
+    places = Places(start_m=start_m, goal_m=goal_m, reference_time_s=torch.full((len(ground),), torch.nan))
     world = World(noise="stored", immobile=immobile, time_budget_s=_LIMIT_S)
-    simulation = Simulation(terrain, task, world, places, 1, range(count))
-    problem = pose_problem(
-        task, terrain.observe(), truth, ground, start_m, goal_m, _LIMIT_S, immobile=immobile
-    )
+    simulation = Simulation(terrain, task, world, places, 1, range(len(ground)))
     planner = make("planner", read_part("planner", {"part": name, "options": PLANNERS[name]}))
     return seconds_of(run_episodes(planner, problem, simulation, rng.generator(0)), robot.dt_s)
 

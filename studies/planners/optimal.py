@@ -18,10 +18,9 @@ import pandas as pd
 from benchnav import evaluate
 from benchnav.core import rng
 from benchnav.core.registry import make, read_part
+from benchnav.planning import Optimal, Problem
 from benchnav.planning.free_space import Immobile
-from benchnav.planning.planners.optimal.optimal import Optimal
 from benchnav.planning.planners.optimal.ways import ways_from
-from benchnav.planning.problem import Problem
 from studies.study import Rows, Work
 from studies.units import STAKES, build_unit, one_unit, stakes_suite
 

@@ -17,11 +17,10 @@ import torch
 from torch import Tensor
 
 from benchnav.core import rng
+from benchnav.planning import MPPI, MPPIConfig, Problem, Step
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.cost_risk import framed_fields, tail_cost
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, advance_chunk, roll_out
-from benchnav.planning.problem import Problem
-from benchnav.planning.sensing.sensor import Step
+from benchnav.planning.planners.mppi import MPPIState, advance_chunk, roll_out
 from benchnav.stats.intervals import mean_interval
 from studies.study import Rows, Work
 from studies.units import build_unit, one_unit, stakes_suite

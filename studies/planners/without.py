@@ -2,33 +2,29 @@
 
 from dataclasses import replace
 from typing import Any
+from unittest.mock import patch
 
 import torch
+from torch import Tensor
 
 from benchnav.planning import CLRRT, AStarDWA
-from benchnav.planning.planners.astar import astar
-from benchnav.planning.planners.astar.recovery import aim, watch
-from benchnav.planning.planners.straight import steer_toward
+from benchnav.planning.planners.astar import guided
+
+
+def farthest(ground: Any, points: Tensor, lookahead_m: float) -> tuple[Tensor, Tensor]:
+    """Return the farthest point of the path within the look-ahead, whatever lies between, and that it is straight."""
+    along_m = torch.linalg.vector_norm(points.diff(dim=1), dim=2).cumsum(dim=1)
+    index = torch.where(along_m <= lookahead_m, torch.arange(along_m.shape[1]), 0).amax(dim=1)
+    target = points[:, 1:].gather(1, index[:, None, None].expand(-1, 1, 2))[:, 0]
+    return target, torch.ones(len(points), dtype=torch.bool)
 
 
 class NoLines(AStarDWA):
-    """A\\*+DWA that heads for the farthest point of the path within the look-ahead, whatever lies between."""
+    """A\\*+DWA that heads for the farthest point of the path within the look-ahead."""
 
     def plan(self, step: Any, plan_state: Any) -> Any:
-        problem, field, state = plan_state.problem, plan_state.field, step.state
-        count = 2 + int(self.config.lookahead_m / problem.grid.resolution_m)
-        points = astar.path_points(problem, field, state, count)
-        along_m = torch.linalg.vector_norm(points.diff(dim=1), dim=2).cumsum(dim=1)
-        farthest = torch.where(along_m <= self.config.lookahead_m, torch.arange(count - 1), 0).amax(dim=1)
-        target = points[:, 1:].gather(1, farthest[:, None, None].expand(-1, 1, 2))[:, 0]
-        action, local, plan = self.local.plan_toward(step, plan_state.local, target)
-        recovery = watch(plan_state.recovery, state, action, problem.robot)
-        everywhere = torch.ones(len(state), dtype=torch.bool)
-        recovery = aim(recovery, plan_state.recovery.active, problem, field, state, everywhere)
-        away = steer_toward(state, recovery.target_m, problem.robot)
-        action = torch.where(recovery.active[:, None], away, action)
-        local = self.local.commit_action(local, action)
-        return action, replace(plan_state, local=local, recovery=recovery), plan
+        with patch.object(guided, "choose_waypoint", farthest):
+            return super().plan(step, plan_state)
 
 
 class NoHalving(CLRRT):

@@ -8,11 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict
-from benchnav.datagen.synth.generate import generate
-from benchnav.viz.maps import frame_map, show_map
-from benchnav.viz.panels import draw_estimates, panel_grid
-from benchnav.viz.style import BLUE, ORANGE, legend_outside, styled
+from benchnav.datagen import generate, load_recipe, recipe_from_dict
+from benchnav.viz import draw_estimates, legend_outside, panel_grid, show_map, styled
+from benchnav.viz.maps import frame_map
+from benchnav.viz.style import BLUE, ORANGE
 from studies.scenarios.statistics import (
     SHARE_EDGES,
     SLOPE_EDGES,
@@ -104,7 +103,7 @@ def draw_tints(work: Work, folder: Path) -> dict[str, Figure]:
 def draw_distributions(series: Mapping[str, Maps], steepest: float) -> Figure:
     """Draw which fractions of all cells in std, hg and hs are above each slope, λ and brightness."""
     labels = ("(a) slope [°]", "(b) realised λ", "(c) brightness (1 is full light)")
-    figure, places = panel_grid(labels, 3, 2.0, sharey=True)
+    figure, places = panel_grid(labels, 3, 2.0)
     panels = [panel for (panel,) in places]
     for name, dashes in (("std", "-"), ("hg-100", "-"), ("hs-100", "--")):
         maps = series[name]
@@ -118,6 +117,7 @@ def draw_distributions(series: Mapping[str, Maps], steepest: float) -> Figure:
             panel.plot(edges, above, color=COLOURS[name[:3].strip("-")], ls=dashes, lw=1.3, label=name)
     panels[0].axvline(steepest, color="0.5", lw=0.8, ls=":", label="steepest in training")
     panels[0].set(xlim=(0, 38), yscale="log", ylim=(1e-5, 1.1), ylabel="fraction of cells above")
+    panels[2].set_xlim(0.2, 1)
     legend_outside(figure)
     return figure
 

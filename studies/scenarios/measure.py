@@ -15,15 +15,12 @@ import torch
 import yaml
 from matplotlib.figure import Figure
 
+from benchnav import Observation, TraversabilityMixture
 from benchnav.core import rng
-from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.terrain import Observation
+from benchnav.datagen import Recipe, generate, load_recipe, recipe_from_dict
 from benchnav.datagen.recipe.latent import latent_mean, latent_std
-from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict
-from benchnav.datagen.synth.generate import generate
-from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models import find_checkpoint, load_checkpoint
 from benchnav.models.fused import FusedModel
-from benchnav.models.predictor import find_checkpoint
 from benchnav.models.quality.measure import pit
 from studies.scenarios.figures import draw_distributions, draw_examples, draw_series
 from studies.scenarios.statistics import SHARE_EDGES, SLOPE_EDGES, Maps, histogram, show

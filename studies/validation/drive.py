@@ -6,17 +6,16 @@ None of the simulation of `benchnav` is used. Letters in shapes: B trials.
 import torch
 from torch import Tensor
 
+from benchnav import Grid
 from benchnav.core import rng
-from benchnav.core.grid import Grid
+from benchnav.planning import MPPI, MPPIConfig, Problem, Robot, Step, distance
 from benchnav.planning.free_space import PENALTY
-from benchnav.planning.objective import distance
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.cost_risk import framed_fields
-from benchnav.planning.planners.mppi import MPPI, OF_EPISODES, MPPIConfig, MPPIState
+from benchnav.planning.planners.mppi import OF_EPISODES, MPPIState
 from benchnav.planning.planners.noise_bank import perturb
-from benchnav.planning.problem import Problem, motion_traversability
-from benchnav.planning.robots import Robot, component_wise
-from benchnav.planning.sensing.sensor import Step
+from benchnav.planning.problem import motion_traversability
+from benchnav.planning.robots import component_wise
 from studies.validation.task import GOAL_M, GOAL_RADIUS_M, STEPS, Setup, TimeAndDistance
 
 # λ of ground off the map that is free: a rollout stays there, at the `min_traversability` of the setup.

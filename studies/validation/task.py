@@ -11,16 +11,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchnav import Observation, TraversabilityMixture
 from benchnav.core import registry, rng
 from benchnav.core.errors import expect
-from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.terrain import Observation
-from benchnav.planning import risk
-from benchnav.planning.free_space import FreeSpace, Rules
-from benchnav.planning.objective import Objective, distance
-from benchnav.planning.planners.mppi import MPPIConfig
-from benchnav.planning.problem import Problem, Task, pose_problem
-from benchnav.planning.robots import Unicycle
+from benchnav.planning import (
+    FreeSpace,
+    MPPIConfig,
+    Objective,
+    Problem,
+    Rules,
+    Task,
+    Unicycle,
+    distance,
+    pose_problem,
+    risk,
+)
 from studies.validation.ground import DIRT, SLICES, VEGETATION
 from studies.validation.world import GRID
 

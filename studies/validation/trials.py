@@ -15,7 +15,7 @@ from rich.progress import track
 from benchnav.core import rng
 from benchnav.core.settings import of, read
 from benchnav.core.store import write_text
-from benchnav.planning.planners.mppi import MPPIConfig
+from benchnav.planning import MPPIConfig
 from studies.study import Work
 from studies.validation.drive import ManyTrialsMPPI, drive
 from studies.validation.tables import tabulate, tabulate_runs

@@ -9,8 +9,8 @@ vegetation is the same vegetation and more. Letters in shapes: M maps.
 
 import numpy as np
 
+from benchnav import Grid
 from benchnav.core import rng
-from benchnav.core.grid import Grid
 from studies.validation.ground import DIRT, VEGETATION
 
 GRID = Grid(9, 9, 1.0)

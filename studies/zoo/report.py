@@ -15,8 +15,7 @@ from benchnav.core.tables import NOTHING
 from benchnav.stats.flips import mean_flip_p
 from benchnav.stats.holm import holm
 from benchnav.stats.intervals import mean_interval
-from benchnav.viz.panels import line_looks, panel_grid
-from benchnav.viz.style import legend_outside, risk_name, styled
+from benchnav.viz import legend_outside, line_looks, panel_grid, risk_name, styled
 
 RISKS, SPLIT = ("expected-time", "cvar:0.8"), "test/std"
 SCORES = ("rmse_expected", "nll", "crps", "pinball", "tail_error", "ause")  # of each the minimum is the best

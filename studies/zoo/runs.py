@@ -16,8 +16,7 @@ from benchnav.core import registry
 from benchnav.core.errors import expect
 from benchnav.core.store import write_text
 from benchnav.datagen import TerrainDataset
-from benchnav.models import load_model
-from benchnav.models.base import predict
+from benchnav.models import load_model, predict
 from benchnav.models.quality.scores import lower_fifth_and_width
 from studies import runs
 from studies.runs import command

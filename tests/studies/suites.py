@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from benchnav.core.settings import of, read
-from benchnav.eval.experiment.condition import Condition, conditions_of
-from benchnav.eval.experiment.suite import Suite
+from benchnav.eval import Condition, Suite
+from benchnav.eval.experiment.condition import conditions_of
 from studies.study import ROOT, Study, Work
 
 WORK = Work(out=Path("runs"), maps_in=Path("maps"))

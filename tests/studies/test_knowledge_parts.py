@@ -8,11 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchnav import Terrain
 from benchnav.core import registry
-from benchnav.core.terrain import Terrain
+from benchnav.planning import Moment, Probe, Problem, Sensed
 from benchnav.planning.planners.astar import astar
-from benchnav.planning.problem import Problem
-from benchnav.planning.sensing.sensor import Moment, Probe, Sensed
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
 from tests.planning.planners.driving import drive

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from benchnav.core import rng
-from benchnav.planning import MPPI, MPPIConfig, Planner, Problem
+from benchnav.planning import MPPI, MPPIConfig, Planner, Problem, Step
 from benchnav.planning.free_space import PENALTY
-from benchnav.planning.sensing.sensor import Step
 from benchnav.testing import check_planner
 from studies.matched.planners import ICEM, ICEMConfig, SmoothConfig, SmoothMPPI, coloured_noise
 from tests import factories
@@ -90,8 +89,7 @@ def test_icem_fits_its_distribution_to_its_elites_as_its_algorithm_says() -> Non
         state.elites,
     )
     for iteration, count in enumerate((40, 20)):
-        first = rng.stream_key(state.key, 3, iteration) % (160 - count + 1)
-        noise = state.coloured[..., first : first + count]
+        noise = state.coloured.take(rng.stream_key(state.key, 3, iteration), count)
         sampled = (mean[..., None] + spread[..., None] * noise).clamp(low, high)
         sequences = torch.cat((sampled, tried, *([mean[..., None]] if iteration else [])), 3)
         order = planner._cost(problem, problem.start, sequences, problem.goal_m, None).argsort(1)[:, :10]

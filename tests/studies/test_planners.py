@@ -9,8 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav.planning.objective import TravelTime
-from benchnav.planning.robots import Unicycle
+from benchnav.planning import TravelTime, Unicycle
 from studies.matched.figure import matched_figure
 from studies.planners import optimal, optimism
 from tests import factories

@@ -30,12 +30,6 @@ def test_intervals_of_times_cover_them_where_a_bootstrap_does_not(generator: np.
     assert width[1] < width[0] < 25
 
 
-@pytest.mark.parametrize("draws", [1, 3])
-def test_settings_that_are_alike_rarely_differ(generator: np.random.Generator, draws: int) -> None:
-    found = np.array(list(studies.false_findings(generator, 40, 50, draws, (0.5,))))
-    assert np.all(found.mean(0) < 0.1)  # 120 studies of 0.05 lie below this
-
-
 def test_what_is_as_good_as_the_best_is_rarely_called_worse(generator: np.random.Generator) -> None:
     """Were each tested against the best alone, some of twelve would be called worse in one study of seven."""
     tied, half = (

@@ -1,12 +1,11 @@
 """Each study is whole: suites, scripts, figures, digests, and a place on its page."""
 
 import re
-from pathlib import Path
 
 import pytest
 import yaml
 
-from benchnav.core.errors import ConfigError
+from benchnav import ConfigError
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.unit import Extent
 from studies.page import BLOCK, FIGURES
@@ -37,7 +36,7 @@ def test_all_that_a_study_names_is_there_and_all_that_is_there_is_named(study: S
     assert (ROOT / study.page).is_file()
     used = {study.suite_of(part) for part in study.parts if not study.parts[part].script}
     assert all(path.is_file() for path in used)
-    others = {study.folder / name for name in ("study.yaml", "hypothesis.yaml", "open.yaml")}
+    others = {study.folder / name for name in ("study.yaml", "hypothesis.yaml", "open.yaml", "tables.yaml")}
     assert set(study.folder.glob("*.yaml")) - others <= used
     scripts = [part.script for part in study.parts.values() if part.script]
     for spec in (*scripts, *study.tables.values(), *(figure.draw for figure in study.figures.values())):
@@ -95,25 +94,6 @@ def test_files_of_a_fixed_suite_are_read_where_they_are_today() -> None:
         assert (ROOT / new).is_file()
     labels = {condition.labels["ground"] for condition in conditions("knowledge", "primary")}
     assert "elsewhere" in labels
-
-
-def test_maps_to_confirm_on_are_new_and_have_one_digest_in_all_studies() -> None:
-    for name in ("knowledge", "cost", "confirmation"):
-        study = STUDIES[name]
-        data = study.suite("primary", WORK)["data"]
-        assert Path(data).stem in study.maps
-        assert Path(data).stem != study.develop
-        assert len({maps.digest for maps in study.maps.values()}) == len(study.maps)
-    assert (
-        len(
-            {
-                study.maps["stakes-v1-seed1"].digest
-                for study in STUDIES.values()
-                if "stakes-v1-seed1" in study.maps
-            }
-        )
-        == 1
-    )
 
 
 def test_a_study_or_part_that_there_is_not_is_rejected() -> None:

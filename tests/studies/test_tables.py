@@ -36,20 +36,6 @@ def test_the_best_is_told_from_the_worst(tmp_path: Path) -> None:
     assert lines[2].endswith(f"| {3 * 2 / 2**10:.2g} |")
 
 
-def test_variants_are_distinguished_by_the_whole_label(tmp_path: Path) -> None:
-    episodes = made(mean=[True] * 12, cvar=[True, False] * 6)
-    worlds = [
-        episodes.assign(world=label, condition=episodes["condition"] + label, success=won, outcome=outcome)
-        for label, won, outcome in (
-            ("stakes immobile=0.05/2s", True, "success"),
-            ("stakes immobile=0.2/2s", False, "timeout"),
-        )
-    ]
-    lines = sweep(run_folder(tmp_path / "run", pd.concat(worlds)))
-    assert lines[2].startswith("| stakes immobile=0.05/2s | 100.0 | 100.0 |")
-    assert lines[3].startswith("| stakes immobile=0.2/2s | 0.0 | 0.0 |")
-
-
 def test_settings_stand_beside_one_another_with_their_success_and_time(tmp_path: Path) -> None:
     shared = dict.fromkeys(tables.NEXT_TO_RISK, "x") | {"planner": "mppi"}
     numbers = ("success_rate", "success_low", "success_high", "total_time_mean_s")

@@ -6,7 +6,7 @@ import torch
 from benchnav.core import registry
 from benchnav.core.settings import of, read
 from benchnav.core.yaml_text import read_yaml
-from benchnav.eval.experiment.suite import Suite
+from benchnav.eval import Suite
 from benchnav.planning.world.outcome import Outcome
 from tests.planning.planners.test_planners import run
 

@@ -1,12 +1,11 @@
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from studies.validation.ground import DIRT, VEGETATION
-from studies.validation.task import Setup, planner_config, pose, predict
+from studies.validation.task import Setup, pose
 from studies.validation.world import draw_vegetation
 from tests.planning.planners.driving import rollout_cost
 
@@ -18,14 +17,6 @@ def test_risk_maps_are_the_tail_means_of_the_ground(setting: str, tail: float) -
     cells = round(100 * tail)
     expected = np.where(VEGETATED, VEGETATION.slices()[:cells].mean(), DIRT.slices()[:cells].mean())
     np.testing.assert_allclose(pose(VEGETATED, [setting], Setup()).risk_map, expected, atol=1e-5)
-
-
-def test_the_prediction_has_the_distribution_of_the_world() -> None:
-    mixture = predict(VEGETATED)
-    for value in (0.1, 0.5, 0.7):
-        at = np.array(value)
-        expected = np.where(VEGETATED, VEGETATION.cdf(at), DIRT.cdf(at))
-        np.testing.assert_allclose(mixture.cdf(value), expected, atol=0.01)
 
 
 def cost_of(actions: np.ndarray, risk_map: np.ndarray, power: int) -> float:
@@ -68,13 +59,6 @@ def test_histograms_give_their_fields() -> None:
     np.testing.assert_allclose(fields[::2].mean(1), expected, atol=0.04)
     np.testing.assert_allclose(fields[1::2].mean(1), expected, atol=0.04)
     np.testing.assert_array_equal(np.unique((100 * fields[0]).round() % 5), [0, 2])
-
-
-def test_their_alpha_is_the_share_of_the_worst_costs() -> None:
-    cost, tail = (planner_config(setting, Setup()) for setting in ("cost", "cost-cvar:0.6"))
-    assert (cost.risk_on, cost.level, cost.fields) == ("cost", 0.0, 64)
-    assert (tail.risk_on, tail.level) == ("cost", 0.6)
-    assert replace(tail, risk_on="map", level=0.0) == planner_config("cvar:0.8", Setup()) == Setup().mppi
 
 
 def test_fields_have_the_distribution_of_each_cell_and_cells_are_independent() -> None:

