@@ -92,7 +92,7 @@ def time_classifier(dataset: TerrainDataset) -> None:
     config = ClassifierConfig(max_epochs=EPOCHS)
     data = MapData(dataset, config.batch_size, 0)
     rows = []
-    for precision in ("32-true", default_precision()):
+    for precision in ("32-true", default_precision("cpu")):
         steps, epochs = ours(data, config, precision, classes)
         base = plain(data, config, classes, precision != "32-true")
         rows.append({"images/s": precision, "plain loop": base, "steps": steps, "whole epochs": epochs})
