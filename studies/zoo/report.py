@@ -52,7 +52,7 @@ def doses_results(rows: pd.DataFrame, models: pd.DataFrame, digest: str) -> dict
     ]
     groups = {key: list(labels) for key, labels in models.groupby(GROUP, sort=False).groups.items()}
     compared = []
-    for one, other in contrasts(sorted(models["size"].unique())):
+    for one, other in contrasts(sorted(set(models["size"].tolist()))):
         a, b = groups[one], groups[other]
         gain = 100 * (by_map.loc[a].mean(0) - by_map.loc[b].mean(0)).to_numpy()
         difference = {
@@ -129,7 +129,8 @@ def draw_doses(table: pd.DataFrame) -> Figure:
     """Draw success over the loss, a mark a dose, a panel a risk setting."""
     sizes = table["training maps"].astype(str)
     kind = table["what"].where(table["what"] != "temperature", "temperature, " + sizes + " maps")
-    looks = line_looks(sorted(kind, reverse=True))
+    by_size = table.sort_values("training maps", ascending=False, kind="stable").index
+    looks = line_looks(list(kind[by_size]))
     figure, places = panel_grid([risk_name(risk) for risk in RISKS], len(RISKS), 2.3, 0.6, sharey=True)
     trained = table[table["dose"] == 1]
     for (panel,), risk in zip(places, RISKS, strict=True):
