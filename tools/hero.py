@@ -13,26 +13,24 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d import Axes3D
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from benchnav.eval.figures.trajectories import drive_at
+from benchnav.eval.figures.moment import drive_at
 from benchnav.eval.folder.results import read_results
 from benchnav.eval.recording import Recording
+from benchnav.eval.report.playback.video import SPEED, Frames
 from benchnav.eval.run.recordings import record_driven
 from benchnav.viz import maps
 from benchnav.viz.style import BLUE, ORANGE, save, styled
 
 FIGURES = Path(__file__).parents[1] / "docs/figures"
-RISKS = {"mean": ("mean of λ", ORANGE), "cvar:0.8": ("CVaR of λ at 0.8", BLUE)}
-FRAMES, TICK_MS = 70, 90
+RISKS = {"mean": ("mean of λ", BLUE), "cvar:0.8": ("CVaR of λ at 0.8", ORANGE)}
+TICK_MS, GIF_SIZE = 120, (800, 450)
 CAUGHT = "immobilises a robot; no image shows it"
 Pair = tuple[Recording, Recording]
 
@@ -92,16 +90,6 @@ def draw_terrain(panel: Axes3D, pair: Pair) -> None:
     panel.set_axis_off()
 
 
-def draw_predicted(panel: Axes, own: Recording, step: int) -> AxesImage:
-    """λ̂ under a risk setting with the cells that immobilise a robot, and the path up to a step; gives the image."""
-    _, colour = RISKS[own.about["risk"]]
-    image = maps.show_map(panel, own.predicted, own.grid.extent_m, **maps.LAMBDA)
-    maps.overlay(panel, own.immobilising, own.grid.extent_m, maps.IMMOBILISING)
-    maps.draw_drive(panel, drive_at(own, step), 2.2, 1.2, colour)
-    panel.set(xticks=[], yticks=[])
-    return image
-
-
 @styled()
 def draw_hero(pair: Pair) -> Figure:
     """The terrain with both paths, and both maps of λ̂."""
@@ -114,31 +102,23 @@ def draw_hero(pair: Pair) -> Figure:
     terrain.legend(handles=handles, loc="lower left", fontsize=8, bbox_to_anchor=(0, -0.08))
     for place, own in enumerate(pair):
         panel = figure.add_subplot(places[1 + place])
-        image = draw_predicted(panel, own, len(own.actions))
-        name, _ = RISKS[own.about["risk"]]
+        name, colour = RISKS[own.about["risk"]]
+        image = maps.show_map(panel, own.predicted, own.grid.extent_m, **maps.LAMBDA)
+        maps.overlay(panel, own.immobilising, own.grid.extent_m, maps.IMMOBILISING)
+        maps.draw_drive(panel, drive_at(own, len(own.actions)), 2.2, 1.2, colour)
+        panel.set(xticks=[], yticks=[])
         panel.set_title(f"λ̂ = {name}: {own.outcome} after {own.end_s:.0f} s", fontsize=9)
         maps.draw_scale(panel, own.grid.extent_m, 8)
     figure.colorbar(image, cax=figure.add_subplot(places[3]), label="λ̂, fraction of the commanded speed")
     return figure
 
 
-@styled()
 def frames(pair: Pair) -> Iterator[Image.Image]:
-    """Both robots on the λ̂ that their planner was given, over time."""
-    longest = max(len(own.actions) for own in pair)
-    for now in np.linspace(0, longest, FRAMES).round().astype(int):
-        figure = Figure(figsize=(6.4, 3.7), dpi=110, layout="constrained")
-        for panel, own in zip(figure.subplots(1, 2), pair, strict=True):
-            step = min(now, len(own.actions))
-            draw_predicted(panel, own, step)
-            name, _ = RISKS[own.about["risk"]]
-            state = own.outcome if step == len(own.actions) else "drives"
-            panel.set_title(f"A*+DWA, {name}: {state}", fontsize=8)
-            maps.draw_scale(panel, own.grid.extent_m, 8)
-        figure.supxlabel(f"{now * pair[0].dt_s:4.1f} s", fontsize=9)
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        yield Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    """Frames of the video of both episodes, a quarter as large."""
+    video = Frames(pair)
+    end_s = max(own.end_s for own in pair)
+    for time_s in [*np.arange(0, end_s, SPEED * TICK_MS / 1000), end_s]:
+        yield Image.fromarray(video.draw(float(time_s))).resize(GIF_SIZE, Image.Resampling.LANCZOS)
 
 
 def main() -> None:
@@ -154,7 +134,7 @@ def main() -> None:
     save(draw_hero(pair), given.out / "hero.png", "png", dpi=170)
     # One palette for all, by coverage, which keeps the colours of few pixels: those of the marks.
     images = list(frames(pair))
-    palette = images[FRAMES // 2].quantize(256, method=Image.Quantize.MAXCOVERAGE)
+    palette = images[len(images) // 2].quantize(256, method=Image.Quantize.MAXCOVERAGE)
     first, *rest = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     first.save(
         given.out / "hero.gif", save_all=True, append_images=rest, duration=[TICK_MS] * len(rest) + [2500],

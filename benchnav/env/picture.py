@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
@@ -18,11 +19,14 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
 from benchnav.env.view import CHANNELS
 from benchnav.viz import maps
-from benchnav.viz.style import bytes_of
 
 SIZE = (640, 480)  # width and height in pixels
 _DPI = 100
-_MAP, _CROP, _MARGIN = 424, 176, 16  # pixels, of squares and between them
+# Squares: the map's and, at its right, two for what the policy is given.
+_PANELS = {
+    **{"width_ratios": (424, 176), "wspace": 16 / 300, "hspace": 48 / 176},
+    **{"left": 16 / 640, "right": 632 / 640, "bottom": 16 / 480, "top": 440 / 480},
+}
 _UNSEEN = 0.35  # of the brightness of ground that was seen
 _TEXT = 8.5  # points
 _MARKS = 1.3
@@ -67,29 +71,27 @@ class Picture:
     """
 
     def __init__(self, grid: Grid) -> None:
-        """Prepares an empty figure."""
+        """Prepare an empty figure."""
         self._grid = grid
         self._figure = Figure(figsize=(SIZE[0] / _DPI, SIZE[1] / _DPI), dpi=_DPI)
         self._canvas = FigureCanvasAgg(self._figure)
 
     def draw(self, scene: Scene) -> np.ndarray:
-        """The image, uint8, shape [480, 640, 3]."""
+        """Draw the image, uint8, shape [480, 640, 3]."""
         self._figure.clear()
-        self._draw_map(scene)
-        known = scene.crop[CHANNELS.index("known")] > 0
-        for place, (channel, title, colours) in enumerate(
-            (("risk", "λ̂ ahead", maps.TRAVERSABILITY_COLOURS), ("spread", "spread of λ", maps.SPREAD_COLOURS))
-        ):
-            self._draw_crop(scene, place, scene.crop[CHANNELS.index(channel)], known, title, colours)
+        panels = self._figure.subplot_mosaic([["map", "risk"], ["map", "spread"]], gridspec_kw=_PANELS)
+        for panel in panels.values():
+            panel.set(xticks=[], yticks=[])
+        self._draw_map(panels["map"], scene)
+        self._draw_crop(panels["risk"], scene, "risk", "λ̂ ahead", maps.TRAVERSABILITY_COLOURS)
+        self._draw_crop(panels["spread"], scene, "spread", "spread of λ", maps.SPREAD_COLOURS)
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _draw_map(self, scene: Scene) -> None:
-        wide, high = self._grid.extent_m
-        width, height = (_MAP * size / max(wide, high) for size in (wide, high))
-        panel = self._panel(_MARGIN + (_MAP - width) / 2, _MARGIN + (_MAP - height) / 2, width, height)
+    def _draw_map(self, panel: Axes, scene: Scene) -> None:
         light = np.where(scene.seen, 1.0, _UNSEEN)[..., None]
-        maps.show_map(panel, (scene.rgb.transpose(1, 2, 0) * light).astype(np.uint8), (wide, high))
+        shown = (scene.rgb.transpose(1, 2, 0) * light).astype(np.uint8)
+        maps.show_map(panel, shown, self._grid.extent_m)
         for colour, line in (("black", 2.4), ("white", 1.2)):
             panel.add_patch(Polygon(scene.corners_m, closed=True, fill=False, ec=colour, lw=line))
         outcome = scene.outcome.replace("running", "")
@@ -99,36 +101,20 @@ class Picture:
         words = f"t = {scene.time_s:.1f} s    λ = {scene.observed:.2f}    {outcome.replace('_', ' ')}"
         panel.set_title(words, fontsize=_TEXT + 1, loc="left", pad=5)
 
-    def _draw_crop(
-        self, scene: Scene, place: int, values: np.ndarray, known: np.ndarray, title: str, colours: str
-    ) -> None:
-        left = 2 * _MARGIN + _MAP
-        bottom = SIZE[1] - 40 - _CROP - place * (_CROP + 48)
-        panel = self._panel(left, bottom, _CROP, _CROP)
-        shown = matplotlib.colormaps[colours](values)[..., :3] * np.where(known, 1.0, _UNSEEN)[..., None]
-        nothing = ~known & (scene.crop[CHANNELS.index("spread")] == 0) & (scene.crop[0] == 0)
-        shown[nothing] = np.array(bytes_of(maps.LACKING)[:3]) / 255
+    def _draw_crop(self, panel: Axes, scene: Scene, channel: str, title: str, colours: str) -> None:
+        values, known, spread = (scene.crop[CHANNELS.index(name)] for name in (channel, "known", "spread"))
+        shown = matplotlib.colormaps[colours](values)[..., :3] * np.where(known > 0, 1.0, _UNSEEN)[..., None]
+        shown[(known <= 0) & (spread == 0) & (scene.crop[0] == 0)] = to_rgb(maps.LACKING)
         cells = len(values)
         # Ahead is up, and the robot's left is left.
-        panel.imshow(
-            shown.transpose(1, 0, 2)[:, ::-1],
-            origin="lower",
-            extent=(0, cells, 0, cells),
-            interpolation="none",
-        )
+        maps.show_map(panel, shown.transpose(1, 0, 2)[:, ::-1], (cells, cells))
         ahead = maps.robot_marker(np.pi / 2)
         maps.mark(panel, "robot", (cells / 2, scene.behind * cells), _MARKS, marker=ahead)
         panel.set_title(title, fontsize=_TEXT, loc="left", pad=4)
-        panel.set_title("0     1", fontsize=_TEXT, loc="right", pad=4)
-        self._draw_scale(left + _CROP - 29, bottom + _CROP + 7, colours)
-
-    def _draw_scale(self, left: float, bottom: float, colours: str) -> None:
-        panel = self._panel(left, bottom, 18, 8)
-        panel.imshow(np.linspace(0, 1, 32)[None], cmap=colours, aspect="auto")
-
-    def _panel(self, left: float, bottom: float, width: float, height: float) -> Axes:
-        place = (left / SIZE[0], bottom / SIZE[1], width / SIZE[0], height / SIZE[1])
-        return self._figure.add_axes(place, xticks=[], yticks=[])
+        bar = panel.inset_axes((0.72, 1.03, 0.2, 0.06), xticks=[], yticks=[])
+        bar.imshow(np.linspace(0, 1, 32)[None], cmap=colours, aspect="auto")
+        for x, end, side in ((-0.1, "0", "right"), (1.1, "1", "left")):
+            bar.text(x, 0.4, end, size=_TEXT, ha=side, va="center", transform=bar.transAxes)
 
 
 class Window:

@@ -5,11 +5,10 @@ Letters in shapes: H×W cells, N positions, M lines.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, ListedColormap, to_rgba
@@ -17,10 +16,11 @@ from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.patches import Patch
 from matplotlib.path import Path as MarkerPath
-from matplotlib.patheffects import Normal, withStroke
+from matplotlib.patheffects import AbstractPathEffect, Normal, withStroke
 from matplotlib.transforms import Affine2D, ScaledTranslation
+from scipy.sparse.csgraph import connected_components
 
-from benchnav.core.grid import is_azimuth, outline
+from benchnav.core.grid import is_azimuth
 from benchnav.viz.style import SKY, bytes_of
 
 TRAVERSABILITY_COLOURS = "viridis"
@@ -88,7 +88,7 @@ class Drive:
 
 
 def draw_drive(
-    panel: Axes, drive: Drive, width: float = 1.4, scale: float = 1.0, colour: Any = "black", label: str = ""
+    panel: Axes, drive: Drive, width: float = 1.4, scale: float = 1.0, colour: Any = "black", **style: Any
 ) -> None:
     """Draw a driven path with its start, its goal, and the robot or how the episode ended.
 
@@ -98,15 +98,23 @@ def draw_drive(
         width: of the path in points.
         scale: of the marks' sizes.
         colour: of the path.
-        label: of the path in a legend; if empty, none.
+        **style: of the path, as in `Axes.plot`.
     """
-    draw_path(panel, drive.track, width, colour, label=label or "_driven")
+    draw_path(panel, drive.track, width, colour, **{"label": "_driven"} | style)
     mark(panel, "start", drive.track[0], scale)
     mark(panel, "goal", drive.goal_m, scale)
-    if drive.outcome:
-        mark_end(panel, drive, scale)
-    else:
-        mark(panel, "robot", drive.track[-1], scale, marker=robot_marker(drive.heading_rad))
+    end = drive.track[-1]
+    if not drive.outcome:
+        mark(panel, "robot", end, scale, marker=robot_marker(drive.heading_rad))
+        return
+    drawn = mark(panel, end_mark(drive.outcome), end, scale, clip_on=False)
+    away = end - drive.goal_m
+    if drive.outcome == "success" and away.any():
+        # On the side away from the goal, which stays in sight.
+        right, up = 0.9 * drawn.get_markersize() / 72 * away / np.linalg.norm(away)
+        figure = panel.get_figure(root=True)
+        assert figure is not None
+        drawn.set_transform(panel.transData + ScaledTranslation(right, up, figure.dpi_scale_trans))
 
 
 def draw_path(
@@ -156,18 +164,6 @@ def end_mark(outcome: str) -> str:
     return _END_MARKS.get(outcome, "failed")
 
 
-def mark_end(panel: Axes, drive: Drive, scale: float = 1.0) -> Line2D:
-    """Mark how an episode ended: at its end, or on the side away from the goal that was reached; return the mark."""
-    drawn = mark(panel, end_mark(drive.outcome), drive.track[-1], scale, clip_on=False)
-    away = drive.track[-1] - drive.goal_m
-    if drive.outcome == "success" and away.any():
-        right, up = 0.9 * drawn.get_markersize() / 72 * away / np.linalg.norm(away)
-        figure = panel.get_figure(root=True)
-        assert figure is not None
-        drawn.set_transform(panel.transData + ScaledTranslation(right, up, figure.dpi_scale_trans))
-    return drawn
-
-
 def mark_ends(
     panel: Axes, tracks: Sequence[np.ndarray], outcomes: Sequence[str], colours: Sequence[Any]
 ) -> None:
@@ -185,36 +181,21 @@ def mark_ends(
     figure.draw_without_rendering()  # so that the size of a point on the map is known
     metre_pt = np.diff(panel.transData.transform([(0, 0), (1, 0)])[:, 0])[0] * 72 / figure.dpi
     apart_m = 1.3 * MARKS["immobilised"]["ms"] / metre_pt
-    for group in _near(ends, apart_m):
+    distances = np.linalg.norm(ends[:, None] - ends, axis=-1)
+    _, labels = connected_components(distances < apart_m)
+    for label in np.unique(labels):
+        group = np.flatnonzero(labels == label).tolist()
         centre = ends[group].mean(axis=0)
         radius_m = 0.0 if len(group) == 1 else max(1.6 * apart_m, apart_m * len(group) / np.pi)
         for turn, index in enumerate(group):
             # Beginning above, where most paths do not come from below.
             angle = 2 * np.pi * turn / len(group) + np.pi / 2
-            position = (
-                ends[index]
-                if len(group) == 1
-                else centre + radius_m * np.array([np.cos(angle), np.sin(angle)])
-            )
+            position = centre + radius_m * np.array([np.cos(angle), np.sin(angle)])
             if len(group) > 1:
                 draw_path(panel, np.stack((ends[index], position)), 0.7, colours[index], zorder=3.6)
                 panel.plot(*ends[index], "o", ms=2.4, color=colours[index], mec="white", mew=0.5, zorder=3.7)
             looks: dict[str, Any] = {"color": colours[index], "label": "_end", "clip_on": False}
             mark(panel, end_mark(outcomes[index]), position, **looks)
-
-
-def _near(positions: np.ndarray, distance: float) -> list[list[int]]:
-    """Group positions that lie within a distance of another of their group."""
-    groups: list[list[int]] = []
-    for index, position in enumerate(positions):
-        joined = [
-            group
-            for group in groups
-            if (np.linalg.norm(positions[group] - position, axis=1) < distance).any()
-        ]
-        groups = [group for group in groups if group not in joined]
-        groups.append(sorted([index, *(member for group in joined for member in group)]))
-    return groups
 
 
 def robot_marker(heading_rad: float) -> MarkerStyle:
@@ -314,12 +295,6 @@ def draw_lines(panel: Axes, lines: np.ndarray, colour: Any, width: float, edge: 
             panel.add_collection(LineCollection(list(lines), colors=[look], linewidths=line_width))
 
 
-def draw_soft(panel: Axes, soft: np.ndarray, resolution_m: float) -> None:
-    """Outline and hatch soft terrain, bool of shape [H, W], on a map."""
-    for lines in (outline, hatching):
-        draw_lines(panel, lines(soft, resolution_m), SOFT, 0.4)
-
-
 def layer_scale(name: str, values: np.ndarray) -> dict[str, Any]:
     """Return how a layer is coloured, as keywords of `imshow`: from 0 or below to its maximum, or around the compass.
 
@@ -344,47 +319,47 @@ def lacking_handle() -> Patch:
     return Patch(facecolor=LACKING, label="unknown")
 
 
-@dataclass(frozen=True, kw_only=True)
-class LayerStyle:
+class LayerStyle(NamedTuple):
     """How a layer of a plan is drawn.
 
     Args:
         label: what a legend calls it.
         colour: red, green, blue and opacity, in hexadecimal digits.
         width: over the thinnest line's.
-        dashed: where lines can be.
-        edged: on white, which parts it from dark ground, where lines can be.
+        dashes: of the line, where lines can be dashed.
+        effects: of the line, where it can have such: a white edge parts it from dark terrain.
     """
 
     label: str
     colour: str
     width: float
-    dashed: bool = False
-    edged: bool = False
+    dashes: str = "solid"
+    effects: Sequence[AbstractPathEffect] = ()
 
 
+_EDGED = (withStroke(linewidth=2.2, foreground="white"), Normal())
 # From the undermost layer to the topmost.
 STYLES: Mapping[str, LayerStyle] = {
-    "tree": LayerStyle(label="tree", colour="#3c3c3c8c", width=1),
-    "samples": LayerStyle(label="samples", colour="#78b4ff6e", width=1),
-    "reference": LayerStyle(label="reference path", colour="#285affff", width=3, dashed=True, edged=True),
-    "path": LayerStyle(label="planned", colour="#00008cff", width=3, edged=True),
+    "tree": LayerStyle("tree", "#3c3c3c8c", 1),
+    "samples": LayerStyle("samples", "#78b4ff6e", 1),
+    "reference": LayerStyle("reference path", "#285affff", 3, "dashed", _EDGED),
+    "path": LayerStyle("planned", "#00008cff", 3, "solid", _EDGED),
 }
 
 
-def plan_layer(style: LayerStyle, lines: Sequence[np.ndarray] = (), scale: float = 1.0) -> LineCollection:
-    """Return a layer of a plan as lines for a map, `scale` times as wide as printed."""
-    width = scale * _LINE_WIDTH * style.width
-    return LineCollection(
-        list(lines),
-        colors=[style.colour],
-        linewidths=width,
-        linestyles="dashed" if style.dashed else "solid",
-        label=style.label,
-        path_effects=[withStroke(linewidth=width + scale, foreground="white"), Normal()]
-        if style.edged
-        else None,
-    )
+def draw_plan(panel: Axes, lines: Mapping[str, Sequence[np.ndarray]]) -> None:
+    """Draw a plan on a map, of each layer of `STYLES` its lines."""
+    for name, style in STYLES.items():
+        if len(lines.get(name, ())):
+            layer = LineCollection(
+                list(lines[name]),
+                colors=[style.colour],
+                linewidths=_LINE_WIDTH * style.width,
+                linestyles=style.dashes,
+                label=style.label,
+                path_effects=list(style.effects),
+            )
+            panel.add_collection(layer)
 
 
 def driven_colours(track: np.ndarray, traversability: np.ndarray, width: float) -> LineCollection:
@@ -412,45 +387,17 @@ def layer_colours(name: str, layer: np.ndarray) -> np.ndarray:
     return np.round(255 * scale["cmap"](fraction)[..., :3]).astype(np.uint8)
 
 
-def predicted_colours(predicted: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Colour λ̂ of shape [H, W], dark grey where it is not free (bool, same shape), as `field_colours` does."""
-    colours = shades(predicted)
-    colours[~free] = bytes_of(CLOSED)[:3]
-    return colours
-
-
 def veiled(colours: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Lay a veil over colours, uint8 of shape [H, W, 3], where the map was not seen, bool of shape [H, W]."""
     veil = (1 - VEIL) * colours + VEIL * np.array(bytes_of(UNSEEN)[:3])
     return np.where(seen[..., None], colours, veil).round().astype(np.uint8)
 
 
-def unseen_layer(seen: np.ndarray, resolution_m: float, scale: float = 1.0) -> LineCollection:
-    """Return the hatching of cells that were not seen, as lines for a map, `scale` times as wide as printed."""
-    return LineCollection(list(hatching(~seen, resolution_m)), colors="black", linewidths=0.3 * scale)
-
-
-def reach_line(outline_m: np.ndarray, scale: float = 1.0, label: str = "_reach") -> Line2D:
-    """Return how far sensors reach, lines of shape [N, 2] with NaN between them, for a map."""
-    edge = [withStroke(linewidth=1.8 * scale, foreground="black"), Normal()]
+def draw_reach(panel: Axes, outline_m: np.ndarray) -> None:
+    """Draw how far sensors reach, lines of shape [N, 2] with NaN between them, on a map."""
+    edge = [withStroke(linewidth=1.1, foreground="black"), Normal()]
     # One line with gaps, so that no piece has its edge on another.
-    return Line2D(*outline_m.T, color=REACH, lw=0.9 * scale, path_effects=edge, label=label, zorder=2.2)
-
-
-def sensing_handles(seen: Sequence[np.ndarray], reaches: bool, scale: float = 1.0) -> list[Artist]:
-    """Return the entries of a legend for what was not seen and for the reach of sensors, where there are such.
-
-    Args:
-        seen: masks of the cells that were seen, each of shape [H, W].
-        reaches: whether the reach of sensors is shown.
-        scale: of the line's width.
-    """
-    handles: list[Artist] = []
-    if not all(mask.all() for mask in seen):
-        handles.append(Patch(fc=UNSEEN, ec="black", hatch="////", lw=0, label="not seen"))
-    if reaches:
-        handles.append(reach_line(np.empty((0, 2)), scale, "reach of the sensors"))
-    return handles
+    panel.plot(*outline_m.T, color=REACH, lw=0.6, path_effects=edge, label="reach of the sensors", zorder=2.2)
 
 
 def field_colours(field: np.ndarray, immobilising: np.ndarray) -> np.ndarray:

@@ -164,26 +164,25 @@ def stack_panels(figure: Figure, count: int, across: int, layers: int = 1, **sha
 
 
 def legend_outside(
-    figure: Figure,
-    handles: Sequence[Artist] = (),
-    columns: int = 4,
-    side: Any = "lower center",
+    figure: Figure, handles: Sequence[Artist] = (), columns: int = 4, side: Any = "lower center"
 ) -> Legend:
-    """Lays a legend beside the panels, at a side of the figure: what has a label in them, once each, then the handles.
+    """Lay a legend next to the panels: what has a label in them, once each, then the handles.
 
     A figure that has a label of all its x-axes has its legend over the panels, as both would be in one place.
+
+    Args:
+        figure: with all its panels.
+        handles: further entries.
+        columns: of the legend of a figure that is as wide as a page; a narrower one has half of them.
+        side: of the figure.
     """
     labelled: dict[str, Artist] = {}
     for panel in figure.axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             labelled.setdefault(label, handle)
+    if figure.get_figwidth() < TWO_COLUMNS_IN:
+        columns = -(-columns // 2)
     return figure.legend(handles=[*labelled.values(), *handles], loc="outside " + side, ncols=columns)
-
-
-def explain(figure: Figure, columns: int = 4, handles: Sequence[Artist] = ()) -> None:
-    """Lay a legend over the panels, in at most so many columns where the figure is of full width."""
-    is_full = figure.get_figwidth() >= TWO_COLUMNS_IN
-    legend_outside(figure, handles, columns if is_full else columns - 2, "upper center")
 
 
 def page_width(count: int, across: int) -> float:

@@ -26,24 +26,19 @@ class Distributions(Figure):
 
     def draw(self, data: RunData) -> Drawing:
         """Draw the episodes of each condition at its height."""
-        return draw_distributions(data.summary, data.episodes)
-
-
-def draw_distributions(summary: pd.DataFrame, episodes: pd.DataFrame) -> Drawing:
-    """Draw the episodes behind a summary of `summary.summarise`, as `Distributions` does."""
-    figure, panels = lay_out(summary, list(_QUANTITIES.values()), legend_in=0.15)
-    for place, (panel, rows) in enumerate(panels):
-        _draw_dots(panel, rows, episodes, list(_QUANTITIES)[place % len(_QUANTITIES)])
-    panels[0][0].set_xlim(left=0)
-    panels[1][0].set_xlim(0, 1)
-    handles = [
-        Line2D([], [], ls="none", ms=3, color=colour, marker=marker, label=label)
-        for label, (colour, marker) in _ENDS.items()
-    ]
-    words = "median and quartiles of all"
-    handles.append(Line2D([], [], color="black", marker="|", ms=6, lw=1.2, label=words))
-    legend_outside(figure, handles)
-    return figure
+        figure, panels = lay_out(data.summary, list(_QUANTITIES.values()), legend_in=0.15)
+        for place, (panel, rows) in enumerate(panels):
+            _draw_dots(panel, rows, data.episodes, list(_QUANTITIES)[place % len(_QUANTITIES)])
+        panels[0][0].set_xlim(left=0)
+        panels[1][0].set_xlim(0, 1)
+        handles = [
+            Line2D([], [], ls="none", ms=3, color=colour, marker=marker, label=label)
+            for label, (colour, marker) in _ENDS.items()
+        ]
+        words = "median and quartiles of all"
+        handles.append(Line2D([], [], color="black", marker="|", ms=6, lw=1.2, label=words))
+        legend_outside(figure, handles)
+        return figure
 
 
 def _draw_dots(panel: Axes, rows: pd.DataFrame, episodes: pd.DataFrame, name: str) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure as Drawing
 
-from benchnav.eval.figures.data import Driven, RunData
+from benchnav.eval.figures.data import RunData
 from benchnav.eval.recording import Ground
 from benchnav.eval.words import NAMING, chosen_in_words, contender_names, outcome_in_words
 from benchnav.viz import maps
@@ -38,49 +38,47 @@ class DrivenPaths(Figure):
 
     def draw(self, data: RunData) -> Drawing:
         """Draw at most eight paths, with a legend at the side of the map."""
-        assert data.driven is not None
-        return draw_driven(data.driven)
-
-
-def draw_driven(driven: Driven) -> Drawing:
-    """Draw driven paths as `DrivenPaths` does."""
-    ground, places = driven.ground, driven.chosen(_MAX_PATHS)
-    rows, tracks = driven.rows.iloc[places], [driven.tracks[place] for place in places]
-    high, wide = ground.grid.shape
-    is_wide = wide >= 2 * high
-    width = TWO_COLUMNS_IN if is_wide else ONE_COLUMN_IN
-    # The legend stands at the side of a map, and below a wide one.
-    tall = min(width * high / wide, 7.0) + (0.15 * (len(rows) + 4) + 0.4 if is_wide else 0.4)
-    figure = Drawing(figsize=(TWO_COLUMNS_IN, tall), layout="compressed")
-    panel = figure.subplots()
-    maps.show_map(panel, _backdrop(ground), ground.grid.extent_m)
-    names = contender_names(rows[[name for name in NAMING if name in rows]].to_dict("records"))
-    colours = condition_colours(list(rows["planner"]))
-    for place, (row, track) in enumerate(zip(rows.to_dict("records"), tracks, strict=True)):
-        # Later ones are thinner, so that paths that coincide are all seen.
-        thickness = 0.9 + 2.2 * (1 - place / max(len(rows), 2))
-        label = f"{names[place]}: {outcome_in_words(row['outcome'])}, {row['end_time_s']:.0f} s"
-        maps.draw_path(panel, track, thickness, colours[place], ls=line_style(place), label=label)
-    maps.mark(panel, "start", tracks[0][0])
-    maps.mark(panel, "goal", ground.goal_m)
-    maps.name_immobilising(panel, ground.immobilising)
-    title = "terrain, faded" if ground.field is None else "λ field of the episode; lighter is higher"
-    panel.set(xlabel="x [m]", ylabel="y [m]", title=title)
-    maps.frame_map(panel)
-    failed = np.flatnonzero(~rows["success"].to_numpy(bool))
-    outcomes = [rows["outcome"].iloc[place] for place in failed]
-    handles, _ = panel.get_legend_handles_labels()
-    for name in dict.fromkeys(map(maps.end_mark, outcomes)):
-        handles.append(maps.mark_handle(name, label=f"{name}, in the colour of its path"))
-    panel.legend(
-        handles=handles,
-        loc="upper left",
-        bbox_to_anchor=(0, -0.18 * wide / high) if is_wide else (1.02, 1.01),
-        borderaxespad=0,
-        ncols=2 if is_wide else 1,
-    )
-    maps.mark_ends(panel, [tracks[place] for place in failed], outcomes, [colours[place] for place in failed])
-    return figure
+        driven = data.driven
+        assert driven is not None
+        ground, places = driven.ground, driven.chosen(_MAX_PATHS)
+        rows, tracks = driven.rows.iloc[places], [driven.tracks[place] for place in places]
+        high, wide = ground.grid.shape
+        is_wide = wide >= 2 * high
+        width = TWO_COLUMNS_IN if is_wide else ONE_COLUMN_IN
+        # The legend stands at the side of a map, and below a wide one.
+        tall = min(width * high / wide, 7.0) + (0.15 * (len(rows) + 4) + 0.4 if is_wide else 0.4)
+        figure = Drawing(figsize=(TWO_COLUMNS_IN, tall), layout="compressed")
+        panel = figure.subplots()
+        maps.show_map(panel, _backdrop(ground), ground.grid.extent_m)
+        names = contender_names(rows[[name for name in NAMING if name in rows]].to_dict("records"))
+        colours = condition_colours(list(rows["planner"]))
+        for place, (row, track) in enumerate(zip(rows.to_dict("records"), tracks, strict=True)):
+            # Later ones are thinner, so that paths that coincide are all seen.
+            thickness = 0.9 + 2.2 * (1 - place / max(len(rows), 2))
+            label = f"{names[place]}: {outcome_in_words(row['outcome'])}, {row['end_time_s']:.0f} s"
+            maps.draw_path(panel, track, thickness, colours[place], ls=line_style(place), label=label)
+        maps.mark(panel, "start", tracks[0][0])
+        maps.mark(panel, "goal", ground.goal_m)
+        maps.name_immobilising(panel, ground.immobilising)
+        title = "terrain, faded" if ground.field is None else "λ field of the episode; lighter is higher"
+        panel.set(xlabel="x [m]", ylabel="y [m]", title=title)
+        maps.frame_map(panel)
+        failed = np.flatnonzero(~rows["success"].to_numpy(bool))
+        outcomes = [rows["outcome"].iloc[place] for place in failed]
+        handles, _ = panel.get_legend_handles_labels()
+        for name in dict.fromkeys(map(maps.end_mark, outcomes)):
+            handles.append(maps.mark_handle(name, label=f"{name}, in the colour of its path"))
+        panel.legend(
+            handles=handles,
+            loc="upper left",
+            bbox_to_anchor=(0, -0.18 * wide / high) if is_wide else (1.02, 1.01),
+            borderaxespad=0,
+            ncols=2 if is_wide else 1,
+        )
+        maps.mark_ends(
+            panel, [tracks[place] for place in failed], outcomes, [colours[place] for place in failed]
+        )
+        return figure
 
 
 def _backdrop(ground: Ground) -> np.ndarray:

@@ -7,9 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
-from benchnav.eval.failures import FailedLine
 from benchnav.eval.figures.data import RunData
-from benchnav.eval.figures.trajectories import drive_at
+from benchnav.eval.figures.moment import drive_at
 from benchnav.eval.recording import Recording
 from benchnav.eval.words import outcome_in_words
 from benchnav.viz import maps
@@ -42,38 +41,34 @@ class Failures(Figure):
         )
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw the sheet."""
-        return draw_failures(data.sheets.shown[self.place][1])
-
-
-def draw_failures(lines: Sequence[FailedLine]) -> Drawing:
-    """Draw the lines of a sheet, one or more."""
-    across = max(len(line.recordings) for line in lines)
-    height, width = lines[0].recordings[0].grid.shape
-    page = TWO_COLUMNS_IN if across > 2 else ONE_COLUMN_IN
-    tall = page / (across + 0.9) * min(height / width, 2.0) + 0.4
-    figure = Drawing(figsize=(page, tall * len(lines) + 0.6), layout="constrained")
-    panels = figure.subplots(len(lines), across, squeeze=False)
-    for panel in panels.flat:
-        panel.set_visible(False)
-    for row_of_panels, line in zip(panels, lines, strict=True):
-        rows = line.failures.to_dict("records")
-        for panel, recording, row in zip(row_of_panels, line.recordings, rows, strict=False):
-            _draw_failure(panel, recording)
-            predicted = recording.predicted_at_end
-            words = ["outside the map" if np.isnan(predicted) else f"λ̂ = {predicted:.2f}"]
-            if not np.isnan(row["last_traversability"]):
-                words.append(f"observed λ = {row['last_traversability']:.2f}")
-            ended = f"{outcome_in_words(row['outcome'])}, {row['end_time_s']:.0f} s"
-            panel.set_title(
-                f"{row['scenario']}, map {row['map']}: {ended}\n{', '.join(words)}", fontsize="small"
-            )
-        count = f"({len(line.failures)} of {line.among} failures)"
-        row_of_panels[0].set_ylabel(f"{line.name}\n{count}", fontsize="small")
-    maps.draw_scale(panels[-1, 0], lines[-1].recordings[0].grid.extent_m)
-    figure.colorbar(panels[0, 0].images[0], ax=panels, fraction=0.03, aspect=30, label="predicted λ̂")
-    legend_outside(figure, columns=6 if across > 2 else 3)
-    return figure
+        """Draw a line a condition, a panel a failure."""
+        _, lines = data.sheets.shown[self.place]
+        across = max(len(line.recordings) for line in lines)
+        height, width = lines[0].recordings[0].grid.shape
+        page = TWO_COLUMNS_IN if across > 2 else ONE_COLUMN_IN
+        tall = page / (across + 0.9) * min(height / width, 2.0) + 0.4
+        figure = Drawing(figsize=(page, tall * len(lines) + 0.6), layout="constrained")
+        panels = figure.subplots(len(lines), across, squeeze=False)
+        for panel in panels.flat:
+            panel.set_visible(False)
+        for row_of_panels, line in zip(panels, lines, strict=True):
+            rows = line.failures.to_dict("records")
+            for panel, recording, row in zip(row_of_panels, line.recordings, rows, strict=False):
+                _draw_failure(panel, recording)
+                predicted = recording.predicted_at_end
+                words = ["outside the map" if np.isnan(predicted) else f"λ̂ = {predicted:.2f}"]
+                if not np.isnan(row["last_traversability"]):
+                    words.append(f"observed λ = {row['last_traversability']:.2f}")
+                ended = f"{outcome_in_words(row['outcome'])}, {row['end_time_s']:.0f} s"
+                panel.set_title(
+                    f"{row['scenario']}, map {row['map']}: {ended}\n{', '.join(words)}", fontsize="small"
+                )
+            count = f"({len(line.failures)} of {line.among} failures)"
+            row_of_panels[0].set_ylabel(f"{line.name}\n{count}", fontsize="small")
+        maps.draw_scale(panels[-1, 0], lines[-1].recordings[0].grid.extent_m)
+        figure.colorbar(panels[0, 0].images[0], ax=panels, fraction=0.03, aspect=30, label="predicted λ̂")
+        legend_outside(figure, columns=6)
+        return figure
 
 
 def _draw_failure(panel: Axes, recording: Recording) -> None:

@@ -1,6 +1,5 @@
 """The forest plot of the hypotheses that were fixed before the run."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import pandas as pd
@@ -14,7 +13,6 @@ from benchnav.core.quantity import Quantity
 from benchnav.eval.experiment.metrics import further_quantities, quantities
 from benchnav.eval.figures.data import RunData
 from benchnav.eval.words import NOT_YET, p_in_words, reading_names
-from benchnav.metrics.shipped import QUANTITIES
 from benchnav.viz.figure import Figure
 from benchnav.viz.panels import GRID, draw_interval
 from benchnav.viz.style import BLUE, TWO_COLUMNS_IN, legend_outside
@@ -38,36 +36,33 @@ class Forest(Figure):
 
     def draw(self, data: RunData) -> Drawing:
         """Draw a row a hypothesis, a panel a metric; the band is where a margin wants the difference to lie."""
-        return draw_forest(data.tests, quantities(further_quantities(data.about)))
-
-
-def draw_forest(tests: pd.DataFrame, known: Mapping[str, Quantity] = QUANTITIES) -> Drawing:
-    """Draw tests as `Forest` does.
-
-    Args:
-        tests: from `hypotheses.test_hypotheses`.
-        known: what conditions are compared by, by name; panels are in this order.
-    """
-    numbered = tests.assign(number=range(1, len(tests) + 1))
-    panels = {name: numbered[numbered["metric"] == name] for name in known if (tests["metric"] == name).any()}
-    heights = [_METRIC_IN + _TEST_IN * len(rows) for rows in panels.values()]
-    figure = Drawing(figsize=(TWO_COLUMNS_IN, sum(heights) + 0.3), layout="constrained")
-    axes = figure.subplots(len(panels), squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
-    for panel, (name, rows) in zip(axes, panels.items(), strict=True):
-        _draw_tests(panel, rows, known[name])
-    point: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 0}
-    is_tested = tests["p_holm"].notna().all()
-    looks: dict[str, Any] = {
-        **({"supported": point} if is_tested else {}),
-        "not supported" if is_tested else NOT_YET: {**point, "mfc": "white"},
-        "90 % interval": {"lw": 2.6},
-        "95 % interval": {"lw": 0.9},
-    }
-    handles: list[Artist] = [Line2D([], [], color=BLUE, label=label, **look) for label, look in looks.items()]
-    if (tests["margin"] > 0).any():
-        handles.append(Patch(color=_MARGIN, label="allowed by the margin"))
-    legend_outside(figure, handles, 5)
-    return figure
+        known = quantities(further_quantities(data.about))
+        numbered = data.tests.assign(number=range(1, len(data.tests) + 1))
+        panels = {
+            name: numbered[numbered["metric"] == name]
+            for name in known
+            if (data.tests["metric"] == name).any()
+        }
+        heights = [_METRIC_IN + _TEST_IN * len(rows) for rows in panels.values()]
+        figure = Drawing(figsize=(TWO_COLUMNS_IN, sum(heights) + 0.3), layout="constrained")
+        axes = figure.subplots(len(panels), squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
+        for panel, (name, rows) in zip(axes, panels.items(), strict=True):
+            _draw_tests(panel, rows, known[name])
+        point: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 0}
+        is_tested = data.tests["p_holm"].notna().all()
+        looks: dict[str, Any] = {
+            **({"supported": point} if is_tested else {}),
+            "not supported" if is_tested else NOT_YET: {**point, "mfc": "white"},
+            "90 % interval": {"lw": 2.6},
+            "95 % interval": {"lw": 0.9},
+        }
+        handles: list[Artist] = [
+            Line2D([], [], color=BLUE, label=label, **look) for label, look in looks.items()
+        ]
+        if (data.tests["margin"] > 0).any():
+            handles.append(Patch(color=_MARGIN, label="allowed by the margin"))
+        legend_outside(figure, handles, 5)
+        return figure
 
 
 def _draw_tests(panel: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:

@@ -3,7 +3,7 @@
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -12,6 +12,7 @@ import pyarrow.dataset as ds
 from matplotlib.figure import Figure as Drawing
 
 from benchnav.eval.figures.data import RunData
+from benchnav.eval.figures.lines import MAX_ACROSS, divide_lines
 from benchnav.eval.folder.steps import AHEAD_COLUMNS, AHEAD_DEG, AHEAD_M, open_steps, rows_of
 from benchnav.eval.stats.best import BLOCK
 from benchnav.eval.words import NAMING, joined, reading_name
@@ -29,7 +30,7 @@ METRICS = dict(
     )
 )
 _BIN_S = 2.0
-_MAX_LINES, _MAX_ACROSS = 7, 4
+_WAYS = ((), ("model",), ("planner", "model"), ("planner", "risk", "model"))
 _LETTER_IN = 0.055
 _EPISODE = ["condition", "seed", "realisation", "map"]
 
@@ -54,7 +55,30 @@ class Learning(Figure):
 
     def draw(self, data: RunData) -> Drawing:
         """Draw a line a condition, with its band; where these are many, a panel a model, planner and risk setting."""
-        return draw_learning(self.curves, data.summary)
+        rows = data.summary[data.summary["condition"].isin(self.curves["condition"])].reset_index(drop=True)
+        differing = [
+            name for name in dict.fromkeys((*BLOCK, *NAMING)) if name in rows and rows[name].nunique() > 1
+        ]
+        titled, groups = divide_lines(rows, [(*BLOCK, *more) for more in _WAYS])
+        named = [name for name in differing if name not in titled]
+        labels = ([reading_name(name, row[name]) for name in named] for row in rows.to_dict("records"))
+        names = [joined(own) or "mean over maps" for own in labels]
+        letters = int((TWO_COLUMNS_IN / min(len(groups), MAX_ACROSS) - 0.4) / _LETTER_IN)
+        points = [
+            self.curves[self.curves["condition"] == rows["condition"][index]].assign(
+                panel=textwrap.fill(title, letters), line=names[index]
+            )
+            for title, shown in groups
+            for index in shown
+        ]
+        table = pd.concat(points).rename(columns={"time_s": "x"})
+        looks = line_looks(names, dashed=True)
+        figure, panels = Curves(
+            table=table, measures=METRICS, looks=looks, x_label="seconds of experience"
+        ).draw()
+        next(iter(panels.values())).set_xlim(left=0)
+        legend_outside(figure)
+        return figure
 
 
 def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
@@ -96,60 +120,3 @@ def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         numbers = np.stack((values.mean(axis=0), low, high), axis=1).ravel()
         rows.append((condition, (place + 0.5) * _BIN_S, len(own), *numbers))
     return pd.DataFrame(rows, columns=columns)
-
-
-def draw_learning(curves: pd.DataFrame, summary: pd.DataFrame) -> Drawing:
-    """Draw curves of `read_learning`, one row or more, as `Learning` does.
-
-    Args:
-        curves: the curves.
-        summary: of the run, which holds the labels of conditions.
-    """
-    rows = summary[summary["condition"].isin(curves["condition"])].reset_index(drop=True)
-    groups, names = _share_out(rows)
-    letters = int((TWO_COLUMNS_IN / min(len(groups), _MAX_ACROSS) - 0.4) / _LETTER_IN)
-    points = [
-        curves[curves["condition"] == rows["condition"][index]].assign(
-            panel=textwrap.fill(title, letters), line=names[index]
-        )
-        for title, shown in groups
-        for index in shown
-    ]
-    table = pd.concat(points).rename(columns={"time_s": "x"})
-    looks = line_looks(names, dashed=True)
-    figure, panels = Curves(
-        table=table, measures=METRICS, looks=looks, x_label="seconds of experience"
-    ).draw()
-    next(iter(panels.values())).set_xlim(left=0)
-    legend_outside(figure)
-    return figure
-
-
-def _share_out(rows: pd.DataFrame) -> tuple[list[tuple[str, list[int]]], list[str]]:
-    """Return titles and conditions of panels, and what each condition is called in all of them.
-
-    Panels are split until none holds more lines than a reader can distinguish.
-
-    Args:
-        rows: a condition each, numbered from 0.
-    """
-    differing = [
-        name for name in dict.fromkeys((*BLOCK, *NAMING)) if name in rows and rows[name].nunique() > 1
-    ]
-    for apart in (
-        BLOCK,
-        (*BLOCK, "model"),
-        (*BLOCK, "model", "planner"),
-        (*BLOCK, "model", "planner", "risk"),
-    ):
-        titled = [name for name in differing if name in apart]
-        groups = list(rows.groupby(titled, sort=False)) if titled else [((), rows)]
-        if max(len(own) for _, own in groups) <= _MAX_LINES:
-            break
-    named = [name for name in differing if name not in titled]
-
-    def words(columns: Sequence[str], row: Any) -> str:
-        return joined(reading_name(name, row[name]) for name in columns)
-
-    names = [words(named, row) or "mean over maps" for row in rows.to_dict("records")]
-    return [(words(titled, own.iloc[0]), own.index.tolist()) for _, own in groups], names

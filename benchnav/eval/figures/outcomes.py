@@ -3,14 +3,13 @@
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.figure import Figure as Drawing
 
 from benchnav.eval.figures.data import RunData
 from benchnav.eval.figures.setting_rows import lay_out
 from benchnav.eval.words import outcome_in_words
 from benchnav.viz.figure import Figure
-from benchnav.viz.style import AMBER, BLUE, GREEN, ORANGE, PINK, SKY, TWO_COLUMNS_IN, legend_outside
+from benchnav.viz.style import AMBER, BLUE, GREEN, ORANGE, PINK, SKY, legend_outside
 
 # From what the terrain did to what the code did: the colour of each failure, and its hatching in white, so that
 # outcomes of one lightness differ in grey. Success is light.
@@ -37,23 +36,18 @@ class Outcomes(Figure):
 
     def draw(self, data: RunData) -> Drawing:
         """Draw a bar a condition."""
-        return draw_outcomes(data.summary)
-
-
-def draw_outcomes(summary: pd.DataFrame) -> Drawing:
-    """Draw the outcomes of a summary of `summary.summarise`, as `Outcomes` does."""
-    ended = [name for name in LOOKS if summary[f"{name}_count"].sum()]
-    label = "fraction of episodes [%]"
-    figure, panels = lay_out(summary, [label], legend_in=0.15 + 0.15 * (len(ended) // 3))
-    for panel, rows in panels:
-        left = np.zeros(len(rows))
-        for name in ended:
-            fraction = 100 * rows[f"{name}_count"] / rows["n_episodes"]
-            colour, hatch = LOOKS[name]
-            look: dict[str, Any] = {"fc": colour, "hatch": hatch, "ec": "white", "lw": 0}
-            panel.barh(rows["height"], fraction, 0.78, left, label=outcome_in_words(name), **look)
-            left = left + fraction
-        panel.barh(rows["height"], 100 - left, 0.78, left, color=SUCCESS_COLOUR, lw=0, label="success")
-    panel.set_xlim(0, 100)
-    legend_outside(figure, columns=3 if figure.get_figwidth() < TWO_COLUMNS_IN else 6)
-    return figure
+        ended = [name for name in LOOKS if data.summary[f"{name}_count"].sum()]
+        label = "fraction of episodes [%]"
+        figure, panels = lay_out(data.summary, [label], legend_in=0.15 + 0.15 * (len(ended) // 3))
+        for panel, rows in panels:
+            left = np.zeros(len(rows))
+            for name in ended:
+                fraction = 100 * rows[f"{name}_count"] / rows["n_episodes"]
+                colour, hatch = LOOKS[name]
+                look: dict[str, Any] = {"fc": colour, "hatch": hatch, "ec": "white", "lw": 0}
+                panel.barh(rows["height"], fraction, 0.78, left, label=outcome_in_words(name), **look)
+                left = left + fraction
+            panel.barh(rows["height"], 100 - left, 0.78, left, color=SUCCESS_COLOUR, lw=0, label="success")
+        panel.set_xlim(0, 100)
+        legend_outside(figure, columns=6)
+        return figure

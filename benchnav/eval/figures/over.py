@@ -1,7 +1,7 @@
 """Sweeps of a run: conditions that are equal in all but one number, which takes three values or more, as curves."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
@@ -9,16 +9,16 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
-from matplotlib.lines import Line2D
 
 from benchnav.core import registry
 from benchnav.datagen.recipe.scenario import find_series
 from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.figures.data import RunData
+from benchnav.eval.figures.lines import MAX_ACROSS, divide_lines
 from benchnav.eval.words import joined
 from benchnav.planning.free_space import Rules
 from benchnav.viz.figure import Figure
-from benchnav.viz.panels import Curves, Looks, line_looks
+from benchnav.viz.panels import Curves, line_looks
 from benchnav.viz.style import BLIND, LINE_COLOURS, condition_colours, legend_outside, planner_name, risk_name
 
 SEVERITY = "severity"
@@ -31,13 +31,11 @@ _MEASURES = {
     "success [%]": ("success_rate", "success_low", "success_high", 100.0),
     "T_total [s]": ("total_time_mean_s", "total_time_low_s", "total_time_high_s", 1.0),
 }
-_MAX_LINES, _MAX_ACROSS = 7, 4
 _SAME = ("data", "scenario", "world", "robot", "objective")
 
-Labels = Mapping[Any, Any]
-
-# What panels are named by, in order.
+# What panels are named by, in order; who plans and the risk setting only where lines are many.
 _LABELS = ("scenario", "data", "world", "model", *KNOWLEDGE, "who", "risk", "robot", "objective")
+_WAYS = [[name for name in _LABELS if name not in left_out] for left_out in (("who", "risk"), ("risk",), ())]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,67 +148,65 @@ class Over(Figure):
         A panel a scenario, world, model and what else there is of that kind; where lines are many, a panel a planner
         too. Over a number of a risk setting, the other settings of the same planner are horizontal lines.
         """
-        return draw_sweep(self.number, self.lines, data.summary)
-
-
-def draw_sweep(number: str, lines: Sequence[Line], summary: pd.DataFrame) -> Drawing:
-    """Draw a sweep of `find_sweeps` as `Over` does."""
-    rows = summary.set_index("condition", drop=False)
-    labels = _label_lines(number, lines, rows)
-    planners = labels.drop_duplicates("name").set_index("name")["planner"]
-    looks = line_looks(planners.index, condition_colours(planners.tolist(), LINE_COLOURS))
-    groups = _panels(labels)
-    points = []
-    for title, shown in groups:
-        for index in shown:
-            own = rows.loc[list(lines[index].conditions)]
-            values = {
-                name + end: scale * own[column].to_numpy()
+        rows = data.summary.set_index("condition", drop=False)
+        labels = _label_lines(self.number, self.lines, rows)
+        planners = labels.drop_duplicates("name").set_index("name")["planner"]
+        looks = line_looks(planners.index, condition_colours(planners.tolist(), LINE_COLOURS))
+        _, groups = divide_lines(labels, _WAYS)
+        groups = [(title or labels["scenario"][shown[0]], shown) for title, shown in groups]
+        measured = pd.DataFrame(
+            {
+                name + end: scale * rows[column]
                 for name, (*columns, scale) in _MEASURES.items()
                 for end, column in zip(("", "_low", "_high"), columns, strict=True)
             }
-            x = _places(number, lines[index].values)
-            points.append(pd.DataFrame({"panel": title, "line": labels["name"][index], "x": x, **values}))
-    across = min(len(groups), _MAX_ACROSS)
-    measures = {name: name for name in _MEASURES}
-    label = _NAMES.get(number, sweep_name(number))
-    curves = Curves(table=pd.concat(points), measures=measures, looks=looks, x_label=label, across=across)
-    figure, panels = curves.draw()
-    ticks = sorted({value for line in lines for value in line.values})
-    for panel in panels.values():
-        panel.set_xticks(_places(number, ticks), [f"{value:g}" for value in ticks])
-    handles = []
-    if number.startswith("risk."):
-        others = rows.drop([condition for line in lines for condition in line.conditions]).to_dict("records")
-        shown_in = [
-            (title, rows.loc[lines[i].conditions[0]], labels["name"][i]) for title, own in groups for i in own
+        )
+        points = [
+            measured.loc[list(self.lines[index].conditions)].assign(
+                panel=title, line=labels["name"][index], x=_places(self.number, self.lines[index].values)
+            )
+            for title, shown in groups
+            for index in shown
         ]
-        handles = _draw_references(panels, shown_in, others, looks)
-    legend_outside(figure, handles, 2 if across == 1 else 4)
-    return figure
+        across = min(len(groups), MAX_ACROSS)
+        measures = {name: name for name in _MEASURES}
+        label = _NAMES.get(self.number, sweep_name(self.number))
+        curves = Curves(table=pd.concat(points), measures=measures, looks=looks, x_label=label, across=across)
+        figure, panels = curves.draw()
+        ticks = sorted({value for line in self.lines for value in line.values})
+        for panel in panels.values():
+            panel.set_xticks(_places(self.number, ticks), [f"{value:g}" for value in ticks])
+        if self.number.startswith("risk."):
+            others = rows.drop([condition for line in self.lines for condition in line.conditions])
+            for title, shown in groups:
+                colours = {index: looks[labels["name"][index]]["color"] for index in shown}
+                firsts = {index: rows.loc[self.lines[index].conditions[0]] for index in shown}
+                for measure in _MEASURES:
+                    _draw_references(panels[title, measure], others, measured[measure], firsts, colours)
+        legend_outside(figure)
+        return figure
 
 
 def _draw_references(
-    panels: Mapping[tuple[str, str], Axes],
-    shown_in: Iterable[tuple[str, Labels, str]],
-    others: Sequence[Labels],
-    looks: Looks,
-) -> list[Line2D]:
-    """Draw settings that have no such number as horizontal lines; return their entries of the legend."""
-    references: dict[str, dict[str, Any]] = {}
-    for title, first, name in shown_in:
-        for label, row in _references(first, others):
-            colour = BLIND if row["model"] == NOT_USED else looks[name]["color"]
-            # A pattern of dashes for each setting, with more and more dots between.
-            dashes = (0, (6, 2, *(1, 1.5) * len(references)))
-            look = references.setdefault(label, {"color": colour, "ls": dashes})
-            for measure, (column, *_, scale) in _MEASURES.items():
-                panels[title, measure].axhline(
-                    scale * row[column], color=colour, ls=look["ls"], lw=1, zorder=1
-                )
-            if look["color"] != colour:  # of several planners
-                look["color"] = "0.2"
-    return [Line2D([], [], lw=1, label=label, **look) for label, look in references.items()]
+    panel: Axes,
+    others: pd.DataFrame,
+    values: pd.Series,
+    firsts: Mapping[int, pd.Series],
+    colours: Mapping[int, Any],
+) -> None:
+    """Draw settings without the number as horizontal lines: those of a line's planner, and blind ones."""
+    settings = [risk_name(row["risk"]) if row["model"] != NOT_USED else planner_name(row["planner"])
+                for row in others.to_dict("records")]  # fmt: skip
+    order = list(dict.fromkeys(settings))
+    for index, first in firsts.items():
+        for name, (condition, row) in zip(settings, others.iterrows(), strict=True):
+            is_blind = row["model"] == NOT_USED
+            shared = list(_SAME) if is_blind else [*_SAME, "model", "planner"]
+            if (row[shared] == first[shared]).all():
+                colour = BLIND if is_blind else colours[index]
+                # A pattern of dashes for each setting, with more and more dots between.
+                dashes = (0, (6, 2, *(1, 1.5) * order.index(name)))
+                panel.axhline(values[condition], color=colour, ls=dashes, lw=1, zorder=1, label=name)
 
 
 def _label_lines(number: str, lines: Sequence[Line], rows: pd.DataFrame) -> pd.DataFrame:
@@ -239,36 +235,6 @@ def _label_lines(number: str, lines: Sequence[Line], rows: pd.DataFrame) -> pd.D
             more = (f"{sweep_name(key)} {rest[key]}" for key in differing)
             names[place] = joined([alike["who"][place], alike["risk"][place], *more])
     return labelled.assign(name=pd.Series(names))
-
-
-def _panels(labels: pd.DataFrame) -> list[tuple[str, list[int]]]:
-    """Titles and lines of the panels: split until no panel holds more lines than a reader can distinguish.
-
-    What is blind stands in the panels of the models, and of what robots know, that it stands beside.
-    """
-    unused = ["model", *KNOWLEDGE]
-    numbered = labels.assign(line=labels.index)
-    blind = numbered["model"] == NOT_USED
-    for left_out in ({"who", "risk"}, {"risk"}, set()):
-        columns = [name for name in _LABELS if name not in left_out]
-        panels = numbered.loc[~blind, columns].drop_duplicates()
-        shared = [name for name in columns if name not in unused]
-        beside = numbered[blind].drop(columns=unused).merge(panels, "left", shared)
-        every = pd.concat([numbered[~blind], beside.fillna(dict.fromkeys(unused, NOT_USED))])
-        groups = every.groupby(columns, sort=False)["line"].agg(list).reset_index()
-        if groups["line"].map(len).max() <= _MAX_LINES:
-            break
-    differing = [name for name in columns if groups[name].nunique() > 1]
-    return [(joined(own[differing]) or own["scenario"], own["line"]) for _, own in groups.iterrows()]
-
-
-def _references(first: Labels, others: Iterable[Labels]) -> Iterator[tuple[str, Labels]]:
-    """Settings that have no such number and stand beside a line: of its planner, and blind ones."""
-    for row in others:
-        blind = row["model"] == NOT_USED
-        shared = _SAME if blind else (*_SAME, "model", "planner")
-        if all(row[name] == first[name] for name in shared):
-            yield planner_name(row["planner"]) if blind else risk_name(row["risk"]), row
 
 
 def _places(number: str, values: Sequence[float]) -> np.ndarray:

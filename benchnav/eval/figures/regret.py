@@ -49,42 +49,37 @@ class Regret(Figure):
 
     def draw(self, data: RunData) -> Drawing:
         """Draw each chain from its planner, on top, to the reference: success left, T_total right."""
-        return draw_regret(data.regret)
-
-
-def draw_regret(table: pd.DataFrame) -> Drawing:
-    """Draw chains of `regret.split_regret`, one row or more, as `Regret` does."""
-    chains = [rows for _, rows in table.groupby("chain", sort=True)][:MAX_CHAINS]
-    steps = 2 + max(len(rows) for rows in chains)
-    height = len(chains) * (_ROW_IN * steps + 0.55) + 0.3
-    figure = Drawing(figsize=(TWO_COLUMNS_IN, height), layout="constrained")
-    axes = figure.subplots(len(chains), len(_MEASURES), squeeze=False, sharey="row", sharex="col")
-    differing = [name for name in BLOCK if table[name].nunique() > 1]
-    for line, rows in zip(axes, chains, strict=True):
-        for panel, measure in zip(line, _MEASURES, strict=True):
-            _draw_chain(panel, rows, measure)
-        told = rows.to_dict("records")
-        first, last = _named(told[0], "one"), _named(told[-1], "other")
-        names = [", ".join(first), *map(_step_name, told), ", ".join(last)]
-        line[0].set_yticks(range(len(names)), names)
-        line[0].set_ylim(len(rows) + 1.6, -0.6)
-        about = rows.iloc[0]
-        title = joined([risk_name(about["risk"]), *(about[name] for name in differing)])
-        line[0].set_title(f"{title}, {about['n_maps']} maps", loc="left")
-    for panel, (label, *_) in zip(axes[-1], _MEASURES.values(), strict=True):
-        panel.set_xlabel(label)
-        panel.set_xlim(left=0)
-    handles: list[Artist] = [
-        Patch(color=ORANGE, label="the next is better"),
-        Patch(color=BLUE, label="the next is worse"),
-        Patch(color=_ENDS, label="of the first, of the near-optimal reference"),
-    ]
-    if table["time_bound"].notna().any():
-        handles.append(
-            Line2D([], [], color=_BOUND, ls="--", lw=1.1, label="lower bound: no planner is better")
-        )
-    legend_outside(figure, handles, len(handles))
-    return figure
+        chains = [rows for _, rows in data.regret.groupby("chain", sort=True)][:MAX_CHAINS]
+        steps = 2 + max(len(rows) for rows in chains)
+        height = len(chains) * (_ROW_IN * steps + 0.55) + 0.3
+        figure = Drawing(figsize=(TWO_COLUMNS_IN, height), layout="constrained")
+        axes = figure.subplots(len(chains), len(_MEASURES), squeeze=False, sharey="row", sharex="col")
+        differing = [name for name in BLOCK if data.regret[name].nunique() > 1]
+        for line, rows in zip(axes, chains, strict=True):
+            for panel, measure in zip(line, _MEASURES, strict=True):
+                _draw_chain(panel, rows, measure)
+            told = rows.to_dict("records")
+            first, last = _named(told[0], "one"), _named(told[-1], "other")
+            names = [", ".join(first), *map(_step_name, told), ", ".join(last)]
+            line[0].set_yticks(range(len(names)), names)
+            line[0].set_ylim(len(rows) + 1.6, -0.6)
+            about = rows.iloc[0]
+            title = joined([risk_name(about["risk"]), *(about[name] for name in differing)])
+            line[0].set_title(f"{title}, {about['n_maps']} maps", loc="left")
+        for panel, (label, *_) in zip(axes[-1], _MEASURES.values(), strict=True):
+            panel.set_xlabel(label)
+            panel.set_xlim(left=0)
+        handles: list[Artist] = [
+            Patch(color=ORANGE, label="the next is better"),
+            Patch(color=BLUE, label="the next is worse"),
+            Patch(color=_ENDS, label="of the first, of the near-optimal reference"),
+        ]
+        if data.regret["time_bound"].notna().any():
+            handles.append(
+                Line2D([], [], color=_BOUND, ls="--", lw=1.1, label="lower bound: no planner is better")
+            )
+        legend_outside(figure, handles, len(handles))
+        return figure
 
 
 def _named(row: Mapping[Any, Any], end: str) -> tuple[str, str]:

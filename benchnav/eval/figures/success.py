@@ -13,7 +13,7 @@ from benchnav.eval.figures.data import RunData
 from benchnav.eval.figures.setting_rows import lay_out
 from benchnav.viz.figure import Figure
 from benchnav.viz.panels import draw_interval
-from benchnav.viz.style import BLIND, TWO_COLUMNS_IN, legend_outside, planner_colours
+from benchnav.viz.style import BLIND, legend_outside, planner_colours
 
 _BAND = 0.12  # opacity
 _POINT: dict[str, Any] = {"marker": "o", "ms": 4, "ls": "none", "color": "0.2"}
@@ -31,39 +31,34 @@ class Success(Figure):
 
     def draw(self, data: RunData) -> Drawing:
         """Draw a point a condition; a blind planner is a line through its panel, the baseline of all others."""
-        return draw_success(data.summary)
-
-
-def draw_success(summary: pd.DataFrame) -> Drawing:
-    """Draw success rates as `Success` does.
-
-    Args:
-        summary: from `summary.summarise`, joined with `best.against_best`, whose `best_marked` fills points.
-    """
-    is_blind = summary["model"] == NOT_USED  # the clairvoyant has a model, and no risk
-    is_marked = summary.get("best_marked", pd.Series(False, summary.index)).fillna(False).astype(bool)
-    handles: list[Any] = []
-    if is_marked.any():
-        handles.append(Line2D([], [], **_POINT, label="not significantly worse than the best"))
-        if not is_marked.all():
-            handles.append(Line2D([], [], **_POINT, mfc="white", label="significantly worse, or a baseline"))
-    if is_blind.any():
-        handles.append(Line2D([], [], color=BLIND, lw=0.8, ls="--", label="blind planner"))
-        handles.append(Patch(color=BLIND, alpha=_BAND, lw=0, label="its 95 % interval"))
-    figure, panels = lay_out(summary, ["success [%]"], legend_in=0.15 * len(handles))
-    colours = planner_colours(list(summary["planner"]))
-    for panel, rows in panels:
-        for row in rows.to_dict("records"):
-            blind = row["model"] == NOT_USED
-            colour = BLIND if blind else colours[row["planner"]]
-            face = colour if row.get("best_marked") else "white"
-            rate, low, high = (100 * row[f"success_{name}"] for name in ("rate", "low", "high"))
-            draw_interval(panel, low, high, row["height"], colour)
-            panel.plot(rate, row["height"], "o", color=colour, ms=4, mfc=face)
-            if blind:
-                panel.axvline(rate, color=colour, lw=0.8, ls="--", zorder=0)
-                panel.axvspan(low, high, color=colour, alpha=_BAND, lw=0, zorder=0)
-    panel.set(xticks=np.arange(0, 101, 25), xlim=(-4, 104))
-    if handles:
-        legend_outside(figure, handles, 2 if figure.get_figwidth() >= TWO_COLUMNS_IN else 1)
-    return figure
+        is_blind = data.summary["model"] == NOT_USED  # the clairvoyant has a model, and no risk
+        is_marked = (
+            data.summary.get("best_marked", pd.Series(False, data.summary.index)).fillna(False).astype(bool)
+        )
+        handles: list[Any] = []
+        if is_marked.any():
+            handles.append(Line2D([], [], **_POINT, label="not significantly worse than the best"))
+            if not is_marked.all():
+                handles.append(
+                    Line2D([], [], **_POINT, mfc="white", label="significantly worse, or a baseline")
+                )
+        if is_blind.any():
+            handles.append(Line2D([], [], color=BLIND, lw=0.8, ls="--", label="blind planner"))
+            handles.append(Patch(color=BLIND, alpha=_BAND, lw=0, label="its 95 % interval"))
+        figure, panels = lay_out(data.summary, ["success [%]"], legend_in=0.15 * len(handles))
+        colours = planner_colours(list(data.summary["planner"]))
+        for panel, rows in panels:
+            for row in rows.to_dict("records"):
+                blind = row["model"] == NOT_USED
+                colour = BLIND if blind else colours[row["planner"]]
+                face = colour if row.get("best_marked") else "white"
+                rate, low, high = (100 * row[f"success_{name}"] for name in ("rate", "low", "high"))
+                draw_interval(panel, low, high, row["height"], colour)
+                panel.plot(rate, row["height"], "o", color=colour, ms=4, mfc=face)
+                if blind:
+                    panel.axvline(rate, color=colour, lw=0.8, ls="--", zorder=0)
+                    panel.axvspan(low, high, color=colour, alpha=_BAND, lw=0, zorder=0)
+        panel.set(xticks=np.arange(0, 101, 25), xlim=(-4, 104))
+        if handles:
+            legend_outside(figure, handles, 2)
+        return figure

@@ -7,7 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
+from benchnav.core.grid import outline
 from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
+from benchnav.eval.figures import moment
 from benchnav.eval.figures.data import RunData, choose_recordings
 from benchnav.eval.recording import Recording
 from benchnav.eval.words import chosen_in_words, condition_name, differ
@@ -70,7 +72,7 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
         _draw_terrain(stack[0], recording, heading)
         _draw_predicted(stack[1], recording)
         if recording.field is not None:
-            _draw_field(stack[2], recording, recording.field)
+            _draw_field(stack[2], recording)
         elif len(stack) > 2:
             stack.pop().remove()
         for panel in stack:
@@ -83,7 +85,7 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
             )
             panel.set_title("\n".join(title), fontsize="small")
         stack[-1].set_xlabel("x [m]")
-    legend_outside(figure, columns=1 if across == 1 else 4)
+    legend_outside(figure)
     figure.colorbar(
         stacks[0][0].collections[-1],
         ax=figure.axes,
@@ -106,44 +108,24 @@ def _headings(recordings: Sequence[Recording]) -> list[str]:
     places = [f", {own.about['scenario']}, map {own.about['map']}" for own in recordings]
     headings = []
     for own, place in zip(recordings, places, strict=True):
-        moment = f"{own.outcome} after {own.end_s:g} s"
-        if not has_ended(own, own.now):
-            moment = f"t = {own.now * own.dt_s:g} s; {moment}"
+        shown = f"{own.outcome} after {own.end_s:g} s"
+        if not moment.has_ended(own, own.now):
+            shown = f"t = {own.now * own.dt_s:g} s; {shown}"
         where = place if len(set(places)) > 1 else ""
-        headings.append(f"{condition_name(own.about, several)}{where}\n{moment}")
+        headings.append(f"{condition_name(own.about, several)}{where}\n{shown}")
     return headings
-
-
-def has_ended(recording: Recording, step: int) -> bool:
-    """Return whether an episode ended by a step."""
-    return step == len(recording.traversability)
-
-
-def drive_at(recording: Recording, step: int) -> maps.Drive:
-    """Return the path of a recording up to a step."""
-    return maps.Drive(
-        track=recording.track[: step + 1],
-        goal_m=recording.goal_m,
-        outcome=recording.about["outcome"] if has_ended(recording, step) else "",
-        heading_rad=recording.states[step, 2],
-    )
-
-
-def _draw_plan(panel: Axes, recording: Recording) -> None:
-    for name, style in maps.STYLES.items():
-        if len(recording.plan.lines.get(name, ())):
-            panel.add_collection(maps.plan_layer(style, recording.plan.lines[name]))
 
 
 def _draw_terrain(panel: Axes, recording: Recording, title: str) -> None:
     """Draw the terrain, and the path driven by that moment, coloured by the observed λ."""
     maps.show_map(panel, np.moveaxis(recording.rgb, 0, -1), recording.grid.extent_m)
     if recording.field is not None and recording.soft.any():
-        maps.draw_soft(panel, recording.soft, recording.resolution_m)
+        for lines in (outline, maps.hatching):
+            maps.draw_lines(panel, lines(recording.soft, recording.resolution_m), maps.SOFT, 0.4)
         look = {"fc": "0.45", "ec": maps.SOFT, "hatch": "////"}
         maps.name_terrain(panel, "soft terrain, which no image shows", **look)
-    _draw_plan(panel, recording)
-    drive = drive_at(recording, recording.now)
+    moment.draw_plan(panel, recording, recording.now)
+    drive = moment.drive_at(recording, recording.now)
     maps.draw_drive(panel, drive, 2)
     panel.add_collection(maps.driven_colours(drive.track, recording.traversability, 2))
     panel.set_title(title)
@@ -151,30 +133,15 @@ def _draw_terrain(panel: Axes, recording: Recording, title: str) -> None:
 
 def _draw_predicted(panel: Axes, recording: Recording) -> None:
     """Draw the λ̂ that the planner had by that moment, and the path in black, since the map has the colours of λ."""
-    predicted, free = recording.given_at(recording.now)
-    maps.show_map(panel, predicted, recording.grid.extent_m, **maps.LAMBDA)
-    if not free.all():
-        maps.overlay(panel, ~free, recording.grid.extent_m, maps.CLOSED)
-        maps.name_terrain(panel, "not free", color=maps.CLOSED)
-    title = "λ̂ given to the planner"
-    if recording.about["model"] == NOT_USED:
-        title = "true E[λ]; the planner uses no map"
-    elif recording.known:
-        title = "λ̂ known by then"
-    elif (recording.about.get("sensor", "full"), recording.about.get("belief", "static")) != (
-        "full",
-        "static",
-    ):
-        title = "λ̂ at the start"  # what was learnt was not recorded
-    panel.set_title(title)
-    _draw_plan(panel, recording)
+    moment.show_known(panel, recording, recording.now)
+    moment.draw_plan(panel, recording, recording.now)
     words = "driven; above in the colour of the observed λ"
-    maps.draw_drive(panel, drive_at(recording, recording.now), label=words)
+    maps.draw_drive(panel, moment.drive_at(recording, recording.now), label=words)
+    panel.set_title(moment.known_in_words(recording))
 
 
-def _draw_field(panel: Axes, recording: Recording, field: np.ndarray) -> None:
+def _draw_field(panel: Axes, recording: Recording) -> None:
     """Draw the λ field, and the whole driven path over it."""
-    maps.show_map(panel, maps.field_colours(field, recording.immobilising), recording.grid.extent_m)
-    maps.draw_drive(panel, drive_at(recording, len(recording.traversability)))
-    maps.name_immobilising(panel, recording.immobilising)
+    moment.show_truth(panel, recording)
+    maps.draw_drive(panel, moment.drive_at(recording, len(recording.traversability)))
     panel.set_title("whole path, over the λ field")

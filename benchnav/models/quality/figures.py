@@ -31,7 +31,7 @@ from benchnav.models.slope_gp.table import SlopeTable, table_slopes
 from benchnav.viz.figure import Figure
 from benchnav.viz.maps import frame_map
 from benchnav.viz.panels import Curves, draw_baseline, line_looks, panel_grid, ticks_of
-from benchnav.viz.style import BLUE, ORANGE, SKY, TEXT, explain, page_width
+from benchnav.viz.style import BLUE, ORANGE, SKY, TEXT, legend_outside, page_width
 
 _SMALL = 5.5
 _MOST_NUMBERED = 16  # classes; among more, numbers would not fit their cells
@@ -123,7 +123,7 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Drawing:
         lower.set_ylabel("cells")
     figure.align_ylabels()
     figure.supxlabel("probability of the most likely class")
-    explain(figure)
+    legend_outside(figure, side="upper center")
     return figure
 
 
@@ -168,7 +168,7 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Drawing:
         ticks_of(panel, "y", 5)
     figure.supxlabel("PIT of observed λ")
     figure.supylabel("density")
-    explain(figure, 5)
+    legend_outside(figure, columns=5, side="upper center")
     return figure
 
 
@@ -212,7 +212,7 @@ def severity_figure(
             low, high = panel.get_ylim()
             panel.set_ylim(min(low, ideal - _NEAR), max(high, ideal + _NEAR))
         ticks_of(panel, "y")
-    explain(figure)
+    legend_outside(figure, side="upper center")
     return figure
 
 
@@ -269,7 +269,7 @@ def latent_figure(
         panel.set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
     figure.supxlabel(f"slope [°]  (σ: noise{', in brackets the true one' if truth else ''})")
     figure.supylabel("traversability")
-    explain(figure)
+    legend_outside(figure, side="upper center")
     return figure
 
 

@@ -2,16 +2,30 @@ import itertools
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
-from benchnav.eval.figures.distributions import draw_distributions
-from benchnav.eval.figures.outcomes import LOOKS, SUCCESS_COLOUR, draw_outcomes
-from benchnav.eval.figures.success import draw_success
+from benchnav.eval.figures.distributions import Distributions
+from benchnav.eval.figures.outcomes import LOOKS, SUCCESS_COLOUR, Outcomes
+from benchnav.eval.figures.success import Success
 from benchnav.planning.world.outcome import FAILURES
 from tests.eval.report import made
+
+
+def draw_success(summary: pd.DataFrame) -> Figure:
+    return Success().draw(made.run_data(summary))
+
+
+def draw_outcomes(summary: pd.DataFrame) -> Figure:
+    return Outcomes().draw(made.run_data(summary))
+
+
+def draw_distributions(rows: pd.DataFrame) -> Figure:
+    return Distributions().draw(made.run_data(made.summarised(rows), episodes=rows))
+
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}
 
@@ -237,7 +251,7 @@ def test_every_episode_is_a_dot_under_its_quantity_and_its_condition() -> None:
         ),
         (made.row(made.condition("b"), i, 50.0, traversability=0.9) for i in range(2)),
     )
-    figure = draw_distributions(made.summarised(rows), rows)
+    figure = draw_distributions(rows)
     times, met = figure.axes
     np.testing.assert_allclose(np.concatenate(dots(times)), [20, 30, 100, 50, 50])
     np.testing.assert_allclose(np.concatenate(dots(met)), [0, 0.1, 0.2, 0.9, 0.9], atol=1e-12)
@@ -258,12 +272,12 @@ def test_each_scenario_has_a_line_of_panels() -> None:
     rows = made.rows(
         made.row(made.condition(scenario=name), 0, 20.0 + n) for n, name in enumerate(("std", "hg"))
     )
-    figure = draw_distributions(made.summarised(rows), rows)
+    figure = draw_distributions(rows)
     assert [panel.get_title() for panel in figure.axes] == ["std", "std", "hg", "hg"]
     assert [medians(panel) for panel in figure.axes] == [[20], [0.8], [21], [0.8]]
 
 
 def test_an_episode_that_met_nothing_is_no_dot() -> None:
     rows = made.rows(made.row(made.condition(), 0, None, traversability=np.nan))
-    _, met = draw_distributions(made.summarised(rows), rows).axes
+    _, met = draw_distributions(rows).axes
     assert not sum(len(np.asarray(group.get_offsets())) for group in met.collections)

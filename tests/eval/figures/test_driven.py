@@ -8,10 +8,11 @@ import pandas as pd
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 
 from benchnav.core.errors import ConfigError
 from benchnav.eval.figures.data import Driven, RunData, read_driven
-from benchnav.eval.figures.driven import DrivenPaths, draw_driven
+from benchnav.eval.figures.driven import DrivenPaths
 from benchnav.eval.recording import GROUND, Ground, Recording
 from benchnav.viz.maps import IMMOBILISING, MARKS
 from benchnav.viz.style import planner_colours
@@ -51,6 +52,12 @@ def episodes(ended: dict[int, list[bool]]) -> pd.DataFrame:
 def track(place: int) -> np.ndarray:
     x = np.linspace(2, 20, 30)
     return np.stack((x, 3 + 0.3 * x + place), axis=1).astype(np.float32)
+
+
+def draw_driven(driven: Driven) -> Figure:
+    data = made.run_data()
+    vars(data).update(driven=driven)  # as read of the folder of a run
+    return DrivenPaths().draw(data)
 
 
 def drawn(figure: Any) -> tuple[Axes, dict[str, np.ndarray]]:

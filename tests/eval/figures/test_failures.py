@@ -4,9 +4,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
-from benchnav.eval.failures import FailedLine, choose_failures
-from benchnav.eval.figures.failures import draw_failures
+from benchnav.eval.failures import FailedLine, Sheets, choose_failures
+from benchnav.eval.figures.failures import Failures
 from tests.eval.report import made
 
 GENERATOR = np.random.default_rng(0)
@@ -35,6 +36,11 @@ def shown(rows: pd.DataFrame, **changes: Any) -> FailedLine:
         for x, y, outcome in rows[["x_m", "y_m", "outcome"]].to_numpy()
     ]
     return FailedLine(name="MPPI, mean", failures=rows, recordings=recordings, among=9)
+
+
+def draw_failures(lines: list[FailedLine]) -> Figure:
+    sheets = Sheets(shown=(("std", lines),), predicted={}, left_out="")
+    return Failures().draw(made.run_data(sheets=sheets))
 
 
 def test_each_outcome_is_shown_before_any_twice() -> None:

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchnav.eval.figures.over import draw_sweep, find_sweeps, sweep_name
+from benchnav.eval.figures.over import Over, find_sweeps, sweep_name
 from benchnav.viz.style import risk_name
 from tests.eval.report import made
 
@@ -100,8 +100,9 @@ def drawn(*conditions: tuple[dict[str, str], int], **changes: Any) -> Figure:
         "+".join(made.row(labels)["condition"].split("+")): values(labels, **changes)
         for labels, _ in conditions
     }
-    ((number, lines),) = find_sweeps(known).items()
-    return draw_sweep(number, lines, made.summarised(rows))
+    data = made.run_data(made.summarised(rows), about={"conditions": known})
+    (figure,) = Over().variants(data)
+    return figure.draw(data)
 
 
 def shown(figure: Figure) -> list[Axes]:

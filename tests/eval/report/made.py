@@ -10,6 +10,7 @@ import torch
 
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import LABELS
+from benchnav.eval.figures.data import RunData
 from benchnav.eval.recording import KnownMap, Recording, drawn_plan, reach_outline
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.summary import summarise
@@ -96,6 +97,13 @@ def summary(episodes: pd.DataFrame) -> pd.DataFrame:
     """What a report makes of rows."""
     table = summarised(episodes)
     return table.merge(against_best(episodes, table, privileged_models(conditions(episodes))), on="condition")
+
+
+def run_data(summary: pd.DataFrame | None = None, **more: Any) -> RunData:
+    """What figures are drawn from."""
+    nothing = pd.DataFrame()
+    given = {"about": {}, "summary": nothing if summary is None else summary, "episodes": nothing}
+    return RunData(**(given | more))
 
 
 def recording(

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from benchnav.eval.experiment.hypotheses import digest_of_tests
-from benchnav.eval.figures.forest import draw_forest
+from benchnav.eval.figures.forest import Forest
 from benchnav.eval.report.hypotheses import hypothesis_findings, hypothesis_table
 from benchnav.eval.report.write import write_report
 from tests.eval.report import made
@@ -91,7 +91,7 @@ def test_a_forest_has_a_panel_a_metric_with_points_intervals_and_margins() -> No
         a_test(supported=False, kind="superiority", direction="lower"),
         a_test(supported=False, kind="superiority", direction="higher"),
     ]
-    success, time = draw_forest(pd.DataFrame(rows)).axes
+    success, time = Forest().draw(made.run_data(tests=pd.DataFrame(rows))).axes
     assert [panel.get_xlabel() for panel in (success, time)] == ["Δ success [points]", "Δ T_total [s]"]
     points = [line for line in time.lines if line.get_marker() == "o"]
     assert [float(point.get_xdata()[0]) for point in points] == [0.1, 2.0, 0.1, 0.1]
@@ -111,7 +111,11 @@ def test_a_forest_has_a_panel_a_metric_with_points_intervals_and_margins() -> No
 
 def test_a_forest_is_drawn_where_no_episode_tells_anything() -> None:
     nothing = dict.fromkeys(("difference", "low", "high", "low_90", "high_90"), np.nan)
-    (panel,) = draw_forest(pd.DataFrame([a_test(kind="difference", margin=0.0, **nothing)])).axes
+    (panel,) = (
+        Forest()
+        .draw(made.run_data(tests=pd.DataFrame([a_test(kind="difference", margin=0.0, **nothing)])))
+        .axes
+    )
     assert np.isfinite(panel.get_xlim()).all()
 
 

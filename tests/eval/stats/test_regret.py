@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from matplotlib.colors import to_rgba
 
-from benchnav.eval.figures.regret import _ENDS, draw_regret
+from benchnav.eval.figures.regret import _ENDS, Regret
 from benchnav.eval.report.write import write_report
 from benchnav.eval.stats.regret import find_chains, split_regret
 from benchnav.viz.style import BLUE, ORANGE
@@ -161,7 +161,7 @@ def test_episodes_that_one_condition_lacks_are_left_out_of_all() -> None:
 
 
 def texts_of(table: pd.DataFrame) -> list[str]:
-    figure = draw_regret(table)
+    figure = Regret().draw(made.run_data(regret=table))
     return [text.get_text() for panel in figure.axes for text in (*panel.texts, *panel.get_yticklabels())]
 
 
@@ -182,7 +182,7 @@ def test_the_waterfall_says_each_step_with_sign_and_interval() -> None:
 def test_bars_are_orange_where_the_next_is_better_and_lines_are_their_intervals() -> None:
     """Less time is better, and more success."""
     table = split(episodes())
-    figure = draw_regret(table)
+    figure = Regret().draw(made.run_data(regret=table))
     for panel, (measure, factor) in zip(figure.axes, (("success", 100.0), ("time", 1.0)), strict=False):
         bars = [bar for bar in panel.patches if bar.get_facecolor()[:3] != to_rgba(_ENDS)[:3]]
         lines = [line for line in panel.lines if line.get_color() == "black"]
@@ -255,7 +255,7 @@ def test_the_lower_bound_stands_beside_the_reference_where_its_rows_have_one() -
     assert table["time_bound"].to_numpy() == pytest.approx(0.1 * (0.9 * 234 + 40 + limit_s))
     drawn = [
         line
-        for panel in draw_regret(table).axes
+        for panel in Regret().draw(made.run_data(regret=table)).axes
         for line in panel.get_lines()
         if line.get_linestyle() == "--"
     ]

@@ -14,17 +14,15 @@ import numpy as np
 import rerun as rr
 
 from benchnav.core.grid import outline
-from benchnav.eval.figures.knowledge import known_colours
+from benchnav.eval.figures.moment import known_colours, true_colours
 from benchnav.eval.recording import Recording, drawing_interval, thinned
 from benchnav.viz.maps import (
     MARKS,
     REACH,
     SOFT,
     STYLES,
-    field_colours,
     hatching,
     layer_colours,
-    predicted_colours,
     shades,
 )
 from benchnav.viz.style import bytes_of
@@ -91,7 +89,7 @@ def log_ground(stream: Any, recording: Recording) -> None:
         _log_image(stream, layer_entity(name), layer_colours(name, layer))
     _log_image(stream, "map/true_mean", shades(recording.true_mean))
     if recording.field is not None:
-        _log_image(stream, "map/field", field_colours(recording.field, recording.immobilising))
+        _log_image(stream, "map/field", true_colours(recording))
     if recording.soft.any():
         for name, lines in (("outline", outline), ("hatching", hatching)):
             flat = _on_map(recording, lines(recording.soft, grid.resolution_m))
@@ -117,12 +115,11 @@ def _log_predicted(stream: Any, driver: Driver) -> None:
     """Logs the λ̂ that a planner was given, and the edge of ground that is not free; and what it learnt on its way."""
     recording = driver.recording
     if not recording.known:
-        colours = predicted_colours(recording.predicted, recording.free)
-        _log_image(stream, driver.entity("map/risk"), colours)
+        _log_image(stream, driver.entity("map/risk"), known_colours(recording, 0)["risk"])
         _log_closed(stream, driver, recording.free)
     for known in recording.known:
         stream.set_time(TIMELINE, duration=known.step * recording.dt_s)
-        for name, colours in known_colours(known).items():
+        for name, colours in known_colours(recording, known.step).items():
             _log_image(stream, driver.entity(f"map/{name}"), colours, static=False)
         _log_closed(stream, driver, known.free, static=False)
         look = driver.colour if driver.name else bytes_of(REACH)

@@ -23,7 +23,6 @@ from benchnav.viz.style import (
     MARKERS,
     TITLE,
     TWO_COLUMNS_IN,
-    explain,
     legend_outside,
     page_width,
 )
@@ -107,7 +106,7 @@ def calibration_figure(tallies: Tallies, looks: Looks) -> Drawing:
                 panel.plot(levels, excess, label=model, markevery=_MARKED_EVERY, **look)
     figure.supxlabel("level of the quantile")
     figure.supylabel("fraction of λ below\nthe quantile − level", fontsize=TITLE)
-    explain(figure, 5)
+    legend_outside(figure, columns=5, side="upper center")
     return figure
 
 
@@ -129,7 +128,7 @@ def sparsification_figure(tallies: Tallies, looks: Looks) -> Drawing:
     figure.supxlabel("fraction of cells left out, those of the widest intervals first")
     figure.supylabel("mean |E[λ] − λ| of the rest", fontsize=TITLE)
     best = Line2D([], [], color="0.4", lw=0.8, ls=":", label="largest errors first, the best order")
-    explain(figure, 5, [best])
+    legend_outside(figure, [best], 5, side="upper center")
     return figure
 
 
@@ -168,7 +167,7 @@ def severity_figure(
     figure, panels = curves.draw()
     for panel in panels.values():
         ticks_of(panel, "y", 5)
-    explain(figure, 5)
+    legend_outside(figure, columns=5, side="upper center")
     return figure
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchnav.core.grid import outline
-from benchnav.eval.figures.knowledge import known_colours
+from benchnav.eval.figures.moment import known_colours
 from benchnav.eval.recording import MOST_POINTS, DrawnPlan, Recording, thinned
 from benchnav.eval.report.playback.viewer_file import arrange, describe, drivers_of, map_views, write_rerun
 from benchnav.viz.maps import IMMOBILISING, field_colours, hatching, layer_colours
@@ -347,7 +347,7 @@ def test_what_was_known_is_shown_from_the_time_it_was(tmp_path: Path) -> None:
         times, shown = images(path, f"/map/{name}")
         np.testing.assert_allclose(times, [0, 0.5, 1.0, 1.5, 2.0], atol=1e-6)
         for known, colours in zip(recording.known, shown, strict=True):
-            np.testing.assert_array_equal(colours, known_colours(known)[name])
+            np.testing.assert_array_equal(colours, known_colours(recording, known.step)[name])
     times, strips = column(path, "/map/closed", "strips")
     np.testing.assert_allclose(times, [0, 0.5, 1.0, 1.5, 2.0], atol=1e-6)
     for known, lines in zip(recording.known, strips, strict=True):
