@@ -180,14 +180,17 @@ class Results:
 
 
 class Plots:
-    """Figures of a run, by the names of their files with `_` for `-`; called with a figure, it draws that one."""
+    """Figures of a run, by the names of their files with `_` for `-`; called with a figure, it draws that one.
+
+    A figure with several variants, such as `over`, is drawn in all of them, as a list.
+    """
 
     def __init__(self, results: Results) -> None:
         """Draw from results."""
         self._results = results
 
-    def __call__(self, figure: Figure) -> Drawing:
-        """Draw a figure of your own; of one with several variants the first.
+    def __call__(self, figure: Figure) -> Drawing | list[Drawing]:
+        """Draw a figure of your own; return a list if it has several variants.
 
         Raises:
             ConfigError: If the run lacks what the figure needs.
@@ -197,7 +200,7 @@ class Plots:
             raise ConfigError(
                 f"Expected a run with what figure {figure.name!r} needs, got {self._results.folder}."
             )
-        return variants[0](self._results._report)
+        return self._draw_all(variants)
 
     def __dir__(self) -> list[str]:
         """List the figures of the run."""
@@ -213,11 +216,19 @@ class Plots:
             raise AttributeError(name)
         return partial(self._draw, name)
 
-    def _draw(self, name: str) -> Drawing:
+    def _draw(self, name: str) -> Drawing | list[Drawing]:
+        """Draw the figure of a name, or all variants of a figure of that name."""
         known = self._figures
-        if name not in known:
+        named = [
+            figure for own, figure in known.items() if name in (own, type(figure).name.replace("-", "_"))
+        ]
+        if not named:
             raise ConfigError(f"Expected a figure among {', '.join(known)}, got {name!r}.{hint(name, known)}")
-        return known[name](self._results._report)
+        return self._draw_all(named)
+
+    def _draw_all(self, figures: Sequence[Figure]) -> Drawing | list[Drawing]:
+        drawn = [figure(self._results._report) for figure in figures]
+        return drawn[0] if len(drawn) == 1 else drawn
 
 
 def open_results(folder: str | Path) -> Results:

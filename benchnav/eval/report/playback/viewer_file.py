@@ -20,7 +20,7 @@ from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.checksums import is_as_noted, note_checksums
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.playback.scene import TIMELINE, Driver, layer_entity, log_driver, log_ground
+from benchnav.eval.report.playback.scene import TIMELINE, Driver, Stage, layer_entity, log_driver, log_terrain
 from benchnav.eval.words import NAMING, contender_names, reading_name
 from benchnav.viz.maps import MAX_SPREAD, layer_scale
 from benchnav.viz.style import bytes_of, condition_colours
@@ -66,7 +66,7 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
         try:
             stream.send_recording_name(_title(drivers))
             stream.log("about", rr.TextDocument(describe(drivers), media_type="text/markdown"), static=True)
-            log_ground(stream, recordings[0])
+            log_terrain(Stage(stream=stream, recording=recordings[0]))
             for driver in drivers:
                 log_driver(stream, driver)
             stream.flush()
