@@ -63,3 +63,8 @@ class Figure(Specified, ABC):
 
         with styled():
             return self.draw(data)
+
+
+def applicable(figures: Sequence[Figure], data: Any) -> list[Figure]:
+    """List the figures whose needs the data meet, in all their variants."""
+    return [variant for figure in figures for variant in figure.variants(data)]

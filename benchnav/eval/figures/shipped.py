@@ -14,7 +14,7 @@ from benchnav.eval.figures.over import Over
 from benchnav.eval.figures.regret import Regret
 from benchnav.eval.figures.success import Success
 from benchnav.eval.figures.trajectories import Trajectories
-from benchnav.viz.figure import Figure
+from benchnav.viz.figure import Figure, applicable
 
 SHIPPED: tuple[type[Figure], ...] = (
     *(Forest, Success, Regret, DrivenPaths, Over, Outcomes, Distributions),
@@ -33,4 +33,4 @@ def figures_of(data: RunData, more: Sequence[Figure] = ()) -> list[Figure]:
         Those whose needs are met.
     """
     figures = [cls() for cls in SHIPPED] + [figure for figure in more if type(figure) not in SHIPPED]
-    return [variant for figure in figures for variant in figure.variants(data)]
+    return applicable(figures, data)

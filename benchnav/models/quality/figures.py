@@ -4,7 +4,7 @@ They are as wide as the two columns of a page, or narrower where panels are few.
 beside their colour. A figure has a panel a split, in the order given. Letters in shapes: C classes, G nodes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
@@ -18,17 +18,16 @@ from matplotlib.ticker import PercentFormatter
 from scipy.stats import binom
 
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.latent import expected_of
 from benchnav.datagen.recipe.latent import truth as true_distribution
 from benchnav.datagen.recipe.scenario import find_series
 from benchnav.models.base import TraversabilityModel
 from benchnav.models.quality.map_sheet import MapSheet, map_sheet_figure, read_sheet, shared_scales
-from benchnav.models.quality.measure import ClassQuality, Quality, TraversabilityQuality
+from benchnav.models.quality.measure import ClassQuality, Quality
 from benchnav.models.quality.report import numbers
 from benchnav.models.quality.scores import CONFIDENCE_BINS, LEVEL, PIT_BINS
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
-from benchnav.viz.figure import Figure
+from benchnav.viz.figure import Figure, applicable
 from benchnav.viz.maps import frame_map
 from benchnav.viz.panels import Curves, draw_baseline, line_looks, panel_grid, ticks_of
 from benchnav.viz.style import BLUE, ORANGE, SKY, TEXT, legend_outside, page_width
@@ -52,225 +51,6 @@ _SEVERITY = (
 )
 _IDEALS = {"coverage": 0.9, "tail_rate": 0.1}  # that are not an end
 _OF_CLASSES = 4  # the first so many
-
-
-def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]) -> Drawing:
-    """Draws which classes are taken for which: shares of each true class, in percent.
-
-    Args:
-        qualities: by split.
-        names: of the C classes.
-    """
-    most = 3 if len(qualities) > 2 else 2
-    shown = [(f"{split}: accuracy {quality.accuracy:.3f}", quality) for split, quality in qualities.items()]
-    ragged = len(shown) > most and len(shown) % most  # panels that end above hold the names of columns too
-    high = 2.2 if most == 3 else 3.1
-    titles, rest = [title for title, _ in shown], 1.25 if ragged else 0.7
-    figure, panels = panel_grid(
-        titles, most, high, rest, page_width(len(shown), most), sharex=True, sharey=True
-    )
-    labels = [name.replace("_", " ") for name in names]
-    palette = matplotlib.colormaps["Blues"].with_extremes(bad="0.85")
-    for (panel,), (_, quality) in zip(panels, shown, strict=True):
-        counts = np.array(quality.confusion, dtype=np.float64)
-        with np.errstate(invalid="ignore"):
-            shares = 100 * counts / counts.sum(1, keepdims=True)
-        image = panel.imshow(shares, cmap=palette, vmin=0, vmax=100)
-        for row, column in np.argwhere(shares >= 0.5) if len(names) <= _MOST_NUMBERED else ():
-            share = shares[row, column]
-            colour = "white" if share > 55 else "black"
-            panel.text(column, row, f"{share:.0f}", size=_SMALL, color=colour, ha="center", va="center")
-        panel.set_xticks(range(len(names)), labels, rotation=90, parse_math=False)
-        panel.set_yticks(range(len(names)), labels, parse_math=False)
-        frame_map(panel)
-    figure.supxlabel("most likely class")
-    figure.supylabel("true class")
-    # Beside the upper right panel, and as high as its square, which is less than the room that it is given.
-    beside = panels[min(len(panels), most) - 1][0].inset_axes((1.04, 0, 0.05, 1))
-    figure.colorbar(image, cax=beside, label="fraction of the true class [%]")
-    return figure
-
-
-def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Drawing:
-    """Draws how often the most likely class is right against its probability, over how many cells say so.
-
-    Args:
-        qualities: by split.
-    """
-    titles = [f"{split}: ECE {quality.ece:.3f}" for split, quality in qualities.items()]
-    heights, width = [3, 1] * -(-len(titles) // 3), page_width(len(titles), 3)
-    figure, pairs = panel_grid(titles, 3, 2.6, 0.35, width, 2, sharex=True, height_ratios=heights)
-    edges = np.linspace(0, 1, CONFIDENCE_BINS + 1)
-    for (upper, lower), quality in zip(pairs, qualities.values(), strict=True):
-        cells, confidence, accuracy = map(np.array, quality.reliability.values())
-        share, filled = cells / cells.sum(), cells > 0
-        often = share >= _RARE
-        few = filled & ~often
-        upper.plot([0, 1], [0, 1], color="0.5", lw=0.8, ls="--", label="calibrated")
-        points: dict[str, Any] = {"color": BLUE, "ms": 3, "lw": 1, "clip_on": False}
-        upper.plot(confidence[often], accuracy[often], "o-", **points, label="observed")
-        if few.any():  # no point at all would ask for all the room there is
-            words = "observed, under 0.1 % of cells"
-            upper.plot(confidence[few], accuracy[few], "o", mfc="white", **points, label=words)
-        gap = (confidence[filled], confidence[filled], accuracy[filled])
-        upper.vlines(*gap, color=ORANGE, lw=2, alpha=0.45, zorder=1.5, label="gap")
-        upper.set(xlim=(0, 1), ylim=(0, 1), yticks=[0, 0.5, 1])
-        lower.bar(edges[:-1], share, 1 / CONFIDENCE_BINS, align="edge", color=SKY, ec="white", lw=0.4)
-        lower.set(ylim=(0, 1), yticks=[0, 1])
-        lower.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-    for upper, lower in pairs[::3]:
-        upper.set_ylabel("accuracy")
-        lower.set_ylabel("cells")
-    figure.align_ylabels()
-    figure.supxlabel("probability of the most likely class")
-    legend_outside(figure, side="upper center")
-    return figure
-
-
-def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Drawing:
-    """Draws the histogram of the PIT of λ as it departs from 1, its height for a calibrated model.
-
-    Each panel has a scale of its own, since one bad split would flatten all others. The band holds 90 % of
-    the bins of as many independent, rightly predicted cells.
-
-    Args:
-        qualities: by split.
-    """
-    rest, width = 0.45 if len(qualities) > 2 else 0.65, page_width(len(qualities), 3)
-    figure, panels = panel_grid(list(qualities), 3, 1.75, rest, width, sharex=True)
-    edges = np.linspace(0, 1, PIT_BINS + 1)
-    tail = round((1 - LEVEL) * PIT_BINS)
-    for (panel,), quality in zip(panels, qualities.values(), strict=True):
-        counts = np.array(quality.pit)
-        level = counts.sum() / PIT_BINS
-        density = counts / level
-        low, high = np.array(binom.interval(0.9, counts.sum(), 1 / PIT_BINS)) / level
-        for first, last, colour, label in (
-            (0, tail, ORANGE, "observed, under VaR at 0.9"),
-            (tail, PIT_BINS, SKY, "observed"),
-        ):
-            heights, ends = density[first:last], edges[first : last + 1]
-            panel.stairs(heights, ends, baseline=1, fill=True, color=colour, alpha=0.75, lw=0, label=label)
-            panel.stairs(heights, ends, baseline=None, color=colour, lw=1)
-        panel.axhline(1, color="black", lw=0.7, label="calibrated")
-        words = "90 % of a calibrated model's bins"
-        panel.fill_between([0, 1], low, high, color=_BAND, lw=0, zorder=0.5, label=words)
-        for bound in (0.05, 0.95):
-            panel.axvline(bound, color="black", lw=0.7, ls=":", label="central 90 %")
-        panel.text(
-            0.5, 0.97,
-            f"in 5–95 %: {quality.coverage:.3f} (ideally 0.9)\nunder VaR: {quality.tail_rate:.3f} (ideally 0.1)",
-            size=TEXT, ha="center", va="top", transform=panel.transAxes, linespacing=1.3,
-        )  # fmt: skip
-        lowest, highest = min(0.95, *density), max(1.05, *density)
-        room = highest - lowest
-        panel.set(xlim=(0, 1), ylim=(lowest - 0.1 * room, highest + 0.5 * room), xticks=[0, 0.5, 1])
-        ticks_of(panel, "y", 5)
-    figure.supxlabel("PIT of observed λ")
-    figure.supylabel("density")
-    legend_outside(figure, columns=5, side="upper center")
-    return figure
-
-
-def severity_figure(
-    all_series: Mapping[str, Sequence[tuple[float, str]]], numbers: Mapping[str, Mapping[str, float]]
-) -> Drawing:
-    """Draws quality against the severity of a shift, a line a scenario.
-
-    Args:
-        all_series: by scenario, its pairs as (severity, split), ascending.
-        numbers: of the quality of all these splits, by name.
-    """
-    table = pd.DataFrame(
-        {"scenario": scenario, "severity": severity, **numbers[split]}
-        for scenario, series in all_series.items()
-        for severity, split in series
-    )
-    measured = table.dropna(axis=1)
-    quantities = _SEVERITY if "accuracy" in measured else _SEVERITY[_OF_CLASSES:]
-    table = table.assign(panel="").rename(columns={"severity": "x", "scenario": "line"})
-    looks = line_looks(list(all_series))
-    measures = {name: title for title, name in quantities}
-    curves = Curves(
-        table=table,
-        measures=measures,
-        looks=looks,
-        x_label="severity of the shift",
-        as_titles=True,
-        width_in=page_width(len(quantities), 4),
-    )
-    figure, panels = curves.draw()
-    for (_, name), panel in panels.items():
-        if name == "entropy_auroc" and "mutual_information" in measured:
-            for scenario, own in table.groupby("line", sort=False):
-                look = {**looks[str(scenario)], "ls": ":", "mfc": "white"}
-                words = "of mutual information; solid: of entropy"
-                panel.plot(own["x"], own["mutual_information_auroc"], label=words, **look)
-        panel.margins(x=0.05, y=0.12)
-        if ideal := _IDEALS.get(name):
-            draw_baseline(panel, ideal, "calibrated")
-            low, high = panel.get_ylim()
-            panel.set_ylim(min(low, ideal - _NEAR), max(high, ideal + _NEAR))
-        ticks_of(panel, "y")
-    legend_outside(figure, side="upper center")
-    return figure
-
-
-def latent_figure(
-    table: SlopeTable,
-    classes: Sequence[TerrainClass],
-    slope_cells: Sequence[Sequence[int]],
-    truth: bool = True,
-) -> Drawing:
-    """Draws each class's GP over slope with its uncertainty, beside the true latent function and E[λ].
-
-    Args:
-        table: the GPs of the C classes.
-        classes: the true functions, where these are known.
-        slope_cells: measured cells by true class and whole degree of slope, [C][90].
-        truth: whether they are.
-    """
-    titles = [item.name.replace("_", " ") for item in classes]
-    rest, width = 0.5 if len(titles) > 4 else 1.0, page_width(len(titles), 5)
-    figure, panels = panel_grid(titles, 5, 1.55, rest, width, sharex=True, sharey=True)
-    x = table_slopes().numpy()
-    x = x[x <= max(10.0, 1.15 * max(_steeper_than(cells, 0) for cells in slope_cells))]
-    class_id, slopes = np.broadcast_arrays(np.arange(len(classes))[:, None, None], x)
-    mixture = table.own(torch.tensor(class_id), torch.tensor(slopes))
-    weights, means, stds = (v.numpy() for v in (mixture.weights, mixture.means, mixture.stds))
-    true = true_distribution(class_id, slopes, tuple(classes))
-    expected, true_expected = expected_of((weights, means, stds)), expected_of(true)
-    noise = table.noise_std.double().cpu().numpy()
-    for number, ((panel,), item) in enumerate(zip(panels, classes, strict=True)):
-        mean, std = means[number, 0, 0], stds[number, 0, 0]
-        latent = np.sqrt(np.maximum(std**2 - noise[number] ** 2, 0))
-        panel.plot(x, mean, color=BLUE, lw=1.1, label="GP mean")
-        panel.plot(x, expected[number, 0], color=ORANGE, lw=1.1, label="predicted E[λ]")
-        for spread, colour, alpha, label in (
-            (std, SKY, 0.3, "± 2σ with noise"),
-            (latent, BLUE, 0.45, "± 2σ of the latent function"),
-        ):
-            low, high = mean - 2 * spread, mean + 2 * spread
-            panel.fill_between(x, low, high, color=colour, alpha=alpha, lw=0, label=label)
-        words = f"σ {noise[number]:.3f}"
-        if truth:
-            panel.plot(x, true[1][number, 0, 0], color="black", lw=0.9, ls="--", label="true latent function")
-            panel.plot(x, true_expected[number, 0], color="black", lw=1, ls=":", label="true E[λ]")
-            words += f" ({item.noise:.3f})"
-        if weights[number, 0, 0, 0] < 1:
-            panel.axhline(means[number, 1, 0, 0], color=BLUE, lw=0.9, ls="-.", label="mean of soft spots")
-        for share, shade, label in (
-            (_RARE, 0.12, "steeper: 1 cell in 1000"),
-            (0.0, 0.25, "steeper: no cell of the class"),
-        ):
-            steeper = _steeper_than(slope_cells[number], share)
-            panel.axvspan(steeper, 90, color="0.4", alpha=shade, lw=0, label=label)
-        panel.text(0.05, 0.05, words, size=TEXT, transform=panel.transAxes)
-        panel.set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
-    figure.supxlabel(f"slope [°]  (σ: noise{', in brackets the true one' if truth else ''})")
-    figure.supylabel("traversability")
-    legend_outside(figure, side="upper center")
-    return figure
 
 
 def _steeper_than(cells: Sequence[int], share: float) -> float:
@@ -329,6 +109,12 @@ class QualityData:
         return lines
 
 
+def series_table(splits: Iterable[str]) -> pd.DataFrame:
+    """Tabulate the series of shifts among splits, a row a `split` with its `scenario` and `severity`."""
+    rows = [(scenario, *pair) for scenario, pairs in find_series(splits).items() for pair in pairs]
+    return pd.DataFrame(rows, columns=["scenario", "severity", "split"])
+
+
 class Confusion(Figure):
     """Which classes are taken for which."""
 
@@ -345,7 +131,39 @@ class Confusion(Figure):
 
     def draw(self, data: QualityData) -> Drawing:
         """Draw a panel a split."""
-        return confusion_figure(data.by_class, [item.name for item in data.dataset.recipe.classes])
+        names = [item.name for item in data.dataset.recipe.classes]
+        most = 3 if len(data.by_class) > 2 else 2
+        shown = [
+            (f"{split}: accuracy {quality.accuracy:.3f}", quality) for split, quality in data.by_class.items()
+        ]
+        ragged = (
+            len(shown) > most and len(shown) % most
+        )  # panels that end above hold the names of columns too
+        high = 2.2 if most == 3 else 3.1
+        titles, rest = [title for title, _ in shown], 1.25 if ragged else 0.7
+        figure, panels = panel_grid(
+            titles, most, high, rest, page_width(len(shown), most), sharex=True, sharey=True
+        )
+        labels = [name.replace("_", " ") for name in names]
+        palette = matplotlib.colormaps["Blues"].with_extremes(bad="0.85")
+        for (panel,), (_, quality) in zip(panels, shown, strict=True):
+            counts = np.array(quality.confusion, dtype=np.float64)
+            with np.errstate(invalid="ignore"):
+                shares = 100 * counts / counts.sum(1, keepdims=True)
+            image = panel.imshow(shares, cmap=palette, vmin=0, vmax=100)
+            for row, column in np.argwhere(shares >= 0.5) if len(names) <= _MOST_NUMBERED else ():
+                share = shares[row, column]
+                colour = "white" if share > 55 else "black"
+                panel.text(column, row, f"{share:.0f}", size=_SMALL, color=colour, ha="center", va="center")
+            panel.set_xticks(range(len(names)), labels, rotation=90, parse_math=False)
+            panel.set_yticks(range(len(names)), labels, parse_math=False)
+            frame_map(panel)
+        figure.supxlabel("most likely class")
+        figure.supylabel("true class")
+        # Beside the upper right panel, and as high as its square, which is less than the room that it is given.
+        beside = panels[min(len(panels), most) - 1][0].inset_axes((1.04, 0, 0.05, 1))
+        figure.colorbar(image, cax=beside, label="fraction of the true class [%]")
+        return figure
 
 
 class Reliability(Figure):
@@ -360,7 +178,34 @@ class Reliability(Figure):
 
     def draw(self, data: QualityData) -> Drawing:
         """Draw a panel a split."""
-        return reliability_figure(data.by_class)
+        titles = [f"{split}: ECE {quality.ece:.3f}" for split, quality in data.by_class.items()]
+        heights, width = [3, 1] * -(-len(titles) // 3), page_width(len(titles), 3)
+        figure, pairs = panel_grid(titles, 3, 2.6, 0.35, width, 2, sharex=True, height_ratios=heights)
+        edges = np.linspace(0, 1, CONFIDENCE_BINS + 1)
+        for (upper, lower), quality in zip(pairs, data.by_class.values(), strict=True):
+            cells, confidence, accuracy = map(np.array, quality.reliability.values())
+            share, filled = cells / cells.sum(), cells > 0
+            often = share >= _RARE
+            few = filled & ~often
+            upper.plot([0, 1], [0, 1], color="0.5", lw=0.8, ls="--", label="calibrated")
+            points: dict[str, Any] = {"color": BLUE, "ms": 3, "lw": 1, "clip_on": False}
+            upper.plot(confidence[often], accuracy[often], "o-", **points, label="observed")
+            if few.any():  # no point at all would ask for all the room there is
+                words = "observed, under 0.1 % of cells"
+                upper.plot(confidence[few], accuracy[few], "o", mfc="white", **points, label=words)
+            gap = (confidence[filled], confidence[filled], accuracy[filled])
+            upper.vlines(*gap, color=ORANGE, lw=2, alpha=0.45, zorder=1.5, label="gap")
+            upper.set(xlim=(0, 1), ylim=(0, 1), yticks=[0, 0.5, 1])
+            lower.bar(edges[:-1], share, 1 / CONFIDENCE_BINS, align="edge", color=SKY, ec="white", lw=0.4)
+            lower.set(ylim=(0, 1), yticks=[0, 1])
+            lower.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+        for upper, lower in pairs[::3]:
+            upper.set_ylabel("accuracy")
+            lower.set_ylabel("cells")
+        figure.align_ylabels()
+        figure.supxlabel("probability of the most likely class")
+        legend_outside(figure, side="upper center")
+        return figure
 
 
 class PIT(Figure):
@@ -375,7 +220,43 @@ class PIT(Figure):
 
     def draw(self, data: QualityData) -> Drawing:
         """Draw a panel a split."""
-        return pit_figure({split: quality.traversability for split, quality in data.qualities.items()})
+        qualities = {split: quality.traversability for split, quality in data.qualities.items()}
+        rest, width = 0.45 if len(qualities) > 2 else 0.65, page_width(len(qualities), 3)
+        figure, panels = panel_grid(list(qualities), 3, 1.75, rest, width, sharex=True)
+        edges = np.linspace(0, 1, PIT_BINS + 1)
+        tail = round((1 - LEVEL) * PIT_BINS)
+        for (panel,), quality in zip(panels, qualities.values(), strict=True):
+            counts = np.array(quality.pit)
+            level = counts.sum() / PIT_BINS
+            density = counts / level
+            low, high = np.array(binom.interval(0.9, counts.sum(), 1 / PIT_BINS)) / level
+            for first, last, colour, label in (
+                (0, tail, ORANGE, "observed, under VaR at 0.9"),
+                (tail, PIT_BINS, SKY, "observed"),
+            ):
+                heights, ends = density[first:last], edges[first : last + 1]
+                panel.stairs(
+                    heights, ends, baseline=1, fill=True, color=colour, alpha=0.75, lw=0, label=label
+                )
+                panel.stairs(heights, ends, baseline=None, color=colour, lw=1)
+            panel.axhline(1, color="black", lw=0.7, label="calibrated")
+            words = "90 % of a calibrated model's bins"
+            panel.fill_between([0, 1], low, high, color=_BAND, lw=0, zorder=0.5, label=words)
+            for bound in (0.05, 0.95):
+                panel.axvline(bound, color="black", lw=0.7, ls=":", label="central 90 %")
+            panel.text(
+                0.5, 0.97,
+                f"in 5–95 %: {quality.coverage:.3f} (ideally 0.9)\nunder VaR: {quality.tail_rate:.3f} (ideally 0.1)",
+                size=TEXT, ha="center", va="top", transform=panel.transAxes, linespacing=1.3,
+            )  # fmt: skip
+            lowest, highest = min(0.95, *density), max(1.05, *density)
+            room = highest - lowest
+            panel.set(xlim=(0, 1), ylim=(lowest - 0.1 * room, highest + 0.5 * room), xticks=[0, 0.5, 1])
+            ticks_of(panel, "y", 5)
+        figure.supxlabel("PIT of observed λ")
+        figure.supylabel("density")
+        legend_outside(figure, columns=5, side="upper center")
+        return figure
 
 
 class Severity(Figure):
@@ -390,8 +271,36 @@ class Severity(Figure):
 
     def draw(self, data: QualityData) -> Drawing:
         """Draw a panel a measure."""
-        values = {split: numbers(quality) for split, quality in data.qualities.items()}
-        return severity_figure(find_series(data.qualities), values)
+        values = pd.DataFrame({"split": split, **numbers(own)} for split, own in data.qualities.items())
+        table = series_table(data.qualities).merge(values, on="split")
+        measured = table.dropna(axis=1)
+        quantities = _SEVERITY if "accuracy" in measured else _SEVERITY[_OF_CLASSES:]
+        table = table.assign(panel="").rename(columns={"severity": "x", "scenario": "line"})
+        looks = line_looks(table["line"].tolist())
+        measures = {name: title for title, name in quantities}
+        curves = Curves(
+            table=table,
+            measures=measures,
+            looks=looks,
+            x_label="severity of the shift",
+            as_titles=True,
+            width_in=page_width(len(quantities), 4),
+        )
+        figure, panels = curves.draw()
+        for (_, name), panel in panels.items():
+            if name == "entropy_auroc" and "mutual_information" in measured:
+                for scenario, own in table.groupby("line", sort=False):
+                    look = {**looks[str(scenario)], "ls": ":", "mfc": "white"}
+                    words = "of mutual information; solid: of entropy"
+                    panel.plot(own["x"], own["mutual_information_auroc"], label=words, **look)
+            panel.margins(x=0.05, y=0.12)
+            if ideal := _IDEALS.get(name):
+                draw_baseline(panel, ideal, "calibrated")
+                low, high = panel.get_ylim()
+                panel.set_ylim(min(low, ideal - _NEAR), max(high, ideal + _NEAR))
+            ticks_of(panel, "y")
+        legend_outside(figure, side="upper center")
+        return figure
 
 
 class Latent(Figure):
@@ -412,7 +321,50 @@ class Latent(Figure):
         assert data.table is not None
         cells = np.sum([quality.slope_cells for quality in data.by_class.values()], 0)
         known = all(data.dataset.truth_of(split) == "generated" for split in data.qualities)
-        return latent_figure(data.table, data.dataset.recipe.classes, cells.tolist(), known)
+        classes = data.dataset.recipe.classes
+        titles = [item.name.replace("_", " ") for item in classes]
+        rest, width = 0.5 if len(titles) > 4 else 1.0, page_width(len(titles), 5)
+        figure, panels = panel_grid(titles, 5, 1.55, rest, width, sharex=True, sharey=True)
+        x = table_slopes().numpy()
+        x = x[x <= max(10.0, 1.15 * max(_steeper_than(cells, 0) for cells in cells))]
+        class_id, slopes = np.broadcast_arrays(np.arange(len(classes))[:, None, None], x)
+        mixture = data.table.own(torch.tensor(class_id), torch.tensor(slopes))
+        weights, means, stds = (v.numpy() for v in (mixture.weights, mixture.means, mixture.stds))
+        true = true_distribution(class_id, slopes, tuple(classes))
+        expected, true_expected = expected_of((weights, means, stds)), expected_of(true)
+        noise = data.table.noise_std.double().cpu().numpy()
+        for number, ((panel,), item) in enumerate(zip(panels, classes, strict=True)):
+            mean, std = means[number, 0, 0], stds[number, 0, 0]
+            latent = np.sqrt(np.maximum(std**2 - noise[number] ** 2, 0))
+            panel.plot(x, mean, color=BLUE, lw=1.1, label="GP mean")
+            panel.plot(x, expected[number, 0], color=ORANGE, lw=1.1, label="predicted E[λ]")
+            for spread, colour, alpha, label in (
+                (std, SKY, 0.3, "± 2σ with noise"),
+                (latent, BLUE, 0.45, "± 2σ of the latent function"),
+            ):
+                low, high = mean - 2 * spread, mean + 2 * spread
+                panel.fill_between(x, low, high, color=colour, alpha=alpha, lw=0, label=label)
+            words = f"σ {noise[number]:.3f}"
+            if known:
+                panel.plot(
+                    x, true[1][number, 0, 0], color="black", lw=0.9, ls="--", label="true latent function"
+                )
+                panel.plot(x, true_expected[number, 0], color="black", lw=1, ls=":", label="true E[λ]")
+                words += f" ({item.noise:.3f})"
+            if weights[number, 0, 0, 0] < 1:
+                panel.axhline(means[number, 1, 0, 0], color=BLUE, lw=0.9, ls="-.", label="mean of soft spots")
+            for share, shade, label in (
+                (_RARE, 0.12, "steeper: 1 cell in 1000"),
+                (0.0, 0.25, "steeper: no cell of the class"),
+            ):
+                steeper = _steeper_than(cells[number], share)
+                panel.axvspan(steeper, 90, color="0.4", alpha=shade, lw=0, label=label)
+            panel.text(0.05, 0.05, words, size=TEXT, transform=panel.transAxes)
+            panel.set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
+        figure.supxlabel(f"slope [°]  (σ: noise{', in brackets the true one' if known else ''})")
+        figure.supylabel("traversability")
+        legend_outside(figure, side="upper center")
+        return figure
 
 
 class MapSheets(Figure):
@@ -444,5 +396,4 @@ class MapSheets(Figure):
 
 def quality_figures(data: QualityData) -> list[Figure]:
     """List the figures of a model's quality that apply."""
-    figures: tuple[Figure, ...] = (Confusion(), Reliability(), PIT(), Severity(), Latent(), MapSheets())
-    return [variant for figure in figures for variant in figure.variants(data)]
+    return applicable((Confusion(), Reliability(), PIT(), Severity(), Latent(), MapSheets()), data)

@@ -1,4 +1,7 @@
+from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,16 +16,10 @@ from benchnav.datagen.recipe.classes import SoftSpots
 from benchnav.datagen.recipe.latent import expected_traversability
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models.predictor import Oracle
-from benchnav.models.quality.figures import (
-    confusion_figure,
-    latent_figure,
-    pit_figure,
-    reliability_figure,
-    severity_figure,
-)
+from benchnav.models.quality.figures import PIT, Confusion, Latent, Reliability, Severity
 from benchnav.models.quality.measure import Quality, evaluate
-from benchnav.models.quality.report import numbers
 from benchnav.models.slope_gp.table import SoftModes
+from benchnav.viz.figure import Figure as BenchnavFigure
 from tests.models.stub import ColourModel, true_table
 
 Qualities = dict[str, Quality]
@@ -31,6 +28,19 @@ Qualities = dict[str, Quality]
 @pytest.fixture(scope="module")
 def qualities(dataset: TerrainDataset) -> Qualities:
     return dict(evaluate(ColourModel(), dataset, ["test/std", "test/hs", "valid", "train"]))
+
+
+def draw(figure: BenchnavFigure, by_class: dict[str, Any] | None = None, **data: Any) -> Figure:
+    """Draw a figure from what it needs of `QualityData`."""
+    classes = [SimpleNamespace(name=name) for name in ColourModel().class_names]
+    dataset = SimpleNamespace(recipe=SimpleNamespace(classes=classes), truth_of=lambda split: "generated")
+    return figure.draw(SimpleNamespace(**{"by_class": by_class, "dataset": dataset, **data}))
+
+
+def latent_figure(table: Any, classes: Sequence[Any], cells: Any) -> Figure:
+    dataset = SimpleNamespace(recipe=SimpleNamespace(classes=classes), truth_of=lambda split: "generated")
+    measured = {"std": SimpleNamespace(slope_cells=cells)}
+    return draw(Latent(), measured, table=table, dataset=dataset, qualities=measured)
 
 
 def panel(figure: Figure, title: str) -> Axes:
@@ -50,7 +60,7 @@ def line(axes: Axes, **style: object) -> np.ndarray:
 def test_rows_of_the_confusion_matrix_are_shares_of_the_true_class(qualities: Qualities) -> None:
     by_class = {split: quality.classes[0] for split, quality in qualities.items()}
     names = ColourModel().class_names
-    figure = confusion_figure(by_class, names)
+    figure = draw(Confusion(), by_class)
     for split, quality in by_class.items():
         axes = panel(figure, split)
         shares, counts = np.ma.filled(axes.images[0].get_array(), np.nan), np.array(quality.confusion)
@@ -69,7 +79,7 @@ def test_rows_of_the_confusion_matrix_are_shares_of_the_true_class(qualities: Qu
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 def test_the_colour_bar_is_as_high_as_the_panel_beside_it(count: int, qualities: Qualities) -> None:
     quality = qualities["valid"].classes[0]
-    figure = confusion_figure({f"split-{n}": quality for n in range(count)}, ColourModel().class_names)
+    figure = draw(Confusion(), {f"split-{n}": quality for n in range(count)})
     figure.set_dpi(50)
     figure.draw_without_rendering()
     beside = panel(figure, f"split-{min(count, 3) - 1}")
@@ -83,7 +93,7 @@ def test_the_colour_bar_is_as_high_as_the_panel_beside_it(count: int, qualities:
 
 def test_the_reliability_diagram_shows_the_curve_and_the_cells(qualities: Qualities) -> None:
     by_class = {split: quality.classes[0] for split, quality in qualities.items()}
-    figure = reliability_figure(by_class)
+    figure = draw(Reliability(), by_class)
     curve = by_class["test/hs"].reliability
     cells = np.array(curve["cells"])
     often = cells >= 1e-3 * cells.sum()
@@ -100,7 +110,7 @@ def test_the_reliability_diagram_shows_the_curve_and_the_cells(qualities: Qualit
 
 
 def test_the_pit_departs_from_one_by_its_counts(qualities: Qualities) -> None:
-    figure = pit_figure({split: quality.traversability for split, quality in qualities.items()})
+    figure = draw(PIT(), qualities=qualities)
     quality = qualities["test/hs"].traversability
     axes = panel(figure, "test/hs")
     density = np.array(quality.pit) * 20 / sum(quality.pit)
@@ -127,33 +137,31 @@ def test_the_pit_departs_from_one_by_its_counts(qualities: Qualities) -> None:
 
 
 def test_the_series_draws_quality_over_severity(qualities: Qualities) -> None:
-    all_series = {
-        "hg": [(0.0, "test/std"), (0.5, "valid")],
-        "hs": [(0.0, "test/std"), (0.5, "train"), (1.0, "test/hs")],
-    }
-    figure = severity_figure(all_series, {split: numbers(item) for split, item in qualities.items()})
+    named = {"test/hg-050": "valid", "test/hs-050": "train", "test/std": "test/std", "test/hs": "test/hs"}
+    measured = {split: qualities[own] for split, own in named.items()}
+    series = ["test/std", "train", "test/hs"]
+    figure = draw(Severity(), qualities=measured)
     for title, values in (
-        ("Accuracy", [qualities[split].classes[0].accuracy for _, split in all_series["hs"]]),
-        ("CRPS", [qualities[split].traversability.crps for _, split in all_series["hs"]]),
-        ("Under VaR", [qualities[split].traversability.tail_rate for _, split in all_series["hs"]]),
+        ("Accuracy", [qualities[split].classes[0].accuracy for split in series]),
+        ("CRPS", [qualities[split].traversability.crps for split in series]),
+        ("Under VaR", [qualities[split].traversability.tail_rate for split in series]),
     ):
         np.testing.assert_allclose(line(panel(figure, title), marker="s"), [[0, 0.5, 1], values])
     np.testing.assert_allclose(line(panel(figure, "In the 90"), linestyle="--")[1], 0.9)
     np.testing.assert_allclose(line(panel(figure, "Under VaR"), linestyle="--")[1], 0.1)
     dotted = line(panel(figure, "AUROC"), marker="s", linestyle=":")[1]
     np.testing.assert_allclose(
-        dotted, [qualities[split].classes[0].mutual_information_auroc for _, split in all_series["hs"]]
+        dotted, [qualities[split].classes[0].mutual_information_auroc for split in series]
     )
 
 
 def test_a_series_without_classes_is_of_traversability_alone(dataset: TerrainDataset) -> None:
     found = dict(evaluate(Oracle(), dataset))
-    figure = severity_figure(
-        {"hs": [(0.0, "test/std"), (1.0, "test/hs")]}, {split: numbers(item) for split, item in found.items()}
-    )
+    found["test/hs-050"] = found["test/std"]
+    figure = draw(Severity(), qualities=found)
     assert len(figure.axes) == 4
     np.testing.assert_allclose(
-        line(panel(figure, "CRPS"), marker="o")[1][1], found["test/hs"].traversability.crps
+        line(panel(figure, "CRPS"), marker="o")[1][-1], found["test/hs"].traversability.crps
     )
 
 
@@ -200,9 +208,9 @@ def test_every_number_of_splits_can_be_drawn(count: int, qualities: Qualities) -
     }
     by_class = {split: replace(one.classes[0], reliability=sure) for split, one in many.items()}
     for figure in (
-        confusion_figure(by_class, ColourModel().class_names),
-        reliability_figure(by_class),
-        pit_figure({split: quality.traversability for split, quality in many.items()}),
+        draw(Confusion(), by_class),
+        draw(Reliability(), by_class),
+        draw(PIT(), qualities=many),
     ):
         figure.set_dpi(20)
         figure.draw_without_rendering()

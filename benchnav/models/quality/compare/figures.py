@@ -4,19 +4,20 @@ A model has one colour, marker and dash in every figure; privileged ones are gre
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 from matplotlib.lines import Line2D
 
 from benchnav.datagen.recipe.scenario import find_series
 from benchnav.models.quality.compare.report import Comparison
+from benchnav.models.quality.figures import series_table
 from benchnav.models.quality.map_sums import MapTally
 from benchnav.models.quality.scores import LEVEL
 from benchnav.models.quality.scores_of_maps import COMPARED
-from benchnav.viz.figure import Figure
+from benchnav.viz.figure import Figure, applicable
 from benchnav.viz.panels import Curves, Looks, draw_baseline, line_looks, panel_grid, ticks_of
 from benchnav.viz.style import (
     LINE_COLOURS,
@@ -33,8 +34,6 @@ _AT_SEVERITY = ("crps", "pinball")
 _MARKED_EVERY = 4
 _ARROWS = {"higher": " ↑", "lower": " ↓", "": ""}
 
-Tallies = Mapping[tuple[str, str], MapTally]
-
 
 def model_looks(models: Sequence[str], privileged: Sequence[str]) -> Looks:
     """Return how the lines of each model are drawn, as keywords of `Axes.plot`; privileged ones are grey."""
@@ -45,134 +44,9 @@ def model_looks(models: Sequence[str], privileged: Sequence[str]) -> Looks:
     return {model: {**looks[model], "ms": 3, "lw": 1} for model in models}
 
 
-def measures_figure(
-    summary: pd.DataFrame, headings: Mapping[str, str], looks: Looks, privileged: Sequence[str]
-) -> Drawing:
-    """Draws each measure of each model with its interval, a panel a measure and a mark a split.
-
-    Args:
-        summary: of `Comparison`.
-        headings: of the measures.
-        looks: from `model_looks`, in the order of the models.
-        privileged: those of the models.
-    """
-    shown = [score for score in COMPARED if score.name in summary and summary[score.name].notna().any()]
-    models, splits = list(looks), list(dict.fromkeys(summary["split"]))
-    across = 4 if len(shown) > 6 else 3
-    high = len(models) * max(_ROW_IN, _LINE_IN * (len(splits) + 1.5)) + 0.45
-    titles = [headings[score.name] + _ARROWS[score.better] for score in shown]
-    figure, places = panel_grid(titles, across, high, 0.35, TWO_COLUMNS_IN, sharey=True)
-    panels = [panel for (panel,) in places]
-    for panel, score in zip(panels, shown, strict=True):
-        name = score.name
-        for place, split in enumerate(splits):
-            rows = summary[summary["split"] == split].set_index("model").reindex(models)
-            y = np.arange(len(models)) + 0.7 * ((place + 0.5) / len(splits) - 0.5)
-            value, low, high_end = (
-                rows[own].to_numpy(float) for own in (name, f"{name}_low", f"{name}_high")
-            )
-            colour = LINE_COLOURS[place % len(LINE_COLOURS)]
-            panel.hlines(y, low, high_end, color=colour, lw=1)
-            panel.plot(value, y, MARKERS[place % len(MARKERS)], color=colour, ms=2.8, label=split)
-        if name == "coverage":
-            draw_baseline(panel, LEVEL, "calibrated", horizontal=False)
-        panel.grid(axis="x", alpha=0.3)
-        panel.margins(x=0.08)
-        ticks_of(panel, "x")
-    for panel in panels[::across]:
-        panel.set_yticks(range(len(models)), models, parse_math=False)
-        for label in panel.get_yticklabels():
-            label.set_color("0.5" if label.get_text() in privileged else "black")
-    panels[0].set_ylim(len(models) - 0.5, -0.5)
-    legend_outside(figure, side="upper center", columns=5)
-    return figure
-
-
-def calibration_figure(tallies: Tallies, looks: Looks) -> Drawing:
-    """Draws by how much more often than it should λ was under each quantile of its prediction, a panel a split.
-
-    Args:
-        tallies: by split and model.
-        looks: from `model_looks`.
-    """
-    figure, panels = _panels_of_splits(tallies)
-    for split, panel in panels.items():
-        panel.axhline(0, color="0.4", lw=0.8, label="calibrated")
-        for model, look in looks.items():
-            if (split, model) in tallies:
-                counts = tallies[split, model].pit
-                levels = np.linspace(0, 1, len(counts) + 1)
-                excess = np.concatenate([[0], np.cumsum(counts) / counts.sum()]) - levels
-                panel.plot(levels, excess, label=model, markevery=_MARKED_EVERY, **look)
-    figure.supxlabel("level of the quantile")
-    figure.supylabel("fraction of λ below\nthe quantile − level", fontsize=TITLE)
-    legend_outside(figure, columns=5, side="upper center")
-    return figure
-
-
-def sparsification_figure(tallies: Tallies, looks: Looks) -> Drawing:
-    """Draws the mean error of the cells that are left over the share that was left out, a panel a split.
-
-    Args:
-        tallies: by split and model.
-        looks: from `model_looks`.
-    """
-    figure, panels = _panels_of_splits(tallies)
-    for split, panel in panels.items():
-        for model, look in looks.items():
-            if (split, model) in tallies:
-                left_out, by_width, by_error = tallies[split, model].curves()
-                panel.plot(left_out, by_width, label=model, markevery=2 * _MARKED_EVERY, **look)
-                panel.plot(left_out, by_error, color=look["color"], lw=0.8, ls=":")
-    panel.set_ylim(bottom=0)  # of all, which share it
-    figure.supxlabel("fraction of cells left out, those of the widest intervals first")
-    figure.supylabel("mean |E[λ] − λ| of the rest", fontsize=TITLE)
-    best = Line2D([], [], color="0.4", lw=0.8, ls=":", label="largest errors first, the best order")
-    legend_outside(figure, [best], 5, side="upper center")
-    return figure
-
-
-def severity_figure(
-    all_series: Mapping[str, Sequence[tuple[float, str]]],
-    summary: pd.DataFrame,
-    headings: Mapping[str, str],
-    looks: Looks,
-) -> Drawing:
-    """Draws CRPS and pinball loss over the severity of a shift, a column a scenario and a line a model.
-
-    Args:
-        all_series: by scenario, its pairs as (severity, split), ascending.
-        summary: of `Comparison`.
-        headings: of the measures.
-        looks: from `model_looks`.
-    """
-    known = summary.set_index(["split", "model"], drop=False)
-    points = [
-        known.loc[[(split, model)]].assign(panel=scenario, line=model, x=severity)
-        for scenario, series in all_series.items()
-        for model in looks
-        for severity, split in series
-        if (split, model) in known.index
-    ]
-    curves = Curves(
-        table=pd.concat(points, ignore_index=True),
-        measures={name: headings[name] for name in _AT_SEVERITY},
-        looks=looks,
-        x_label="severity of the shift",
-        across=min(len(all_series), 3),
-        high_in=1.7,
-        width_in=page_width(len(all_series), 3),
-        bars=True,
-    )
-    figure, panels = curves.draw()
-    for panel in panels.values():
-        ticks_of(panel, "y", 5)
-    legend_outside(figure, columns=5, side="upper center")
-    return figure
-
-
-def _panels_of_splits(tallies: Tallies) -> tuple[Drawing, dict[str, Axes]]:
-    splits = list(dict.fromkeys(split for split, _ in tallies))
+def _draw_tallies(data: Comparison) -> tuple[Drawing, list[tuple[Axes, str, MapTally, Mapping[str, Any]]]]:
+    """Make a panel a split; return the figure, and the panel, name, tally and look of each line."""
+    splits = list(dict.fromkeys(split for split, _ in data.tallies))
     width = page_width(len(splits), 3)
     figure, places = panel_grid(splits, 3, 1.8, 0.6, width, sharex=True, sharey=True)
     panels = {split: panel for split, (panel,) in zip(splits, places, strict=True)}
@@ -180,7 +54,11 @@ def _panels_of_splits(tallies: Tallies) -> tuple[Drawing, dict[str, Axes]]:
         panel.set_xlim(0, 1)
         panel.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
         panel.grid(alpha=0.3)
-    return figure, panels
+    known = [(split, model) for model in data.models for split in splits if (split, model) in data.tallies]
+    looks = _looks(data)
+    return figure, [
+        (panels[split], model, data.tallies[split, model], looks[model]) for split, model in known
+    ]
 
 
 class _Measures(Figure):
@@ -191,7 +69,41 @@ class _Measures(Figure):
     )
 
     def draw(self, data: Comparison) -> Drawing:
-        return measures_figure(data.summary, _headings(), _looks(data), data.privileged)
+        looks = _looks(data)
+        shown = [
+            score
+            for score in COMPARED
+            if score.name in data.summary and data.summary[score.name].notna().any()
+        ]
+        models, splits = list(looks), list(dict.fromkeys(data.summary["split"]))
+        across = 4 if len(shown) > 6 else 3
+        high = len(models) * max(_ROW_IN, _LINE_IN * (len(splits) + 1.5)) + 0.45
+        titles = [score.title + _ARROWS[score.better] for score in shown]
+        figure, places = panel_grid(titles, across, high, 0.35, TWO_COLUMNS_IN, sharey=True)
+        panels = [panel for (panel,) in places]
+        for panel, score in zip(panels, shown, strict=True):
+            name = score.name
+            for place, split in enumerate(splits):
+                rows = data.summary[data.summary["split"] == split].set_index("model").reindex(models)
+                y = np.arange(len(models)) + 0.7 * ((place + 0.5) / len(splits) - 0.5)
+                value, low, high_end = (
+                    rows[own].to_numpy(float) for own in (name, f"{name}_low", f"{name}_high")
+                )
+                colour = LINE_COLOURS[place % len(LINE_COLOURS)]
+                panel.hlines(y, low, high_end, color=colour, lw=1)
+                panel.plot(value, y, MARKERS[place % len(MARKERS)], color=colour, ms=2.8, label=split)
+            if name == "coverage":
+                draw_baseline(panel, LEVEL, "calibrated", horizontal=False)
+            panel.grid(axis="x", alpha=0.3)
+            panel.margins(x=0.08)
+            ticks_of(panel, "x")
+        for panel in panels[::across]:
+            panel.set_yticks(range(len(models)), models, parse_math=False)
+            for label in panel.get_yticklabels():
+                label.set_color("0.5" if label.get_text() in data.privileged else "black")
+        panels[0].set_ylim(len(models) - 0.5, -0.5)
+        legend_outside(figure, side="upper center", columns=5)
+        return figure
 
 
 class _Calibration(Figure):
@@ -202,7 +114,17 @@ class _Calibration(Figure):
     )
 
     def draw(self, data: Comparison) -> Drawing:
-        return calibration_figure(data.tallies, _looks(data))
+        figure, lines = _draw_tallies(data)
+        for panel in figure.axes:
+            panel.axhline(0, color="0.4", lw=0.8, label="calibrated")
+        for panel, model, tally, look in lines:
+            levels = np.linspace(0, 1, len(tally.pit) + 1)
+            excess = np.concatenate([[0], np.cumsum(tally.pit) / tally.pit.sum()]) - levels
+            panel.plot(levels, excess, label=model, markevery=_MARKED_EVERY, **look)
+        figure.supxlabel("level of the quantile")
+        figure.supylabel("fraction of λ below\nthe quantile − level", fontsize=TITLE)
+        legend_outside(figure, columns=5, side="upper center")
+        return figure
 
 
 class _Sparsification(Figure):
@@ -213,7 +135,17 @@ class _Sparsification(Figure):
     )
 
     def draw(self, data: Comparison) -> Drawing:
-        return sparsification_figure(data.tallies, _looks(data))
+        figure, lines = _draw_tallies(data)
+        for panel, model, tally, look in lines:
+            left_out, by_width, by_error = tally.curves()
+            panel.plot(left_out, by_width, label=model, markevery=2 * _MARKED_EVERY, **look)
+            panel.plot(left_out, by_error, color=look["color"], lw=0.8, ls=":")
+        panel.set_ylim(bottom=0)  # of all, which share it
+        figure.supxlabel("fraction of cells left out, those of the widest intervals first")
+        figure.supylabel("mean |E[λ] − λ| of the rest", fontsize=TITLE)
+        best = Line2D([], [], color="0.4", lw=0.8, ls=":", label="largest errors first, the best order")
+        legend_outside(figure, [best], 5, side="upper center")
+        return figure
 
 
 class _Severity(Figure):
@@ -227,18 +159,30 @@ class _Severity(Figure):
         return bool(find_series(data.splits))
 
     def draw(self, data: Comparison) -> Drawing:
-        return severity_figure(find_series(data.splits), data.summary, _headings(), _looks(data))
+        series = series_table(data.splits)
+        count = series["scenario"].nunique()
+        measured = data.summary.rename(columns={"model": "line"})
+        curves = Curves(
+            table=series.merge(measured, on="split").rename(columns={"scenario": "panel", "severity": "x"}),
+            measures={score.name: score.title for score in COMPARED if score.name in _AT_SEVERITY},
+            looks=_looks(data),
+            x_label="severity of the shift",
+            across=min(count, 3),
+            high_in=1.7,
+            width_in=page_width(count, 3),
+            bars=True,
+        )
+        figure, panels = curves.draw()
+        for panel in panels.values():
+            ticks_of(panel, "y", 5)
+        legend_outside(figure, columns=5, side="upper center")
+        return figure
 
 
 def comparison_figures(comparison: Comparison) -> list[Figure]:
     """List the figures of a comparison that apply."""
-    figures: tuple[Figure, ...] = (_Measures(), _Calibration(), _Sparsification(), _Severity())
-    return [variant for figure in figures for variant in figure.variants(comparison)]
+    return applicable((_Measures(), _Calibration(), _Sparsification(), _Severity()), comparison)
 
 
 def _looks(comparison: Comparison) -> Looks:
     return model_looks(list(comparison.models), comparison.privileged)
-
-
-def _headings() -> dict[str, str]:
-    return {score.name: score.title for score in COMPARED}

@@ -1,3 +1,6 @@
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -6,13 +9,7 @@ from matplotlib.figure import Figure
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.predictor import Oracle
-from benchnav.models.quality.compare.figures import (
-    calibration_figure,
-    measures_figure,
-    model_looks,
-    severity_figure,
-    sparsification_figure,
-)
+from benchnav.models.quality.compare.figures import comparison_figures, model_looks
 from benchnav.models.quality.map_sums import MapTally
 from benchnav.models.quality.measure import measure_split
 from benchnav.models.quality.scores_of_maps import COMPARED
@@ -21,7 +18,7 @@ from tests.models.stub import ColourModel
 
 MODELS = ("colours", "oracle")
 SPLITS = ("train", "test/std")
-HEADINGS = {score.name: score.name for score in COMPARED}
+HEADINGS = {score.name: score.title for score in COMPARED}
 Tallies = dict[tuple[str, str], MapTally]
 
 
@@ -44,6 +41,14 @@ def summary_of(tallies: Tallies) -> pd.DataFrame:
     return pd.concat(tables, names=["split", "model"]).reset_index()
 
 
+def draw(name: str, summary: pd.DataFrame | None = None, **data: Any) -> Figure:
+    """Draw the figure of a name from what it needs of `Comparison`."""
+    given = {"summary": summary, "models": MODELS, "privileged": ["oracle"], "splits": SPLITS, **data}
+    comparison: Any = SimpleNamespace(**given)
+    (figure,) = [own for own in comparison_figures(comparison) if own.name == name]
+    return figure.draw(comparison)
+
+
 def panel(figure: Figure, title: str) -> Axes:
     return next(axes for axes in figure.axes if axes.get_title() == title)
 
@@ -58,10 +63,10 @@ def test_models_differ_in_look_and_privileged_ones_are_grey() -> None:
 
 def test_marks_and_lines_are_the_measures_and_their_intervals(tallies: Tallies) -> None:
     summary = summary_of(tallies)
-    figure = measures_figure(summary, HEADINGS, model_looks(MODELS, ["oracle"]), ["oracle"])
-    axes = panel(figure, "crps ↓")
+    figure = draw("measures", summary)
+    axes = panel(figure, f"{HEADINGS['crps']} ↓")
     titles = [axes.get_title() for axes in figure.axes]
-    assert {"accuracy ↑", "ause ↓", "width"} < set(titles)
+    assert {f"{HEADINGS['accuracy']} ↑", f"{HEADINGS['ause']} ↓", HEADINGS["width"]} < set(titles)
     marks = {line.get_label(): line.get_xdata() for line in axes.lines}
     for split in SPLITS:
         wanted = summary[summary["split"] == split].set_index("model")["crps"].reindex(MODELS)
@@ -71,11 +76,11 @@ def test_marks_and_lines_are_the_measures_and_their_intervals(tallies: Tallies) 
     np.testing.assert_allclose(ends[0], train.loc["colours", ["crps_low", "crps_high"]].astype(float))
     labels = {label.get_text(): label.get_color() for label in figure.axes[0].get_yticklabels()}
     assert labels == {"colours": "black", "oracle": "0.5"}
-    assert panel(figure, "coverage").lines[-1].get_xdata()[0] == 0.9  # type: ignore[index]
+    assert panel(figure, HEADINGS["coverage"]).lines[-1].get_xdata()[0] == 0.9  # type: ignore[index]
 
 
 def test_calibration_is_the_share_under_each_quantile(tallies: Tallies) -> None:
-    figure = calibration_figure(tallies, model_looks(MODELS, ["oracle"]))
+    figure = draw("calibration", tallies=tallies)
     for split in SPLITS:
         lines = {line.get_label(): line for line in panel(figure, split).lines}
         for model in MODELS:
@@ -87,7 +92,7 @@ def test_calibration_is_the_share_under_each_quantile(tallies: Tallies) -> None:
 
 
 def test_sparsification_shows_both_rankings_of_every_split(tallies: Tallies) -> None:
-    figure = sparsification_figure(tallies, model_looks(MODELS, ["oracle"]))
+    figure = draw("sparsification", tallies=tallies)
     for split in SPLITS:
         axes = panel(figure, split)
         assert len(axes.lines) == 2 * len(MODELS)
@@ -104,10 +109,10 @@ def test_sparsification_shows_both_rankings_of_every_split(tallies: Tallies) -> 
 
 def test_severity_has_a_line_a_model_and_leaves_out_what_was_not_measured(tallies: Tallies) -> None:
     summary = summary_of({key: own for key, own in tallies.items() if key != ("train", "oracle")})
-    series = {"test/hg": [(0.0, "test/std"), (0.5, "train")]}
-    figure = severity_figure(series, summary, HEADINGS, model_looks(MODELS, ["oracle"]))
+    summary["split"] = summary["split"].replace({"train": "test/hg-050"})
+    figure = draw("severity", summary, splits=["test/std", "test/hg-050"])
     for axes, name in zip(figure.axes[:2], ("crps", "pinball"), strict=True):
         lines = {line.get_label(): line.get_data() for line in axes.lines}
         own = summary[summary["model"] == "colours"].set_index("split")[name]
-        np.testing.assert_allclose(lines["colours"], [[0, 0.5], [own["test/std"], own["train"]]])
+        np.testing.assert_allclose(lines["colours"], [[0, 0.5], [own["test/std"], own["test/hg-050"]]])
         assert len(lines["oracle"][0]) == 1
