@@ -68,6 +68,17 @@ def condition_name(labels: Mapping[str, Any], several: Collection[str] = ()) -> 
     return joined([planner_name(labels["planner"]), *beside, risk_name(labels["risk"])])
 
 
+def episode_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
+    """Name episodes that are shown together, each by planner and risk setting and by what else differs.
+
+    Args:
+        labels: of the condition of each.
+    """
+    several = [name for name in NAMING if differ(own.get(name, NOT_USED) for own in labels)]
+    more = [name for name in ("robot", "objective") if name in several]
+    return [joined([condition_name(own, several), *(own[name] for name in more)]) for own in labels]
+
+
 def with_names(summary: pd.DataFrame) -> pd.DataFrame:
     """Rows of conditions with the `name` of each among them."""
     several = naming_labels(summary)

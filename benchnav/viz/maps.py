@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Colormap, ListedColormap, to_rgba
+from matplotlib.colors import Colormap, ListedColormap, Normalize, to_rgba
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.patches import Patch
@@ -218,6 +220,28 @@ def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) 
     width, height = map(float, extent_m)
     panel.set(xlim=(0, width), ylim=(0, height))
     return panel.imshow(values, origin="lower", extent=(0, width, 0, height), interpolation="none", **style)
+
+
+def draw_bar(
+    figure: Figure,
+    label: str,
+    panels: Any = None,
+    scale: tuple[str, float] = (TRAVERSABILITY_COLOURS, 1.0),
+    **style: Any,
+) -> None:
+    """Draw a colour bar at the right of panels.
+
+    Args:
+        figure: with the panels.
+        label: of the bar.
+        panels: that it is of; None for all.
+        scale: colours, and the value of the lightest; the darkest is 0.
+        **style: as in `Figure.colorbar`.
+    """
+    colours, most = scale
+    shown = ScalarMappable(Normalize(0, most), colours)
+    panels = figure.axes if panels is None else list(panels)
+    figure.colorbar(shown, ax=panels, fraction=0.03, label=label, **style)
 
 
 def overlay(

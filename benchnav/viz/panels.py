@@ -73,35 +73,6 @@ def panel_grid(
     return figure, places
 
 
-def draw_estimates(
-    panel: Axes,
-    x: Any,
-    y: Any,
-    low: Any,
-    high: Any,
-    look: Mapping[str, Any],
-    label: str = "",
-    bars: bool = False,
-) -> None:
-    """Draw estimates as a line with the band of their intervals.
-
-    Args:
-        panel: where.
-        x: shape [N].
-        y: shape [N].
-        low: lower ends of the intervals, shape [N]; NaN for none.
-        high: upper ends.
-        look: keywords of `Axes.plot`.
-        label: of the line in a legend; if empty, none.
-        bars: whether intervals are bars in place of a band.
-    """
-    if bars:
-        panel.vlines(x, low, high, color=look["color"], lw=0.7)
-    else:
-        panel.fill_between(x, low, high, color=look["color"], alpha=0.15, lw=0)
-    panel.plot(x, y, label=label or "_line", **look)
-
-
 def draw_interval(
     panel: Axes, low: float, high: float, height: float, colour: Any, width: float = 1.2
 ) -> None:
@@ -123,7 +94,6 @@ class Curves:
         high_in: height of a panel in inches.
         width_in: of the figure, as in `panel_grid`.
         bars: whether intervals are bars in place of bands.
-        as_titles: whether labels of measures stand over their panels; these must then be of one group.
     """
 
     table: pd.DataFrame
@@ -134,60 +104,43 @@ class Curves:
     high_in: float = 1.65
     width_in: float = 0.0
     bars: bool = False
-    as_titles: bool = False
 
     def draw(self) -> tuple[Figure, dict[tuple[str, str], Axes]]:
-        """Draw them.
+        """Draw them: measures of a single group side by side with their labels as titles, else stacked.
 
         Returns:
             The figure, without a legend, and its panels by group and measure.
         """
-        groups = list(dict.fromkeys(self.table["panel"]))
-        if len(groups) == 1 and (self.as_titles or self.across > 1):
-            panels = self._side_by_side(groups[0])
-        else:
-            panels = self._stacked(groups)
+        groups, labels = list(dict.fromkeys(self.table["panel"])), list(self.measures.values())
+        is_single = len(groups) == 1 and self.across > 1
+        titles, layers = (labels, 1) if is_single else (groups, len(labels))
+        high_in = self.high_in * layers
+        figure, places = panel_grid(titles, self.across, high_in, 0.5, self.width_in, layers, sharex=True)
+        across = min(self.across, len(titles))
+        for index, stack in enumerate(places):
+            stack[-1].set_xlabel(self.x_label)
+            stack[-1].tick_params(labelbottom=True)
+            for panel, first, label in zip(
+                stack, places[0], () if is_single else labels, strict=not is_single
+            ):
+                if index:
+                    panel.sharey(first)
+                panel.tick_params(labelleft=index % across == 0)
+                panel.set_ylabel("" if index % across else label)
+        keys = [(group, name) for group in groups for name in self.measures]
+        panels = dict(zip(keys, [panel for stack in places for panel in stack], strict=True))
         for (group, measure), panel in panels.items():
             own = self.table[self.table["panel"] == group]
             for line, points in own.groupby("line", sort=False):
-                x, y = points["x"], points[measure]
+                x, y, look = points["x"], points[measure], self.looks[line]
                 low, high = (points.get(f"{measure}_{end}", y) for end in ("low", "high"))
-                draw_estimates(panel, x, y, low, high, self.looks[line], str(line), self.bars)
+                if self.bars:
+                    panel.vlines(x, low, high, color=look["color"], lw=0.7)
+                else:
+                    panel.fill_between(x, low, high, color=look["color"], alpha=0.15, lw=0)
+                panel.plot(x, y, label=str(line), **look)
             panel.grid(axis="y", color=GRID)
-        figure = next(iter(panels.values())).get_figure()
-        assert isinstance(figure, Figure)
         return figure, panels
-
-    def _side_by_side(self, group: str) -> dict[tuple[str, str], Axes]:
-        labels = list(self.measures.values())
-        titles = labels if self.as_titles else [group] * len(labels)
-        width = self.width_in or TWO_COLUMNS_IN
-        _, places = panel_grid(titles, self.across, self.high_in, width_in=width, sharex=True)
-        for (panel,), label in zip(places, labels, strict=True):
-            panel.set_ylabel("" if self.as_titles else label)
-        figure = places[0][0].get_figure()
-        assert isinstance(figure, Figure)
-        figure.supxlabel(self.x_label)
-        return {(group, name): panel for name, (panel,) in zip(self.measures, places, strict=True)}
-
-    def _stacked(self, groups: Sequence[str]) -> dict[tuple[str, str], Axes]:
-        layers = len(self.measures)
-        _, places = panel_grid(
-            groups, self.across, self.high_in * layers, width_in=self.width_in, layers=layers, sharex=True
-        )
-        across = min(self.across, len(groups))
-        for place, stack in enumerate(places):
-            for panel, first, label in zip(stack, places[0], self.measures.values(), strict=True):
-                if place:
-                    panel.sharey(first)
-                panel.tick_params(labelleft=place % across == 0)
-                panel.set_ylabel("" if place % across else label)
-            stack[-1].set_xlabel(self.x_label)
-            stack[-1].tick_params(labelbottom=True)
-        panels: dict[tuple[str, str], Axes] = {}
-        for group, stack in zip(groups, places, strict=True):
-            panels |= {(group, name): panel for name, panel in zip(self.measures, stack, strict=True)}
-        return panels
 
 
 def draw_baseline(panel: Axes, value: float, label: str, horizontal: bool = True) -> None:

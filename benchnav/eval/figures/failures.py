@@ -66,7 +66,7 @@ class Failures(Figure):
             count = f"({len(line.failures)} of {line.among} failures)"
             row_of_panels[0].set_ylabel(f"{line.name}\n{count}", fontsize="small")
         maps.draw_scale(panels[-1, 0], lines[-1].recordings[0].grid.extent_m)
-        figure.colorbar(panels[0, 0].images[0], ax=panels, fraction=0.03, aspect=30, label="predicted λ̂")
+        maps.draw_bar(figure, "predicted λ̂", aspect=30, alpha=_LIGHT)
         legend_outside(figure, columns=6)
         return figure
 

@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure as Drawing
 
 from benchnav.core.grid import outline
@@ -79,8 +77,7 @@ def draw_knowledge(recording: Recording) -> Drawing:
             maps.draw_drive(panel, moment.drive_at(recording, step), 1.2, 0.8, label="driven")
             maps.frame_map(panel)
         row[0].set_ylabel("y [m]")
-        scale = ScalarMappable(Normalize(0, most), colours)
-        figure.colorbar(scale, ax=list(row), fraction=0.03, aspect=20, label=label)
+        maps.draw_bar(figure, label, row, (colours, most), aspect=20)
     for (above, below), step in zip(panels.T, steps, strict=True):
         ended = f"\n{recording.outcome}" if step == last else ""
         above.set_title(f"t = {step * recording.dt_s:.1f} s{ended}", fontsize="small")

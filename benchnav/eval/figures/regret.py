@@ -1,6 +1,6 @@
 """The waterfall of regret: what each step of a chain of conditions takes from success, and adds to time."""
 
-from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from benchnav.eval.figures.data import RunData
 from benchnav.eval.stats.best import BLOCK
 from benchnav.eval.words import joined
-from benchnav.stats.tables import signed
+from benchnav.stats.tables import signed, signed_interval
 from benchnav.viz.figure import Figure
 from benchnav.viz.panels import GRID, draw_interval
 from benchnav.viz.style import BLUE, ORANGE, TEXT, TWO_COLUMNS_IN, legend_outside, planner_name, risk_name
@@ -58,9 +58,7 @@ class Regret(Figure):
         for line, rows in zip(axes, chains, strict=True):
             for panel, measure in zip(line, _MEASURES, strict=True):
                 _draw_chain(panel, rows, measure)
-            told = rows.to_dict("records")
-            first, last = _named(told[0], "one"), _named(told[-1], "other")
-            names = [", ".join(first), *map(_step_name, told), ", ".join(last)]
+            names = _row_names(rows)
             line[0].set_yticks(range(len(names)), names)
             line[0].set_ylim(len(rows) + 1.6, -0.6)
             about = rows.iloc[0]
@@ -82,15 +80,15 @@ class Regret(Figure):
         return figure
 
 
-def _named(row: Mapping[Any, Any], end: str) -> tuple[str, str]:
-    """Planner and model of an end of a step, as they are read."""
-    return planner_name(row[f"{end}_planner"]), row[f"{end}_model"]
-
-
-def _step_name(row: Mapping[Any, Any]) -> str:
-    """What changes from one condition to the next, of planner and model."""
-    pairs = zip(_named(row, "one"), _named(row, "other"), strict=True)
-    return "\n".join(f"{first} → {then}" for first, then in pairs if first != then)
+def _row_names(rows: pd.DataFrame) -> list[str]:
+    """Name the first condition of a chain, what changes in each step, and the last condition."""
+    ends = [("one", rows.iloc[0]), *(("other", row) for _, row in rows.iterrows())]
+    named = [(planner_name(row[f"{end}_planner"]), row[f"{end}_model"]) for end, row in ends]
+    steps = [
+        "\n".join(f"{first} → {then}" for first, then in zip(*pair, strict=True) if first != then)
+        for pair in pairwise(named)
+    ]
+    return [", ".join(named[0]), *steps, ", ".join(named[-1])]
 
 
 def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
@@ -109,10 +107,10 @@ def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
         panel.barh(place, end - start, left=start, color=ORANGE if better else BLUE, **looks)
         from_x, to_x = np.clip([start - high, start - low], 0, None if more_is_worse else factor)
         draw_interval(panel, from_x, to_x, place, "black", 0.9)
-        words = _signed(-difference)
+        words = signed(-difference)
         if low == low:  # of few maps there is no interval
-            words += f" ({_signed(-high)} to {_signed(-low)})"
-        panel.text(1.02, place, words, transform=beside, va="center", size=TEXT)
+            words += f" ({signed_interval(-high, -low)})"
+        panel.text(1.02, place, words.replace("-", "−"), transform=beside, va="center", size=TEXT)
     for place, value in enumerate(means):
         panel.plot([value, value], [place - 0.35, place + 1.35], color="0.5", lw=0.5)
     bound = factor * rows[f"{measure}_bound"].iloc[0]
@@ -122,8 +120,3 @@ def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
     panel.set_axisbelow(True)
     panel.use_sticky_edges = False
     panel.tick_params(axis="y", length=0)
-
-
-def _signed(value: float) -> str:
-    """Write a difference with its sign and one decimal; 0 has none."""
-    return signed(value).replace("-", "−") if abs(value) >= 0.05 else "0.0"

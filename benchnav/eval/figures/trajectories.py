@@ -8,11 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
 from benchnav.core.grid import outline
-from benchnav.eval.experiment.condition import KNOWLEDGE, NOT_USED
 from benchnav.eval.figures import moment
 from benchnav.eval.figures.data import RunData, choose_recordings
 from benchnav.eval.recording import Recording
-from benchnav.eval.words import chosen_in_words, condition_name, differ
+from benchnav.eval.words import chosen_in_words, episode_names
 from benchnav.viz import maps
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import ONE_COLUMN_IN, TWO_COLUMNS_IN, legend_outside, stack_panels
@@ -86,33 +85,22 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
             panel.set_title("\n".join(title), fontsize="small")
         stack[-1].set_xlabel("x [m]")
     legend_outside(figure)
-    figure.colorbar(
-        stacks[0][0].collections[-1],
-        ax=figure.axes,
-        fraction=0.03,
-        aspect=40,
-        shrink=min(1.0, 4 / figure.get_figheight()),
-        anchor=(0, 1),
-        label="traversability λ",
-    )
+    shrink = min(1.0, 4 / figure.get_figheight())
+    maps.draw_bar(figure, "traversability λ", aspect=40, shrink=shrink, anchor=(0, 1))
     return figure
 
 
 def _headings(recordings: Sequence[Recording]) -> list[str]:
     """Name each recording by what differs, and say when it is shown and how it ended."""
-    several = [
-        name
-        for name in ("model", *KNOWLEDGE, "world")
-        if differ(own.about.get(name, NOT_USED) for own in recordings)
-    ]
+    names = episode_names([own.about for own in recordings])
     places = [f", {own.about['scenario']}, map {own.about['map']}" for own in recordings]
     headings = []
-    for own, place in zip(recordings, places, strict=True):
+    for own, name, place in zip(recordings, names, places, strict=True):
         shown = f"{own.outcome} after {own.end_s:g} s"
         if not moment.has_ended(own, own.now):
             shown = f"t = {own.now * own.dt_s:g} s; {shown}"
         where = place if len(set(places)) > 1 else ""
-        headings.append(f"{condition_name(own.about, several)}{where}\n{shown}")
+        headings.append(f"{name}{where}\n{shown}")
     return headings
 
 

@@ -186,13 +186,9 @@ class Reliability(Figure):
             cells, confidence, accuracy = map(np.array, quality.reliability.values())
             share, filled = cells / cells.sum(), cells > 0
             often = share >= _RARE
-            few = filled & ~often
             upper.plot([0, 1], [0, 1], color="0.5", lw=0.8, ls="--", label="calibrated")
             points: dict[str, Any] = {"color": BLUE, "ms": 3, "lw": 1, "clip_on": False}
             upper.plot(confidence[often], accuracy[often], "o-", **points, label="observed")
-            if few.any():  # no point at all would ask for all the room there is
-                words = "observed, under 0.1 % of cells"
-                upper.plot(confidence[few], accuracy[few], "o", mfc="white", **points, label=words)
             gap = (confidence[filled], confidence[filled], accuracy[filled])
             upper.vlines(*gap, color=ORANGE, lw=2, alpha=0.45, zorder=1.5, label="gap")
             upper.set(xlim=(0, 1), ylim=(0, 1), yticks=[0, 0.5, 1])
@@ -283,7 +279,6 @@ class Severity(Figure):
             measures=measures,
             looks=looks,
             x_label="severity of the shift",
-            as_titles=True,
             width_in=page_width(len(quantities), 4),
         )
         figure, panels = curves.draw()

@@ -12,15 +12,13 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import replacing
-from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.figures import moment
 from benchnav.eval.recording import Recording
-from benchnav.eval.words import NAMING, condition_name, differ, joined
+from benchnav.eval.words import episode_names
 from benchnav.viz import maps
 from benchnav.viz.style import TEXT, condition_colours, legend_outside, line_style, stack_panels, styled
 
@@ -99,7 +97,7 @@ class Frames:
         columns = _columns(count, extent_m[1] / extent_m[0])
         panels = [panel for (panel,) in stack_panels(self._figure, count, columns)]
         self.given, self.truths = panels[: len(recordings)], panels[len(recordings) :]
-        names = _names(recordings)
+        names = episode_names([own.about for own in recordings])
         planners = [own.about["planner"] for own in recordings]
         self._colours = condition_colours(planners) if len(recordings) > 1 else ["black"]
         letters = int(SIZE[0] / _DPI / (columns + 0.4) / _LETTER_IN)
@@ -121,9 +119,7 @@ class Frames:
         self._figure.suptitle(words, x=0.01, ha="left", parse_math=False)
         at: dict[str, float | str] = {"x": 0.99, "y": 0.985, "va": "top", "ha": "right", "s": ""}
         self.time = self._figure.text(**at, family="monospace", animated=True)  # type: ignore[arg-type]
-        scale = ScalarMappable(cmap=maps.TRAVERSABILITY_COLOURS)
-        scale.set_clim(0, 1)
-        self._figure.colorbar(scale, ax=panels, fraction=0.03, aspect=30, label="traversability λ, λ̂")
+        maps.draw_bar(self._figure, "traversability λ, λ̂", aspect=30)
         for time_s in np.linspace(0, max(own.end_s for own in recordings), _MOMENTS):
             self._put(float(time_s))
         legend_outside(self._figure, columns=5)
@@ -204,14 +200,6 @@ def _title(panel: Axes, words: str, letters: int, colour: str = "black") -> None
     """Write over a panel what it shows, in lines of a number of letters."""
     lines = [line for part in words.splitlines() for line in textwrap.wrap(part, letters)]
     panel.set_title("\n".join(lines), color=colour, parse_math=False)
-
-
-def _names(recordings: Sequence[Recording]) -> list[str]:
-    """Names of planner and risk setting, and of what else differs."""
-    every = [own.about for own in recordings]
-    several = [name for name in NAMING if differ(about.get(name, NOT_USED) for about in every)]
-    more = [name for name in ("robot", "objective") if name in several]
-    return [joined([condition_name(about, several), *(about[name] for name in more)]) for about in every]
 
 
 def _alike(recordings: Sequence[Recording]) -> list[list[int]]:
