@@ -108,17 +108,6 @@ def test_a_panel_per_field_and_row_shows_what_is_stored(dataset: TerrainDataset)
         assert texts.count(title) == 1
 
 
-def test_rows_share_scales_and_compare(dataset: TerrainDataset) -> None:
-    drawn = panels(preview_figure(dataset, "train", [0, 1, 2]))
-    elevation = dataset.read("train", [0, 1, 2])["elevation_m"]
-    relief = np.ptp(elevation, axis=(1, 2)).max()
-    for row in range(3):
-        assert drawn[f"elevation_m {row}"].images[0].get_clim() == pytest.approx((0, relief))
-        assert drawn[f"slope_deg {row}"].images[0].get_clim() == (0, 30)
-        assert drawn[f"traversability {row}"].images[0].get_clim() == (0, 1)
-    assert drawn["elevation_m bar"].get_xlim() == pytest.approx((0, relief))
-
-
 def test_axes_are_numbered_once(dataset: TerrainDataset) -> None:
     figure = preview_figure(dataset, "train", [0, 1])
     figure.draw_without_rendering()
@@ -195,20 +184,6 @@ def test_grids_of_any_shape(tmp_path: Path, height: int, width: int) -> None:
     assert box.height / box.width == pytest.approx(height / width)
 
 
-def test_only_shown_classes_of_many_are_named(tmp_path: Path) -> None:
-    one = load_recipe("paper-v1").classes[0]
-    many = tuple(replace(one, name=f"stony_$k_{k}$", colour=(k, k, k)) for k in range(255))
-    recipe = train_only(classes=many, occupancy=(1 / 30,) * 30)
-    figure = preview_figure(TerrainDataset(tiny_dataset(tmp_path / "many.h5", recipe)), "train", [0])
-    assert len(legend_names(figure)) == 2 + 30
-    assert not any(text.get_parse_math() for text in figure.legends[1].get_texts())
-    bar = panels(figure)["elevation_m bar"]
-    figure.draw_without_rendering()
-    assert figure.legends[1].get_window_extent().y1 < bar.xaxis.label.get_window_extent().y0
-    assert "3 stony $k 3$" in legend_names(figure)
-    check_texts(figure)
-
-
 def with_values(
     dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch, **changed: Callable[..., Any]
 ) -> None:
@@ -242,14 +217,6 @@ def test_unobserved_traversability_is_grey_and_explained(
     grey = figure.legends[0].get_patches()[0].get_facecolor()
     assert len(set(grey[:3])) == 1
     np.testing.assert_array_equal((rgba == grey).all(-1), hole)
-
-
-def test_level_maps_are_drawn(dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    with_values(dataset, monkeypatch, elevation_m=lambda z: z * 0 + 5, slope_deg=np.zeros_like)
-    panel = panels(preview_figure(dataset, "train", [0]))["elevation_m 0"]
-    assert not panel.images[0].get_array().any()
-    assert panel.images[0].get_clim() == (0, 1)
-    assert np.allclose(panel.images[1].get_array()[..., 3], 0)
 
 
 def test_hillshade_lights_the_north_west(dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -313,11 +280,6 @@ def test_a_contact_sheet_stops_at_most(dataset: TerrainDataset, monkeypatch: pyt
     assert "first 5 of 8 maps" in figure.texts[0].get_text().replace("\n", " ")
 
 
-@pytest.mark.parametrize(("count", "ratio", "columns"), [(100, 1, 10), (20, 1, 5), (1, 1, 1), (16, 4, 8)])
-def test_contact_columns(count: int, ratio: float, columns: int) -> None:
-    assert contact_columns(count, ratio) == columns
-
-
 @given(count=st.integers(1, 1000), ratio=st.floats(0.25, 4))
 def test_contact_grids_are_nearly_square_and_full(count: int, ratio: float) -> None:
     columns = contact_columns(count, ratio)
@@ -370,23 +332,6 @@ def test_soft_ground_is_hatched_and_outlined(stakes: TerrainDataset) -> None:
             assert not drawn[f"{plain} {row}"].collections
     assert legend_names(figure)[:3] == ["start", "goal", "may hide soft spots"]
     check_texts(figure)
-
-
-def test_a_sheet_without_soft_ground_says_nothing_of_it(
-    stakes: TerrainDataset, dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with_values(stakes, monkeypatch, class_id=np.zeros_like)
-    for made in (preview_figure(stakes, "train", [0]), preview_figure(dataset, "train", [0])):
-        assert "may hide soft spots" not in legend_names(made)
-        assert not panels(made)["class_id 0"].collections
-
-
-def test_a_map_that_is_soft_all_over_is_hatched_whole(
-    stakes: TerrainDataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with_values(stakes, monkeypatch, class_id=np.ones_like)
-    (hatched, *_) = lines_of(panels(preview_figure(stakes, "train", [0]))["class_id 0"])
-    np.testing.assert_array_equal(hatched, hatching(np.ones((32, 32), bool), stakes.grid.resolution_m))
 
 
 def test_a_contact_sheet_of_soft_ground_shows_stored_traversability(stakes: TerrainDataset) -> None:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from benchnav.core.grid import outline
 from benchnav.core.registry import find, names
-from benchnav.viz.maps import MARKS, hatching, layer_scale, robot_marker
+from benchnav.viz.maps import hatching, layer_scale, robot_marker
 from benchnav.viz.style import (
     _RISKS,
     BLIND,
@@ -55,17 +55,6 @@ def test_conditions_have_their_planners_colours_where_these_tell_them_apart() ->
     assert condition_colours(planners) == [own[planner] for planner in planners]
     assert condition_colours(["mppi"] * 3) == list(LINE_COLOURS[:3])
     assert condition_colours(["mppi", "straight", "mppi"]) == [LINE_COLOURS[0], BLIND, LINE_COLOURS[1]]
-
-
-def test_eight_conditions_have_eight_colours() -> None:
-    assert len(set(condition_colours(["mppi"] * 8))) == 8
-    assert condition_colours(["mppi"] * 9)[8] == condition_colours(["mppi"] * 2)[0]
-
-
-def test_marks_differ_in_shape_and_have_an_edge_that_parts_them_from_the_ground() -> None:
-    assert len({str(looks["marker"]) for looks in MARKS.values()}) == len(MARKS)
-    assert {name for name, looks in MARKS.items() if looks["mec"] != "white"} == {"robot"}
-    assert MARKS["robot"]["mec"] == "black"
 
 
 def test_lines_that_are_drawn_together_differ_in_style() -> None:

@@ -189,17 +189,6 @@ def test_outcomes_differ_in_grey_by_lightness_or_hatching() -> None:
         assert hatch != beside or abs(light - dark) > 0.25
 
 
-def test_bars_are_hatched_as_their_outcomes_are() -> None:
-    rows = made.rows(made.row(made.condition(), i, None, outcome=name) for i, name in enumerate(LOOKS))
-    figure = draw_outcomes(made.summarised(rows))
-    drawn = {
-        to_hex(bar.get_facecolor()).upper(): bar.get_hatch()
-        for bar in figure.axes[0].patches
-        if bar.get_width()
-    }
-    assert drawn == dict(LOOKS.values())
-
-
 def test_shares_stand_in_one_order_and_fill_the_bar() -> None:
     first, second = made.condition("a"), made.condition("b")
     ends = ["timeout", "immobilised", "immobilised", "timeout", "stuck"]
@@ -219,13 +208,6 @@ def test_shares_stand_in_one_order_and_fill_the_bar() -> None:
     assert below == [(LOOKS["stuck"][0], 25), (SUCCESS_COLOUR, 75)]
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == ["immobilised", "stuck", "timeout", "success"]
-
-
-def test_each_scenario_has_its_panel() -> None:
-    rows = made.rows(made.row(made.condition(scenario=name)) for name in ("std", "hg"))
-    figure = draw_outcomes(made.summarised(rows))
-    assert [panel.get_title() for panel in figure.axes] == ["std", "hg"]
-    assert figure.get_figwidth() * 25.4 == pytest.approx(180)
 
 
 def medians(panel: Axes) -> list[float]:
@@ -266,18 +248,3 @@ def test_every_episode_is_a_dot_under_its_quantity_and_its_condition() -> None:
     assert not np.allclose(arrived.get_facecolor(), failed.get_edgecolor())
     assert len(arrived.get_paths()[0]) != len(failed.get_paths()[0])
     assert figure.get_figwidth() * 25.4 == pytest.approx(180)
-
-
-def test_each_scenario_has_a_line_of_panels() -> None:
-    rows = made.rows(
-        made.row(made.condition(scenario=name), 0, 20.0 + n) for n, name in enumerate(("std", "hg"))
-    )
-    figure = draw_distributions(rows)
-    assert [panel.get_title() for panel in figure.axes] == ["std", "std", "hg", "hg"]
-    assert [medians(panel) for panel in figure.axes] == [[20], [0.8], [21], [0.8]]
-
-
-def test_an_episode_that_met_nothing_is_no_dot() -> None:
-    rows = made.rows(made.row(made.condition(), 0, None, traversability=np.nan))
-    _, met = draw_distributions(rows).axes
-    assert not sum(len(np.asarray(group.get_offsets())) for group in met.collections)

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchnav.eval.figures.over import Over, find_sweeps, sweep_name
+from benchnav.eval.figures.over import Over, find_sweeps
 from benchnav.viz.style import risk_name
 from tests.eval.report import made
 
@@ -208,15 +208,3 @@ def test_many_lines_are_distinguished_by_panels() -> None:
     figure = drawn(*((made.condition(p, f"cvar:{level}"), 5) for p in planners for level in LEVELS))
     assert len(shown(figure)) == 18
     assert all(len(curves(panel)) == 1 for panel in shown(figure))
-
-
-def test_figures_have_the_width_of_a_column_or_a_page() -> None:
-    one = drawn(*((made.condition(risk=f"cvar:{level}"), 5) for level in LEVELS))
-    assert one.get_figwidth() * 25.4 == pytest.approx(88)
-    two = drawn(*((made.condition(risk=f"cvar:{level}", world=w), 5) for level in LEVELS for w in ("a", "b")))
-    assert two.get_figwidth() * 25.4 == pytest.approx(180)
-
-
-def test_a_number_goes_by_its_last_word() -> None:
-    assert sweep_name("planner.options.dwa.horizon") == "horizon"
-    assert sweep_name("severity") == "severity"

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from benchnav.core.grid import outline
-from benchnav.eval.figures.data import MAX_PANELS, choose_recordings
+from benchnav.eval.figures.data import choose_recordings
 from benchnav.eval.figures.moment import known_colours
 from benchnav.eval.figures.trajectories import draw_trajectories
 from benchnav.eval.recording import Recording
@@ -51,11 +51,6 @@ def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do
     alike = [ended(name, 1, "success") for name in "ab"] + [ended(name, 2, "stuck") for name in "ab"]
     assert chosen(alike, ["a", "b"]) == [("a", "2"), ("b", "2")]
     assert chosen(alike[:2], ["a", "b"]) == [("a", "1"), ("b", "1")]
-
-
-def test_no_more_than_can_be_seen() -> None:
-    conditions = [f"t{k}" for k in range(12)]
-    assert len(chosen([recording(condition) for condition in conditions], conditions)) == MAX_PANELS
 
 
 def shown(figure: Figure) -> list:  # type: ignore[type-arg]
@@ -148,13 +143,6 @@ def test_soft_ground_is_marked_on_the_terrain_alone() -> None:
         assert not wanted & (drawn[1] | drawn[2])
 
 
-def test_a_robot_that_was_not_held_has_no_mark_of_it() -> None:
-    taken = held(about=made.recording().about)
-    *_, last = shown(figure := draw_trajectories([taken]))
-    assert not [line for line in last.lines if (line.get_marker(), line.get_color()) == ("X", "black")]
-    assert "immobilised" not in names_in_legend(figure)
-
-
 def test_only_panels_whose_λ_stayed_have_a_third() -> None:
     figure = draw_trajectories([recording(), held(), recording(), recording(), held()])
     titles = [axes.get_title() for axes in shown(figure)]
@@ -165,16 +153,6 @@ def test_only_panels_whose_λ_stayed_have_a_third() -> None:
         axes.get_subplotspec().colspan.start for axes in shown(figure) if "λ field" in axes.get_title()
     ]
     assert columns == [1, 1]
-
-
-def test_ground_is_not_drawn_where_λ_was_resampled() -> None:
-    taken = held(field=None)
-    bare = replace(taken, soft=np.zeros_like(taken.soft), immobilising=np.zeros_like(taken.immobilising))
-    with_ground, without = (draw_trajectories([one]) for one in (taken, bare))
-    assert names_in_legend(with_ground) == names_in_legend(without)
-    for one, other in zip(shown(with_ground), shown(without), strict=True):
-        lines = [sum(len(drawn.get_paths()) for drawn in axes.collections) for axes in (one, other)]
-        assert lines[0] == lines[1] > 0
 
 
 def test_titles_tell_models_and_worlds_apart_where_they_differ() -> None:
@@ -188,12 +166,6 @@ def test_titles_tell_models_and_worlds_apart_where_they_differ() -> None:
     assert titles(told) == ["MPPI, clairvoyant"]
     assert titles({"model": "oracle"}, told) == ["MPPI, oracle, CVaR", "MPPI, clairvoyant"]
     assert titles({}, {"world": "stakes"}) == ["MPPI, paper, CVaR", "MPPI, stakes, CVaR"]
-
-
-def test_maps_stand_in_the_titles_where_they_differ() -> None:
-    figure = draw_trajectories([recording(), recording(map_index=3)])
-    titles = [axes.get_title().split("\n")[0] for axes in shown(figure) if " after " in axes.get_title()]
-    assert titles == ["MPPI, CVaR, std, map 0", "MPPI, CVaR, std, map 3"]
 
 
 def test_without_a_recorded_plan_the_whole_path_is_shown_and_how_it_ended() -> None:

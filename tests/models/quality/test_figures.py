@@ -190,13 +190,6 @@ def test_latent_functions_stand_over_the_true_ones(dataset: TerrainDataset) -> N
     assert sorted(span.get_x() for span in axes.patches) == [10, 12]
 
 
-def test_a_class_that_was_not_measured_is_shaded_throughout(dataset: TerrainDataset) -> None:
-    classes = dataset.recipe.classes
-    figure = latent_figure(ColourModel().table, classes, [[0] * 90 for _ in classes])
-    assert [span.get_x() for span in panel(figure, classes[0].name).patches] == [0, 0]
-    assert figure.axes[0].get_xlim()[1] == pytest.approx(10)
-
-
 @pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's where a layout does not work out
 @pytest.mark.parametrize("count", [1, 2, 4, 5])
 def test_every_number_of_splits_can_be_drawn(count: int, qualities: Qualities) -> None:

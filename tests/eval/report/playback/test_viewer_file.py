@@ -249,27 +249,6 @@ def test_each_map_shows_its_own_layer_under_what_is_driven_and_planned() -> None
     assert list(resampled)[-1] == "λ̂ given to the planner, free: λ̂ above 0.3"
 
 
-def test_each_planner_is_seen_on_what_it_was_given() -> None:
-    recordings = [
-        made.recording(10, labels=made.condition(risk=risk), free_by="mean", free_above=above)
-        for risk, above in (("cvar:0.9", 0.1), ("mean", 0.2))
-    ]
-    views = map_views(drivers_of(recordings))
-    assert views["λ̂ given to mean, free: mean λ above 0.2"] == [
-        "/map/risk/conditions/mean", "/map/overlay/conditions/mean/**", "/map/places/**"
-    ]  # fmt: skip
-    assert views["λ̂ given to CVaR₀.₉, free: mean λ above 0.1"][0] == "/map/risk/conditions/CVaR₀.₉"
-    assert views["Colour"] == ["/map/colour", "/map/soft/**", *OVERLAY]
-
-
-def test_hatching_is_named_where_there_is_some() -> None:
-    hard = made.recording(10)
-    soft = replace(hard, soft=np.ones_like(hard.soft))
-    assert [next(iter(map_views(drivers_of([one])))) for one in (hard, soft)] == [
-        "Colour", "Colour, soft ground hatched"
-    ]  # fmt: skip
-
-
 def test_the_blueprint_has_all_of_them() -> None:
     drivers = drivers_of(
         [made.held_recording(), replace(made.held_recording(), about=made.recording().about)]
@@ -294,19 +273,6 @@ def test_an_episode_is_told_with_its_outcome_and_the_threshold() -> None:
         "std 4",
     ):
         assert words in text
-
-
-def test_conditions_are_told_side_by_side() -> None:
-    first = made.recording(200, labels=made.condition(risk="cvar:0.9"))
-    about = {**made.recording().about, "risk": "mean", "outcome": "out_of_bounds"}
-    text = describe(drivers_of([first, made.recording(150, about=about)]))
-    assert "|  | CVaR₀.₉ | mean |" in text
-    assert "| outcome | **success** | **out of bounds** |" in text
-    assert "| time | 20.0 s of 100 s | 15.0 s of 100 s |" in text
-
-
-def test_an_episode_that_ended_at_once_met_nothing() -> None:
-    assert "| observed λ | – |" in describe(drivers_of([made.recording(0)]))
 
 
 def test_each_layer_has_a_view_of_its_own_beside_the_colours(tmp_path: Path) -> None:
@@ -381,19 +347,3 @@ def test_a_robot_that_learns_has_views_of_what_it_knows() -> None:
     assert list(views)[:-3] == list(map_views(drivers_of([replace(learning, known=())])))
     other = replace(learning, about=learning.about | {"ground": "contact"})
     assert not [name for name in map_views(drivers_of([learning, other])) if name.startswith("Belief")]
-
-
-def test_conditions_that_learn_have_names_and_reaches_of_their_own(tmp_path: Path) -> None:
-    learning = made.learning_recording(12)
-    grounds = ("contact", "probe radius_m=2")
-    path = written(
-        tmp_path, *(replace(learning, about=learning.about | {"ground": ground}) for ground in grounds)
-    )
-    verify(path)
-    found = [
-        entity
-        for entity in chunks(path)
-        if entity.startswith("/map/overlay/conditions/") and "reach" in entity
-    ]
-    assert len(found) == 2
-    assert sum("contact" in entity for entity in found) == 1
