@@ -9,7 +9,7 @@ from benchnav.eval.recording import Ground
 from benchnav.eval.words import NAMING, chosen_in_words, contender_names, outcome_in_words
 from benchnav.viz import maps
 from benchnav.viz.figure import Figure
-from benchnav.viz.style import ONE_COLUMN_IN, TWO_COLUMNS_IN, condition_colours, line_style
+from benchnav.viz.style import LINE_COLOURS, ONE_COLUMN_IN, TWO_COLUMNS_IN, condition_colours, line_style
 
 _MAX_PATHS = 8
 _DARKEST = 0.35  # grey of λ = 0
@@ -51,7 +51,7 @@ class DrivenPaths(Figure):
         panel = figure.subplots()
         maps.show_map(panel, _backdrop(ground), ground.grid.extent_m)
         names = contender_names(rows[[name for name in NAMING if name in rows]].to_dict("records"))
-        colours = condition_colours(list(rows["planner"]))
+        colours = condition_colours(list(rows["planner"]), LINE_COLOURS)
         for place, (row, track) in enumerate(zip(rows.to_dict("records"), tracks, strict=True)):
             # Later ones are thinner, so that paths that coincide are all seen.
             thickness = 0.9 + 2.2 * (1 - place / max(len(rows), 2))

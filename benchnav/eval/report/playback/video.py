@@ -31,6 +31,7 @@ MOST_CONDITIONS = 6
 
 _DPI = 160  # a frame is as large as a printed figure, and letters and lines are those of one
 _ENDS_IN, _HEADING_IN = 0.8, 0.6  # heights of what is over and below all maps, and around each row of them
+_BAR_IN = 0.9  # width of the colour bar
 _LETTER_IN = 0.068
 _MOMENTS = 9  # of an episode, of which the legend names what is drawn
 
@@ -189,7 +190,7 @@ def _columns(count: int, ratio: float) -> int:
     """Return how many maps of a height over width stand side by side, so that they are as large as possible."""
     wide, high = (size / _DPI for size in SIZE)
     widths = {
-        columns: min(wide / columns, ((high - _ENDS_IN) / rows - _HEADING_IN) / ratio)
+        columns: min((wide - _BAR_IN) / columns, ((high - _ENDS_IN) / rows - _HEADING_IN) / ratio)
         for columns in range(1, count + 1)
         for rows in [-(-count // columns)]
     }
