@@ -50,7 +50,9 @@ def test_the_public_names_are_these(name: str) -> None:
 
 
 def test_an_old_name_is_answered_with_the_new_one() -> None:
-    with pytest.raises(ImportError, match=r"^benchnav.planning.OptimalBound is now benchnav.planning.NearOptimal.$"):
+    with pytest.raises(
+        ImportError, match=r"^benchnav.planning.OptimalBound is now benchnav.planning.NearOptimal.$"
+    ):
         exec("from benchnav.planning import OptimalBound")
 
 

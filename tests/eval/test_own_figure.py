@@ -5,14 +5,18 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.figure import Figure as Drawing
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.figures import figures_of
+from benchnav.eval.figures.data import RunData
 from benchnav.eval.figures.shipped import SHIPPED
 from benchnav.eval.report.write import read_report, write_report
+from benchnav.eval.results import open_results
 from benchnav.eval.run.check import check_suite
+from benchnav.viz import Figure
 from tests.commands import call
 from tests.eval.report.test_write import episodes, run_folder
 
@@ -101,3 +105,23 @@ def test_shipped_figures_have_names_and_needs_and_are_listed_in_order(folder: Pa
     more = [registry.make("figure", name) for name in ("success", f"{OWN}:WhenFailed")]
     names = [figure.name for figure in figures_of(report, more)]
     assert names == ["success", "outcomes", "distributions", "when-failed"]
+
+
+class Twice(Figure):
+    """Two variants, each with its place as title."""
+
+    name, place = "twice", 0
+
+    def variants(self, data: RunData) -> list["Twice"]:
+        return self.numbered(2)
+
+    def draw(self, data: RunData) -> Drawing:
+        figure = Drawing()
+        figure.suptitle(self.name)
+        return figure
+
+
+def test_all_variants_of_a_figure_are_drawn(folder: Path) -> None:
+    drawn = open_results(folder).plot(Twice())
+    assert isinstance(drawn, list)
+    assert [figure.get_suptitle() for figure in drawn] == ["twice-1", "twice-2"]
