@@ -187,7 +187,7 @@ def legend_outside(
 
 def page_width(count: int, across: int) -> float:
     """Return the width in inches of a figure with some places, of which so many fill both columns of a page."""
-    return max(TWO_COLUMNS_IN * min(count, across) / across, _MIN_WIDTH_IN)
+    return max(TWO_COLUMNS_IN * (min(count, across) / across), _MIN_WIDTH_IN)
 
 
 def save(
