@@ -192,8 +192,8 @@ def _log_known(stage: Stage, driver: Driver) -> None:
         stage.edges(driver.entity("map/closed"), edge, _CLOSED, 0.08, not learns)
     for known in recording.known:
         stage.at(known.step)
-        colours = [driver.colour if driver.name else bytes_of(REACH)]
-        stage.both(driver.entities("reach"), _STRIPS, known.outlines, (0.05, 0.15), colors=colours)
+        reach = [driver.colour if driver.name else bytes_of(REACH)]
+        stage.both(driver.entities("reach"), _STRIPS, known.outlines, (0.05, 0.15), colors=reach)
 
 
 def _log_robot(stage: Stage, driver: Driver) -> None:
