@@ -7,7 +7,7 @@ __getattr__, __dir__, __all__ = face(
     {
         "benchnav.viz.figure": ("Figure",),
         "benchnav.viz.maps": ("Drive", "draw_drive", "draw_path", "mark", "show_map"),
-        "benchnav.viz.panels": ("Curves", "draw_interval", "line_looks", "panel_grid"),
+        "benchnav.viz.panels": ("Curves", "draw_estimates", "draw_interval", "line_looks", "panel_grid"),
         "benchnav.viz.style": (
             "condition_colours",
             "legend_outside",

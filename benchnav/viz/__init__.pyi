@@ -1,6 +1,6 @@
 from benchnav.viz.figure import Figure
 from benchnav.viz.maps import Drive, draw_drive, draw_path, mark, show_map
-from benchnav.viz.panels import Curves, draw_interval, line_looks, panel_grid
+from benchnav.viz.panels import Curves, draw_estimates, draw_interval, line_looks, panel_grid
 from benchnav.viz.style import (
     condition_colours,
     legend_outside,
@@ -18,6 +18,7 @@ __all__ = [
     "Figure",
     "condition_colours",
     "draw_drive",
+    "draw_estimates",
     "draw_interval",
     "draw_path",
     "legend_outside",

@@ -73,6 +73,35 @@ def panel_grid(
     return figure, places
 
 
+def draw_estimates(
+    panel: Axes,
+    x: Any,
+    y: Any,
+    low: Any,
+    high: Any,
+    look: Mapping[str, Any],
+    label: str = "",
+    bars: bool = False,
+) -> None:
+    """Draw estimates as a line with the band of their intervals.
+
+    Args:
+        panel: where.
+        x: shape [N].
+        y: shape [N].
+        low: lower ends of the intervals, shape [N]; NaN for none.
+        high: upper ends.
+        look: keywords of `Axes.plot`.
+        label: of the line in a legend; if empty, none.
+        bars: whether intervals are bars in place of a band.
+    """
+    if bars:
+        panel.vlines(x, low, high, color=look["color"], lw=0.7)
+    else:
+        panel.fill_between(x, low, high, color=look["color"], alpha=0.15, lw=0)
+    panel.plot(x, y, label=label or "_line", **look)
+
+
 def draw_interval(
     panel: Axes, low: float, high: float, height: float, colour: Any, width: float = 1.2
 ) -> None:
@@ -132,13 +161,9 @@ class Curves:
         for (group, measure), panel in panels.items():
             own = self.table[self.table["panel"] == group]
             for line, points in own.groupby("line", sort=False):
-                x, y, look = points["x"], points[measure], self.looks[line]
+                x, y = points["x"], points[measure]
                 low, high = (points.get(f"{measure}_{end}", y) for end in ("low", "high"))
-                if self.bars:
-                    panel.vlines(x, low, high, color=look["color"], lw=0.7)
-                else:
-                    panel.fill_between(x, low, high, color=look["color"], alpha=0.15, lw=0)
-                panel.plot(x, y, label=str(line), **look)
+                draw_estimates(panel, x, y, low, high, self.looks[line], str(line), self.bars)
             panel.grid(axis="y", color=GRID)
         return figure, panels
 
