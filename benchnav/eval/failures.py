@@ -52,7 +52,7 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
     steps = [rows[read] for rows in step_files(folder, set(failed["condition"]))]
     if not steps:
         return failed.assign(**dict.fromkeys(_ENDS, np.nan))
-    return failed.merge(_ends(pd.concat(steps)), on=_KEYS, how="left")
+    return failed.merge(_ends(pd.concat(steps, ignore_index=True)), on=_KEYS, how="left")
 
 
 def _ends(steps: pd.DataFrame) -> pd.DataFrame:

@@ -191,13 +191,15 @@ def write_report(
     if not report.tests.empty:
         caption = report.says("Tests of the hypotheses that were fixed before the run.")
         texts["hypotheses.tex"] = to_latex([report.hypotheses], caption, f"{report.name}-hypotheses")
-    captions, faults = _draw_figures(report, figures, out / "figures")
-    report = replace(report, warnings=(*report.warnings, *faults), faults=faults)
-    texts |= {file: render(file, report, captions) for file in ("summary.md", PAGE)}
     for name, text in texts.items():
         write_text(out / name, text)
+    captions, faults = _draw_figures(report, figures, out / "figures")
+    report = replace(report, warnings=(*report.warnings, *faults), faults=faults)
+    pages = "summary.md", PAGE
+    for name in pages:
+        write_text(out / name, render(name, report, captions))
     drawn = [path.with_suffix(suffix) for path in captions for suffix in (".png", ".pdf")]
-    note_checksums(out, [*drawn, *(out / name for name in texts)])
+    note_checksums(out, [*drawn, *(out / name for name in (*texts, *pages))])
     return report
 
 

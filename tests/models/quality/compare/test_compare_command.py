@@ -257,11 +257,7 @@ def test_a_model_that_is_worse_than_none_is_told_so(
         ([], "one model or more"),
         (["colours", "colours"], "models that differ"),
         (["colour"], "Did you mean 'colours'"),
-        (["colours", "--splits", "[test/hg]"], "test/hg"),
-        (["colours", "--splits", "[]"], "Expected `splits` among "),
-        (["colours", "--seed", "-1"], "`seed`"),
         (["colours", "--out", "folder"], "is something else than a comparison"),
-        (["colours", "--out", "folder/file/out"], "folder/file"),
     ],
 )
 def test_bad_input_is_refused_in_one_line_before_any_work(
