@@ -2,17 +2,18 @@
 
 import json
 import math
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, combinations, islice
+from datetime import timedelta
+from itertools import chain, combinations
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from benchnav.core.command import tell
 from benchnav.core.errors import ConfigError
 from benchnav.core.quantity import Quantity
 from benchnav.core.settings import check_known
@@ -32,8 +33,7 @@ from benchnav.eval.folder.run_folder import (
     read_table,
 )
 from benchnav.eval.report.comparison_tables import comparison_table, metric_table
-from benchnav.eval.stats.by_metric import compare_by
-from benchnav.eval.stats.comparison import compare
+from benchnav.eval.stats.comparison import compare, compare_by
 from benchnav.eval.stats.pairs import (
     Compared,
     Pair,
@@ -51,7 +51,6 @@ _LISTED, _NAMED = 8, 3
 _MIN_DIFFERENCE = 1e-5  # of success; a run has 10⁸ episodes at most
 # From so many pairs on their time is announced, from that of a few.
 _MANY, _TIMED = 5_000, 5
-_UNITS = (("days", 86_400), ("hours", 3_600), ("minutes", 60), ("seconds", 1))
 
 
 def compare_runs(
@@ -181,19 +180,13 @@ def read_conditions(runs: Sequence[Run]) -> list[Compared]:
 
 def _announce(conditions: Sequence[Compared], by: str, against: str, difference: float) -> None:
     """Print on stderr about how long a comparison of many pairs takes, from the time of a few."""
-    if math.comb(len(conditions), 2) < _MANY:
+    every = list(matches(conditions, by, against)) if math.comb(len(conditions), 2) >= _MANY else []
+    if len(every) < _MANY:
         return
-    count = sum(1 for _ in matches(conditions, by, against))
-    if count < _MANY:
-        return
-    few = list(islice(matches(conditions, by, against), _TIMED))
     begin = time.perf_counter()
-    compare(find_pairs(list(dict.fromkeys(chain(*few))), by, against)[:_TIMED], difference)
-    seconds = (time.perf_counter() - begin) / _TIMED * count
-    unit, value = next((unit, seconds / size) for unit, size in _UNITS if seconds >= size or size == 1)
-    print(
-        f"benchnav-eval: comparing {count} pairs takes about {value:.0f} {unit}.", file=sys.stderr, flush=True
-    )
+    compare(find_pairs(list(dict.fromkeys(chain(*every[:_TIMED]))), by, against)[:_TIMED], difference)
+    seconds = (time.perf_counter() - begin) / _TIMED * len(every)
+    tell(f"benchnav-eval: comparing {len(every)} pairs takes about {timedelta(seconds=round(seconds))}.")
 
 
 def _codes(about: Mapping[str, Any], run: str, digests: Iterable[str]) -> dict[str, Any]:

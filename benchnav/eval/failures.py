@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.dataset as ds
 
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.folder.steps import open_steps, rows_of
+from benchnav.eval.folder.steps import step_files
 from benchnav.eval.recording import Recording
 from benchnav.eval.stats.best import competing
 from benchnav.eval.words import blocks, with_names
@@ -50,12 +48,11 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
     failed = episodes.loc[~episodes["success"].astype(bool), [*columns, "end_time_s", "code"]].reset_index(
         drop=True
     )
-    source = open_steps(folder)
-    if source is None:
+    read = [*_KEYS, "time_s", "x_m", "y_m", "traversability"]
+    steps = [rows[read] for rows in step_files(folder, set(failed["condition"]))]
+    if not steps:
         return failed.assign(**dict.fromkeys(_ENDS, np.nan))
-    chosen = ds.field("condition").isin(pa.array(failed["condition"].unique(), pa.string()))
-    steps = rows_of(folder, source, [*_KEYS, "time_s", "x_m", "y_m", "traversability"], chosen)
-    return failed.merge(_ends(steps), on=_KEYS, how="left")
+    return failed.merge(_ends(pd.concat(steps, ignore_index=True)), on=_KEYS, how="left")
 
 
 def _ends(steps: pd.DataFrame) -> pd.DataFrame:

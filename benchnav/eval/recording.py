@@ -263,18 +263,15 @@ class Recording(Ground):
 
     @classmethod
     def _read(cls, values: dict[str, Any]) -> Self:
-        packed = {name: values.pop(name) for name in list(values) if name.startswith("plans:")}
-        layers = {name: values.pop(name) for name in list(values) if name.startswith("layers:")}
-        known = {name: values.pop(name) for name in list(values) if name.startswith("known:")}
-        return cls(
-            **values
-            | {
-                "plans": _unpack(packed),
-                "known": _unpack_known(known) if known else (),
-                "action_names": tuple(values["action_names"]),
-                "layers": {name.removeprefix("layers:"): layer for name, layer in layers.items()},
-            }
-        )
+        layers, plans, known = (_under(prefix, values) for prefix in ("layers:", "plans:", "known:"))
+        own = {name: value for name, value in values.items() if ":" not in name}
+        own["action_names"] = tuple(own["action_names"])
+        return cls(**own, layers=layers, plans=_unpack(plans), known=_unpack_known(known) if known else ())
+
+
+def _under(prefix: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values whose names begin with a prefix, by the rest of their names."""
+    return {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
 
 
 def read_recordings(folder: Path) -> list[Recording]:
@@ -334,14 +331,11 @@ def _pack(plans: Sequence[DrawnPlan]) -> dict[str, np.ndarray]:
 
 
 def _unpack(arrays: Mapping[str, np.ndarray]) -> list[DrawnPlan]:
-    points, sizes, counts = (
-        {name.removeprefix(kind): array for name, array in arrays.items() if name.startswith(kind)}
-        for kind in ("plans:points/", "plans:sizes/", "plans:counts/")
-    )
+    points, sizes, counts = (_under(kind, arrays) for kind in ("points/", "sizes/", "counts/"))
     layers = {name: _cut(_cut(points[name], sizes[name]), counts[name]) for name in points}
     return [
         DrawnPlan(step=int(step), lines={name: lines[place] for name, lines in layers.items()})
-        for place, step in enumerate(arrays["plans:steps"])
+        for place, step in enumerate(arrays["steps"])
     ]
 
 
@@ -378,7 +372,7 @@ def _pack_known(known: Sequence[KnownMap]) -> dict[str, np.ndarray]:
 
 
 def _unpack_known(arrays: Mapping[str, np.ndarray]) -> tuple[KnownMap, ...]:
-    values = {name.removeprefix("known:"): array for name, array in arrays.items()}
+    values = dict(arrays)
     width = values[NUMBERS[0]].shape[-1]
     for name in NUMBERS:
         values[name] = values[name].cumsum(axis=0, dtype=np.uint8).astype(np.float32) / _LEVELS

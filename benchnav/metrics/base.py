@@ -182,6 +182,17 @@ class Metric(Specified, ABC):
         return Quantity(**known | {"words": words, "heading": self.heading or f"{words}{unit}"})
 
 
+class Recorded(Metric):
+    """A number that the episode holds under the name of the column."""
+
+    min_steps = 0
+
+    def compute(self, episode: Episode) -> float:
+        """Return the number."""
+        value: float = getattr(episode, self.column)
+        return value
+
+
 def measure(metric: Metric, episode: Episode) -> float:
     """Computes a metric that may be a user's.
 

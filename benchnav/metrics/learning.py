@@ -1,7 +1,6 @@
 """Metrics of what a robot learnt during an episode; NaN if it learnt nothing."""
 
 import math
-from abc import abstractmethod
 
 import numpy as np
 
@@ -17,9 +16,10 @@ class _OfLearnt(Metric):
         """Return the value; NaN if the robot learnt nothing."""
         return math.nan if episode.learnt is None else float(self.of(episode.learnt))
 
-    @abstractmethod
     def of(self, learnt: Learnt) -> float:
-        """Return the value of a robot that learnt."""
+        """Return the value of a robot that learnt: what it holds under the name of the column."""
+        value: float = getattr(learnt, self.column)
+        return value
 
 
 class Revisions(_OfLearnt):
@@ -27,10 +27,6 @@ class Revisions(_OfLearnt):
 
     name = column = heading = "revisions"
     meaning = "how often its planner was given another map"
-
-    def of(self, learnt: Learnt) -> float:
-        """Return the count."""
-        return learnt.revisions
 
 
 class SeenCells(_OfLearnt):
@@ -40,10 +36,6 @@ class SeenCells(_OfLearnt):
     heading = "cells seen"
     meaning = "cells whose appearance a robot saw"
 
-    def of(self, learnt: Learnt) -> float:
-        """Return the count."""
-        return learnt.seen_cells
-
 
 class SensedCells(_OfLearnt):
     """Cells whose λ the robot sensed."""
@@ -51,10 +43,6 @@ class SensedCells(_OfLearnt):
     name = column = "sensed_cells"
     heading = "cells sensed"
     meaning = "cells whose λ it sensed"
-
-    def of(self, learnt: Learnt) -> float:
-        """Return the count."""
-        return learnt.sensed_cells
 
 
 class _Ahead(_OfLearnt):

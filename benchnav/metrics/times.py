@@ -6,10 +6,10 @@ metric ground navigation" (BARN), for the score.
 
 import math
 
-from benchnav.metrics.base import Episode, Metric
+from benchnav.metrics.base import Episode, Metric, Recorded
 
 
-class Success(Metric):
+class Success(Recorded):
     """Whether the robot reached the goal."""
 
     name = column = "success"
@@ -18,11 +18,6 @@ class Success(Metric):
     better = "higher"
     heading = "Succ. [%]"
     meaning = "share of episodes that reached the goal"
-    min_steps = 0
-
-    def compute(self, episode: Episode) -> float:
-        """Return whether the episode is a success, a bool."""
-        return episode.success
 
 
 class TotalTime(Metric):
@@ -41,7 +36,7 @@ class TotalTime(Metric):
         return episode.end_time_s if episode.success else episode.time_budget_s
 
 
-class EndTime(Metric):
+class EndTime(Recorded):
     """When the episode ended."""
 
     name = "end_time"
@@ -49,14 +44,9 @@ class EndTime(Metric):
     suffix = "_s"
     unit = "s"
     meaning = "time at which the episode ended"
-    min_steps = 0
-
-    def compute(self, episode: Episode) -> float:
-        """Return the time in seconds."""
-        return episode.end_time_s
 
 
-class ReferenceTime(Metric):
+class ReferenceTime(Recorded):
     """The dataset's reference time of the map."""
 
     name = "reference_time"
@@ -64,11 +54,6 @@ class ReferenceTime(Metric):
     suffix = "_s"
     unit = "s"
     meaning = "least travel time over the grid at 1 m/s, of the dataset"
-    min_steps = 0
-
-    def compute(self, episode: Episode) -> float:
-        """Return the time in seconds; NaN if the map has none."""
-        return episode.reference_time_s
 
 
 class TimeRatio(Metric):

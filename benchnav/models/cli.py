@@ -11,8 +11,7 @@ from benchnav.models.config import (
     TrainOptions,
 )
 from benchnav.models.onnx_command import export
-from benchnav.models.quality.command import evaluate_command
-from benchnav.models.quality.compare.command import compare
+from benchnav.models.quality.command import compare, evaluate_command
 
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
 

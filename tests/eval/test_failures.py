@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pytest
 
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.failures import Sheets, collect_sheets, failures_table
@@ -77,14 +76,6 @@ def test_without_steps_there_is_no_place(tmp_path: Path) -> None:
     )
 
 
-def test_a_run_without_failures_has_an_empty_table(tmp_path: Path) -> None:
-    rows = made.rows(made.row(made.condition(), 0))
-    keep(tmp_path, steps(rows["condition"][0], 0, [0.5]))
-    table = failures_table(tmp_path, rows)
-    assert table.empty
-    assert {"outcome", "x_m", "last_traversability"} <= set(table.columns)
-
-
 RATES = {"mean": 2, "var": 5, "cvar": 8}
 
 
@@ -139,14 +130,6 @@ def test_the_best_and_the_worst_that_sees_are_shown(tmp_path: Path) -> None:
     # What was predicted is that of all failures, shown or not.
     assert set(sheets.predicted) == {conditions["cvar"], conditions["mean"]}
     np.testing.assert_allclose(sheets.predicted[conditions["mean"]], np.arange(2, 10) / 100)
-
-
-def test_a_planner_that_is_told_nothing_has_no_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in RATES:  # the blind line, which fails on all, is then as good
-        monkeypatch.setitem(RATES, name, 0)
-    sheets, conditions = collected(tmp_path, recorded)
-    assert conditions["–"] not in sheets.predicted
-    assert all("straight" not in line.name for _, lines in sheets.shown for line in lines)
 
 
 def test_it_is_left_out_with_a_reason(tmp_path: Path) -> None:

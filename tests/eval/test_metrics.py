@@ -324,25 +324,6 @@ def test_a_metric_of_this_process_alone_is_refused_for_workers(dataset_path: Pat
         run(dataset_path, tmp_path / "run", jobs=2, metrics=("here",))
 
 
-def test_a_hypothesis_on_a_metric_without_a_better_way_names_its_direction(
-    dataset_path: Path, tmp_path: Path
-) -> None:
-    claim = {
-        "one": {"risk": "cvar"},
-        "other": {"risk": "mean"},
-        "metric": "own",
-        "kind": "superiority",
-        "margin": 1,
-    }
-    own = own_metric(tmp_path, "1.0")
-    with pytest.raises(ConfigError, match="Expected `direction` of hypothesis 1"):
-        run(dataset_path, tmp_path / "run", metrics=(own,), hypotheses=(claim,))
-    rows, _ = run(
-        dataset_path, tmp_path / "run", metrics=(own,), hypotheses=({**claim, "direction": "lower"},)
-    )
-    assert (rows["own"] == 1).all()
-
-
 def test_shards_merge_and_reruns_repeat_with_the_metric(dataset_path: Path, tmp_path: Path) -> None:
     parts = []
     for index in (1, 2):

@@ -1,4 +1,3 @@
-import json
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -207,13 +206,6 @@ def test_what_was_known_comes_back_within_a_level(tmp_path: Path) -> None:
     for one, other in zip(again.known, Recording.load(tmp_path / "b.npz").known, strict=True):
         for item in fields(KnownMap):
             np.testing.assert_array_equal(getattr(one, item.name), getattr(other, item.name))
-
-
-def test_files_without_it_are_as_before(tmp_path: Path) -> None:
-    made.recording(10).save(tmp_path / "a.npz")
-    with np.load(tmp_path / "a.npz") as stored:
-        assert not any("known" in name for name in (*stored, *json.loads(str(stored["scalars"]))))
-    assert Recording.load(tmp_path / "a.npz").known == ()
 
 
 def test_forty_seconds_of_learning_are_small(tmp_path: Path) -> None:

@@ -88,14 +88,6 @@ def test_mean_interval_is_students() -> None:
         np.testing.assert_allclose((low, high), (expected.low, expected.high))
 
 
-def test_seven_maps_and_none_have_no_interval_of_a_mean() -> None:
-    mean, low, high = mean_interval(np.arange(7.0))
-    assert mean == 3
-    assert np.isnan([low, high]).all()
-    assert np.isfinite(mean_interval(np.arange(8.0))).all()
-    assert np.isnan(mean_interval(np.empty(0))).all()
-
-
 def test_total_time_is_put_together_of_failures_and_of_time_without_them() -> None:
     """By hand: ten maps, two of which fail at 100 s; those that arrive take 30 or 40 s."""
     times = np.array([30.0, 40, 30, 40, 30, 40, 30, 40, 100, 100])
@@ -114,12 +106,6 @@ def test_total_time_is_put_together_of_failures_and_of_time_without_them() -> No
 def test_wilson_interval_is_scipys(successes: int, n: int) -> None:
     expected = binomtest(successes, n).proportion_ci(0.95, method="wilson")
     assert wilson_interval(successes / n, n) == pytest.approx((expected.low, expected.high), abs=1e-12)
-
-
-def test_a_fraction_of_an_episode_counts_as_that() -> None:
-    whole, half, more = (wilson_interval(0.8, n) for n in (20, 20.5, 21))
-    assert whole[0] < half[0] < more[0]
-    assert whole[1] > half[1] > more[1]
 
 
 def drawn(

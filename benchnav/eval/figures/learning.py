@@ -7,13 +7,11 @@ from typing import Self
 
 import numpy as np
 import pandas as pd
-import pyarrow.compute as pc
-import pyarrow.dataset as ds
 from matplotlib.figure import Figure as Drawing
 
 from benchnav.eval.figures.data import RunData
 from benchnav.eval.figures.lines import MAX_ACROSS, divide_lines
-from benchnav.eval.folder.steps import AHEAD_COLUMNS, AHEAD_DEG, AHEAD_M, open_steps, rows_of
+from benchnav.eval.folder.steps import AHEAD_COLUMNS, AHEAD_DEG, AHEAD_M, step_files
 from benchnav.eval.stats.best import BLOCK
 from benchnav.eval.words import NAMING, joined, reading_name
 from benchnav.stats.bootstrap import LEAST_MAPS, bootstrap_counts
@@ -101,12 +99,14 @@ def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         "maps",
         *(f"{name}{end}" for name in names for end in ("", "_low", "_high")),
     ]
-    source = open_steps(folder)
-    if source is None or not set(names) <= set(source.schema.names):
+    known = [
+        rows.loc[rows[names[0]].notna(), [*_EPISODE, "time_s", *names]]
+        for rows in step_files(folder)
+        if names[0] in rows
+    ]
+    if not known:
         return pd.DataFrame(columns=columns)
-    told = pc.is_finite(ds.field(names[0]))
-    steps = rows_of(folder, source, [*_EPISODE, "time_s", *names], told)
-    steps = steps.merge(episodes[[*_EPISODE, "group"]], on=_EPISODE)
+    steps = pd.concat(known).merge(episodes[[*_EPISODE, "group"]], on=_EPISODE)
     steps["bin"] = (steps["time_s"] / _BIN_S + 1e-6).astype(int)
     # An episode counts once in a bin, and a map once, however many episodes were on it.
     once = steps.groupby([*_EPISODE, "group", "bin"])[names].mean()

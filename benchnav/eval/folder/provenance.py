@@ -116,29 +116,31 @@ def describe_parts(condition: Condition) -> Code:
     modules, parts = [_UNIT], {}
     for kind in PART_KINDS:
         part = getattr(condition, kind)
-        name = f"{kind} {part.part}"
-        if is_checkpoint(kind, part.part):
-            folder = find_checkpoint(part.part)
-            parts[name] = text_digest(digests_of(folder))
-            own = split_own(part.part)
-            family = registry.find(kind, own[0]) if own else find_family(read_config(folder)["model"])
-            if family.shipped:
-                modules.append(family.target.__module__)
-            else:
-                parts[f"class of {name}"] = text_digest([family.origin, family.digest])
-            continue
-        found = registry.find(kind, part.part)
+        name, found = f"{kind} {part.part}", _code_of(kind, part)
+        is_trained = is_checkpoint(kind, part.part)
+        if is_trained:
+            parts[name] = text_digest(digests_of(find_checkpoint(part.part)))
         if found.shipped:
             modules.append(found.target.__module__)
         else:
-            parts[name] = text_digest([found.origin, found.digest])
-        files = registry.option_files(kind, part)
-        parts |= {f"{text} of {name}": digest for text, digest in files.items()}
+            parts[f"class of {name}" if is_trained else name] = text_digest([found.origin, found.digest])
+        if not is_trained:
+            files = registry.option_files(kind, part)
+            parts |= {f"{text} of {name}": digest for text, digest in files.items()}
     if condition.needs_statistics:
         dataset = TerrainDataset(find_dataset(condition.data))
         statistics = find_ground_statistics(condition.model, dataset)
         parts["statistics of the ground"] = text_digest(statistics.to_json())
     return {"modules": package_modules(modules), "parts": parts}
+
+
+def _code_of(kind: str, part: Part) -> registry.Found:
+    """Return the class or function of a part; of a checkpoint the class that loads it."""
+    if not is_checkpoint(kind, part.part):
+        return registry.find(kind, part.part)
+    if own := split_own(part.part):
+        return registry.find(kind, own[0])
+    return find_family(read_config(find_checkpoint(part.part))["model"])
 
 
 def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
@@ -169,18 +171,8 @@ def lacks_metrics(code: Mapping[str, Any], wanted: Code) -> list[str]:
 def touches(condition: Condition, metrics: Iterable[Part] = ()) -> Touches:
     """Return what the user's own parts of a unit have touched in this process; see `benchnav.core.touched`."""
     every = [registry.find("metric", part.part) for part in metrics]
-    targets = [found.target for found in every if not found.shipped]
-    for kind in PART_KINDS:
-        part = getattr(condition, kind)
-        if not is_checkpoint(kind, part.part):
-            found = registry.find(kind, part.part)
-        elif own := split_own(part.part):
-            found = registry.find(kind, own[0])
-        else:
-            found = find_family(read_config(find_checkpoint(part.part))["model"])
-        if not found.shipped:
-            targets.append(found.target)
-    return touches_of(targets)
+    every += [_code_of(kind, getattr(condition, kind)) for kind in PART_KINDS]
+    return touches_of([found.target for found in every if not found.shipped])
 
 
 def describe_datasets(conditions: Conditions) -> dict[str, Any]:

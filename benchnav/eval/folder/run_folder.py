@@ -27,7 +27,7 @@ from benchnav.eval.experiment.condition import NOT_USED, Condition, condition_fr
 from benchnav.eval.experiment.suite import RECORDS
 from benchnav.eval.experiment.unit import DRAW, Extent, Unit, steps_path
 from benchnav.eval.folder.provenance import METRICS, TOUCHED, Origin, code_digest, touches
-from benchnav.eval.folder.sealed import CONTENT, DamageError, metadata, read_sealed, with_metadata
+from benchnav.eval.folder.sealed import CONTENT, DamageError, damage_of, metadata, read_sealed, with_metadata
 
 FORMAT, FORMAT_VERSION = "benchnav-run", 6
 RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
@@ -192,22 +192,15 @@ class Finished:
 
         Steps and recordings count if they are of this making of the unit; a file that is missing is no damage.
         """
-        lines = []
-        try:
-            read_sealed(self.path)
-        except DamageError as error:
-            lines.append(f"{self.path.relative_to(self.folder)}: {error}")
+        lines = damage_of(self.path, str(self.path.relative_to(self.folder)))
         steps = steps_path(self.about["unit"][0], self.path.name.rpartition("-")[0])
         about = metadata(self.folder / steps)
         if about and about.get("key") != self.about["key"]:
             return lines
         if self.about.get("steps") and (self.folder / steps).exists():
-            try:
-                read_sealed(self.folder / steps)
-                if about.get(CONTENT) != self.about["steps"]:
-                    raise DamageError("it holds the steps of another run")
-            except DamageError as error:
-                lines.append(f"{steps}: {error}")
+            of_others = [f"{steps}: it holds the steps of another run"]
+            is_own = about.get(CONTENT) == self.about["steps"]
+            lines += damage_of(self.folder / steps, str(steps)) or ([] if is_own else of_others)
         for name, digest in self.about.get("recordings", {}).items():
             if digest_of_path(self.folder / name) not in ("", digest):
                 lines.append(f"{name}: it was changed after benchnav wrote it")

@@ -97,3 +97,12 @@ def read_sealed(path: Path) -> pa.Table:
     if not about or about.get(CONTENT) != content:
         raise DamageError("it was changed after benchnav wrote it")
     return table.replace_schema_metadata(None)
+
+
+def damage_of(path: Path, name: str) -> list[str]:
+    """Return a line that begins with the name of a file and says what is wrong with it; none where it is as written."""
+    try:
+        read_sealed(path)
+    except DamageError as error:
+        return [f"{name}: {error}"]
+    return []

@@ -5,24 +5,22 @@ The files are `steps/condition=ID/SEED-REALISATION-BLOCK.parquet`.
 Any reader of partitioned Parquet takes them: `pandas.read_parquet(run / "steps", filters=[("condition", "==", id)])`.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import check_known
 from benchnav.core.store import replacing
 from benchnav.eval.experiment.condition import LABELS
-from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.folder.run_folder import EPISODES, damaged, open_run
-from benchnav.eval.folder.sealed import DamageError, metadata, read_sealed, with_metadata
+from benchnav.eval.experiment.unit import DRAW, Unit
+from benchnav.eval.folder.run_folder import damaged, open_run
+from benchnav.eval.folder.sealed import metadata, read_sealed, with_metadata
 
 STEPS = "steps"
 
@@ -30,9 +28,7 @@ LAST_COLUMN = "traversability"
 # RMSE of E[λ] and mean log score of what is believed of the ground ahead of a robot.
 AHEAD_COLUMNS = ("ahead_rmse", "ahead_log_score")
 AHEAD_M, AHEAD_DEG = 5.0, 45.0  # how far, and how far to either side, ground is ahead of a robot
-_KEYS = ("seed", "realisation", "map")
-_VALUES = ("time_s", "x_m", "y_m", LAST_COLUMN)
-_ORDER = ["condition", *_KEYS, "step"]
+_ORDER = ["condition", *DRAW, "step"]
 _REMEDY = "Remove the steps, which the report can do without, or run it again with another `--out`."
 
 
@@ -75,58 +71,30 @@ def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
             _write(path, pa.table(full), metadata(path))
 
 
-def open_steps(folder: Path) -> ds.Dataset | None:
-    """Opens the steps of a run; None where none were kept.
+def has_steps(folder: Path) -> bool:
+    """Return whether steps of a run were kept."""
+    return any((folder / STEPS).glob("*/*.parquet"))
+
+
+def step_files(folder: Path, conditions: Collection[str] | None = None) -> Iterator[pd.DataFrame]:
+    """Yield the steps of a run, a file at a time, whose digest is of all that it holds.
 
     Args:
         folder: the run folder.
+        conditions: ids of those that are read; None for all.
+
+    Yields:
+        Columns as of `step_table`, and `condition`. Files of a run that is not finished may differ in their columns.
 
     Raises:
-        ConfigError: a file of them is damaged.
+        ConfigError: a file is damaged.
     """
-    if not any((folder / STEPS).glob("*/*.parquet")):
-        return None
-    with damaged(folder / STEPS, _REMEDY):
-        # By its type, since an id of digits alone would be taken for a number.
-        parts = ds.partitioning(pa.schema([("condition", pa.string())]), flavor="hive")
-        source = ds.dataset(folder / STEPS, partitioning=parts)
-        # Files of a run that is not finished may differ in their columns.
-        if not (folder / EPISODES).exists():
-            schemas = [fragment.physical_schema for fragment in source.get_fragments()]
-            source = source.replace_schema(pa.unify_schemas([source.schema, *schemas]).remove_metadata())
-        return source
-
-
-def rows_of(
-    folder: Path, source: ds.Dataset, columns: Sequence[str] | None, chosen: pc.Expression
-) -> pd.DataFrame:
-    """Reads steps.
-
-    Args:
-        folder: the run folder.
-        source: its steps.
-        columns: which; None for all.
-        chosen: of which rows.
-
-    Raises:
-        ConfigError: a file of them is damaged.
-    """
-    # Whole files, since their digests are of all that they hold.
-    tables = []
-    with damaged(folder / STEPS, _REMEDY):
-        for field in source.schema:
-            fits = pa.types.is_integer if field.name in _KEYS else pa.types.is_floating
-            if field.name in (*_KEYS, *_VALUES) and not fits(field.type):
-                raise DamageError(f"{field.name} holds {field.type}")
-        for fragment in source.get_fragments(filter=chosen):
-            table = read_sealed(Path(fragment.path))
-            condition = ds.get_partition_keys(fragment.partition_expression)["condition"]
-            table = table.append_column("condition", pa.array([condition] * len(table), pa.string()))
-            table = table.filter(chosen)
-            tables.append(table.select(columns) if columns else table)
-        if not tables:
-            return source.schema.empty_table().select(columns or source.schema.names).to_pandas()
-        return pa.concat_tables(tables, promote_options="default").to_pandas()
+    for path in sorted((folder / STEPS).glob("*/*.parquet")):
+        condition = path.parent.name.removeprefix("condition=")
+        if conditions is None or condition in conditions:
+            with damaged(folder / STEPS, _REMEDY):
+                rows = read_sealed(path).to_pandas()
+            yield rows.assign(condition=condition)
 
 
 def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
@@ -144,20 +112,27 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
     Raises:
         ConfigError: the run has no steps, or nothing by that filter's name.
     """
-    run, source = open_run(folder), open_steps(folder)
-    if source is None:
+    run = open_run(folder)
+    if not has_steps(folder):
         raise ConfigError(
             f"Expected a run with steps, got {folder} without any. Make them with `--record steps`."
         )
-    chosen = pc.scalar(True)
+    conditions = set(run.conditions)
+    chosen = {}
     for name, value in filters.items():
+        check_known("filters", name, (*LABELS, *_ORDER))
         values = list(value) if isinstance(value, list | tuple | set | range | np.ndarray) else [value]
         if name in LABELS:
-            values = [i for i, (condition, _) in run.conditions.items() if condition.labels[name] in values]
-            name = "condition"
-        check_known("filters", name, source.schema.names)
-        chosen &= ds.field(name).isin(pa.array(values, source.schema.field(name).type))
-    rows = rows_of(folder, source, None, chosen)
-    order = [name for name in _ORDER if name in rows]
-    rows = rows.sort_values(order, kind="stable", ignore_index=True)
-    return rows[[*order, *(name for name in rows if name not in order)]]
+            conditions &= {i for i, (known, _) in run.conditions.items() if known.labels[name] in values}
+        elif name == "condition":
+            conditions &= set(values)
+        else:
+            chosen[name] = values
+    files = []
+    for rows in step_files(folder, conditions):
+        for name, values in chosen.items():
+            rows = rows[rows[name].isin(values)]
+        files.append(rows)
+    rows = pd.concat(files) if files else next(step_files(folder)).head(0)
+    rows = rows.sort_values(_ORDER, kind="stable", ignore_index=True)
+    return rows[[*_ORDER, *(name for name in rows if name not in _ORDER)]]

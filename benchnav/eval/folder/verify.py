@@ -7,7 +7,7 @@ from benchnav.core.sources import digest_of_path
 from benchnav.eval.experiment.unit import units
 from benchnav.eval.folder.checksums import SUMS, read_checksums
 from benchnav.eval.folder.run_folder import EPISODES, RUN, Finished, find_units, open_run, read_table
-from benchnav.eval.folder.sealed import DamageError, metadata, read_sealed
+from benchnav.eval.folder.sealed import damage_of, metadata
 from benchnav.eval.folder.steps import STEPS
 
 
@@ -38,10 +38,7 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
             continue
         damage += finished.damage()
     for path in sorted((folder / STEPS).glob("*/*.parquet")):
-        try:
-            read_sealed(path)
-        except DamageError as error:
-            damage.append(f"{path.relative_to(folder)}: {error}")
+        damage += damage_of(path, str(path.relative_to(folder)))
     if (folder / EPISODES).exists():
         try:
             read_table(folder, EPISODES)

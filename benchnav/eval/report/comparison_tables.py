@@ -1,5 +1,6 @@
 """The tables of a comparison: a row a pair of conditions."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -22,16 +23,12 @@ def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
         difference: of success, that `maps_needed` is for.
         by: in what the conditions of a pair differ.
     """
-    labels = _differing_labels(table)
-    counts = [Column("maps", cell_of("n_maps", str))] if table["n_maps"].nunique() > 1 else []
     scale, stored, unit = (100, "share", "% of T") if "time_difference_share" in table else (1, "s", "s")
     share = "; in shares of each condition's own T, since T differs" if stored == "share" else ""
     points, times, arrivals = (
         "Δ [points], 95 %", f"Δ T_total [{unit}], 95 %", "Δ T if both arrive [s], 95 %, on maps"
     )  # fmt: skip
     columns = [
-        *_label_columns(labels, by),
-        *counts,
         Column(
             "Succ. [%]",
             lambda row: f"{short(100 * row['success_one'])} : {short(100 * row['success_other'])}",
@@ -70,20 +67,17 @@ def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
         ),
         Column("on maps", cell_of("arrival_time_n_maps", str)),
     ]  # fmt: skip
-    notes = _comparison_notes(table, difference)
-    return table_of(table.to_dict("records"), columns, labels=len(labels) + 2, notes=notes)
+    return _pair_table(table, by, ("n_maps",), columns, _comparison_notes(table, difference))
 
 
 def metric_table(table: pd.DataFrame, quantity: Quantity, by: str) -> Table:
     """Write a comparison by one metric.
 
     Args:
-        table: from `by_metric.compare_by`.
+        table: from `comparison.compare_by`.
         quantity: what is compared.
         by: in what the conditions of a pair differ.
     """
-    labels = _differing_labels(table)
-    counts = [name for name in ("n_maps", "n_episodes") if table[name].nunique() > 1]
     unit = f" [{quantity.unit}]" if quantity.unit else ""
     pairs, grouped = _pairs_and_unit(table)
     better = f"; {quantity.better} is better" if quantity.better != "neither" else ""
@@ -96,8 +90,6 @@ def metric_table(table: pd.DataFrame, quantity: Quantity, by: str) -> Table:
         return NOT_USED if np.isnan(row["low"]) else f"{row['low']:+.3g} to {row['high']:+.3g}"
 
     columns = [
-        *_label_columns(labels, by),
-        *(Column(name.removeprefix("n_"), cell_of(name)) for name in counts),
         Column(
             quantity.words + unit, values, f"{quantity.meaning}, means of the two conditions{better}.{over}"
         ),
@@ -115,20 +107,22 @@ def metric_table(table: pd.DataFrame, quantity: Quantity, by: str) -> Table:
         f"Tests by {grouped}: signs of the difference, p corrected over {pairs} (Holm).",
         f"Intervals are of means and not corrected: they can exclude 0 where p > {ALPHA}.",
     )
-    return table_of(table.to_dict("records"), columns, labels=len(labels) + 2, notes=notes)
+    return _pair_table(table, by, ("n_maps", "n_episodes"), columns, notes)
 
 
-def _differing_labels(table: pd.DataFrame) -> list[str]:
-    return [name for name in (*LABELS, "run") if name in table and differ(table[name])]
-
-
-def _label_columns(labels: list[str], by: str) -> list[Column]:
-    """Return the columns that name a pair: what both share, and the two labels in which they differ."""
-    return [
+def _pair_table(
+    table: pd.DataFrame, by: str, counts: Sequence[str], columns: Sequence[Column], notes: tuple[str, ...]
+) -> Table:
+    """Write columns after those that name a pair: labels that differ, the two that are compared, and counts."""
+    labels = [name for name in (*LABELS, "run") if name in table and differ(table[name])]
+    named = [
         *(Column(name, cell_of(name, partial(reading_name, name))) for name in labels),
         Column(by, cell_of("one", partial(reading_name, by))),
         Column("against", cell_of("other", partial(reading_name, by))),
     ]
+    shown = [Column(name.removeprefix("n_"), cell_of(name)) for name in counts if table[name].nunique() > 1]
+    rows = table.to_dict("records")
+    return table_of(rows, [*named, *shown, *columns], labels=len(named), notes=notes)
 
 
 def _significance(p: str) -> Column:

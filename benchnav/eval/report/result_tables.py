@@ -3,7 +3,8 @@
 Source: Endo, Honda and Ishigami (2024), Table I.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ from benchnav.metrics.base import Metric
 from benchnav.stats.best import FEWEST_MAPS
 from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA
+from benchnav.stats.tables import Column, Row, cell_of, table_of
 
 # What `follows` is where a planner follows the user's objective alone.
 _USERS_OWN = ("", "J")
@@ -40,8 +42,7 @@ _TOTAL_TIME = shipped.TOTAL_TIME.quantity
 _MET = shipped.TRAVERSABILITY.quantity
 ALONE, IN_BATCH = "one robot [ms]", "per episode of a batch [ms]"
 LATENCIES = ("median_ms", "p95_ms", "max_ms")
-# What columns hold, by heading; only those that are shown are explained.
-_COLUMNS = {
+_MEANINGS = {
     "data": "dataset.",
     "scenario": "kind of ground: a test split of the dataset.",
     "world": "behaviour of λ during an episode, and rules of the task.",
@@ -56,35 +57,71 @@ _COLUMNS = {
     "groups": "number of groups of maps; the group is the statistical unit.",
     "maps": "number of maps.",
     "episodes": "number of episodes.",
-    _SUCCESS.heading: f"{_SUCCESS.meaning}.",
-    "95 % interval": "Wilson's interval of the success rate, with maps as the unit.",
-    _TOTAL_TIME.heading: f"mean {_TOTAL_TIME.meaning}, with its 95 % interval in brackets; "
-    f"no interval under {LEAST_MAPS} maps.",
-    "T if success [s]": "time of the episodes that reached the goal, mean ± standard deviation.",
-    _MET.heading: f"{_MET.meaning}, mean ± standard deviation over episodes.",
-    ALONE: "planning time of a step of one robot alone, on one thread: median (95th percentile, maximum) over at most "
-    "100 steps.",
-    IN_BATCH: "planning time of a step of a batch, divided by its episodes, on one thread: median (95th percentile) "
-    "over steps; no latency.",
-    "failures": "how the other episodes ended.",
 }
-# Of the columns that not every run has, that of the summary which says so.
-_TIMES = {ALONE: "latency_median_ms", IN_BATCH: "planning_ms_median"}
 _PAPER = (_SUCCESS.heading, _TOTAL_TIME.heading, _MET.heading)
-_RESULTS = (_SUCCESS.heading, "95 % interval", _TOTAL_TIME.heading, "T if success [s]", _MET.heading)
-_LEARNT_COUNTS = (shipped.SEEN_CELLS, shipped.SENSED_CELLS, shipped.REVISIONS)
-_LEARNT_METRICS = (*_LEARNT_COUNTS, *shipped.AHEAD, shipped.LEARNING_TIME)
-_LEARNT = {
-    **{metric.heading: f"{metric.meaning}, mean over episodes." for metric in _LEARNT_METRICS},
-    "planning [ms]": "time of a step for planning, likewise: median over steps.",
-}
-_TO_FULL = {
-    "Succ. to full [points]": "success less that of the same condition with the sensor `full`; "
-    "`compare --by sensor --against full` has the interval and the test.",
-    "T_total to full [s]": "mean T_total less that of the same condition with the sensor `full`.",
-}
 _MOST_ACROSS = 3
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def _success(row: Row) -> str:
+    rate = rate_in_words(row)
+    return Bold(rate) if row["best_marked"] else rate
+
+
+def _total_time(row: Row) -> str:
+    mean = f"{row['total_time_mean_s']:.1f}"
+    if np.isnan(row["total_time_low_s"]):
+        return mean
+    return f"{mean} ({row['total_time_low_s']:.1f}–{row['total_time_high_s']:.1f})"
+
+
+def _met(row: Row) -> str:
+    met = mean_and_std(100 * row["traversability_mean"], 100 * row["traversability_std"])
+    # An episode that ended at once met nothing: its λ̄ is of fewer episodes than the row.
+    some = 0 < row["traversability_n"] < row["n_episodes"]
+    return f"{met} (n = {row['traversability_n']})" if some else met
+
+
+def _planning_time(row: Row) -> str:
+    compiled = "¶" if row["compiled_share"] > 0 and not np.isnan(row["planning_ms_median"]) else ""
+    return _times(row["planning_ms_median"], row["planning_ms_p95_median"]) + compiled
+
+
+_RESULTS = (
+    Column(_SUCCESS.heading, _success, f"{_SUCCESS.meaning}."),
+    Column(
+        "95 % interval",
+        success_interval_in_words,
+        "Wilson's interval of the success rate, with maps as the unit.",
+    ),
+    Column(
+        _TOTAL_TIME.heading,
+        _total_time,
+        f"mean {_TOTAL_TIME.meaning}, with its 95 % interval in brackets; no interval under {LEAST_MAPS} maps.",
+    ),
+    Column(
+        "T if success [s]",
+        lambda row: mean_and_std(row["success_time_mean_s"], row["success_time_std_s"]),
+        "time of the episodes that reached the goal, mean ± standard deviation.",
+    ),
+    Column(_MET.heading, _met, f"{_MET.meaning}, mean ± standard deviation over episodes."),
+)
+# Of the columns that not every run has, that of the summary which says so.
+_TIMES = {
+    "latency_median_ms": Column(
+        ALONE,
+        lambda row: _times(*(row[f"latency_{name}"] for name in LATENCIES)),
+        "planning time of a step of one robot alone, on one thread: median (95th percentile, maximum) over at most "
+        "100 steps.",
+    ),
+    "planning_ms_median": Column(
+        IN_BATCH,
+        _planning_time,
+        "planning time of a step of a batch, divided by its episodes, on one thread: median (95th percentile) over "
+        "steps; no latency.",
+    ),
+}
+_FAILURES = Column("failures", failures_in_words, "how the other episodes ended.")
 
 
 def result_table(
@@ -100,27 +137,17 @@ def result_table(
         conditions: by id what `run.json` knows of them: `follows` and `remarks` become notes.
         further: quantities that the run has besides those of every run, a column each.
     """
-    labels = [name for name in LABELS if name in _ALWAYS or differ(summary[name])]
+    marks, notes = _notes(summary, conditions)
+    labels = _label_columns(summary, _ALWAYS)
     counts = [
-        name
+        Column(name, cell_of(f"n_{name}"), _MEANINGS[name])
         for name in ("groups", "maps", "episodes")
         if summary[f"n_{name}"].nunique() > 1 and (name != "groups" or unit_of_statistics(summary) == "group")
     ]
-    times = [heading for heading, name in _TIMES.items() if name in summary and summary[name].notna().any()]
-    own = {quantity.heading: quantity for quantity in further}
-    explained = {**_COLUMNS, **{heading: _explain(quantity) for heading, quantity in own.items()}}
-    headings = (*labels, *counts, *_RESULTS, *own, *times, "failures")
-    marks, notes = _notes(summary, conditions)
-    rows = []
-    for row, mark in zip(summary.to_dict("records"), marks, strict=True):
-        cells = {name: reading_name(name, str(row[name])) for name in labels}
-        cells |= {name: str(row[f"n_{name}"]) for name in counts}
-        cells |= {"planner": cells["planner"] + mark, **_results(row)}
-        cells |= {heading: _mean_in_words(quantity, row) for heading, quantity in own.items()}
-        if row["best_marked"]:
-            cells[_SUCCESS.heading] = Bold(cells[_SUCCESS.heading])
-        rows.append(tuple(cells[heading] for heading in headings))
-    if any("¶" in cell for row in rows for cell in row):
+    times = [column for name, column in _TIMES.items() if name in summary and summary[name].notna().any()]
+    columns = [*labels, *counts, *_RESULTS, *map(_further_column, further), *times, _FAILURES]
+    rows = summary.assign(mark=marks).to_dict("records")
+    if any(column.cell(row).endswith("¶") for column in times for row in rows):
         notes.append("¶ The planner ran as compiled code.")
     if (summary["best_rivals"] > 0).any() and not summary["best_marked"].any():
         few = summary["best_maps"].max() < FEWEST_MAPS
@@ -130,24 +157,32 @@ def result_table(
             else "no setting is significantly"
         )
         notes.append(f"No rate is bold: {why} worse than the best.")
-    return Table(
-        headings=headings,
-        labels=len(labels),
-        rows=tuple(rows),
-        notes=tuple(notes),
-        bold_note=bold_note(summary),
-        explained=tuple((heading, explained[heading]) for heading in headings),
-    )
+    return table_of(rows, columns, labels=len(labels), notes=tuple(notes), bold_note=bold_note(summary))
 
 
-def _explain(quantity: Quantity) -> str:
-    return (
+def _label_columns(summary: pd.DataFrame, always: Collection[str]) -> list[Column]:
+    """Return the columns of labels that differ and of those that always stand there; a planner has its mark."""
+    return [
+        Column(name, partial(_label, name), _MEANINGS[name])
+        for name in LABELS
+        if name in always or differ(summary[name])
+    ]
+
+
+def _label(name: str, row: Row) -> str:
+    mark = row.get("mark", "") if name == "planner" else ""
+    return reading_name(name, str(row[name])) + mark
+
+
+def _further_column(quantity: Quantity) -> Column:
+    meaning = (
         f"{quantity.meaning}: mean over episodes, with its 95 % interval in brackets; no interval under {LEAST_MAPS} "
         "maps; n is the number of episodes that have it, if not all have."
     )
+    return Column(quantity.heading, partial(_mean_in_words, quantity), meaning)
 
 
-def _mean_in_words(quantity: Quantity, row: Mapping[Any, Any]) -> str:
+def _mean_in_words(quantity: Quantity, row: Row) -> str:
     """The mean of a further quantity with its interval, in the quantity's unit."""
     mean, low, high = (
         quantity.scale * row[quantity.summary_column(name)] for name in ("mean", "low", "high")
@@ -167,46 +202,56 @@ def learning_table(summary: pd.DataFrame) -> Table | None:
     """
     if summary.empty or summary["revisions_mean"].isna().all():
         return None
-    learnt = summary[summary["revisions_mean"].notna()]
-    labels = [name for name in LABELS if name in (*_ALWAYS, "ground", "belief") or differ(summary[name])]
+    rows = summary[summary["revisions_mean"].notna()].to_dict("records")
     full = {_but_sensor(row): row for row in summary.to_dict("records") if row["sensor"] == "full"}
-    partly = [row for row in learnt.to_dict("records") if row["sensor"] != "full"]
-    compared = any(_but_sensor(row) in full for row in partly)
-    rows = [
-        (
-            *(reading_name(name, str(row[name])) for name in labels),
-            *(f"{row[_mean_of(metric)]:.0f}" for metric in _LEARNT_COUNTS),
-            *(_number(row[_mean_of(metric)]) for metric in shipped.AHEAD),
-            *(_times(row[name]) for name in (_mean_of(shipped.LEARNING_TIME), "planning_ms_median")),
-            *(_lost(row, full.get(_but_sensor(row))) if compared else ()),
-        )
-        for row in learnt.to_dict("records")
+    labels = _label_columns(summary, (*_ALWAYS, "ground", "belief"))
+    columns = [
+        *labels,
+        *(
+            _mean_column(metric, "{:.0f}".format)
+            for metric in (shipped.SEEN_CELLS, shipped.SENSED_CELLS, shipped.REVISIONS)
+        ),
+        *(_mean_column(metric, _number) for metric in shipped.AHEAD),
+        _mean_column(shipped.LEARNING_TIME, _times),
+        Column(
+            "planning [ms]",
+            cell_of("planning_ms_median", _times),
+            "time of a step for planning, likewise: median over steps.",
+        ),
     ]
-    explained = {name: _COLUMNS[name] for name in labels} | _LEARNT | (_TO_FULL if compared else {})
-    return Table(
-        headings=tuple(explained),
-        labels=len(labels),
-        rows=tuple(rows),
-        explained=tuple(explained.items()),
-        title="What robots learnt on their way",
-    )
+    if any(row["sensor"] != "full" and _but_sensor(row) in full for row in rows):
+        columns += [
+            Column(
+                "Succ. to full [points]",
+                lambda row: _lost(row, full, "success_rate", 100),
+                "success less that of the same condition with the sensor `full`; "
+                "`compare --by sensor --against full` has the interval and the test.",
+            ),
+            Column(
+                "T_total to full [s]",
+                lambda row: _lost(row, full, "total_time_mean_s", 1),
+                "mean T_total less that of the same condition with the sensor `full`.",
+            ),
+        ]
+    return table_of(rows, columns, labels=len(labels), title="What robots learnt on their way")
 
 
-def _mean_of(metric: Metric) -> str:
-    return metric.quantity.summary_column("mean")
+def _mean_column(metric: Metric, write: Callable[[Any], str]) -> Column:
+    cell = cell_of(metric.quantity.summary_column("mean"), write)
+    return Column(metric.quantity.heading, cell, f"{metric.meaning}, mean over episodes.")
 
 
-def _but_sensor(row: Mapping[Any, Any]) -> tuple[str, ...]:
+def _but_sensor(row: Row) -> tuple[str, ...]:
     """What a condition is beside its sensor of appearance."""
     return tuple(str(row[name]) for name in LABELS if name != "sensor")
 
 
-def _lost(row: Mapping[Any, Any], full: Mapping[Any, Any] | None) -> tuple[str, str]:
-    """Success in points and T_total in seconds, less those of a robot that sees all."""
-    if full is None or row["sensor"] == "full":
-        return NOT_USED, NOT_USED
-    success = 100 * (row["success_rate"] - full["success_rate"])
-    return f"{success:+.1f}", f"{row['total_time_mean_s'] - full['total_time_mean_s']:+.1f}"
+def _lost(row: Row, full: Mapping[tuple[str, ...], Row], name: str, scale: float) -> str:
+    """A value less that of a robot that sees all."""
+    reference = full.get(_but_sensor(row))
+    if reference is None or row["sensor"] == "full":
+        return NOT_USED
+    return f"{scale * (row[name] - reference[name]):+.1f}"
 
 
 def paper_table(summary: pd.DataFrame, label: str, mark: str = "") -> str:
@@ -247,7 +292,10 @@ def _across(known: Sequence[tuple[str, pd.DataFrame]], several: Sequence[str]) -
     for name in labels:
         names[name] = [reading_name(name, label) for label in names[name]]
     return Table(
-        headings=(*(name.capitalize() for name in labels), *_PAPER * len(known)),
+        headings=(
+            *(name.capitalize() for name in labels),
+            *(_SUCCESS.heading, _TOTAL_TIME.heading, _MET.heading) * len(known),
+        ),
         labels=len(labels),
         rows=tuple(map(tuple, np.hstack([names.mask(as_above, ""), cells]))),
         groups=tuple(title for title, _ in known),
@@ -255,7 +303,7 @@ def _across(known: Sequence[tuple[str, pd.DataFrame]], several: Sequence[str]) -
     )
 
 
-def _in_paper(row: Mapping[Any, Any]) -> list[str]:
+def _in_paper(row: Row) -> list[str]:
     success = f"{rate_in_words(row)} ({success_interval_in_words(row)})"
     return [
         Bold(success) if row["best_marked"] else success,
@@ -282,27 +330,6 @@ def bold_note(summary: pd.DataFrame) -> str:
         model for part in PRIVILEGED for model in left_out.loc[left_out["privileged"] == part, "model"]
     )
     return f"{words}. Privileged models ({', '.join(models)}) do not compete." if models else f"{words}."
-
-
-def _results(row: Mapping[Any, Any]) -> dict[str, str]:
-    met = mean_and_std(100 * row["traversability_mean"], 100 * row["traversability_std"])
-    compiled = "¶" if row["compiled_share"] > 0 and not np.isnan(row["planning_ms_median"]) else ""
-    # An episode that ended at once met nothing: its λ̄ is of fewer episodes than the row.
-    if 0 < row["traversability_n"] < row["n_episodes"]:
-        met += f" (n = {row['traversability_n']})"
-    total = f"{row['total_time_mean_s']:.1f}"
-    if not np.isnan(row["total_time_low_s"]):
-        total += f" ({row['total_time_low_s']:.1f}–{row['total_time_high_s']:.1f})"
-    return {
-        _SUCCESS.heading: rate_in_words(row),
-        "95 % interval": success_interval_in_words(row),
-        _TOTAL_TIME.heading: total,
-        "T if success [s]": mean_and_std(row["success_time_mean_s"], row["success_time_std_s"]),
-        _MET.heading: met,
-        ALONE: _times(*(row.get(f"latency_{name}", np.nan) for name in LATENCIES)),
-        IN_BATCH: _times(row["planning_ms_median"], row["planning_ms_p95_median"]) + compiled,
-        "failures": failures_in_words(row),
-    }
 
 
 def _number(value: float) -> str:

@@ -42,9 +42,6 @@ from benchnav.viz.style import planner_name, save_twice
 PAGE = "report.html"
 PARTIAL = "partial"  # folder of the report of a run that is not finished
 
-_FILES = (PAGE, *(f"summary.{suffix}" for suffix in ("csv", "md", "tex")), "failures.csv", "hypotheses.csv")
-_FILES += ("hypotheses.tex", "regret.csv")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Report(RunData):
@@ -83,6 +80,10 @@ class Report(RunData):
     def marked(self, table: Table) -> Table:
         """A table that says so where the run is not finished."""
         return replace(table, notes=(*([_capital(self.mark)] if self.mark else []), *table.notes))
+
+    def says(self, text: str) -> str:
+        """A text that begins with the mark of a run that is not finished."""
+        return f"{_capital(self.mark)}. {text}" if self.mark else text
 
     def csv(self, table: pd.DataFrame, digits: int = 6) -> str:
         """A table as CSV; of a run that is not finished it has a column `partial`."""
@@ -182,25 +183,23 @@ def write_report(
     """
     report = read_report(folder, record_driven, partial)
     out = out or (folder / PARTIAL if report.mark else folder)
-    write_text(out / "summary.csv", report.csv(report.summary))
-    write_text(out / "failures.csv", report.csv(report.failures, digits=4))
+    tables = {"summary": report.summary, "hypotheses": report.tests, "regret": report.regret}
+    texts = {f"{name}.csv": report.csv(table) for name, table in tables.items() if not table.empty}
+    texts["failures.csv"] = report.csv(report.failures, digits=4)
     comments = "".join(f"% {line}\n" for line in (*report.header, *report.table.notes, *report.warnings))
-    mark = f"{_capital(report.mark)}. " if report.mark else ""
-    write_text(out / "summary.tex", comments + paper_table(report.summary, report.name, mark))
+    texts["summary.tex"] = comments + paper_table(report.summary, report.name, report.says(""))
     if not report.tests.empty:
-        write_text(out / "hypotheses.csv", report.csv(report.tests))
-        caption = f"{mark}Tests of the hypotheses that were fixed before the run."
-        write_text(
-            out / "hypotheses.tex", to_latex([report.hypotheses], caption, f"{report.name}-hypotheses")
-        )
-    if not report.regret.empty:
-        write_text(out / "regret.csv", report.csv(report.regret))
+        caption = report.says("Tests of the hypotheses that were fixed before the run.")
+        texts["hypotheses.tex"] = to_latex([report.hypotheses], caption, f"{report.name}-hypotheses")
+    for name, text in texts.items():
+        write_text(out / name, text)
     captions, faults = _draw_figures(report, figures, out / "figures")
     report = replace(report, warnings=(*report.warnings, *faults), faults=faults)
-    for file in ("summary.md", PAGE):
-        write_text(out / file, render(file, report, captions))
+    pages = "summary.md", PAGE
+    for name in pages:
+        write_text(out / name, render(name, report, captions))
     drawn = [path.with_suffix(suffix) for path in captions for suffix in (".png", ".pdf")]
-    note_checksums(out, [*drawn, *(path for name in _FILES if (path := out / name).is_file())])
+    note_checksums(out, [*drawn, *(out / name for name in (*texts, *pages))])
     return report
 
 
@@ -241,14 +240,13 @@ def _draw_figures(
 
 
 def _save_figures(report: Report, figures: Iterable[Figure], folder: Path, captions: dict[Path, str]) -> None:
-    mark = f"{_capital(report.mark)}. " if report.mark else ""
     for figure in figures:
         path = folder / f"{figure.name}.png"
         if path in captions or path.parent != folder or not figure.name:
             raise ConfigError(
                 f"Expected the name of a figure that no other has, got {figure.name!r}. Rename it."
             )
-        caption = mark + figure.caption(report)
+        caption = report.says(figure.caption(report))
         save_twice(figure(report), path, trim=figure.trim, mark=_capital(report.mark))
         captions[path] = caption
 

@@ -16,7 +16,7 @@ from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.checksums import note_checksums
 from benchnav.eval.folder.results import code_of
 from benchnav.eval.folder.run_folder import EPISODES, KEYS, Run, find_units, open_run, read_table, unit_rows
-from benchnav.eval.folder.steps import LAST_COLUMN, open_steps, read_steps
+from benchnav.eval.folder.steps import LAST_COLUMN, has_steps, read_steps
 from benchnav.eval.recording import GROUND, MAP, Ground, Recording
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.unit import (
@@ -177,7 +177,7 @@ def keep_ground(folder: Path) -> None:
     Args:
         folder: a run whose rows are all there.
     """
-    if open_steps(folder) is None:
+    if not has_steps(folder):
         return
     rows = read_table(folder, EPISODES)
     about = telling_map(rows)

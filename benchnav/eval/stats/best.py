@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.experiment.unit import DRAW
+from benchnav.eval.stats.pairs import on_common_draws
 from benchnav.stats.best import best_set_p
 from benchnav.stats.by_map import alike
 from benchnav.stats.holm import ALPHA
@@ -100,11 +100,9 @@ def against_best(
 
 def _compare(rivals: Mapping[str, pd.DataFrame]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
     """Columns of `against_best` that are those of the block, and by condition its own."""
-    met = [set(rows[DRAW].itertuples(index=False, name=None)) for rows in rivals.values()]
-    common = pd.DataFrame(sorted(set.intersection(*met)), columns=DRAW)
-    judged = rivals
-    if len(common):
-        judged = {condition: common.merge(rows, on=DRAW) for condition, rows in rivals.items()}
+    common = on_common_draws(rivals)
+    is_none = any(rows.empty for rows in common.values())
+    judged = rivals if is_none else common
     names = sorted(judged)  # those that are as good and as fast, in the order of their digests
     times = np.array([judged[name]["total_time_s"].mean() for name in names])
     mean_s = dict(zip(names, alike(times, times.max()), strict=True))
@@ -112,7 +110,7 @@ def _compare(rivals: Mapping[str, pd.DataFrame]) -> tuple[dict[str, Any], dict[s
     episodes, maps = len(judged[best]), judged[best]["group"].nunique()
     about = {"best": best, "best_rivals": len(others), "best_episodes": episodes, "best_maps": maps}
     made: dict[str, dict[str, Any]] = {best: {"best_alike": True}}
-    if common.empty:  # nothing to compare
+    if is_none:  # nothing to compare
         return about, made | {condition: {"best_alike": True, "best_p": 1.0} for condition in others}
     wins = [judged[one].groupby("group")["success"].sum() for one in (best, *others)]
     values = np.stack([won.to_numpy(dtype=int) for won in wins], axis=1)

@@ -1,10 +1,12 @@
-"""The table of a comparison: a row a pair of conditions, corrected over all rows together."""
+"""The tables of comparisons: a row a pair of conditions, corrected over all rows together."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pandas as pd
 
+from benchnav.core.quantity import Quantity
+from benchnav.eval.stats.hypotheses import comparable, means_and_difference
 from benchnav.eval.stats.pairs import Pair
 from benchnav.stats.episodes import (
     Interval,
@@ -42,24 +44,65 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
     """
     alpha = ALPHA / len(pairs)
     in_shares = any(budgets_differ(pair.episodes) for pair in pairs)
-    table = pd.DataFrame([_compare(pair, alpha, difference, in_shares) for pair in pairs])
-    return table.assign(**{f"{name}_holm": holm(table[name].to_numpy()) for name in ("success_p", "time_p")})
+    rows = [
+        _labels(pair, pair.episodes) | _compare(pair.episodes, alpha, difference, in_shares) for pair in pairs
+    ]
+    return _corrected(rows, "success_p", "time_p")
 
 
-def _compare(pair: Pair, alpha: float, difference: float, in_shares: bool) -> dict[str, Any]:
-    rows = pair.episodes
+def compare_by(pairs: Sequence[Pair], quantity: Quantity) -> pd.DataFrame:
+    """Compare each pair by one metric, over the episodes in which both conditions have a value.
+
+    Args:
+        pairs: from `pairs.find_pairs`.
+        quantity: what is compared.
+
+    Returns:
+        A row a pair: labels of the two, `one`, `other`; `n_maps`, `n_groups`, `n_episodes` of each condition; `metric`,
+        `unit` of all that follows; `mean_one`, `mean_other`, `difference` with its 95 % interval `low`, `high`; `p` of
+        a test by flipping signs and, corrected, `p_holm`. A difference and its ends are NaN without episodes.
+    """
+    rows = []
+    for pair in pairs:
+        one, other = pair.members
+        episodes = comparable(one.episodes, other.episodes, quantity)
+        rows.append(
+            {
+                **_labels(pair, episodes),
+                "metric": quantity.name,
+                "unit": quantity.unit,
+                **means_and_difference(quantity, episodes),
+                "p": difference_p(episodes, quantity.column),
+            }
+        )
+    return _corrected(rows, "p")
+
+
+def _labels(pair: Pair, episodes: pd.DataFrame) -> dict[str, Any]:
+    """Return the columns that say what a row is of, and how many maps and episodes it has."""
+    return {
+        **pair.shared,
+        "one": pair.one,
+        "other": pair.other,
+        "n_maps": episodes["map"].nunique(),
+        "n_groups": episodes["group"].nunique(),
+        "n_episodes": len(episodes),
+    }
+
+
+def _corrected(rows: Sequence[Mapping[str, Any]], *names: str) -> pd.DataFrame:
+    """Return the table of rows with p-values corrected over all of them, each kind apart."""
+    table = pd.DataFrame(rows)
+    return table.assign(**{f"{name}_holm": holm(table[name].to_numpy()) for name in names})
+
+
+def _compare(rows: pd.DataFrame, alpha: float, difference: float, in_shares: bool) -> dict[str, Any]:
     timed = in_budgets(rows) if in_shares else rows
     gain, draws = gain_by_map(rows)
     std = float(standard_deviation(gain, draws))
     arrived = mean_differences(rows[rows["success"] & rows["success_other"]])
     mean, low, high = map(float, mean_interval(arrived))
     return {
-        **pair.shared,
-        "one": pair.one,
-        "other": pair.other,
-        "n_maps": rows["map"].nunique(),
-        "n_groups": len(gain),
-        "n_episodes": len(rows),
         "success_one": rows["success"].mean(),
         "success_other": rows["success_other"].mean(),
         **named("success", interval_of(rows, "success")),

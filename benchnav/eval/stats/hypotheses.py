@@ -56,8 +56,19 @@ def test_hypotheses(
         )
         quantity = quantities[test.metric]
         both = comparable(one, other, quantity)
-        p = p_of(test, both, quantities) if is_whole else np.nan
-        made.append({**plain, **describe_pair(quantity, both), "p": p})
+        _, low_90, high_90 = _interval(both, quantity, 0.9)
+        made.append(
+            {
+                **plain,
+                "unit": quantity.unit,
+                "n_maps": both["group"].nunique(),
+                "n_episodes": len(both),
+                **means_and_difference(quantity, both),
+                "low_90": low_90,
+                "high_90": high_90,
+                "p": p_of(test, both, quantities) if is_whole else np.nan,
+            }
+        )
     table = pd.DataFrame(made)
     table["p_holm"] = holm(table["p"].to_numpy()) if is_whole else np.nan
     return table.assign(supported=table["p_holm"] < ALPHA)
@@ -83,24 +94,21 @@ def comparable(one: pd.DataFrame, other: pd.DataFrame, quantity: Quantity) -> pd
     return both.dropna(subset=[column, f"{column}_other"])
 
 
-def describe_pair(quantity: Quantity, rows: pd.DataFrame) -> dict[str, Any]:
-    """Return `unit`, counts, means and the difference with its 95 % and 90 % intervals; see `test_hypotheses`.
+def means_and_difference(quantity: Quantity, rows: pd.DataFrame) -> dict[str, float]:
+    """Return `mean_one`, `mean_other` and `difference` with the 95 % interval `low`, `high`, in the quantity's unit.
 
     Args:
         quantity: what is compared.
         rows: from `comparable`.
     """
-    row: dict[str, Any] = {
-        "unit": quantity.unit,
-        "n_maps": rows["group"].nunique(),
-        "n_episodes": len(rows),
+    difference, low, high = _interval(rows, quantity, 0.95)
+    return {
         "mean_one": quantity.scale * rows[quantity.column].mean(),
         "mean_other": quantity.scale * rows[f"{quantity.column}_other"].mean(),
+        "difference": difference,
+        "low": low,
+        "high": high,
     }
-    for suffix, confidence in (("_90", 0.9), ("", 0.95)):
-        difference, low, high = _interval(rows, quantity, confidence)
-        row |= {"difference": difference, f"low{suffix}": low, f"high{suffix}": high}
-    return row
 
 
 def _interval(rows: pd.DataFrame, quantity: Quantity, confidence: float) -> Interval:

@@ -243,6 +243,17 @@ def side_by_side(one: pd.DataFrame, other: pd.DataFrame, measures: Sequence[str]
     return one[["group", *columns]].merge(other[columns], on=DRAW, suffixes=("", "_other"))
 
 
+def on_common_draws(conditions: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """Return the episodes that all conditions have in common, in one order; no rows where there are none.
+
+    Args:
+        conditions: rows of each.
+    """
+    draws = [set(rows[DRAW].itertuples(index=False, name=None)) for rows in conditions.values()]
+    common = pd.DataFrame(sorted(set.intersection(*draws)), columns=DRAW, dtype=int)
+    return {condition: common.merge(rows, on=DRAW) for condition, rows in conditions.items()}
+
+
 def check_maps(one: Compared, other: Compared, names: str) -> None:
     """Checks that two conditions were evaluated on the same maps, with the same meaning and in the same groups.
 

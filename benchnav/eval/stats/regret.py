@@ -15,10 +15,9 @@ from typing import Any
 import pandas as pd
 
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.experiment.unit import DRAW
 from benchnav.eval.stats.best import BLOCK, PRIVILEGED
 from benchnav.eval.stats.comparison import named
-from benchnav.eval.stats.pairs import side_by_side
+from benchnav.eval.stats.pairs import on_common_draws, side_by_side
 from benchnav.eval.stats.summary import time_budgets
 from benchnav.stats.episodes import interval_of
 
@@ -94,16 +93,13 @@ def split_regret(
     rows = dict(list(episodes.groupby("condition", sort=False)))
     made: list[dict[str, Any]] = []
     for number, chain in enumerate(find_chains(conditions), start=1):
-        met = [set(rows[condition][DRAW].itertuples(index=False, name=None)) for condition in chain]
-        common = pd.DataFrame(sorted(set.intersection(*met)), columns=DRAW)
-        if common.empty:
-            continue
+        common = on_common_draws({condition: rows[condition] for condition in chain})
         own = {
-            condition: common.merge(rows[condition], on=DRAW).assign(
-                time_budget_s=lambda found, world=worlds[condition]: time_budgets(found, world)
-            )
-            for condition in chain
+            condition: found.assign(time_budget_s=time_budgets(found, worlds[condition]))
+            for condition, found in common.items()
         }
+        if own[chain[0]].empty:
+            continue
         labels = conditions[chain[0]]["labels"]
         about = {name: labels[name] for name in (*BLOCK, "planner", "model", "risk")}
         bounds = best_possible(own[chain[-1]])

@@ -3,9 +3,6 @@
 A model that is worse than these is worse than none. Letters in shapes: B maps, H×W cells, C classes.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,33 +11,6 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 
 _BINS = 2**12
-
-
-@dataclass(frozen=True, kw_only=True)
-class Baselines:
-    """How good what can be said without a model is.
-
-    Args:
-        nearest_colour_accuracy: share of the labelled cells whose class the nearest colour tells, by split.
-        climatology_crps: CRPS of one distribution of λ for all cells, by split.
-    """
-
-    nearest_colour_accuracy: dict[str, float]
-    climatology_crps: dict[str, float]
-
-
-def baselines_of(dataset: TerrainDataset, splits: Iterable[str], with_classes: Iterable[str]) -> Baselines:
-    """Measures what can be said without a model.
-
-    Args:
-        dataset: the maps.
-        splits: of which λ is measured.
-        with_classes: of which classes are.
-    """
-    return Baselines(
-        nearest_colour_accuracy={split: nearest_colour_accuracy(dataset, split) for split in with_classes},
-        climatology_crps={split: climatology_crps(dataset, split) for split in splits},
-    )
 
 
 def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """A model's quality in numbers and words: a table for each kind of file, and what columns and figures mean."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -12,7 +12,7 @@ from benchnav.core.tables import NOTHING, Table
 from benchnav.datagen.recipe.scenario import find_series
 from benchnav.models.quality.columns import COLUMNS, FILES_ONLY, LOOK_ALIKES
 from benchnav.models.quality.measure import Quality
-from benchnav.models.quality.output import json_text, page
+from benchnav.models.quality.output import json_text
 from benchnav.stats.tables import Column, cell_of, table_of
 
 
@@ -72,23 +72,6 @@ def quality_csv(qualities: Mapping[str, Quality]) -> str:
     if table[LOOK_ALIKES[0]].isna().all():
         table = table.drop(columns=list(LOOK_ALIKES))
     return table.replace((math.inf, -math.inf), math.nan).to_csv(index=False, float_format="%.6g")
-
-
-def quality_markdown(
-    title: str,
-    qualities: Mapping[str, Quality],
-    notes: Sequence[str],
-    figures: Sequence[tuple[str, str, str]],
-) -> str:
-    """Writes the numbers as a page with its figures, and what each column and figure means.
-
-    Args:
-        title: of the page.
-        qualities: by split.
-        notes: lines under the table.
-        figures: from `output.save_figures`.
-    """
-    return page(title, [quality_table(title, qualities, whole=True)], notes, figures)
 
 
 def numbers(quality: Quality) -> dict[str, float]:

@@ -4,12 +4,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchnav.core.tables import to_latex, to_markdown, to_terminal
+from benchnav.core.tables import to_markdown
 from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.report.comparison_tables import comparison_table, metric_table
 from benchnav.eval.report.result_tables import learning_table, paper_table, result_table
-from benchnav.eval.stats.by_metric import compare_by
-from benchnav.eval.stats.comparison import compare
+from benchnav.eval.stats.comparison import compare, compare_by
 from benchnav.eval.stats.pairs import Compared, Pair
 from benchnav.eval.stats.summary import summarise
 from benchnav.metrics import Energy
@@ -72,21 +71,6 @@ def test_eight_maps_give_times_an_interval() -> None:
     )
     assert "23.0" in seven
     assert any(re.fullmatch(r"23\.5 \(21\.\d–4\d\.\d\)", cell) for cell in eight)
-
-
-def test_only_columns_that_are_shown_are_explained_each_in_one_sentence() -> None:
-    table = table_of(made.rows(made.row(made.condition())))
-    assert tuple(heading for heading, _ in table.explained) == table.headings
-    assert all(text.endswith(".") for _, text in table.explained)
-
-
-def test_the_mark_of_compiled_planners_is_explained_wherever_it_stands() -> None:
-    compiled, eager = (
-        table_of(made.rows(made.row(made.condition(), compiled=value))) for value in (True, False)
-    )
-    for written in (to_terminal(compiled), to_markdown(compiled), to_latex([compiled], "", "")):
-        assert "The planner ran as compiled code" in written
-    assert not eager.notes
 
 
 def test_tables_without_planning_have_no_column_of_it() -> None:
@@ -193,13 +177,6 @@ def test_a_planner_that_follows_the_users_objective_alone_needs_no_note(follows:
     assert table.notes == ()
 
 
-def test_one_failure_of_many_does_not_read_as_none() -> None:
-    labels = made.condition()
-    episodes = made.rows(made.row(labels, i, 30.0 if i else None) for i in range(200))
-    assert table_of(episodes).rows[0][table_of(episodes).labels] == "99.5"
-    assert r"99.5 {\scriptsize" in paper_table(made.summary(episodes), "run")
-
-
 def test_groups_are_counted_and_named_where_there_are_such() -> None:
     def grouped(labels: dict[str, str], maps: int) -> list[dict]:  # type: ignore[type-arg]
         return [made.row(labels, i, 30.0 if i < 20 else None, group=i // 2) for i in range(maps)]
@@ -281,13 +258,6 @@ def test_a_model_is_named_where_there_are_several() -> None:
     assert r"\begin{table}[t]" in text
 
 
-@pytest.mark.parametrize(("counts", "expected"), [((30,), False), ((30, 29), False), ((30, 29, 5), True)])
-def test_bold_is_used_and_explained_where_something_is_worse(counts: tuple[int, ...], expected: bool) -> None:
-    text = paper_of(*((made.condition(risk=f"r{i}"), count) for i, count in enumerate(counts)))
-    assert ("Bold:" in text) == expected
-    assert (r"\textbf" in text) == expected
-
-
 def cells(table: pd.DataFrame, difference: float = 0.05) -> list[dict[str, str]]:
     shown = comparison_table(table, difference, "risk")
     names = [f"{heading}{i}" if heading == "95 %" else heading for i, heading in enumerate(shown.headings)]
@@ -312,22 +282,10 @@ def test_success_is_in_points_and_p_is_the_corrected_one() -> None:
     assert second["Δ [points]"] == "-25.0"
 
 
-def test_shares_are_not_rounded_to_a_wrong_whole() -> None:
-    table = compare([pair([30.0] * 121 + [100.0] * 79, [30.0] * 145 + [100.0] * 55)])
-    assert cells(table)[0]["Succ. [%]"] == "60.5 : 72.5"
-
-
 def test_what_is_not_significant_says_so() -> None:
     table = compare([pair(A, B)])
     assert table["success_p_holm"][0] > 0.05
     assert cells(table)[0]["significant"] == "no"
-
-
-def test_no_minus_before_a_zero_and_a_dash_for_nothing() -> None:
-    (row,) = cells(compare([pair([30.0, 30.0, 100.0], [30.001, 30.001, 100.0])]))
-    assert row["Δ T_total [s]"] == "+0.0"
-    (row,) = cells(compare([pair([30.0, 100.0], [100.0, 30.0])]))
-    assert row["Δ T if both arrive [s]"] == "–"
 
 
 def test_labels_that_differ_have_a_column_and_notes_name_the_family() -> None:
@@ -352,19 +310,6 @@ def test_maps_too_few_to_show_any_difference_say_so() -> None:
     assert note.endswith(
         "These maps are too few for any difference to be significant, and to tell how many it needs."
     )
-
-
-def test_what_test_p_is_of_stands_in_heading_and_note() -> None:
-    """An interval of the mean that leaves 0 out may stand beside a p of ranks of 1."""
-    shown = comparison_table(compare([pair(A, B)]), 0.05, "risk")
-    assert shown.headings[shown.headings.index("Δ T_total [s]") + 2] == "p (ranks)"
-    notes = " ".join(shown.notes)
-    assert "Tests by map: signs of the difference (success) and ranks (T_total)" in notes
-    assert "Intervals are of means and not corrected" in notes
-    assert all(len(note) <= 110 for note in shown.notes)
-    columns = dict(shown.explained)
-    assert columns["p (ranks)"].startswith("Wilcoxon's signed-rank test of T_total")
-    assert "shares" not in " ".join(columns.values())
 
 
 def test_times_in_shares_of_unlike_budgets_say_so() -> None:

@@ -108,17 +108,6 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
     assert not list(folder.rglob("*partial*"))
 
 
-def test_options_of_planners_stand_in_the_header(tmp_path: Path) -> None:
-    folder = run_folder(tmp_path / "run", episodes())
-    about = json.loads((folder / "run.json").read_text())
-    for condition in about["conditions"].values():
-        if condition["labels"]["planner"] == "cl_rrt":
-            condition["changed"] = ["expansions = 64", "follower.speed_mps = 0.5"]
-    write_run(folder, about)
-    line = "Planner options: cl_rrt expansions = 64, cl_rrt follower.speed_mps = 0.5."
-    assert line in read_report(folder).header
-
-
 def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
     rows = episodes()
     folder = run_folder(tmp_path / "run", rows)

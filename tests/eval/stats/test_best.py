@@ -40,14 +40,6 @@ def test_the_best_is_compared_with_all_others_and_corrected_over_them() -> None:
     assert np.isnan(found.loc["best", "best_difference"])
 
 
-def test_nothing_is_marked_where_nothing_is_worse() -> None:
-    found = compared(
-        episodes(made.condition(risk="a"), range(29)), episodes(made.condition(risk="b"), range(28))
-    )
-    assert found["best_alike"].all()
-    assert not found["best_marked"].any()
-
-
 def test_groups_of_maps_are_the_unit_of_the_best() -> None:
     """The same episodes: thirty maps tell two settings apart, three groups of them cannot."""
 

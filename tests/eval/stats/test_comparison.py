@@ -99,14 +99,6 @@ def test_pairs_of_which_never_both_arrived_have_no_time_of_arrival() -> None:
     assert row["arrival_time_n_maps"] == 0
 
 
-def test_so_few_maps_have_no_interval_of_time() -> None:
-    few, enough = (compare([pair(A[:n], B[:n])]).iloc[0] for n in (7, 8))
-    for name in ("time_low_s", "time_high_s"):
-        assert np.isnan(few[name])
-        assert np.isfinite(enough[name])
-    assert np.isfinite(few["time_difference_s"])
-
-
 def test_a_difference_of_time_knows_what_failures_cost() -> None:
     """Both arrive everywhere and as fast as each other: what few maps could not show is in the interval."""
     same = [30.0 + i % 3 for i in range(20)]

@@ -79,12 +79,6 @@ def test_all_against_one() -> None:
     assert names(find_pairs(conditions, against="cvar")) == [("mean", "cvar"), ("var", "cvar")]
 
 
-def test_by_follows_what_is_compared_with() -> None:
-    conditions = [compared("mppi", "mean"), compared("mppi", "cvar"), compared("cl_rrt", "mean")]
-    assert names(find_pairs(conditions, against="cl_rrt")) == [("mppi", "cl_rrt")]
-    assert names(find_pairs(conditions, by="planner")) == [("cl_rrt", "mppi")]
-
-
 def test_a_blind_planner_goes_with_every_setting_and_model() -> None:
     blind = compared("straight", NOT_USED, model=NOT_USED)
     conditions = [
@@ -130,19 +124,6 @@ def test_what_only_one_condition_met_is_left_out_and_counted() -> None:
     (pair,) = find_pairs([compared(episodes=both), compared(risk="cvar", episodes=part)])
     assert sorted(pair.episodes["map"]) == [0, 0, 1, 2, 2]
     assert left_out(pair) == 6 + 5 - 2 * 5
-
-
-def test_a_map_that_was_met_more_often_leaves_the_others_in() -> None:
-    again = [[row(condition("mppi", risk), 0, seed=5)] for risk in ("mean", "cvar")]
-    plain = [[row(condition("mppi", risk), map_index) for map_index in range(4)] for risk in ("mean", "cvar")]
-    (pair,) = find_pairs(
-        [
-            compared(risk=risk, episodes=own + more)
-            for risk, own, more in zip(("mean", "cvar"), plain, again, strict=True)
-        ]
-    )
-    assert sorted(pair.episodes["map"]) == [0, 0, 1, 2, 3]
-    assert left_out(pair) == 0
 
 
 def test_runs_that_share_conditions_are_compared_with_each_other() -> None:
@@ -193,12 +174,6 @@ def test_what_cannot_be_paired_is_refused_with_the_reason(
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         find_pairs([compared(), compared(**{"risk": "cvar", **changes})], **asked)
-
-
-def test_a_shorter_condition_is_paired_on_the_maps_it_met() -> None:
-    short = [row(condition("mppi", "cvar"), map_index) for map_index in range(2)]
-    (pair,) = find_pairs([compared(), compared(risk="cvar", maps=["a", "b"], episodes=short)])
-    assert (len(pair.episodes), left_out(pair)) == (2, 2)
 
 
 def world(label: str, **changes: Any) -> Compared:
@@ -272,20 +247,6 @@ def test_pairs_hold_the_group_of_each_map() -> None:
     (pair,) = find_pairs([compared(episodes=grouped), compared(risk="cvar", episodes=grouped)])
     assert list(pair.episodes.sort_values("map")["group"]) == [7, 7, 8, 8]
     assert pair.episodes["group"].dtype == np.int64
-
-
-def test_pairs_hold_every_measure_of_both() -> None:
-    other = [
-        row(condition("mppi", "cvar"), i, score=0.25, path_length_m=9.0, traversability=0.5) for i in range(4)
-    ]
-    (pair,) = find_pairs([compared(), compared(risk="cvar", episodes=other)])
-    first = pair.episodes.iloc[0]
-    assert tuple(first[["score", "path_length_m", "traversability"]]) == (0.25, 9.0, 0.5)
-    assert tuple(first[["path_length_m_other", "traversability_other", "time_budget_s_other"]]) == (
-        22.0,
-        0.8,
-        100.0,
-    )
 
 
 def learning(ground: str, belief: str = "copula", **changes: Any) -> Compared:

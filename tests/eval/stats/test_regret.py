@@ -199,14 +199,6 @@ def test_bars_are_orange_where_the_next_is_better_and_lines_are_their_intervals(
             assert gain == 0 or bar.get_facecolor() == pytest.approx(to_rgba(colour))
 
 
-def test_one_map_has_no_interval() -> None:
-    table = split(episodes([own[:1] for own in TIMES]))
-    assert table["time_difference"].tolist() == pytest.approx([4.0, 0.0, 3.0, 4.0])
-    assert table["success_difference"].tolist() == [0.0] * 4
-    assert table[["time_low", "time_high", "success_low", "success_high"]].isna().all(axis=None)
-    assert not any("nan" in text for text in texts_of(table))
-
-
 @pytest.mark.usefixtures("whole_fonts")
 def test_the_report_of_a_run_with_a_chain_has_it(tmp_path: Path) -> None:
     rows = bounded_episodes()

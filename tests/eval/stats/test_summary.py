@@ -68,15 +68,6 @@ def test_failures_are_counted_by_their_outcome() -> None:
     assert "success_count" not in found
 
 
-def test_episodes_of_one_map_are_not_maps() -> None:
-    # Under five seeds each, one of two maps is always solved: that is two maps, not ten.
-    episodes = [row(condition(), m, 30.0 if m else None, seed=seed) for m in (0, 1) for seed in range(5)]
-    found = summary_of(*episodes)
-    assert (found["n_episodes"], found["n_maps"]) == (10, 2)
-    assert found["design_effect"] == pytest.approx(5)
-    assert (found["success_low"], found["success_high"]) == pytest.approx(wilson_interval(0.5, 2))
-
-
 def test_a_row_a_condition_in_order_of_appearance() -> None:
     order = [
         condition("mppi", scenario="std"),
@@ -89,21 +80,6 @@ def test_a_row_a_condition_in_order_of_appearance() -> None:
     ]  # fmt: skip
     assert summary["model"].tolist() == ["paper-v1"] * 3
     assert summary["n_episodes"].tolist() == [2, 2, 2]
-
-
-def test_planning_time_is_the_median_and_compilation_a_share() -> None:
-    found = summary_of(
-        *(
-            row(
-                condition(), i, planning_ms=ms, planning_ms_p95=10 * ms, planning_start_ms=-ms, compiled=i > 0
-            )
-            for i, ms in enumerate((1.0, 2.0, 9.0, 3.0))
-        )
-    )
-    assert found["planning_ms_median"] == 2.5
-    assert found["planning_ms_p95_median"] == 25
-    assert found["planning_start_ms_median"] == -2.5
-    assert found["compiled_share"] == 0.75
 
 
 def test_time_has_the_interval_of_its_own_condition_over_maps() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.quality.baselines import baselines_of, climatology_crps, nearest_colour_accuracy
+from benchnav.models.quality.baselines import climatology_crps
 
 
 def test_the_crps_of_one_distribution_is_half_the_mean_difference_of_two_cells(
@@ -27,9 +27,3 @@ def test_cells_that_were_not_observed_do_not_count(
     assert climatology_crps(dataset, "test/std") == pytest.approx(0.125, abs=2e-4)
     monkeypatch.setattr(dataset, "chunks", lambda *_: [(range(1), {"traversability": values * np.nan})])
     assert math.isnan(climatology_crps(dataset, "test/std"))
-
-
-def test_classes_are_asked_where_there_are_any(dataset: TerrainDataset) -> None:
-    found = baselines_of(dataset, ["test/std", "test/hs"], ["test/hs"])
-    assert found.nearest_colour_accuracy == {"test/hs": nearest_colour_accuracy(dataset, "test/hs")}
-    assert list(found.climatology_crps) == ["test/std", "test/hs"]

@@ -15,18 +15,22 @@ from benchnav.models.base import TraversabilityModel
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.figures import QualityData, quality_figures
 from benchnav.models.quality.measure import Quality, evaluate
+from benchnav.models.quality.output import Page
 from benchnav.models.quality.report import (
     COLUMNS,
     LOOK_ALIKES,
     numbers,
     quality_csv,
     quality_json,
-    quality_markdown,
     quality_table,
 )
 from tests.models.stub import ColourModel
 
 Qualities = dict[str, Quality]
+
+
+def page_of(qualities: Qualities) -> str:
+    return Page(title="title", tables=[quality_table("title", qualities, whole=True)]).to_markdown()
 
 
 @pytest.fixture(scope="module")
@@ -50,25 +54,14 @@ def test_the_table_has_a_row_a_split_and_fits(qualities: Qualities) -> None:
     assert not any("…" in line for line in lines)
 
 
-def test_a_name_too_long_is_folded_rather_than_a_number(qualities: Qualities) -> None:
-    printed = to_terminal(quality_table("title", {"test/" + "long" * 20: qualities["valid"]}), width=124)
-    assert max(map(len, printed.splitlines())) <= 124
-    for value in numbers(qualities["valid"]).values():
-        assert f"{value:.4f}" in printed or value in (
-            qualities["valid"].classes[0].miou_predicted,
-            qualities["valid"].classes[0].entropy,
-            qualities["valid"].classes[0].mutual_information,
-        )
-
-
 def test_what_there_is_not_is_left_out_or_dashed(qualities: Qualities, dataset: TerrainDataset) -> None:
     oracle = dict(evaluate(Oracle(), dataset, ["valid"]))
-    page = quality_markdown("title", oracle, [], {})
+    page = page_of(oracle)
     assert "mIoU" not in page
     assert f"{oracle['valid'].traversability.crps:.4f}" in page
     nameless = replace(qualities["valid"].classes[0], entropy_auroc=float("nan"))
     mixed = {**qualities, "valid": replace(qualities["valid"], classes=(nameless,))}
-    (row,) = [line for line in quality_markdown("title", mixed, [], {}).splitlines() if "| valid |" in line]
+    (row,) = [line for line in page_of(mixed).splitlines() if "| valid |" in line]
     assert "–" in row
 
 
@@ -105,16 +98,10 @@ def test_csv_has_scenario_severity_and_every_number(qualities: Qualities) -> Non
         assert found == pytest.approx(numbers(quality), rel=1e-5)
 
 
-def test_csv_leaves_a_number_that_there_is_not_empty(qualities: Qualities) -> None:
-    single = replace(qualities["valid"].classes[0], mutual_information=float("nan"))
-    text = quality_csv({"valid": replace(qualities["valid"], classes=(single,))})
-    (row,) = csv.DictReader(io.StringIO(text))
-    assert row["mutual_information"] == ""
-
-
 def test_the_page_shows_table_notes_and_figures(qualities: Qualities) -> None:
     figures = [("figures/pit.png", "PIT", "What it shows."), ("figures/maps-a.png", "Maps of a", "Maps.")]
-    lines = quality_markdown("title", qualities, ["a note"], figures).splitlines()
+    page = Page(title="title", tables=[quality_table("title", qualities, whole=True)], notes=["a note"])
+    lines = page.to_markdown(figures).splitlines()
     assert lines[0] == "# title"
     header, rule, *rows = [line for line in lines if line.startswith("|")]
     assert len({line.count("|") for line in (header, rule, *rows)}) == 1
@@ -132,20 +119,11 @@ def test_every_column_of_the_page_is_explained_and_no_other(
 ) -> None:
     oracle = dict(evaluate(Oracle(), dataset, ["valid"]))
     for measured in (qualities, oracle):
-        lines = quality_markdown("title", measured, [], {}).splitlines()
+        lines = page_of(measured).splitlines()
         headings = [cell.strip() for cell in lines[2].strip("|").split("|")]
         explained = [line[4:].partition("**: ") for line in lines if line.startswith("- **")]
         assert [heading for heading, _, _ in explained] == [h for h in headings if h != "maps"]
         assert all(sentence.endswith(".") for _, _, sentence in explained)
-
-
-def test_every_figure_has_a_caption(dataset: TerrainDataset) -> None:
-    measured = dict(evaluate(ColourModel(), dataset))
-    data = QualityData(title="", model=ColourModel(), dataset=dataset, qualities=measured, maps=1)
-    figures = {figure.name: figure for figure in quality_figures(data)}
-    assert {"confusion", "reliability", "pit", "latent", "maps-test-std", "maps-test-hs"} == set(figures)
-    assert len({figure.title for figure in figures.values()}) == len(figures)
-    assert all(figure.caption(data).endswith(".") for figure in figures.values())
 
 
 class Quantiles(TraversabilityModel):

@@ -14,15 +14,14 @@ from scipy.stats import entropy, mannwhitneyu
 from torch import Tensor
 from torchmetrics.functional.classification import multiclass_calibration_error
 
-from benchnav.core import registry
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.quantiles import LEVELS, QuantileDistribution
+from benchnav.core.tables import to_markdown
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.models.quality.command import evaluate_command
 from benchnav.models.quality.measure import evaluate
-from benchnav.models.quality.report import LOOK_ALIKES, quality_csv, quality_json, quality_markdown
+from benchnav.models.quality.report import LOOK_ALIKES, quality_csv, quality_json, quality_table
 from benchnav.models.quality.scores import (
     ErrorRanking,
     LookAlikeQuality,
@@ -56,15 +55,6 @@ def random_probabilities(maps: int = 3, classes: int = 4, size: int = 20) -> tor
     return (3 * torch.randn(maps, classes, size, size, generator=generator(), dtype=torch.float64)).softmax(1)
 
 
-def test_crps_is_the_closed_form_of_a_gaussian_far_from_the_bounds() -> None:
-    mixture = single(0.5, 0.05, (1, 101))
-    observed = torch.linspace(0.3, 0.7, 101, dtype=torch.float64)[None]
-    z = ((observed - 0.5) / 0.05).numpy()
-    density = torch.exp(-0.5 * torch.from_numpy(z) ** 2) / math.sqrt(2 * math.pi)
-    exact = 0.05 * (torch.from_numpy(z * (2 * ndtr(z) - 1)) + 2 * density - 1 / math.sqrt(math.pi))
-    torch.testing.assert_close(mixture.crps(observed), exact, rtol=0, atol=1e-6)
-
-
 @settings(max_examples=25, deadline=None)
 @given(
     means=st.lists(st.floats(-0.5, 1.5), min_size=3, max_size=3),
@@ -94,18 +84,6 @@ def test_crps_of_certain_predictions_is_their_distance() -> None:
     mixture, observed = single(0.3, 0.0, (1, 3)), torch.tensor([[0.0, 0.3, 1.0]], dtype=torch.float64)
     expected = torch.tensor([[0.3, 0.0, 0.7]], dtype=torch.float64)
     torch.testing.assert_close(mixture.crps(observed), expected, rtol=0, atol=0.02)
-
-
-@pytest.mark.parametrize("mean", [0.5, 0.95, 0.05, 1.2])
-def test_what_is_drawn_from_the_prediction_is_calibrated(mean: float) -> None:
-    mixture = single(mean, 0.15)
-    transformed = pit(mixture, draw(mixture, 1, generator())[0], generator(1))
-    assert coverage(transformed) == pytest.approx(0.9, abs=0.006)
-    assert tail_rate(transformed) == pytest.approx(0.1, abs=0.006)
-    counts = pit_counts(transformed)
-    assert int(counts.sum()) == transformed.numel()
-    # Twenty binomial counts of mean 2000 and standard deviation 44.
-    assert 1800 < int(counts.min()) <= int(counts.max()) < 2200
 
 
 def test_pit_is_the_cdf_inside_and_within_the_atoms_at_the_ends() -> None:
@@ -181,14 +159,6 @@ def test_entropy_is_that_of_scipy() -> None:
     torch.testing.assert_close(predictive_entropy(probabilities), expected)
 
 
-def test_members_that_agree_share_no_doubt_and_sure_ones_that_differ_have_nothing_else() -> None:
-    unsure = cell(0.5, 0.5, 0)
-    assert float(mutual_information(torch.stack([unsure, unsure]))) == 0
-    differ = torch.stack([cell(1, 0, 0), cell(0, 1, 0), cell(0, 0, 1)])
-    assert float(mutual_information(differ)) == pytest.approx(math.log(3))
-    assert mutual_information(differ).dtype == differ.dtype
-
-
 def test_rounding_makes_no_information_negative() -> None:
     one = torch.randn(1, 1, 10, 40, 40, generator=generator(), dtype=torch.float64).softmax(2)
     information = mutual_information(one.expand(7, -1, -1, -1, -1))
@@ -225,18 +195,6 @@ def test_the_ranking_of_errors_is_the_statistic_of_mann_and_whitney(scale: float
     exact /= int(wrong.sum()) * int((~wrong).sum())
     assert ranking.compute()[1] == pytest.approx(exact, abs=1e-4)
     assert exact > 0.6
-
-
-def test_a_ranking_is_right_wrong_or_blind() -> None:
-    wrong = torch.tensor([[True, False], [False, True]])
-    for score, expected in (
-        (torch.tensor([[2.0, 1.0], [0.0, 3.0]]), 1.0),
-        (torch.tensor([[0.0, 1.0], [2.0, -0.0]]), 0.0),
-        (torch.ones(2, 2), 0.5),
-    ):
-        ranking = ErrorRanking()
-        ranking.update(score, wrong)
-        assert ranking.compute()[1] == expected
 
 
 def test_a_score_under_zero_by_rounding_is_of_the_surest() -> None:
@@ -354,23 +312,9 @@ def test_a_dataset_with_look_alikes_is_measured_with_them_merged(
     row = json.loads(quality_json({}, qualities))["splits"]["test/std"]
     assert {name: row[name] for name in LOOK_ALIKES} == pytest.approx(vars(measured.look_alikes))
     assert f"{measured.look_alikes.look_alike_accuracy:.6g}" in quality_csv(qualities)
-    page = quality_markdown("", qualities, [], {})
+    page = to_markdown(quality_table("", qualities, whole=True))
     assert "mIoU look-alikes=1" in page
     assert len({row.count("|") for row in page.splitlines() if row.startswith("|")}) == 1
-
-
-def test_the_command_writes_and_draws_look_alikes(
-    dataset: TerrainDataset,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setattr(registry, "_REGISTERED", {})
-    registry.register("model", "colours", ColourModel)
-    evaluate_command("colours", str(dataset.path), out=str(tmp_path / "q"), maps=1)
-    assert "look-alikes=1" in capfd.readouterr().out
-    assert (tmp_path / "q" / "figures" / "confusion.png").is_file()
-    assert "look-alikes=1" in (tmp_path / "q" / "quality.md").read_text()
 
 
 def test_a_dataset_without_look_alikes_has_no_such_numbers(dataset: TerrainDataset, tmp_path: Path) -> None:
@@ -380,7 +324,7 @@ def test_a_dataset_without_look_alikes_has_no_such_numbers(dataset: TerrainDatas
         pass
     qualities = dict(evaluate(ColourModel(), TerrainDataset(tmp_path / "plain.h5")))
     assert qualities["test/std"].classes[0].look_alikes is None
-    assert "look_alikes" not in quality_markdown("", qualities, [], {})
+    assert "look_alikes" not in to_markdown(quality_table("", qualities, whole=True))
     assert not {*LOOK_ALIKES, "look_alikes"} & set(
         json.loads(quality_json({}, qualities))["splits"]["test/std"]
     )
@@ -432,14 +376,6 @@ def test_sparsification_is_a_direct_sort(cells: int, seed: int) -> None:
     for row, order in zip(curves, (np.argsort(uncertainty), np.argsort(error)), strict=True):
         by_hand = [error[order[: left + 1]].mean() for left in range(cells)]
         np.testing.assert_allclose(row, by_hand, atol=1e-12)
-
-
-def test_sparsification_by_the_error_itself_has_no_area_and_by_nothing_is_flat() -> None:
-    error = torch.linspace(0.1, 1, 50)[torch.randperm(50, generator=generator())]
-    own = sparsification(error, error)
-    torch.testing.assert_close(own[0], own[1])
-    flat, _ = sparsification(error, torch.full_like(error, 0.3))
-    torch.testing.assert_close(flat, torch.full_like(flat, float(error.double().mean())))
 
 
 def test_pit_is_drawn_within_any_atom() -> None:

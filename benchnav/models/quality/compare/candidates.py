@@ -54,6 +54,13 @@ class Candidate:
         return isinstance(self.model, Oracle | Ideal)
 
 
+def candidate(source: str, label: str, model: TraversabilityModel | None = None) -> Candidate:
+    """Return a model as a candidate; it is loaded from its source where it is not given."""
+    return Candidate(
+        label=label, source=source, model=model or load_model(source), trained_on=trained_on(source)
+    )
+
+
 def find_candidates(sources: Sequence[str]) -> list[Candidate]:
     """Loads the models that are compared: those asked for in their order, then the privileged ones.
 
@@ -73,11 +80,8 @@ def find_candidates(sources: Sequence[str]) -> list[Candidate]:
     models = {source: load_model(source) for source in sources}
     models |= {name: load_model(name) for name in PRIVILEGED if name not in models}
     labels = _labels(list(models))
-    found = [
-        Candidate(label=labels[source], source=source, model=model, trained_on=trained_on(source))
-        for source, model in models.items()
-    ]
-    return sorted(found, key=lambda candidate: candidate.privileged)
+    found = [candidate(source, labels[source], model) for source, model in models.items()]
+    return sorted(found, key=lambda one: one.privileged)
 
 
 def _folder(source: str) -> Path | None:

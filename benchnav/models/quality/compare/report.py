@@ -10,7 +10,7 @@ import pandas as pd
 
 from benchnav.core.tables import NOTHING, Bold, Table
 from benchnav.models.quality.map_sums import MapTally
-from benchnav.models.quality.output import json_text, page
+from benchnav.models.quality.output import json_text
 from benchnav.models.quality.scores_of_maps import COMPARED, SCORES, TAIL_RATES
 from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA
@@ -192,18 +192,3 @@ def comparison_csv(comparison: Comparison) -> str:
     columns = ["split", "model", "privileged", "units", *names, *COSTS, *(score.name for score in TAIL_RATES)]
     known = [name for name in columns if name in numbers]
     return numbers.to_csv(columns=known, index=False, float_format="%.6g")
-
-
-def comparison_markdown(
-    title: str, comparison: Comparison, notes: Sequence[str], figures: Sequence[tuple[str, str, str]]
-) -> str:
-    """Write the tables as a page with its figures, and what columns and figures mean.
-
-    Args:
-        title: of the page.
-        comparison: what was measured.
-        notes: lines under the table.
-        figures: from `output.save_figures`.
-    """
-    tables = [comparison_table(title, comparison, whole=True), difference_table(comparison)]
-    return page(title, [table for table in tables if table.rows], notes, figures)

@@ -1,8 +1,5 @@
 import csv
 import json
-import math
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +12,7 @@ from benchnav.core.terrain import Observation
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import TraversabilityModel
 from benchnav.models.predictor import Oracle
-from benchnav.models.quality import baselines
-from benchnav.models.quality.compare import candidates
+from benchnav.models.quality import baselines, laboratory
 from benchnav.models.quality.measure import evaluate, measure_split
 from tests.commands import call
 from tests.models.stub import ColourModel
@@ -160,8 +156,8 @@ def test_seed_and_device_reach_the_measurement(
         assert pits[seed] == list(measure_split(ColourModel(), dataset, "valid", seed).traversability.pit)
     assert pits[0] != pits[7]
     asked_for: list[torch.device] = []
-    measured, timed = measure_split, candidates.prediction_ms
-    monkeypatch.setattr("benchnav.core.device.find_device", lambda name: torch.device("cpu", 0))
+    measured = measure_split
+    monkeypatch.setattr(laboratory, "find_device", lambda name: torch.device("cpu", 0))
 
     def spy(
         model: TraversabilityModel,
@@ -174,8 +170,7 @@ def test_seed_and_device_reach_the_measurement(
         asked_for.append(place)
         return measured(model, data, split, seed, torch.device("cpu"), **how)
 
-    monkeypatch.setattr("benchnav.models.quality.measure.measure_split", spy)
-    monkeypatch.setattr(candidates, "prediction_ms", lambda model, terrain: timed(model, terrain))
+    monkeypatch.setattr("benchnav.models.quality.measurement.measure_split", spy)
     assert call("train", "compare", "colours", "--data", dataset.path, "--splits", "[valid]") == 0
     assert asked_for == [torch.device("cpu", 0)] * 3
 
@@ -256,48 +251,13 @@ def test_a_model_that_is_worse_than_none_is_told_so(
     assert not any(line.startswith("oracle: ") for line in out)
 
 
-def test_maps_that_a_model_was_trained_on_are_named(
-    dataset: TerrainDataset,
-    checkpoint_path: Path,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    asked = (checkpoint_path, "colours", "--data", dataset.path, "--splits", "[valid]")
-    assert call("train", "compare", *asked) == 0
-    lines = [line for line in capfd.readouterr().out.splitlines() if "was trained" in line]
-    assert [line.partition(":")[0] for line in lines] == ["tiny"]
-
-
-def test_a_series_is_drawn_where_there_is_one(
-    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    held = dict(dataset.manifest["splits"])
-    monkeypatch.setattr(
-        TerrainDataset, "splits", property(lambda self: {**held, "test/hs-100": held["test/hs"]})
-    )
-    read = TerrainDataset.read
-    monkeypatch.setattr(
-        TerrainDataset, "read", lambda self, split, *rest: read(self, split.removesuffix("-100"), *rest)
-    )
-    asked = ("colours", "--data", dataset.path, "--splits", "[test/std,test/hs-100]", "--out", tmp_path / "q")
-    assert call("train", "compare", *asked) == 0
-    assert (tmp_path / "q" / "figures" / "severity.png").is_file()
-    assert "(figures/severity.png)" in (tmp_path / "q" / "compare.md").read_text()
-    found = json.loads((tmp_path / "q" / "compare.json").read_text())
-    assert list(found["series"]) == ["test/hs"]
-    assert math.isclose(found["series"]["test/hs"][1]["severity"], 1.0)
-
-
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
         ([], "one model or more"),
         (["colours", "colours"], "models that differ"),
         (["colour"], "Did you mean 'colours'"),
-        (["colours", "--splits", "[test/hg]"], "test/hg"),
-        (["colours", "--splits", "[]"], "Expected `splits` among "),
-        (["colours", "--seed", "-1"], "`seed`"),
         (["colours", "--out", "folder"], "is something else than a comparison"),
-        (["colours", "--out", "folder/file/out"], "folder/file"),
     ],
 )
 def test_bad_input_is_refused_in_one_line_before_any_work(
@@ -322,12 +282,3 @@ def test_bad_input_is_refused_in_one_line_before_any_work(
     assert expected in err
     assert out == ""
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
-
-
-def test_the_command_is_light_to_import() -> None:
-    code = (
-        "import sys, benchnav.models.quality.compare.command; "
-        "print(sorted({'torch', 'torchmetrics', 'matplotlib', 'pandas'} & set(sys.modules)))"
-    )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout.strip() == "[]"
