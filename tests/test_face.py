@@ -33,7 +33,7 @@ FACES = {
     "DifferentialDrive FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Near NearOptimal "
     "Objective Optimal Places Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensed "
     "Sensor Simulation Static Step Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem CVaR Chance "
-    "ExpectedTime Mean RiskMeasure SingleClass TimeCVaR VaR",
+    "Prediction ExpectedTime Mean RiskMeasure SingleClass TimeCVaR VaR",
     "benchnav.testing": "check_belief check_metric check_model check_objective check_planner check_risk check_robot "
     "check_sensor",
 }

@@ -13,12 +13,12 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard
 from benchnav.core.tables import to_terminal
 from benchnav.eval.compare import compare_runs
-from benchnav.eval.experiment.condition import conditions_of
+from benchnav.eval.experiment.condition import conditions_of, scenarios_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.run_folder import caveats, open_run
 from benchnav.eval.report.write import print_report, write_report
 from benchnav.eval.run.begin import Work, begin
-from benchnav.eval.run.check import check_suite, scenarios_of
+from benchnav.eval.run.check import check_suite
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.rerun import rerun
 from benchnav.eval.run.runner import run_suite
