@@ -115,7 +115,7 @@ class ModelPart(Part):
     def key(self) -> str:
         """The description as text, with digests of code and files; see `loaded`."""
         folder = self.folder
-        files = digests_of(folder) if folder else {}
+        files = digests_of(folder) if folder else registry.option_files(self)
         return json.dumps([self.part, dict(self.options), self.found.digest, files], sort_keys=True)
 
     @property
@@ -164,7 +164,7 @@ def load_model(source: Source) -> TraversabilityModel:
     part = read_model(source)
     found, folder = part.found, part.folder
     if folder is not None:
-        model = _rebuilt(found, _checked_checkpoint(part, folder, found))
+        model = open_checkpoint(_checked_checkpoint(part, folder, found), found)
     elif is_family(found.target):
         raise no_model(part)
     else:
@@ -253,15 +253,6 @@ def _checked_checkpoint(part: ModelPart, folder: Path, family: Found) -> Checkpo
     return checkpoint
 
 
-def open_checkpoint(checkpoint: Checkpoint) -> TraversabilityModel:
-    """Rebuilds the model of a checkpoint through the family that it names.
-
-    Raises:
-        CheckpointError: the family is not known here by name, or cannot rebuild the model.
-    """
-    return _rebuilt(find_family(checkpoint.model), checkpoint)
-
-
 def find_family(name: str) -> Found:
     """Finds the family that a checkpoint names.
 
@@ -280,8 +271,17 @@ def find_family(name: str) -> Found:
     return found
 
 
-def _rebuilt(family: Found, checkpoint: Checkpoint) -> TraversabilityModel:
-    """Rebuilds a model, and tells when its class is of other code now; what that raises ends in one line."""
+def open_checkpoint(checkpoint: Checkpoint, family: Found | None = None) -> TraversabilityModel:
+    """Rebuild the model of a checkpoint, and warn if its class is of other code now.
+
+    Args:
+        checkpoint: as it was read.
+        family: the class that rebuilds it; None for that which the checkpoint names.
+
+    Raises:
+        CheckpointError: If the family is not known here by name, or cannot rebuild the model.
+    """
+    family = family or find_family(checkpoint.model)
     if checkpoint.code and checkpoint.code != family.digest:
         tell(
             f"benchnav: warning: {checkpoint.model} in {family.origin} has changed since it trained the checkpoint "

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from benchnav.core.errors import ConfigError, expect
-from benchnav.core.settings import check_known
+from benchnav.core.settings import check_known, plain
 from benchnav.core.short_repr import short_repr
 
 PartSpec = str | dict[str, Any]
@@ -133,6 +133,11 @@ class Suite:
             raise ConfigError(
                 f"Expected `record` as {', '.join(RECORDS[:-1])} or {RECORDS[-1]}, got {self.record!r}."
             )
+
+    @property
+    def plain(self) -> dict[str, Any]:
+        """The suite as plain data, as `run.json` holds it."""
+        return dict(plain(self))
 
     @property
     def products(self) -> list[dict[str, list[Any]]]:

@@ -17,6 +17,8 @@ from benchnav.eval.experiment.suite import MAX_CONDITIONS
 from benchnav.models.base import is_family
 from benchnav.models.predictor import ModelPart, no_model
 
+_Chosen = dict[tuple[str, ...], Any]  # values by where they stand
+
 
 def part_of(kind: str, about: Mapping[str, Any], label: str) -> Part:
     """Return the part that `part` and `options` describe."""
@@ -55,9 +57,6 @@ def read_parts(kind: str, given: Any) -> list[Part]:
     return parts
 
 
-_Chosen = dict[tuple[str, ...], Any]  # values by where they stand
-
-
 def each_part(kind: str, part: Part) -> list[Part]:
     """Gives a part for each combination of values where an option is given a list of them.
 
@@ -72,22 +71,18 @@ def each_part(kind: str, part: Part) -> list[Part]:
         The part itself where nothing is swept.
     """
     known = registry.options_of(kind, registry.find(kind, part.part).target)
+    first = next(iter(known), "")
     swept = {
         name: value
         for name, value in part.options.items()
         if name in known and not _taken(kind, part.part, name, known[name], value)
     }
-    first = next(iter(known), "")
-    return [
-        replace(
-            part,
-            label=registry.label_of(
-                part.label, {".".join(path): value for path, value in chosen.items()}, first
-            ),
-            options=_with(part.options, chosen),
-        )
-        for chosen in _choices(swept)
-    ]
+    parts = []
+    for chosen in _choices(swept):
+        named = {".".join(path): value for path, value in chosen.items()}
+        label = registry.label_of(part.label, named, first)
+        parts.append(replace(part, label=label, options=_with(part.options, chosen)))
+    return parts
 
 
 def each_mapping(given: Any) -> list[Any]:

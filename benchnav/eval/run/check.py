@@ -27,6 +27,7 @@ from benchnav.eval.experiment.metrics import NamedMetric, quantities, read_metri
 from benchnav.eval.experiment.suite import Suite, check_size
 from benchnav.eval.experiment.sweep import read_parts
 from benchnav.eval.experiment.unit import BLOCK_MAPS, Conditions, Extent
+from benchnav.eval.folder.run_folder import caveats
 from benchnav.eval.run.unit import read_maps
 from benchnav.models.base import PrivilegedModel
 from benchnav.models.checkpoint import load_checkpoint
@@ -57,6 +58,11 @@ class Checked:
     warnings: tuple[str, ...]
     hypotheses: dict[str, Any]
     metrics: tuple[NamedMetric, ...] = ()
+
+    @property
+    def caveats(self) -> list[str]:
+        """What readers of the run's tables should know, a line each."""
+        return caveats(vars(self))
 
 
 def check_suite(suite: Suite, elsewhere: bool) -> Checked:

@@ -16,7 +16,6 @@ from typing import Any
 from benchnav.core.device import gpu_name
 from benchnav.core.errors import ConfigError
 from benchnav.core.progress import Progress
-from benchnav.core.settings import plain
 from benchnav.core.store import Shard, sole_writer
 from benchnav.core.touched import changes_since, unlike
 from benchnav.core.workers import connected, run_calls
@@ -28,7 +27,6 @@ from benchnav.eval.folder.run_folder import (
     EPISODES,
     ERRORS,
     Finished,
-    caveats,
     find_units,
     finish_run,
     unit_path,
@@ -75,11 +73,11 @@ def run_suite(
     """
     with sole_writer(folder, str(folder)):
         checked = check_suite(suite, elsewhere=jobs != 1 or settings.planner_limit_s > 0)
-        for line in caveats(vars(checked)):
+        for line in checked.caveats:
             say(line)
         work = Work(
             **vars(checked),
-            suite=plain(suite),
+            suite=suite.plain,
             record=suite.record,
             settings=settings,
             shard=shard,

@@ -95,6 +95,16 @@ def test_a_run_in_which_nothing_is_left_is_refused(dataset_path: Path, tmp_path:
     assert not (tmp_path / "run").exists()
 
 
+def test_a_world_without_a_feasible_path_is_refused_before_anything_is_run(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    world = {"preset": "stakes", "immobile": {"below": 0.999, "for_s": 2}, "time_budget_s": 3.0}
+    suite = suite_on(dataset_path, planners=(FREE,), robots=("unicycle",), world=world)
+    with pytest.raises(ConfigError, match="Expected a feasible path from start to goal"):
+        list(run_suite(suite, tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_merged_run_says_what_its_shards_said(dataset_path: Path, tmp_path: Path) -> None:
     parts = [tmp_path / "1", tmp_path / "2"]
     for index, part in enumerate(parts, start=1):
