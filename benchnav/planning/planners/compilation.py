@@ -76,7 +76,7 @@ class Fused(Generic[R]):
             return self._function(*args)
         signature = self._signature(items)
         try:
-            result = self._call(args, items, signature)
+            result = self._call([type(arg) for arg in args], items, signature)
         except (torch._dynamo.exc.TorchDynamoException, torch._dynamo.exc.FailOnRecompileLimitHit) as error:
             self.compiled = False
             reason = str(error).strip().splitlines()[0]
@@ -86,13 +86,13 @@ class Fused(Generic[R]):
         self.compiled = True
         return result
 
-    def _call(self, args: tuple[Any, ...], items: list[Any], signature: tuple[object, ...]) -> R:
+    def _call(self, kinds: list[type], items: list[Any], signature: tuple[object, ...]) -> R:
         """Runs what is compiled, for a new signature under the settings of compiling."""
         if self._fused is None:
-            self._fused = torch.compile(self._function, dynamic=False, fullgraph=True)
+            self._fused = torch.compile(_of_items(self._function, kinds), dynamic=False, fullgraph=True)
         if signature in self._seen:
             try:
-                return self._fused(*args)
+                return self._fused(*items)
             except torch._dynamo.exc.FailOnRecompileLimitHit:
                 pass  # what it was compiled for has changed in what the signature does not tell
         with _compiling(checked=not all(map(_is_ours, items))):
@@ -100,7 +100,7 @@ class Fused(Generic[R]):
                 # The number of episodes may be any, except one.
                 if items[index] is not None and len(items[index]) > 1:
                     torch._dynamo.maybe_mark_dynamic(items[index], 0)
-            return self._fused(*args)
+            return self._fused(*items)
 
     def _signature(self, items: list[Any]) -> tuple[object, ...]:
         """What a call is compiled for: shapes, dtypes and devices of tensors, the other arguments, PyTorch's modes."""
@@ -116,6 +116,26 @@ class Fused(Generic[R]):
             else:
                 found.append(_key(item))
         return tuple(found)
+
+
+def _of_items(function: Callable[..., R], kinds: list[type]) -> Callable[..., R]:
+    """Return a function of single items, whose checks at each call are cheaper than those of tuples.
+
+    Args:
+        function: takes arguments of these kinds.
+        kinds: types of its arguments; a named tuple stands for its items.
+    """
+    sizes = [len(kind._fields) if issubclass(kind, tuple) else 0 for kind in kinds]  # type: ignore[attr-defined]
+
+    def call(*items: Any) -> R:
+        args: list[Any] = []
+        first = 0
+        for kind, size in zip(kinds, sizes, strict=True):
+            args.append(kind(*items[first : first + size]) if size else items[first])
+            first += size or 1
+        return function(*args)
+
+    return call
 
 
 @contextmanager

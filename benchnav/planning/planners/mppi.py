@@ -442,9 +442,10 @@ def roll_out(
         for first in range(0, mean.shape[1], _CHUNK_STEPS)
     ]
     parts = [Sampled(mean[:, chunk].contiguous(), noise[chunk], *problem.action_bounds) for chunk in chunks]
+    dynamics = problem.dynamics
     if dwell is None or problem.immobile is None:
         for sampled in parts:
-            states, cost = advance(states, cost, sampled, ground, target, problem.dynamics)
+            states, cost = advance(states, cost, sampled, ground, target, dynamics)
         return states, cost, None
     most = steps_in(problem.immobile.for_s, problem.dt_s)
     held = dwell.held.repeat_interleave(count, 0)[:, None].expand_as(cost).clamp(max=most - 1).contiguous()
@@ -453,7 +454,7 @@ def roll_out(
     goal = problem.goal_m.repeat_interleave(count, 0)[:, None].contiguous()
     for chunk, sampled in zip(chunks, parts, strict=True):
         rules = Entrapment(goal, left - chunk.start, problem.goal_radius_m, problem.immobile.below, most)
-        states, cost, held = advance(states, cost, held, sampled, ground, target, rules, problem.dynamics)
+        states, cost, held = advance(states, cost, held, sampled, ground, target, rules, dynamics)
     return states, cost, held < most
 
 
