@@ -67,6 +67,14 @@ def test_every_public_name_can_be_had_and_lies_in_its_package(name: str) -> None
 
 
 @EACH
+def test_no_module_takes_the_place_of_a_public_name_when_it_is_imported(name: str) -> None:
+    folder = ROOT.joinpath(*name.split("."))
+    modules = {path.stem for path in folder.glob("*") if path.suffix in ("", ".py")}
+    hidden = modules & set(face(name).__all__)
+    assert all(isinstance(getattr(face(name), each), ModuleType) for each in hidden)
+
+
+@EACH
 def test_editors_are_told_the_same_names_of_the_same_modules(name: str) -> None:
     folder = ROOT.joinpath(*name.split("."))
     stub = (folder / "__init__.pyi").read_text()
