@@ -26,7 +26,7 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.core.quantiles": ("QuantileDistribution",),
         "benchnav.core.registry": ("register",),
         "benchnav.core.terrain": ("Observation", "Terrain"),
-        "benchnav.eval.evaluate": ("evaluate",),
+        "benchnav.eval.evaluation": ("evaluate",),
         "benchnav.eval.results": ("Results", "open_results as open_run"),
     },
 )

@@ -8,7 +8,7 @@ from benchnav.core.pooled import pool
 from benchnav.core.quantiles import QuantileDistribution
 from benchnav.core.registry import register
 from benchnav.core.terrain import Observation, Terrain
-from benchnav.eval.evaluate import evaluate
+from benchnav.eval.evaluation import evaluate
 from benchnav.eval.results import Results
 from benchnav.eval.results import open_results as open_run
 

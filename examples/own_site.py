@@ -72,8 +72,9 @@ def drive(terrain: Terrain) -> pd.DataFrame:
         unknown = torch.full((DRIVES,), torch.nan)
         places = planning.Places(start_m=position, goal_m=goal, reference_time_s=unknown)
         simulation = planning.Simulation(terrain, task, world, places, 0, range(DRIVES))
-        maps = terrain.observe(), terrain.truth, terrain.traversability  # which `Straight` does not look at
-        problem = planning.pose_problem(task, *maps, position, goal, LEG_S)
+        # Which `Straight` does not look at.
+        predicted = planning.Prediction(terrain.observe(), terrain.truth, terrain.traversability)
+        problem = planning.pose_problem(task, predicted, position, goal, LEG_S)
         planner, state = planning.Straight(), simulation.init(problem.start)
         plan, met = planner.init(problem, GENERATOR), unknown
         for step in range(steps):

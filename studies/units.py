@@ -13,7 +13,8 @@ from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.unit import Extent, Unit, units
 from benchnav.eval.run.rollout import Episodes
 from benchnav.eval.run.unit import Built, Settings, build, simulate
-from benchnav.planning import Problem, Task, pose_problem
+from benchnav.planning import Prediction, Problem, Task, pose_problem
+from benchnav.planning.free_space import Immobile
 from benchnav.planning.world.outcome import Outcome
 
 # What suites of the studies in the world `stakes` have in common.
@@ -44,7 +45,7 @@ def pose_on(
     ends_m: tuple[Tensor, Tensor],
     task: Task,
     time_budget_s: float,
-    **options: Any,
+    immobile: Immobile | None = None,
 ) -> tuple[Problem, Terrain]:
     """Return a problem on flat terrain whose λ is known, and the terrain.
 
@@ -54,7 +55,7 @@ def pose_on(
         ends_m: start and goal, shape [B, 2] each.
         task: of the robots.
         time_budget_s: of an episode.
-        **options: of `pose_problem`.
+        immobile: what immobilises robots.
     """
     level, flat = ground[:, None], torch.zeros_like(ground)
     truth = TraversabilityMixture(torch.ones_like(level), level, torch.zeros_like(level), (0,))
@@ -62,7 +63,8 @@ def pose_on(
     terrain = Terrain(
         rgb=rgb, class_id=flat.long(), elevation_m=flat, slope_deg=flat, truth=truth, traversability=ground, grid=grid
     )  # fmt: skip
-    problem = pose_problem(task, terrain.observe(), truth, ground, *ends_m, time_budget_s, **options)
+    prediction = Prediction(terrain.observe(), truth, ground)
+    problem = pose_problem(task, prediction, *ends_m, time_budget_s, immobile)
     return problem, terrain
 
 

@@ -12,7 +12,7 @@ from benchnav.datagen.files.create import create
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe
 from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective
-from benchnav.planning.problem import Problem, Task, pose_problem
+from benchnav.planning.problem import Prediction, Problem, Task, pose_problem
 from benchnav.planning.robots import Robot, Unicycle
 from benchnav.planning.world.world import Places
 
@@ -89,9 +89,8 @@ def problem(
     elevation_m = flat if elevation_m is None else elevation_m
     observation = Observation(rgb, elevation_m, flat, Grid(height, width, 0.5))
     made = task(robot, objective, rules)
-    return pose_problem(
-        made, observation, certain(traversability), traversability, start_m, goal_m, time_budget_s
-    )
+    prediction = Prediction(observation, certain(traversability), traversability)
+    return pose_problem(made, prediction, start_m, goal_m, time_budget_s)
 
 
 def tiny_recipe(**maps: int) -> Recipe:

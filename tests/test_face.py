@@ -33,7 +33,7 @@ FACES = {
     "DifferentialDrive FreeSpace Full GoalDistance Law LocalPlanner MPPI MPPIConfig Moment Near NearOptimal "
     "Objective Optimal Places Plan PlanStatus Planner Probe Problem Robot Rules SPEED STEERING Sensed "
     "Sensor Simulation Static Step Straight TURN_RATE Task TravelTime Unicycle World distance pose_problem CVaR Chance "
-    "ExpectedTime Mean RiskMeasure SingleClass TimeCVaR VaR",
+    "Prediction ExpectedTime Mean RiskMeasure SingleClass TimeCVaR VaR",
     "benchnav.testing": "check_belief check_metric check_model check_objective check_planner check_risk check_robot "
     "check_sensor",
 }
@@ -64,6 +64,14 @@ def test_every_public_name_can_be_had_and_lies_in_its_package(name: str) -> None
         assert public in dir(face(name))
     with pytest.raises(AttributeError, match=f"module '{name}' has no attribute 'Nothing'"):
         face(name).Nothing  # noqa: B018
+
+
+@EACH
+def test_no_module_takes_the_place_of_a_public_name_when_it_is_imported(name: str) -> None:
+    folder = ROOT.joinpath(*name.split("."))
+    modules = {path.stem for path in folder.glob("*") if path.suffix in ("", ".py")}
+    hidden = modules & set(face(name).__all__)
+    assert all(isinstance(getattr(face(name), each), ModuleType) for each in hidden)
 
 
 @EACH

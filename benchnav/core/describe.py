@@ -70,7 +70,9 @@ def _from_arguments(kind: str, instance: Any) -> Part | None:
             options = {name: plain(value) for name, value in bound.items() if name in known}
     except (BenchnavError, TypeError):  # an argument is an object itself, or a setting has no default
         return None
-    return Part(part=source, label=_label(_short(source), options, next(iter(known), "")), options=options)
+    return Part(
+        part=source, label=registry.label_of(_short(source), options, next(iter(known), "")), options=options
+    )
 
 
 def _source_of(kind: str, target: Any) -> str | None:
@@ -136,14 +138,3 @@ def _public(instance: Any) -> dict[str, Any]:
 
 def _short(source: str) -> str:
     return source.rpartition(":")[2]
-
-
-def _label(name: str, options: Mapping[str, Any], first: str) -> str:
-    """Name a part as sweeps do: a first option behind a colon, others by their names."""
-    if list(options) == [first]:
-        return f"{name}:{_text(options[first])}"
-    return " ".join([name, *(f"{option}={_text(value)}" for option, value in options.items())])
-
-
-def _text(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)

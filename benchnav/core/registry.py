@@ -30,7 +30,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -115,13 +115,28 @@ class Part:
     kind: str = field(default="", compare=False, repr=False)
 
     @property
+    def found(self) -> "Found":
+        """The class or function that creates the object, and where it comes from."""
+        return find(self.kind, self.part)
+
+    @property
     def object(self) -> Any:
         """The object. A process creates it once; it is asked for its properties and keeps no state."""
-        return _object_of(self)
+        target = self.found.target
+        description = json.dumps([self.kind, self.part, plain(self.options)], sort_keys=True)
+        known, created = _CREATED.get(description, (None, None))
+        if known is not target:
+            created = self.create()
+            _CREATED[description] = target, created
+        return created
 
     def create(self, **given: Any) -> Any:
         """Create a new object; see `make`."""
         return make(self.kind, self, **given)
+
+
+# By description, with the class or function that the object was created by: that of a file changes with the file.
+_CREATED: dict[str, tuple[Any, Any]] = {}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,6 +150,7 @@ class Found:
             package, and where no source is to be had.
         shipped: it is one of ours.
         everywhere: other processes find it too.
+        instance: the object itself, if nothing describes it.
     """
 
     target: Any
@@ -142,6 +158,7 @@ class Found:
     source_digest: Callable[[], str] = str
     shipped: bool = False
     everywhere: bool = True
+    instance: Any = None
 
     @property
     def digest(self) -> str:
@@ -154,9 +171,8 @@ class Found:
         return digest_of(map(str.encode, (source, *listed))) if listed else source
 
 
-_REGISTERED: dict[tuple[str, str], Any] = {}
-# Objects of this process that nothing describes, by kind and name.
-_OBJECTS: dict[tuple[str, str], Any] = {}
+# What only this process knows, by kind and name.
+_REGISTERED: dict[tuple[str, str], Found] = {}
 
 
 def register(kind: str, name: str, target: Any) -> None:
@@ -167,7 +183,10 @@ def register(kind: str, name: str, target: Any) -> None:
         name: what it is to be called.
         target: the class or function.
     """
-    _REGISTERED[_checked(kind), name] = target
+    digest = partial(digest_of_target, target)
+    _REGISTERED[_checked(kind), name] = Found(
+        target=target, origin="this process", source_digest=digest, everywhere=False
+    )
 
 
 def register_object(kind: str, name: str, instance: Any) -> str:
@@ -181,16 +200,24 @@ def register_object(kind: str, name: str, instance: Any) -> str:
     Returns:
         The name under which `make` returns it.
     """
+    known = names(kind)
     candidates = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
-    known = {*names(kind), *(name for other, name in _OBJECTS if other == kind)}
-    free = next(one for one in candidates if _OBJECTS.get((kind, one)) is instance or one not in known)
-    _OBJECTS[_checked(kind), free] = instance
+    free = next(one for one in candidates if one not in known or _instance_of(kind, one) is instance)
+    # A class is created, a risk measure is called with a distribution; anything else is returned as it is.
+    register(kind, free, instance if kind == "risk" or inspect.isclass(instance) else lambda: instance)
+    source = instance if inspect.isroutine(instance) or inspect.isclass(instance) else type(instance)
+    digest = partial(digest_of_target, source)
+    _REGISTERED[kind, free] = replace(_REGISTERED[kind, free], source_digest=digest, instance=instance)
     return free
 
 
 def is_object(kind: str, source: str) -> bool:
     """Whether a name stands for an object of this process."""
-    return (kind, source) in _OBJECTS
+    return _instance_of(kind, source) is not None
+
+
+def _instance_of(kind: str, source: str) -> Any:
+    return _REGISTERED[kind, source].instance if (kind, source) in _REGISTERED else None
 
 
 def names(kind: str) -> list[str]:
@@ -294,7 +321,7 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
     part = read_part(kind, part)
     owner = f"{kind} {part.part!r}"
     target = find(kind, part.part).target
-    complete(kind, part)
+    complete(kind, part)  # which rejects options that cannot be recorded
     arguments = _read_options(kind, part, target)
     config = config_class(target, _skipped(kind, target))
     if config:
@@ -305,20 +332,6 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
     made = call(owner, target, arguments)
     check_base(kind, made, owner)
     return made
-
-
-# By description, with the class or function that the object was created by: that of a file changes with the file.
-_CREATED: dict[str, tuple[Any, Any]] = {}
-
-
-def _object_of(part: Part) -> Any:
-    target = find(part.kind, part.part).target
-    description = json.dumps([part.kind, part.part, plain(part.options)], sort_keys=True)
-    known, created = _CREATED.get(description, (None, None))
-    if known is not target:
-        created = part.create()
-        _CREATED[description] = target, created
-    return created
 
 
 def take(kind: str, part: Any, **given: Any) -> Any:
@@ -365,18 +378,8 @@ def find(kind: str, source: str) -> Found:
         ConfigError: there is none, or it cannot be imported.
     """
     if (_checked(kind), source) in _REGISTERED:
-        target = _REGISTERED[kind, source]
         touched.watch()
-        digest = partial(digest_of_target, target)
-        return Found(target=target, origin="this process", source_digest=digest, everywhere=False)
-    if is_object(kind, source):
-        instance = _OBJECTS[kind, source]
-        touched.watch()
-        is_source = inspect.isroutine(instance) or inspect.isclass(instance)
-        digest = partial(digest_of_target, instance if is_source else type(instance))
-        # A class is created, a risk measure is called with a distribution; anything else is returned as it is.
-        target = instance if kind == "risk" or inspect.isclass(instance) else partial(_itself, instance)
-        return Found(target=target, origin="this process", source_digest=digest, everywhere=False)
+        return _REGISTERED[kind, source]
     points = [point for point in entry_points_of(kind) if point.name == source]
     if len(points) > 1:
         raise ConfigError(
@@ -395,10 +398,6 @@ def find(kind: str, source: str) -> Found:
     elif Path(f"{source}.py").is_file():
         remedy = f" Did you mean './{source}.py:Name'?"
     raise _unknown(kind, source, remedy)
-
-
-def _itself(instance: Any) -> Any:
-    return instance
 
 
 def options_of(kind: str, target: Any) -> dict[str, Option]:
@@ -462,6 +461,22 @@ def _skipped(kind: str, target: Any) -> tuple[str, ...]:
 def given_parameters(kind: str) -> tuple[str, ...]:
     """Names of the parameters that the program gives, such as an objective's `robot`."""
     return _GIVEN.get(kind, ())
+
+
+def label_of(name: str, options: Mapping[str, Any], first: str) -> str:
+    """Label a part by its options: the first option behind a colon, others by their names.
+
+    Args:
+        name: of the part.
+        options: those that tables show.
+        first: name of the part's first option.
+    """
+    texts = {
+        option: f"{value:g}" if isinstance(value, float) else str(value) for option, value in options.items()
+    }
+    if list(texts) == [first]:
+        return f"{name}:{texts[first]}"
+    return " ".join([name, *(f"{option}={text}" for option, text in texts.items())])
 
 
 def _a(kind: str) -> str:
@@ -554,7 +569,7 @@ def _listed_files(target: Any) -> Iterator[str]:
         yield from (name, digest)
 
 
-def option_files(kind: str, part: Part) -> dict[str, str]:
+def option_files(part: Part) -> dict[str, str]:
     """Digests of what a part's options name: files and folders, by the path as it is written.
 
     What reads as a path and is not there is among them, with an empty digest, so that it is seen when it comes or goes.
@@ -563,14 +578,14 @@ def option_files(kind: str, part: Part) -> dict[str, str]:
     Raises:
         ConfigError: an option names a folder that holds the working folder.
     """
-    written = getattr(find(kind, part.part).target, "writes", ())
+    written = getattr(part.found.target, "writes", ()) if part.options else ()
     found = {}
     for text in _texts([value for name, value in part.options.items() if name not in written]):
         path = Path(os.path.expanduser(text))
         there = os.path.exists(path)  # of what cannot be a path false, where Path raises
         if there and path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
             raise ConfigError(
-                f"Expected options of {kind} {part.part!r} that name files or folders of their own, got {text!r}, "
+                f"Expected options of {part.kind} {part.part!r} that name files or folders of their own, got {text!r}, "
                 "which holds the working folder. Name the folder that is read, or list the option in its `writes`."
             )
         if there or os.sep in text or re.search(r"\.[A-Za-z]\w*$", text):

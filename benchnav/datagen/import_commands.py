@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from benchnav import datagen
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.progress import show_progress
-from benchnav.datagen.dem.raster import GroundOptions, Rasters
+from benchnav.datagen.dem.raster import Cut, GroundOptions, Rasters
 
 if TYPE_CHECKING:
     from benchnav.datagen.dem.extent import GroundError
@@ -66,7 +66,7 @@ def import_dem(
         splits: Splits and their shares of the maps, such as train:0.7,valid:0.1,test/site:0.2; no two of them touch.
         scenario: Which of the recipe's scenarios lights the maps.
     """
-    dataset = _import(options, overrides, splits, dem=dem, ground=ground, rasters=rasters, scenario=scenario)
+    dataset = _import(options, overrides, splits, ground, scenario, dem=dem, rasters=rasters)
     for split, entry in dataset.splits.items():
         left_out = entry["parts"][0]["source"]["left_out"]
         between = left_out.pop("between_splits")
@@ -122,7 +122,7 @@ def import_drives(
     )
     rasters = Rasters(photo=photo, classes=classes, class_ids=class_ids, layer=layer, unlabelled=not classes)
     log = Drives(file=drives, least_speed=least_speed, speed=speed)
-    dataset = _import(options, overrides, splits, dem=dem, ground=ground, rasters=rasters, drives=log)
+    dataset = _import(options, overrides, splits, ground, dem=dem, rasters=rasters, drives=log)
     sources = {split: entry["parts"][0]["source"] for split, entry in dataset.splits.items()}
     about = next(iter(sources.values()))["drives"]
     print(_sum_up(about))
@@ -211,7 +211,12 @@ def _few(names: Sequence[str]) -> str:
 
 
 def _import(
-    options: ImportOptions, overrides: list[str], splits: str, **settings: Any
+    options: ImportOptions,
+    overrides: list[str],
+    splits: str,
+    ground: GroundOptions,
+    scenario: str = "std",
+    **settings: Any,
 ) -> "datagen.TerrainDataset":
     """Imports under the id that is asked for, or that the output names."""
     from benchnav.datagen.dem.extent import GroundError
@@ -222,15 +227,20 @@ def _import(
 
     path = Path(options.out)
     name = options.id or name_of(path)
-    scenario = settings.get("scenario", "std")
     used = f"splits={{imported: {{scenario: {scenario}, maps: 1}}}}"  # so that others need not fit the maps
     chosen = datagen.load_recipe(options.recipe, [f"id={name}", used, *overrides] if overrides else [])
     if options.id or not overrides:
         chosen = replace(chosen, id=name)
+    cut = Cut(
+        shares=read_shares(splits),
+        scenario=scenario,
+        stride_m=options.stride,
+        solvable=options.solvable,
+        ground=ground,
+    )
     steps = import_maps(
-        out=path, recipe=chosen, shares=read_shares(splits), stride_m=options.stride,
-        solvable=options.solvable, overwrite=options.overwrite, announce=print, **settings,
-    )  # fmt: skip
+        out=path, recipe=chosen, cut=cut, overwrite=options.overwrite, announce=print, **settings
+    )
     try:
         show_progress(steps, "maps")
     except GroundError as error:

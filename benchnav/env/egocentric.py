@@ -5,7 +5,7 @@ sub-environments, N×N cells of the crop, S state and A action dimensions.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -204,11 +204,11 @@ class EgocentricVectorEnv(OffRoadVectorEnv):
         return tuple(self._batch.draw(member) for member in range(self.num_envs))
 
 
-class EgocentricBatch(EnvBatch):
-    """B sub-environments as one batch; see `EgocentricEnv` for what they are.
+@dataclass(frozen=True, kw_only=True)
+class Perception:
+    """What robots perceive, predict and believe, and how observations and actions show it; see `EgocentricEnv`.
 
     Args:
-        size: B.
         sensor: what of the ground's looks is seen.
         ground: which λ is sensed.
         model: predicts λ; if empty, `oracle`, with a warning.
@@ -219,40 +219,47 @@ class EgocentricBatch(EnvBatch):
         crop_cells: N.
         crop_behind: share of the crop that is behind the robot.
         normalised_actions: actions are in [−1, 1].
-        drawn: keeps what is needed to draw.
-        arguments: those of `EnvBatch`.
     """
 
-    def __init__(
-        self,
-        size: int,
-        *,
-        sensor: AnyPart | Sensor = "full",
-        ground: AnyPart | Sensor = "contact",
-        model: AnyPart | TraversabilityModel = "",
-        risk: Any = "mean",
-        belief: AnyPart | Belief[Any] = "static",
-        unseen: str = "prior",
-        replan_every_s: float = 0.5,
-        crop_cells: int = 32,
-        crop_behind: float = 1 / 3,
-        normalised_actions: bool = False,
-        drawn: bool = False,
-        **arguments: Any,
-    ) -> None:
+    sensor: AnyPart | Sensor = "full"
+    ground: AnyPart | Sensor = "contact"
+    model: AnyPart | TraversabilityModel = ""
+    risk: Any = "mean"
+    belief: AnyPart | Belief[Any] = "static"
+    unseen: str = "prior"
+    replan_every_s: float = 0.5
+    crop_cells: int = 32
+    crop_behind: float = 1 / 3
+    normalised_actions: bool = False
+
+
+class EgocentricBatch(EnvBatch):
+    """B sub-environments as one batch; see `EgocentricEnv` for what they are.
+
+    Args:
+        size: B.
+        drawn: keeps what is needed to draw.
+        arguments: fields of `Perception`, and arguments of `EnvBatch`.
+    """
+
+    def __init__(self, size: int, *, drawn: bool = False, **arguments: Any) -> None:
         """Loads the maps of the split, and the model."""
-        self.view = View(cells=crop_cells, behind=crop_behind)
+        own = {each.name: arguments.pop(each.name) for each in fields(Perception) if each.name in arguments}
+        perception = Perception(**own)
+        self.view = View(cells=perception.crop_cells, behind=perception.crop_behind)
         super().__init__(size, **arguments)
+        unseen, replan_every_s = perception.unseen, perception.replan_every_s
         rules = replace(self._task.rules, unseen=unseen, replan_every_s=replan_every_s)
         self._task = replace(self._task, rules=rules)
+        model, risk = perception.model, perception.risk
         if isinstance(model, str) and not model:
             guard.warn_of_default_model()
             model = "oracle"
         predictor: Any = model if isinstance(model, TraversabilityModel) else load_model(model)
         if mismatch := class_mismatch(predictor, self._dataset.recipe):
             guard.warn(f"{mismatch}.")
-        sees: Any = registry.take("sensor", sensor)
-        believes: Any = registry.take("belief", belief)
+        sees: Any = registry.take("sensor", perception.sensor)
+        believes: Any = registry.take("belief", perception.belief)
         clairvoyant = isinstance(predictor, Clairvoyant)
         expect(
             self._world.noise != "resampled" or not (believes.learns or clairvoyant),
@@ -265,7 +272,7 @@ class EgocentricBatch(EnvBatch):
             statistics = find_ground_statistics(source, self._dataset)
         learner = Learner(
             sensor=sees,
-            ground=registry.take("ground", ground),
+            ground=registry.take("ground", perception.ground),
             belief=believes,
             law=self._law(predictor, statistics),
             measure=risk if callable(risk) else registry.make("risk", risk),
@@ -276,7 +283,7 @@ class EgocentricBatch(EnvBatch):
         every = steps_in(replan_every_s, self._task.robot.dt_s)
         self._experience = Experience(learner, every, alike=not clairvoyant)
         self._bounds: tuple[Tensor, Tensor] | None = None
-        if normalised_actions:
+        if perception.normalised_actions:
             self._bounds = (
                 torch.from_numpy(self.action_space.low.copy()),
                 torch.from_numpy(self.action_space.high.copy()),

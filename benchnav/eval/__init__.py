@@ -7,7 +7,7 @@ __getattr__, __dir__, __all__ = face(
     {
         "benchnav.eval.compare": ("compare_runs",),
         "benchnav.eval.experiment.condition": ("Condition",),
-        "benchnav.eval.evaluate": ("evaluate",),
+        "benchnav.eval.evaluation": ("evaluate",),
         "benchnav.eval.experiment.suite": ("Suite",),
         "benchnav.eval.folder.steps": ("read_steps",),
         "benchnav.eval.report.write": ("read_report", "write_report"),

@@ -1,5 +1,5 @@
 from benchnav.eval.compare import compare_runs
-from benchnav.eval.evaluate import evaluate
+from benchnav.eval.evaluation import evaluate
 from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.steps import read_steps

@@ -207,7 +207,7 @@ def measure(metric: Metric, episode: Episode) -> float:
         MetricError: If the metric raises, or returns anything else.
     """
     try:
-        value = metric.value(episode)
+        value = metric.compute(episode) if episode.steps >= metric.min_steps else math.nan
     except Exception as error:
         raise out_of_memory(error) or _no_number(metric, fault(error)) from error
     if not isinstance(value, Real | np.bool_) or math.isinf(value):

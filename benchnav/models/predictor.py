@@ -6,8 +6,11 @@ stands at a name is either called with its options and makes a model, or is a fa
 Letters in shapes: K components.
 """
 
+import json
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,7 @@ from benchnav.core.describe import describe, name_object
 from benchnav.core.errors import CheckpointError, ConfigError, expect, out_of_memory
 from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.registry import Found, Part
 from benchnav.core.shipped_files import shipped_folder
 from benchnav.core.sources import digest_of
 from benchnav.core.terrain import Terrain
@@ -32,6 +36,7 @@ from benchnav.models.checkpoint import (
     CONFIG,
     FUSED,
     Checkpoint,
+    digests_of,
     load_checkpoint,
     read_config,
     read_ground,
@@ -72,11 +77,74 @@ class Clairvoyant(PrivilegedModel):
 
 
 _SOURCE = "_source"  # attribute that keeps how a model was found
-Source = str | Path | Mapping[str, Any] | registry.Part
+Source = str | Path | Mapping[str, Any] | Part
 # `Law.nugget` under a model that learnt; docs/reference/sensing.md has the figures it was chosen by. Without a nugget,
 # scores of neighbouring cells that the model predicts wrongly contradict each other.
 MODEL_NUGGET = 0.1
 IN_REPOSITORY_ALONE = "paper-v1"  # a checkpoint that `setup.py` leaves out of wheels
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelPart(Part):
+    """The description of a model: a part of the registry, or a checkpoint, perhaps with the class that rebuilds it."""
+
+    kind: str = field(default="model", compare=False, repr=False)
+
+    @property
+    def folder(self) -> Path | None:
+        """Folder of the checkpoint; None for a part of the registry, whose names go first."""
+        is_place = ":" in self.part or self.part.endswith(".py")
+        if self.part in registry.names("model"):
+            return None
+        if is_place and split_own(self.part) is None and not (Path(self.part) / CONFIG).is_file():
+            return None
+        folder = find_checkpoint(self.part)
+        expect(not self.options, f"no options for the checkpoint {self.part!r}, got {dict(self.options)}.")
+        return folder
+
+    @property
+    def found(self) -> Found:
+        """The class or function that creates the model; of a checkpoint the class that rebuilds it."""
+        folder = self.folder
+        if folder is None:
+            return registry.find("model", self.part)
+        own = split_own(self.part)
+        return registry.find("model", own[0]) if own else find_family(read_config(folder)["model"])
+
+    @property
+    def key(self) -> str:
+        """The description as text, with digests of code and files; see `loaded`."""
+        folder = self.folder
+        files = digests_of(folder) if folder else registry.option_files(self)
+        return json.dumps([self.part, dict(self.options), self.found.digest, files], sort_keys=True)
+
+    @property
+    def object(self) -> TraversabilityModel:
+        """The model. A process keeps the last two, as long as their code and files stay the same."""
+        return loaded(self.key)
+
+    def create(self, **given: Any) -> TraversabilityModel:
+        """Load the model; see `load_model`."""
+        return load_model(self)
+
+
+@lru_cache(maxsize=2)
+def loaded(key: str) -> TraversabilityModel:
+    """Return the model of a `ModelPart.key`, which this process keeps."""
+    part, options, *_ = json.loads(key)
+    return load_model(ModelPart(part=part, label="", options=options))
+
+
+def read_model(source: Source) -> ModelPart:
+    """Read the description of a model as users write it; see `load_model`.
+
+    Raises:
+        ConfigError: If it is not a text, a path or a mapping as of a part.
+    """
+    if isinstance(source, ModelPart):
+        return source
+    part = registry.read_part("model", str(source) if isinstance(source, Path) else source)
+    return ModelPart(part=part.part, label=part.label, options=part.options)
 
 
 @torch.inference_mode(False)  # so that it is the same model wherever it is loaded
@@ -93,15 +161,31 @@ def load_model(source: Source) -> TraversabilityModel:
         ConfigError: there is no such model, or it refuses its options.
         CheckpointError: the checkpoint cannot be used.
     """
-    model = _load(source)
-    if not isinstance(source, Mapping):
-        source = registry.read_part("model", str(source) if isinstance(source, Path) else source)
+    part = read_model(source)
+    found, folder = part.found, part.folder
+    if folder is not None:
+        model = open_checkpoint(_checked_checkpoint(part, folder, found), found)
+    elif is_family(found.target):
+        raise no_model(part)
+    else:
+        model = registry.make("model", part)
     # A frozen model refuses attributes, and a network takes them for its own.
-    object.__setattr__(model, _SOURCE, registry.read_part("model", source))
+    object.__setattr__(model, _SOURCE, part)
     return model
 
 
-def describe_model(model: Any) -> registry.Part:
+def no_model(part: ModelPart) -> ConfigError:
+    """Return the error that says what to name in place of a family of models."""
+    same_name = next((path for path in list_checkpoints() if path.name == part.part), None)
+    how = (
+        f"path: {same_name}" if same_name else "name or path, a class of your own as FILE.py:Class@CHECKPOINT"
+    )
+    return ConfigError(
+        f"Expected a model, got {part.part!r}, which is a family of models. Name a checkpoint of it, by its {how}."
+    )
+
+
+def describe_model(model: Any) -> Part:
     """Describe a model by what loads it again; see `benchnav.core.describe.describe`.
 
     Args:
@@ -114,10 +198,8 @@ def describe_model(model: Any) -> registry.Part:
     Raises:
         ConfigError: If it is no model.
     """
-    if isinstance(model, Path):
-        return registry.read_part("model", str(model))
-    if isinstance(model, str | Mapping | registry.Part):
-        return registry.read_part("model", model)
+    if isinstance(model, str | Path | Mapping | Part):
+        return read_model(model)
     part = getattr(model, _SOURCE, None)
     if part is None:
         return describe("model", model)
@@ -146,58 +228,32 @@ def networks_of(value: Any) -> Iterator[nn.Module]:
             yield from networks_of(member)
 
 
-def _load(source: Source) -> TraversabilityModel:
-    part = _as_part(source)
-    if isinstance(part, Path):
-        own = split_own(registry.read_part("model", source).part) if not isinstance(source, Path) else None
-        if own:
-            return _load_own(own[0], part)
-        checkpoint = load_checkpoint(part)
-        if checkpoint.model == FUSED and CLASSIFIER not in checkpoint.parts:
-            refuse_unfinished(part, checkpoint.parts)
-        return open_checkpoint(checkpoint)
-    if is_family(registry.find("model", part.part).target):
-        there = next((path for path in list_checkpoints() if path.name == part.part), None)
-        how = f"path: {there}" if there else "name or path, a class of your own as FILE.py:Class@CHECKPOINT"
-        raise ConfigError(
-            f"Expected a model, got {part.part!r}, which is a family of models. Name a checkpoint of it, by its {how}."
-        )
-    return registry.make("model", part)
-
-
 def split_own(source: str | Path) -> tuple[str, str] | None:
     """Splits `path/to/file.py:Name@CHECKPOINT` into class and checkpoint; None of what is not of this form."""
     named = re.fullmatch(r"(.+?:[A-Za-z_][\w.]*)@(.+)", str(source))
     return None if named is None or (Path(source) / CONFIG).is_file() else (named[1], named[2])
 
 
-def _load_own(place: str, folder: Path) -> TraversabilityModel:
-    """Rebuilds the model of a checkpoint by a class that the user names."""
-    found = registry.find("model", place)
-    if not is_family(found.target):
+def _checked_checkpoint(part: ModelPart, folder: Path, family: Found) -> Checkpoint:
+    """Read a checkpoint that is finished and, where the user names a class, was trained with it."""
+    own = split_own(part.part)
+    if own and not is_family(family.target):
         raise ConfigError(
-            f"Expected {place} to be a benchnav.models.TrainableModel or ModelFamily, whose models are kept in "
+            f"Expected {own[0]} to be a benchnav.models.TrainableModel or ModelFamily, whose models are kept in "
             "checkpoints, got another class or function."
         )
-    checkpoint, name = load_checkpoint(folder), found.target.__name__
-    if checkpoint.model != name:
+    checkpoint = load_checkpoint(folder)
+    if own and checkpoint.model != family.target.__name__:
         raise CheckpointError(
-            f"Expected a checkpoint of the class {name}, got {folder}, which is one of {checkpoint.model!r}. "
-            "Name the class that it was trained with."
+            f"Expected a checkpoint of the class {family.target.__name__}, got {folder}, which is one of "
+            f"{checkpoint.model!r}. Name the class that it was trained with."
         )
-    return _rebuilt(found, checkpoint)
+    if not own and checkpoint.model == FUSED and CLASSIFIER not in checkpoint.parts:
+        refuse_unfinished(folder, checkpoint.parts)
+    return checkpoint
 
 
-def open_checkpoint(checkpoint: Checkpoint) -> TraversabilityModel:
-    """Rebuilds the model of a checkpoint through the family that it names.
-
-    Raises:
-        CheckpointError: the family is not known here by name, or cannot rebuild the model.
-    """
-    return _rebuilt(find_family(checkpoint.model), checkpoint)
-
-
-def find_family(name: str) -> registry.Found:
+def find_family(name: str) -> Found:
     """Finds the family that a checkpoint names.
 
     Names alone are looked up, never a module or file: what a checkpoint says runs no code of its choice.
@@ -215,8 +271,17 @@ def find_family(name: str) -> registry.Found:
     return found
 
 
-def _rebuilt(family: registry.Found, checkpoint: Checkpoint) -> TraversabilityModel:
-    """Rebuilds a model, and tells when its class is of other code now; what that raises ends in one line."""
+def open_checkpoint(checkpoint: Checkpoint, family: Found | None = None) -> TraversabilityModel:
+    """Rebuild the model of a checkpoint, and warn if its class is of other code now.
+
+    Args:
+        checkpoint: as it was read.
+        family: the class that rebuilds it; None for that which the checkpoint names.
+
+    Raises:
+        CheckpointError: If the family is not known here by name, or cannot rebuild the model.
+    """
+    family = family or find_family(checkpoint.model)
     if checkpoint.code and checkpoint.code != family.digest:
         tell(
             f"benchnav: warning: {checkpoint.model} in {family.origin} has changed since it trained the checkpoint "
@@ -293,11 +358,9 @@ def trained_on(source: Source) -> dict[str, str]:
         By digest of a split its name and that of its dataset, such as "train of paper-v1"; empty of what is no
         checkpoint.
     """
-    place = _as_part(source)
-    if not isinstance(place, Path):
-        return {}
-    found = {}
-    for part in read_config(place)["parts"].values():
+    folder = read_model(source).folder
+    found, parts = {}, read_config(folder)["parts"] if folder else {}
+    for part in parts.values():
         for entry in part["data"]["digest"].split(","):
             split, _, digest = entry.partition(":")
             found[digest] = f"{split} of {part['data']['id']}"
@@ -322,8 +385,8 @@ def find_ground_statistics(source: Source, dataset: TerrainDataset) -> GroundSta
         ConfigError: there are none.
         CheckpointError: those of the checkpoint are damaged.
     """
-    place = _as_part(source)
-    found = read_ground(place, read_config(place)) if isinstance(place, Path) else None
+    folder = read_model(source).folder
+    found = read_ground(folder, read_config(folder)) if folder else None
     found = found or find_ground(dataset)
     if found is None:
         path = ground_file(dataset.path)
@@ -353,26 +416,6 @@ def class_mismatch(model: TraversabilityModel | Checkpoint, recipe: Recipe, name
         f"{name} was trained on other classes than those of {recipe.id}: {', '.join(model.class_names)}; the maps have "
         f"{', '.join(names)}"
     )
-
-
-def _as_part(source: Source) -> registry.Part | Path:
-    """Reads a source as a part of the registry or as the folder of a checkpoint; known names go first.
-
-    Of the checkpoint of a class that a file or module holds it is the folder.
-    """
-    if isinstance(source, Path):
-        return find_checkpoint(source)
-    part = registry.read_part("model", source)
-    if split_own(part.part):
-        expect(not part.options, f"no options for the checkpoint {part.part!r}, got {dict(part.options)}.")
-        return find_checkpoint(part.part)
-    if part.part in registry.names("model") or registry.is_object("model", part.part):
-        return part
-    if (":" in part.part or part.part.endswith(".py")) and not (Path(part.part) / CONFIG).is_file():
-        return part
-    folder = find_checkpoint(part.part)
-    expect(not part.options, f"no options for the checkpoint {part.part!r}, got {dict(part.options)}.")
-    return folder
 
 
 def _checkpoint_folders() -> tuple[Path, Path]:

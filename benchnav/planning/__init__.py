@@ -14,7 +14,7 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.planning.planners.optimal.optimal": ("NearOptimal", "Optimal"),
         "benchnav.planning.planners.planner": ("LocalPlanner", "Plan", "PlanStatus", "Planner"),
         "benchnav.planning.planners.straight": ("Straight",),
-        "benchnav.planning.problem": ("Problem", "Task", "pose_problem"),
+        "benchnav.planning.problem": ("Prediction", "Problem", "Task", "pose_problem"),
         "benchnav.planning.risk": (
             "CVaR",
             "Chance",

@@ -7,7 +7,7 @@ from benchnav.planning.planners.mppi import MPPI, MPPIConfig
 from benchnav.planning.planners.optimal.optimal import NearOptimal, Optimal
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, PlanStatus
 from benchnav.planning.planners.straight import Straight
-from benchnav.planning.problem import Problem, Task, pose_problem
+from benchnav.planning.problem import Prediction, Problem, Task, pose_problem
 from benchnav.planning.risk import Chance, CVaR, ExpectedTime, Mean, RiskMeasure, SingleClass, TimeCVaR, VaR
 from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Bicycle, DifferentialDrive, Robot, Unicycle
 from benchnav.planning.sensing.belief import Belief, Law, Static
@@ -52,6 +52,7 @@ __all__ = [
     "Plan",
     "PlanStatus",
     "Planner",
+    "Prediction",
     "Probe",
     "Problem",
     "RiskMeasure",

@@ -6,7 +6,7 @@ cells, S state and A action dimensions, *K any further dimensions.
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -175,6 +175,11 @@ class Problem(Batch):
             self.start.new_tensor(self.robot.action_high),
         )
 
+    @property
+    def dynamics(self) -> "Dynamics":
+        """What a rollout goes by besides its maps."""
+        return Dynamics(self.grid, self.robot, self.objective, self.task.rules.min_traversability)
+
     def ground_at(self, state: Tensor) -> Tensor:
         """Reads `padded_ground` where the robots stand; shape of `state` [B, *K, S] without the last."""
         return self.grid.lookup(self.padded_ground, state[..., 0], state[..., 1])
@@ -204,6 +209,22 @@ class Problem(Batch):
     def terminal_cost(self, state: Tensor, target: Tensor) -> Tensor:
         """J of the last state, and the penalty of ground that is not free; shapes as for `stage_cost`."""
         return terminal_cost(self.objective, state, self.ground_at(state), target)
+
+
+class Dynamics(NamedTuple):
+    """What a rollout goes by besides its maps, for functions that are compiled.
+
+    Args:
+        grid: size and resolution of the maps.
+        robot: F.
+        objective: J.
+        min_traversability: least λ̂ of motion.
+    """
+
+    grid: Grid
+    robot: Robot
+    objective: Objective
+    min_traversability: float
 
 
 def ground_map(grid: Grid, traversability: Tensor, free: Tensor) -> Tensor:
@@ -241,47 +262,59 @@ def terminal_cost(objective: Objective, state: Tensor, ground: Tensor, target: T
     return objective.terminal(state, predicted_traversability(ground), target) + PENALTY * (ground <= 0)
 
 
+@dataclass(frozen=True)
+class Prediction:
+    """What is predicted of B maps.
+
+    Args:
+        observation: what the robots saw.
+        distribution: the predicted distribution of λ, shape [B, H, W].
+        risk_map: λ̂ as the risk setting gives it, shape [B, H, W].
+        free: free terrain, except that at the goal, bool, shape [B, H, W]; None for what the rules derive from λ̂.
+        fields: draws whole fields of λ; None if no planner asks for them.
+    """
+
+    observation: Observation
+    distribution: TraversabilityDistribution
+    risk_map: Tensor
+    free: Tensor | None = None
+    fields: FieldSource | None = None
+
+
 def pose_problem(
     task: Task,
-    observation: Observation,
-    distribution: TraversabilityDistribution,
-    risk_map: Tensor,
+    prediction: Prediction,
     start_m: Tensor,
     goal_m: Tensor,
     time_budget_s: Tensor | float,
-    free: Tensor | None = None,
-    fields: FieldSource | None = None,
     immobile: Immobile | None = None,
 ) -> Problem:
-    """Poses the problem of driving from start to goal, heading at the goal.
+    """Pose the problem of driving from start to goal, facing the goal.
 
     Args:
         task: what is to be done.
-        observation: what the robots saw, B maps.
-        distribution: the predicted distribution of λ, shape [B, H, W].
-        risk_map: λ̂ as the risk setting gives it, shape [B, H, W].
+        prediction: of B maps.
         start_m: (x, y), shape [B, 2].
         goal_m: (x, y), shape [B, 2].
         time_budget_s: T, of all or of each, shape [B].
-        free: free ground, but for that at the goal, bool, shape [B, H, W]; None for what the rules make of λ̂.
-        fields: draws whole fields of λ; None where nobody asks for them.
         immobile: what immobilises robots in the world; None for nothing.
     """
-    rules = task.rules
-    free = rules.free(risk_map, distribution) if free is None else free
-    at_goal = cells_at_goal(observation.grid, goal_m, rules.goal_radius_m)
+    rules, free = task.rules, prediction.free
+    if free is None:
+        free = rules.free(prediction.risk_map, prediction.distribution)
+    at_goal = cells_at_goal(prediction.observation.grid, goal_m, rules.goal_radius_m)
     return Problem(
         task=task,
-        observation=observation,
-        distribution=distribution,
-        risk_map=risk_map,
+        observation=prediction.observation,
+        distribution=prediction.distribution,
+        risk_map=prediction.risk_map,
         free=free | at_goal,
         start=task.robot.initial_state(heading_to(start_m, goal_m)),
         goal_m=goal_m,
         time_budget_s=torch.as_tensor(time_budget_s, dtype=torch.float64, device=goal_m.device)
         .expand(len(goal_m))
         .clone(),
-        fields=fields,
+        fields=prediction.fields,
         immobile=immobile,
     )
 

@@ -19,7 +19,7 @@ from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.boundary import NOT_FINITE, find_fault, find_layer_faults
 from benchnav.planning.planners.planner import INPUTS, Plan, Planner, PlanStatus
-from benchnav.planning.problem import Problem, Task, pose_problem
+from benchnav.planning.problem import Prediction, Problem, Task, pose_problem
 from benchnav.planning.sensing.belief import Fields, Law, Static
 from benchnav.planning.sensing.sensor import Step
 from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
@@ -311,7 +311,7 @@ def _make_problem(task: Task, height: int, width: int, device: torch.device, kno
     start = ground.new_tensor([1.2, 1.3]).repeat(4, 1)
     goal = (ground.new_tensor(grid.extent_m) - ground.new_tensor([1.7, 1.4])).repeat(4, 1)
     fields = _fields_of(mixture, grid)
-    return pose_problem(task, seen, mixture, ground, start, goal, 60.0, fields=fields)
+    return pose_problem(task, Prediction(seen, mixture, ground, fields=fields), start, goal, 60.0)
 
 
 def _fields_of(mixture: TraversabilityMixture, grid: Grid) -> Fields:

@@ -32,6 +32,7 @@ from benchnav.eval import Suite
 from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.unit import Extent, Unit, units
 from benchnav.eval.run.knowledge import Knowing
+from benchnav.eval.run.rollout import Observer
 from benchnav.eval.run.unit import Built, Settings, read_block, simulate
 from benchnav.planning.world.realisation import joined
 from studies.study import Rows, Work
@@ -108,7 +109,7 @@ def sums_of(unit: Unit, settings: Settings, out: Path) -> Tensor:
     if not path.exists():
         built = build_unit(unit)
         coverage = Coverage(unit, built)
-        simulate(unit, built, settings, witness=coverage)
+        simulate(unit, built, settings, observer=Observer(knowledge=coverage))
         part = path.with_suffix(".part.npy")
         np.save(part, coverage.sums.numpy())
         part.replace(path)

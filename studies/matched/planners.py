@@ -14,8 +14,8 @@ from torch import Tensor
 from benchnav.core import rng
 from benchnav.planning import MPPI, MPPIConfig, Plan, Problem
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.mppi import MPPIState, advance_chunk, roll_out, total_cost
-from benchnav.planning.planners.noise_bank import NoiseBank, perturb
+from benchnav.planning.planners.mppi import Ends, MPPIState, advance_chunk, roll_out, total_cost
+from benchnav.planning.planners.noise_bank import NoiseBank, Sampled, perturb
 from benchnav.planning.robots import component_wise
 
 
@@ -56,10 +56,15 @@ class SmoothMPPI(MPPI):
         states, cost, _ = roll_out(problem, step.state, mean, noise, target_m, self._advance)
         changes = perturb(mean[..., None], noise, low, high).diff(dim=1) / (high - low)[:, None]
         cost = cost + config.smoothness * changes.square().sum((1, 2))
+        ends = self._ends(plan_state, target_m, problem.padded_ground, None)
         _, updated = self._weigh(
-            states, cost, mean, noise, low, high, problem.padded_ground, target_m[:, None].contiguous(), problem.grid,
-            problem.objective, config.temperature, config.temperature_share, 1, 0.0, None, plan_state.to_go,
-        )  # fmt: skip
+            states,
+            cost,
+            Sampled(mean, noise, low, high),
+            ends,
+            config.temperature,
+            config.temperature_share,
+        )
         shifted = torch.cat((updated[:, 1:], updated[:, -1:]), dim=1)
         after = replace(plan_state, mean=shifted, step=plan_state.step + 1)
         return updated[:, 0], after, Plan.empty(len(problem), step.state.device)
@@ -161,15 +166,17 @@ class ICEM(MPPI):
         cost = state.new_zeros(states.shape[:2])
         for chunk in samples.split(10, dim=1):
             states, cost = self._roll(
-                states, cost, chunk.contiguous(), *problem.action_bounds, ground, target, problem.grid, problem.robot,
-                problem.objective, problem.task.rules.min_traversability,
-            )  # fmt: skip
-        return total_cost(states, cost, ground, target, problem.grid, problem.objective, to_go=to_go)[0]
+                states, cost, chunk.contiguous(), *problem.action_bounds, ground, target, problem.dynamics
+            )
+        return total_cost(states, cost, Ends(ground, target, problem.grid, problem.objective, to_go=to_go))[0]
 
 
-def _advance(states: Tensor, cost: Tensor, actions: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
+def _advance(
+    states: Tensor, cost: Tensor, actions: Tensor, low: Tensor, high: Tensor, *rest: Any
+) -> tuple[Tensor, Tensor]:
     """Roll samples out whose actions, [B, T, A, K], differ by episode: as deviations from a mean of 0."""
-    return advance_chunk(states, cost, torch.zeros_like(actions[..., 0]), actions.movedim(1, 0), *rest)
+    sampled = Sampled(torch.zeros_like(actions[..., 0]), actions.movedim(1, 0), low, high)
+    return advance_chunk(states, cost, sampled, *rest)
 
 
 def coloured_noise(steps: int, shape: tuple[int, ...], colour: float, generator: torch.Generator) -> Tensor:

@@ -3,20 +3,21 @@
 None of the simulation of `benchnav` is used. Letters in shapes: B trials.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from benchnav import Grid
 from benchnav.core import rng
-from benchnav.planning import MPPI, MPPIConfig, Problem, Robot, Step, distance
+from benchnav.planning import MPPI, MPPIConfig, Problem, Step, distance
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.cost_risk import framed_fields
 from benchnav.planning.planners.mppi import OF_EPISODES, MPPIState
-from benchnav.planning.planners.noise_bank import perturb
-from benchnav.planning.problem import motion_traversability
+from benchnav.planning.planners.noise_bank import Sampled, perturb
+from benchnav.planning.problem import Dynamics, motion_traversability
 from benchnav.planning.robots import component_wise
-from studies.validation.task import GOAL_M, GOAL_RADIUS_M, STEPS, Setup, TimeAndDistance
+from studies.validation.task import GOAL_M, GOAL_RADIUS_M, STEPS, Setup
 
 # λ of ground off the map that is free: a rollout stays there, at the `min_traversability` of the setup.
 _STILL = 1e-30
@@ -54,10 +55,8 @@ class ManyTrialsMPPI(MPPI):
 
 
 def advance_pair(
-    states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
-    padded_ground: Tensor, target: Tensor, grid: Grid, robot: Robot, objective: TimeAndDistance,
-    min_traversability: float,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    states: Tensor, cost: Tensor, sampled: Sampled, padded_ground: Tensor, target: Tensor, dynamics: Dynamics
+) -> tuple[Tensor, Tensor]:
     """Roll samples out as `mppi.advance_chunk` does, where one field scales v and another ω.
 
     The motion of `ROVER` and the cost of `TimeAndDistance` are written out, with x, y and θ apart: by `robot` and
@@ -66,6 +65,9 @@ def advance_pair(
     Args:
         padded_ground: a linear field and then an angular one, shape [B·M, 2·N]; the others are those of `mppi`.
     """
+    mean, noise, low, high = sampled
+    grid, robot, _, min_traversability = dynamics
+    objective: Any = dynamics.objective  # a `TimeAndDistance`
     x, y, heading = states.unbind(-1)
     away = distance(states, target)
     fields, angular = padded_ground.flatten(), padded_ground.shape[1] // 2

@@ -18,6 +18,7 @@ from benchnav.planning import (
     FreeSpace,
     MPPIConfig,
     Objective,
+    Prediction,
     Problem,
     Rules,
     Task,
@@ -194,15 +195,13 @@ def pose(
         min_traversability=setup.min_traversability,
         goal_radius_m=GOAL_RADIUS_M,
     )
+    observation = Observation(flat[:, None].expand(-1, 3, -1, -1).to(torch.uint8), flat, flat, GRID)
     return pose_problem(
         Task(robot=ROVER, objective=choose_objective(setup), rules=rules),
-        Observation(flat[:, None].expand(-1, 3, -1, -1).to(torch.uint8), flat, flat, GRID),
-        mixture,
-        torch.stack(risk_maps, dim=1).flatten(0, 1),
+        Prediction(observation, mixture, torch.stack(risk_maps, dim=1).flatten(0, 1), fields=fields),
         torch.tensor(START_M).expand(trials, 2),
         torch.tensor(GOAL_M).expand(trials, 2),
         STEPS * ROVER.dt_s,
-        fields=fields,
     )
 
 

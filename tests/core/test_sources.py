@@ -194,32 +194,30 @@ def test_files_and_folders_that_options_name_are_known_by_what_they_hold(part: P
     Path("tables").mkdir()
     Path("tables", "a").write_bytes(b"1")
     options = {"weights": "weights.npz", "inner": {"tables": ["tables", "", "mean"], "level": 0.5}}
-    asked = Part(part=f"{part}:Planner", label="", options=options)
-    seen = [option_files("planner", asked)]
+    asked = Part(part=f"{part}:Planner", label="", kind="planner", options=options)
+    seen = [option_files(asked)]
     assert set(seen[0]) == {"weights.npz", "tables"}
     Path("weights.npz").write_bytes(b"2")
-    seen.append(option_files("planner", asked))
+    seen.append(option_files(asked))
     assert [seen[1][name] == seen[0][name] for name in ("weights.npz", "tables")] == [False, True]
     os.rename("tables/a", "tables/b")
-    assert option_files("planner", asked)["tables"] != seen[0]["tables"]
+    assert option_files(asked)["tables"] != seen[0]["tables"]
     Path("weights.npz").unlink()
-    assert option_files("planner", asked)["weights.npz"] == ""
+    assert option_files(asked)["weights.npz"] == ""
 
 
 def test_what_a_part_writes_is_not_what_it_reads(part: Path) -> None:
     Path("log").mkdir()
-    asked = Part(part=f"{part}:Planner", label="", options={"weights": "log"})
-    assert set(option_files("planner", asked)) == {"log"}
+    asked = Part(part=f"{part}:Planner", label="", kind="planner", options={"weights": "log"})
+    assert set(option_files(asked)) == {"log"}
     part.write_text(PART.replace("class Planner:\n", "class Planner:\n    writes = ('weights',)\n"))
-    assert option_files("planner", asked) == {}
+    assert option_files(asked) == {}
 
 
 @pytest.mark.parametrize("folder", [".", "..", "/"])
 def test_a_folder_that_holds_the_working_folder_is_refused(part: Path, folder: str) -> None:
-    asked = Part(part=f"{part}:Planner", label="", options={"weights": folder})
-    assert f"got {folder!r}, which holds the working folder" in refusal(
-        lambda: option_files("planner", asked)
-    )
+    asked = Part(part=f"{part}:Planner", label="", kind="planner", options={"weights": folder})
+    assert f"got {folder!r}, which holds the working folder" in refusal(lambda: option_files(asked))
 
 
 MOVED = {

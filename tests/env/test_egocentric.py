@@ -18,7 +18,7 @@ from benchnav.env.view import CHANNELS, View
 from benchnav.eval.run.knowledge import Knowing, Learning
 from benchnav.models import TraversabilityModel
 from benchnav.models.predictor import Oracle
-from benchnav.planning.problem import pose_problem
+from benchnav.planning.problem import Prediction, pose_problem
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.knowledge import Truth
 from benchnav.planning.sensing.near import Near
@@ -136,10 +136,9 @@ def test_what_is_known_is_what_robots_of_an_evaluation_know(
     truth = Truth(terrain=terrain, field=simulation.field.clone(), keys=keys)
     whole = learner.predict(terrain, terrain.observe()) if learner.sensor.sees_all else None
     start = learner.begin(truth, now.state, whole)
-    problem = pose_problem(
-        batch._task, start.observation, learner.distribution(start), start.risk_map,
-        batch._places.start_m[chosen], batch._places.goal_m[chosen], 3.0,
-    )  # fmt: skip
+    prediction = Prediction(start.observation, learner.distribution(start), start.risk_map)
+    places = batch._places
+    problem = pose_problem(batch._task, prediction, places.start_m[chosen], places.goal_m[chosen], 3.0)
     knowing, running = Knowing(Learning(learner=learner, start=start, truth=truth), problem), now.running
     changed = 0
     for step in range(13):

@@ -11,7 +11,7 @@ from benchnav.env import PolicyPlanner
 from benchnav.env.egocentric import EgocentricBatch
 from benchnav.env.view import CHANNELS
 from benchnav.eval.run.rollout import run_episodes
-from benchnav.planning.problem import Problem, pose_problem
+from benchnav.planning.problem import Prediction, Problem, pose_problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.near import Near
 from benchnav.planning.sensing.sensor import Step
@@ -34,10 +34,9 @@ def problem_of(batch: EgocentricBatch) -> Problem:
     simulation, now = batch._current()
     knowledge, learner = batch._experience._current(), batch._experience._learner
     chosen = torch.from_numpy(batch._map)
-    posed = pose_problem(
-        batch._task, knowledge.observation, learner.distribution(knowledge), knowledge.risk_map,
-        batch._places.start_m[chosen], batch._places.goal_m[chosen], simulation.time_budget_s,
-    )  # fmt: skip
+    prediction = Prediction(knowledge.observation, learner.distribution(knowledge), knowledge.risk_map)
+    start_m, goal_m = batch._places.start_m[chosen], batch._places.goal_m[chosen]
+    posed = pose_problem(batch._task, prediction, start_m, goal_m, simulation.time_budget_s)
     return replace(posed, start=now.state)
 
 

@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
 from benchnav.core import registry
@@ -174,6 +175,7 @@ def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, caps
         ("run", "--noise", "stored", "--model", "oracle"),
         ("run", "--planner_limit_s", "-1", "--model", "oracle"),
         ("run", "--device", "gpu", "--model", "oracle"),
+        ("run", "--device", "cuda", "--model", "oracle"),
         ("run", "--config", "no-such.yaml"),
         ("run", "--out", "/proc/none/run", "--model", "oracle"),
         ("run", "--out", "/dev/null", "--model", "oracle"),
@@ -191,6 +193,7 @@ def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, caps
 )
 def test_bad_input_is_one_line_and_status_2(arguments, dataset_path, tmp_path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     extra = ("--data", str(dataset_path)) if arguments[0] == "run" and "--data" not in arguments else ()
     assert call("eval", *arguments, *extra) == 2
     captured = capsys.readouterr()

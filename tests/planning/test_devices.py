@@ -21,7 +21,7 @@ from benchnav.core.terrain import Terrain
 from benchnav.planning.planners.boundary import act, begin
 from benchnav.planning.planners.planner import Plan
 from benchnav.planning.planners.straight import Straight
-from benchnav.planning.problem import Problem, pose_problem
+from benchnav.planning.problem import Prediction, Problem, pose_problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world import realisation
@@ -111,9 +111,8 @@ def test_lookups_and_costs_of_a_problem(robot: str) -> None:
 
 def test_a_problem_is_posed_selected_and_copied_where_it_is() -> None:
     made = make_problem()
-    posed = pose_problem(
-        made.task, made.observation, made.distribution, made.risk_map, made.start[:, :2], made.goal_m, 100.0
-    )
+    prediction = Prediction(made.observation, made.distribution, made.risk_map)
+    posed = pose_problem(made.task, prediction, made.start[:, :2], made.goal_m, 100.0)
     chosen = posed.select(torch.empty(2, dtype=torch.int64, device="cuda"))
     for one, batch in ((posed, BATCH), (posed.clone(), BATCH), (chosen, 2)):
         expect(one.start, batch, 3)

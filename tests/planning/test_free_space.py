@@ -11,7 +11,7 @@ from benchnav.planning.free_space import PENALTY, FreeSpace, Rules, cells_at_goa
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.astar.dwa import DWAConfig, score
 from benchnav.planning.planners.planner import rollout_path
-from benchnav.planning.problem import Problem, pose_problem
+from benchnav.planning.problem import Prediction, Problem, pose_problem
 from tests import factories
 from tests.planning.planners.driving import held_paths, rollout_cost
 
@@ -223,7 +223,7 @@ def test_ground_that_was_not_seen_is_closed_by_no_pessimism(unseen: str) -> None
     task = replace(factories.task(rules=rules))
     posed = factories.problem(ground)
     places = posed.start[:, :2], torch.tensor([[50.0, 50.0]])
-    problem = pose_problem(task, posed.observation, certain, ground, *places, 9.0, wanted)
+    problem = pose_problem(task, Prediction(posed.observation, certain, ground, wanted), *places, 9.0)
     assert torch.equal(problem.free, wanted)
 
 

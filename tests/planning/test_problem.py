@@ -12,7 +12,7 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.quantiles import QuantileDistribution
 from benchnav.core.terrain import Observation
 from benchnav.planning.free_space import FreeSpace, Rules, cells_at_goal
-from benchnav.planning.problem import Problem, heading_to, pose_problem
+from benchnav.planning.problem import Prediction, Problem, heading_to, pose_problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
 from benchnav.planning.sensing.belief import Belief, Fields, Law, Static
 from benchnav.planning.sensing.copula import Copula
@@ -35,7 +35,7 @@ def varied() -> Problem:
         torch.tensor([[9.0, 2.0], [3.0, 5.5], [1.0, 0.5]]),
     )
     task = factories.task(robot=DifferentialDrive())
-    return pose_problem(task, observation, mixture, mixture.cvar(0.5), start_m, goal_m, 42.0)
+    return pose_problem(task, Prediction(observation, mixture, mixture.cvar(0.5)), start_m, goal_m, 42.0)
 
 
 def tensors(problem: Problem) -> dict[str, Tensor]:
@@ -162,7 +162,8 @@ def test_any_distribution_is_posed_and_taken_apart_with_the_batch() -> None:
     made, law = varied(), quantiles(maps=BATCH)
     law = QuantileDistribution(law.values[..., :1, :1].expand(-1, -1, HEIGHT, WIDTH).float().contiguous())
     task = replace(made.task, rules=Rules(free_space=FreeSpace(by="mean", above=0.3)))
-    problem = pose_problem(task, made.observation, law, law.cvar(0.9), made.start[:, :2], made.goal_m, 42.0)
+    prediction = Prediction(made.observation, law, law.cvar(0.9))
+    problem = pose_problem(task, prediction, made.start[:, :2], made.goal_m, 42.0)
     away = ~cells_at_goal(problem.grid, problem.goal_m, problem.goal_radius_m)
     assert torch.equal(problem.free[away], (law.mean() > 0.3)[away])
     kept = problem.clone().select(torch.tensor([2]))

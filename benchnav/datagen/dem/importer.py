@@ -13,7 +13,7 @@ to be left out between them, and gives no more units than maps side by side.
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from benchnav.core.errors import DatasetError, expect
 from benchnav.core.store import building, real_place
 from benchnav.datagen.dem.drive_log import Drives
 from benchnav.datagen.dem.extent import MAX_RELIEF_M
-from benchnav.datagen.dem.raster import GroundOptions, Rasters, load_rasterio
+from benchnav.datagen.dem.raster import Cut, Rasters, load_rasterio
 from benchnav.datagen.dem.survey import Survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import SHARD_CELLS
@@ -62,12 +62,8 @@ def import_dem(
     rasters: Rasters = Rasters(),  # noqa: B008
     *,
     drives: Drives | None = None,
-    shares: Mapping[str, float] | None = None,
-    scenario: str = "std",
-    stride_m: float | None = None,
-    solvable: bool = False,
+    cut: Cut = Cut(),  # noqa: B008
     overwrite: bool = False,
-    ground: GroundOptions = GroundOptions(),  # noqa: B008
     announce: Callable[[str], object] = str,
 ) -> Iterator[tuple[int, int]]:
     """Makes a dataset from rasters, yielding (maps done, maps in all); to be iterated to the end.
@@ -82,12 +78,8 @@ def import_dem(
         recipe: id of the dataset, size, resolution, start and goal of the maps, class table, light, seed.
         rasters: where classes, colours, λ and layers come from.
         drives: log of drives that λ comes from, around which the ground is cut; maps that none crossed are left out.
-        shares: of the maps, by split; None for all in `test/real`.
-        scenario: which of the recipe's scenarios lights the maps.
-        stride_m: from one map to the next; None for maps side by side.
-        solvable: keep only maps whose goal can be reached, and store the grid reference time.
+        cut: which maps are cut out of the ground.
         overwrite: replace what is there.
-        ground: how the elevation model is read and cut.
         announce: is given what will be imported, in sentences, before anything is read.
 
     Raises:
@@ -99,7 +91,7 @@ def import_dem(
         "λ from `drives` or from `traversability`, got both. Leave one out.",
     )
     expect(
-        not (solvable and rasters.unlabelled),
+        not (cut.solvable and rasters.unlabelled),
         "`classes` with `solvable`, which goes by the class table, got none. Leave `solvable` out, or pass --classes.",
     )
     affecting = [spec.name for spec in recipe.layers if spec.affects]
@@ -108,15 +100,14 @@ def import_dem(
         f"a recipe whose `layers` leave λ as it is, since an import draws none, got {', '.join(affecting)}.",
     )
     out = real_place(out)
-    shares = {"test/real": 1.0} if shares is None else shares
-    splits = {name: Split(scenario=scenario, maps=1, solvable=solvable) for name in shares}
+    splits = {name: Split(scenario=cut.scenario, maps=1, solvable=cut.solvable) for name in cut.shares}
     recipe = replace(recipe, splits=splits)
     with ExitStack() as stack:
         stack.enter_context(held(out, overwrite))
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
-        survey = Survey(stack, dem, rasters, recipe, shares, stride_m, drives, ground, announce)
+        survey = Survey(stack, dem, rasters, recipe, cut, drives, announce)
         folder = stack.enter_context(building(out))
-        parts = {name: _Part(name, recipe, folder, survey) for name in shares}
+        parts = {name: _Part(name, recipe, folder, survey) for name in splits}
         done = 0
         for run in survey.tiling.runs(recipe.grid.maps_in(_CELLS_AT_ONCE)):
             parts[run.split].add(run)

@@ -8,7 +8,7 @@ import json
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,6 +42,25 @@ class GroundOptions:
     def __post_init__(self) -> None:
         """Check the number of maps."""
         expect(self.max_maps >= 1, f"`max_maps` ≥ 1, got {self.max_maps}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cut:
+    """Which maps an import cuts out of the ground.
+
+    Args:
+        shares: of the maps, by split.
+        scenario: which of the recipe's scenarios lights the maps.
+        stride_m: from one map to the next; None for maps side by side.
+        solvable: keep only maps whose goal can be reached, and store the grid reference time.
+        ground: how the elevation model is read and cut.
+    """
+
+    shares: Mapping[str, float] = field(default_factory=lambda: {"test/real": 1.0})
+    scenario: str = "std"
+    stride_m: float | None = None
+    solvable: bool = False
+    ground: GroundOptions = field(default_factory=GroundOptions)
 
 
 @dataclass(frozen=True, kw_only=True)

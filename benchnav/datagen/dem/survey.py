@@ -7,7 +7,7 @@ covers most of it. Letters in shapes: B maps, K bands, H×W cells of a map.
 """
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from benchnav.datagen.dem.drive_cells import (
 from benchnav.datagen.dem.drive_log import Drives, read_drives
 from benchnav.datagen.dem.drive_motion import compare_motion, compare_slopes
 from benchnav.datagen.dem.extent import Extent
-from benchnav.datagen.dem.raster import GroundOptions, Layer, Raster, Rasters, opened
+from benchnav.datagen.dem.raster import Cut, Layer, Raster, Rasters, opened
 from benchnav.datagen.dem.sentinel import is_certain, is_missing, looks_missing, widest_gap_m, zero_gap_m
 from benchnav.datagen.dem.tiling import SLACK, Run
 from benchnav.datagen.dem.units import check_metres, in_unit
@@ -67,10 +67,8 @@ class Survey:
         dem: str,
         rasters: Rasters,
         recipe: Recipe,
-        shares: Mapping[str, float],
-        stride_m: float | None,
+        cut: Cut,
         drives: Drives | None = None,
-        options: GroundOptions = GroundOptions(),  # noqa: B008
         announce: Callable[[str], object] = str,
     ) -> None:
         """Opens rasters and lays them on the cells of all maps.
@@ -80,16 +78,15 @@ class Survey:
             dem: of elevations, one band, by any name that rasterio opens.
             rasters: the others.
             recipe: size and resolution of the maps, class table.
-            shares: of the maps, by split.
-            stride_m: from one map to the next; None for maps side by side.
+            cut: which maps are cut out of the ground.
             drives: log of drives, around which the ground is cut; None for all of the elevation model.
-            options: how the elevation model is read and cut.
             announce: is given what will be imported, in sentences.
 
         Raises:
             ConfigError: a setting does not fit the recipe.
             DatasetError: a raster or the log does not fit, or the ground is too small.
         """
+        shares, stride_m, options = cut.shares, cut.stride_m, cut.ground
         names, step = [kind.name for kind in recipe.classes], recipe.resolution_m
         named = dict(enumerate(names)) if rasters.class_ids is None else rasters.class_ids
         unknown = sorted(map(str, {*named.values()} - {*names, None}))

@@ -116,7 +116,8 @@ def create(
                 name: [folder / shard.name for shard in shards if shard.split == name]
                 for name in recipe.splits
             }
-            assemble(whole(recipe, files), folder, path)
+            contents = whole(recipe, files)
+            assemble(contents, folder, path)
             if is_one_file(path):
                 shutil.rmtree(folder)
 

@@ -97,10 +97,10 @@ class LayerSpec:
         """
         if self.is_vegetation:
             return read(Vegetation, self.options, of("layer 'vegetation'"))
-        part = registry.Part(part=self.part, label=self.name, options=self.options)
+        part = registry.Part(part=self.part, label=self.name, options=self.options, kind=KIND)
         try:
-            layer, digest = registry.make(KIND, part), registry.find(KIND, self.part).digest
-            files = registry.option_files(KIND, part) if self.source else {}
+            layer, digest = part.create(), part.found.digest
+            files = registry.option_files(part) if self.source else {}
         except BenchnavError as error:
             raise ConfigError(
                 f"The code of layer {self.name!r} is needed to generate maps or to tell what colours show: {error}"
@@ -155,7 +155,8 @@ def read_layer(given: Any) -> LayerSpec:
     if isinstance(given, LayerSpec):
         return given
     if isinstance(given, Layer):
-        return _record(registry.Part(part=_part_of(given), label="", options=plain(given.settings())), given)
+        options = plain(given.settings())
+        return _record(registry.Part(part=_part_of(given), label="", options=options, kind=KIND), given)
     if isinstance(given, Mapping) and "name" in given:
         return read(LayerSpec, given, of("a layer"))
     expect(
@@ -163,7 +164,7 @@ def read_layer(given: Any) -> LayerSpec:
         f"a layer as NAME or as {{part: NAME, options: {{…}}}}, got {given!r}.",
     )
     part = registry.complete(KIND, registry.read_part(KIND, given))
-    return _record(part, registry.make(KIND, part))
+    return _record(part, part.create())
 
 
 def read_layers(given: Any) -> tuple[LayerSpec, ...]:
@@ -223,7 +224,7 @@ def _record(part: registry.Part, layer: Layer) -> LayerSpec:
     """Record a layer that was built."""
     kind, is_vegetation = type(layer), isinstance(layer, Vegetation)
     stored = kind.field()
-    found = None if is_vegetation else registry.find(KIND, part.part)
+    found = None if is_vegetation else part.found
     is_own = found is not None and not found.shipped
     spec = LayerSpec(
         part="vegetation" if is_vegetation else part.part,
@@ -238,7 +239,7 @@ def _record(part: registry.Part, layer: Layer) -> LayerSpec:
         hides=kind.hides(),
         source=found.origin if found and is_own else "",
         digest=found.digest if found and is_own else "",
-        files=registry.option_files(KIND, part) if is_own else {},
+        files=registry.option_files(part) if is_own else {},
     )
     vars(spec)["layer"] = layer
     return spec

@@ -7,22 +7,23 @@ is run, and belong to the suite.
 
 import itertools
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
-import torch
-
-from benchnav.core import hub, registry
+from benchnav.core import registry
 from benchnav.core.errors import ConfigError, expect
-from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.ground import GroundStatistics
 from benchnav.core.registry import Part
-from benchnav.core.settings import call, check_known, of, read
+from benchnav.core.settings import call, of, read
 from benchnav.core.short_repr import short_repr
 from benchnav.core.store import text_digest
+from benchnav.datagen.files.find import find_dataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.experiment.sweep import check_count, each_mapping, each_part
+from benchnav.eval.experiment.sweep import check_count, each_mapping, part_of, read_parts
+from benchnav.models.predictor import ModelPart, find_ground_statistics
 from benchnav.planning.free_space import Rules
 from benchnav.planning.planners.planner import INPUTS
 from benchnav.planning.problem import Task
@@ -44,8 +45,6 @@ MEANING = "class table, λ_stuck, resolution or kind of truth"
 # The only input by which a setting bears on a planner where no robot learns.
 _BEARS_BY: Mapping[str, str] = {"risk": "risk_map", "belief": "fields"}
 _ORDER = ("robot", "objective", "model", *KNOWLEDGE, "risk", "planner")  # of tables
-# What a product lists, by the names that a suite has for it.
-_LISTED = ("data", "scenarios", *(f"{kind}s" for kind in PART_KINDS), "world", "task")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +74,7 @@ class Condition:
 
     data: str
     scenario: str
-    model: Part
+    model: ModelPart
     risk: Part
     planner: Part
     robot: Part
@@ -99,10 +98,21 @@ class Condition:
         return f"test/{self.scenario}"
 
     @property
+    def dataset(self) -> TerrainDataset:
+        """The dataset, opened again each time, since its file may have changed."""
+        return TerrainDataset(find_dataset(self.data))
+
+    @property
+    def parts(self) -> dict[str, Part]:
+        """Its parts by kind."""
+        return {kind: getattr(self, kind) for kind in PART_KINDS}
+
+    @property
     def value(self) -> dict[str, Any]:
         """All that bears on the condition's rows, as plain data; no labels."""
-        given = {kind: getattr(self, kind) for kind in PART_KINDS}
-        parts = {kind: {"part": part.part, "options": dict(part.options)} for kind, part in given.items()}
+        parts = {
+            kind: {"part": part.part, "options": dict(part.options)} for kind, part in self.parts.items()
+        }
         return {
             "data": self.data,
             "split": self.split,
@@ -119,7 +129,7 @@ class Condition:
     @property
     def labels(self) -> dict[str, str]:
         """What tables call it, by column."""
-        parts = {kind: getattr(self, kind).label for kind in PART_KINDS}
+        parts = {kind: part.label for kind, part in self.parts.items()}
         parts |= dict.fromkeys(self.stands_for, NOT_USED)
         if self.blind:
             parts |= dict.fromkeys(("model", "risk", *KNOWLEDGE), NOT_USED)
@@ -141,9 +151,7 @@ class Condition:
     def unreproducible(self) -> tuple[str, ...]:
         """Its parts that are objects of this process, each as kind and label; no other process can create them."""
         return tuple(
-            f"{kind} {getattr(self, kind).label}"
-            for kind in PART_KINDS
-            if registry.is_object(kind, getattr(self, kind).part)
+            f"{kind} {part.label}" for kind, part in self.parts.items() if registry.is_object(kind, part.part)
         )
 
     @property
@@ -152,12 +160,19 @@ class Condition:
         return not self.sensor.object.sees_all or self.belief.object.learns
 
     @property
-    def needs_statistics(self) -> bool:
-        """Whether statistics of the training maps have to be there."""
-        return not self.sensor.object.sees_all or self.belief.object.needs_statistics
+    def statistics(self) -> GroundStatistics | None:
+        """Statistics of the training maps, None if neither sensor nor belief needs them.
 
+        Raises:
+            ConfigError: If they are needed and missing.
+        """
+        if self.sensor.object.sees_all and not self.belief.object.needs_statistics:
+            return None
+        return find_ground_statistics(self.model, self.dataset)
+
+    @property
     def planner_uses(self) -> frozenset[str]:
-        """Names the inputs that bear on what the planner does in this task, see `Planner.uses`.
+        """Names of the inputs that bear on what the planner does in this task, see `Planner.uses`.
 
         Raises:
             ConfigError: If the planner does not say it in the words of `INPUTS`.
@@ -178,7 +193,7 @@ class Condition:
         """
         if self.blind or self.learns:
             return ()
-        used = self.planner_uses()
+        used = self.planner_uses
         return tuple(kind for kind, name in _BEARS_BY.items() if name not in used)
 
     @property
@@ -186,7 +201,7 @@ class Condition:
         """Digest of what bears on its rows; conditions that differ only in what is not used share it."""
         stand_ins: dict[str, Any] = {
             "risk": ANY_RISK,
-            "belief": Part(label=NOT_USED, kind="belief", **KNOWLEDGE["belief"]),
+            "belief": part_of("belief", KNOWLEDGE["belief"], NOT_USED),
         }
         return replace(self, **{kind: stand_ins[kind] for kind in self.unused}).id
 
@@ -194,10 +209,7 @@ class Condition:
 def condition_from(about: Mapping[str, Any]) -> Condition:
     """Rebuilds a condition from its `value`, `labels` and `stands_for`, as `run.json` holds them."""
     value, labels = {**KNOWLEDGE, **about["value"]}, about["labels"]
-    parts = {
-        kind: Part(part=value[kind]["part"], label=labels[kind], options=value[kind]["options"], kind=kind)
-        for kind in PART_KINDS
-    }
+    parts: dict[str, Any] = {kind: part_of(kind, value[kind], labels[kind]) for kind in PART_KINDS}
     return Condition(
         data=value["data"],
         scenario=value["split"].removeprefix("test/"),
@@ -210,25 +222,32 @@ def condition_from(about: Mapping[str, Any]) -> Condition:
     )
 
 
-def conditions_of(suite: Suite, scenarios_of: Any) -> list[Condition]:
+def scenarios_of(data: str) -> list[str]:
+    """The scenarios of a dataset's test splits, by its path or id."""
+    splits = TerrainDataset(find_dataset(data)).splits
+    return [name.removeprefix("test/") for name in splits if name.startswith("test/")]
+
+
+def conditions_of(
+    suite: Suite, scenarios_of: Callable[[str], Sequence[str]] = scenarios_of
+) -> list[Condition]:
     """Lists the conditions of a suite, in the order of tables.
 
     Args:
         suite: what is evaluated.
-        scenarios_of: gives the scenarios of a dataset's test splits, from its path or id.
+        scenarios_of: returns the scenarios of a dataset's test splits, from its path or id.
 
     Raises:
         ConfigError: a part cannot be had as asked for, two parts share a label, or one is there twice.
     """
     every: list[Condition] = []
-    for product in suite.conditions or ({},):
+    for listed in suite.products:
         here: set[str] = set()
-        for condition in _product(_listed(suite, product), scenarios_of):
+        for condition in _product(listed, scenarios_of):
             if condition.id in here:
                 words = " ".join(label_words(condition.labels))
                 raise ConfigError(f"Expected settings that differ, got {words} twice.")
             here.add(condition.id)
-            check_count([len(every)])
             every.append(_as_run_once(condition))
     check_labels(every)
     return merge_alike({condition.id: condition for condition in every}.values())
@@ -298,25 +317,11 @@ def check_labels(conditions: Iterable[Condition]) -> None:
                 )
 
 
-def _listed(suite: Suite, product: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """What a product lists under each key, in the singular or the plural; the suite's where it names none."""
-    listed = {key: getattr(suite, key) for key in _LISTED} | {"models": suite.models or suite.model}
-    spelt: dict[str, str] = {}
-    for given, values in product.items():
-        spellings = (given, f"{given}s", str(given).removesuffix("s"))
-        key = next((key for key in spellings if key in listed), given)
-        check_known("keys of `conditions`", key, listed)
-        first = spelt.setdefault(key, given)
-        expect(first == given, f"`{first}` or `{given}` in one of `conditions`, got both. Leave one out.")
-        listed[key] = values
-    return {
-        key: list(values) if isinstance(values, list | tuple) else [values] for key, values in listed.items()
-    }
-
-
 def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Condition]:
+    scenarios = {data: listed["scenarios"] or scenarios_of(data) for data in listed["data"]}
     parts = {
-        kind: [part for given in listed[f"{kind}s"] for part in _parts(kind, given)] for kind in PART_KINDS
+        kind: [part for given in listed[f"{kind}s"] for part in read_parts(kind, given)]
+        for kind in PART_KINDS
     }
     worlds = [
         read_world(world, task)
@@ -325,55 +330,15 @@ def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Con
         for listed_task in listed["task"]
         for task in each_mapping(listed_task)
     ]
+    check_count([sum(map(len, scenarios.values())), len(worlds), *map(len, parts.values())])
     for data in listed["data"]:
-        scenarios = listed["scenarios"] or scenarios_of(data)
-        check_count(map(len, (listed["data"], scenarios, worlds, *parts.values())))
         for scenario, (world, rules, label), *chosen in itertools.product(
-            scenarios, worlds, *(parts[kind] for kind in _ORDER)
+            scenarios[data], worlds, *(parts[kind] for kind in _ORDER)
         ):
-            condition = Condition(
+            yield Condition(
                 data=data, scenario=scenario, rules=rules, world=world, world_label=label,
                 **dict(zip(_ORDER, chosen, strict=True)),
             )  # fmt: skip
-            yield condition
-
-
-def is_checkpoint(kind: str, source: str) -> bool:
-    """Whether a part is a checkpoint, by folder or by name, or with the class that a file or module holds."""
-    from benchnav.models.predictor import split_own
-
-    if kind != "model" or source in registry.names("model") or registry.is_object("model", source):
-        return False
-    return ":" not in source or split_own(source) is not None
-
-
-def _parts(kind: str, given: Any) -> list[Part]:
-    """What is given as one part: several where options are given lists of values."""
-    from benchnav.models.base import is_family
-    from benchnav.models.predictor import find_checkpoint, load_model
-
-    part = registry.read_part(kind, given)
-    if is_checkpoint(kind, part.part):
-        folder = find_checkpoint(part.part)
-        if part.options:
-            raise ConfigError(
-                f"Expected no options for the checkpoint {part.part!r}, got {dict(part.options)}."
-            )
-        is_named = part.label not in (part.part, part.part.rpartition(":")[2])
-        label = part.part.rpartition("/")[2] if hub.is_address(part.part) else folder.name
-        return [part if is_named else replace(part, label=label)]
-    if kind == "model" and is_family(registry.find("model", part.part).target):
-        load_model(part)  # says what to name in place of a family
-    made = [registry.complete(kind, one) for one in each_part(kind, part)]
-    if kind == "risk" and registry.find("risk", part.part).shipped:
-        # Lets it refuse its options on one cell, also where no condition uses it.
-        cell = torch.full((1, 1, 1, 1), 0.5)
-        for one in made:
-            one.object(TraversabilityMixture(torch.ones_like(cell), cell, cell, (0,)))
-    if kind in KNOWLEDGE:
-        for one in made:
-            _ = one.object  # rejects its options
-    return made
 
 
 def _as_run_once(condition: Condition) -> Condition:
@@ -382,11 +347,11 @@ def _as_run_once(condition: Condition) -> Condition:
     What a blind planner is given is not looked at; of λ that is known every measure of risk is λ itself, and nothing is
     left to be learnt; and a belief that does not learn ignores what is sensed of the ground.
     """
-    unused = {kind: Part(label=NOT_USED, kind=kind, **default) for kind, default in KNOWLEDGE.items()}
-    if condition.planner.object.blind or not condition.planner_uses():
+    unused = {kind: part_of(kind, default, NOT_USED) for kind, default in KNOWLEDGE.items()}
+    if condition.planner.object.blind or not condition.planner_uses:
         given: dict[str, Any] = {
             **unused,
-            "model": Part(part="oracle", label=NOT_USED, kind="model"),
+            "model": ModelPart(part="oracle", label=NOT_USED),
             "risk": ANY_RISK,
         }
         return replace(condition, blind=True, **given)

@@ -10,6 +10,7 @@ from benchnav.core.quantity import Quantity
 from benchnav.core.registry import Part
 from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.experiment.suite import PartSpec
+from benchnav.eval.experiment.sweep import read_parts
 from benchnav.eval.experiment.unit import DRAW
 from benchnav.metrics.base import Metric, MetricError, measure
 from benchnav.metrics.check import attribute_faults, sample_episodes
@@ -61,11 +62,11 @@ def read_metrics(given: Sequence[PartSpec], robots: Iterable[Robot]) -> tuple[Na
     Raises:
         ConfigError: If there is no such metric, it breaks its contract, or two have one name or column.
     """
-    episodes = [episode for robot in robots for episode in sample_episodes(robot)] if given else []
+    parts = [part for spec in given for part in read_parts("metric", spec)]
+    episodes = [episode for robot in robots for episode in sample_episodes(robot)] if parts else []
     named: list[NamedMetric] = []
-    for spec in given:
-        part = registry.complete("metric", registry.read_part("metric", spec))
-        metric: Metric = registry.make("metric", part)
+    for part in parts:
+        metric: Metric = part.object
         if type(metric) in map(type, SHIPPED):
             raise ConfigError(
                 f"Expected `metrics` besides those that every run has, got {part.part!r}. Leave it out."

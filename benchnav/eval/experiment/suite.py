@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from benchnav.core.errors import ConfigError, expect
+from benchnav.core.settings import check_known, plain
 from benchnav.core.short_repr import short_repr
 
 PartSpec = str | dict[str, Any]
 
-# Fields that list parts, with their kinds.
+# Fields that list parts of conditions, with their kinds.
 PART_FIELDS = {
     "models": "model",
     "planners": "planner",
@@ -21,9 +22,10 @@ PART_FIELDS = {
     "sensors": "sensor",
     "grounds": "ground",
     "beliefs": "belief",
-    "metrics": "metric",
-    "figures": "figure",
 }
+
+# What a product lists, by the names that a suite has for it.
+_LISTED = ("data", "scenarios", *PART_FIELDS, "world", "task")
 
 # What is kept of episodes beside their rows, each with all that stands before it.
 Record = Literal["none", "steps", "first", "failures", "all"]
@@ -105,7 +107,7 @@ class Suite:
 
     def __post_init__(self) -> None:
         """Describe objects as plain data, and reject a suite without conditions."""
-        for name, kind in PART_FIELDS.items():
+        for name, kind in {**PART_FIELDS, "metrics": "metric", "figures": "figure"}.items():
             object.__setattr__(self, name, tuple(_as_plain(kind, given) for given in getattr(self, name)))
         object.__setattr__(self, "model", _as_plain("model", self.model))
         for name in ("planners", "risks", "robots", "objectives", "sensors", "grounds", "beliefs", "world"):
@@ -133,9 +135,42 @@ class Suite:
             )
 
     @property
+    def plain(self) -> dict[str, Any]:
+        """The suite as plain data, as `run.json` holds it."""
+        return dict(plain(self))
+
+    @property
+    def products(self) -> list[dict[str, list[Any]]]:
+        """What each product lists, by the field of the suite; the suite's own values where it names none.
+
+        Raises:
+            ConfigError: If a mapping of `conditions` has an unknown key, or one in the singular and in the plural.
+        """
+        whole = {key: getattr(self, key) for key in _LISTED} | {"models": self.models or self.model}
+        products = []
+        for product in self.conditions or ({},):
+            listed, spelt = dict(whole), dict[str, str]()
+            for given, values in product.items():
+                spellings = (given, f"{given}s", str(given).removesuffix("s"))
+                key = next((key for key in spellings if key in listed), given)
+                check_known("keys of `conditions`", key, listed)
+                first = spelt.setdefault(key, given)
+                expect(
+                    first == given, f"`{first}` or `{given}` in one of `conditions`, got both. Leave one out."
+                )
+                listed[key] = values
+            products.append({key: _as_list(values) for key, values in listed.items()})
+        return products
+
+    @property
     def all_seeds(self) -> tuple[int, ...]:
         """The root seeds."""
         return self.seeds or (self.seed,)
+
+    @property
+    def draws(self) -> list[tuple[int, int]]:
+        """Root seed and realisation of each draw of λ."""
+        return [(seed, r) for seed in self.all_seeds for r in range(self.realisations)]
 
 
 def _as_plain(kind: str, given: Any) -> PartSpec:
@@ -155,6 +190,10 @@ def _described(kind: str, instance: Any) -> dict[str, Any]:
     return {"part": part.part, "label": part.label, "options": dict(part.options)}
 
 
+def _as_list(values: Any) -> list[Any]:
+    return list(values) if isinstance(values, list | tuple) else [values]
+
+
 def check_size(
     conditions: int, seeds: int, realisations: int, maps: int, block_maps: int = MAX_EPISODES
 ) -> None:
@@ -172,11 +211,12 @@ def check_size(
     """
     draws = conditions * seeds * realisations
     episodes, n_units = draws * maps, draws * -(-maps // block_maps)
-    expect(
-        episodes <= MAX_EPISODES and n_units <= MAX_UNITS,
-        f"a run of at most {MAX_EPISODES:,} episodes in {MAX_UNITS:,} units, got {episodes:,} episodes in {n_units:,}: "
-        f"{conditions} conditions × {seeds} seeds × {realisations} `realisations` × {maps} `maps`. Ask for fewer.",
-    )
+    if episodes > MAX_EPISODES or n_units > MAX_UNITS:
+        raise ConfigError(
+            f"Expected a run of at most {MAX_EPISODES:,} episodes in {MAX_UNITS:,} units, got {episodes:,} episodes in "
+            f"{n_units:,}: {conditions} conditions × {seeds} seeds × {realisations} `realisations` × {maps} `maps`. "
+            "Ask for fewer."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

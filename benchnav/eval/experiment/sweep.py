@@ -1,4 +1,4 @@
-"""Sweeps: where a suite gives several values for one, it means each of them."""
+"""Parts and sweeps of a suite: where it gives several values for one, it means each of them."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -6,13 +6,55 @@ from dataclasses import replace
 from itertools import product
 from typing import Any
 
-from benchnav.core import registry
-from benchnav.core.errors import ConfigError, expect
+import torch
+
+from benchnav.core import hub, registry
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.registry import Part
 from benchnav.core.settings import changed, of, read
 from benchnav.eval.experiment.suite import MAX_CONDITIONS
+from benchnav.models.base import is_family
+from benchnav.models.predictor import ModelPart, no_model
 
 _Chosen = dict[tuple[str, ...], Any]  # values by where they stand
+
+
+def part_of(kind: str, about: Mapping[str, Any], label: str) -> Part:
+    """Return the part that `part` and `options` describe."""
+    part_class = ModelPart if kind == "model" else Part
+    return part_class(kind=kind, part=about["part"], label=label, options=about["options"])
+
+
+def read_parts(kind: str, given: Any) -> list[Part]:
+    """Read what a suite lists as one part: several parts where options are given lists of values.
+
+    Args:
+        kind: one of `registry.KINDS`.
+        given: in any form that `registry.read_part` reads.
+
+    Raises:
+        ConfigError: If there is no such part or option, or the part rejects its options.
+    """
+    part = registry.read_part(kind, given)
+    if kind == "model":
+        model = ModelPart(**vars(part))
+        if folder := model.folder:
+            is_named = part.label not in (part.part, part.part.rpartition(":")[2])
+            label = part.part.rpartition("/")[2] if hub.is_address(part.part) else folder.name
+            return [model if is_named else replace(model, label=label)]
+        if is_family(model.found.target):
+            raise no_model(model)
+    completed = [registry.complete(kind, one) for one in each_part(kind, part)]
+    parts = [part_of(kind, vars(one), one.label) for one in completed]
+    for one in parts:
+        if kind == "risk" and one.found.shipped:
+            # Lets it reject its options on one cell, also where no condition uses it.
+            cell = torch.full((1, 1, 1, 1), 0.5)
+            one.object(TraversabilityMixture(torch.ones_like(cell), cell, cell, (0,)))
+        elif kind in ("sensor", "ground", "belief"):
+            _ = one.object  # rejects its options
+    return parts
 
 
 def each_part(kind: str, part: Part) -> list[Part]:
@@ -29,16 +71,18 @@ def each_part(kind: str, part: Part) -> list[Part]:
         The part itself where nothing is swept.
     """
     known = registry.options_of(kind, registry.find(kind, part.part).target)
+    first = next(iter(known), "")
     swept = {
         name: value
         for name, value in part.options.items()
         if name in known and not _taken(kind, part.part, name, known[name], value)
     }
-    first = next(iter(known), "")
-    return [
-        replace(part, label=_label(part.label, chosen, first), options=_with(part.options, chosen))
-        for chosen in _choices(swept)
-    ]
+    parts = []
+    for chosen in _choices(swept):
+        named = {".".join(path): value for path, value in chosen.items()}
+        label = registry.label_of(part.label, named, first)
+        parts.append(replace(part, label=label, options=_with(part.options, chosen)))
+    return parts
 
 
 def each_mapping(given: Any) -> list[Any]:
@@ -66,10 +110,11 @@ def check_count(counts: Iterable[int]) -> None:
         ConfigError: If there are more.
     """
     counts = [count for count in counts if count > 1]
-    expect(
-        math.prod(counts) <= MAX_CONDITIONS,
-        f"at most {MAX_CONDITIONS:,} settings, got a product of {' × '.join(map(str, counts))} values. List fewer.",
-    )
+    if math.prod(counts) > MAX_CONDITIONS:
+        product_of = " × ".join(map(str, counts))
+        raise ConfigError(
+            f"Expected at most {MAX_CONDITIONS:,} settings, got a product of {product_of} values. List fewer."
+        )
 
 
 def _taken(kind: str, source: str, name: str, option: Any, value: Any) -> bool:
@@ -96,13 +141,3 @@ def _with(options: Mapping[str, Any], chosen: _Chosen) -> dict[str, Any]:
     for path, value in chosen.items():
         made = changed(made, path, value)
     return made
-
-
-def _label(label: str, chosen: _Chosen, first: str) -> str:
-    if list(chosen) == [(first,)]:
-        return f"{label}:{_text(chosen[(first,)])}"
-    return " ".join([label, *(f"{'.'.join(path)}={_text(value)}" for path, value in chosen.items())])
-
-
-def _text(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -30,12 +30,11 @@ from benchnav.core.shipped_files import PACKAGE
 from benchnav.core.sources import digest_of, package_modules
 from benchnav.core.store import text_digest
 from benchnav.core.touched import Touches, touches_of, unlike
-from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.eval.experiment.condition import MEANING, PART_KINDS, Condition, is_checkpoint
+from benchnav.eval.experiment.condition import MEANING, Condition
 from benchnav.eval.experiment.unit import Conditions, Unit
-from benchnav.models.checkpoint import digests_of, read_config
-from benchnav.models.predictor import find_checkpoint, find_family, find_ground_statistics, split_own
+from benchnav.models.checkpoint import digests_of
+from benchnav.models.predictor import ModelPart
 from benchnav.planning.planners.compilation import can_compile
 
 PACKAGES = ("torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch")
@@ -105,7 +104,7 @@ class Origins:
             self._codes[known_by] = {"environment": self._environment, **describe_parts(condition), **metrics}
         place = condition.data, condition.split, unit.maps
         if place not in self._maps:
-            dataset = TerrainDataset(find_dataset(condition.data))
+            dataset = condition.dataset
             digests = map_digests(dataset, condition.split, unit.maps)
             self._maps[place] = (dataset.about_digest(condition.split), *digests)
         return Origin(code=self._codes[known_by], maps=self._maps[place])
@@ -114,43 +113,30 @@ class Origins:
 def describe_parts(condition: Condition) -> Code:
     """The `modules` of this package that a condition's units import, and the digests of its other `parts`."""
     modules, parts = [_UNIT], {}
-    for kind in PART_KINDS:
-        part = getattr(condition, kind)
-        name, found = f"{kind} {part.part}", _code_of(kind, part)
-        is_trained = is_checkpoint(kind, part.part)
-        if is_trained:
-            parts[name] = text_digest(digests_of(find_checkpoint(part.part)))
+    for kind, part in condition.parts.items():
+        name, found = f"{kind} {part.part}", part.found
+        folder = part.folder if isinstance(part, ModelPart) else None
+        if folder is not None:
+            parts[name] = text_digest(digests_of(folder))
         if found.shipped:
             modules.append(found.target.__module__)
         else:
-            parts[f"class of {name}" if is_trained else name] = text_digest([found.origin, found.digest])
-        if not is_trained:
-            files = registry.option_files(kind, part)
-            parts |= {f"{text} of {name}": digest for text, digest in files.items()}
-    if condition.needs_statistics:
-        dataset = TerrainDataset(find_dataset(condition.data))
-        statistics = find_ground_statistics(condition.model, dataset)
+            parts[f"class of {name}" if folder else name] = text_digest([found.origin, found.digest])
+        files = registry.option_files(part)
+        parts |= {f"{text} of {name}": digest for text, digest in files.items()}
+    if statistics := condition.statistics:
         parts["statistics of the ground"] = text_digest(statistics.to_json())
     return {"modules": package_modules(modules), "parts": parts}
-
-
-def _code_of(kind: str, part: Part) -> registry.Found:
-    """Return the class or function of a part; of a checkpoint the class that loads it."""
-    if not is_checkpoint(kind, part.part):
-        return registry.find(kind, part.part)
-    if own := split_own(part.part):
-        return registry.find(kind, own[0])
-    return find_family(read_config(find_checkpoint(part.part))["model"])
 
 
 def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
     """Return part, options and digest of each metric's code and files, by its column."""
     described = {}
     for part in metrics:
-        found = registry.find("metric", part.part)
+        found = part.found
         known = package_modules([found.target.__module__]) if found.shipped else [found.origin, found.digest]
-        files = registry.option_files("metric", part)
-        described[registry.make("metric", part).column] = {
+        files = registry.option_files(part)
+        described[part.object.column] = {
             "part": part.part,
             "options": dict(part.options),
             "digest": text_digest([known, files]),
@@ -170,16 +156,15 @@ def lacks_metrics(code: Mapping[str, Any], wanted: Code) -> list[str]:
 
 def touches(condition: Condition, metrics: Iterable[Part] = ()) -> Touches:
     """Return what the user's own parts of a unit have touched in this process; see `benchnav.core.touched`."""
-    every = [registry.find("metric", part.part) for part in metrics]
-    every += [_code_of(kind, getattr(condition, kind)) for kind in PART_KINDS]
-    return touches_of([found.target for found in every if not found.shipped])
+    known = [part.found for part in (*metrics, *condition.parts.values())]
+    return touches_of(found.target for found in known if not found.shipped)
 
 
 def describe_datasets(conditions: Conditions) -> dict[str, Any]:
     """The maps used: by dataset its id and, by split, a digest of each map and one of what they mean."""
     described: dict[str, Any] = {}
     for condition, extent in conditions.values():
-        dataset, split = TerrainDataset(find_dataset(condition.data)), condition.split
+        dataset, split = condition.dataset, condition.split
         about = described.setdefault(condition.data, {"id": dataset.id, "maps": {}, "about": {}})
         if extent.maps > len(about["maps"].get(split, ())):
             about["maps"][split] = map_digests(dataset, split, range(extent.maps))

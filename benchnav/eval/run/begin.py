@@ -217,7 +217,7 @@ def _notes(condition: Condition) -> dict[str, Any]:
 
 def changed_options(planner: Part) -> list[str]:
     """Options of a planner that differ from their defaults, as `name = value`, nested ones with dots."""
-    options = registry.options_of("planner", registry.find("planner", planner.part).target)
+    options = registry.options_of("planner", planner.found.target)
     required = {n: planner.options[n] for n, option in options.items() if option.default is NO_DEFAULT}
     defaults = registry.complete("planner", replace(planner, options=required)).options
     return [f"{name} = {now}" for name, _, now in differences(defaults, planner.options)]

@@ -1,38 +1,44 @@
-"""Before a run: every condition is built on one map, so that what cannot be run is refused before anything is.
+"""Before a run: its conditions are built and tried, so that what cannot be run is rejected before anything is run.
 
-Nothing is predicted and nothing is planned. Combinations of parts that cannot be run are left out; see `combinations`.
+Nothing is predicted and nothing is planned. A suite is a product, and some of its combinations make no sense: a planner
+that cannot steer a robot, `single-class` with a model that knows no classes. They are left out, each with its reason.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
-from benchnav.core import registry
 from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.quantity import Quantity
-from benchnav.core.settings import hint
+from benchnav.core.registry import Part
+from benchnav.core.settings import call, hint
 from benchnav.core.store import text_digest
-from benchnav.datagen.files.find import find_dataset
+from benchnav.core.terrain import Grid, Observation
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
-from benchnav.eval.experiment.condition import KNOWLEDGE, PART_KINDS, Condition, conditions_of, is_checkpoint
+from benchnav.datagen.recipe.recipe import shipped_recipes, shipped_sizes
+from benchnav.eval.experiment.condition import KNOWLEDGE, Condition, conditions_of, scenarios_of
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.metrics import NamedMetric, quantities, read_metrics
 from benchnav.eval.experiment.suite import Suite, check_size
+from benchnav.eval.experiment.sweep import read_parts
 from benchnav.eval.experiment.unit import BLOCK_MAPS, Conditions, Extent
-from benchnav.eval.folder import provenance
-from benchnav.eval.run.combinations import LeftOut, find_left_out
-from benchnav.eval.run.unit import noise_key, read_maps
+from benchnav.eval.folder.run_folder import caveats
+from benchnav.eval.run.unit import read_maps
+from benchnav.models.base import PrivilegedModel
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.predictor import class_mismatch, find_checkpoint, find_ground_statistics, load_model
-from benchnav.planning.problem import Task
-from benchnav.planning.world.realisation import check_known
-from benchnav.planning.world.simulation import Simulation
+from benchnav.models.predictor import class_mismatch
+from benchnav.planning.planners.planner import check_steers
+from benchnav.planning.problem import Prediction, pose_problem
+from benchnav.planning.sensing.belief import Fields, Law, Static
+from benchnav.planning.world.realisation import check_known, draw_frozen
 
 Say = Callable[[str], None]
+LeftOut = dict[str, str]  # the labels that do not go together, by column, and the `reason`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,85 +47,80 @@ class Checked:
 
     Args:
         conditions: by id, with how often each is to be run.
-        dropped: combinations that cannot be run: the labels that do not go together, by column, and the `reason`.
+        dropped: combinations that cannot be run.
         warnings: what readers of the results should know.
         hypotheses: from `fix_hypotheses`.
         metrics: that rows have besides those that every run has.
     """
 
     conditions: dict[str, tuple[Condition, Extent]]
-    dropped: tuple[dict[str, str], ...]
+    dropped: tuple[LeftOut, ...]
     warnings: tuple[str, ...]
     hypotheses: dict[str, Any]
     metrics: tuple[NamedMetric, ...] = ()
 
+    @property
+    def caveats(self) -> list[str]:
+        """What readers of the run's tables should know, a line each."""
+        return caveats(vars(self))
+
 
 def check_suite(suite: Suite, elsewhere: bool) -> Checked:
-    """Makes the conditions of a suite and refuses what cannot be run.
+    """Build the conditions of a suite, and reject what cannot be run.
 
     Args:
         suite: what is evaluated.
-        elsewhere: parts are made in other processes.
+        elsewhere: whether parts are created in other processes.
 
     Raises:
-        ConfigError: a part, scenario or map cannot be had, no combination can be run, or a hypothesis names one that
+        ConfigError: If a part, scenario or map is missing, no combination can be run, or a hypothesis names one that
             cannot.
-        DatasetError: there is no such dataset.
+        DatasetError: If there is no such dataset.
     """
-    for figure in suite.figures:
-        registry.take("figure", figure)
-    conditions = conditions_of(suite, scenarios_of)
+    conditions = conditions_of(suite)
     if not conditions:
         raise ConfigError(
             f"Expected a suite with at least one condition, got none; data has {scenarios_of(suite.data)}."
         )
-    for condition in conditions:
-        check_split(condition, suite.maps)
-    most_maps = suite.maps or max(_open(one).map_count(one.split) for one in conditions)
-    check_size(len(conditions), len(suite.all_seeds), suite.realisations, most_maps, BLOCK_MAPS)
+    maps = {condition.id: check_split(condition, suite.maps) for condition in conditions}
+    check_size(len(conditions), len(suite.all_seeds), suite.realisations, max(maps.values()), BLOCK_MAPS)
     left_out = find_left_out(conditions)
     kept = [condition for condition in conditions if condition.id not in left_out]
     if not kept:
-        raise ConfigError(next(iter(left_out.values())).reason)
-    robots = {condition.robot.label: condition.task.robot for condition in kept}
-    metrics = read_metrics(suite.metrics, robots.values())
+        raise ConfigError(next(iter(left_out.values()))["reason"])
+    for figure in suite.figures:
+        for part in read_parts("figure", figure):
+            _ = part.object  # which may reject its options
+    metrics = read_metrics(suite.metrics, {one.robot.label: one.task.robot for one in kept}.values())
+    known = quantities(metric.quantity for metric in metrics)
     if elsewhere:
         check_everywhere(kept, metrics)
-    extents = {condition.id: _extent(condition, suite) for condition in conditions}
-    known = quantities(metric.quantity for metric in metrics)
-    hypotheses = _fix_hypotheses(suite, {c.id: (c, extents[c.id]) for c in conditions}, left_out, known)
-    warnings = build_each(kept, suite.all_seeds[0], suite.maps)
-    for condition in kept:
-        warnings += _doubts(condition, _open(condition))
+    every = {
+        one.id: (one, Extent(draws=tuple((*draw, maps[one.id]) for draw in suite.draws)))
+        for one in conditions
+    }
+    hypotheses = _fix_hypotheses(suite, every, left_out, known)
+    warnings = build_each(kept, suite.maps)
     lone = [part for condition in kept for part in condition.unreproducible]
     lone += [f"metric {metric.quantity.name}" for metric in metrics if metric.is_object]
     warnings += [f"not reproducible: {part} is an object of one process" for part in lone]
     return Checked(
-        conditions={condition.id: (condition, extents[condition.id]) for condition in kept},
-        dropped=tuple(provenance.join(one.entry for one in left_out.values())),
+        conditions={condition.id: every[condition.id] for condition in kept},
+        dropped=tuple({json.dumps(entry): entry for entry in left_out.values()}.values()),
         warnings=tuple(dict.fromkeys(warnings)),
         hypotheses=hypotheses,
         metrics=metrics,
     )
 
 
-def _extent(condition: Condition, suite: Suite) -> Extent:
-    maps = suite.maps or _open(condition).map_count(condition.split)
-    return Extent.product(suite.all_seeds, suite.realisations, maps)
-
-
 def _fix_hypotheses(
-    suite: Suite,
-    conditions: Conditions,
-    left_out: Mapping[str, LeftOut],
-    known: Mapping[str, Quantity],
+    suite: Suite, conditions: Conditions, left_out: Mapping[str, LeftOut], known: Mapping[str, Quantity]
 ) -> dict[str, Any]:
-    """Fixes the hypotheses of a suite on the conditions that are run.
+    """Fix the hypotheses of a suite on the conditions that are run.
 
     Raises:
         ConfigError: If a hypothesis compares a condition that is run with one that is left out, or is invalid.
     """
-    kept = {i: entry for i, entry in conditions.items() if i not in left_out}
     try:
         tests = fix_hypotheses(suite.hypotheses, conditions, known).get("tests", ())
     except ConfigError:  # perhaps of a combination that is left out
@@ -129,43 +130,65 @@ def _fix_hypotheses(
         if len(lost) == 1:
             raise ConfigError(
                 f"Expected hypotheses on conditions that can be run, got {test['claim']!r}, which names one that "
-                f"cannot: {lost[0].reason}"
+                f"cannot: {lost[0]['reason']}"
             )
+    kept = {i: entry for i, entry in conditions.items() if i not in left_out}
     return fix_hypotheses(suite.hypotheses, kept, known)
 
 
-def _open(condition: Condition) -> TerrainDataset:
-    return TerrainDataset(find_dataset(condition.data))
+def check_split(condition: Condition, maps: int) -> int:
+    """Return how many maps of a condition's split are run; reject a missing scenario, and more maps than there are.
 
-
-def scenarios_of(data: str) -> list[str]:
-    """The scenarios of a dataset's test splits."""
-    splits = TerrainDataset(find_dataset(data)).splits
-    return [name.removeprefix("test/") for name in splits if name.startswith("test/")]
-
-
-def check_split(condition: Condition, maps: int) -> None:
-    """Refuses a scenario that a dataset lacks, and more maps than it has."""
-    dataset, known = _open(condition), scenarios_of(condition.data)
+    Args:
+        condition: its data and scenario.
+        maps: how many are asked for; 0 for all.
+    """
+    dataset, known = condition.dataset, scenarios_of(condition.data)
     if condition.scenario not in known:
         raise ConfigError(
             f"Expected `scenarios` among {known} of {dataset.path}, got {condition.scenario!r}."
-            f"{hint(condition.scenario, known)}{_make_all(dataset, condition.split, 1)}"
+            f"{hint(condition.scenario, known)}{_remedy(dataset, condition.split, 1)}"
         )
     count = dataset.map_count(condition.split)
     if maps > count:
         raise ConfigError(
             f"Expected `maps` at most {count}, the maps of {condition.split} in {dataset.path}, got {maps}. "
-            f"0 takes all.{_make_all(dataset, condition.split, maps)}"
+            f"0 takes all.{_remedy(dataset, condition.split, maps)}"
         )
+    return maps or count
 
 
-def build_each(conditions: Sequence[Condition], seed: int, maps: int) -> list[str]:
+def _remedy(dataset: TerrainDataset, split: str, maps: int) -> str:
+    """Return how to make the maps that a file lacks, if its shipped recipe has them."""
+    if dataset.id not in shipped_recipes() or shipped_sizes(dataset.id).get(split, 0) < maps:
+        return ""
+    return f" All maps of {dataset.id} are made with `benchnav-datagen create {dataset.id}`."
+
+
+def check_everywhere(conditions: Iterable[Condition], metrics: Iterable[NamedMetric] = ()) -> None:
+    """Reject parts that other processes would not find.
+
+    Raises:
+        ConfigError: If there are such.
+    """
+    parts = [part for condition in conditions for part in condition.parts.values()]
+    for part in (*parts, *(metric.part for metric in metrics)):
+        if not part.found.everywhere:
+            raise ConfigError(
+                f"Expected a {part.kind} that other processes can load (for `jobs` > 1, `scheduler` or "
+                f"`planner_limit_s`), got {part.part!r}, which only this process has. Write its class into a file, "
+                "and import it from there or name it as path/to/file.py:Name."
+            )
+
+
+# --- each condition on one map ------------------------------------------------------------------------
+
+
+def build_each(conditions: Sequence[Condition], maps: int) -> list[str]:
     """Build conditions on the first map of their splits, without a prediction or a plan.
 
     Args:
         conditions: what is built; what several share is built once.
-        seed: root seed of the draw of λ.
         maps: number of maps of each split; 0 for all.
 
     Returns:
@@ -175,15 +198,14 @@ def build_each(conditions: Sequence[Condition], seed: int, maps: int) -> list[st
         BenchnavError: If a condition cannot be run.
     """
     warnings: list[str] = []
-    for condition in _distinct(conditions, "data", "scenario", "world"):
-        _check_known_ground(condition, _open(condition), maps)
     for condition in _distinct(conditions, "data", "scenario", "world", "rules", "robot"):
-        warnings += _check_world(condition, _open(condition), seed, maps)
+        warnings += _check_world(condition, condition.dataset, maps)
     for condition in _distinct(conditions, "data", "scenario", "model", *KNOWLEDGE):
-        if condition.needs_statistics:
-            find_ground_statistics(condition.model, _open(condition))
+        _ = condition.statistics  # which may be missing
     for condition in _distinct([one for one in conditions if not one.blind], "data", "model"):
-        warnings += _check_model(condition, _open(condition))
+        warnings += _check_model(condition)
+    for condition in conditions:
+        warnings += _doubts(condition, condition.dataset)
     return warnings
 
 
@@ -191,47 +213,39 @@ def _distinct(conditions: Sequence[Condition], *names: str) -> list[Condition]:
     """Return the first condition of each combination of values of some fields."""
     first: dict[str, Condition] = {}
     for condition in conditions:
-        value = {**condition.value, "data": condition.data, "scenario": condition.scenario}
+        value = {**condition.value, "scenario": condition.scenario}
         first.setdefault(text_digest({name: value.get(name) for name in names}), condition)
     return list(first.values())
 
 
-def _check_world(condition: Condition, dataset: TerrainDataset, seed: int, maps: int) -> list[str]:
-    """Build the simulation on one map, and warn of goals that top speed does not reach within T."""
-    block = read_maps(dataset, condition.split, [0])
-    noise = noise_key(seed, condition.split, 0)
-    Simulation(block.terrain, condition.task, condition.world, block.places, noise, [0])
-    return _late(condition, condition.task, dataset, maps)
+def _check_model(condition: Condition) -> list[str]:
+    """Load the model, which may reject its options, and warn of another class table."""
+    model, name = condition.model.object, f"model {condition.model.label}"
+    folder = condition.model.folder
+    # A checkpoint has a class table, whether or not its model predicts classes.
+    known = load_checkpoint(folder) if folder else model
+    line = class_mismatch(known, condition.dataset.recipe, name)
+    return [line] if line else []
 
 
-def _make_all(dataset: TerrainDataset, split: str, maps: int) -> str:
-    """How to make the maps that a file lacks, where its shipped recipe has them."""
-    if dataset.id not in shipped_recipes():
-        return ""
-    whole = load_recipe(dataset.id).splits.get(split)
-    if whole is None or whole.maps < maps:
-        return ""
-    return f" All maps of {dataset.id} are made with `benchnav-datagen create {dataset.id}`."
-
-
-def _check_known_ground(condition: Condition, dataset: TerrainDataset, maps: int) -> None:
-    """Refuses maps with cells whose λ a world cannot tell, which only maps that were imported have."""
-    if not any("source" in part for part in dataset.splits[condition.split]["parts"]):
-        return
-    chosen = range(maps or dataset.map_count(condition.split))
-    for start in chosen[::BLOCK_MAPS]:
-        check_known(dataset.terrain(condition.split, chosen[start : start + BLOCK_MAPS]), condition.world)
-
-
-def _late(condition: Condition, task: Task, dataset: TerrainDataset, maps: int) -> list[str]:
-    """Tells of goals that top speed does not reach within T; refuses a T without a step."""
-    chosen = range(maps or dataset.map_count(condition.split))
-    read = dataset.read(condition.split, chosen, ["start_m", "goal_m", "reference_time_s"])
+def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> list[str]:
+    """Draw λ of the first map, and warn of goals that top speed does not reach within T."""
+    task, world, split = condition.task, condition.world, condition.split
+    chosen = range(maps or dataset.map_count(split))
+    read = dataset.read(split, chosen, ["start_m", "goal_m", "reference_time_s"])
     top_speed = task.robot.top_speed_mps
-    budget = condition.world.budget_s(torch.from_numpy(read["reference_time_s"]), top_speed)
-    condition.world.steps(budget, task.robot.dt_s)
-    way = np.linalg.norm(read["goal_m"] - read["start_m"], axis=1) - task.rules.goal_radius_m
-    late = way / top_speed > budget.numpy()
+    budget = world.budget_s(torch.from_numpy(read["reference_time_s"]), top_speed)
+    world.steps(budget, task.robot.dt_s)
+    # Only imported maps have cells of which λ is missing.
+    is_imported = any("source" in part for part in dataset.splits[split]["parts"])
+    for start in chosen[::BLOCK_MAPS] if is_imported else chosen[:1]:
+        block = read_maps(dataset, split, chosen[start : start + BLOCK_MAPS] if is_imported else [0])
+        check_known(block.terrain, world)
+        if world.noise == "frozen" and start == 0:
+            first = block.terrain.select(torch.tensor([0])), block.places.select(torch.tensor([0]))
+            draw_frozen(first[0], world, first[1], key=0, maps=[0])
+    distance_m = np.linalg.norm(read["goal_m"] - read["start_m"], axis=1) - task.rules.goal_radius_m
+    late = distance_m / top_speed > budget.numpy()
     if not late.any():
         return []
     return [
@@ -240,45 +254,155 @@ def _late(condition: Condition, task: Task, dataset: TerrainDataset, maps: int) 
     ]
 
 
-def _check_model(condition: Condition, dataset: TerrainDataset) -> list[str]:
-    """Loads the model, which may reject its options; warns of another class table."""
-    part = condition.model.part
-    model: Any = load_model(condition.model)
-    if is_checkpoint("model", part):
-        model = load_checkpoint(find_checkpoint(part))  # which has a class table in any case
-    line = class_mismatch(model, dataset.recipe, f"model {condition.model.label}")
-    return [line] if line else []
-
-
-def check_everywhere(conditions: Iterable[Condition], metrics: Iterable[NamedMetric] = ()) -> None:
-    """Refuses parts that other processes would not find.
-
-    Raises:
-        ConfigError: there are such.
-    """
-    parts = [(kind, getattr(condition, kind).part) for condition in conditions for kind in PART_KINDS]
-    parts += [("metric", metric.part.part) for metric in metrics]
-    for kind, source in parts:
-        if not is_checkpoint(kind, source) and not registry.find(kind, source).everywhere:
-            raise ConfigError(
-                f"Expected a {kind} that other processes can load (for `jobs` > 1, `scheduler` or "
-                f"`planner_limit_s`), got {source!r}, which only this process has. Write its class into a file, "
-                "and import it from there or name it as path/to/file.py:Name."
-            )
-
-
-def _doubts(condition: Condition, dataset: TerrainDataset) -> list[str]:
-    lines = []
+def _doubts(condition: Condition, dataset: TerrainDataset) -> Iterator[str]:
+    """Yield what of the maps does not fit the rules of the task."""
     threshold = dataset.recipe.stuck_threshold
     if condition.rules.free_space.above != threshold:
-        lines.append(
+        yield (
             f"maps of {dataset.id} have a feasible path over ground above {threshold:g}, but free ground is above "
             f"{condition.rules.free_space.above:g} in this run"
         )
     split = dataset.recipe.splits.get(condition.split)
     if split is not None and not split.solvable:
-        lines.append(
+        yield (
             f"maps of {dataset.id} {condition.split} may have no feasible path to the goal (no `solvable: true`), "
             "so that a planner may fail on them for that alone"
         )
-    return lines
+
+
+# --- combinations that cannot be run ------------------------------------------------------------------
+
+
+def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
+    """Find the conditions whose parts do not go together.
+
+    Args:
+        conditions: of a suite.
+
+    Returns:
+        Why each of them is not run, by its id, in the order of the conditions.
+
+    Raises:
+        ConfigError: If a shipped planner rejects its settings in each combination that the suite has of it.
+    """
+    reasons: dict[tuple[Any, ...], str] = {}
+    left_out: dict[str, LeftOut] = {}
+    refusals: dict[str, str] = {}  # by planner; empty if it can be prepared for some condition
+    for condition in conditions:
+        for columns, rule in _RULES.items():
+            labels = {column: condition.labels[column] for column in columns}
+            # With the part, since all parts that are not used have one label.
+            key = rule, condition.risk.part, *labels.values()
+            if key not in reasons:
+                reasons[key] = rule(condition)
+            if rule is _unprepared:
+                planner = condition.planner.label
+                refusals[planner] = reasons[key] and refusals.get(planner, reasons[key])
+            if reasons[key]:
+                left_out[condition.id] = {**labels, "reason": reasons[key]}
+                break
+    for reason in filter(None, refusals.values()):
+        raise ConfigError(reason)  # of the planner's own settings
+    return left_out
+
+
+def _unsteered(condition: Condition) -> str:
+    try:
+        check_steers(condition.planner.object, condition.task.robot, condition.planner.label)
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+def _plans_once(condition: Condition) -> str:
+    if condition.blind or not condition.planner.object.plans_once or not condition.learns:
+        return ""
+    return (
+        f"Expected belief 'static' and sensor 'full' for planner {condition.planner.label!r}, which plans once, got "
+        f"{condition.belief.label!r} and {condition.sensor.label!r}."
+    )
+
+
+def _given_truth(condition: Condition) -> str:
+    is_given = not condition.blind and condition.planner.object.given_truth
+    if not is_given or condition.model.part == "clairvoyant":
+        return ""
+    return (
+        f"Expected model 'clairvoyant' for planner {condition.planner.label!r}, which is given λ itself, got "
+        f"{condition.model.label!r}."
+    )
+
+
+def _resampled(condition: Condition) -> str:
+    if condition.model.part != "clairvoyant" or condition.world.noise != "resampled":
+        return ""
+    return (
+        f"Expected a world with λ that stays for the model 'clairvoyant', got {condition.world_label!r}, which "
+        "resamples λ at each step. Take the world stakes, or `world.noise` frozen or stored."
+    )
+
+
+def _learns_no_class(condition: Condition) -> str:
+    if not _is_single_class(condition) or not condition.belief.object.learns:
+        return ""
+    return (
+        "Expected a belief that does not learn for the risk setting 'single-class', got "
+        f"{condition.belief.label!r}: what is learnt of λ is of no class. Take the belief static."
+    )
+
+
+def _without_classes(condition: Condition) -> str:
+    if not _is_single_class(condition):
+        return ""
+    model = condition.model.object
+    if model.class_names or isinstance(model, PrivilegedModel):
+        return ""
+    return (
+        f"Expected a model that predicts classes for the risk setting 'single-class', got {condition.model.label!r}, "
+        "which has no `class_names`."
+    )
+
+
+def _is_single_class(condition: Condition) -> bool:
+    return not condition.blind and condition.risk.part == "single-class"
+
+
+def _unprepared(condition: Condition) -> str:
+    """Return why a shipped planner rejects what only its preparation can tell, such as its bounds."""
+    planner: Part = condition.planner
+    if not planner.found.shipped:
+        return ""
+    ground = torch.full((1, 4, 4), 0.9)
+    grid = Grid(4, 4, condition.dataset.grid.resolution_m)
+    seen = Observation(torch.zeros(1, 3, 4, 4, dtype=torch.uint8), 0 * ground, 0 * ground, grid)
+    ones = torch.ones_like(ground).unsqueeze(1)
+    mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
+    start, goal = (torch.full((1, 2), cells * grid.resolution_m) for cells in (0.5, 3.5))
+
+    def prepare() -> None:
+        fields = Fields(Static(), Static().init(mixture, Law(grid=grid, correlation_m=0.0)), (0,))
+        prediction = Prediction(seen, mixture, ground, fields=fields)
+        problem = pose_problem(condition.task, prediction, start, goal, 1.0, condition.world.immobile)
+        planner.object.init(problem, torch.Generator())
+
+    labels = condition.labels
+    what = (
+        f"Planner {labels['planner']!r} for robot {labels['robot']!r} and objective {labels['objective']!r}"
+    )
+    try:
+        call(what, prepare, {})
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+# By the columns whose labels decide it; what takes longest comes last.
+_RULES: Mapping[tuple[str, ...], Callable[[Condition], str]] = {
+    ("planner", "robot"): _unsteered,
+    ("planner", "sensor", "belief"): _plans_once,
+    ("planner", "model"): _given_truth,
+    ("model", "world"): _resampled,
+    ("risk", "belief"): _learns_no_class,
+    ("planner", "robot", "objective", "world", "data"): _unprepared,
+    ("model", "risk"): _without_classes,
+}

@@ -20,7 +20,7 @@ from benchnav.eval.recording import (
     thinned,
 )
 from benchnav.eval.run.knowledge import Knowing
-from benchnav.eval.run.rollout import Episodes
+from benchnav.eval.run.rollout import Episodes, Observer
 from benchnav.planning.planners.planner import Plan
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
@@ -43,7 +43,6 @@ class Recorder:
     ) -> None:
         """Begins with nothing."""
         self.unit, self.problem, self.simulation, self.terrain = unit, problem, simulation, terrain
-        self.every = drawing_interval(problem.dt_s)
         self._plans: dict[int, list[DrawnPlan]] = {member: [] for member in members}
         self._known: dict[int, list[KnownMap]] = {member: [] for member in self._plans}
 
@@ -62,9 +61,9 @@ class Recorder:
                 self._plans[member].append(drawn if whole else thinned(drawn))
 
     @property
-    def watching(self) -> dict[str, Any]:
-        """The arguments of `run_episodes` by which it is told of plans and of what is known."""
-        return {"watch": self.watch, "watch_every": self.every, "witness": self.learn}
+    def observer(self) -> Observer:
+        """What `run_episodes` calls with plans and with what is known."""
+        return Observer(plan=self.watch, every=drawing_interval(self.problem.dt_s), knowledge=self.learn)
 
     def learn(self, step: int, knowing: Knowing) -> None:
         """Keeps what is known from a step on.

@@ -10,8 +10,6 @@ import torch
 
 from benchnav.core.device import device_of_run
 from benchnav.core.errors import BenchnavError, ConfigError
-from benchnav.datagen.files.find import find_dataset
-from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.checksums import note_checksums
 from benchnav.eval.folder.results import code_of
@@ -56,7 +54,7 @@ def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = Non
         # Without a time limit of planners, which changes no action.
         settings = Settings(device=device_of_run(open_run(folder).about).type)
         recorder, built = _recorder(unit, settings, [member])
-        episodes, _ = simulate(unit, built, settings, **recorder.watching)
+        episodes, _ = simulate(unit, built, settings, observer=recorder.observer)
     recording = recorder.recording(episodes, member)
     if not _repeats(row, recording):
         raise BenchnavError(
@@ -183,7 +181,7 @@ def keep_ground(folder: Path) -> None:
     about = telling_map(rows)
     on_map = rows[(rows[list(about)] == pd.Series(about)).all(axis=1)]
     condition, _ = open_run(folder).conditions[on_map["condition"].iloc[0]]
-    block = read_maps(TerrainDataset(find_dataset(condition.data)), condition.split, [about["map"]])
+    block = read_maps(condition.dataset, condition.split, [about["map"]])
     noise = noise_key(about["seed"], condition.split, about["realisation"])
     simulation = Simulation(
         block.terrain, condition.task, condition.world, block.places, noise, [about["map"]]

@@ -30,8 +30,7 @@ from benchnav.eval.folder.run_folder import (
     read_table,
 )
 from benchnav.eval.run.begin import Work, check_resumable
-from benchnav.eval.run.check import Say, build_each, check_everywhere, check_split
-from benchnav.eval.run.combinations import find_left_out
+from benchnav.eval.run.check import Say, build_each, check_everywhere, check_split, find_left_out
 from benchnav.eval.run.runner import run_work
 from benchnav.eval.run.unit import Settings
 
@@ -152,8 +151,8 @@ def _check_there(run: Run) -> None:
         raise ConfigError(f"Expected all that {run.folder} was made with, got a lack: {' '.join(lacking)}")
     conditions = [condition for condition, _ in run.conditions.values()]
     for one in find_left_out(conditions).values():
-        raise ConfigError(one.reason)
-    build_each(conditions, seed=0, maps=1)
+        raise ConfigError(one["reason"])
+    build_each(conditions, maps=1)
 
 
 def _verdict(

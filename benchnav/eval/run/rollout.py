@@ -32,8 +32,20 @@ from benchnav.planning.world.simulation import Simulation, SimulationState, end
 _FULL = 0.75  # share of a batch that still runs, over which it is left as it is
 _LOOK_EVERY = 8  # steps between two looks at which episodes still run, where a look waits for a GPU
 
-Watcher = Callable[[int, Plan, list[int]], None]  # step, plan, and the episodes that are planned for
-Witness = Callable[[int, Knowing], None]  # step, and what is known
+
+@dataclass(frozen=True, kw_only=True)
+class Observer:
+    """What is called while episodes run, for recordings.
+
+    Args:
+        plan: called with a step's number, its plan and the episodes that it is for, before the step is taken.
+        every: steps between two calls of `plan`, from the first on.
+        knowledge: called with a step's number and what is known when that was updated, before the step is planned.
+    """
+
+    plan: Callable[[int, Plan, list[int]], None] | None = None
+    every: int = 1
+    knowledge: Callable[[int, Knowing], None] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,11 +196,9 @@ def run_episodes(
     problem: Problem,
     simulation: Simulation,
     generator: torch.Generator,
-    watch: Watcher | None = None,
-    watch_every: int = 1,
+    observer: Observer = Observer(),
     enough: Callable[[int], bool] = lambda step: False,
     learning: Learning | None = None,
-    witness: Witness | None = None,
 ) -> Episodes:
     """Runs a batch of episodes to the end of the last.
 
@@ -200,13 +210,11 @@ def run_episodes(
         problem: with predicted traversability.
         simulation: with the true terrain.
         generator: the planner's randomness.
-        watch: is called with a step's number, its plan and the episodes that it is for, before the step is taken.
-        watch_every: of so many steps one is watched, from the first on.
+        observer: what is called on the way.
         enough: is asked before each step, by its number, whether to leave it there; episodes that still run are then
             left running.
         learning: how the robots learn on their way, whose planner then goes on under what they know; None where they
             learn nothing.
-        witness: is called when what is known was updated, before the step is planned.
 
     Returns:
         What happened.
@@ -241,17 +249,17 @@ def run_episodes(
                     revised = knowing.learn(count, at, goes_on)
                 if knowing.is_due(count):
                     knowing.look_ahead(count, at, goes_on)
-                    if witness is not None:
-                        witness(count, knowing)
-            watched = watch is not None and count % watch_every == 0
+                    if observer.knowledge is not None:
+                        observer.knowledge(count, knowing)
+            watched = observer.plan is not None and count % observer.every == 0
             step = Step(state=now.state, traversability=observed, time_s=count * problem.dt_s, draw=watched)
             with log.clock.timed():
                 if revised is not None:
                     batch.revise(revised, generator)
                 answer = batch.act(step)
             log.planned.append(len(batch.members))
-            if watched and watch is not None:
-                watch(count, answer.plan, batch.members.tolist())
+            if watched and observer.plan is not None:
+                observer.plan(count, answer.plan, batch.members.tolist())
             action, faulty, status = batch.spread(answer)
             log.blame(now.running & faulty, answer.reason)
             now = end(now, faulty, Outcome.PLANNER_ERROR)

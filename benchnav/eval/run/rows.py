@@ -10,7 +10,6 @@ import pyarrow as pa
 import torch
 from torch import Tensor
 
-from benchnav.core import registry
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.steps import AHEAD_COLUMNS, LAST_COLUMN
 from benchnav.eval.run.rollout import Episodes
@@ -148,7 +147,7 @@ def episode_rows(
     Raises:
         MetricError: If a metric fails, or returns an infinite number or none.
     """
-    further = [registry.make("metric", part) for part in unit.metrics]
+    further = [part.create() for part in unit.metrics]
     rows = []
     for map_index, episode, error in zip(unit.maps, finished, errors, strict=True):
         row: dict[str, Any] = {"outcome": episode.outcome}

@@ -5,6 +5,7 @@ or extended by giving the same command or another. A row does not depend on the 
 units, or on interruptions.
 """
 
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import chdir
 from dataclasses import replace
@@ -15,7 +16,6 @@ from typing import Any
 from benchnav.core.device import gpu_name
 from benchnav.core.errors import ConfigError
 from benchnav.core.progress import Progress
-from benchnav.core.settings import plain
 from benchnav.core.store import Shard, sole_writer
 from benchnav.core.touched import changes_since, unlike
 from benchnav.core.workers import connected, run_calls
@@ -27,7 +27,6 @@ from benchnav.eval.folder.run_folder import (
     EPISODES,
     ERRORS,
     Finished,
-    caveats,
     find_units,
     finish_run,
     unit_path,
@@ -74,11 +73,11 @@ def run_suite(
     """
     with sole_writer(folder, str(folder)):
         checked = check_suite(suite, elsewhere=jobs != 1 or settings.planner_limit_s > 0)
-        for line in caveats(vars(checked)):
+        for line in checked.caveats:
             say(line)
         work = Work(
             **vars(checked),
-            suite=plain(suite),
+            suite=suite.plain,
             record=suite.record,
             settings=settings,
             shard=shard,
@@ -199,74 +198,72 @@ def _run_in(
     return unit, {}
 
 
+# Why units that are there in part are run again, as `say` receives it.
+_AGAIN = {
+    "unrecorded": "are run again for recordings or steps that they lack",
+    "unmeasured": "are run again for metrics that they lack ({})",
+    "damaged": "are damaged and are run again; the first: {}",
+    "changed": "are run again, since what their parts read changed: {}",
+    "other": "were finished by other code or maps ({}) and are run again; --reuse-code takes units of other code",
+}
+
+
 def _missing(
     own: list[Unit], origins: Origins, folder: Path, reuse_code: bool, say: Say, is_here: bool
 ) -> list[tuple[Unit, Origin]]:
-    """What is to be run: units that are not finished, damaged, or not recorded as they are now to be.
+    """Return what is to be run: units that are not finished, damaged, or not recorded as they are now to be.
 
     Args:
         own: units of this run.
         origins: what they come from now.
         folder: the run folder.
         reuse_code: take units of other code.
-        say: is told how many units are run again, and why.
+        say: receives how many units are run again, and why.
         is_here: units are run on this machine, so that what parts read can be compared with what is here.
     """
-    missing, again, unused, stale, unmeasured = [], 0, 0, 0, 0
-    other: dict[str, None] = {}
-    lacking: dict[str, None] = {}
-    changed: dict[str, None] = {}
-    damage: list[str] = []
+    missing: list[tuple[Unit, Origin]] = []
+    counts: Counter[str] = Counter()
+    details: dict[str, dict[str, None]] = defaultdict(dict)
     for unit in own:
-        origin, known = origins.of(unit), find_units(folder, unit)
-        counts = _counting(known, unit, origin, reuse_code)
-        if lines := _damage(folder, unit, origin, counts):
-            missing.append((replace(unit, record=_richest(unit, counts)), origin))
-            damage.append(lines[0])
-        elif counts is None and known and (columns := _unmeasured(known[0], origin)):
-            missing.append((replace(unit, record=_richest(unit, known[0])), origin))
-            unmeasured += 1
-            lacking |= dict.fromkeys(columns)
-        elif counts is None:
-            missing.append((unit, origin))
-            if known:
-                unused += 1
-                other |= dict.fromkeys(_differences(known[0], origin))
-        elif is_here and not reuse_code and (lines := changes_since(counts.about.get(TOUCHED, {}))):
-            missing.append((replace(unit, record=_richest(unit, counts)), origin))
-            stale += 1
-            changed |= dict.fromkeys(lines)
-        elif not counts.has(unit):
-            again += 1
-            missing.append((replace(unit, record=_richest(unit, counts)), origin))
+        origin, makings = origins.of(unit), find_units(folder, unit)
+        finished = _counting(makings, unit, origin, reuse_code)
+        why, lines = _why_missing(folder, unit, origin, makings, finished)
+        if not why and is_here and not reuse_code and finished:
+            lines = changes_since(finished.about.get(TOUCHED, {}))
+            why = "changed" if lines else ""
+        if not why and finished and not finished.has(unit):
+            why = "unrecorded"
+        if not why:
+            continue
+        counts[why] += 1
+        if why != "damaged" or not details[why]:
+            details[why] |= dict.fromkeys(lines)
+        kept = makings[0] if why == "unmeasured" else finished
+        missing.append((replace(unit, record=_richest(unit, kept)), origin))
     if done := len(own) - len(missing):
         say(f"{done} of {len(own)} units were there already")
-    if again:
-        say(f"{again} of {len(own)} units are run again for recordings or steps that they lack")
-    if unmeasured:
-        say(
-            f"{unmeasured} of {len(own)} units are run again for metrics that they lack ({', '.join(lacking)})"
-        )
-    if damage:
-        say(f"{len(damage)} of {len(own)} units are damaged and are run again; the first: {damage[0]}")
-    if stale:
-        say(
-            f"{stale} of {len(own)} units are run again, since what their parts read changed: {'; '.join(changed)}"
-        )
-    if unused:
-        say(
-            f"{unused} of {len(own)} units were finished by other code or maps ({'; '.join(other)}) and are run again; "
-            "--reuse-code takes units of other code"
-        )
+    for why, text in _AGAIN.items():
+        if counts[why]:
+            say(f"{counts[why]} of {len(own)} units {text.format('; '.join(details[why]))}")
     return missing
 
 
-def _damage(folder: Path, unit: Unit, origin: Origin, counts: Finished | None) -> list[str]:
-    """Lines on what of the making of a unit that counts is damaged; of one that cannot be recognised, on its file."""
-    if counts is not None:
-        return counts.damage()
+def _why_missing(
+    folder: Path, unit: Unit, origin: Origin, makings: list[Finished], finished: Finished | None
+) -> tuple[str, list[str]]:
+    """Return why a unit is not there as a whole, a key of `_AGAIN` or "new", with lines on it; else an empty key."""
+    if finished is not None:
+        damage = finished.damage()
+        return ("damaged", damage[:1]) if damage else ("", [])
     path = unit_path(unit, origin.key(unit))
-    return [f"{path}: it cannot be read"] if (folder / path).exists() else []
+    if (folder / path).exists():
+        return "damaged", [f"{path}: it cannot be read"]
+    if not makings:
+        return "new", []
+    differences = _differences(makings[0], origin)
+    if not differences and (columns := lacks_metrics(makings[0].about["code"], origin.code)):
+        return "unmeasured", [", ".join(columns)]
+    return "other", differences
 
 
 def _richest(unit: Unit, counts: Finished | None) -> Record:
@@ -293,11 +290,6 @@ def _counting(known: list[Finished], unit: Unit, origin: Origin, reuse_code: boo
 def _counted(unit: Unit, origins: Origins, folder: Path, reuse_code: bool) -> Finished | None:
     """The making of a unit that counts now; None where it is not finished."""
     return _counting(find_units(folder, unit), unit, origins.of(unit), reuse_code)
-
-
-def _unmeasured(finished: Finished, origin: Origin) -> list[str]:
-    """Columns of the metrics that a finished unit lacks, if it differs in nothing else from what is to be run."""
-    return [] if _differences(finished, origin) else lacks_metrics(finished.about["code"], origin.code)
 
 
 def _differences(finished: Finished, origin: Origin) -> list[str]:

@@ -4,7 +4,6 @@ Only the unit's own block of maps is read and predicted. A prediction serves all
 of its block that a process runs one after another.
 """
 
-import json
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -21,10 +20,10 @@ from benchnav.core import rng
 from benchnav.core.device import CPU, GPU_FAULTS, find_device, gpu_failed
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
-from benchnav.core.registry import Part
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.provenance import Origin, Origins, code_differences
 from benchnav.eval.folder.run_folder import clear_unit, write_unit
@@ -32,12 +31,12 @@ from benchnav.eval.folder.steps import write_steps
 from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.knowledge import Learning
 from benchnav.eval.run.recorder import Recorder
-from benchnav.eval.run.rollout import Episodes, run_episodes
+from benchnav.eval.run.rollout import Episodes, Observer, run_episodes
 from benchnav.eval.run.rows import Draws, episode_rows, finished_episodes, step_table, unbegun_episodes
 from benchnav.models.base import predict
-from benchnav.models.predictor import Clairvoyant, find_ground_statistics, load_model, nugget_of
+from benchnav.models.predictor import Clairvoyant, loaded, nugget_of
 from benchnav.planning.planners.planner import Plan, Planner
-from benchnav.planning.problem import Problem, heading_to, pose_problem
+from benchnav.planning.problem import Prediction, Problem, heading_to, pose_problem
 from benchnav.planning.sensing.belief import Fields, Law
 from benchnav.planning.sensing.knowledge import KnowledgeError, Learner, Truth, call, sensor_keys
 from benchnav.planning.sensing.sensor import Step
@@ -98,7 +97,9 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
         problem, simulation = built.problem, built.simulation
         watched = unit.watched()
         recorder = Recorder(unit, problem, simulation, block.terrain, watched)
-        episodes, compiled = simulate(unit, built, settings, **(recorder.watching if watched else {}))
+        episodes, compiled = simulate(
+            unit, built, settings, observer=recorder.observer if watched else Observer()
+        )
         failed = all(episodes.errors)  # a planner that cannot be made, say
         least_s = None if failed else _lower_bounds_s(unit, built)
     succeeded = (episodes.outcome == Outcome.SUCCESS).tolist()
@@ -200,25 +201,27 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
     noise = noise_key(unit.seed, condition.split, unit.realisation)
     simulation = Simulation(block.terrain, task, condition.world, block.places, noise, unit.maps)
     try:
-        learner = _learner(unit, origin, device)
+        learner = _learner(condition, block)
         redrawn = simulation.field is None
         field = simulation.field_at(0) if condition.learns else block.terrain.traversability
         truth = Truth(terrain=block.terrain, field=field, keys=sensor_keys(noise, unit.maps))
         predicted = None
         if learner.sensor.sees_all:
-            predicted = call(Outcome.MODEL_ERROR, lambda: _predict(unit, origin, device, simulation.field))
+            predicted = call(
+                Outcome.MODEL_ERROR, lambda: _predict(condition.model.key, block, simulation.field)
+            )
         start = task.robot.initial_state(heading_to(block.places.start_m, block.places.goal_m))
         known = learner.begin(truth, start, predicted)
+        fields = Fields(learner.belief, known.believed, tuple(unit.maps))
+        prediction = Prediction(
+            known.observation, learner.distribution(known), known.risk_map, known.free, fields
+        )
         problem = pose_problem(
             task,
-            known.observation,
-            learner.distribution(known),
-            known.risk_map,
+            prediction,
             block.places.start_m,
             block.places.goal_m,
             simulation.time_budget_s,
-            known.free,
-            Fields(learner.belief, known.believed, tuple(unit.maps)),
             condition.world.immobile,
         )
     except GPU_FAULTS as error:
@@ -231,19 +234,17 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
     return Built(problem=problem, simulation=simulation, learning=learning)
 
 
-def _learner(unit: Unit, origin: Origin, device: torch.device) -> Learner:
+def _learner(condition: Condition, block: Block) -> Learner:
     """How the robots of a unit learn."""
-    condition, block = unit.condition, read_block(unit, origin, device)
-    dataset = TerrainDataset(find_dataset(condition.data))
-    world, part = condition.world, condition.model
+    dataset, world = condition.dataset, condition.world
     sensor = call(Outcome.SENSOR_ERROR, condition.sensor.create)
     belief = call(Outcome.BELIEF_ERROR, condition.belief.create)
-    model = call(Outcome.MODEL_ERROR, lambda: _model(_model_key(unit, origin)))
+    model = call(Outcome.MODEL_ERROR, lambda: condition.model.object)
     law = Law(
         grid=block.terrain.grid,
         correlation_m=dataset.recipe.correlation_m if world.noise == "stored" else world.correlation_m,
         nugget=nugget_of(model),
-        statistics=find_ground_statistics(part, dataset) if condition.needs_statistics else None,
+        statistics=condition.statistics,
         class_names=model.class_names or tuple(item.name for item in dataset.recipe.classes),
     )
 
@@ -258,22 +259,13 @@ def _learner(unit: Unit, origin: Origin, device: torch.device) -> Learner:
     )
 
 
-def _predict(
-    unit: Unit, origin: Origin, device: torch.device, field: Tensor | None
-) -> TraversabilityDistribution:
-    """The prediction of a unit's block, kept for other settings; of the clairvoyant's λ, of this unit alone."""
-    model, block = _model_key(unit, origin), read_block(unit, origin, device)
-    if not isinstance(_model(model), Clairvoyant):
-        return _prediction(model, block)
+def _predict(model_key: str, block: Block, field: Tensor | None) -> TraversabilityDistribution:
+    """The prediction of a block, kept for other settings; of the clairvoyant's λ, of one unit alone."""
+    model = loaded(model_key)
+    if not isinstance(model, Clairvoyant):
+        return _prediction(model_key, block)
     assert field is not None  # suites are refused in which λ cannot be known
-    return predict(_model(model), replace(block.terrain, traversability=field))
-
-
-def _model_key(unit: Unit, origin: Origin) -> str:
-    """What identifies a model, with the digest of its code and files."""
-    part = unit.condition.model
-    digest = origin.code["parts"].get(f"model {part.part}", "")
-    return json.dumps([part.part, dict(part.options), digest], sort_keys=True)
+    return predict(model, replace(block.terrain, traversability=field))
 
 
 def noise_key(seed: int, split: str, realisation: int) -> int:
@@ -363,11 +355,5 @@ def _block(
 
 
 @lru_cache(maxsize=2)
-def _prediction(model: str, block: Block) -> TraversabilityDistribution:
-    return predict(_model(model), block.terrain)
-
-
-@lru_cache(maxsize=2)
-def _model(model: str) -> Any:
-    part, options, _ = json.loads(model)
-    return load_model(Part(part=part, label="", options=options))
+def _prediction(model_key: str, block: Block) -> TraversabilityDistribution:
+    return predict(loaded(model_key), block.terrain)

@@ -6,6 +6,7 @@ processes read for it. Letters in shapes: B maps in all, b maps in a batch, H×W
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -164,6 +165,34 @@ def apply_symmetry(maps: Tensor, which: int, name: str = "") -> Tensor:
     return turned
 
 
+@dataclass(frozen=True, kw_only=True)
+class Augmentation:
+    """How training maps are varied.
+
+    Args:
+        jitter: largest relative change of brightness, contrast and saturation.
+        symmetries: whether maps are turned and mirrored.
+    """
+
+    jitter: float = 0.0
+    symmetries: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loading:
+    """How maps are read.
+
+    Args:
+        in_memory: hold all maps in memory.
+        workers: processes that read ahead; 0 reads in this one.
+        valid_every: n if only every n-th map of `valid` counts.
+    """
+
+    in_memory: bool = False
+    workers: int = 0
+    valid_every: int = 1
+
+
 class MapData(lightning.LightningDataModule):
     """The maps of the splits `train` and `valid`.
 
@@ -176,12 +205,9 @@ class MapData(lightning.LightningDataModule):
         batch_size: most maps a batch.
         seed: root seed of order and augmentation.
         fields: which to read.
-        jitter: largest relative change of brightness, contrast and saturation of a training map.
-        symmetries: whether training maps are turned and mirrored.
+        augmentation: how training maps are varied.
         crop: cells of a side of the squares to train and to measure on; 0 takes whole maps.
-        in_memory: hold all maps in memory.
-        workers: processes that read ahead; 0 reads in this one.
-        valid_every: n where it is every n-th map of `valid` that counts.
+        loading: how maps are read.
         masks: what of the maps is seen; all where there are none.
 
     Raises:
@@ -194,21 +220,18 @@ class MapData(lightning.LightningDataModule):
         batch_size: int,
         seed: int,
         fields: Sequence[str] = ("rgb", "class_id"),
-        jitter: float = 0.0,
-        symmetries: bool = True,
+        augmentation: Augmentation = Augmentation(),
         crop: int = 0,
-        in_memory: bool = False,
-        workers: int = 0,
-        valid_every: int = 1,
+        loading: Loading = Loading(),
         masks: RandomMasks | None = None,
     ) -> None:
         """Opens the splits."""
         super().__init__()
-        self.batch_size, self.seed, self.jitter, self.workers = batch_size, seed, jitter, workers
-        self.symmetries = symmetries
+        self.batch_size, self.seed, self.workers = batch_size, seed, loading.workers
+        self.augmentation = augmentation
         self.train, self.valid = (
-            MapDataset(dataset.path, split, fields, in_memory, crop, seed, every, masks)
-            for split, every in ((TRAIN, 1), (VALID, valid_every))
+            MapDataset(dataset.path, split, fields, loading.in_memory, crop, seed, every, masks)
+            for split, every in ((TRAIN, 1), (VALID, loading.valid_every))
         )
 
     def scale(self, inputs: Sequence[str]) -> dict[str, LayerScale]:
@@ -242,8 +265,10 @@ class MapData(lightning.LightningDataModule):
         """Augmented batches in random order."""
         height, width = self.train.dataset.grid.shape
         square = height == width or self.train.crop
-        symmetries = (0,) if not self.symmetries else _SYMMETRIES if square else _SYMMETRIES_OF_RECTANGLE
-        return self._load(self.train, symmetries=symmetries, jitter=self.jitter, shuffle=True)
+        symmetries = _SYMMETRIES if square else _SYMMETRIES_OF_RECTANGLE
+        if not self.augmentation.symmetries:
+            symmetries = (0,)
+        return self._load(self.train, symmetries=symmetries, jitter=self.augmentation.jitter, shuffle=True)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """Batches as stored, in order."""

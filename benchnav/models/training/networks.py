@@ -40,6 +40,8 @@ from benchnav.models.training.conformal import check_valid, conformal_table, sto
 from benchnav.models.training.data import (
     TRAIN,
     VALID,
+    Augmentation,
+    Loading,
     MapData,
     MapDataset,
     open_dataset,
@@ -248,11 +250,16 @@ def fit_network(
         calibrated.
     """
     config, network = trainable.config, trainable.kind(trainable.config)
+    augmentation = Augmentation(jitter=config.jitter, symmetries=config.symmetries)
+    loading = Loading(
+        in_memory=options.in_memory,
+        workers=options.workers,
+        valid_every=stopping_every(options.conformal),
+    )
+    masks = masks_of(config, dataset)
     data = MapData(
-        dataset, config.batch_size, seed, fields_of(network), config.jitter, config.symmetries, config.crop,
-        in_memory=options.in_memory, workers=options.workers, valid_every=stopping_every(options.conformal),
-        masks=masks_of(config, dataset),
-    )  # fmt: skip
+        dataset, config.batch_size, seed, fields_of(network), augmentation, config.crop, loading, masks
+    )
     network.build(data.scale(network.inputs), class_names(dataset), seed)
     early = [EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)]
     metrics = fit(

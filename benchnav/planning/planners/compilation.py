@@ -47,11 +47,11 @@ class Fused(Generic[R]):
     holds its own verdict: one that cannot be compiled leaves all others as they are.
 
     Args:
-        function: takes and returns tensors, one of them first; it must not change its arguments.
+        function: takes and returns tensors, one of them first, alone or in named tuples; it must not change them.
         rollouts: how many of an episode a call is for.
         least: so many are worth the seconds that compiling takes. Fewer run eagerly, which takes the same time however
             few they are.
-        batched: places of the arguments whose first dimension is that of the episodes.
+        batched: indices of the arguments whose first dimension is that of the episodes, each item of a tuple counted.
     """
 
     def __init__(
@@ -66,15 +66,17 @@ class Fused(Generic[R]):
 
     def __call__(self, *args: Any) -> R:
         """Calls the function."""
-        if self.compiled is None and (
-            _is_switched_off() or not worth_compiling(self._rollouts, self._least, args[0].device)
-        ):
-            self.compiled = False
         if self.compiled is False:
             return self._function(*args)
-        signature = self._signature(args)
+        items = [item for arg in args for item in (arg if isinstance(arg, tuple) else (arg,))]
+        if self.compiled is None and (
+            _is_switched_off() or not worth_compiling(self._rollouts, self._least, items[0].device)
+        ):
+            self.compiled = False
+            return self._function(*args)
+        signature = self._signature(items)
         try:
-            result = self._call(args, signature)
+            result = self._call([type(arg) for arg in args], items, signature)
         except (torch._dynamo.exc.TorchDynamoException, torch._dynamo.exc.FailOnRecompileLimitHit) as error:
             self.compiled = False
             reason = str(error).strip().splitlines()[0]
@@ -84,37 +86,56 @@ class Fused(Generic[R]):
         self.compiled = True
         return result
 
-    def _call(self, args: tuple[Any, ...], signature: tuple[object, ...]) -> R:
+    def _call(self, kinds: list[type], items: list[Any], signature: tuple[object, ...]) -> R:
         """Runs what is compiled, for a new signature under the settings of compiling."""
         if self._fused is None:
-            self._fused = torch.compile(self._function, dynamic=False, fullgraph=True)
+            self._fused = torch.compile(_of_items(self._function, kinds), dynamic=False, fullgraph=True)
         if signature in self._seen:
             try:
-                return self._fused(*args)
+                return self._fused(*items)
             except torch._dynamo.exc.FailOnRecompileLimitHit:
                 pass  # what it was compiled for has changed in what the signature does not tell
-        with _compiling(checked=not all(_is_ours(arg) for arg in args)):
-            for place in self._batched:
-                if (
-                    args[place] is not None and len(args[place]) > 1
-                ):  # the number of episodes may be any, but one
-                    torch._dynamo.maybe_mark_dynamic(args[place], 0)
-            return self._fused(*args)
+        with _compiling(checked=not all(map(_is_ours, items))):
+            for index in self._batched:
+                # The number of episodes may be any, except one.
+                if items[index] is not None and len(items[index]) > 1:
+                    torch._dynamo.maybe_mark_dynamic(items[index], 0)
+            return self._fused(*items)
 
-    def _signature(self, args: tuple[object, ...]) -> tuple[object, ...]:
+    def _signature(self, items: list[Any]) -> tuple[object, ...]:
         """What a call is compiled for: shapes, dtypes and devices of tensors, the other arguments, PyTorch's modes."""
         found: list[object] = [
             torch.is_inference_mode_enabled(),
             torch.is_grad_enabled(),
             torch.get_num_threads(),
         ]
-        for place, arg in enumerate(args):
-            if isinstance(arg, torch.Tensor):
-                shape = (len(arg) > 1, arg.shape[1:]) if place in self._batched else arg.shape
-                found.append((shape, arg.dtype, arg.device))
+        for index, item in enumerate(items):
+            if isinstance(item, torch.Tensor):
+                shape = (len(item) > 1, item.shape[1:]) if index in self._batched else item.shape
+                found.append((shape, item.dtype, item.device))
             else:
-                found.append(_key(arg))
+                found.append(_key(item))
         return tuple(found)
+
+
+def _of_items(function: Callable[..., R], kinds: list[type]) -> Callable[..., R]:
+    """Return a function of single items, whose checks at each call are cheaper than those of tuples.
+
+    Args:
+        function: takes arguments of these kinds.
+        kinds: types of its arguments; a named tuple stands for its items.
+    """
+    sizes = [len(kind._fields) if issubclass(kind, tuple) else 0 for kind in kinds]  # type: ignore[attr-defined]
+
+    def call(*items: Any) -> R:
+        args: list[Any] = []
+        first = 0
+        for kind, size in zip(kinds, sizes, strict=True):
+            args.append(kind(*items[first : first + size]) if size else items[first])
+            first += size or 1
+        return function(*args)
+
+    return call
 
 
 @contextmanager

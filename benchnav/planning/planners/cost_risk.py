@@ -10,21 +10,21 @@ for lookups.
 """
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from benchnav.core.grid import Grid
-from benchnav.planning.objective import Objective
-from benchnav.planning.planners.noise_bank import perturb
+from benchnav.planning.planners.noise_bank import Sampled, sampled_actions
 from benchnav.planning.problem import (
+    Dynamics,
     Problem,
     ground_map,
     motion_traversability,
     predicted_traversability,
     stage_cost,
 )
-from benchnav.planning.robots import Robot, component_wise
+from benchnav.planning.robots import component_wise
 
 
 def framed_fields(problem: Problem, fields: Tensor) -> Tensor:
@@ -74,43 +74,58 @@ def tail_cost(cost: Tensor, level: float) -> Tensor:
     return (most[:, :-1].sum(1) + (worst - count + 1) * most[:, -1]) / worst
 
 
+class Entrapment(NamedTuple):
+    """What immobilises a robot for good, and what that costs.
+
+    Args:
+        goal: (x, y) of the goal, shape [B, 1, 2].
+        steps_left: from the first step of a rollout until the time is over, shape [B, 1].
+        goal_radius_m: how near the goal a robot has reached it.
+        below: λ under which terrain immobilises a robot.
+        max_steps: consecutive steps on such terrain after which a robot is immobilised.
+    """
+
+    goal: Tensor
+    steps_left: Tensor
+    goal_radius_m: float
+    below: float
+    max_steps: int
+
+
 def advance_entrapped(
-    states: Tensor, cost: Tensor, held: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
-    padded_ground: Tensor, target: Tensor, goal: Tensor, steps_left: Tensor, grid: Grid, robot: Robot,
-    objective: Objective, min_traversability: float, goal_radius_m: float, below: float, most: int,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    states: Tensor,
+    cost: Tensor,
+    held: Tensor,
+    sampled: Sampled,
+    padded_ground: Tensor,
+    target: Tensor,
+    entrapment: Entrapment,
+    dynamics: Dynamics,
+) -> tuple[Tensor, Tensor, Tensor]:
     """Rolls samples out as `mppi.advance_chunk` does, where ground of little λ immobilises a robot.
 
-    One that was on such ground for `most` steps in a row stops there, and pays J of standing there, with the penalty
-    of ground that is not free, until its time is over. Its states go on, and cost nothing more. One that has been at
-    the goal has arrived, and is not immobilised on ground behind it.
+    One that was on such ground for `max_steps` steps in a row stops there, and pays J of standing there, with the
+    penalty of ground that is not free, until its time is over. Its states go on, and cost nothing more. One that has
+    been at the goal has arrived, and is not immobilised on ground behind it.
 
     Args:
         states: shape [B, K, S].
         cost: so far, shape [B, K].
-        held: steps in a row on immobilising ground, shape [B, K]; `most` of one that has stopped, −1 of one that has
-            arrived.
-        mean: of the actions, shape [B, T, A].
-        noise: added to it, shape [T, A, K].
-        low: least actions, shape [A].
-        high: greatest actions, shape [A].
+        held: steps in a row on immobilising ground, shape [B, K]; `max_steps` of one that has stopped, −1 of one
+            that has arrived.
+        sampled: action sequences.
         padded_ground: as of `Problem`, shape [B, N].
         target: (x, y) to be reached, shape [B, 1, 2].
-        goal: (x, y) of the goal, shape [B, 1, 2].
-        steps_left: from the first of these steps until the time is over, shape [B, 1].
-        grid: of the maps.
-        robot: F.
-        objective: J.
-        min_traversability: least λ of motion.
-        goal_radius_m: how near the goal a robot has arrived.
-        below: λ under which ground immobilises a robot.
-        most: steps in a row on such ground after which a robot is immobilised.
+        entrapment: what immobilises a robot.
+        dynamics: of the problem.
 
     Returns:
         States, cost and `held` after these steps.
     """
-    for step in range(mean.shape[1]):
-        action = perturb(mean[:, step, :, None], noise[step], low, high).movedim(1, 2)
+    goal, steps_left, goal_radius_m, below, most = entrapment
+    grid, robot, objective, min_traversability = dynamics
+    for step in range(sampled.mean.shape[1]):
+        action = sampled_actions(sampled, step)
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
         traversability, going = predicted_traversability(ground), held < most
         away = torch.hypot(states[..., 0] - goal[..., 0], states[..., 1] - goal[..., 1])

@@ -27,7 +27,7 @@ in any batch.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -41,24 +41,31 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import Objective, has_path_cost
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.cost_risk import advance_entrapped, framed_fields, tail_cost, within_reach
-from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank, perturb
+from benchnav.planning.planners.cost_risk import (
+    Entrapment,
+    advance_entrapped,
+    framed_fields,
+    tail_cost,
+    within_reach,
+)
+from benchnav.planning.planners.noise_bank import NoiseBank, Sampled, draw_bank, perturb, sampled_actions
 from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
 from benchnav.planning.planners.turns import choose, is_steered
 from benchnav.planning.problem import (
+    Dynamics,
     Problem,
     Task,
     motion_traversability,
     stage_cost,
     terminal_cost,
 )
-from benchnav.planning.robots import Robot, component_wise, steps_in
+from benchnav.planning.robots import component_wise, steps_in
 from benchnav.planning.sensing.sensor import Step
 
 # A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
 _CHUNK_STEPS = 10
 OF_EPISODES = (0, 1, 2, 6, 7)  # arguments of what is compiled: states, cost, mean, padded_ground, target
-# states, cost, held, mean, padded_ground, target, goal, steps_left
+# states, cost, held, mean, padded_ground, target, goal, steps_left of what is compiled with entrapment
 ENTRAPPED_OF_EPISODES = (0, 1, 2, 3, 7, 8, 9, 10)
 _DRAWN_SAMPLES = 40
 _LEAST_TAIL = 10  # fields in the tail of which a cost is the mean
@@ -182,7 +189,7 @@ class MPPI(LocalPlanner[MPPIState]):
         rollouts, least = self.config.samples * self._fields, self.worth_compiling
         self._advance = Fused(advance_chunk, rollouts, least, batched=OF_EPISODES)
         self._advance_entrapped = Fused(advance_entrapped, rollouts, least, batched=ENTRAPPED_OF_EPISODES)
-        self._weigh = Fused(weigh, rollouts, least, batched=(*OF_EPISODES, 14, 15))  # going, to_go
+        self._weigh = Fused(weigh, rollouts, least, batched=(*OF_EPISODES, 12, 13))  # going, to_go
 
     @property
     def seeks_goal(self) -> bool:
@@ -279,31 +286,39 @@ class MPPI(LocalPlanner[MPPIState]):
         """Solves one step; see `LocalPlanner`."""
         problem, config = plan_state.problem, self.config
         noise, ground = plan_state.noise.at(plan_state.step), self._ground(plan_state, step.state)
-        held = self._held(plan_state, step)
-        mean, follows = self._turned(step, plan_state, target_m, ground, held)
-        advance = self._advance if held is None else self._advance_entrapped
-        states, cost, going = roll_out(
-            problem, step.state, mean, noise, target_m, advance, ground, held, step.time_s
-        )
+        dwell = self._dwell(plan_state, step)
+        mean, follows = self._turned(step, plan_state, target_m, ground, dwell)
+        advance = self._advance if dwell is None else self._advance_entrapped
+        states, cost, going = roll_out(problem, step.state, mean, noise, target_m, advance, ground, dwell)
         if config.control_cost:
             own = control_cost(mean, noise, plan_state.noise.scale)
             cost = cost + config.control_cost * own.repeat_interleave(self._fields, 0)
-        target = target_m[:, None].repeat_interleave(self._fields, 0).contiguous()
         weights, updated = self._weigh(
-            states, cost, mean, noise, *problem.action_bounds, ground, target, problem.grid, problem.objective,
-            config.temperature, config.temperature_share, self._fields, config.level, going,
-            plan_state.to_go,
-        )  # fmt: skip
+            states,
+            cost,
+            Sampled(mean, noise, *problem.action_bounds),
+            self._ends(plan_state, target_m, ground, going),
+            config.temperature,
+            config.temperature_share,
+        )
         if is_steered(problem.robot):
             updated = torch.where(follows[:, None, None], mean, updated)
         shifted = torch.cat((updated[:, 1:], updated[:, -1:]), dim=1)
         layers = _drawn(problem, step.state, updated, mean, noise, weights) if step.draw else {}
         plan = Plan.empty(len(problem), step.state.device, **layers)
         after = replace(plan_state, mean=shifted, follows=follows, step=plan_state.step + 1)
-        return updated[:, 0], after if held is None else replace(after, held=held), plan
+        return updated[:, 0], after if dwell is None else replace(after, held=dwell.held), plan
+
+    def _ends(self, plan_state: MPPIState, target_m: Tensor, ground: Tensor, going: Tensor | None) -> "Ends":
+        problem = plan_state.problem
+        target = target_m[:, None].repeat_interleave(self._fields, 0).contiguous()
+        return Ends(
+            ground, target, problem.grid, problem.objective,
+            self._fields, self.config.level, going, plan_state.to_go,
+        )  # fmt: skip
 
     def _turned(
-        self, step: Step, plan_state: MPPIState, target_m: Tensor, ground: Tensor, held: Tensor | None
+        self, step: Step, plan_state: MPPIState, target_m: Tensor, ground: Tensor, dwell: "Dwell | None"
     ) -> tuple[Tensor, Tensor]:
         """Mean action sequences or turns, shape [B, T, A], and which are of Dubins paths, [B]; see `turns.choose`."""
         problem, mean = plan_state.problem, plan_state.mean
@@ -311,13 +326,11 @@ class MPPI(LocalPlanner[MPPIState]):
             return mean, plan_state.follows
 
         def cost_of(base: Tensor, offset: Tensor) -> Tensor:
-            advance = advance_chunk if held is None else advance_entrapped
+            advance = advance_chunk if dwell is None else advance_entrapped
             states, cost, going = roll_out(
-                problem, step.state, base, offset, target_m, advance, ground, held, step.time_s
+                problem, step.state, base, offset, target_m, advance, ground, dwell
             )
-            target = target_m[:, None].repeat_interleave(self._fields, 0)
-            parts = problem.grid, problem.objective, self._fields, self.config.level, going, plan_state.to_go
-            return total_cost(states, cost, ground, target, *parts)[0]
+            return total_cost(states, cost, self._ends(plan_state, target_m, ground, going))[0]
 
         return choose(cost_of, mean, problem, step.state, target_m, ground, plan_state.follows)
 
@@ -332,12 +345,13 @@ class MPPI(LocalPlanner[MPPIState]):
         cells = within_reach(problem, state, plan_state.mean.shape[1] * problem.dt_s)
         return framed_fields(problem, problem.sample_fields(self._fields, key, cells))
 
-    def _held(self, plan_state: MPPIState, step: Step) -> Tensor | None:
-        """Steps in a row on immobilising ground, shape [B]; None without entrapment."""
+    def _dwell(self, plan_state: MPPIState, step: Step) -> "Dwell | None":
+        """How long robots have been on immobilising terrain; None without entrapment."""
         immobile = plan_state.problem.immobile
         if not self.config.entrapment or immobile is None:
             return None
-        return torch.where(step.traversability < immobile.below, plan_state.held + 1, 0)
+        held = torch.where(step.traversability < immobile.below, plan_state.held + 1, 0)
+        return Dwell(held, step.time_s)
 
 
 def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
@@ -354,6 +368,42 @@ def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
     return torch.einsum("bta,tak->bk", mean / scale**2, noise)
 
 
+class Dwell(NamedTuple):
+    """How long robots have been on immobilising terrain.
+
+    Args:
+        held: consecutive steps, up to now, shape [B].
+        time_s: since the start.
+    """
+
+    held: Tensor
+    time_s: float
+
+
+class Ends(NamedTuple):
+    """What the last states of rollouts are judged by.
+
+    Args:
+        padded_ground: M maps of an episode after another, shape [B·M, N].
+        target: (x, y) to be reached, shape [B·M, 1, 2].
+        grid: size and resolution of the maps.
+        objective: J.
+        fields: M.
+        level: of the CVaR over them.
+        going: which rollouts have not stopped, bool, shape [B·M, K]; None if none stops.
+        to_go: of the cheapest paths, as of `astar.framed`, shape [B, 2, N]; None if J tells the last cost.
+    """
+
+    padded_ground: Tensor
+    target: Tensor
+    grid: Grid
+    objective: Objective
+    fields: int = 1
+    level: float = 0.0
+    going: Tensor | None = None
+    to_go: Tensor | None = None
+
+
 def roll_out(
     problem: Problem,
     state: Tensor,
@@ -362,8 +412,7 @@ def roll_out(
     target_m: Tensor,
     advance: Callable[..., Any],
     ground: Tensor | None = None,
-    held: Tensor | None = None,
-    time_s: float = 0.0,
+    dwell: Dwell | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Rolls sampled action sequences out, summing J and the penalty of ground that is not free.
 
@@ -373,13 +422,12 @@ def roll_out(
         mean: mean action sequences, shape [B, T, A].
         noise: added to every mean and clipped to the action bounds, shape [T, A, K].
         target_m: (x, y) to be reached, shape [B, 2].
-        advance: `advance_chunk`, with `held` `advance_entrapped`, or the same compiled.
+        advance: `advance_chunk`, with `dwell` `advance_entrapped`, or the same compiled.
         ground: M maps of an episode after another, as of `framed_fields`, shape [B·M, N]; None for λ̂.
-        held: steps in a row, up to now, on immobilising ground, shape [B]; None without entrapment.
-        time_s: since the start, of which `held` has use.
+        dwell: how long robots have been on immobilising terrain; None without entrapment.
 
     Returns:
-        The last states, shape [B·M, K, S], the cost but for theirs, shape [B·M, K], and, with `held`, which have not
+        The last states, shape [B·M, K, S], the cost but for theirs, shape [B·M, K], and, with `dwell`, which have not
         stopped, bool of that shape.
     """
     ground = problem.padded_ground if ground is None else ground
@@ -389,35 +437,34 @@ def roll_out(
     # Contiguous, as all that is passed on: another layout is compiled for anew.
     target = target_m[:, None].contiguous()
     cost = state.new_zeros(states.shape[:2])
-    parts = problem.grid, problem.robot, problem.objective, problem.task.rules.min_traversability
-    if held is None or problem.immobile is None:
-        for chunk in _chunks(mean.shape[1]):
-            given = mean[:, chunk].contiguous(), noise[chunk], *problem.action_bounds, ground, target
-            states, cost = advance(states, cost, *given, *parts)
+    chunks = [
+        slice(first, min(first + _CHUNK_STEPS, mean.shape[1]))
+        for first in range(0, mean.shape[1], _CHUNK_STEPS)
+    ]
+    parts = [Sampled(mean[:, chunk].contiguous(), noise[chunk], *problem.action_bounds) for chunk in chunks]
+    dynamics = problem.dynamics
+    if dwell is None or problem.immobile is None:
+        for sampled in parts:
+            states, cost = advance(states, cost, sampled, ground, target, dynamics)
         return states, cost, None
     most = steps_in(problem.immobile.for_s, problem.dt_s)
-    rows = held.repeat_interleave(count, 0)[:, None].expand_as(cost).clamp(max=most - 1).contiguous()
-    left = ((problem.time_budget_s - time_s) / problem.dt_s).round().to(state)
+    held = dwell.held.repeat_interleave(count, 0)[:, None].expand_as(cost).clamp(max=most - 1).contiguous()
+    left = ((problem.time_budget_s - dwell.time_s) / problem.dt_s).round().to(state)
     left = left.repeat_interleave(count, 0)[:, None]
     goal = problem.goal_m.repeat_interleave(count, 0)[:, None].contiguous()
-    held_by = problem.goal_radius_m, problem.immobile.below, most
-    for chunk in _chunks(mean.shape[1]):
-        given = mean[:, chunk].contiguous(), noise[chunk], *problem.action_bounds, ground, target
-        states, cost, rows = advance(states, cost, rows, *given, goal, left - chunk.start, *parts, *held_by)
-    return states, cost, rows < most
-
-
-def _chunks(horizon: int) -> list[slice]:
-    return [slice(first, min(first + _CHUNK_STEPS, horizon)) for first in range(0, horizon, _CHUNK_STEPS)]
+    for chunk, sampled in zip(chunks, parts, strict=True):
+        rules = Entrapment(goal, left - chunk.start, problem.goal_radius_m, problem.immobile.below, most)
+        states, cost, held = advance(states, cost, held, sampled, ground, target, rules, dynamics)
+    return states, cost, held < most
 
 
 def advance_chunk(
-    states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
-    padded_ground: Tensor, target: Tensor, grid: Grid, robot: Robot, objective: Objective, min_traversability: float,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Rolls samples out over a chunk of the horizon, adding up their costs; takes a problem in its parts."""
-    for step in range(mean.shape[1]):
-        action = perturb(mean[:, step, :, None], noise[step], low, high).movedim(1, 2)
+    states: Tensor, cost: Tensor, sampled: Sampled, padded_ground: Tensor, target: Tensor, dynamics: Dynamics
+) -> tuple[Tensor, Tensor]:
+    """Roll samples out over a chunk of the horizon, and add up their costs; takes a problem in its parts."""
+    grid, robot, objective, min_traversability = dynamics
+    for step in range(sampled.mean.shape[1]):
+        action = sampled_actions(sampled, step)
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
         cost = cost + stage_cost(objective, states, action, ground, target)
         states = robot(states, action, motion_traversability(ground, min_traversability))
@@ -425,29 +472,28 @@ def advance_chunk(
 
 
 def weigh(
-    states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
-    padded_ground: Tensor, target: Tensor, grid: Grid, objective: Objective,
-    temperature: float | None, temperature_share: float, fields: int = 1, level: float = 0.0,
-    going: Tensor | None = None, to_go: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    states: Tensor,
+    cost: Tensor,
+    sampled: Sampled,
+    ends: Ends,
+    temperature: float | None,
+    temperature_share: float,
+) -> tuple[Tensor, Tensor]:
     """Adds the cost of the last states, weighs the samples by exp(−cost / temperature) and moves the mean.
 
     Returns:
         Weights of the samples, shape [B, K], and the mean action sequences, shape [B, T, A].
     """
-    cost, each = total_cost(states, cost, padded_ground, target, grid, objective, fields, level, going, to_go)
+    cost, each = total_cost(states, cost, ends)
     scale: Tensor | float | None = temperature
     if scale is None:
-        stopped = None if going is None else (~going).unflatten(0, (-1, fields)).sum(1)
+        stopped = None if ends.going is None else (~ends.going).unflatten(0, (-1, ends.fields)).sum(1)
         scale = temperature_share * cost_spread(cost, each, stopped)
     weights = torch.softmax((cost.amin(dim=1, keepdim=True) - cost) / scale, dim=1)
-    return weights, average(mean, noise, weights, low, high)
+    return weights, average(sampled.mean, sampled.noise, weights, sampled.low, sampled.high)
 
 
-def total_cost(
-    states: Tensor, cost: Tensor, padded_ground: Tensor, target: Tensor, grid: Grid, objective: Objective,
-    fields: int = 1, level: float = 0.0, going: Tensor | None = None, to_go: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+def total_cost(states: Tensor, cost: Tensor, ends: Ends) -> tuple[Tensor, Tensor]:
     """Add the cost of the last states.
 
     Of rollouts on M fields the cost is the CVaR over them; those that have stopped have paid all that there is to pay.
@@ -455,6 +501,7 @@ def total_cost(
     Returns:
         Cost of the samples, shape [B, K], and on each field, shape [B, M, K].
     """
+    padded_ground, target, grid, objective, fields, level, going, to_go = ends
     ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
     if to_go is None:
         last = terminal_cost(objective, states, ground, target)

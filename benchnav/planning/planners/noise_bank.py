@@ -4,6 +4,7 @@ Letters in shapes: A action dimensions, T horizon steps, K samples, N numbers of
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -49,6 +50,28 @@ class NoiseBank:
         # Row i of the windows is the run that begins at number i; nothing is copied before the selection.
         windows = self.values.as_strided((self.values.numel() - self.samples + 1, self.samples), (1, 1))
         return windows.index_select(0, begin.flatten()).view(horizon, actions, self.samples)
+
+
+class Sampled(NamedTuple):
+    """Action sequences about a mean.
+
+    Args:
+        mean: u, shape [B, T, A].
+        noise: ε as drawn, shape [T, A, K].
+        low: minimum actions, shape [A].
+        high: maximum actions, shape [A].
+    """
+
+    mean: Tensor
+    noise: Tensor
+    low: Tensor
+    high: Tensor
+
+
+def sampled_actions(sampled: Sampled, step: int) -> Tensor:
+    """Return the actions of a step of the horizon, clip(u + ε), shape [B, K, A]."""
+    mean, noise, low, high = sampled
+    return perturb(mean[:, step, :, None], noise[step], low, high).movedim(1, 2)
 
 
 def perturb(mean: Tensor, noise: Tensor, low: Tensor, high: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import pytest
 
 from benchnav.core.errors import BenchnavError
 from benchnav.datagen.dem.importer import import_dem
-from benchnav.datagen.dem.raster import GroundOptions, Rasters
+from benchnav.datagen.dem.raster import Cut, GroundOptions, Rasters
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.reader import TerrainDataset
 from tests.factories import tiny_recipe
@@ -64,8 +64,14 @@ def run(dem: Path | str, out: Path, settings: dict[str, Any]) -> list[tuple[int,
         name: settings.pop(name) for name in ("class_ids", "random_classes", "layer") if name in settings
     }
     ground = {name: settings.pop(name) for name in ("dem_unit", "origin", "max_maps") if name in settings}
-    options = GroundOptions(**ground)
-    return list(import_dem(str(dem), out, rasters=Rasters(**files, **plain), ground=options, **settings))
+    cut = cut_of(settings, ground=GroundOptions(**ground))
+    return list(import_dem(str(dem), out, rasters=Rasters(**files, **plain), cut=cut, **settings))
+
+
+def cut_of(settings: dict[str, Any], **more: Any) -> Cut:
+    """Take the settings of `Cut` out of others."""
+    names = ("shares", "scenario", "stride_m", "solvable")
+    return Cut(**{name: settings.pop(name) for name in names if name in settings}, **more)
 
 
 def read(dem: Path | str, folder: Path | None = None, suffix: str = ".h5", **settings: Any) -> TerrainDataset:

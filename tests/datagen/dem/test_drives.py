@@ -25,7 +25,7 @@ from benchnav.datagen.files.merge import merge
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from tests.commands import call
-from tests.datagen.dem.rasters import COUNTER, RECIPE, SOUTH, WEST, rough, source_of, write
+from tests.datagen.dem.rasters import COUNTER, RECIPE, SOUTH, WEST, cut_of, rough, source_of, write
 
 rasterio = pytest.importorskip("rasterio")
 
@@ -85,7 +85,8 @@ def imported(
         "shares": THREE,
         "rasters": Rasters(photo=str(dem.parent / "photo.tif"), unlabelled=True),
     } | settings
-    list(import_dem(str(dem), out, drives=drives, **settings))
+    cut = cut_of(settings)
+    list(import_dem(str(dem), out, drives=drives, cut=cut, **settings))
     assert find_faults(out) == []
     return TerrainDataset(out)
 

@@ -15,7 +15,7 @@ from benchnav.core.errors import BenchnavError, ConfigError, DatasetError
 from benchnav.datagen.dem import importer
 from benchnav.datagen.dem.extent import GroundError
 from benchnav.datagen.dem.importer import import_dem
-from benchnav.datagen.dem.raster import GroundOptions, Layer
+from benchnav.datagen.dem.raster import Cut, GroundOptions, Layer
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.merge import merge
 from benchnav.datagen.files.reader import TerrainDataset
@@ -428,7 +428,7 @@ def test_the_paragraph_gives_maps_size_unit_and_origin_before_anything_is_read(
         str(dem),
         tmp_path / "o.h5",
         RECIPE,
-        ground=GroundOptions(origin=(WEST + 1, SOUTH + 2), max_maps=10**6),
+        cut=Cut(ground=GroundOptions(origin=(WEST + 1, SOUTH + 2), max_maps=10**6)),
         announce=said.append,
     )
     with pytest.raises(pytest.fail.Exception):
@@ -451,7 +451,7 @@ def test_ground_that_does_not_fit_is_rejected_with_settings_that_do(tmp_path: Pa
     assert caught.value.changes["resolution_m"] == 10
     assert caught.value.stride_m is None
     with pytest.raises(ConfigError, match="`max_maps`"):
-        next(import_dem(str(dem), tmp_path / "o.h5", RECIPE, ground=GroundOptions(max_maps=0)))
+        next(import_dem(str(dem), tmp_path / "o.h5", RECIPE, cut=Cut(ground=GroundOptions(max_maps=0))))
 
 
 def test_an_origin_is_the_corner_of_the_first_map_around_drives_too(tmp_path: Path) -> None:

@@ -156,7 +156,8 @@ def test_a_recipe_with_a_layer_is_changed_by_its_place_in_the_list(
 def test_a_layer_of_this_process_only_is_not_made_in_two(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(registry, "_REGISTERED", {("layer", "mine"): Plain})
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    registry.register("layer", "mine", Plain)
     recipe = recipe_from_dict(small_stakes().to_dict() | {"layers": ["mine"]}, "test")
     with pytest.raises(ConfigError, match="one process with layer 'plain'"):
         next(create_dataset(recipe, tmp_path / "d.h5", jobs=2))

@@ -66,3 +66,12 @@ def test_the_order_of_columns_and_those_without_a_value_do_not_count() -> None:
     missing = pa.array(np.full(3, np.nan, np.float32))
     wider = TABLE.select(TABLE.column_names[::-1]).append_column("steering_rad", missing)
     assert content_digest(wider) == content_digest(TABLE)
+
+
+def test_files_without_a_digest_are_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "unit.parquet"
+    for table in (TABLE.replace_schema_metadata({b"benchnav": b'{"key": "k"}'}), TABLE):
+        pq.write_table(table, path)
+        assert metadata(path) == {}
+        with pytest.raises(DamageError):
+            read_sealed(path)

@@ -13,12 +13,12 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard
 from benchnav.core.tables import to_terminal
 from benchnav.eval.compare import compare_runs
-from benchnav.eval.experiment.condition import conditions_of
+from benchnav.eval.experiment.condition import conditions_of, scenarios_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.run_folder import caveats, open_run
 from benchnav.eval.report.write import print_report, write_report
 from benchnav.eval.run.begin import Work, begin
-from benchnav.eval.run.check import check_suite, scenarios_of
+from benchnav.eval.run.check import check_suite
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.rerun import rerun
 from benchnav.eval.run.runner import run_suite
@@ -91,6 +91,16 @@ def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
 def test_a_run_in_which_nothing_is_left_is_refused(dataset_path: Path, tmp_path: Path) -> None:
     suite = suite_on(dataset_path, planners=(STEERING,), robots=("bicycle",))
     with pytest.raises(ConfigError, match="Expected a robot with actions"):
+        list(run_suite(suite, tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_world_without_a_feasible_path_is_refused_before_anything_is_run(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    world = {"preset": "stakes", "immobile": {"below": 0.999, "for_s": 2}, "time_budget_s": 3.0}
+    suite = suite_on(dataset_path, planners=(FREE,), robots=("unicycle",), world=world)
+    with pytest.raises(ConfigError, match="Expected a feasible path from start to goal"):
         list(run_suite(suite, tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 

@@ -26,7 +26,7 @@ from benchnav.planning.free_space import FreeSpace, Immobile, Rules, cells_at_go
 from benchnav.planning.objective import TravelTime
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig
 from benchnav.planning.planners.astar.dwa import DWAConfig
-from benchnav.planning.problem import Problem, Task, pose_problem
+from benchnav.planning.problem import Prediction, Problem, Task, pose_problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.belief import Belief, Predicted, Static
 from benchnav.planning.sensing.classes import Classes
@@ -98,7 +98,7 @@ def drives(seed: int = 0, replan_every_s: float = 0.5, **changes: Any) -> Drives
     rules = replace(RULES, replan_every_s=replan_every_s)
     task = Task(robot=Unicycle(), objective=TravelTime(robot=Unicycle(), goal_radius_m=1.0), rules=rules)
     simulation = Simulation(terrain, task, WORLD, places, rng.stream_key(0, "noise"), range(BATCH))
-    problem = pose_problem(task, terrain.observe(), truth, measure(truth), start, goal, 24.0)
+    problem = pose_problem(task, Prediction(terrain.observe(), truth, measure(truth)), start, goal, 24.0)
     known = Truth(terrain=terrain, field=field, keys=KEYS)
     how = learning(problem, known, **changes)
     believed = how.learner.distribution(how.start)

@@ -15,7 +15,6 @@ from benchnav.core.errors import ConfigError
 from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.eval.compare import compare_runs
 from benchnav.eval.experiment.condition import KNOWLEDGE
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
@@ -23,7 +22,6 @@ from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder.provenance import describe_parts
 from benchnav.eval.folder.run_folder import EPISODES, ERRORS, differences, open_run, read_table
 from benchnav.eval.folder.steps import read_steps
-from benchnav.eval.report.write import write_report
 from benchnav.eval.run.recordings import find_recording
 from benchnav.eval.run.rerun import compare, rerun
 from benchnav.eval.run.runner import run_suite
@@ -35,7 +33,6 @@ from benchnav.planning.sensing.sensor import Moment, Probe
 from benchnav.planning.world.lower_bound import Motion, lower_bound_s
 from tests import factories
 from tests.commands import call
-from tests.eval.forged import forge_run
 
 DRIVES = {"part": "tests.eval.parts:Faulty", "label": "ahead", "options": {"after_s": 1e9}}
 SEARCHES = {"part": "astar_dwa", "options": {"dwa": {"turn_rates": 7, "horizon_s": 1.5}}}
@@ -422,33 +419,6 @@ def test_other_statistics_of_the_ground_are_another_origin(dataset_path: Path, t
         assert changed == (condition.sensor.part == "near")
     finish(suite, tmp_path / "run", say=said.append)
     assert any("(statistics of the ground) and are run again" in line for line in said), said
-
-
-def test_runs_of_versions_without_sensors_open_and_compare(dataset_path: Path, tmp_path: Path) -> None:
-    suite = suite_on(dataset_path, planners=(DRIVES, "straight"), sensors=("full",), beliefs=("static",))
-    suite = replace(suite, model=Suite.model, models=("oracle", "clairvoyant"), record="none")
-    rows = finish(suite, tmp_path / "new")
-    run = open_run(tmp_path / "new")
-    learnt = ["revisions", "seen_cells", "sensed_cells", "ahead_rmse", "ahead_log_score", "learning_ms"]
-    entries = {
-        name: {**entry, "labels": {k: v for k, v in entry["labels"].items() if k not in KNOWLEDGE}}
-        for name, entry in run.about["conditions"].items()
-    }
-    about = {name: run.about[name] for name in ("datasets", "suite", "history")}
-    code, *_ = run.about["codes"].values()
-    old = forge_run(
-        tmp_path / "old", rows.drop(columns=[*KNOWLEDGE, *learnt, "code"]), entries, code=code, **about
-    )
-    pd.testing.assert_frame_equal(
-        read_table(old, EPISODES).drop(columns="code"), rows.drop(columns=[*learnt, "code"])
-    )
-    assert open_run(old).conditions == run.conditions
-    write_report(old)
-    table, _ = compare_runs([old, tmp_path / "new"], "run", "", {}, 0.1)
-    assert len(table) == 3
-    # Among the conditions of one run those of today's labels are compared as well.
-    assert len(compare_runs([old], "planner", "", {}, 0.1)[0]) == 2
-    assert len(compare_runs([old], "model", "", {}, 0.1)[0]) == 1
 
 
 def test_the_time_of_a_planner_alone_is_measured_by_what_it_knows(finished: tuple[Suite, Path]) -> None:

@@ -250,9 +250,9 @@ def test_what_cannot_be_repeated_is_refused(suite: Suite, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ((), {"jobs": 1, "scheduler": "", "overwrite": False}),
+        ((), {"jobs": 1, "overwrite": False}),
         (("--jobs", "3", "--overwrite"), {"jobs": 3, "overwrite": True}),
-        (("--backend", "dask", "--scheduler", "tcp://a:1"), {"scheduler": "tcp://a:1"}),
+        (("--backend", "dask", "--scheduler", "tcp://a:1"), {"jobs": "tcp://a:1"}),
     ],
 )
 def test_the_command_repeats_with_the_workers_that_are_asked_for(

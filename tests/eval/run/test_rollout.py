@@ -167,8 +167,8 @@ def home(
         assert planned is not None
         planned.append((step, members, plan.path[:, 0, 0].tolist()))
 
-    watcher = None if planned is None else watch
-    return rollout.run_episodes(planner, problem, simulation, torch.Generator(), watcher, 5)
+    observer = rollout.Observer(plan=None if planned is None else watch, every=5)
+    return rollout.run_episodes(planner, problem, simulation, torch.Generator(), observer)
 
 
 def test_episodes_that_have_ended_are_planned_for_no_more_and_nothing_else_changes() -> None:

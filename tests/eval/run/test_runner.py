@@ -182,7 +182,7 @@ def test_a_killed_run_goes_on_to_the_same_rows(finished: tuple[Suite, Path], tmp
     code = (
         "import sys; from pathlib import Path; from benchnav.eval.experiment.suite import Suite\n"
         "from benchnav.eval.run.runner import run_suite\n"
-        f"for _ in run_suite({suite!r}, Path({str(folder)!r})): pass"
+        f"for _ in run_suite(Suite(**{vars(suite)!r}), Path({str(folder)!r})): pass"
     )
     process = subprocess.Popen([sys.executable, "-c", code])
     while len(list(folder.glob("units/*/*.parquet"))) < 2:
@@ -206,7 +206,7 @@ def test_workers_end_with_a_command_that_was_killed(dataset_path: Path, tmp_path
     code = (
         "from pathlib import Path; from benchnav.eval.experiment.suite import Suite\n"
         "from benchnav.eval.run.runner import run_suite\n"
-        f"for _ in run_suite({suite!r}, Path({str(tmp_path / 'run')!r}), jobs=2): pass"
+        f"for _ in run_suite(Suite(**{vars(suite)!r}), Path({str(tmp_path / 'run')!r}), jobs=2): pass"
     )
     process = subprocess.Popen([sys.executable, "-c", code], start_new_session=True)
     while len(list((tmp_path / "begun").iterdir())) < 2:
@@ -673,7 +673,7 @@ def test_parts_of_this_process_alone_are_refused_for_workers(
     registry.register("planner", "mine", Faulty)
     suite = quick(dataset_path, planners=("mine",))
     assert len(finish(suite, tmp_path / "run")) == 8
-    for options in ({"jobs": 2}, {"planner_limit_s": 9.0}):
+    for options in ({"jobs": 2}, {"settings": Settings(planner_limit_s=9.0)}):
         with pytest.raises(ConfigError, match="jobs"):
             finish(suite, tmp_path / "two", **options)
 

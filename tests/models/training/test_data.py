@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from benchnav.core.errors import DatasetError
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.training.data import MapData, apply_jitter, apply_symmetry
+from benchnav.models.training.data import Augmentation, Loading, MapData, apply_jitter, apply_symmetry
 from benchnav.models.training.map_order import MapKey, MapSampler
 from tests.models.support import make_dataset
 
@@ -53,7 +53,10 @@ def test_order_is_keyed_by_seed_and_epoch() -> None:
 
 @pytest.mark.parametrize("how", [{"in_memory": True}, {"workers": 2}, {"workers": 1, "in_memory": True}])
 def test_batches_are_the_same_however_maps_are_read(dataset: TerrainDataset, how: dict[str, int]) -> None:
-    plain, other = MapData(dataset, 3, 0, jitter=0.2), MapData(dataset, 3, 0, jitter=0.2, **how)
+    plain, other = (
+        MapData(dataset, 3, 0, augmentation=Augmentation(jitter=0.2), loading=loading)
+        for loading in (Loading(), Loading(**how))
+    )
     for load in ("train_dataloader", "val_dataloader"):
         for one, two in zip(getattr(plain, load)(), getattr(other, load)(), strict=True):
             assert all(torch.equal(one[name], two[name]) for name in one)
@@ -71,7 +74,7 @@ def test_maps_are_read_when_they_are_asked_for_or_at_once(
     assert asked == []
     next(iter(lazy.train_dataloader()))
     assert asked == ["train"]
-    held = MapData(dataset, 3, 0, in_memory=True)
+    held = MapData(dataset, 3, 0, loading=Loading(in_memory=True))
     assert asked == ["train", "train", "valid"]
     next(iter(held.train_dataloader()))
     assert len(asked) == 3
@@ -84,7 +87,7 @@ def test_an_epoch_has_every_map_once_in_batches_of_nearly_one_size() -> None:
 
 
 def test_training_maps_are_turned_and_validation_maps_are_not(dataset: TerrainDataset) -> None:
-    data = MapData(dataset, 4, seed=0, jitter=0.1)
+    data = MapData(dataset, 4, seed=0, augmentation=Augmentation(jitter=0.1))
     turned, changed = set(), []
     for _, which, factors, *_ in data.train_dataloader().sampler:
         turned |= set(which.tolist())
@@ -134,7 +137,9 @@ def test_jitter_is_within_its_range_and_valid_maps_are_never_changed(dataset: Te
     assert drawn.min() >= 0.8
     assert drawn.max() <= 1.2
     assert drawn.std() > 0.1
-    plain, jittered = (MapData(dataset, 4, seed=0, jitter=jitter) for jitter in (0.0, 0.5))
+    plain, jittered = (
+        MapData(dataset, 4, seed=0, augmentation=Augmentation(jitter=jitter)) for jitter in (0.0, 0.5)
+    )
     assert torch.equal(*(next(iter(data.val_dataloader()))["rgb"] for data in (plain, jittered)))
     first, second = (next(iter(data.train_dataloader())) for data in (plain, jittered))
     assert torch.equal(first["class_id"], second["class_id"])
@@ -161,7 +166,7 @@ def test_processes_share_every_batch(maps: int, batch_size: int, processes: int)
 
 
 def test_squares_are_cut_from_all_fields_alike_and_lie_within_their_maps(dataset: TerrainDataset) -> None:
-    data = MapData(dataset, 4, seed=0, crop=20, symmetries=False)
+    data = MapData(dataset, 4, seed=0, augmentation=Augmentation(symmetries=False), crop=20)
     stored = dataset.read("train")
     height, width = dataset.grid.shape
     corners = set()

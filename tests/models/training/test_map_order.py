@@ -13,7 +13,7 @@ from benchnav.datagen.files import reader
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.training import map_order as module
-from benchnav.models.training.data import MapData
+from benchnav.models.training.data import Loading, MapData
 from benchnav.models.training.map_order import WINDOW_SHARDS, MapSampler, map_order
 from tests.factories import tiny_recipe
 
@@ -110,7 +110,7 @@ def test_batches_of_many_shards_are_the_same_however_they_are_read(
     plain = [batch["rgb"] for batch in data.train_dataloader()]
     assert sorted(opened) == sorted(piece.path for piece in dataset.pieces["train"])  # each once
     for how in ({"workers": 2}, {"in_memory": True}):
-        other = MapData(dataset, 2, seed=4, **how).train_dataloader()  # type: ignore[arg-type]
+        other = MapData(dataset, 2, seed=4, loading=Loading(**how)).train_dataloader()
         assert all(torch.equal(*pair) for pair in zip(plain, (batch["rgb"] for batch in other), strict=True))
 
 

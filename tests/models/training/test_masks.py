@@ -25,7 +25,7 @@ from benchnav.models.config import (
     plain_config,
 )
 from benchnav.models.predictor import load_model
-from benchnav.models.training.data import MapData, MapDataset
+from benchnav.models.training.data import Loading, MapData, MapDataset
 from benchnav.models.training.fit import FitOptions
 from benchnav.models.training.masks import RandomMasks, path_distances
 from benchnav.models.training.networks import classifier_of, fit_network, train_networks
@@ -171,7 +171,9 @@ def test_masks_that_are_none_are_refused(change: dict[str, object], named: str) 
 def test_training_maps_are_masked_anew_each_epoch_and_valid_maps_alike(dataset: TerrainDataset) -> None:
     law = masks(dataset, Masking(share=0.9))
     fields = ("rgb", "slope_deg", "seen", "class_id")
-    data, workers = (MapData(dataset, 3, 5, fields, masks=law, workers=workers) for workers in (0, 1))
+    data, workers = (
+        MapData(dataset, 3, 5, fields, masks=law, loading=Loading(workers=workers)) for workers in (0, 1)
+    )
     loader = data.train_dataloader()
     epochs = []
     for epoch in (0, 1, 0):

@@ -176,7 +176,8 @@ def test_an_installed_class_is_loaded_by_its_name_and_its_code_compared_too(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setitem(registry._REGISTERED, ("model", "cells"), module.CellModel)
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    registry.register("model", "cells", module.CellModel)
     assert call("train", "fit", "cells", "--data", dataset.path, "--out", "c", *QUICK) == 0
     kept = load_checkpoint("c")
     assert (kept.model, list(kept.parts)) == ("cells", ["cells"])

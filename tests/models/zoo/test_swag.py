@@ -10,7 +10,7 @@ from torch import Tensor
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.training import networks
 from benchnav.models.training.best import KeepBest
-from benchnav.models.training.data import MapData
+from benchnav.models.training.data import Augmentation, MapData
 from benchnav.models.training.fit import FitOptions
 from benchnav.models.training.networks import fit_network
 from tests.models.zoo.support import EXACT, ZOO, make, to_train
@@ -90,7 +90,7 @@ def test_a_prediction_is_the_average_of_plain_networks_of_the_drawn_weights(
     assert found.means.shape[1] == 3
     # The maps that the statistics were made of: the first epoch's, here all.
     fields = ("rgb", "slope_deg", "traversability")
-    data = MapData(dataset, 5, 3, fields, model.config.jitter)
+    data = MapData(dataset, 5, 3, fields, Augmentation(jitter=model.config.jitter))
     batches = list(data.train_dataloader())
     for index in range(3):
         plain = make("mean_variance")

@@ -22,6 +22,8 @@ from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConf
 from benchnav.planning.planners.cost_risk import advance_entrapped, framed_fields, tail_cost, within_reach
 from benchnav.planning.planners.mppi import (
     MPPI,
+    Dwell,
+    Ends,
     MPPIConfig,
     MPPIState,
     advance_chunk,
@@ -29,6 +31,7 @@ from benchnav.planning.planners.mppi import (
     roll_out,
     weigh,
 )
+from benchnav.planning.planners.noise_bank import Sampled
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.belief import Fields, Law, Static
@@ -356,8 +359,7 @@ def test_a_rollout_that_is_held_pays_what_is_left_of_the_time(objective: Objecti
         problem.goal_m,
         advance_entrapped,
         None,
-        torch.tensor([float(held)]),
-        2.0,
+        Dwell(torch.tensor([float(held)]), 2.0),
     )
     assert going is not None
     last = problem.terminal_cost(states, problem.goal_m[:, None])
@@ -379,19 +381,8 @@ def test_rollouts_that_have_stopped_have_no_last_cost() -> None:
     states = problem.start[:, None].expand(-1, 4, -1).clone()
     cost, going = torch.tensor([[3.0, 3.0, 3.0, 4.0]]), torch.tensor([[True, False, True, False]])
     given = problem.padded_ground, problem.goal_m[:, None], problem.grid, problem.objective
-    weights, _ = weigh(
-        states,
-        cost,
-        torch.zeros(1, 1, 2),
-        torch.zeros(1, 2, 4),
-        *problem.action_bounds,
-        *given,
-        1.0,
-        0.1,
-        1,
-        0.0,
-        going,
-    )
+    sampled = Sampled(torch.zeros(1, 1, 2), torch.zeros(1, 2, 4), *problem.action_bounds)
+    weights, _ = weigh(states, cost, sampled, Ends(*given, going=going), 1.0, 0.1)
     last = problem.terminal_cost(states, problem.goal_m[:, None])
     assert float(last.min()) > 1
     wanted = torch.softmax(-(cost + torch.where(going, last, 0)), dim=1)
@@ -410,10 +401,10 @@ def test_a_step_off_free_ground_on_one_field_does_not_set_the_temperature() -> N
         states = problem.goal_m[:, None].repeat(20, 4, 1)
         states = torch.cat((states, torch.zeros(20, 4, 1)), 2)
         ground = framed_fields(problem, fields(problem, 20))
-        weights, _ = weigh(
-            states, cost[0], torch.zeros(1, 1, 2), torch.zeros(1, 2, 4), *problem.action_bounds, ground,
-            problem.goal_m[:, None].repeat(20, 1, 1), problem.grid, GoalDistance(), None, 1.0, 20, level,
-        )  # fmt: skip
+        sampled = Sampled(torch.zeros(1, 1, 2), torch.zeros(1, 2, 4), *problem.action_bounds)
+        target = problem.goal_m[:, None].repeat(20, 1, 1)
+        ends = Ends(ground, target, problem.grid, GoalDistance(), 20, level)
+        weights, _ = weigh(states, cost[0], sampled, ends, None, 1.0)
         assert float(weights[0, 0] / weights[0, 1]) == pytest.approx(math.exp(-2 / wanted), rel=1e-4)
 
 
@@ -426,10 +417,9 @@ def test_samples_that_are_held_on_more_fields_than_the_best_do_not_set_the_tempe
     going = torch.ones(2, 4, dtype=torch.bool)
     going[1, 2] = False
     ground = framed_fields(problem, fields(problem, 2))
-    weights, _ = weigh(
-        states, cost.repeat(2, 1), torch.zeros(1, 1, 2), torch.zeros(1, 2, 4), *problem.action_bounds, ground,
-        problem.goal_m[:, None].repeat(2, 1, 1), problem.grid, GoalDistance(), None, 1.0, 2, 0.0, going,
-    )  # fmt: skip
+    sampled = Sampled(torch.zeros(1, 1, 2), torch.zeros(1, 2, 4), *problem.action_bounds)
+    ends = Ends(ground, problem.goal_m[:, None].repeat(2, 1, 1), problem.grid, GoalDistance(), 2, 0.0, going)
+    weights, _ = weigh(states, cost.repeat(2, 1), sampled, ends, None, 1.0)
     assert float(weights[0, 0] / weights[0, 1]) == pytest.approx(math.exp(-2), rel=1e-4)
 
 

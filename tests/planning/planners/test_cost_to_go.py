@@ -13,7 +13,8 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConfig
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig, advance_chunk, roll_out, weigh
+from benchnav.planning.planners.mppi import MPPI, Ends, MPPIConfig, advance_chunk, roll_out, weigh
+from benchnav.planning.planners.noise_bank import Sampled
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.world.outcome import Outcome
@@ -80,10 +81,9 @@ def test_all_fields_share_the_cost_to_go(closed: float, temperature: float) -> N
     mean, noise = torch.zeros(2, 1, 2), torch.zeros(1, 2, 5)
     ground = torch.stack([replace(problem, risk_map=field).padded_ground for field in fields.unbind(1)], 1)
     target = problem.goal_m[:, None].repeat_interleave(count, 0)
-    weights, _ = weigh(
-        states.flatten(0, 1), cost.flatten(0, 1), mean, noise, *problem.action_bounds, ground.flatten(0, 1),
-        target, problem.grid, problem.objective, temperature, 0.1, count, 0.0, None, costs,
-    )  # fmt: skip
+    sampled = Sampled(mean, noise, *problem.action_bounds)
+    ends = Ends(ground.flatten(0, 1), target, problem.grid, problem.objective, count, to_go=costs)
+    weights, _ = weigh(states.flatten(0, 1), cost.flatten(0, 1), sampled, ends, temperature, 0.1)
     each = torch.stack([cost[:, i] + last_cost(problem, problem, states[:, i]) for i in range(count)], 1)
     # Some end on ground that is not free, and pay for that beside their paths.
     assert bool(problem.free_at(states).all()) is (closed == 0)

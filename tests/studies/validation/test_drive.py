@@ -10,7 +10,8 @@ from benchnav.core import rng
 from benchnav.planning import MPPIConfig, Plan, Planner, Problem, Step
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.mppi import advance_chunk
-from benchnav.planning.problem import ground_map
+from benchnav.planning.planners.noise_bank import Sampled
+from benchnav.planning.problem import Dynamics, ground_map
 from benchnav.planning.robots import component_wise
 from studies.validation.drive import ManyTrialsMPPI, advance_pair, drive, has_arrived, move, traction_at
 from studies.validation.task import ROVER, Setup, choose_objective, planner_config, pose
@@ -74,11 +75,9 @@ def test_rollouts_on_pairs_move_as_the_world_does() -> None:
     draws = torch.randn((2, 12, 5), generator=torch.Generator().manual_seed(1))
     noise = torch.stack((draws[0].abs(), draws[1]), dim=1)
     start = torch.tensor([0.5, 0.5, math.pi / 4]).expand(3, 5, 3)
-    task = problem().task
-    states, _ = advance_pair(
-        start, torch.zeros(3, 5), torch.zeros(3, 12, 2), noise, *problem().action_bounds, padded,
-        torch.tensor([[[8.5, 8.5]]]).expand(3, 1, 2), GRID, task.robot, task.objective, 1e-6,
-    )  # fmt: skip
+    task, sampled = problem().task, Sampled(torch.zeros(3, 12, 2), noise, *problem().action_bounds)
+    target, dynamics = torch.tensor([[[8.5, 8.5]]]), Dynamics(GRID, task.robot, task.objective, 1e-6)
+    states, _ = advance_pair(start, torch.zeros(3, 5), sampled, padded, target.expand(3, 1, 2), dynamics)
     for sample in range(5):
         state = start[:, sample]
         for action in noise[:, :, sample]:
@@ -94,8 +93,8 @@ def test_a_pair_of_equal_fields_costs_what_one_field_does(power: int) -> None:
     noise = torch.stack((torch.full((90, 4), 3.0), turns), dim=1)
     noise[:, 0, 2:] /= 10  # these never arrive
     start = component_wise(posed.start[:, None].expand(2, 4, 3))
-    given = torch.zeros(2, 4), torch.zeros(2, 90, 2), noise, *posed.action_bounds
-    parts = posed.goal_m[:, None].contiguous(), GRID, ROVER, posed.objective, setup.min_traversability
+    sampled = Sampled(torch.zeros(2, 90, 2), noise, *posed.action_bounds)
+    given, parts = (torch.zeros(2, 4), sampled), (posed.goal_m[:, None].contiguous(), posed.dynamics)
     states, cost = advance_chunk(start, *given, posed.padded_ground, *parts)
     states_of_pair, cost_of_pair = advance_pair(start, *given, posed.padded_ground.repeat(1, 2), *parts)
     assert has_arrived(states.flatten(0, 1)).any()
@@ -122,9 +121,9 @@ def test_a_rollout_off_the_map_pays_the_penalty_or_is_still(setting: str, motion
         is_paired = len(ground[0]) == 2 * 121
         assert is_paired == (setting == "cost" and motions == "two")
         pair = ground if is_paired else torch.cat((ground, ground), dim=1)
-        states, cost = advance_pair(
-            off, torch.zeros(1, 1), torch.full((1, 2, 2), 3.0), torch.zeros(2, 2, 1), *problem().action_bounds, pair,
-            torch.tensor([[[8.5, 8.5]]]), GRID, ROVER, choose_objective(setup), setup.min_traversability,
-        )  # fmt: skip
+        sampled = Sampled(torch.full((1, 2, 2), 3.0), torch.zeros(2, 2, 1), *problem().action_bounds)
+        dynamics = Dynamics(GRID, ROVER, choose_objective(setup), setup.min_traversability)
+        target = torch.tensor([[[8.5, 8.5]]])
+        states, cost = advance_pair(off, torch.zeros(1, 1), sampled, pair, target, dynamics)
         torch.testing.assert_close(states, off, atol=1e-5, rtol=0)
         assert float(cost) == pytest.approx(2 * (0.1 + math.hypot(9, 4.5) + penalty), rel=1e-4)

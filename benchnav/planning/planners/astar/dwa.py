@@ -13,24 +13,24 @@ Letters in shapes: B episodes, M velocity pairs, T horizon steps, S state dimens
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch
-from benchnav.core.grid import Grid
-from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
 from benchnav.planning.planners.straight import turn_toward
 from benchnav.planning.problem import (
+    Dynamics,
     Problem,
     Task,
     motion_traversability,
     predicted_traversability,
     stage_cost,
 )
-from benchnav.planning.robots import Robot, component_wise, steps_in
+from benchnav.planning.robots import component_wise, steps_in
 from benchnav.planning.sensing.sensor import Step
 
 # A chunk of the horizon compiles in seconds.
@@ -160,18 +160,39 @@ def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Te
     return least + (most - least) * torch.cartesian_prod(*shares)
 
 
+class Arcs(NamedTuple):
+    """Where velocity pairs have led, and what that cost.
+
+    Args:
+        states: shape [B, M, S].
+        cost: shape [B, M].
+        under_way: which have not reached the target, bool, shape [B, M].
+    """
+
+    states: Tensor
+    cost: Tensor
+    under_way: Tensor
+
+
 def rollout(
-    states: Tensor, cost: Tensor, under_way: Tensor, pairs: Tensor, padded_ground: Tensor, target: Tensor,
-    grid: Grid, robot: Robot, objective: Objective, min_traversability: float, arrival_m: float, steps: int,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Holds each pair for some steps, adding up costs of those under way; takes a problem in its parts."""
+    arcs: Arcs,
+    pairs: Tensor,
+    padded_ground: Tensor,
+    target: Tensor,
+    dynamics: Dynamics,
+    arrival_m: float,
+    steps: int,
+) -> Arcs:
+    """Hold each pair for some steps, and add up costs of those under way; takes a problem in its parts."""
+    states, cost, under_way = arcs
+    grid, robot, objective, min_traversability = dynamics
     for _ in range(steps):
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
         cost = cost + stage_cost(objective, states, pairs, ground, target) * under_way
         states = robot(states, pairs, motion_traversability(ground, min_traversability))
         offset = states[..., :2] - target
         under_way = under_way & ((offset * offset).sum(-1) > arrival_m**2)
-    return component_wise(states), cost, under_way
+    return Arcs(component_wise(states), cost, under_way)
 
 
 def score(
@@ -180,7 +201,7 @@ def score(
     window: Tensor,
     target_m: Tensor,
     config: DWAConfig,
-    advance: Callable[..., tuple[Tensor, Tensor, Tensor]] = rollout,
+    advance: Callable[..., Arcs] = rollout,
 ) -> Tensor:
     """Rolls out the window's pairs and sums their costs.
 
@@ -199,14 +220,12 @@ def score(
     states = component_wise(state[:, None].expand(-1, window.shape[1], -1))
     pairs = component_wise(window)
     cost = torch.zeros_like(window[..., 0])
-    under_way = torch.ones_like(cost, dtype=torch.bool)
+    arcs = Arcs(states, cost, torch.ones_like(cost, dtype=torch.bool))
     steps = steps_in(config.horizon_s, problem.dt_s)
     for first in range(0, steps, _CHUNK_STEPS):
-        states, cost, under_way = advance(
-            states, cost, under_way, pairs, problem.padded_ground, target, problem.grid, problem.robot,
-            problem.objective, problem.task.rules.min_traversability, config.arrival_m,
-            min(_CHUNK_STEPS, steps - first),
-        )  # fmt: skip
+        count = min(_CHUNK_STEPS, steps - first)
+        arcs = advance(arcs, pairs, problem.padded_ground, target, problem.dynamics, config.arrival_m, count)
+    states, cost, under_way = arcs
     # The unit of the heading's weight: the size of what J, without penalties, costs robots that stand for the horizon.
     standing = problem.start.new_zeros(len(problem), 2).clamp(*problem.action_bounds)
     traversability = predicted_traversability(problem.ground_at(state))

@@ -13,7 +13,7 @@ from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY, Rules
 from benchnav.planning.objective import GoalDistance, TravelTime
 from benchnav.planning.planners.astar import astar
-from benchnav.planning.problem import Problem, pose_problem
+from benchnav.planning.problem import Prediction, Problem, pose_problem
 from benchnav.planning.robots import Unicycle
 from tests import factories
 
@@ -211,7 +211,8 @@ def test_a_goal_at_a_corner_of_coarse_cells_is_reached() -> None:
     made = factories.problem(torch.full((1, 8, 8), 0.9))
     observation = replace(made.observation, grid=Grid(8, 8, 2.0))
     start, goal = torch.tensor([[3.0, 3.0]]), torch.tensor([[12.0, 12.0]])
-    problem = pose_problem(made.task, observation, made.distribution, made.risk_map, start, goal, 100.0)
+    prediction = Prediction(observation, made.distribution, made.risk_map)
+    problem = pose_problem(made.task, prediction, start, goal, 100.0)
     field = astar.search(problem)
     assert field.following[0, 6 * 8 + 6] == 6 * 8 + 6
     # Five diagonal steps of 2√2 m.
