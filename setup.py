@@ -1,8 +1,9 @@
-"""Puts the shipped maps and models into wheels and source archives; all else is said in pyproject.toml.
+"""Puts the shipped maps and models into wheels and source archives; all else is said in
+pyproject.toml.
 
-They stay where they are in the repository, and the wheel holds them under `benchnav/_shipped`. Only the files
-named here go in, whatever else lies in those folders. The checkpoint paper-v1, 29 MB of weights, stays out, of
-source archives too.
+They stay where they are in the repository, and the wheel holds them under
+`benchnav/_shipped`. Only the files named here go in, whatever else lies in those
+folders. The checkpoint paper-v1, 29 MB of weights, stays out, of source archives too.
 """
 
 from pathlib import Path
@@ -32,7 +33,9 @@ SHIPPED = (
 
 
 class BuildWithShipped(build_py):
-    """Copies the shipped files beside the modules; an editable installation reads them where they are."""
+    """Copies the shipped files beside the modules; an editable installation reads them
+    where they are.
+    """
 
     def run(self) -> None:
         """Builds the modules, then adds the files."""

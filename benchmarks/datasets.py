@@ -1,10 +1,12 @@
-"""How fast datasets are made and read, next to plain h5py on the same maps in the same run.
+"""How fast datasets are made and read, next to plain h5py on the same maps in the same
+run.
 
     python -m benchmarks.datasets
 
-Making is timed from the call to the closed file, with solvable test maps and their reference times. Reading is the
-batches of an epoch as training takes them from 2 000 shards, turned and mirrored, in one process of one thread, and
-seconds are those of its core; the files lie in the page cache.
+Making is timed from the call to the closed file, with solvable test maps and their
+reference times. Reading is the batches of an epoch as training takes them from 2 000
+shards, turned and mirrored, in one process of one thread, and seconds are those of its
+core; the files lie in the page cache.
 """
 
 import tempfile
@@ -34,27 +36,40 @@ def make(recipe: Recipe, path: Path, jobs: int = 2, shard_cells: int = 0) -> Non
 
 
 def write_plainly(recipe: Recipe, path: Path) -> None:
-    """Write what one would without this package: the same maps, through HDF5's own filters."""
+    """Write what one would without this package: the same maps, through HDF5's own
+    filters.
+    """
     with h5py.File(path, "w") as file:
         for split, spec in recipe.splits.items():
             for name, values in generate(recipe, split, np.arange(spec.maps)).items():
                 chunk = (1, *values.shape[1:]) if values.ndim > 2 else values.shape
                 file.create_dataset(
-                    f"{split}/{name}", data=values, chunks=chunk,
-                    compression="gzip", shuffle=True, fletcher32=True,
-                )  # fmt: skip
+                    f"{split}/{name}",
+                    data=values,
+                    chunks=chunk,
+                    compression="gzip",
+                    shuffle=True,
+                    fletcher32=True,
+                )
 
 
 def time_making(folder: Path) -> None:
     """Print how many maps of `paper-v1` are made a second."""
     recipe = load_recipe("paper-v1")
     works = {
-        "generate, h5py's own filters": lambda: write_plainly(recipe, folder / "plain.h5"),
+        "generate, h5py's own filters": lambda: write_plainly(
+            recipe, folder / "plain.h5"
+        ),
         "create, one worker": lambda: make(recipe, folder / "made.h5", 1),
         "create, two workers": lambda: make(recipe, folder / "made.h5", 2),
     }
     total = sum(split.maps for split in recipe.splits.values())
-    show([{"maps/s": name, **per_second(total, seconds(work, 7))} for name, work in works.items()])
+    show(
+        [
+            {"maps/s": name, **per_second(total, seconds(work, 7))}
+            for name, work in works.items()
+        ]
+    )
 
 
 def make_shards(path: Path) -> None:
@@ -63,14 +78,20 @@ def make_shards(path: Path) -> None:
     splits = {"train": Split(scenario="std", maps=SHARDS * MAPS_A_SHARD)}
     small = {"height": 32, "width": 32, "start_m": (4.0, 4.0), "goal_m": (12.0, 12.0)}
     recipe = replace(
-        paper, id="shards", class_periods_m=(6.0, 3.0, 1.5), splits=splits,
-        scenarios={"std": paper.scenarios["std"]}, **small,
-    )  # fmt: skip
+        paper,
+        id="shards",
+        class_periods_m=(6.0, 3.0, 1.5),
+        splits=splits,
+        scenarios={"std": paper.scenarios["std"]},
+        **small,
+    )
     make(recipe, path, shard_cells=MAPS_A_SHARD * 32 * 32)
 
 
 def time_reading(folder: Path) -> None:
-    """Print how fast an epoch is read in windows of shards and in any order, and a file opened for each map."""
+    """Print how fast an epoch is read in windows of shards and in any order, and a file
+    opened for each map.
+    """
     torch.set_num_threads(1)
     make_shards(folder / "shards")
     pieces = TerrainDataset(folder / "shards").pieces["train"]
@@ -83,7 +104,9 @@ def time_reading(folder: Path) -> None:
                     file["train"][name][index % MAPS_A_SHARD]
 
     def epoch(shards: tuple[int, ...]) -> None:
-        for key in MapSampler(len(maps), 16, symmetries=tuple(range(8)), shuffle=True, shards=shards):
+        for key in MapSampler(
+            len(maps), 16, symmetries=tuple(range(8)), shuffle=True, shards=shards
+        ):
             maps[key]
 
     windows = tuple(piece.maps for piece in pieces)
@@ -93,9 +116,12 @@ def time_reading(folder: Path) -> None:
         "batches of training, windows of shards": (len(maps), lambda: epoch(windows)),
     }
     clock = time.process_time
-    show([
-        {"maps/s": name, **per_second(count, seconds(work, 3, clock))} for name, (count, work) in works.items()
-    ])  # fmt: skip
+    show(
+        [
+            {"maps/s": name, **per_second(count, seconds(work, 3, clock))}
+            for name, (count, work) in works.items()
+        ]
+    )
 
 
 def main() -> None:

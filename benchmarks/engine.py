@@ -1,11 +1,14 @@
-"""How fast planners, risk measures, environments and commands are, next to a peer in the same run.
+"""How fast planners, risk measures, environments and commands are, next to a peer in
+the same run.
 
     python -m benchmarks.engine [FILE.json]
 
-One thread. Each figure is the median of the repeats, on maps of `paper-v1-test`; ratios are to the peer's median.
-Peers: for MPPI the same rollouts as ten plain lines of PyTorch, with as many normals drawn a step; with risk on the
-cost as many rollouts on the risk map; for A*+DWA the same planner uncompiled; for the optimal planner A*'s search of
-the map; for risk maps thirty halvings of every cell; for the environment its step in which none is reset.
+One thread. Each figure is the median of the repeats, on maps of `paper-v1-test`; ratios
+are to the peer's median.
+Peers: for MPPI the same rollouts as ten plain lines of PyTorch, with as many normals
+drawn a step; with risk on the cost as many rollouts on the risk map; for A*+DWA the
+same planner uncompiled; for the optimal planner A*'s search of the map; for risk maps
+thirty halvings of every cell; for the environment its step in which none is reset.
 """
 
 import json
@@ -36,12 +39,16 @@ COMMANDS = (
 )
 
 
-def row(work: str, ms: float, peer: str = "", peer_ms: float = float("nan")) -> dict[str, Any]:
+def row(
+    work: str, ms: float, peer: str = "", peer_ms: float = float("nan")
+) -> dict[str, Any]:
     """Return a row of the table."""
     return {"work": work, "ms": ms, "peer": peer, "peer_ms": peer_ms}
 
 
-def plain_mppi(problem: Problem, mean: Tensor, generator: torch.Generator, samples: int = 5000) -> Tensor:
+def plain_mppi(
+    problem: Problem, mean: Tensor, generator: torch.Generator, samples: int = 5000
+) -> Tensor:
     """Plan a step of one episode by MPPI in plain PyTorch: the peer."""
     ground, resolution = problem.risk_map[0], problem.grid.resolution_m
     noise = torch.randn((mean.shape[0], 2, samples), generator=generator) * 0.5
@@ -50,7 +57,10 @@ def plain_mppi(problem: Problem, mean: Tensor, generator: torch.Generator, sampl
     speed = (mean[:, 0, None] + noise[:, 0]).clamp(0, 1)
     turn = (mean[:, 1, None] + noise[:, 1]).clamp(-1, 1)
     for v, w in zip(speed, turn, strict=True):
-        row, column = (y / resolution).long().clamp(0, 63), (x / resolution).long().clamp(0, 63)
+        row, column = (
+            (y / resolution).long().clamp(0, 63),
+            (x / resolution).long().clamp(0, 63),
+        )
         traversability = ground[row, column]
         cost = cost + torch.hypot(x - problem.goal_m[0, 0], y - problem.goal_m[0, 1])
         cost = cost + 1e4 * (traversability <= 0.3)
@@ -64,7 +74,9 @@ def plain_mppi(problem: Problem, mean: Tensor, generator: torch.Generator, sampl
 
 def halved_cvar(mixture: TraversabilityMixture, tail: float) -> Tensor:
     """Return CVaR by thirty halvings in float64: the peer."""
-    weights, means, stds = (values[0].double() for values in (mixture.weights, mixture.means, mixture.stds))
+    weights, means, stds = (
+        values[0].double() for values in (mixture.weights, mixture.means, mixture.stds)
+    )
 
     def terms(value: Tensor) -> tuple[Tensor, Tensor]:
         z = (value - means) / stds
@@ -88,14 +100,19 @@ def planners() -> list[dict[str, Any]]:
     on_map = MPPIConfig(samples=1024 * 64)
     again = "the same, an episode of 20"
     rows = [
-        row("MPPI 5 000 × 50, one episode", plan_ms(MPPI(), one), "plain PyTorch", peer),
+        row(
+            "MPPI 5 000 × 50, one episode", plan_ms(MPPI(), one), "plain PyTorch", peer
+        ),
         row(again, plan_ms(MPPI(), many), "plain PyTorch", peer),
     ]
     for name, problem in (("MPPI 1 024 × 50 on 64 fields", one), (again, many)):
         own, peer = (plan_ms(MPPI(config), problem) for config in (on_cost, on_map))
         rows.append(row(name, own, "as many on the map", peer))
     own, peer = (
-        milliseconds(lambda planner=planner: planner.init(several, torch.Generator()), 3) / 10
+        milliseconds(
+            lambda planner=planner: planner.init(several, torch.Generator()), 3
+        )
+        / 10
         for planner in (Optimal(), AStarDWA())
     )
     rows.append(row("optimal, a map of 10", own, "A*", peer))
@@ -109,25 +126,36 @@ def planners() -> list[dict[str, Any]]:
 def risk_maps() -> list[dict[str, Any]]:
     """Measure risk maps of a map of 64 × 64 cells of 10 components."""
     seen = predict(
-        load_model("paper-v1"), TerrainDataset(find_dataset("paper-v1-test")).terrain("test/hs", [0])
+        load_model("paper-v1"),
+        TerrainDataset(find_dataset("paper-v1-test")).terrain("test/hs", [0]),
     )
     peer = milliseconds(lambda: halved_cvar(seen, 0.1))
     five = milliseconds(lambda: [seen.cvar(level) for level in LEVELS])
     return [
         row(
-            "CVaR of 64 × 64 cells, 10 components", milliseconds(lambda: seen.cvar(0.9)), "30 halvings", peer
+            "CVaR of 64 × 64 cells, 10 components",
+            milliseconds(lambda: seen.cvar(0.9)),
+            "30 halvings",
+            peer,
         ),
         row("the same at 5 levels", five, "30 halvings, 5 times", 5 * peer),
-        row("expected time of the same cells", milliseconds(lambda: seen.expected_time(0.05))),
+        row(
+            "expected time of the same cells",
+            milliseconds(lambda: seen.expected_time(0.05)),
+        ),
     ]
 
 
 def environments(size: int = 512) -> list[dict[str, Any]]:
     """Measure a step of the vector environment, without and with a reset."""
     envs = gymnasium.make_vec(
-        "benchnav/OffRoad-v0", num_envs=size, vectorization_mode="vector_entry_point", data="paper-v1-test",
-        split="test/std", world="paper",
-    )  # fmt: skip
+        "benchnav/OffRoad-v0",
+        num_envs=size,
+        vectorization_mode="vector_entry_point",
+        data="paper-v1-test",
+        split="test/std",
+        world="paper",
+    )
     envs.reset(seed=0)
     own: Any = envs.unwrapped
     still = np.zeros(envs.action_space.shape, np.float32)
@@ -136,9 +164,15 @@ def environments(size: int = 512) -> list[dict[str, Any]]:
         own._ended[7] = True  # as if its episode had ended with the last step
         envs.step(still)
 
-    plain, reset = milliseconds(lambda: envs.step(still), 15), milliseconds(with_reset, 15)
+    plain, reset = (
+        milliseconds(lambda: envs.step(still), 15),
+        milliseconds(with_reset, 15),
+    )
     name = f"vector environment, {size}, a step"
-    return [row(name, plain), row("the same, one of them is reset", reset, "none is", plain)]
+    return [
+        row(name, plain),
+        row("the same, one of them is reset", reset, "none is", plain),
+    ]
 
 
 def commands() -> list[dict[str, Any]]:
@@ -146,11 +180,16 @@ def commands() -> list[dict[str, Any]]:
 
     def process_ms(program: str, *words: str) -> float:
         command = [Path(sys.executable).with_name(program), *words]
-        return milliseconds(lambda: subprocess.run(command, check=True, capture_output=True), 5)
+        return milliseconds(
+            lambda: subprocess.run(command, check=True, capture_output=True), 5
+        )
 
     bare = process_ms(Path(sys.executable).name, "-c", "")
     data = find_dataset("paper-v1-test")
-    rows = [row(command, process_ms(*command.split()), "bare Python", bare) for command in COMMANDS]
+    rows = [
+        row(command, process_ms(*command.split()), "bare Python", bare)
+        for command in COMMANDS
+    ]
     own = process_ms("benchnav-datagen", "show", str(data))
     return [*rows, row(f"benchnav-datagen show {data.name}", own, "bare Python", bare)]
 
@@ -167,7 +206,9 @@ def main() -> None:
             "machine": platform.machine(),
         }
         plain = json.loads(pd.DataFrame(rows).to_json(orient="records"))
-        Path(sys.argv[1]).write_text(json.dumps({"about": about, "rows": plain}, indent=1))
+        Path(sys.argv[1]).write_text(
+            json.dumps({"about": about, "rows": plain}, indent=1)
+        )
 
 
 if __name__ == "__main__":

@@ -2,10 +2,11 @@
 
     python -m benchmarks.parts
 
-One thread. Rollouts: 5 000 samples × 50 steps, an episode of 20, compiled; the same without one part or another.
-Without headings the robot moves along x and y; without lookups all ground is as in the first cell. Neither drives
-anywhere sensible. CVaR: the first map of `hs` in `paper-v1-test` as the shipped model sees it, 64 × 64 cells of 10
-components.
+One thread. Rollouts: 5 000 samples × 50 steps, an episode of 20, compiled; the same
+without one part or another. Without headings the robot moves along x and y; without
+lookups all ground is as in the first cell. Neither drives
+anywhere sensible. CVaR: the first map of `hs` in `paper-v1-test` as the shipped model
+sees it, 64 × 64 cells of 10 components.
 """
 
 import math
@@ -52,7 +53,11 @@ def without(problem: Problem, headings: bool = False, lookups: bool = False) -> 
     grid = Blind(*problem.grid.shape, problem.grid.resolution_m)
     if headings:
         problem = replace(problem, task=replace(problem.task, robot=Crab()))
-    return replace(problem, observation=replace(problem.observation, grid=grid)) if lookups else problem
+    return (
+        replace(problem, observation=replace(problem.observation, grid=grid))
+        if lookups
+        else problem
+    )
 
 
 def rollout_ms(problem: Problem) -> float:
@@ -61,7 +66,9 @@ def rollout_ms(problem: Problem) -> float:
     state = planner.init(problem, torch.Generator().manual_seed(0))
     noise = state.noise.at(0)
     return milliseconds(
-        lambda: roll_out(problem, problem.start, state.mean, noise, problem.goal_m, planner._advance)
+        lambda: roll_out(
+            problem, problem.start, state.mean, noise, problem.goal_m, planner._advance
+        )
     ) / len(problem)
 
 
@@ -69,7 +76,10 @@ def parts_of_cvar() -> list[dict[str, Any]]:
     """Measure a CVaR map and its parts."""
     dataset = TerrainDataset(find_dataset("paper-v1-test"))
     mixture = predict(load_model("paper-v1"), dataset.terrain("test/hs", [0]))
-    flat = [values[0].flatten(1).double() for values in (mixture.weights, mixture.means, mixture.stds)]
+    flat = [
+        values[0].flatten(1).double()
+        for values in (mixture.weights, mixture.means, mixture.stds)
+    ]
     cells = cvar.Cells(flat[0], flat[1], math.sqrt(0.5) / flat[2])
     tail = torch.full_like(cells.means[0], 1 - LEVEL)
     root = cvar._first_root(cells, tail)
@@ -79,7 +89,9 @@ def parts_of_cvar() -> list[dict[str, Any]]:
         "F, its density and G at the VaR in float64": lambda: cells.around(root),
         "G at 0 in float64": lambda: cells.integral(0.0),
     }
-    return [{"CVaR": name, "ms": milliseconds(work, 101)} for name, work in works.items()]
+    return [
+        {"CVaR": name, "ms": milliseconds(work, 101)} for name, work in works.items()
+    ]
 
 
 def main() -> None:
@@ -92,7 +104,12 @@ def main() -> None:
         "without lookups": without(problem, lookups=True),
         "without both": without(problem, headings=True, lookups=True),
     }
-    show([{"rollouts": name, "ms an episode": rollout_ms(own)} for name, own in problems.items()])
+    show(
+        [
+            {"rollouts": name, "ms an episode": rollout_ms(own)}
+            for name, own in problems.items()
+        ]
+    )
     show(parts_of_cvar())
 
 

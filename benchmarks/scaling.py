@@ -1,9 +1,10 @@
-"""How the time of a plan grows: with samples, horizon, episodes and the size of the map.
+"""How the time of a plan grows: with samples, horizon, episodes and the size of the
+map.
 
     python -m benchmarks.scaling OUT.png
 
-One thread, medians. Each curve changes one setting of: 5 000 samples, 5 s (50 steps), 20 episodes, a map of 64 × 64
-cells.
+One thread, medians. Each curve changes one setting of: 5 000 samples, 5 s (50 steps),
+20 episodes, a map of 64 × 64 cells.
 """
 
 import sys
@@ -15,7 +16,16 @@ import torch
 
 from benchmarks.timing import plan_ms, show
 from benchnav import Grid
-from benchnav.planning import MPPI, AStarDWA, GoalDistance, MPPIConfig, Problem, Rules, Task, Unicycle
+from benchnav.planning import (
+    MPPI,
+    AStarDWA,
+    GoalDistance,
+    MPPIConfig,
+    Problem,
+    Rules,
+    Task,
+    Unicycle,
+)
 from benchnav.viz import draw_estimates, legend_outside, line_looks, panel_grid, styled
 from benchnav.viz.style import save
 from studies.units import pose_on
@@ -29,7 +39,9 @@ SIZES = (64, 128, 256, 512, 1024)
 def problem_of(episodes: int = 20, size: int = 64) -> Problem:
     """Return a problem on uneven ground, the same for all episodes."""
     generator = torch.Generator().manual_seed(0)
-    ground = 0.35 + 0.6 * torch.rand((1, size, size), generator=generator).expand(episodes, -1, -1)
+    ground = 0.35 + 0.6 * torch.rand((1, size, size), generator=generator).expand(
+        episodes, -1, -1
+    )
     ends_m = torch.full((episodes, 2), 4.0), torch.full((episodes, 2), size / 2 - 4.0)
     task = Task(robot=Unicycle(), objective=GoalDistance(), rules=Rules())
     return pose_on(ground, Grid(size, size, 0.5), ends_m, task, 100.0)[0]
@@ -40,14 +52,28 @@ def main() -> None:
     """Print the times and draw them."""
     torch.set_num_threads(1)
     cases: list[tuple[str, str, int, Any, Problem]] = [
-        *(("samples", "MPPI", n, MPPI(MPPIConfig(samples=n)), problem_of()) for n in SAMPLES),
-        *(("horizon [s]", "MPPI", s, MPPI(MPPIConfig(horizon_s=s)), problem_of()) for s in HORIZONS_S),
+        *(
+            ("samples", "MPPI", n, MPPI(MPPIConfig(samples=n)), problem_of())
+            for n in SAMPLES
+        ),
+        *(
+            ("horizon [s]", "MPPI", s, MPPI(MPPIConfig(horizon_s=s)), problem_of())
+            for s in HORIZONS_S
+        ),
         *(("episodes", "MPPI", n, MPPI(), problem_of(n)) for n in EPISODES),
         *(("episodes", "A*+DWA", n, AStarDWA(), problem_of(n)) for n in EPISODES),
-        *(("cells along a side of the map", "MPPI", n, MPPI(), problem_of(size=n)) for n in SIZES),
+        *(
+            ("cells along a side of the map", "MPPI", n, MPPI(), problem_of(size=n))
+            for n in SIZES
+        ),
     ]
     rows = [
-        {"setting": setting, "planner": name, "value": value, "ms": plan_ms(planner, problem, 11)}
+        {
+            "setting": setting,
+            "planner": name,
+            "value": value,
+            "ms": plan_ms(planner, problem, 11),
+        }
         for setting, name, value, planner, problem in cases
     ]
     show(rows)
@@ -56,9 +82,13 @@ def main() -> None:
     settings = list(dict.fromkeys(table["setting"]))
     figure, places = panel_grid([""] * len(settings), 4, 1.8, sharey=True)
     for (panel,), setting in zip(places, settings, strict=True):
-        for name, curve in table[table["setting"] == setting].groupby("planner", sort=False):
+        for name, curve in table[table["setting"] == setting].groupby(
+            "planner", sort=False
+        ):
             ms = curve["ms"]
-            draw_estimates(panel, curve["value"], ms, ms, ms, looks[str(name)], str(name))
+            draw_estimates(
+                panel, curve["value"], ms, ms, ms, looks[str(name)], str(name)
+            )
         panel.set(xscale="log", yscale="log", xlabel=setting)
     places[0][0].set_ylabel("ms a step and episode")
     legend_outside(figure)

@@ -1,9 +1,12 @@
-"""Do large things work in little memory? A map of 1024 × 1024 cells, 100 000 maps, a raster of 30 000 × 30 000 cells.
+"""Do large things work in little memory? A map of 1024 × 1024 cells, 100 000 maps, a
+raster of 30 000 × 30 000 cells.
 
-    python -m benchmarks.sizes                # 10 minutes and 10 GB of disk, in a temporary folder
+    python -m benchmarks.sizes                # 10 minutes and 10 GB of disk, in a
+    temporary folder
 
-Every line is the command that it names, in processes of its own; the time is from start to end, the memory the maximum
-that one process held. The two processes that make 100 000 maps are killed (SIGKILL) once each and restarted.
+Every line is the command that it names, in processes of its own; the time is from start
+to end, the memory the maximum that one process held. The two processes that make 100
+000 maps are killed (SIGKILL) once each and restarted.
 """
 
 import multiprocessing
@@ -21,16 +24,21 @@ from benchmarks.timing import show
 
 MIB = 2**10
 SIDE, BAND = 30_000, 500  # cells of the raster, and rows that are written at a time
-MANY = "benchnav-datagen create paper-v1 id=big splits.train.maps=100000 --out big --shard"
+MANY = (
+    "benchnav-datagen create paper-v1 id=big splits.train.maps=100000 --out big --shard"
+)
 COMMANDS = (
-    "benchnav-datagen create paper-v1 id=wide height=1024 width=1024 splits.test/std.maps=1 --splits [test/std] "
+    "benchnav-datagen create paper-v1 id=wide height=1024 width=1024 "
+    "splits.test/std.maps=1 --splits [test/std] "
     "--out wide.h5",
     "benchnav-train evaluate paper-v1 --data wide.h5",
-    "benchnav-eval run --data wide.h5 --models [paper-v1] --risks [mean,cvar:0.9] --planners [astar_dwa] "
+    "benchnav-eval run --data wide.h5 --models [paper-v1] --risks [mean,cvar:0.9] "
+    "--planners [astar_dwa] "
     "--scenarios [std] --maps 1 --out large",
     MANY,
     "benchnav-datagen validate big",
-    "benchnav-datagen import-dem dem.tif --out dem --stride 160 --splits train:0.8,valid:0.1,test/site:0.1",
+    "benchnav-datagen import-dem dem.tif --out dem --stride 160 --splits "
+    "train:0.8,valid:0.1,test/site:0.1",
     "benchnav-datagen validate dem",
 )
 
@@ -47,7 +55,10 @@ class Processes:
         program, *rest = words.split()
         command = [Path(sys.executable).with_name(program), *rest]
         return subprocess.Popen(
-            command, cwd=self.folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            command,
+            cwd=self.folder,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         )
 
     def wait(self, process: subprocess.Popen[bytes]) -> int:
@@ -58,7 +69,9 @@ class Processes:
         return process.returncode
 
     def make_many(self) -> bool:
-        """Make 100 000 maps by two processes, each killed after 30 s of work; return whether one failed."""
+        """Make 100 000 maps by two processes, each killed after 30 s of work; return
+        whether one failed.
+        """
         shares = [f"{MANY} {share}/2" for share in (1, 2)]
         making = [self.start(words) for words in shares]
         for place, words in enumerate(shares):
@@ -73,9 +86,17 @@ class Processes:
 def run(folder: Path, words: str) -> dict[str, Any]:
     """Run a command to its end; return its row."""
     begun, processes = time.perf_counter(), Processes(folder)
-    if processes.make_many() if words == MANY else processes.wait(processes.start(words)):
+    if (
+        processes.make_many()
+        if words == MANY
+        else processes.wait(processes.start(words))
+    ):
         sys.exit(f"failed: {words}")
-    return {"command": words, "s": time.perf_counter() - begun, "MiB": processes.memory / MIB}
+    return {
+        "command": words,
+        "s": time.perf_counter() - begun,
+        "MiB": processes.memory / MIB,
+    }
 
 
 def write_raster(path: Path) -> None:
@@ -84,20 +105,33 @@ def write_raster(path: Path) -> None:
     from rasterio.transform import from_origin
 
     generator = np.random.default_rng(0)
-    waves = [(generator.uniform(5, 400), *generator.uniform(0, 2 * np.pi, 2)) for _ in range(12)]
+    waves = [
+        (generator.uniform(5, 400), *generator.uniform(0, 2 * np.pi, 2))
+        for _ in range(12)
+    ]
     x = np.arange(SIDE, dtype=np.float32) * 0.5
     profile = {
-        "driver": "GTiff", "height": SIDE, "width": SIDE, "count": 1, "dtype": "float32", "crs": "EPSG:32633",
-        "tiled": True, "compress": "deflate", "predictor": 3, "BIGTIFF": "YES",
+        "driver": "GTiff",
+        "height": SIDE,
+        "width": SIDE,
+        "count": 1,
+        "dtype": "float32",
+        "crs": "EPSG:32633",
+        "tiled": True,
+        "compress": "deflate",
+        "predictor": 3,
+        "BIGTIFF": "YES",
         "transform": from_origin(400_000, 5_300_000, 0.5, 0.5),
-    }  # fmt: skip
+    }
     with rasterio.open(path, "w", **profile) as raster:
         for first in range(0, SIDE, BAND):
             y = x[first : first + BAND, None]
             ground = 0.02 * generator.standard_normal((len(y), SIDE), dtype=np.float32)
             for length, phase, turn in waves:
                 along = np.float32(np.cos(turn)) * x + np.float32(np.sin(turn)) * y
-                wave = np.sin(along * np.float32(2 * np.pi / length) + np.float32(phase))
+                wave = np.sin(
+                    along * np.float32(2 * np.pi / length) + np.float32(phase)
+                )
                 ground += np.float32(0.02 * length) * wave
             raster.write(ground, 1, window=((first, first + len(y)), (0, SIDE)))
 
@@ -106,8 +140,11 @@ def main() -> None:
     """Print the table."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        # In a process of its own: what this one held would count for those that it starts.
-        writer = multiprocessing.get_context("spawn").Process(target=write_raster, args=(folder / "dem.tif",))
+        # In a process of its own: what this one held would count for those that it
+        # starts.
+        writer = multiprocessing.get_context("spawn").Process(
+            target=write_raster, args=(folder / "dem.tif",)
+        )
         writer.start()
         writer.join()
         show([run(folder, words) for words in COMMANDS])

@@ -1,10 +1,12 @@
-"""How long a large map takes tile by tile, and how much memory: that of the whole process at its most.
+"""How long a large map takes tile by tile, and how much memory: that of the whole
+process at its most.
 
-    python -m benchmarks.tiles                       # 4096 × 4096 cells, the shipped checkpoint stakes-v1
-    python -m benchmarks.tiles paper-v1 2048 512     # another checkpoint, side of the map and of a tile
+    python -m benchmarks.tiles                       # 4096 × 4096 cells, the shipped
+    checkpoint stakes-v1 python -m benchmarks.tiles paper-v1 2048 512     # another
+    checkpoint, side of the map and of a tile
 
-The map is laid out of shipped maps, drawn at random. What is written is its CVaR at level 0.9 and its mean. Times are
-those of one core.
+The map is laid out of shipped maps, drawn at random. What is written is its CVaR at
+level 0.9 and its mean. Times are those of one core.
 """
 
 import sys
@@ -33,7 +35,9 @@ def large_map(name: str, side: int) -> Observation:
     split = next(iter(dataset.splits))
     maps = dataset.terrain(split).observe()
     count = -(-side // dataset.grid.height)
-    drawn = torch.randint(len(maps.rgb), (count, count), generator=torch.Generator().manual_seed(0))
+    drawn = torch.randint(
+        len(maps.rgb), (count, count), generator=torch.Generator().manual_seed(0)
+    )
 
     def lay_out(layer: Tensor) -> Tensor:
         rows = [torch.cat([layer[i] for i in row.tolist()], -1) for row in drawn]
@@ -51,7 +55,13 @@ def main(name: str = "stakes-v1", side: str = "4096", tile: str = "1024") -> Non
     def measured(work: str, call: Callable[[], Any]) -> Any:
         start = time.process_time()
         result = call()
-        rows.append({"work": work, "s": time.process_time() - start, "peak memory [GiB]": peak_gib()})
+        rows.append(
+            {
+                "work": work,
+                "s": time.process_time() - start,
+                "peak memory [GiB]": peak_gib(),
+            }
+        )
         return result
 
     model = measured("imports and the checkpoint", lambda: load_model(name))
@@ -60,7 +70,9 @@ def main(name: str = "stakes-v1", side: str = "4096", tile: str = "1024") -> Non
     with tempfile.TemporaryDirectory() as folder:
         measured(
             "write_risk_maps: CVaR and mean",
-            lambda: write_risk_maps(model, observation, MEASURES, folder, int(tile), margin),
+            lambda: write_risk_maps(
+                model, observation, MEASURES, folder, int(tile), margin
+            ),
         )
     print(f"{name}, {side} × {side} cells, tiles of {tile}, margin of {margin} cells")
     show(rows)

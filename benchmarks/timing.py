@@ -20,7 +20,9 @@ REPEATS = 31
 
 
 def seconds(
-    work: Callable[[], object], repeats: int, clock: Callable[[], float] = time.perf_counter
+    work: Callable[[], object],
+    repeats: int,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> list[float]:
     """Return how long some work takes, each time that it is repeated."""
     times = []
@@ -55,13 +57,19 @@ def peak_gib() -> float:
 def problem_of(episodes: int) -> Problem:
     """Return the problem of the first maps of std, whose λ distributions are known."""
     suite = Suite(
-        data="paper-v1-test", scenarios=("std",), model="oracle", planners=("straight",), risks=("mean",)
+        data="paper-v1-test",
+        scenarios=("std",),
+        model="oracle",
+        planners=("straight",),
+        risks=("mean",),
     )
     return build_unit(one_unit(suite, episodes)).problem
 
 
 def plan_ms(planner: Any, problem: Problem, repeats: int = REPEATS) -> float:
-    """Return the time of a step of a planner that has begun, divided by the number of episodes."""
+    """Return the time of a step of a planner that has begun, divided by the number of
+    episodes.
+    """
     state = planner.init(problem, torch.Generator().manual_seed(0))
     observed = torch.full((len(problem),), torch.nan)
     step = Step(state=problem.start, traversability=observed, time_s=0.0)

@@ -1,11 +1,13 @@
-"""How fast the classifier trains, next to a plain PyTorch loop over the same network, and the Gaussian processes.
+"""How fast the classifier trains, next to a plain PyTorch loop over the same network,
+and the Gaussian processes.
 
     python -m benchmarks.training [DATASET]
 
-Without a dataset, paper-v1 is made in a temporary folder. Ours is an epoch of `benchnav-train
-classifier` as it comes: augmentation, schedule, metrics, logs. The whole epoch adds validation and the
-state that a killed training resumes from. The plain loop steps AdamW over the same batches, neither
-turned nor measured.
+Without a dataset, paper-v1 is made in a temporary folder. Ours is an epoch of
+`benchnav-train
+classifier` as it comes: augmentation, schedule, metrics, logs. The whole epoch adds
+validation and the state that a killed training resumes from. The plain loop steps AdamW
+over the same batches, neither turned nor measured.
 """
 
 import contextlib
@@ -43,33 +45,51 @@ class Stopwatch(Callback):
         self.starts: list[float] = []
         self.ends: list[float] = []
 
-    def on_train_epoch_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_train_epoch_start(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule
+    ) -> None:
         self.starts.append(time.perf_counter())
 
     def on_train_batch_end(self, *_: object) -> None:
         self.last = time.perf_counter()
 
-    def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_train_epoch_end(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule
+    ) -> None:
         self.steps.append(self.last - self.starts[-1])
 
-    def on_train_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+    def on_train_end(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule
+    ) -> None:
         self.ends = [*self.starts[1:], time.perf_counter()]
 
 
 def ours(
     data: MapData, config: ClassifierConfig, precision: str, classes: tuple[str, ...]
 ) -> tuple[float, float]:
-    """Images a second of training, and of whole epochs; the best of the epochs but the first."""
+    """Images a second of training, and of whole epochs; the best of the epochs but the
+    first.
+    """
     watch = Stopwatch()
     model = TerrainClassifier(config).build(data.scale(("rgb",)), classes)
     with tempfile.TemporaryDirectory() as folder:
         options = FitOptions(folder=Path(folder), trainer={"precision": precision})
-        fit(model, "bench", options, {}, [KeepBest(), watch], {"datamodule": data}, max_epochs=EPOCHS)
+        fit(
+            model,
+            "bench",
+            options,
+            {},
+            [KeepBest(), watch],
+            {"datamodule": data},
+            max_epochs=EPOCHS,
+        )
     whole = [end - start for start, end in zip(watch.starts, watch.ends, strict=True)]
     return len(data.train) / min(watch.steps[1:]), len(data.train) / min(whole[1:])
 
 
-def plain(data: MapData, config: ClassifierConfig, classes: tuple[str, ...], autocast: bool) -> float:
+def plain(
+    data: MapData, config: ClassifierConfig, classes: tuple[str, ...], autocast: bool
+) -> float:
     """Images a second of a plain loop."""
     model = TerrainClassifier(config).build(data.scale(("rgb",)), classes).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3)
@@ -79,7 +99,9 @@ def plain(data: MapData, config: ClassifierConfig, classes: tuple[str, ...], aut
         for batch in data.train_dataloader():
             optimizer.zero_grad()
             with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
-                loss = torch.nn.functional.cross_entropy(model(batch), batch["class_id"].long())
+                loss = torch.nn.functional.cross_entropy(
+                    model(batch), batch["class_id"].long()
+                )
             loss.backward()
             optimizer.step()
         best = min(best, time.perf_counter() - start)
@@ -95,20 +117,34 @@ def time_classifier(dataset: TerrainDataset) -> None:
     for precision in ("32-true", default_precision("cpu")):
         steps, epochs = ours(data, config, precision, classes)
         base = plain(data, config, classes, precision != "32-true")
-        rows.append({"images/s": precision, "plain loop": base, "steps": steps, "whole epochs": epochs})
+        rows.append(
+            {
+                "images/s": precision,
+                "plain loop": base,
+                "steps": steps,
+                "whole epochs": epochs,
+            }
+        )
     show(rows)
 
 
 def time_gps(dataset: TerrainDataset) -> None:
-    """Print seconds of reading all cells and of fitting the Gaussian processes of all classes."""
+    """Print seconds of reading all cells and of fitting the Gaussian processes of all
+    classes.
+    """
     sums = sum_split(dataset, "train")
     works: dict[str, Callable[[], object]] = {
         "reading and summing all cells": lambda: sum_split(dataset, "train"),
-        "fit_gps, one mode a class": lambda: fit_gps(LatentGPConfig(second_component=False), sums),
+        "fit_gps, one mode a class": lambda: fit_gps(
+            LatentGPConfig(second_component=False), sums
+        ),
         "fit_gps, looking for second modes": lambda: fit_gps(LatentGPConfig(), sums),
     }
     with contextlib.redirect_stderr(io.StringIO()):
-        rows = [{"work": name, "s": median(seconds(work, 5))} for name, work in works.items()]
+        rows = [
+            {"work": name, "s": median(seconds(work, 5))}
+            for name, work in works.items()
+        ]
     show(rows)
 
 

@@ -1,6 +1,7 @@
 """BenchNav: benchmarks for off-road robot navigation under uncertain traversability.
 
-Importing the package registers the Gymnasium environments `benchnav/OffRoad-v0` and `-v1`, and loads no PyTorch.
+Importing the package registers the Gymnasium environments `benchnav/OffRoad-v0` and
+`-v1`, and loads no PyTorch.
 """
 
 import gymnasium

@@ -1,7 +1,13 @@
 from benchnav.core.batch import Batch
 from benchnav.core.conditioned import ConditionedDistribution
 from benchnav.core.distribution import TraversabilityDistribution
-from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError, DatasetError, TrainingError
+from benchnav.core.errors import (
+    BenchnavError,
+    CheckpointError,
+    ConfigError,
+    DatasetError,
+    TrainingError,
+)
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.pooled import pool

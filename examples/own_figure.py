@@ -1,10 +1,18 @@
-"""A figure for reports of your own: when episodes failed, a panel a scenario and a line a planner."""
+"""A figure for reports of your own: when episodes failed, a panel a scenario and a line
+a planner.
+"""
 
 import matplotlib.figure
 import numpy as np
 
 from benchnav.eval.figures import RunData
-from benchnav.viz import Figure, legend_outside, panel_grid, planner_colours, planner_name
+from benchnav.viz import (
+    Figure,
+    legend_outside,
+    panel_grid,
+    planner_colours,
+    planner_name,
+)
 
 
 class WhenFailed(Figure):
@@ -22,7 +30,9 @@ class WhenFailed(Figure):
         scenarios = dict(list(data.failures.groupby("scenario")))
         colours = planner_colours(list(data.failures["planner"].unique()))
         bins = np.linspace(0, data.failures["end_time_s"].max(), 21)
-        figure, places = panel_grid(list(scenarios), across=3, high_in=1.8, sharex=True, sharey=True)
+        figure, places = panel_grid(
+            list(scenarios), across=3, high_in=1.8, sharex=True, sharey=True
+        )
         for (panel,), rows in zip(places, scenarios.values(), strict=True):
             for planner, own in rows.groupby("planner"):
                 look = {"color": colours[planner], "label": planner_name(planner)}

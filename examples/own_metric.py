@@ -25,5 +25,8 @@ class Detour(Metric):
         if not episode.success:
             return math.nan
         driven_m = np.linalg.norm(np.diff(episode.positions_m, axis=0), axis=1).sum()
-        straight_m = np.linalg.norm(episode.goal_m - episode.positions_m[0]) - episode.goal_radius_m
+        straight_m = (
+            np.linalg.norm(episode.goal_m - episode.positions_m[0])
+            - episode.goal_radius_m
+        )
         return float(driven_m / straight_m)

@@ -1,11 +1,14 @@
-"""A traversability model of one's own: a small network with a loss of its own, trained as ours are.
+"""A traversability model of one's own: a small network with a loss of its own, trained
+as ours are.
 
-    benchnav-train fit examples/own_model.py:CellModel --data DATASET --out checkpoints/mine --members 3
-    benchnav-train evaluate examples/own_model.py:CellModel@checkpoints/mine --data DATASET
-    benchnav-eval run --model examples/own_model.py:CellModel@checkpoints/mine --data DATASET
+    benchnav-train fit examples/own_model.py:CellModel --data DATASET --out
+    checkpoints/mine --members 3 benchnav-train evaluate
+    examples/own_model.py:CellModel@checkpoints/mine --data DATASET benchnav-eval run
+    --model examples/own_model.py:CellModel@checkpoints/mine --data DATASET
 
-The network looks at one cell at a time, at the layers that `inputs` names, and gives one Gaussian, clipped to [0, 1].
-Its loss is the continuous ranked probability score of a Gaussian (Gneiting and Raftery, 2007).
+The network looks at one cell at a time, at the layers that `inputs` names, and gives
+one Gaussian, clipped to [0, 1]. Its loss is the continuous ranked probability score of
+a Gaussian (Gneiting and Raftery, 2007).
 """
 
 import math
@@ -21,7 +24,9 @@ from benchnav.models import TrainableModel, TrainingConfig
 
 @dataclass(frozen=True, kw_only=True)
 class CellConfig(TrainingConfig):
-    """Each field is a setting: `--settings.hidden 64 --settings.inputs '[rgb, slope_deg, elevation_m]'`."""
+    """Each field is a setting: `--settings.hidden 64 --settings.inputs '[rgb,
+    slope_deg, elevation_m]'`.
+    """
 
     inputs: tuple[str, ...] = ("rgb", "slope_deg")
     hidden: int = 32
@@ -35,7 +40,9 @@ class CellModel(TrainableModel):
 
     def configure_network(self, channels: int) -> nn.Module:
         hidden = self.config.hidden
-        return nn.Sequential(nn.Conv2d(channels, hidden, 1), nn.SiLU(), nn.Conv2d(hidden, 2, 1))
+        return nn.Sequential(
+            nn.Conv2d(channels, hidden, 1), nn.SiLU(), nn.Conv2d(hidden, 2, 1)
+        )
 
     def configure_losses(self) -> Callable[[Tensor, Tensor], Tensor]:
         def crps(outputs: Tensor, observed: Tensor) -> Tensor:
@@ -43,13 +50,17 @@ class CellModel(TrainableModel):
             seen = observed.isfinite()  # λ is NaN where it was not observed
             z = (torch.where(seen, observed, 0.5) - mean) / std
             density = torch.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
-            scores = std * (z * torch.erf(z / math.sqrt(2)) + 2 * density - 1 / math.sqrt(math.pi))
+            scores = std * (
+                z * torch.erf(z / math.sqrt(2)) + 2 * density - 1 / math.sqrt(math.pi)
+            )
             return (scores * seen).sum() / seen.sum().clamp(min=1)
 
         return crps
 
     def to_distribution(self, outputs: Tensor) -> TraversabilityMixture:
-        mean, std = (values.unsqueeze(1) for values in self.gaussian(outputs))  # [B, K = 1, H, W]
+        mean, std = (
+            values.unsqueeze(1) for values in self.gaussian(outputs)
+        )  # [B, K = 1, H, W]
         return TraversabilityMixture(torch.ones_like(mean), mean, std)
 
     def gaussian(self, outputs: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,10 +1,11 @@
 """A planner of one's own: full speed ahead along the best of a fan of arcs.
 
-    benchnav-eval run --planners '[straight,examples/own_planner.py:Fan]' --risks '[mean,cvar:0.9]' --out runs/fan
+    benchnav-eval run --planners '[straight,examples/own_planner.py:Fan]' --risks
+    '[mean,cvar:0.9]' --out runs/fan
 
 It is found by its file; its constructor's parameters are its options, as in
-`{part: examples/own_planner.py:Fan, label: wide fan, options: {arcs: 31}}`. Its tests need one line,
-`check_planner("examples/own_planner.py:Fan")` of `benchnav.testing`.
+`{part: examples/own_planner.py:Fan, label: wide fan, options: {arcs: 31}}`. Its tests
+need one line, `check_planner("examples/own_planner.py:Fan")` of `benchnav.testing`.
 """
 
 import torch
@@ -23,10 +24,15 @@ class Fan(Planner[Problem]):
     def init(self, problem: Problem, generator: torch.Generator) -> Problem:
         return problem  # the plan state: all that is kept from step to step
 
-    def plan(self, step: Step, plan_state: Problem) -> tuple[torch.Tensor, Problem, Plan]:
+    def plan(
+        self, step: Step, plan_state: Problem
+    ) -> tuple[torch.Tensor, Problem, Plan]:
         problem = plan_state
         low, high = problem.action_bounds
-        turns = torch.linspace(0, 1, self.arcs, device=low.device) * (high[1] - low[1]) + low[1]
+        turns = (
+            torch.linspace(0, 1, self.arcs, device=low.device) * (high[1] - low[1])
+            + low[1]
+        )
         actions = torch.stack((high[0].expand_as(turns), turns), dim=1)  # [M, 2]
         state = step.state[:, None].expand(-1, self.arcs, -1)  # [B, M, S]
         target, cost, path = problem.goal_m[:, None], 0.0, [state[..., :2]]
@@ -37,4 +43,8 @@ class Fan(Planner[Problem]):
             path.append(state[..., :2])
         best = (cost + problem.terminal_cost(state, target)).argmin(dim=1)
         drawn = {"samples": torch.stack(path, dim=2)} if step.draw else {}
-        return actions[best], plan_state, Plan.empty(len(problem), state.device, **drawn)
+        return (
+            actions[best],
+            plan_state,
+            Plan.empty(len(problem), state.device, **drawn),
+        )

@@ -18,7 +18,9 @@ class Tracked(Unicycle):
 
     def __call__(self, state, action, traversability):
         turning = traversability.clamp(min=0.05) ** (self.turn_loss - 1)
-        slowed = action * turning[..., None] ** action.new_tensor([0.0, 1.0])  # (v, ω): ω alone
+        slowed = action * turning[..., None] ** action.new_tensor(
+            [0.0, 1.0]
+        )  # (v, ω): ω alone
         return super().__call__(state, slowed, traversability)
 
 
@@ -29,7 +31,9 @@ class Energy(Objective):
     waste: float = 2.0
 
     def stage(self, state, action, traversability, target):
-        return distance(state, target) + self.waste * action[..., 0].abs() * (1 - traversability)
+        return distance(state, target) + self.waste * action[..., 0].abs() * (
+            1 - traversability
+        )
 
     def terminal(self, state, traversability, target):
         return distance(state, target)

@@ -1,10 +1,13 @@
-"""A policy by PPO of stable-baselines3, trained in `benchnav/OffRoad-v1`, and as a planner.
+"""A policy by PPO of stable-baselines3, trained in `benchnav/OffRoad-v1`, and as a
+planner.
 
-    benchnav-datagen create stakes-v1 --splits '[train]' --first 64 --out datasets/stakes-train.h5
-    python examples/ppo.py datasets/stakes-train.h5 ppo.zip --steps 100000
-    benchnav-eval run --data stakes-v1 --model stakes-v1 --planners '[straight,examples/ppo.py:Policy]' --out runs/ppo
+    benchnav-datagen create stakes-v1 --splits '[train]' --first 64 --out
+    datasets/stakes-train.h5 python examples/ppo.py datasets/stakes-train.h5 ppo.zip
+    --steps 100000 benchnav-eval run --data stakes-v1 --model stakes-v1 --planners
+    '[straight,examples/ppo.py:Policy]' --out runs/ppo
 
-`Batched` gives stable-baselines3 all sub-environments as one batch: 16 take a tenth of the time of one after the other.
+`Batched` gives stable-baselines3 all sub-environments as one batch: 16 take a tenth of
+the time of one after the other.
 """
 
 import argparse
@@ -24,12 +27,18 @@ KNOWS = {"model": "stakes-v1", "risk": "expected-time"}
 
 
 class Batched(VecEnv):
-    """The vector environment as stable-baselines3 has it: ended episodes start anew in the same step."""
+    """The vector environment as stable-baselines3 has it: ended episodes start anew in
+    the same step.
+    """
 
     def __init__(self, count: int, **settings) -> None:
-        self.envs = gymnasium.make_vec("benchnav/OffRoad-v1", num_envs=count, **settings)
+        self.envs = gymnasium.make_vec(
+            "benchnav/OffRoad-v1", num_envs=count, **settings
+        )
         self.actions = None
-        super().__init__(count, self.envs.single_observation_space, self.envs.single_action_space)
+        super().__init__(
+            count, self.envs.single_observation_space, self.envs.single_action_space
+        )
 
     def reset(self):
         seen, info = self.envs.reset(seed=self._seeds[0])
@@ -44,7 +53,9 @@ class Batched(VecEnv):
         seen, reward, terminated, truncated, info = self.envs.step(self.actions)
         ended, infos = terminated | truncated, self.each(info)
         for i in np.flatnonzero(ended):
-            infos[i]["terminal_observation"] = {name: values[i] for name, values in seen.items()}
+            infos[i]["terminal_observation"] = {
+                name: values[i] for name, values in seen.items()
+            }
             infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
         if ended.any():
             seen, fresh = self.envs.reset(options={"reset_mask": ended})
@@ -53,7 +64,10 @@ class Batched(VecEnv):
         return seen, reward.astype(np.float32), ended, infos
 
     def each(self, info: dict[str, np.ndarray]) -> list[dict]:
-        return [{name: values[i] for name, values in info.items()} for i in range(self.num_envs)]
+        return [
+            {name: values[i] for name, values in info.items()}
+            for i in range(self.num_envs)
+        ]
 
     def close(self) -> None:
         self.envs.close()
@@ -62,10 +76,14 @@ class Batched(VecEnv):
         return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name, value, indices=None):
-        raise NotImplementedError("sub-environments are one batch and have no attributes of their own")
+        raise NotImplementedError(
+            "sub-environments are one batch and have no attributes of their own"
+        )
 
     def env_method(self, method_name, *method_args, indices=None, **method_kwargs):
-        raise NotImplementedError("sub-environments are one batch and have no methods of their own")
+        raise NotImplementedError(
+            "sub-environments are one batch and have no methods of their own"
+        )
 
     def env_is_wrapped(self, wrapper_class, indices=None):
         return [False] * len(list(self._get_indices(indices)))
@@ -81,7 +99,10 @@ class Looks(BaseFeaturesExtractor):
         super().__init__(observation_space, width + observation_space["state"].shape[0])
         layers = []
         for inner, outer in ((4, 16), (16, 32), (32, 32)):
-            layers += [torch.nn.Conv2d(inner, outer, 3, stride=2, padding=1), torch.nn.ReLU()]
+            layers += [
+                torch.nn.Conv2d(inner, outer, 3, stride=2, padding=1),
+                torch.nn.ReLU(),
+            ]
         self.crop = torch.nn.Sequential(
             *layers, torch.nn.Flatten(), torch.nn.LazyLinear(width), torch.nn.ReLU()
         )
@@ -96,15 +117,30 @@ class Policy(PolicyPlanner):
 
     def __init__(self, path: str = "ppo.zip") -> None:
         policy = PPO.load(path, device="cpu").policy
-        super().__init__(lambda seen: policy.predict(seen, deterministic=True)[0], normalised_actions=True)
+        super().__init__(
+            lambda seen: policy.predict(seen, deterministic=True)[0],
+            normalised_actions=True,
+        )
 
 
-def train(data: str, out: str, steps: int, count: int = 32, seed: int = 0, rollout: int = 128) -> PPO:
-    envs = VecMonitor(Batched(count, data=data, world="stakes", normalised_actions=True, **KNOWS))
+def train(
+    data: str, out: str, steps: int, count: int = 32, seed: int = 0, rollout: int = 128
+) -> PPO:
+    envs = VecMonitor(
+        Batched(count, data=data, world="stakes", normalised_actions=True, **KNOWS)
+    )
     ppo = PPO(
-        "MultiInputPolicy", envs, n_steps=rollout, batch_size=512, gamma=0.995, learning_rate=3e-4, seed=seed,
-        device="cpu", verbose=1, policy_kwargs={"features_extractor_class": Looks},
-    )  # fmt: skip
+        "MultiInputPolicy",
+        envs,
+        n_steps=rollout,
+        batch_size=512,
+        gamma=0.995,
+        learning_rate=3e-4,
+        seed=seed,
+        device="cpu",
+        verbose=1,
+        policy_kwargs={"features_extractor_class": Looks},
+    )
     ppo.learn(steps)
     ppo.save(out)
     return ppo

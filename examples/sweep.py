@@ -1,4 +1,5 @@
-"""A sweep with Optuna: tunes learning rate and width of the example's model by the validation loss, and prunes trials.
+"""A sweep with Optuna: tunes learning rate and width of the example's model by the
+validation loss, and prunes trials.
 
 pip install optuna
 python examples/sweep.py DATASET FOLDER [TRIALS]
@@ -24,8 +25,12 @@ class Prune(Callback):
     def __init__(self, trial: optuna.Trial) -> None:
         self.trial = trial
 
-    def on_validation_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
-        self.trial.report(float(trainer.callback_metrics["valid_loss"]), trainer.current_epoch)
+    def on_validation_epoch_end(
+        self, trainer: Trainer, module: LightningModule
+    ) -> None:
+        self.trial.report(
+            float(trainer.callback_metrics["valid_loss"]), trainer.current_epoch
+        )
         if self.trial.should_prune():
             raise optuna.TrialPruned
 

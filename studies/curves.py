@@ -1,4 +1,6 @@
-"""Curves with intervals over rows of summaries, as the figures of the studies show them."""
+"""Curves with intervals over rows of summaries, as the figures of the studies show
+them.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,22 +13,33 @@ from benchnav.viz import Curves, legend_outside, line_looks
 
 # Columns of a summary with their ends, factor and label.
 SUCCESS = ("success_rate", "success_low", "success_high"), 100.0, "success [%]"
-TOTAL_TIME = ("total_time_mean_s", "total_time_low_s", "total_time_high_s"), 1.0, "T_total [s]"
+TOTAL_TIME = (
+    ("total_time_mean_s", "total_time_low_s", "total_time_high_s"),
+    1.0,
+    "T_total [s]",
+)
 
 
 def in_units(row: Any, measure: Any) -> list[Any]:
-    """Return a measure of a row, or of rows, and the ends of its interval, in the units of its label."""
+    """Return a measure of a row, or of rows, and the ends of its interval, in the units
+    of its label.
+    """
     columns, factor, _ = measure
     return [factor * row[column] for column in columns]
 
 
 def draw_curves(
-    rows: pd.DataFrame, measures: Mapping[str, Any], x_label: str = "", across: int = 2, high_in: float = 2.0
+    rows: pd.DataFrame,
+    measures: Mapping[str, Any],
+    x_label: str = "",
+    across: int = 2,
+    high_in: float = 2.0,
 ) -> tuple[Figure, dict[tuple[str, str], Axes]]:
     """Draw measures of conditions with 95 % intervals, a marker each, and a legend.
 
     Args:
-        rows: rows of a summary with `panel`, `line` and `x`; a curve joins the rows of a line as they stand.
+        rows: rows of a summary with `panel`, `line` and `x`; a curve joins the rows of
+            a line as they stand.
         measures: by name, such as `SUCCESS`.
         x_label: of the axes.
         across: panels side by side.
@@ -38,11 +51,19 @@ def draw_curves(
     table, labels = rows.copy(), {}
     for name, measure in measures.items():
         labels[name] = measure[-1]
-        for end, values in zip(("", "_low", "_high"), in_units(table, measure), strict=True):
+        for end, values in zip(
+            ("", "_low", "_high"), in_units(table, measure), strict=True
+        ):
             table[name + end] = values
     looks = line_looks(list(rows["line"]))
     curves = Curves(
-        table=table, measures=labels, looks=looks, x_label=x_label, across=across, high_in=high_in, bars=True
+        table=table,
+        measures=labels,
+        looks=looks,
+        x_label=x_label,
+        across=across,
+        high_in=high_in,
+        bars=True,
     )
     figure, panels = curves.draw()
     legend_outside(figure, columns=min(len(looks), 4), side="upper center")

@@ -1,7 +1,8 @@
 """Writing the tables and the figures of a study's page.
 
-A table stands between `<!-- KIND RUN -->` and `<!-- end -->`, which may be indented, as in a fold. `RUN` names a run of
-the study. A table or figure whose run is missing stays as it is.
+A table stands between `<!-- KIND RUN -->` and `<!-- end -->`, which may be indented, as
+in a fold. `RUN` names a run of the study. A table or figure whose run is missing stays
+as it is.
 """
 
 import re
@@ -21,7 +22,9 @@ from studies.runs import developed, digest_of
 from studies.study import ROOT, Study, Work
 from studies.tables import KINDS
 
-BLOCK = re.compile(r"^( *)<!-- ([\w-]+) ([\w/.-]+) -->\n.*?<!-- end -->", re.DOTALL | re.MULTILINE)
+BLOCK = re.compile(
+    r"^( *)<!-- ([\w-]+) ([\w/.-]+) -->\n.*?<!-- end -->", re.DOTALL | re.MULTILINE
+)
 FIGURES = ROOT / "docs" / "figures"
 
 
@@ -64,7 +67,10 @@ def _table(study: Study, part: str, kind: str, folder: Path) -> str | None:
     if study.parts[part].script:
         stored = folder / f"{kind}.md"
         return stored.read_text() if stored.exists() else None
-    kinds = KINDS | {name: (study.function(spec), rows.SUMMARY) for name, spec in study.tables.items()}
+    kinds = KINDS | {
+        name: (study.function(spec), rows.SUMMARY)
+        for name, spec in study.tables.items()
+    }
     expect(kind in kinds, f"a table among {', '.join(kinds)}, got {kind}.")
     table, needed = kinds[kind]
     return to_markdown(table(folder)) if (folder / needed).exists() else None
@@ -74,8 +80,14 @@ def draw_figures(study: Study, work: Work) -> None:
     """Draw the figures of the page, or copy them from the runs."""
     for name, drawing in study.figures.items():
         path = FIGURES / name
-        folders = [rows.folder_of(study, study.run_of(part), work) for part in drawing.parts]
-        needed = [work.out / drawing.copy] if drawing.copy else [folder / rows.SUMMARY for folder in folders]
+        folders = [
+            rows.folder_of(study, study.run_of(part), work) for part in drawing.parts
+        ]
+        needed = (
+            [work.out / drawing.copy]
+            if drawing.copy
+            else [folder / rows.SUMMARY for folder in folders]
+        )
         if not all(file.exists() for file in needed):
             print(f"left as it is: {name}")
         elif drawing.copy:

@@ -19,22 +19,33 @@ ALPHA, POWER = 0.05, 0.8
 def power(study: Study, work: Work) -> str:
     """Return a table of the power of each hypothesis, as Markdown.
 
-    It is of the first and the last place of Holm's correction, if the difference is the one that was found; of
-    equivalence and non-inferiority also if there is none. Of a difference the table has the smallest one that is shown
-    with a power of 0.8 in the first place too.
+    It is of the first and the last place of Holm's correction, if the difference is the
+    one that was found; of equivalence and non-inferiority also if there is none. Of a
+    difference the table has the smallest one that is shown with a power of 0.8 in the
+    first place too.
     """
     maps = yaml.safe_load(study.suite_of("primary").read_text())["maps"]
     tests = read_report(developed(study, work)).tests.to_dict("records")
-    rows = [{"": number, **_row(test, len(tests), maps)} for number, test in enumerate(tests, 1)]
+    rows = [
+        {"": number, **_row(test, len(tests), maps)}
+        for number, test in enumerate(tests, 1)
+    ]
     return to_markdown(table_of(pd.DataFrame(rows)))
 
 
 def _row(test: Mapping[Any, Any], n_tests: int, maps: int) -> dict[str, str]:
     """Return the cells of a hypothesis, one of `n_tests`, on so many maps."""
-    error = (test["high"] - test["low"]) / 2 / norm.ppf(0.975) * np.sqrt(test["n_maps"] / maps)
+    error = (
+        (test["high"] - test["low"])
+        / 2
+        / norm.ppf(0.975)
+        * np.sqrt(test["n_maps"] / maps)
+    )
     places = (ALPHA / n_tests, ALPHA)
     if_found, if_none = (
-        " to ".join(f"{power_of(test, error, alpha, difference):.2f}" for alpha in places)
+        " to ".join(
+            f"{power_of(test, error, alpha, difference):.2f}" for alpha in places
+        )
         for difference in (test["difference"], 0.0)
     )
     tails = 1 if test["direction"] else 2
@@ -42,7 +53,8 @@ def _row(test: Mapping[Any, Any], n_tests: int, maps: int) -> dict[str, str]:
     has_margin = test["kind"] in ("equivalence", "non-inferiority")
     return {
         "hypothesis": test["claim"],
-        "found on other maps (95 %)": f"{test['difference']:+.2f} ({test['low']:+.1f} to {test['high']:+.1f})",
+        "found on other maps (95 %)": f"{test['difference']:+.2f} ({test['low']:+.1f} "
+        f"to {test['high']:+.1f})",
         "power, if so": if_found,
         "power, if no difference": if_none if has_margin else NOTHING,
         f"smallest difference with a power of {POWER}": f"{smallest:.1f}"
@@ -51,7 +63,9 @@ def _row(test: Mapping[Any, Any], n_tests: int, maps: int) -> dict[str, str]:
     }
 
 
-def power_of(test: Mapping[Any, Any], error: float, alpha: float, difference: float) -> float:
+def power_of(
+    test: Mapping[Any, Any], error: float, alpha: float, difference: float
+) -> float:
     """Return the probability that a hypothesis is supported.
 
     Args:
@@ -63,11 +77,18 @@ def power_of(test: Mapping[Any, Any], error: float, alpha: float, difference: fl
     kind, margin = test["kind"], test["margin"]
     if kind == "equivalence":
         ends = (
-            (margin + away) / max(error, 1e-9) - norm.ppf(1 - alpha) for away in (difference, -difference)
+            (margin + away) / max(error, 1e-9) - norm.ppf(1 - alpha)
+            for away in (difference, -difference)
         )
         return max(0.0, float(sum(norm.cdf(end) for end in ends)) - 1)
     # Of a difference in either direction the side that it lies on counts.
-    gain = difference * (-1 if test["direction"] == "lower" else 1) if test["direction"] else abs(difference)
+    gain = (
+        difference * (-1 if test["direction"] == "lower" else 1)
+        if test["direction"]
+        else abs(difference)
+    )
     smallest = -margin if kind == "non-inferiority" else margin
     tails = 1 if test["direction"] else 2
-    return float(norm.cdf((gain - smallest) / max(error, 1e-9) - norm.ppf(1 - alpha / tails)))
+    return float(
+        norm.cdf((gain - smallest) / max(error, 1e-9) - norm.ppf(1 - alpha / tails))
+    )

@@ -1,6 +1,8 @@
-"""Rows of finished runs that a study keeps in its folder: a table of conditions and one of episodes for each run.
+"""Rows of finished runs that a study keeps in its folder: a table of conditions and one
+of episodes for each run.
 
-They are stored apart from any version of the run folder, so that every later version can read them.
+They are stored apart from any version of the run folder, so that every later version
+can read them.
 """
 
 from pathlib import Path
@@ -11,14 +13,34 @@ from studies.study import Study, Work
 
 SUMMARY, EPISODES = "summary.csv", "episodes.parquet"
 KEPT = (
-    "data", "scenario", "world", "robot", "objective", "model", "sensor", "ground", "belief", "planner", "risk",
-    "seed", "realisation", "map", "group", "outcome", "success", "total_time_s", "end_time_s", "traversability",
+    "data",
+    "scenario",
+    "world",
+    "robot",
+    "objective",
+    "model",
+    "sensor",
+    "ground",
+    "belief",
+    "planner",
+    "risk",
+    "seed",
+    "realisation",
+    "map",
+    "group",
+    "outcome",
+    "success",
+    "total_time_s",
+    "end_time_s",
+    "traversability",
     "reference_time_s",
-)  # fmt: skip
+)
 
 
 def folder_of(study: Study, run: str, work: Work) -> Path:
-    """Return the folder of a run, or of the rows that are kept of it where it is not there."""
+    """Return the folder of a run, or of the rows that are kept of it where it is not
+    there.
+    """
     folder = work.out / run
     return folder if folder.exists() else study.folder / "rows" / run
 
@@ -34,8 +56,12 @@ def keep(study: Study, parts: list[str], work: Work) -> None:
         kept.mkdir(parents=True, exist_ok=True)
         summary = pd.read_csv(folder / SUMMARY, dtype=str, keep_default_na=False)
         _without_paths(summary).to_csv(kept / SUMMARY, index=False)
-        episodes = _without_paths(pd.read_parquet(folder / EPISODES, columns=list(KEPT)))
-        episodes.to_parquet(kept / EPISODES, index=False, compression="zstd", compression_level=19)
+        episodes = _without_paths(
+            pd.read_parquet(folder / EPISODES, columns=list(KEPT))
+        )
+        episodes.to_parquet(
+            kept / EPISODES, index=False, compression="zstd", compression_level=19
+        )
         print(f"kept: {run}, {len(summary)} conditions, {len(episodes)} episodes")
 
 

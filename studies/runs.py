@@ -24,13 +24,19 @@ DEVELOPED_MAPS = 200
 
 
 def command(program: str, *words: object) -> None:
-    """Run one of our commands from the root of the repository, where paths of parts begin."""
+    """Run one of our commands from the root of the repository, where paths of parts
+    begin.
+    """
     started = time.perf_counter()
     if code := subprocess.run(
         [Path(sys.executable).with_name(program), *map(str, words)], cwd=ROOT
     ).returncode:
         sys.exit(code)  # it has said why
-    print(f"-- {program} {' '.join(map(str, words[:3]))}: {time.perf_counter() - started:.0f} s", flush=True)
+    print(
+        f"-- {program} {' '.join(map(str, words[:3]))}: "
+        f"{time.perf_counter() - started:.0f} s",
+        flush=True,
+    )
 
 
 def make_maps(study: Study, work: Work) -> None:
@@ -44,11 +50,20 @@ def make_maps(study: Study, work: Work) -> None:
         path = work.maps_in / f"{name}.h5"
         if not path.exists():
             splits = f"[{','.join(maps.splits)}]"
-            command("benchnav-datagen", "create", *maps.create, "--splits", splits, "--out", path)
+            command(
+                "benchnav-datagen",
+                "create",
+                *maps.create,
+                "--splits",
+                splits,
+                "--out",
+                path,
+            )
         digest = TerrainDataset(path).splits[maps.splits[0]]["digest"]
         expect(
             digest == (maps.digest or digest),
-            f"maps of digest {maps.digest} in {path}, got {digest}. Delete the file, or use another `--maps_in`.",
+            f"maps of digest {maps.digest} in {path}, got {digest}. Delete the file, "
+            "or use another `--maps_in`.",
         )
         print(f"{name}: {digest}")
 
@@ -71,7 +86,9 @@ def drive(suite: dict[str, Any], folder: Path, jobs: int) -> None:
 
 
 def _run_script(study: Study, part: str, work: Work) -> None:
-    """Call the function of a part, and store each result as NAME.md, NAME.csv or NAME.png."""
+    """Call the function of a part, and store each result as NAME.md, NAME.csv or
+    NAME.png.
+    """
     folder, about = work.out / study.run_of(part), study.parts[part]
     folder.mkdir(parents=True, exist_ok=True)
     options = {**about.options, **({"maps": work.maps} if work.maps else {})}
@@ -95,8 +112,13 @@ def _run_script(study: Study, part: str, work: Work) -> None:
 
 def table_of(rows: pd.DataFrame) -> Table:
     """Return rows as a table, numbers with four digits."""
-    cells = rows.map(lambda value: f"{value:.4g}" if isinstance(value, float) else str(value))
-    return Table(headings=tuple(map(str, rows.columns)), rows=tuple(cells.itertuples(index=False, name=None)))
+    cells = rows.map(
+        lambda value: f"{value:.4g}" if isinstance(value, float) else str(value)
+    )
+    return Table(
+        headings=tuple(map(str, rows.columns)),
+        rows=tuple(cells.itertuples(index=False, name=None)),
+    )
 
 
 def develop(study: Study, work: Work) -> None:
@@ -108,7 +130,11 @@ def develop(study: Study, work: Work) -> None:
     expect(study.develop, f"a study with maps to develop on, got {study.name}.")
     suite = study.suite("primary", work)
     on = {"data": str(work.maps_in / f"{study.develop}.h5"), "seed": study.seed}
-    drive(suite | on | {"maps": min(DEVELOPED_MAPS, suite["maps"])}, developed(study, work), work.jobs)
+    drive(
+        suite | on | {"maps": min(DEVELOPED_MAPS, suite["maps"])},
+        developed(study, work),
+        work.jobs,
+    )
 
 
 def developed(study: Study, work: Work) -> Path:

@@ -1,8 +1,9 @@
 """What a study consists of, as its file `study.yaml` says.
 
-A study has parts. A part is a suite, which is run into a folder, or a script of the study, which computes tables and
-figures. Suites whose digest stands on a page keep their bytes: paths in them are those of the day when they were
-fixed. `moved` says where such a file is today, and the suite that is run names that.
+A study has parts. A part is a suite, which is run into a folder, or a script of the
+study, which computes tables and figures. Suites whose digest stands on a page keep
+their bytes: paths in them are those of the day when they were fixed. `moved` says where
+    such a file is today, and the suite that is run names that.
 """
 
 import importlib
@@ -46,9 +47,11 @@ class Part:
     """A part of a study.
 
     Args:
-        suite: name of its suite in the study's folder, or of a shipped one; if empty, the part's name.
-        script: `MODULE:FUNCTION` of the study's folder, in place of a suite; called with the `Work`, the run's folder
-            and the options, it returns figures, tables (rows or Markdown) by name.
+        suite: name of its suite in the study's folder, or of a shipped one; if empty,
+            the part's name.
+        script: `MODULE:FUNCTION` of the study's folder, in place of a suite; called
+            with the `Work`, the run's folder and the options, it returns figures,
+            tables (rows or Markdown) by name.
         options: of the script.
         run: name of the run; if empty, `STUDY-PART`.
         maps: number of maps of each condition, the first ones; if 0, as the suite says.
@@ -82,7 +85,8 @@ class Drawing:
 
     Args:
         copy: path of a figure in the folder of the runs; empty where it is drawn.
-        draw: `MODULE:FUNCTION` of the study's folder; called with the rows of all summaries, it returns the figure.
+        draw: `MODULE:FUNCTION` of the study's folder; called with the rows of all
+            summaries, it returns the figure.
         parts: parts whose summaries it is given.
     """
 
@@ -103,7 +107,8 @@ class Study:
         moved: path of today by a path in a suite that was fixed before.
         develop: maps on which its hypotheses were developed; empty where it has none.
         seed: of the episodes there.
-        tables: `MODULE:FUNCTION` of the study's folder by kind of table; it makes one of a run's folder.
+        tables: `MODULE:FUNCTION` of the study's folder by kind of table; it makes one
+            of a run's folder.
         figures: figures of the page by name of their file in docs/figures.
     """
 
@@ -124,14 +129,29 @@ class Study:
         Raises:
             ConfigError: If there is no such study, or its file is not usable.
         """
-        folder = next((path for path in (HOME / name, Path(name)) if (path / "study.yaml").is_file()), None)
+        folder = next(
+            (
+                path
+                for path in (HOME / name, Path(name))
+                if (path / "study.yaml").is_file()
+            ),
+            None,
+        )
         known = sorted(path.parent.name for path in HOME.glob("*/study.yaml"))
-        expect(folder, f"`study` among {', '.join(known)}, or a folder with a study.yaml, got {name}.")
+        expect(
+            folder,
+            f"`study` among {', '.join(known)}, or a folder with a study.yaml, got "
+            f"{name}.",
+        )
         assert folder is not None
         data = yaml.safe_load((folder / "study.yaml").read_text())
         # A part that says nothing is the suite of its name.
         data["parts"] = {part: options or {} for part, options in data["parts"].items()}
-        study: Study = read(cls, data | {"folder": str(folder.resolve())}, of(str(folder / "study.yaml")))
+        study: Study = read(
+            cls,
+            data | {"folder": str(folder.resolve())},
+            of(str(folder / "study.yaml")),
+        )
         return study
 
     @property
@@ -158,7 +178,9 @@ class Study:
         return own if own.is_file() else SUITES / f"{name}.yaml"
 
     def suite(self, part: str, work: Work) -> dict[str, Any]:
-        """Return a part's suite as it is run: with maps by their files, and files where they are today."""
+        """Return a part's suite as it is run: with maps by their files, and files where
+        they are today.
+        """
         content: dict[str, Any] = yaml.safe_load(self.suite_of(part).read_text())
         suite: dict[str, Any] = self._placed(content, work)
         maps = work.maps or self.parts[part].maps
@@ -166,7 +188,9 @@ class Study:
 
     def _placed(self, value: Any, work: Work, key: str = "") -> Any:
         if isinstance(value, Mapping):
-            return {name: self._placed(item, work, name) for name, item in value.items()}
+            return {
+                name: self._placed(item, work, name) for name, item in value.items()
+            }
         if isinstance(value, list):
             return [self._placed(item, work, key) for item in value]
         if key == "data" and value in self.maps:

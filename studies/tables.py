@@ -2,10 +2,11 @@
 
 - `results`: the table of the run's report;
 - `hypotheses`: what the suite was to show, and the tests of it;
-- `settings`: success and mean T_total, a row for each model, planner and world, a column for each risk setting;
-- `sweep`: success of each setting under each value, and what the best gains on the worst; p of the sign-flip test,
-  after Holm's correction over all pairs of settings of the row. Best and worst are chosen by what was seen, so the
-  gain is biased upward.
+- `settings`: success and mean T_total, a row for each model, planner and world, a
+  column for each risk setting;
+- `sweep`: success of each setting under each value, and what the best gains on the
+  worst; p of the sign-flip test, after Holm's correction over all pairs of settings of
+  the row. Best and worst are chosen by what was seen, so the gain is biased upward.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,10 +24,22 @@ from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import Pair, find_pairs
 from studies.rows import SUMMARY
 
-NEXT_TO_RISK = ("data", "scenario", "world", "robot", "model", "sensor", "ground", "belief", "planner")
+NEXT_TO_RISK = (
+    "data",
+    "scenario",
+    "world",
+    "robot",
+    "model",
+    "sensor",
+    "ground",
+    "belief",
+    "planner",
+)
 
 
-def table(headings: Sequence[str], rows: Sequence[Sequence[str]], labels: int = 1) -> Table:
+def table(
+    headings: Sequence[str], rows: Sequence[Sequence[str]], labels: int = 1
+) -> Table:
     """Return a table, its first columns labels."""
     return Table(headings=tuple(headings), rows=tuple(map(tuple, rows)), labels=labels)
 
@@ -52,7 +65,9 @@ def settings(run: Path) -> Table:
     summary = pd.read_csv(run / SUMMARY)
     summary = summary[summary["risk"] != NOT_USED]
     risks = list(summary["risk"].unique())
-    varied = [name for name in NEXT_TO_RISK if summary[name].nunique() > 1] or ["planner"]
+    varied = [name for name in NEXT_TO_RISK if summary[name].nunique() > 1] or [
+        "planner"
+    ]
     rows = []
     for labels, conditions in summary.groupby(varied, sort=False):
         cells = {
@@ -64,9 +79,13 @@ def settings(run: Path) -> Table:
 
 
 def sweep(run: Path) -> Table:
-    """Return success of each setting under each value that was swept, and what the best gains on the worst."""
+    """Return success of each setting under each value that was swept, and what the best
+    gains on the worst.
+    """
     pairs = find_pairs(read_conditions([open_run(run)]), by="risk")
-    varied = [name for name in NEXT_TO_RISK if len({pair.shared[name] for pair in pairs}) > 1]
+    varied = [
+        name for name in NEXT_TO_RISK if len({pair.shared[name] for pair in pairs}) > 1
+    ]
     variants: dict[tuple[str, ...], list[Pair]] = {}
     for pair in pairs:
         labels = {**pair.shared, "data": Path(pair.shared["data"]).name}
@@ -76,21 +95,33 @@ def sweep(run: Path) -> Table:
     for values, pairs_of_value in variants.items():
         rates, gain, p = _best_and_worst(compare(pairs_of_value))
         rows.append([*values, *(f"{rates[risk]:.1f}" for risk in risks), gain, p])
-    return table([*varied, *risks, "best − worst [points] (95 %)", "p"], rows, len(varied))
+    return table(
+        [*varied, *risks, "best − worst [points] (95 %)", "p"], rows, len(varied)
+    )
 
 
 def _best_and_worst(compared: pd.DataFrame) -> tuple[dict[str, float], str, str]:
-    """Return success of each setting in per cent, what the best gains on the worst in points, and p."""
+    """Return success of each setting in per cent, what the best gains on the worst in
+    points, and p.
+    """
     rates: dict[str, float] = {}
     for row in compared.to_dict("records"):
-        rates |= {row["other"]: 100 * row["success_other"], row["one"]: 100 * row["success_one"]}
+        rates |= {
+            row["other"]: 100 * row["success_other"],
+            row["one"]: 100 * row["success_one"],
+        }
     order = sorted(rates, key=rates.__getitem__)
     worst, best = order[0], order[-1]
-    pair = compared[compared["one"].isin((best, worst)) & compared["other"].isin((best, worst))].iloc[0]
+    pair = compared[
+        compared["one"].isin((best, worst)) & compared["other"].isin((best, worst))
+    ].iloc[0]
     low, high = 100 * pair["success_low"], 100 * pair["success_high"]
     if pair["one"] == worst:
         low, high = -high, -low
-    gain = f"{best} − {worst} {rates[best] - rates[worst]:+.1f} ({low:+.0f} to {high:+.0f})"
+    gain = (
+        f"{best} − {worst} {rates[best] - rates[worst]:+.1f} ({low:+.0f} to "
+        f"{high:+.0f})"
+    )
     return rates, gain, f"{pair['success_p_holm']:.2g}"
 
 

@@ -1,4 +1,6 @@
-"""One unit of a suite, built and run in this process: what scripts of studies ask of problems and episodes."""
+"""One unit of a suite, built and run in this process: what scripts of studies ask of
+problems and episodes.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -19,8 +21,12 @@ from benchnav.planning.world.outcome import Outcome
 
 # What suites of the studies in the world `stakes` have in common.
 STAKES: dict[str, Any] = {
-    "objectives": ("travel_time",), "scenarios": ("std",), "record": "none", "world": ("stakes",), "seeds": (1,),
-}  # fmt: skip
+    "objectives": ("travel_time",),
+    "scenarios": ("std",),
+    "record": "none",
+    "world": ("stakes",),
+    "seeds": (1,),
+}
 
 
 def stakes_suite(data: Path, **options: Any) -> Suite:
@@ -31,7 +37,9 @@ def stakes_suite(data: Path, **options: Any) -> Suite:
 def one_unit(suite: Suite, maps: int) -> Unit:
     """Return the unit of the first maps of a suite's first condition."""
     condition = conditions_of(suite, lambda data: ["std"])[0]
-    return units({condition.id: (condition, Extent.product(suite.seeds or (0,), 1, maps))})[0]
+    return units(
+        {condition.id: (condition, Extent.product(suite.seeds or (0,), 1, maps))}
+    )[0]
 
 
 def build_unit(unit: Unit) -> Built:
@@ -58,11 +66,19 @@ def pose_on(
         immobile: what immobilises robots.
     """
     level, flat = ground[:, None], torch.zeros_like(ground)
-    truth = TraversabilityMixture(torch.ones_like(level), level, torch.zeros_like(level), (0,))
+    truth = TraversabilityMixture(
+        torch.ones_like(level), level, torch.zeros_like(level), (0,)
+    )
     rgb = torch.zeros(len(ground), 3, *grid.shape, dtype=torch.uint8)
     terrain = Terrain(
-        rgb=rgb, class_id=flat.long(), elevation_m=flat, slope_deg=flat, truth=truth, traversability=ground, grid=grid
-    )  # fmt: skip
+        rgb=rgb,
+        class_id=flat.long(),
+        elevation_m=flat,
+        slope_deg=flat,
+        truth=truth,
+        traversability=ground,
+        grid=grid,
+    )
     prediction = Prediction(terrain.observe(), truth, ground)
     problem = pose_problem(task, prediction, *ends_m, time_budget_s, immobile)
     return problem, terrain
@@ -75,7 +91,9 @@ def seconds_of(episodes: Episodes, dt_s: float) -> np.ndarray:
 
 
 def drive_unit(unit: Unit) -> tuple[np.ndarray, Built]:
-    """Return seconds to the goal, infinite if it was not reached, shape [B], and what was driven."""
+    """Return seconds to the goal, infinite if it was not reached, shape [B], and what
+    was driven.
+    """
     built = build_unit(unit)
     episodes, _ = simulate(unit, built, Settings())
     return seconds_of(episodes, built.problem.dt_s), built

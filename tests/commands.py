@@ -5,7 +5,11 @@ from importlib import import_module
 
 import pytest
 
-PACKAGES = {"datagen": "benchnav.datagen", "train": "benchnav.models", "eval": "benchnav.eval"}
+PACKAGES = {
+    "datagen": "benchnav.datagen",
+    "train": "benchnav.models",
+    "eval": "benchnav.eval",
+}
 
 
 def call(program: str, *words: object) -> int:

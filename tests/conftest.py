@@ -10,7 +10,8 @@ import torch
 from benchnav.viz import style as figures
 from tests import factories
 
-# What collection imports stays. To search it for garbage takes seconds, while it is imported and in each test.
+# What collection imports stays. To search it for garbage takes seconds, while it is
+# imported and in each test.
 _THRESHOLD = gc.get_threshold()
 gc.set_threshold(1_000_000)
 torch.set_num_threads(1)

@@ -1,4 +1,6 @@
-"""Seeded random edits of files, for tests that whatever was edited is refused in one line or makes no difference."""
+"""Seeded random edits of files, for tests that whatever was edited is refused in one
+line or makes no difference.
+"""
 
 import copy
 import json
@@ -17,7 +19,9 @@ def edit_json(path: Path, chance: random.Random) -> str:
     text = path.read_text()
     if chance.random() < 0.15:
         cut = chance.randrange(len(text))
-        path.write_text(chance.choice((text[:cut], text[cut:], text[:cut] + "}" + text[cut:], "")))
+        path.write_text(
+            chance.choice((text[:cut], text[cut:], text[:cut] + "}" + text[cut:], ""))
+        )
         return f"text at {cut}"
     content = json.loads(text)
     done = [_edit(content, chance) for _ in range(chance.choice((1, 1, 3)))]
@@ -26,7 +30,9 @@ def edit_json(path: Path, chance: random.Random) -> str:
 
 
 def _edit(content: Any, chance: random.Random) -> str:
-    """Removes, replaces, doubles or renames one item of nested mappings and lists, at any depth alike."""
+    """Removes, replaces, doubles or renames one item of nested mappings and lists, at
+    any depth alike.
+    """
     holder, place, way = content, "", []
     while True:
         keys = list(holder) if isinstance(holder, dict) else list(range(len(holder)))
@@ -53,7 +59,9 @@ def _edit(content: Any, chance: random.Random) -> str:
 
 def edit_table(path: Path, chance: random.Random) -> str:
     """Edits a Parquet file: its bytes, its rows, its columns or a value; says how."""
-    kind = chance.choice(("bytes", "cut", "rows", "double", "drop", "type", "value", "shuffle"))
+    kind = chance.choice(
+        ("bytes", "cut", "rows", "double", "drop", "type", "value", "shuffle")
+    )
     if kind in ("bytes", "cut"):
         content = bytearray(path.read_bytes())
         place = chance.randrange(len(content))
@@ -70,13 +78,17 @@ def edit_table(path: Path, chance: random.Random) -> str:
     elif kind == "drop":
         rows = rows.drop(columns=name)
     elif kind == "type":
-        rows[name] = chance.choice(([str(value) for value in rows[name]], [np.nan] * len(rows), 7, None))
+        rows[name] = chance.choice(
+            ([str(value) for value in rows[name]], [np.nan] * len(rows), 7, None)
+        )
     elif kind == "value":
         values = [*rows[name]]
         values[row] = chance.choice(("x", -1, 1e9, True))
         mixed = len({type(value) for value in values}) > 1 or chance.random() < 0.2
         rows[name] = [str(value) if mixed else value for value in values]
     else:
-        rows[name] = rows[name].sample(frac=1, random_state=chance.randrange(1000)).to_numpy()
+        rows[name] = (
+            rows[name].sample(frac=1, random_state=chance.randrange(1000)).to_numpy()
+        )
     rows.to_parquet(path)
     return f"{kind} {name} {row}"

@@ -25,12 +25,21 @@ def normal(mean: torch.Tensor, std: torch.Tensor) -> TraversabilityMixture:
     return TraversabilityMixture(torch.ones_like(means), means, std.unsqueeze(1), (0,))
 
 
-def draw(mixture: TraversabilityMixture, count: int, generator: torch.Generator) -> torch.Tensor:
+def draw(
+    mixture: TraversabilityMixture, count: int, generator: torch.Generator
+) -> torch.Tensor:
     """Draws λ independently in each cell, component first, shape [count, *B, H, W]."""
-    shape, expanded = (count, *mixture.weights.movedim(-3, 0).shape[1:]), (count, *mixture.weights.shape)
+    shape, expanded = (
+        (count, *mixture.weights.movedim(-3, 0).shape[1:]),
+        (count, *mixture.weights.shape),
+    )
     pick = torch.rand(shape, generator=generator, dtype=mixture.weights.dtype)
     edges = mixture.weights.cumsum(-3)
-    component = (pick.unsqueeze(-3) >= edges).sum(-3, keepdim=True).clamp(max=edges.shape[-3] - 1)
+    component = (
+        (pick.unsqueeze(-3) >= edges)
+        .sum(-3, keepdim=True)
+        .clamp(max=edges.shape[-3] - 1)
+    )
     mean, std = (
         torch.gather(values.expand(expanded), -3, component).squeeze(-3)
         for values in (mixture.means, mixture.stds)
@@ -55,20 +64,36 @@ def terrain(mean: torch.Tensor, std: float = 0.1) -> Terrain:
 
 
 def places(goal_m: torch.Tensor, start_m: torch.Tensor | None = None) -> Places:
-    """Goals [B, 2], with starts at (1.25, 1.25) unless they are given, and no reference times."""
+    """Goals [B, 2], with starts at (1.25, 1.25) unless they are given, and no reference
+    times.
+    """
     start_m = torch.full_like(goal_m, 1.25) if start_m is None else start_m
-    return Places(start_m=start_m, goal_m=goal_m, reference_time_s=torch.full_like(goal_m[:, 0], torch.nan))
+    return Places(
+        start_m=start_m,
+        goal_m=goal_m,
+        reference_time_s=torch.full_like(goal_m[:, 0], torch.nan),
+    )
 
 
-def task(robot: Robot | None = None, objective: Objective | None = None, rules: Rules | None = None) -> Task:
+def task(
+    robot: Robot | None = None,
+    objective: Objective | None = None,
+    rules: Rules | None = None,
+) -> Task:
     """The paper's task, with some of its parts replaced."""
-    return Task(robot=robot or Unicycle(), objective=objective or GoalDistance(), rules=rules or Rules())
+    return Task(
+        robot=robot or Unicycle(),
+        objective=objective or GoalDistance(),
+        rules=rules or Rules(),
+    )
 
 
 def certain(traversability: torch.Tensor) -> TraversabilityMixture:
     """A prediction without doubt, from λ of shape [B, H, W]."""
     means = traversability.unsqueeze(1)
-    return TraversabilityMixture(torch.ones_like(means), means, torch.zeros_like(means), (0,))
+    return TraversabilityMixture(
+        torch.ones_like(means), means, torch.zeros_like(means), (0,)
+    )
 
 
 def problem(
@@ -81,9 +106,14 @@ def problem(
     elevation_m: torch.Tensor | None = None,
     time_budget_s: float = 100.0,
 ) -> Problem:
-    """A problem on maps with the given λ̂, shape [B, H, W], flat unless elevations are given."""
+    """A problem on maps with the given λ̂, shape [B, H, W], flat unless elevations are
+    given.
+    """
     batch, height, width = traversability.shape
-    start_m, goal_m = (torch.tensor([position] * batch, dtype=torch.float32) for position in (start, goal))
+    start_m, goal_m = (
+        torch.tensor([position] * batch, dtype=torch.float32)
+        for position in (start, goal)
+    )
     flat = torch.zeros_like(traversability)
     rgb = torch.full((batch, 3, height, width), 128, dtype=torch.uint8)
     elevation_m = flat if elevation_m is None else elevation_m
@@ -94,11 +124,14 @@ def problem(
 
 
 def tiny_recipe(**maps: int) -> Recipe:
-    """The shipped `tiny-v1` with fewer maps; keyword names have `_` for `/` in split names."""
+    """The shipped `tiny-v1` with fewer maps; keyword names have `_` for `/` in split
+    names.
+    """
     recipe = load_recipe("tiny-v1")
     sizes = {"train": 8, "valid": 3, "test_std": 2, "test_hg": 2, "test_hs": 2} | maps
     splits = {
-        name: replace(split, maps=sizes[name.replace("/", "_")]) for name, split in recipe.splits.items()
+        name: replace(split, maps=sizes[name.replace("/", "_")])
+        for name, split in recipe.splits.items()
     }
     return replace(recipe, splits=splits)
 

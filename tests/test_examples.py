@@ -20,20 +20,43 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
 def test_a_model_of_ones_own_is_trained_calibrated_measured_and_driven_with(
-    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    dataset_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     os.symlink(EXAMPLES / "own_model.py", tmp_path / "own_model.py")
     assert call("datagen", "create", "tiny-v1", "--out", "tiny.h5") == 0
-    quick = ("--settings.batch_size", 2, "--settings.learning_rate", 0.02, "--trainer.precision", "32-true")
-    fit = ("fit", "own_model.py:CellModel", "--data", "tiny.h5", "--out", "mine", "--members", 2, *quick)
+    quick = (
+        "--settings.batch_size",
+        2,
+        "--settings.learning_rate",
+        0.02,
+        "--trainer.precision",
+        "32-true",
+    )
+    fit = (
+        "fit",
+        "own_model.py:CellModel",
+        "--data",
+        "tiny.h5",
+        "--out",
+        "mine",
+        "--members",
+        2,
+        *quick,
+    )
     assert call("train", *fit) == 0
     assert "pool of 2 networks" in capfd.readouterr().out
     assert len((tmp_path / "own_model.py").read_text().splitlines()) < 60
     model = "own_model.py:CellModel@mine"
     measured = {}
     for name in (model, "oracle"):
-        assert call("train", "evaluate", name, "--data", "tiny.h5", "--json", "q.json") == 0
+        assert (
+            call("train", "evaluate", name, "--data", "tiny.h5", "--json", "q.json")
+            == 0
+        )
         measured[name] = json.loads((tmp_path / "q.json").read_text())["splits"]
     dataset = TerrainDataset(tmp_path / "tiny.h5")
     observed = dataset.read("train", fields=["traversability"])["traversability"]
@@ -43,7 +66,9 @@ def test_a_model_of_ones_own_is_trained_calibrated_measured_and_driven_with(
         oracle = measured["oracle"][split]
         assert own["rmse_expected"] < 0.8 * constant
         assert oracle["crps"] < own["crps"]
-    rows = evaluate(dataset_path, tmp_path, "--model", model, "--planners", "[astar_dwa]")
+    rows = evaluate(
+        dataset_path, tmp_path, "--model", model, "--planners", "[astar_dwa]"
+    )
     assert set(rows["model"]) == {"mine"}
     assert set(rows["outcome"]) <= {"success", "timeout", "stuck", "stalled"}
 
@@ -52,7 +77,10 @@ def test_a_model_of_ones_own_is_trained_calibrated_measured_and_driven_with(
 def test_a_site_of_ones_own_goes_from_drives_to_a_suite(tmp_path: Path) -> None:
     pytest.importorskip("rasterio")
     done = subprocess.run(
-        [sys.executable, EXAMPLES / "own_site.py", tmp_path], capture_output=True, text=True, timeout=900
+        [sys.executable, EXAMPLES / "own_site.py", tmp_path],
+        capture_output=True,
+        text=True,
+        timeout=900,
     )
     said = done.stdout
     assert done.returncode == 0, done.stderr
@@ -62,7 +90,9 @@ def test_a_site_of_ones_own_goes_from_drives_to_a_suite(tmp_path: Path) -> None:
     assert table, said
 
 
-def test_what_robots_log_on_a_site_is_its_ground(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_robots_log_on_a_site_is_its_ground(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("rasterio")
     site = runpy.run_path(str(EXAMPLES / "own_site.py"))
     terrain = site["survey"](tmp_path)
@@ -70,12 +100,16 @@ def test_what_robots_log_on_a_site_is_its_ground(tmp_path: Path, capfd: pytest.C
     log.to_csv(tmp_path / "drives.csv", index=False)
     rasters = "--dem dem.tif --photo photo.tif --recipe stakes-v1 --splits train:1"
     site["command"](
-        f"benchnav-datagen import-drives drives.csv {rasters} --out site.h5", tmp_path, *site["MAPS"]
+        f"benchnav-datagen import-drives drives.csv {rasters} --out site.h5",
+        tmp_path,
+        *site["MAPS"],
     )
     dataset = TerrainDataset(tmp_path / "site.h5")
     assert dataset.truth_of("train") == "unknown"
     source, maps = dataset.splits["train"]["parts"][0]["source"], dataset.read("train")
-    west, south = (np.array(source["origin_m"]) - [site["WEST"], site["SOUTH"]]) / site["CELL"]
+    west, south = (np.array(source["origin_m"]) - [site["WEST"], site["SOUTH"]]) / site[
+        "CELL"
+    ]
     ground = terrain.traversability[0].numpy()
     errors = []
     for place, number in enumerate(source["kept"]):
@@ -122,7 +156,9 @@ def test_a_bag_becomes_a_log_of_drives(tmp_path: Path) -> None:
     def read_bag(*words: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(EXAMPLES / "read_bag.py"), "one.bag", *words]
         here = os.environ | {"PYTHONPATH": str(tmp_path)}
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, env=here)
+        return subprocess.run(
+            command, cwd=tmp_path, capture_output=True, text=True, timeout=100, env=here
+        )
 
     (tmp_path / "rosbags").mkdir()
     (tmp_path / "rosbags" / "__init__.py").write_text("")
@@ -144,7 +180,14 @@ def test_a_bag_becomes_a_log_of_drives(tmp_path: Path) -> None:
     done = read_bag("--origin", "500", "200", "90")
     assert "12 rows, 4 without a command" in done.stdout, done.stderr
     rows = pd.read_csv(tmp_path / "drives.csv")
-    assert list(rows) == ["time_s", "x_m", "y_m", "measured_m_s", "commanded_m_s", "drive"]
+    assert list(rows) == [
+        "time_s",
+        "x_m",
+        "y_m",
+        "measured_m_s",
+        "commanded_m_s",
+        "drive",
+    ]
     np.testing.assert_allclose(rows["time_s"], np.arange(12) / 10)
     np.testing.assert_allclose(rows["x_m"], 498)
     np.testing.assert_allclose(rows["y_m"], 200 + np.arange(12))
@@ -155,7 +198,9 @@ def test_a_bag_becomes_a_log_of_drives(tmp_path: Path) -> None:
 
 
 def evaluate(dataset: Path, folder: Path, *flags: str, jobs: int = 1) -> pd.DataFrame:
-    """Runs `benchnav-eval run` and gives the rows; with two jobs in processes of its own, as a user does."""
+    """Runs `benchnav-eval run` and gives the rows; with two jobs in processes of its
+    own, as a user does.
+    """
     words = [
         "run", "--data", str(dataset), "--model", "oracle", "--maps", "2", "--scenarios", "[std]", "--record", "none",
         "--jobs", str(jobs), "--out", str(folder / "run"), "--world.time_budget_s", "60", *flags,
@@ -164,12 +209,16 @@ def evaluate(dataset: Path, folder: Path, *flags: str, jobs: int = 1) -> pd.Data
         assert call("eval", *words) == 0
     else:
         command = [str(Path(sys.executable).with_name("benchnav-eval")), *words]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, timeout=300
+        )
         assert done.returncode == 0, done.stderr
     return pd.read_parquet(folder / "run" / "episodes.parquet")
 
 
-def test_a_planner_and_a_risk_measure_of_ones_own_by_file(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_planner_and_a_risk_measure_of_ones_own_by_file(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     # Given by a path that begins where the command is run.
     for name in ("own_planner.py", "own_risk.py"):
         os.symlink(EXAMPLES / name, tmp_path / name)
@@ -183,14 +232,20 @@ def test_a_planner_and_a_risk_measure_of_ones_own_by_file(dataset_path: Path, tm
         jobs=2,
     )
     cells = rows.groupby(["planner", "risk"]).size()
-    assert dict(cells) == {("straight", "–"): 2, ("Fan", "mean"): 2, ("Fan", "worst"): 2}
+    assert dict(cells) == {
+        ("straight", "–"): 2,
+        ("Fan", "mean"): 2,
+        ("Fan", "worst"): 2,
+    }
     assert rows["success"].all()
     check_planner(f"{EXAMPLES / 'own_planner.py'}:Fan")
     for name in ("worst", "cautious"):
         check_risk(f"{EXAMPLES / 'own_risk.py'}:{name}")
 
 
-def test_a_robot_and_an_objective_of_ones_own_by_file(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_robot_and_an_objective_of_ones_own_by_file(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     path = EXAMPLES / "own_robot.py"
     assert len(path.read_text().splitlines()) < 40
     rows = evaluate(
@@ -212,16 +267,24 @@ def test_the_command_in_an_examples_docstring_names_what_is_there(name: str) -> 
     named = re.findall(r"(examples/\w+\.py):(\w+)", text.split('"""')[1])
     assert named
     for file, part in named:
-        assert re.search(rf"^(class|def) {part}\b", (EXAMPLES.parent / file).read_text(), re.MULTILINE)
+        assert re.search(
+            rf"^(class|def) {part}\b",
+            (EXAMPLES.parent / file).read_text(),
+            re.MULTILINE,
+        )
 
 
 def test_a_sweep_finds_the_best_of_its_trials(tmp_path: Path) -> None:
-    pytest.importorskip("optuna", reason="Optuna, which the example alone needs, is not installed")
+    pytest.importorskip(
+        "optuna", reason="Optuna, which the example alone needs, is not installed"
+    )
     assert call("datagen", "create", "tiny-v1", "--out", tmp_path / "tiny.h5") == 0
     done = subprocess.run(
         [sys.executable, EXAMPLES / "sweep.py", "tiny.h5", "trials", "3"],
         cwd=tmp_path, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert re.search(r"best: trial \d, validation loss -?\d\.\d+, \{'learning_rate'", done.stdout)
+    assert re.search(
+        r"best: trial \d, validation loss -?\d\.\d+, \{'learning_rate'", done.stdout
+    )
     assert (tmp_path / "trials" / "trial-0" / "config.json").is_file()

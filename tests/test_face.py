@@ -1,4 +1,6 @@
-"""The public names: which they are, that each can be had, and what importing them costs."""
+"""The public names: which they are, that each can be had, and what importing them
+costs.
+"""
 
 import ast
 import importlib
@@ -51,7 +53,8 @@ def test_the_public_names_are_these(name: str) -> None:
 
 def test_an_old_name_is_answered_with_the_new_one() -> None:
     with pytest.raises(
-        ImportError, match=r"^benchnav.planning.OptimalBound is now benchnav.planning.NearOptimal.$"
+        ImportError,
+        match=r"^benchnav.planning.OptimalBound is now benchnav.planning.NearOptimal.$",
     ):
         exec("from benchnav.planning import OptimalBound")
 
@@ -62,12 +65,16 @@ def test_every_public_name_can_be_had_and_lies_in_its_package(name: str) -> None
         value = getattr(face(name), public)
         assert getattr(value, "__module__", name).startswith(name)
         assert public in dir(face(name))
-    with pytest.raises(AttributeError, match=f"module '{name}' has no attribute 'Nothing'"):
+    with pytest.raises(
+        AttributeError, match=f"module '{name}' has no attribute 'Nothing'"
+    ):
         face(name).Nothing  # noqa: B018
 
 
 @EACH
-def test_no_module_takes_the_place_of_a_public_name_when_it_is_imported(name: str) -> None:
+def test_no_module_takes_the_place_of_a_public_name_when_it_is_imported(
+    name: str,
+) -> None:
     folder = ROOT.joinpath(*name.split("."))
     modules = {path.stem for path in folder.glob("*") if path.suffix in ("", ".py")}
     hidden = modules & set(face(name).__all__)
@@ -91,14 +98,22 @@ def test_editors_are_told_the_same_names_of_the_same_modules(name: str) -> None:
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
     )
     table = ast.literal_eval(call.args[1])
-    pairs = [(module, *name.split(" as ")) for module, names in table.items() for name in names]
+    pairs = [
+        (module, *name.split(" as "))
+        for module, names in table.items()
+        for name in names
+    ]
     assert told == {names[-1]: (module, names[0]) for module, *names in pairs}
 
 
 def fresh(code: str, *arguments: str) -> str:
     """What code prints in a new process."""
     done = subprocess.run(
-        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=120, cwd=ROOT
+        [sys.executable, "-c", code, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=ROOT,
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -153,9 +168,15 @@ def test_what_needs_no_pytorch_loads_none(words: str, tmp_path: Path) -> None:
 def test_no_public_name_is_that_of_a_commands_function(name: str) -> None:
     # The parser would ask the package for it, and load its module.
     text = "".join(
-        path.read_text() for path in ROOT.glob("benchnav/**/c*.py") if path.stem in ("cli", "command")
+        path.read_text()
+        for path in ROOT.glob("benchnav/**/c*.py")
+        if path.stem in ("cli", "command")
     )
-    functions = {node.name for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)}
+    functions = {
+        node.name
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.FunctionDef)
+    }
     assert not functions & set(face(name).__all__)
 
 
@@ -165,8 +186,17 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md"
 
 def imported_from(code: str) -> set[str]:
     tree = ast.parse(code)
-    named = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
-    named |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    named = {
+        node.module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module
+    }
+    named |= {
+        alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import)
+        for alias in node.names
+    }
     return {name for name in named if name.partition(".")[0] == "benchnav"}
 
 

@@ -1,4 +1,6 @@
-"""Hostile command lines and files: each ends in one line and status 2, before anything is written."""
+"""Hostile command lines and files: each ends in one line and status 2, before anything
+is written.
+"""
 
 # ruff: noqa: E501 - a case a line
 
@@ -19,7 +21,8 @@ BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
 # What makes a suite short, so that one which is not refused ends soon.
 SHORT = "data: d.h5\nmodel: oracle\nscenarios: [std]\nplanners: [straight]\n"
 
-# Suites, by what is wrong with them: `eval run --config NAME.yaml --out o` is tried with each.
+# Suites, by what is wrong with them: `eval run --config NAME.yaml --out o` is tried
+# with each.
 SUITES: dict[str, str | bytes] = {
     # keys twice
     "twice": SHORT + "maps: 1\nmaps: 2\n",
@@ -292,7 +295,8 @@ LINES: list[str] = [
 ]  # fmt: skip
 
 CASES = [
-    f"eval run --config {name}.yaml{' --out o' * (not name.endswith('-out'))}" for name in SUITES
+    f"eval run --config {name}.yaml{' --out o' * (not name.endswith('-out'))}"
+    for name in SUITES
 ] + LINES
 
 
@@ -300,7 +304,9 @@ def lay_out(folder: Path, dataset: Path) -> None:
     """Puts the files that cases name into a folder, with a finished run on a dataset."""
     (folder / "d.h5").symlink_to(dataset)
     for name, content in SUITES.items():
-        Path(folder, f"{name}.yaml").write_bytes(content.encode() if isinstance(content, str) else content)
+        Path(folder, f"{name}.yaml").write_bytes(
+            content.encode() if isinstance(content, str) else content
+        )
     for name in ("text", "text.csv"):
         Path(folder, name).write_text("nothing\n")
     for suffix in ("yaml", "py", "csv", "h5"):
@@ -322,19 +328,25 @@ def files_in(folder: Path) -> dict[str, int]:
     found = {}
     for place, folders, files in os.walk(folder):
         found |= {f"{place}/{name}": 0 for name in folders}
-        found |= {f"{place}/{name}": os.lstat(f"{place}/{name}").st_mtime_ns for name in files}
+        found |= {
+            f"{place}/{name}": os.lstat(f"{place}/{name}").st_mtime_ns for name in files
+        }
     return found
 
 
 @pytest.fixture(scope="module")
-def laid_out(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, int]]:
+def laid_out(
+    dataset_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, dict[str, int]]:
     """The folder, and all that is in it."""
     folder = tmp_path_factory.mktemp("hostile")
     lay_out(folder, dataset_path)
     return folder, files_in(folder)
 
 
-@pytest.mark.parametrize("line", CASES, ids=[f"{n} {ascii(line)[1:90]}" for n, line in enumerate(CASES)])
+@pytest.mark.parametrize(
+    "line", CASES, ids=[f"{n} {ascii(line)[1:90]}" for n, line in enumerate(CASES)]
+)
 def test_hostile_input_ends_in_one_line(
     line: str,
     laid_out: tuple[Path, dict[str, int]],

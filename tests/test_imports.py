@@ -1,4 +1,6 @@
-"""Imports go one way: core, stats and viz, datagen, planning and models, env and metrics, eval; so do their folders."""
+"""Imports go one way: core, stats and viz, datagen, planning and models, env and
+metrics, eval; so do their folders.
+"""
 
 import ast
 from graphlib import TopologicalSorter
@@ -8,7 +10,8 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "benchnav"
 
-# The values that the folders of `planning` share, and the shells that Gymnasium is given.
+# The values that the folders of `planning` share, and the shells that Gymnasium is
+# given.
 VALUES = ("free_space", "objective", "problem", "risk", "robots")
 PLANNING = tuple(f"planning.{name}" for name in VALUES)
 DRAWN = ("datagen.noise", "datagen.schema")  # what all of synthesis shares
@@ -16,18 +19,27 @@ SYNTHESIS = ("datagen.synth", "datagen.recipe", "datagen.layers", *DRAWN)
 # Whatever is known of models beside their training and their quality.
 WHOLE = ("fused", "conformal", "predictor")
 MODELS = tuple(
-    f"models.{name}" for name in ("base", "slope_gp", "nets", "zoo", "checkpoint", "config", *WHOLE)
+    f"models.{name}"
+    for name in ("base", "slope_gp", "nets", "zoo", "checkpoint", "config", *WHOLE)
 )
 VALUES_OF_EVAL = ("eval.experiment",)
 # What running writes and reports read.
 WRITTEN = ("eval.folder", "eval.recording")
 # What figures of runs are drawn from and with.
 FIGURES = (
-    *("eval.figures", "eval.failures", "eval.words", "eval.stats", *WRITTEN, *VALUES_OF_EVAL),
+    *(
+        "eval.figures",
+        "eval.failures",
+        "eval.words",
+        "eval.stats",
+        *WRITTEN,
+        *VALUES_OF_EVAL,
+    ),
     *("metrics", "planning", "datagen", "viz"),
 )
 
-# What the modules of a folder may import besides the root's; a name stands for all that is under it.
+# What the modules of a folder may import besides the root's; a name stands for all that
+# is under it.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "": (),
     "core": ("core",),
@@ -44,7 +56,13 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "datagen/dem": ("datagen.dem", "datagen.files", *SYNTHESIS),
     "models": ("models", "datagen"),
     "models/slope_gp": ("models.slope_gp", "models.config", "datagen"),
-    "models/nets": ("models.nets", "models.base", "models.checkpoint", "models.config", "datagen"),
+    "models/nets": (
+        "models.nets",
+        "models.base",
+        "models.checkpoint",
+        "models.config",
+        "datagen",
+    ),
     "models/zoo": (
         "models.zoo",
         "models.nets",
@@ -59,7 +77,11 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "planning/world": (*PLANNING, "planning.world"),
     "planning/sensing": ("planning.sensing",),
     "planning/sensing/knowledge.py": (*PLANNING, "planning.sensing", "planning.world"),
-    "planning/sensing/appearance.py": ("planning.sensing", "datagen.synth", "datagen.schema"),
+    "planning/sensing/appearance.py": (
+        "planning.sensing",
+        "datagen.synth",
+        "datagen.schema",
+    ),
     "planning/planners": (*PLANNING, "planning.sensing", "planning.planners"),
     "metrics": ("metrics", *PLANNING),
     "env": ("env", "models", "planning", "datagen", "viz"),
@@ -68,7 +90,15 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "eval/experiment": ("eval.experiment", "metrics", "models", "planning", "datagen"),
     "eval/folder": ("eval.folder", *VALUES_OF_EVAL, "models", "planning", "datagen"),
     "eval/recording.py": ("eval.folder", "planning"),
-    "eval/run": ("eval.run", *WRITTEN, *VALUES_OF_EVAL, "metrics", "models", "planning", "datagen"),
+    "eval/run": (
+        "eval.run",
+        *WRITTEN,
+        *VALUES_OF_EVAL,
+        "metrics",
+        "models",
+        "planning",
+        "datagen",
+    ),
     "eval/stats": ("eval.stats", "eval.experiment", "metrics", "planning"),
     "eval/words.py": ("eval.stats", *VALUES_OF_EVAL, "planning", "viz"),
     "eval/failures.py": ("eval.words", "eval.stats", *WRITTEN, *VALUES_OF_EVAL),
@@ -82,7 +112,9 @@ def modules() -> list[Path]:
 
 
 def folder_of(place: Path) -> str:
-    """The nearest entry of the table: the module's own, else that of a folder it lies in."""
+    """The nearest entry of the table: the module's own, else that of a folder it lies
+    in.
+    """
     return next(
         name
         for candidate in (place, *place.parents)
@@ -93,18 +125,26 @@ def folder_of(place: Path) -> str:
 def may_import(place: Path, name: str) -> bool:
     """Tells whether a module may import another, both of ours."""
     inner = name.removeprefix("benchnav").removeprefix(".")
-    is_below = inner.split(".")[0] in ("core", *(() if place.parts[0] == "core" else ("stats",)))
+    is_below = inner.split(".")[0] in (
+        "core",
+        *(() if place.parts[0] == "core" else ("stats",)),
+    )
     if inner.split(".")[-1] == "cli" or ".cli." in f".{inner}.":
         return False
     return (
         not inner
         or is_below
-        or any(f"{inner}.".startswith(f"{known}.") for known in MAY_IMPORT[folder_of(place)])
+        or any(
+            f"{inner}.".startswith(f"{known}.")
+            for known in MAY_IMPORT[folder_of(place)]
+        )
     )
 
 
 def imported(path: Path) -> set[str]:
-    """Modules of ours that a file imports, wherever in it; of `from a import b` the module b where it is one."""
+    """Modules of ours that a file imports, wherever in it; of `from a import b` the
+    module b where it is one.
+    """
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -124,14 +164,17 @@ def is_module(name: str) -> bool:
 
 @pytest.mark.parametrize("place", modules(), ids=Path.as_posix)
 def test_imports_go_one_way(place: Path) -> None:
-    wrong = sorted(name for name in imported(PACKAGE / place) if not may_import(place, name))
+    wrong = sorted(
+        name for name in imported(PACKAGE / place) if not may_import(place, name)
+    )
     assert not wrong, f"{place} imports {', '.join(wrong)}"
 
 
 def test_no_modules_import_one_another_in_a_circle() -> None:
     # But for a package's `__init__`, which hands names on.
     graph = {
-        "benchnav." + ".".join(place.with_suffix("").parts): imported(PACKAGE / place) for place in modules()
+        "benchnav." + ".".join(place.with_suffix("").parts): imported(PACKAGE / place)
+        for place in modules()
     }
     TopologicalSorter(graph).prepare()  # raises where there is one
 
@@ -160,7 +203,11 @@ def test_no_modules_import_one_another_in_a_circle() -> None:
         ("planning/sensing/sensor.py", "benchnav.datagen.synth.elevation", False),
         ("planning/world/simulation.py", "benchnav.planning.problem", True),
         ("planning/world/simulation.py", "benchnav.planning.planners.planner", False),
-        ("planning/planners/cl_rrt/tree.py", "benchnav.planning.planners.planner", True),
+        (
+            "planning/planners/cl_rrt/tree.py",
+            "benchnav.planning.planners.planner",
+            True,
+        ),
         ("planning/planners/cl_rrt/tree.py", "benchnav.planning.world.outcome", False),
         ("planning/planners/mppi.py", "benchnav.eval.experiment.condition", False),
         ("metrics/base.py", "benchnav.planning.robots", True),

@@ -20,20 +20,30 @@ def install(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     monkeypatch.setattr(sys, "argv", ["install.py", "docs"])
-    for variable in ("UV_DEFAULT_INDEX", "UV_INDEX", "UV_FIND_LINKS", "UV_INSECURE_HOST", "SSL_CERT_FILE"):
+    for variable in (
+        "UV_DEFAULT_INDEX",
+        "UV_INDEX",
+        "UV_FIND_LINKS",
+        "UV_INSECURE_HOST",
+        "SSL_CERT_FILE",
+    ):
         monkeypatch.delenv(variable, raising=False)
     return module
 
 
 class Installers:
-    """Records commands in place of running them; those with `failing` in them fail, and pip's last has status 3."""
+    """Records commands in place of running them; those with `failing` in them fail, and
+    pip's last has status 3.
+    """
 
     def __init__(self, listing: str = "", failing: str = "\0") -> None:
         self.listing, self.failing = listing, failing
         self.commands: list[list[str]] = []
         self.variables: dict[str, str] = {}
 
-    def run(self, command: list[str], env: Any = None, **_: Any) -> subprocess.CompletedProcess[str]:
+    def run(
+        self, command: list[str], env: Any = None, **_: Any
+    ) -> subprocess.CompletedProcess[str]:
         self.commands.append(list(command[2:]))
         if self.failing in command:
             raise subprocess.CalledProcessError(2, command, stderr="error: no\nmore")
@@ -44,7 +54,9 @@ class Installers:
 
 
 def test_settings_of_pip_go_to_uv_and_variables_of_uv_go_first(
-    install: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    install: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     listing = """\
 :env:.find-links='/wheels /more'
@@ -76,7 +88,10 @@ install.trusted-host='one.example'
     [
         (Installers(failing="uv"), "error: no"),
         (Installers(failing="config"), "error: no"),
-        (Installers("global.no-index='true'"), "pip's setting 'no-index' is not passed on"),
+        (
+            Installers("global.no-index='true'"),
+            "pip's setting 'no-index' is not passed on",
+        ),
     ],
     ids=["uv", "pip config", "setting"],
 )
@@ -90,7 +105,10 @@ def test_pip_installs_where_uv_does_not(
     monkeypatch.setattr(subprocess, "run", installers.run)
     assert install.main() == 3
     said = capsys.readouterr().err
-    assert said == f"benchnav: installing with pip, several minutes, since uv failed: {why}\n"
+    assert (
+        said
+        == f"benchnav: installing with pip, several minutes, since uv failed: {why}\n"
+    )
     assert installers.commands[-1][0] == "pip"
     constraint = ["--constraint", str(SCRIPT.parents[1] / "constraints.txt")]
     assert installers.commands[-1][-5:] == [

@@ -1,4 +1,6 @@
-"""Source archive and wheel hold the package with the shipped maps and models, and run where there is no repository."""
+"""Source archive and wheel hold the package with the shipped maps and models, and run
+where there is no repository.
+"""
 
 import importlib.util
 import os
@@ -21,7 +23,9 @@ IN_REPOSITORY_ALONE = "checkpoints/paper-v1/"
 def shipped_files() -> tuple[str, ...]:
     """The list in setup.py, which is not run."""
     pytest.importorskip("setuptools")
-    spec = importlib.util.spec_from_file_location("setup_of_benchnav", ROOT / "setup.py")
+    spec = importlib.util.spec_from_file_location(
+        "setup_of_benchnav", ROOT / "setup.py"
+    )
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -34,7 +38,9 @@ def built(what: str, source: Path, out: Path) -> Path:
     pytest.importorskip("setuptools", minversion="77")
     out.mkdir()
     build = f"from setuptools import build_meta; print(build_meta.build_{what}({str(out)!r}))"
-    subprocess.run([sys.executable, "-c", build], cwd=source, check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-c", build], cwd=source, check=True, capture_output=True
+    )
     (path,) = out.iterdir()
     return path
 
@@ -43,17 +49,29 @@ def files_of_git(*folders: str) -> list[str]:
     if not (ROOT / ".git").exists():
         pytest.skip("no git checkout")
     listed = subprocess.run(
-        ["git", "ls-files", "-z", *folders], cwd=ROOT, check=True, capture_output=True, text=True
+        ["git", "ls-files", "-z", *folders],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
     )
-    return [name for name in listed.stdout.split("\0") if name and (ROOT / name).exists()]
+    return [
+        name for name in listed.stdout.split("\0") if name and (ROOT / name).exists()
+    ]
 
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A source archive built of a copy of the repository, in which a user has made maps and a model."""
+    """A source archive built of a copy of the repository, in which a user has made maps
+    and a model.
+    """
     work = tmp_path_factory.mktemp("archive")
     copy = work / "copy"
-    own = ("datasets/mine-test.h5", "checkpoints/mine/config.json", "checkpoints/paper-v1/notes.json")
+    own = (
+        "datasets/mine-test.h5",
+        "checkpoints/mine/config.json",
+        "checkpoints/paper-v1/notes.json",
+    )
     for name in (*files_of_git(), *own):
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
         if name in own:
@@ -75,13 +93,22 @@ def wheel(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_source_archive_holds_what_git_has(archive: Path) -> None:
     with tarfile.open(archive) as packed:
-        names = {name.partition("/")[2] for name in packed.getnames() if packed.getmember(name).isfile()}
-    made = {name for name in names if name.startswith("benchnav.egg-info/")} | {"PKG-INFO", "setup.cfg"}
+        names = {
+            name.partition("/")[2]
+            for name in packed.getnames()
+            if packed.getmember(name).isfile()
+        }
+    made = {name for name in names if name.startswith("benchnav.egg-info/")} | {
+        "PKG-INFO",
+        "setup.cfg",
+    }
     kept = {name for name in files_of_git() if not name.startswith(IN_REPOSITORY_ALONE)}
     assert names - made == kept - {".gitignore"}
 
 
-def test_the_wheel_holds_the_package_and_what_is_shipped_and_nothing_else(wheel: Path) -> None:
+def test_the_wheel_holds_the_package_and_what_is_shipped_and_nothing_else(
+    wheel: Path,
+) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
         inside = {f"benchnav/_shipped/{name}" for name in shipped_files()}
@@ -105,7 +132,9 @@ def test_what_is_shipped_is_what_git_has() -> None:
     assert sorted(shipped_files()) == sorted(named)
 
 
-def test_out_of_the_wheel_the_shipped_maps_and_models_are_found(wheel: Path, tmp_path: Path) -> None:
+def test_out_of_the_wheel_the_shipped_maps_and_models_are_found(
+    wheel: Path, tmp_path: Path
+) -> None:
     site, here = tmp_path / "site", tmp_path / "here"
     here.mkdir()
     with zipfile.ZipFile(wheel) as archive:
@@ -133,8 +162,16 @@ except benchnav.ConfigError as error:
     inside = site / "benchnav" / "_shipped"
     assert told == [
         *(str(site / "benchnav" / "__init__.py"), "datasets", str(inside / "datasets")),
-        *(str(inside / "datasets" / f"{name}-test.h5") for name in ("paper-v1", "stakes-v1")),
-        *("stakes-v1", "stakes-v1-masked", str(inside / "checkpoints" / "stakes-v1"), "FusedModel"),
+        *(
+            str(inside / "datasets" / f"{name}-test.h5")
+            for name in ("paper-v1", "stakes-v1")
+        ),
+        *(
+            "stakes-v1",
+            "stakes-v1-masked",
+            str(inside / "checkpoints" / "stakes-v1"),
+            "FusedModel",
+        ),
         "Expected_the_checkpoint_paper-v1_in_checkpoints/,_got_none:_the_wheel_leaves_it_out_for_its_size.",
     ]
 

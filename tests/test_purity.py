@@ -49,11 +49,19 @@ def test_mixture_methods() -> None:
 
 
 def test_datagen() -> None:
-    z, class_id = np.random.default_rng(0).random((2, 8, 8)), np.zeros((2, 8, 8), dtype=int)
+    z, class_id = (
+        np.random.default_rng(0).random((2, 8, 8)),
+        np.zeros((2, 8, 8), dtype=int),
+    )
     light = appearance.light_direction(np.zeros(2), np.full(2, 0.5))
     classes = load_recipe("paper-v1").classes
     colours = np.full((2, 3, 8, 8), 99.0)
-    same_after(lambda: elevation.inclination_deg(*elevation.horn_gradient(elevation.framed(z), 0.5)), z)
+    same_after(
+        lambda: elevation.inclination_deg(
+            *elevation.horn_gradient(elevation.framed(z), 0.5)
+        ),
+        z,
+    )
     same_after(lambda: appearance.shade(z, z, light, 0.1), z, light)
     same_after(lambda: appearance.paint(colours, z), colours, z)
     same_after(lambda: appearance.class_bands(z, np.array([0.5, 0.5])), z)
@@ -96,27 +104,49 @@ def test_parts_of_planners() -> None:
     costs, goals = astar.edge_costs(problem).numpy(), np.zeros((2, 16, 16), dtype=bool)
     same_after(lambda: gridgraph.cost_to_go(costs, goals, (16, 16)), costs, goals)
     mean, noise, target = torch.rand(2, 12, 2), torch.randn(12, 2, 5), problem.goal_m
-    same_after(lambda: rollout_cost(problem, problem.start, mean, noise, target), mean, noise, *maps)
+    same_after(
+        lambda: rollout_cost(problem, problem.start, mean, noise, target),
+        mean,
+        noise,
+        *maps,
+    )
     velocity, config = torch.zeros(2, 2), DWAConfig()
     same_after(lambda: velocity_window(problem, velocity, config), velocity, *maps)
     window = velocity_window(problem, velocity, config)
-    same_after(lambda: score(problem, problem.start, window, target, config), window, *maps)
+    same_after(
+        lambda: score(problem, problem.start, window, target, config), window, *maps
+    )
 
 
 def test_the_world() -> None:
     problem = factories.problem(torch.rand(2, 16, 16))
     action, outcome = torch.full((2, 2), 5.0), torch.full((2,), int(Outcome.TIMEOUT))
     terrain = factories.terrain(torch.rand(2, 16, 16))
-    truth = (terrain.truth.weights, terrain.truth.means, terrain.truth.stds, terrain.traversability)
-    simulation = Simulation(terrain, problem.task, World(), factories.places(problem.goal_m), 0, [0, 1])
+    truth = (
+        terrain.truth.weights,
+        terrain.truth.means,
+        terrain.truth.stds,
+        terrain.traversability,
+    )
+    simulation = Simulation(
+        terrain, problem.task, World(), factories.places(problem.goal_m), 0, [0, 1]
+    )
     now = simulation.init(problem.start)
     given = (now.state, now.outcome, now.step, action, *maps_of(problem), *truth)
     same_after(lambda: simulation.step(now, action), *given)
     same_after(lambda: simulation.unhindered(now, action), *given)
-    same_after(lambda: end(now, torch.tensor([True, False]), Outcome.PLANNER_ERROR), *given)
+    same_after(
+        lambda: end(now, torch.tensor([True, False]), Outcome.PLANNER_ERROR), *given
+    )
     steps = torch.tensor([199, 199])
     track, driven = torch.zeros(2, 200, 2), torch.zeros(2, 199)
-    same_after(lambda: tell_standstill(outcome, steps, track, driven, 0.1), outcome, steps, track, driven)
+    same_after(
+        lambda: tell_standstill(outcome, steps, track, driven, 0.1),
+        outcome,
+        steps,
+        track,
+        driven,
+    )
 
 
 def test_the_global_generators_are_left_alone() -> None:
@@ -126,6 +156,13 @@ def test_the_global_generators_are_left_alone() -> None:
     generate(tiny_recipe(), "train", np.arange(2))
     ground = torch.full((2, 16, 16), 0.8)
     problem = factories.problem(ground)
-    Simulation(factories.terrain(ground), problem.task, World(), factories.places(problem.goal_m), 0, [0, 1])
+    Simulation(
+        factories.terrain(ground),
+        problem.task,
+        World(),
+        factories.places(problem.goal_m),
+        0,
+        [0, 1],
+    )
     assert torch.equal(before[0], torch.get_rng_state())
     np.testing.assert_array_equal(before[1], np.random.get_state()[1])  # noqa: NPY002

@@ -34,7 +34,9 @@ def test_a_model_is_trained_and_measured_on_ground_that_is_labelled_in_part(
     monkeypatch.chdir(tmp_path)
     generator = np.random.default_rng(0)
     classes = generator.integers(0, 3, (ROWS, COLUMNS)).astype(np.uint8)
-    photo = np.stack([60 + 60 * classes, 90 + 30 * classes, 200 - 60 * classes]).astype(np.uint8)
+    photo = np.stack([60 + 60 * classes, 90 + 30 * classes, 200 - 60 * classes]).astype(
+        np.uint8
+    )
     classes[:8] = 200  # the northern quarter
     write(tmp_path / "dem.tif", rough(ROWS, COLUMNS))
     write(tmp_path / "classes.tif", classes, nodata=200)
@@ -75,37 +77,69 @@ def test_a_model_is_trained_and_measured_on_ground_that_is_labelled_in_part(
     assert "Expected maps with a class in every cell to drive on" in line
     assert not (tmp_path / "run").exists()
     with pytest.raises(ConfigError, match="a class in every cell"):
-        gymnasium.make("benchnav/OffRoad-v0", data="real.h5", split="train", world="paper")
+        gymnasium.make(
+            "benchnav/OffRoad-v0", data="real.h5", split="train", world="paper"
+        )
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two classes of measured λ near 0.2 and 0.9, which is not what the recipe's class table says of them.
+    """Two classes of measured λ near 0.2 and 0.9, which is not what the recipe's class
+    table says of them.
 
     The first map of the split `test/site` has no class, but colours and a measured λ.
     """
     folder, generator = tmp_path_factory.mktemp("site"), np.random.default_rng(1)
-    classes = np.repeat(generator.integers(0, 2, (ROWS // 8, COLUMNS // 8)), 8, 0).repeat(8, 1)
-    value = np.clip(np.where(classes == 0, 0.2, 0.9) + 0.03 * generator.standard_normal(classes.shape), 0, 1)
-    photo = np.stack([60 + 150 * classes, 90 + 30 * classes, 200 - 60 * classes]).astype(np.uint8)
+    classes = np.repeat(
+        generator.integers(0, 2, (ROWS // 8, COLUMNS // 8)), 8, 0
+    ).repeat(8, 1)
+    value = np.clip(
+        np.where(classes == 0, 0.2, 0.9)
+        + 0.03 * generator.standard_normal(classes.shape),
+        0,
+        1,
+    )
+    photo = np.stack(
+        [60 + 150 * classes, 90 + 30 * classes, 200 - 60 * classes]
+    ).astype(np.uint8)
     labels = classes.astype(np.uint8)
     labels[:, 8 * 32 : 9 * 32] = 200
     write(folder / "dem.tif", rough(ROWS, COLUMNS))
     write(folder / "classes.tif", labels, nodata=200)
     write(folder / "photo.tif", photo)
     write(folder / "value.tif", value.astype(np.float32))
-    rasters = ("dem.tif", "--classes", "classes.tif", "--photo", "photo.tif", "--traversability", "value.tif")
+    rasters = (
+        "dem.tif",
+        "--classes",
+        "classes.tif",
+        "--photo",
+        "photo.tif",
+        "--traversability",
+        "value.tif",
+    )
     splits = ("--splits", "train:0.4,valid:0.2,test/site:0.4", "--recipe", "tiny-v1")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         assert call("datagen", "import-dem", *rasters, *splits, "--out", "real.h5") == 0
-        gp = ("--gp.epochs", "2", "--gp.epoch_steps", "10", "--classifier.encoder_depth", "3")
-        assert call("train", "all", "--data", "real.h5", "--out", "mine", *QUICK, *gp) == 0
+        gp = (
+            "--gp.epochs",
+            "2",
+            "--gp.epoch_steps",
+            "10",
+            "--classifier.encoder_depth",
+            "3",
+        )
+        assert (
+            call("train", "all", "--data", "real.h5", "--out", "mine", *QUICK, *gp) == 0
+        )
     return folder
 
 
 def test_nothing_is_scored_against_a_truth_that_is_unknown(
-    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    site: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(site)
     dataset = TerrainDataset("real.h5")
@@ -126,11 +160,14 @@ def test_nothing_is_scored_against_a_truth_that_is_unknown(
         said, _ = capfd.readouterr()
         page = (tmp_path / model / "quality.md").read_text()
         for text in (said, page):
-            assert "the true distribution of λ is unknown on test/site: RMSE E[λ] is a dash" in text
-            assert "are against measured λ" in text
-            assert ("this model gives the class table of the recipe, not the truth" in text) == (
-                model == "oracle"
+            assert (
+                "the true distribution of λ is unknown on test/site: RMSE E[λ] is a dash"
+                in text
             )
+            assert "are against measured λ" in text
+            assert (
+                "this model gives the class table of the recipe, not the truth" in text
+            ) == (model == "oracle")
         found = json.loads((tmp_path / model / "quality.json").read_text())
         assert found["truth"] == {"test/site": "unknown"}
         assert found["splits"]["test/site"]["rmse_expected"] is None
@@ -145,7 +182,9 @@ def test_nothing_is_scored_against_a_truth_that_is_unknown(
     assert not {"expected_true 0", "error 0"} & set(panels)
 
 
-def test_a_map_without_labels_but_with_a_measured_traversability_is_learned_from(site: Path) -> None:
+def test_a_map_without_labels_but_with_a_measured_traversability_is_learned_from(
+    site: Path,
+) -> None:
     dataset = TerrainDataset(site / "real.h5")
     labels = dataset.read("test/site", fields=["class_id", "traversability"])
     (bare,) = np.flatnonzero((labels["class_id"] == UNLABELLED).all(axis=(1, 2)))
@@ -159,18 +198,50 @@ def test_lambda_that_the_class_table_drew_is_not_called_measured(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "dem.tif", rough(ROWS, 32 * 3))
-    assert call("datagen", "import-dem", "dem.tif", "--recipe", "tiny-v1", "--out", "real.h5") == 0
+    assert (
+        call(
+            "datagen",
+            "import-dem",
+            "dem.tif",
+            "--recipe",
+            "tiny-v1",
+            "--out",
+            "real.h5",
+        )
+        == 0
+    )
     capfd.readouterr()
     assert call("train", "evaluate", "oracle", "--data", "real.h5") == 0
     said = capfd.readouterr().out
     assert "λ that the class table drew at least in part, not measured λ" in said
     # Beside such ground the truth of what a recipe made is as well known as before.
-    made = ("create", "tiny-v1", "--splits", "[test/std]", "--first", 1, "--out", "made.h5")
+    made = (
+        "create",
+        "tiny-v1",
+        "--splits",
+        "[test/std]",
+        "--first",
+        1,
+        "--out",
+        "made.h5",
+    )
     assert call("datagen", *made) == 0
     assert call("datagen", "merge", "made.h5", "real.h5", "--out", "mixed.h5") == 0
     capfd.readouterr()
     out = ("--out", tmp_path / "std", "--maps", 1)
-    assert call("train", "evaluate", "oracle", "--data", "mixed.h5", "--splits", "[test/std]", *out) == 0
+    assert (
+        call(
+            "train",
+            "evaluate",
+            "oracle",
+            "--data",
+            "mixed.h5",
+            "--splits",
+            "[test/std]",
+            *out,
+        )
+        == 0
+    )
     assert "unknown" not in capfd.readouterr().out
     found = json.loads((tmp_path / "std" / "quality.json").read_text())
     assert found["truth"] == {"test/std": "generated"}
@@ -179,30 +250,51 @@ def test_lambda_that_the_class_table_drew_is_not_called_measured(
 
 @pytest.mark.parametrize("cell", [0.8, 0.4, 0.2])
 def test_the_page_on_real_ground_is_right_to_the_letter(
-    cell: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    cell: float,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    # The rasters of its first command, on 5 maps of 64 cells, and an elevation model with two cells to spare.
+    # The rasters of its first command, on 5 maps of 64 cells, and an elevation model
+    # with two cells to spare.
     page = (Path(__file__).parent.parent / "docs/how-to/real-ground.md").read_text()
     block = re.search(r"```sh\nbenchnav-datagen (import-dem .*?)```", page, re.DOTALL)
     assert block
     words = shlex.split(block[1].replace("\\\n", " "))
     monkeypatch.chdir(tmp_path)
     generator = np.random.default_rng(3)
-    classes = generator.choice(np.array([1, 2, 9], np.uint8), (64, 320), p=[0.6, 0.3, 0.1])
+    classes = generator.choice(
+        np.array([1, 2, 9], np.uint8), (64, 320), p=[0.6, 0.3, 0.1]
+    )
     photo = generator.integers(0, 256, (3, 64, 320), dtype=np.uint8)
-    measured, canopy = (generator.uniform(0, 1, (64, 320)).astype(np.float32) for _ in range(2))
+    measured, canopy = (
+        generator.uniform(0, 1, (64, 320)).astype(np.float32) for _ in range(2)
+    )
     spare = round(64 * 0.4 / cell) + 4, round(320 * 0.4 / cell) + 4
     x, y = centres(*spare, cell)
-    write(tmp_path / "site.tif", 500 + 0.3 * x + 0.1 * y, cell, offset=(-2 * cell, -2 * cell))
-    for name, values in (("cover", classes), ("ortho", photo), ("driven", measured), ("canopy", canopy)):
+    write(
+        tmp_path / "site.tif",
+        500 + 0.3 * x + 0.1 * y,
+        cell,
+        offset=(-2 * cell, -2 * cell),
+    )
+    for name, values in (
+        ("cover", classes),
+        ("ortho", photo),
+        ("driven", measured),
+        ("canopy", canopy),
+    ):
         write(tmp_path / f"{name}.tif", values, 0.4)
-    # Without an origin the maps begin in the spare cells, and the command says where to begin; or they begin there.
+    # Without an origin the maps begin in the spare cells, and the command says where to
+    # begin; or they begin there.
     call("datagen", *words)
     said, _ = capfd.readouterr()
     origin = f"[{WEST:.10g},{SOUTH:.10g}]"
     begins_there = f"from the south-west corner {origin} on" in said
     assert begins_there == (cell == 0.8)
-    assert set(re.findall(r"--origin '(.*?)'", said)) == (set() if begins_there else {origin})
+    assert set(re.findall(r"--origin '(.*?)'", said)) == (
+        set() if begins_there else {origin}
+    )
     assert call("datagen", *words, "--origin", origin, "--overwrite") == 0
     said, _ = capfd.readouterr()
     assert f"from the south-west corner {origin} on" in said
@@ -223,7 +315,9 @@ def test_the_page_on_real_ground_is_right_to_the_letter(
                 tile = values[..., ::-1, :][..., 64 * number : 64 * number + 64]
                 np.testing.assert_allclose(maps[name][index], tile, atol=2.0**-16)
             np.testing.assert_allclose(
-                maps["slope_deg"][index], np.degrees(np.arctan(np.hypot(0.3, 0.1))), atol=0.02
+                maps["slope_deg"][index],
+                np.degrees(np.arctan(np.hypot(0.3, 0.1))),
+                atol=0.02,
             )
         unlabelled = (maps["class_id"] == UNLABELLED).sum()
         cells = maps["class_id"].size

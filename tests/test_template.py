@@ -1,4 +1,6 @@
-"""The template of a package is installed, found by its entry points, driven with, and keeps its own tests."""
+"""The template of a package is installed, found by its entry points, driven with, and
+keeps its own tests.
+"""
 
 import os
 import shutil
@@ -20,7 +22,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("setuptools", minversion="77")
     pytest.importorskip("pip")
     work = tmp_path_factory.mktemp("template")
-    shutil.copytree(ROOT / "examples" / "template", work / "template", ignore=shutil.ignore_patterns("build"))
+    shutil.copytree(
+        ROOT / "examples" / "template",
+        work / "template",
+        ignore=shutil.ignore_patterns("build"),
+    )
     pip = [
         sys.executable,
         "-m",
@@ -31,18 +37,50 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "--no-index",
         "--no-build-isolation",
     ]
-    subprocess.run([*pip, "--target", work / "site", work / "template"], check=True, capture_output=True)
+    subprocess.run(
+        [*pip, "--target", work / "site", work / "template"],
+        check=True,
+        capture_output=True,
+    )
     return work / "site"
 
 
 def test_its_parts_are_driven_with_by_name(
-    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    site: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.syspath_prepend(str(site))
-    asked = ("--planners", "[straight,{part: rays, options: {rays: 24}}]", "--model", "slope:0.02")
-    ground = ("--data", "stakes-v1", "--scenarios", "[std]", "--maps", "2", "--world.time_budget_s", "60")
+    asked = (
+        "--planners",
+        "[straight,{part: rays, options: {rays: 24}}]",
+        "--model",
+        "slope:0.02",
+    )
+    ground = (
+        "--data",
+        "stakes-v1",
+        "--scenarios",
+        "[std]",
+        "--maps",
+        "2",
+        "--world.time_budget_s",
+        "60",
+    )
     out = tmp_path / "run"
-    assert not call("eval", "run", *asked, *ground, "--risks", "[mean]", "--record", "none", "--out", out)
+    assert not call(
+        "eval",
+        "run",
+        *asked,
+        *ground,
+        "--risks",
+        "[mean]",
+        "--record",
+        "none",
+        "--out",
+        out,
+    )
     rows = pd.read_parquet(out / "episodes.parquet")
     own = rows[rows["planner"] == "rays"]
     assert list(own["model"]) == ["slope:0.02"] * 2

@@ -4,7 +4,10 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-OLD = re.compile(r"luck|yardstick|told[ _]apart|\brungs?\b|ladder|\btwins?\b|slowest|\bfelt\b", re.IGNORECASE)
+OLD = re.compile(
+    r"luck|yardstick|told[ _]apart|\brungs?\b|ladder|\btwins?\b|slowest|\bfelt\b",
+    re.IGNORECASE,
+)
 # Unmistakable parts of sentences that no reader understood.
 RIDDLES = re.compile(
     r"so many maps show|told apart from it|does not tell from it|is told the truth|of the draws of λ [\d{]|joined "
@@ -13,18 +16,28 @@ RIDDLES = re.compile(
     re.IGNORECASE,
 )
 # The table of renames, its test, and this.
-NAME_THEM = {"benchnav/core/settings.py", "tests/eval/test_replay.py", "tests/test_words.py"}
+NAME_THEM = {
+    "benchnav/core/settings.py",
+    "tests/eval/test_replay.py",
+    "tests/test_words.py",
+}
 
 
 def test_riddles_are_gone() -> None:
-    files = [path for folder in ("benchnav", "docs") for path in (ROOT / folder).rglob("*")]
+    files = [
+        path for folder in ("benchnav", "docs") for path in (ROOT / folder).rglob("*")
+    ]
     texts = {
         path.relative_to(ROOT).as_posix(): " ".join(_joined(path).split())
         for path in files
         if path.suffix in (".py", ".md", ".html", ".yaml")
     }
     assert len(texts) > 250
-    assert not {f"{name}: {riddle[0]}" for name, text in texts.items() if (riddle := RIDDLES.search(text))}
+    assert not {
+        f"{name}: {riddle[0]}"
+        for name, text in texts.items()
+        if (riddle := RIDDLES.search(text))
+    }
     assert RIDDLES.search("So many maps show a difference from about 46 points on.")
 
 
@@ -34,7 +47,16 @@ def _joined(path: Path) -> str:
 
 
 def test_old_words_are_gone() -> None:
-    folders = ("benchnav", "benchmarks", "studies", "docs", "examples", "tests", "datasets", "checkpoints")
+    folders = (
+        "benchnav",
+        "benchmarks",
+        "studies",
+        "docs",
+        "examples",
+        "tests",
+        "datasets",
+        "checkpoints",
+    )
     files = [
         path
         for folder in folders
@@ -45,6 +67,7 @@ def test_old_words_are_gone() -> None:
     found = {
         f"{path.relative_to(ROOT).as_posix()}: {old[0]}"
         for path in [*files, ROOT / "README.md"]
-        if path.relative_to(ROOT).as_posix() not in NAME_THEM and (old := OLD.search(path.read_text()))
+        if path.relative_to(ROOT).as_posix() not in NAME_THEM
+        and (old := OLD.search(path.read_text()))
     }
     assert not found

@@ -1,10 +1,12 @@
-"""Draws the picture and the moving picture of README.md: one map, two risk settings, one robot that was immobilised.
+"""Draws the picture and the moving picture of README.md: one map, two risk settings,
+one robot that was immobilised.
 
     benchnav-eval run --config demo --out runs/demo
     python tools/hero.py runs/demo
 
-writes docs/figures/hero.png and docs/figures/hero.gif. The map is the one on which the first setting is immobilised
-and the second reaches the goal, and the driven paths lie farthest apart.
+writes docs/figures/hero.png and docs/figures/hero.gif. The map is the one on which the
+first setting is immobilised and the second reaches the goal, and the driven paths lie
+farthest apart.
 """
 
 import argparse
@@ -36,12 +38,22 @@ Pair = tuple[Recording, Recording]
 
 
 def find_pair(folder: Path) -> Pair:
-    """Recordings of the two settings on the map where their paths lie farthest apart and their outcomes differ."""
+    """Recordings of the two settings on the map where their paths lie farthest apart
+    and their outcomes differ.
+    """
     rows = read_results(folder, False).episodes
-    first, second = (rows[(rows["risk"] == risk) & (rows["planner"] == "astar_dwa")] for risk in RISKS)
+    first, second = (
+        rows[(rows["risk"] == risk) & (rows["planner"] == "astar_dwa")]
+        for risk in RISKS
+    )
     keys = ["seed", "realisation", "map"]
-    both = first[first["outcome"] == "immobilised"].merge(second[second["success"]], on=keys)[keys]
-    pairs = zip(*(driven(folder, own.merge(both, on=keys)) for own in (first, second)), strict=True)
+    both = first[first["outcome"] == "immobilised"].merge(
+        second[second["success"]], on=keys
+    )[keys]
+    pairs = zip(
+        *(driven(folder, own.merge(both, on=keys)) for own in (first, second)),
+        strict=True,
+    )
     return max(pairs, key=lambda pair: apart(*(own.track for own in pair)))
 
 
@@ -67,13 +79,22 @@ def draw_terrain(panel: Axes3D, pair: Pair) -> None:
     first = pair[0]
     rows, columns = first.elevation_m.shape
     x, y = ((np.arange(size) + 0.5) * first.resolution_m for size in (columns, rows))
-    colours = (np.moveaxis(first.rgb, 0, -1) / 255) ** 1.4  # which are shaded, and light
+    colours = (
+        np.moveaxis(first.rgb, 0, -1) / 255
+    ) ** 1.4  # which are shaded, and light
     colours[first.immobilising] = to_rgb(maps.IMMOBILISING)
     panel.computed_zorder = False
     panel.plot_surface(
-        *np.meshgrid(x, y), first.elevation_m, facecolors=colours, rstride=1, cstride=1, lw=0, antialiased=False,
-        shade=False, zorder=1,
-    )  # fmt: skip
+        *np.meshgrid(x, y),
+        first.elevation_m,
+        facecolors=colours,
+        rstride=1,
+        cstride=1,
+        lw=0,
+        antialiased=False,
+        shade=False,
+        zorder=1,
+    )
     for own, (name, colour) in zip(pair, RISKS.values(), strict=True):
         high = heights(own, own.track) + 0.3
         for edge, width in (("white", 4.2), (colour, 2.2)):
@@ -82,9 +103,16 @@ def draw_terrain(panel: Axes3D, pair: Pair) -> None:
     end = first.track[-1]
     positions = {"start": first.track[0], "goal": first.goal_m, "immobilised": end}
     for (name, (x_m, y_m)), top in zip(
-        positions.items(), heights(first, np.array(list(positions.values()))), strict=True
+        positions.items(),
+        heights(first, np.array(list(positions.values()))),
+        strict=True,
     ):
-        panel.plot([x_m], [y_m], [top + 0.4], **maps.MARKS[name] | {"ms": 1.3 * maps.MARKS[name]["ms"]})
+        panel.plot(
+            [x_m],
+            [y_m],
+            [top + 0.4],
+            **maps.MARKS[name] | {"ms": 1.3 * maps.MARKS[name]["ms"]},
+        )
     panel.set_box_aspect((1, rows / columns, 0.22), zoom=1.15)
     panel.view_init(elev=50, azim=-62)
     panel.set_axis_off()
@@ -99,7 +127,9 @@ def draw_hero(pair: Pair) -> Figure:
     draw_terrain(terrain, pair)
     handles, _ = terrain.get_legend_handles_labels()
     handles.append(Patch(color=maps.IMMOBILISING, label=CAUGHT))
-    terrain.legend(handles=handles, loc="lower left", fontsize=8, bbox_to_anchor=(0, -0.08))
+    terrain.legend(
+        handles=handles, loc="lower left", fontsize=8, bbox_to_anchor=(0, -0.08)
+    )
     for place, own in enumerate(pair):
         panel = figure.add_subplot(places[1 + place])
         name, colour = RISKS[own.about["risk"]]
@@ -107,9 +137,15 @@ def draw_hero(pair: Pair) -> Figure:
         maps.overlay(panel, own.immobilising, own.grid.extent_m, maps.IMMOBILISING)
         maps.draw_drive(panel, drive_at(own, len(own.actions)), 2.2, 1.2, colour)
         panel.set(xticks=[], yticks=[])
-        panel.set_title(f"λ̂ = {name}: {own.outcome} after {own.end_s:.0f} s", fontsize=9)
+        panel.set_title(
+            f"λ̂ = {name}: {own.outcome} after {own.end_s:.0f} s", fontsize=9
+        )
         maps.draw_scale(panel, own.grid.extent_m, 8)
-    figure.colorbar(image, cax=figure.add_subplot(places[3]), label="λ̂, fraction of the commanded speed")
+    figure.colorbar(
+        image,
+        cax=figure.add_subplot(places[3]),
+        label="λ̂, fraction of the commanded speed",
+    )
     return figure
 
 
@@ -118,7 +154,9 @@ def frames(pair: Pair) -> Iterator[Image.Image]:
     video = Frames(pair)
     end_s = max(own.end_s for own in pair)
     for time_s in [*np.arange(0, end_s, SPEED * TICK_MS / 1000), end_s]:
-        yield Image.fromarray(video.draw(float(time_s))).resize(GIF_SIZE, Image.Resampling.LANCZOS)
+        yield Image.fromarray(video.draw(float(time_s))).resize(
+            GIF_SIZE, Image.Resampling.LANCZOS
+        )
 
 
 def main() -> None:
@@ -132,14 +170,21 @@ def main() -> None:
     pair = find_pair(given.run)
     print(f"map {pair[0].about['map']}")
     save(draw_hero(pair), given.out / "hero.png", "png", dpi=170)
-    # One palette for all, by coverage, which keeps the colours of few pixels: those of the marks.
+    # One palette for all, by coverage, which keeps the colours of few pixels: those of
+    # the marks.
     images = list(frames(pair))
     palette = images[len(images) // 2].quantize(256, method=Image.Quantize.MAXCOVERAGE)
-    first, *rest = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    first, *rest = (
+        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
+    )
     first.save(
-        given.out / "hero.gif", save_all=True, append_images=rest, duration=[TICK_MS] * len(rest) + [2500],
-        loop=0, optimize=True,
-    )  # fmt: skip
+        given.out / "hero.gif",
+        save_all=True,
+        append_images=rest,
+        duration=[TICK_MS] * len(rest) + [2500],
+        loop=0,
+        optimize=True,
+    )
 
 
 if __name__ == "__main__":

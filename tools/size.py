@@ -1,7 +1,8 @@
 """Count the tokens of Python code, without comments, docstrings and layout.
 
     python tools/size.py                    # by package, and by area
-    python tools/size.py --against REVISION # next to those of a revision of the repository
+    python tools/size.py --against REVISION # next to those of a revision of the
+    repository
 
 Run it with Python 3.11: later versions split f-strings into tokens.
 """
@@ -34,7 +35,8 @@ def count(text: str) -> int:
     documented = _docstring_lines(ast.parse(text))
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
     return sum(
-        token.type not in _LAYOUT and not (token.type == tokenize.STRING and token.start[0] in documented)
+        token.type not in _LAYOUT
+        and not (token.type == tokenize.STRING and token.start[0] in documented)
         for token in tokens
     )
 
@@ -42,11 +44,15 @@ def count(text: str) -> int:
 def _docstring_lines(module: ast.Module) -> set[int]:
     lines = set()
     for node in ast.walk(module):
-        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+        if not isinstance(
+            node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+        ):
             continue
         # A string by itself documents the statement above it.
         for statement in node.body:
-            is_text = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+            is_text = isinstance(statement, ast.Expr) and isinstance(
+                statement.value, ast.Constant
+            )
             if is_text and isinstance(statement.value.value, str):
                 lines.add(statement.lineno)
     return lines
@@ -67,13 +73,19 @@ def sizes(revision: str = "") -> dict[str, int]:
         and (revision or (ROOT / path).exists())
     ]
     return {
-        path: count(_git("show", f"{revision}:{path}") if revision else (ROOT / path).read_text())
+        path: count(
+            _git("show", f"{revision}:{path}")
+            if revision
+            else (ROOT / path).read_text()
+        )
         for path in paths
     }
 
 
 def _git(*words: str) -> str:
-    return subprocess.run(["git", *words], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    return subprocess.run(
+        ["git", *words], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout
 
 
 def by_folder(files: dict[str, int]) -> Counter[str]:
@@ -82,7 +94,13 @@ def by_folder(files: dict[str, int]) -> Counter[str]:
     for path, tokens in files.items():
         folders = path.split("/")[:-1]
         totals[
-            "/".join(folders[: 3 if folders[:2] in (["benchnav", "eval"], ["benchnav", "models"]) else 2])
+            "/".join(
+                folders[
+                    : 3
+                    if folders[:2] in (["benchnav", "eval"], ["benchnav", "models"])
+                    else 2
+                ]
+            )
         ] += tokens
         totals["package"] += tokens * (folders[0] == "benchnav")
     return totals
@@ -98,14 +116,17 @@ def main() -> None:
     given = parser.parse_args()
     if sys.version_info[:2] != (3, 11):
         print(
-            f"warning: Python {sys.version_info[0]}.{sys.version_info[1]} may split tokens otherwise than 3.11"
+            f"warning: Python {sys.version_info[0]}.{sys.version_info[1]} may split "
+            "tokens otherwise than 3.11"
         )
     now, before = sizes(), sizes(given.against) if given.against else {}
     if not given.files:
         now, before = by_folder(now), by_folder(before)
     for name in sorted(now.keys() | before.keys()):
         change = (
-            f" {before.get(name, 0):8} {now.get(name, 0) - before.get(name, 0):+8}" if given.against else ""
+            f" {before.get(name, 0):8} {now.get(name, 0) - before.get(name, 0):+8}"
+            if given.against
+            else ""
         )
         print(f"{name:50} {now.get(name, 0):8}{change}")
 

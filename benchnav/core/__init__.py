@@ -1,1 +1,3 @@
-"""What every package stands on: values, random streams, the registry of parts, settings, files and commands."""
+"""What every package stands on: values, random streams, the registry of parts,
+settings, files and commands.
+"""

@@ -1,4 +1,6 @@
-"""Batches: frozen dataclasses of tensors whose first dimension is that of the members, episodes or maps."""
+"""Batches: frozen dataclasses of tensors whose first dimension is that of the members,
+episodes or maps.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
@@ -13,7 +15,9 @@ Value = TypeVar("Value", bound=Any)
 
 
 class Batch:
-    """The base of dataclasses whose tensors, and those of the batches in them, have the members first."""
+    """The base of dataclasses whose tensors, and those of the batches in them, have the
+    members first.
+    """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Give each dataclass the short representation, which its decorator keeps."""
@@ -21,13 +25,24 @@ class Batch:
         cls.__repr__ = short_repr  # type: ignore[method-assign]
 
     def select(self, members: Tensor) -> Self:
-        """Keeps some members, by index, int64, shape [M]; one may be taken more than once."""
+        """Keeps some members, by index, int64, shape [M]; one may be taken more than
+        once.
+        """
         # A batch in it keeps them as it does by itself.
-        return _mapped(self, lambda values: values[members], lambda inner: inner.select(members), ())
+        return _mapped(
+            self,
+            lambda values: values[members],
+            lambda inner: inner.select(members),
+            (),
+        )
 
     def put(self, members: Tensor, others: Self) -> Self:
-        """Puts M members in the places of others, by index, int64, shape [M]; this one is not changed."""
-        return map_tensors(self, lambda old, new: old.index_copy(0, members, new), others)
+        """Puts M members in the places of others, by index, int64, shape [M]; this one
+        is not changed.
+        """
+        return map_tensors(
+            self, lambda old, new: old.index_copy(0, members, new), others
+        )
 
     def clone(self) -> Self:
         """A copy that shares no tensor."""
@@ -39,30 +54,42 @@ class Batch:
 
 
 def map_tensors(value: Value, change: Callable[..., Tensor], *others: Value) -> Value:
-    """Changes each tensor of a dataclass, and of the batches, tuples of batches and mappings in it; all else stays.
+    """Changes each tensor of a dataclass, and of the batches, tuples of batches and
+    mappings in it; all else stays.
 
     Args:
         value: the dataclass.
         change: is given a tensor, and those that have its place in the others.
         others: more of the same kind.
     """
-    return _mapped(value, change, lambda first, *rest: map_tensors(first, change, *rest), others)
+    return _mapped(
+        value, change, lambda first, *rest: map_tensors(first, change, *rest), others
+    )
 
 
 def _mapped(
-    value: Value, change: Callable[..., Tensor], inner: Callable[..., Any], others: Sequence[Any]
+    value: Value,
+    change: Callable[..., Tensor],
+    inner: Callable[..., Any],
+    others: Sequence[Any],
 ) -> Value:
     """Changes each tensor by `change` and each batch by `inner`."""
     given: Any = value
     names = [each.name for each in fields(given)]
     found = {
-        n: _changed(getattr(given, n), change, inner, [getattr(one, n) for one in others]) for n in names
+        n: _changed(
+            getattr(given, n), change, inner, [getattr(one, n) for one in others]
+        )
+        for n in names
     }
     return cast(Value, replace(given, **found))
 
 
 def _changed(
-    first: Any, change: Callable[..., Tensor], inner: Callable[..., Any], rest: Sequence[Any]
+    first: Any,
+    change: Callable[..., Tensor],
+    inner: Callable[..., Any],
+    rest: Sequence[Any],
 ) -> Any:
     if isinstance(first, Tensor):
         return change(first, *rest)
@@ -72,13 +99,15 @@ def _changed(
         return tuple(inner(own, *same) for own, *same in zip(first, *rest, strict=True))
     if isinstance(first, Mapping):
         return {
-            key: _changed(own, change, inner, [other[key] for other in rest]) for key, own in first.items()
+            key: _changed(own, change, inner, [other[key] for other in rest])
+            for key, own in first.items()
         }
     return first
 
 
 def put_if_alike(value: Value, members: Tensor, others: Value) -> Value:
-    """Puts some members of another batch in the same places of this one; of an unlike kind or size, gives the other.
+    """Puts some members of another batch in the same places of this one; of an unlike
+    kind or size, gives the other.
 
     Args:
         value: of B members; it is not changed.
@@ -92,7 +121,8 @@ def put_if_alike(value: Value, members: Tensor, others: Value) -> Value:
 
 
 def first_tensor(value: Batch) -> Tensor:
-    """The first tensor of a dataclass, the batches and tuples of batches in it included.
+    """The first tensor of a dataclass, the batches and tuples of batches in it
+    included.
 
     Raises:
         StopIteration: it has none.
@@ -113,9 +143,15 @@ def _tensors(value: Any) -> Iterator[Tensor]:
 
 
 def find_tensor_fault(
-    what: str, values: Any, dtype: torch.dtype, shape: tuple[int, ...], device: torch.device
+    what: str,
+    values: Any,
+    dtype: torch.dtype,
+    shape: tuple[int, ...],
+    device: torch.device,
 ) -> str:
-    """Tells in one line what makes something another tensor than is expected; empty where nothing does."""
+    """Tells in one line what makes something another tensor than is expected; empty
+    where nothing does.
+    """
     wanted, got = f"{dtype} of shape {list(shape)} on {device}", type(values).__name__
     if isinstance(values, Tensor):
         got = f"{values.dtype} of shape {list(values.shape)} on {values.device}"

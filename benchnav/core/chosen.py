@@ -1,4 +1,5 @@
-"""A distribution that is one of two in each cell, such as a prediction where ground was seen and a prior elsewhere.
+"""A distribution that is one of two in each cell, such as a prediction where ground was
+seen and a prior elsewhere.
 
 Letters in shapes: H×W cells, K components, *B any leading dimensions.
 """
@@ -39,7 +40,10 @@ class ChosenDistribution(TraversabilityDistribution):
 
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]; see the base."""
-        (low, high), (other_low, other_high) = self.first.cdf_limits(value), self.second.cdf_limits(value)
+        (low, high), (other_low, other_high) = (
+            self.first.cdf_limits(value),
+            self.second.cdf_limits(value),
+        )
         return self._pick(low, other_low), self._pick(high, other_high)
 
     @property
@@ -48,8 +52,12 @@ class ChosenDistribution(TraversabilityDistribution):
         return self.first.searched and self.second.searched
 
     def quantile(self, probability: Tensor | float) -> Tensor:
-        """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the base."""
-        return self._pick(self.first.quantile(probability), self.second.quantile(probability))
+        """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the
+        base.
+        """
+        return self._pick(
+            self.first.quantile(probability), self.second.quantile(probability)
+        )
 
     def mean(self) -> Tensor:
         """E[λ], shape [*B, H, W]."""
@@ -61,23 +69,36 @@ class ChosenDistribution(TraversabilityDistribution):
 
     def expected_time(self, floor: float) -> Tensor:
         """E[1 / max(λ, floor)], shape [*B, H, W]; see the base."""
-        return self._pick(self.first.expected_time(floor), self.second.expected_time(floor))
+        return self._pick(
+            self.first.expected_time(floor), self.second.expected_time(floor)
+        )
 
     def time_cvar(self, level: float, floor: float) -> Tensor:
         """CVaR of the time 1 / max(λ, floor), shape [*B, H, W]; see the base."""
-        return self._pick(self.first.time_cvar(level, floor), self.second.time_cvar(level, floor))
+        return self._pick(
+            self.first.time_cvar(level, floor), self.second.time_cvar(level, floor)
+        )
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log density on (0, 1), log mass at 0 and at 1, shape [*B, H, W]; see the base."""
+        """Log density on (0, 1), log mass at 0 and at 1, shape [*B, H, W]; see the
+        base.
+        """
         return self._pick(self.first.log_prob(value), self.second.log_prob(value))
 
     def from_normal(self, normal: Tensor) -> Tensor:
         """λ of standard normal numbers, shape [*B, H, W]; see the base."""
-        return self._pick(self.first.from_normal(normal), self.second.from_normal(normal))
+        return self._pick(
+            self.first.from_normal(normal), self.second.from_normal(normal)
+        )
 
     def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
-        """The interval of standard normal numbers, each of shape [*B, H, W]; see the base."""
-        (low, high), (other_low, other_high) = self.first.to_normal(value), self.second.to_normal(value)
+        """The interval of standard normal numbers, each of shape [*B, H, W]; see the
+        base.
+        """
+        (low, high), (other_low, other_high) = (
+            self.first.to_normal(value),
+            self.second.to_normal(value),
+        )
         return self._pick(low, other_low), self._pick(high, other_high)
 
     def _pick(self, first: Tensor, second: Tensor) -> Tensor:
@@ -85,7 +106,9 @@ class ChosenDistribution(TraversabilityDistribution):
 
 
 def choose(
-    chosen: Tensor, first: TraversabilityDistribution, second: TraversabilityDistribution
+    chosen: Tensor,
+    first: TraversabilityDistribution,
+    second: TraversabilityDistribution,
 ) -> TraversabilityDistribution:
     """The first distribution where cells are chosen, the second in all other cells.
 
@@ -95,17 +118,29 @@ def choose(
         second: of shape [*B, H, W].
 
     Returns:
-        A mixture again where both are; the components of the second then belong to no class.
+        A mixture again where both are; the components of the second then belong to no
+        class.
     """
-    if not isinstance(first, TraversabilityMixture) or not isinstance(second, TraversabilityMixture):
+    if not isinstance(first, TraversabilityMixture) or not isinstance(
+        second, TraversabilityMixture
+    ):
         return ChosenDistribution(first, second, chosen)
     own = chosen.unsqueeze(-3)
     parts = [first, second]
     weights = torch.cat(
-        [torch.where(own == (part is first), part.weights, 0.0).to(first.weights) for part in parts], -3
+        [
+            torch.where(own == (part is first), part.weights, 0.0).to(first.weights)
+            for part in parts
+        ],
+        -3,
     )
     means, stds = (
-        torch.cat([getattr(part, name).to(first.weights) for part in parts], -3) for name in ("means", "stds")
+        torch.cat([getattr(part, name).to(first.weights) for part in parts], -3)
+        for name in ("means", "stds")
     )
-    group = None if first.group is None else (*first.group, *[NO_CLASS] * second.weights.shape[-3])
+    group = (
+        None
+        if first.group is None
+        else (*first.group, *[NO_CLASS] * second.weights.shape[-3])
+    )
     return TraversabilityMixture(weights, means, stds, group)

@@ -1,8 +1,9 @@
 """How the commands read their words and report errors: one way for all three.
 
-Words and YAML files make one plain mapping, which `benchnav.core.settings` reads by the types of the function's
-parameters; the help is jsonargparse's. `--contact-sheet` is `--contact_sheet true`, `--maps 3` is `--maps [3]`; a
-flag whose value is a name or a mapping may be given as both, `--world paper --world.noise stored`. Bad input ends in
+Words and YAML files make one plain mapping, which `benchnav.core.settings` reads by the
+types of the function's parameters; the help is jsonargparse's. `--contact-sheet` is
+`--contact_sheet true`, `--maps 3` is `--maps [3]`; a flag whose value is a name or a
+mapping may be given as both, `--world paper --world.noise stored`. Bad input ends in
 one line on standard error and exit status 2; an interruption in status 130.
 """
 
@@ -20,7 +21,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_origin
 
-from benchnav.core.errors import BenchnavError, ConfigError, check_text, expect, out_of_memory
+from benchnav.core.errors import (
+    BenchnavError,
+    ConfigError,
+    check_text,
+    expect,
+    out_of_memory,
+)
 from benchnav.core.registry import KINDS
 from benchnav.core.settings import (
     NO_DEFAULT,
@@ -42,11 +49,17 @@ INTERRUPTED = 130
 
 # Options that name what a command writes, of all commands.
 OUTPUTS = ("out", "json", "onnx", "video")
-_LONGEST = 2000  # characters of a message, of which the middle of a longer one is left out
+_LONGEST = (
+    2000  # characters of a message, of which the middle of a longer one is left out
+)
 
-_Flag = tuple[list[str], str]  # the option that a flag stands for, keys within its value; and its text
+_Flag = tuple[
+    list[str], str
+]  # the option that a flag stands for, keys within its value; and its text
 
-Device = Literal["auto", "cpu", "cuda"]  # of the flag --device; see `benchnav.core.device`
+Device = Literal[
+    "auto", "cpu", "cuda"
+]  # of the flag --device; see `benchnav.core.device`
 
 
 @dataclass(frozen=True)
@@ -54,12 +67,15 @@ class Command:
     """One subcommand.
 
     Args:
-        function: does the work; its type hints and docstring become flags and help. Of a dataclass without a default
-            each field becomes a flag. It returns the exit status, or None for success.
-        positionals: names of its parameters that are given by place rather than by flag; one that is a
-            list takes what is left.
-        repeated: names of lists whose flag may be given again, which adds to the list; of others the last one holds.
-        configs: folder of shipped YAML files, which `--config NAME` finds where there is no such file.
+        function: does the work; its type hints and docstring become flags and help. Of
+            a dataclass without a default each field becomes a flag. It returns the exit
+            status, or None for success.
+        positionals: names of its parameters that are given by place rather than by
+            flag; one that is a list takes what is left.
+        repeated: names of lists whose flag may be given again, which adds to the list;
+            of others the last one holds.
+        configs: folder of shipped YAML files, which `--config NAME` finds where there
+            is no such file.
     """
 
     function: Callable[..., int | None]
@@ -71,7 +87,11 @@ class Command:
     def settings(self) -> dict[str, type]:
         """Dataclasses whose fields are flags, by the function's parameter."""
         known = list_options(self.function).items()
-        kinds = {name: dataclass_in(option.kind) for name, option in known if option.default is NO_DEFAULT}
+        kinds = {
+            name: dataclass_in(option.kind)
+            for name, option in known
+            if option.default is NO_DEFAULT
+        }
         return {name: kind for name, kind in kinds.items() if kind}
 
     @cached_property
@@ -79,13 +99,23 @@ class Command:
         """What can be given, by name."""
         options: dict[str, Option] = {}
         for name, option in list_options(self.function).items():
-            options |= list_options(self.settings[name]) if name in self.settings else {name: option}
+            options |= (
+                list_options(self.settings[name])
+                if name in self.settings
+                else {name: option}
+            )
         return options
 
     @cached_property
     def flags(self) -> dict[str, Any]:
-        """Types by flag; flags for the fields of a dataclass have a dot, those of a dataclass in it two."""
-        kinds = {name: option.kind for name, option in self.options.items() if name not in self.positionals}
+        """Types by flag; flags for the fields of a dataclass have a dot, those of a
+        dataclass in it two.
+        """
+        kinds = {
+            name: option.kind
+            for name, option in self.options.items()
+            if name not in self.positionals
+        }
         level = kinds
         while level:
             level = {
@@ -100,13 +130,21 @@ class Command:
     @cached_property
     def shipped(self) -> dict[str, Path]:
         """Shipped YAML files by name."""
-        return {path.stem: path for path in sorted(self.configs.glob("*.yaml"))} if self.configs else {}
+        return (
+            {path.stem: path for path in sorted(self.configs.glob("*.yaml"))}
+            if self.configs
+            else {}
+        )
 
 
 def run(
-    program: str, description: str, commands: dict[str, Command], argv: Sequence[str] | None = None
+    program: str,
+    description: str,
+    commands: dict[str, Command],
+    argv: Sequence[str] | None = None,
 ) -> int:
-    """Reads a command line and runs the subcommand it names; without one it prints the help.
+    """Reads a command line and runs the subcommand it names; without one it prints the
+    help.
 
     Args:
         program: name of the command.
@@ -115,7 +153,8 @@ def run(
         argv: arguments, or None for the process's own.
 
     Returns:
-        Exit status: 0, 1 where the command or its error says so, 2 for bad input, 130 when interrupted.
+        Exit status: 0, 1 where the command or its error says so, 2 for bad input, 130
+            when interrupted.
     """
     # Notices of libraries to their own developers would bury what a user has to read.
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"torch\..*")
@@ -129,7 +168,8 @@ def run(
             return 0
         if command is None:
             raise ConfigError(
-                f"Expected a command among {', '.join(commands)}, got {asked!r}.{hint(asked, commands)}"
+                f"Expected a command among {', '.join(commands)}, got "
+                f"{asked!r}.{hint(asked, commands)}"
             )
         return _call(f"{program} {asked}", command, words) or 0
     except BrokenPipeError:
@@ -139,15 +179,22 @@ def run(
         line = _said(error, command)
         if line is None:
             raise
-        return _refuse(program, line, error.status if isinstance(error, BenchnavError) else 2)
+        return _refuse(
+            program, line, error.status if isinstance(error, BenchnavError) else 2
+        )
     except KeyboardInterrupt as stopped:  # by Ctrl-C, or by a scheduler's SIGTERM
         # A command that knows what it has kept says so by the interruption's text.
-        print("; ".join([f"{program}: interrupted", *map(str, stopped.args)]), file=sys.stderr)
+        print(
+            "; ".join([f"{program}: interrupted", *map(str, stopped.args)]),
+            file=sys.stderr,
+        )
         return INTERRUPTED
 
 
 def tell(line: str) -> None:
-    """Prints a line on standard error; where no one reads it any more, the work goes on without."""
+    """Prints a line on standard error; where no one reads it any more, the work goes on
+    without.
+    """
     try:
         print(line, file=sys.stderr, flush=True)
     except BrokenPipeError:
@@ -155,7 +202,9 @@ def tell(line: str) -> None:
 
 
 def _call(program: str, command: Command, words: Sequence[str]) -> int | None:
-    """Calls the function of a subcommand with what its words say, or prints its help or settings."""
+    """Calls the function of a subcommand with what its words say, or prints its help or
+    settings.
+    """
     import yaml
 
     for word in words:
@@ -165,24 +214,37 @@ def _call(program: str, command: Command, words: Sequence[str]) -> int | None:
     flags, places = _read_words(program, command, words)
     arguments = _read_arguments(program, command, flags, places)
     known = {
-        name: option.default for name, option in command.options.items() if option.default is not NO_DEFAULT
+        name: option.default
+        for name, option in command.options.items()
+        if option.default is not NO_DEFAULT
     }
     if printed := [value for path, value in flags if path == ["print_config"]]:
         settings = plain(arguments if "skip_default" in printed else known | arguments)
         print(yaml.safe_dump(settings, sort_keys=False, allow_unicode=True), end="")
         return 0
     if lacking := [name for name in command.options if name not in known | arguments]:
-        named = [name.upper() if name in command.positionals else f"--{name}" for name in lacking]
-        raise ConfigError(f"Expected {' and '.join(named)}, got none. See `{program} --help`.")
+        named = [
+            name.upper() if name in command.positionals else f"--{name}"
+            for name in lacking
+        ]
+        raise ConfigError(
+            f"Expected {' and '.join(named)}, got none. See `{program} --help`."
+        )
     _check_texts(command, arguments)
     for parameter, kind in command.settings.items():
-        own = {name: arguments.pop(name) for name in list_options(kind) if name in arguments}
+        own = {
+            name: arguments.pop(name)
+            for name in list_options(kind)
+            if name in arguments
+        }
         arguments[parameter] = kind(**own)
     return command.function(**arguments)
 
 
 def _check_texts(command: Command, arguments: dict[str, Any]) -> None:
-    """Refuse text that is empty where that means nothing, and outputs that are no paths here; fill in `~` in these."""
+    """Refuse text that is empty where that means nothing, and outputs that are no paths
+    here; fill in `~` in these.
+    """
     for name, value in arguments.items():
         option = command.options[name]
         shown = name.upper() if name in command.positionals else f"--{name}"
@@ -198,7 +260,8 @@ def _read_arguments(
 ) -> dict[str, Any]:
     """Makes arguments by name of flags and of what is given by place.
 
-    YAML files come first, then flags, then keys within the value of a flag, wherever they stand.
+    YAML files come first, then flags, then keys within the value of a flag, wherever
+    they stand.
 
     Raises:
         ConfigError: something given is unknown or of another type.
@@ -206,25 +269,40 @@ def _read_arguments(
     options = command.options
     arguments: dict[str, Any] = {}  # from which later ones begin
     for file in [value for path, value in flags if path == ["config"]]:
-        arguments |= read_options(options, _read_config(command, file), of(file), now=arguments)
+        arguments |= read_options(
+            options, _read_config(command, file), of(file), now=arguments
+        )
     given: dict[str, Any] = {}
     for (name, *keys), value in sorted(flags, key=lambda flag: len(flag[0])):
         if name in options:
-            kind, now = options[name].kind, given.get(name, arguments.get(name, options[name].default))
+            kind, now = (
+                options[name].kind,
+                given.get(name, arguments.get(name, options[name].default)),
+            )
             again = name in given and name in command.repeated
-            given[name] = _appended(now, value) if again else _merged(name, kind, now, keys, value)
+            given[name] = (
+                _appended(now, value)
+                if again
+                else _merged(name, kind, now, keys, value)
+            )
     for name in command.positionals:
         if options[name].kind == list[str] and (places or name not in arguments):
             given[name], places = list(places), []
         elif places:
             given[name], *places = places
     if places:
-        raise ConfigError(f"Expected nothing more, got {' '.join(places)!r}. See `{program} --help`.")
+        raise ConfigError(
+            f"Expected nothing more, got {' '.join(places)!r}. See `{program} --help`."
+        )
     return arguments | read_options(options, given, "--{}".format, now=arguments)
 
 
-def _read_words(program: str, command: Command, words: Sequence[str]) -> tuple[list[_Flag], list[str]]:
-    """Reads words as flags, each with the keys that it stands for and its value; and what is given by place."""
+def _read_words(
+    program: str, command: Command, words: Sequence[str]
+) -> tuple[list[_Flag], list[str]]:
+    """Reads words as flags, each with the keys that it stands for and its value; and
+    what is given by place.
+    """
     flags: list[_Flag] = []
     places: list[str] = []
     rest = deque(words)
@@ -241,7 +319,9 @@ def _read_words(program: str, command: Command, words: Sequence[str]) -> tuple[l
         if is_switch:
             has_value = has_value and rest[0].lower() in ("true", "false", "yes", "no")
         if not equals and not has_value and not is_switch:
-            raise ConfigError(f"Expected a value after {flag} ({in_words(kind)}), got none.")
+            raise ConfigError(
+                f"Expected a value after {flag} ({in_words(kind)}), got none."
+            )
         if not equals:
             value = rest.popleft() if has_value else "true"
         flags.append((path, value))
@@ -261,13 +341,20 @@ def _path_of(program: str, command: Command, flag: str) -> list[str]:
     if keys and _takes_mapping(command.flags.get(name)):
         return [name, *keys]  # which stay as they are
     near = hint(whole, command.flags, "--")
-    raise ConfigError(f"Expected flags that `{program}` has, got {flag}.{near} See `{program} --help`.")
+    raise ConfigError(
+        f"Expected flags that `{program}` has, got {flag}.{near} See `{program} "
+        "--help`."
+    )
 
 
 def _merged(name: str, kind: Any, now: Any, keys: Sequence[str], text: str) -> Any:
-    """The value of an option when the text of a flag is added to it: of the whole, or of a key in it."""
+    """The value of an option when the text of a flag is added to it: of the whole, or
+    of a key in it.
+    """
     is_group, value = dataclass_in(kind) is not None, text
-    if (keys and not is_group) or (text.lstrip().startswith("{") and (is_group or _takes_mapping(kind))):
+    if (keys and not is_group) or (
+        text.lstrip().startswith("{") and (is_group or _takes_mapping(kind))
+    ):
         value = load_yaml(text)
     if is_group and not isinstance(now, dict):
         now = {}  # what is not given stays as it is
@@ -285,17 +372,27 @@ def _read_config(command: Command, value: str) -> dict[str, Any]:
         path = command.shipped.get(value, path)
     if not path.exists():
         among = f", or one of {', '.join(command.shipped)}" if command.shipped else ""
-        near = [*command.shipped, *(str(path.parent / other.name) for other in path.parent.glob("*.y*ml"))]
+        near = [
+            *command.shipped,
+            *(str(path.parent / other.name) for other in path.parent.glob("*.y*ml")),
+        ]
         raise ConfigError(
-            f"Expected --config as a YAML file{among}, got {value!r}, which is not there.{hint(str(path), near)}"
+            f"Expected --config as a YAML file{among}, got {value!r}, which is not "
+            f"there.{hint(str(path), near)}"
         )
     content = read_yaml(path)
     if not isinstance(content, dict | None):
-        raise ConfigError(f"Expected {path} to hold settings as `name: value`, got {type(content).__name__}.")
+        raise ConfigError(
+            f"Expected {path} to hold settings as `name: value`, got "
+            f"{type(content).__name__}."
+        )
     settings: dict[str, Any] = {}
     for key, item in (content or {}).items():
         keys = str(key).split(".")
-        expect(not _is_set(settings, keys), f"each setting of {path} once, got {str(key)!r} twice.")
+        expect(
+            not _is_set(settings, keys),
+            f"each setting of {path} once, got {str(key)!r} twice.",
+        )
         settings = changed(settings, keys, item)
     return settings
 
@@ -309,8 +406,13 @@ def _is_set(settings: Any, keys: Sequence[str]) -> bool:
     return True
 
 
-def _print_help(program: str, description: str, commands: Mapping[str, Command]) -> None:
-    print(f"usage: {program} COMMAND …\n\n{description}\n\ncommands, each with a --help of its own:")
+def _print_help(
+    program: str, description: str, commands: Mapping[str, Command]
+) -> None:
+    print(
+        f"usage: {program} COMMAND …\n\n{description}\n\ncommands, each with a --help "
+        "of its own:"
+    )
     width = max(map(len, commands))
     for name, command in commands.items():
         print(f"  {name:{width}}  {_summary(command.function)}")
@@ -324,22 +426,34 @@ def _print_help_of(program: str, command: Command) -> int:
     shipped = f", or one of {', '.join(command.shipped)}" if command.shipped else ""
     about = f"Path of a YAML file with these settings{shipped}."
     parser.add_argument("--config", action="config", help=about)
-    documented = {p.arg_name: p.description for p in parse(inspect.getdoc(command.function) or "").params}
+    documented = {
+        p.arg_name: p.description
+        for p in parse(inspect.getdoc(command.function) or "").params
+    }
     for name in command.positionals:
         is_list = command.options[name].kind == list[str]
-        action = parser.add_argument(name, help=documented.get(name), nargs="*" if is_list else None)
-        action.required = not is_list  # whether an empty list will do is the function's to say
+        action = parser.add_argument(
+            name, help=documented.get(name), nargs="*" if is_list else None
+        )
+        action.required = (
+            not is_list
+        )  # whether an empty list will do is the function's to say
     skip: set[str | int] = set(command.positionals)
     for kind in command.settings.values():
         parser.add_class_arguments(kind, as_group=False)
-    parser.add_function_arguments(command.function, as_group=False, skip=skip | set(command.settings))
+    parser.add_function_arguments(
+        command.function, as_group=False, skip=skip | set(command.settings)
+    )
     parser.print_help()
     return 0
 
 
 def _appended(one: str, other: str) -> str:
     """Two lists, each as text with or without brackets, as one."""
-    inner = (text.strip().removeprefix("[").removesuffix("]").strip() for text in (one, other))
+    inner = (
+        text.strip().removeprefix("[").removesuffix("]").strip()
+        for text in (one, other)
+    )
     return f"[{', '.join(text for text in inner if text)}]"
 
 
@@ -372,9 +486,20 @@ def _unusable(error: OSError, command: Command | None) -> str:
     path = Path(str(error.filename))
     if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"could not use {path}: {reason}"
-    existing = next(place for place in (path.absolute(), *path.absolute().parents) if os.path.exists(place))
-    remedy = "Choose another place with --out, or change" if command and "out" in command.flags else "Change"
-    return f"could not use {path.absolute()}: {reason}. {remedy} the permissions of {existing}."
+    existing = next(
+        place
+        for place in (path.absolute(), *path.absolute().parents)
+        if os.path.exists(place)
+    )
+    remedy = (
+        "Choose another place with --out, or change"
+        if command and "out" in command.flags
+        else "Change"
+    )
+    return (
+        f"could not use {path.absolute()}: {reason}. {remedy} the permissions of "
+        f"{existing}."
+    )
 
 
 def _summary(function: Callable[..., Any]) -> str:

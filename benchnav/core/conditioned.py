@@ -1,9 +1,11 @@
-"""A distribution whose normal score is known better than before: what observations nearby tell of a cell.
+"""A distribution whose normal score is known better than before: what observations
+nearby tell of a cell.
 
-A field of λ goes through correlated standard normals, λ = Q(Φ(z)). Where observations give z a posterior N(μ, σ²), λ
-has the quantile function Q(Φ(μ + σ Φ⁻¹(u))) and the CDF Φ((Φ⁻¹(F(x)) − μ) / σ). Where the posterior is skew, as beside
-ground whose score is known to lie in an interval, σ multiplies a shifted log-normal number of that skewness in place
-of the normal one.
+A field of λ goes through correlated standard normals, λ = Q(Φ(z)). Where observations
+give z a posterior N(μ, σ²), λ has the quantile function Q(Φ(μ + σ Φ⁻¹(u))) and the CDF
+Φ((Φ⁻¹(F(x)) − μ) / σ). Where the posterior is skew, as beside ground whose score is
+known to lie in an interval, σ multiplies a shifted log-normal number of that skewness
+in place of the normal one.
 Letters in shapes: H×W cells, *B any leading dimensions.
 """
 
@@ -43,9 +45,15 @@ class ConditionedDistribution(TraversabilityDistribution):
     def __post_init__(self) -> None:
         """Checks the shapes."""
         skew = self.score_std if self.score_skew is None else self.score_skew
-        if not self.score_mean.shape == self.score_std.shape == skew.shape == self.base.shape:
+        if (
+            not self.score_mean.shape
+            == self.score_std.shape
+            == skew.shape
+            == self.base.shape
+        ):
             raise ConfigError(
-                f"Expected `score_mean` and `score_std` of the base's shape {list(self.base.shape)}, got "
+                "Expected `score_mean` and `score_std` of the base's shape "
+                f"{list(self.base.shape)}, got "
                 f"{list(self.score_mean.shape)} and {list(self.score_std.shape)}."
             )
 
@@ -61,48 +69,75 @@ class ConditionedDistribution(TraversabilityDistribution):
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]; see the base."""
         lower, upper = self._scores(value)
-        return torch.special.ndtr(lower).to(self.dtype), torch.special.ndtr(upper).to(self.dtype)
+        return torch.special.ndtr(lower).to(self.dtype), torch.special.ndtr(upper).to(
+            self.dtype
+        )
 
     def quantile(self, probability: Tensor | float) -> Tensor:
-        """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the base."""
+        """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the
+        base.
+        """
         share = torch.as_tensor(probability, dtype=torch.float64, device=self.device)
         score = torch.special.ndtri(share).clamp(-MOST_SCORE, MOST_SCORE)
         value = self.from_normal(score.expand(self.shape))
         if not isinstance(probability, Tensor) and 0 < probability < 1:
             return value
         # The ends of the range, which no finite score reaches.
-        ends = self.base.quantile((share >= 1).double().expand(self.shape)).to(self.dtype)
-        return torch.where(((share <= 0) | (share >= 1)) & (self.score_std > 0), ends, value)
+        ends = self.base.quantile((share >= 1).double().expand(self.shape)).to(
+            self.dtype
+        )
+        return torch.where(
+            ((share <= 0) | (share >= 1)) & (self.score_std > 0), ends, value
+        )
 
     def from_normal(self, normal: Tensor) -> Tensor:
-        """λ of the rank that a standard normal number has, shape [*B, H, W]; see the base."""
+        """λ of the rank that a standard normal number has, shape [*B, H, W]; see the
+        base.
+        """
         if self.score_skew is not None:
             normal = skewed(normal, self.score_skew).to(self.score_std.dtype)
-        return self.base.from_normal(self.score_mean + self.score_std * normal).to(self.dtype)
+        return self.base.from_normal(self.score_mean + self.score_std * normal).to(
+            self.dtype
+        )
 
     def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
-        """The interval of standard normal numbers that `from_normal` takes to λ, each of shape [*B, H, W]."""
+        """The interval of standard normal numbers that `from_normal` takes to λ, each
+        of shape [*B, H, W].
+        """
         lower, upper = self._scores(value)
         return lower.to(self.dtype), upper.to(self.dtype)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log density on (0, 1), log mass at 0 and at 1, shape [*B, H, W]; not a number where the base has none."""
+        """Log density on (0, 1), log mass at 0 and at 1, shape [*B, H, W]; not a number
+        where the base has none.
+        """
         value, std = value.double(), self.score_std.double().clamp(min=_SMALLEST_STD)
         lower, upper = self._scores(value)
         prior = self.base._exact().to_normal(value)[1]  # whose density is known
         inside = (
-            self.base._exact().log_prob(value).double() + (prior.square() - upper.square()) / 2 - std.log()
+            self.base._exact().log_prob(value).double()
+            + (prior.square() - upper.square()) / 2
+            - std.log()
         )
         if self.score_skew is not None:
-            inside = torch.where(upper.isinf(), -math.inf, inside - _slope(upper, self.score_skew).log())
+            inside = torch.where(
+                upper.isinf(), -math.inf, inside - _slope(upper, self.score_skew).log()
+            )
         mass = torch.where(value <= 0, upper, -lower)
-        total = torch.where((value <= 0) | (value >= 1), torch.special.log_ndtr(mass), inside)
+        total = torch.where(
+            (value <= 0) | (value >= 1), torch.special.log_ndtr(mass), inside
+        )
         return torch.where((value < 0) | (value > 1), -math.inf, total).to(self.dtype)
 
     def _scores(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
-        """Standard normal numbers in float64, whose Φ are P(λ < value) and P(λ ≤ value)."""
+        """Standard normal numbers in float64, whose Φ are P(λ < value) and P(λ ≤
+        value).
+        """
         lower, upper = self.base._exact().to_normal(value)
-        mean, std = self.score_mean.double(), self.score_std.double().clamp(min=_SMALLEST_STD)
+        mean, std = (
+            self.score_mean.double(),
+            self.score_std.double().clamp(min=_SMALLEST_STD),
+        )
         ends = (lower - mean) / std, (upper - mean) / std
         if self.score_skew is None:
             return ends
@@ -110,7 +145,8 @@ class ConditionedDistribution(TraversabilityDistribution):
 
 
 def skewed(normal: Tensor, skew: Tensor) -> Tensor:
-    """Makes of a standard normal number one of mean 0 and variance 1 that is skew, a shifted log-normal one, float64.
+    """Makes of a standard normal number one of mean 0 and variance 1 that is skew, a
+    shifted log-normal one, float64.
 
     Args:
         normal: any shape.
@@ -131,11 +167,15 @@ def unskewed(value: Tensor, skew: Tensor) -> Tensor:
 def _slope(normal: Tensor, skew: Tensor) -> Tensor:
     """Derivative of `skewed`."""
     sign, _, scale, width = _log_normal(skew)
-    return torch.where(skew.abs() < LEAST_SKEW, 1.0, width * (sign * width * normal).exp() / scale)
+    return torch.where(
+        skew.abs() < LEAST_SKEW, 1.0, width * (sign * width * normal).exp() / scale
+    )
 
 
 def _log_normal(skew: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of exp(σ z) for the σ that gives it a skewness: the sign, the mean, the standard deviation, and σ."""
+    """Of exp(σ z) for the σ that gives it a skewness: the sign, the mean, the standard
+    deviation, and σ.
+    """
     size = skew.double().abs().clamp(min=LEAST_SKEW)
     half = 1 + size.square() / 2
     third = (half + (half.square() - 1).sqrt()).pow(1 / 3)
@@ -148,7 +188,9 @@ def _log_normal(skew: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     )
 
 
-def conditioned(base: TraversabilityDistribution, mean: Tensor, std: Tensor) -> TraversabilityDistribution:
+def conditioned(
+    base: TraversabilityDistribution, mean: Tensor, std: Tensor
+) -> TraversabilityDistribution:
     """The distribution of λ where its normal score has a posterior.
 
     Args:
@@ -157,10 +199,12 @@ def conditioned(base: TraversabilityDistribution, mean: Tensor, std: Tensor) -> 
         std: σ ≥ 0 of the score, shape [*B, H, W].
 
     Returns:
-        A mixture again, exactly, where the base is one of a single component: clip(m + s (μ + σ z)); else a
-        `ConditionedDistribution`.
+        A mixture again, exactly, where the base is one of a single component: clip(m +
+        s (μ + σ z)); else a `ConditionedDistribution`.
     """
     if not isinstance(base, TraversabilityMixture) or base.weights.shape[-3] > 1:
         return ConditionedDistribution(base, mean, std)
     means = base.means + base.stds * mean.unsqueeze(-3)
-    return TraversabilityMixture(base.weights, means, base.stds * std.unsqueeze(-3), base.group)
+    return TraversabilityMixture(
+        base.weights, means, base.stds * std.unsqueeze(-3), base.group
+    )

@@ -1,8 +1,10 @@
 """Describe an object of this process by the part that creates it again elsewhere.
 
-A part that a user creates in a program, such as `CVaR(0.8)` or `MPPI(MPPIConfig(samples=200))`, is described by the
-name, module or file of its class and the arguments of its constructor. What cannot be described so (a function without
-a name, a class of a notebook, an object that was changed after it was created) is known by a name in this process only.
+A part that a user creates in a program, such as `CVaR(0.8)` or
+`MPPI(MPPIConfig(samples=200))`, is described by the name, module or file of its class
+and the arguments of its constructor. What cannot be described so (a function without a
+name, a class of a notebook, an object that was changed after it was created) is known
+by a name in this process only.
 """
 
 import inspect
@@ -25,11 +27,12 @@ def describe(kind: str, instance: Any) -> Part:
 
     Args:
         kind: one of `registry.KINDS`.
-        instance: an object of that kind; its class, if all options have defaults; or what `registry.read_part` reads.
+        instance: an object of that kind; its class, if all options have defaults; or
+            what `registry.read_part` reads.
 
     Returns:
-        The part that creates the object again. If there is none, a part by a name that this process knows; see
-        `registry.is_object`.
+        The part that creates the object again. If there is none, a part by a name that
+        this process knows; see `registry.is_object`.
 
     Raises:
         ConfigError: If the object is not of that kind.
@@ -38,10 +41,18 @@ def describe(kind: str, instance: Any) -> Part:
         return registry.read_part(kind, instance)
     if inspect.isclass(instance):
         source = _source_of(kind, instance)
-        return Part(part=source, label=_short(source)) if source else name_object(kind, instance)
+        return (
+            Part(part=source, label=_short(source))
+            if source
+            else name_object(kind, instance)
+        )
     registry.check_base(kind, instance, f"the {kind}")
     part = _from_arguments(kind, instance)
-    return part if part is not None and _is_same(kind, part, instance) else name_object(kind, instance)
+    return (
+        part
+        if part is not None and _is_same(kind, part, instance)
+        else name_object(kind, instance)
+    )
 
 
 def name_object(kind: str, instance: Any) -> Part:
@@ -51,7 +62,9 @@ def name_object(kind: str, instance: Any) -> Part:
 
 
 def _from_arguments(kind: str, instance: Any) -> Part | None:
-    """Describe an object by its class and the arguments of its constructor; None if either is unknown."""
+    """Describe an object by its class and the arguments of its constructor; None if
+    either is unknown.
+    """
     if inspect.isroutine(instance):
         source = _source_of(kind, instance)
         return None if source is None else Part(part=source, label=_short(source))
@@ -65,19 +78,33 @@ def _from_arguments(kind: str, instance: Any) -> Part | None:
         if "config" in bound and config_class(target, registry.given_parameters(kind)):
             settings = plain(bound["config"])
             defaults = plain(type(bound["config"])())
-            options = {name: value for name, value in settings.items() if value != defaults.get(name)}
+            options = {
+                name: value
+                for name, value in settings.items()
+                if value != defaults.get(name)
+            }
         else:
-            options = {name: plain(value) for name, value in bound.items() if name in known}
-    except (BenchnavError, TypeError):  # an argument is an object itself, or a setting has no default
+            options = {
+                name: plain(value) for name, value in bound.items() if name in known
+            }
+    except (
+        BenchnavError,
+        TypeError,
+    ):  # an argument is an object itself, or a setting has no default
         return None
     return Part(
-        part=source, label=registry.label_of(_short(source), options, next(iter(known), "")), options=options
+        part=source,
+        label=registry.label_of(_short(source), options, next(iter(known), "")),
+        options=options,
     )
 
 
 def _source_of(kind: str, target: Any) -> str | None:
     """Name a class or function so that other processes find it; None if they cannot."""
-    module, name = getattr(target, "__module__", ""), getattr(target, "__qualname__", "")
+    module, name = (
+        getattr(target, "__module__", ""),
+        getattr(target, "__qualname__", ""),
+    )
     if not name or "<" in name or module == "__main__":
         return None
     place = f"{module}:{name}"
@@ -91,13 +118,16 @@ def _source_of(kind: str, target: Any) -> str | None:
         return None
     if "." in module or any(map(file.is_relative_to, installed_folders())):
         return place
-    # A module that lies by itself is found by its file, wherever a command is called from.
+    # A module that lies by itself is found by its file, wherever a command is called
+    # from.
     shown = file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file
     return f"{shown}:{name}"
 
 
 def _is_same(kind: str, part: Part, instance: Any) -> bool:
-    """Whether a part creates an object of the same class and the same public attributes."""
+    """Whether a part creates an object of the same class and the same public
+    attributes.
+    """
     try:
         given = {
             name: getattr(instance, name)
@@ -110,13 +140,17 @@ def _is_same(kind: str, part: Part, instance: Any) -> bool:
         if _code_of(type(created)) != _code_of(type(instance)):
             return False
         attributes, expected = _public(created), _public(instance)
-        return _is_equal(attributes, expected) or pickle.dumps(attributes) == pickle.dumps(expected)
+        return _is_equal(attributes, expected) or pickle.dumps(
+            attributes
+        ) == pickle.dumps(expected)
     except Exception:  # a user's class may raise anything, and may not be picklable
         return False
 
 
 def _code_of(target: type) -> list[tuple[str, Any]]:
-    """Compiled functions of a class and of those it derives from, which a file may have others of by now."""
+    """Compiled functions of a class and of those it derives from, which a file may have
+    others of by now.
+    """
     return [
         (f"{base.__qualname__}.{name}", value.__code__)
         for base in target.__mro__
@@ -133,7 +167,11 @@ def _is_equal(one: dict[str, Any], other: dict[str, Any]) -> bool:
 
 
 def _public(instance: Any) -> dict[str, Any]:
-    return {name: value for name, value in vars(instance).items() if not name.startswith("_")}
+    return {
+        name: value
+        for name, value in vars(instance).items()
+        if not name.startswith("_")
+    }
 
 
 def _short(source: str) -> str:

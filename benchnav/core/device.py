@@ -22,7 +22,8 @@ def gpu_failed(said: object) -> DeviceError:
     """Tells in one line that a GPU failed, and what PyTorch said of it."""
     line = str(said).strip().splitlines()[0].rstrip(".")
     return DeviceError(
-        f"The GPU failed: {line}. Finished work is kept: give the same command again, if need be with fewer `jobs`."
+        f"The GPU failed: {line}. Finished work is kept: give the same command again, "
+        "if need be with fewer `jobs`."
     )
 
 
@@ -30,15 +31,20 @@ def find_device(name: str) -> torch.device:
     """Finds a device by name.
 
     Args:
-        name: "cpu"; "cuda"; or "auto", which is CUDA where there is a GPU and else the CPU.
+        name: "cpu"; "cuda"; or "auto", which is CUDA where there is a GPU and else the
+            CPU.
 
     Raises:
         ConfigError: there is no such device here.
     """
-    expect(name in ("auto", "cpu", "cuda"), f"`device` among auto, cpu, cuda, got {name!r}.")
+    expect(
+        name in ("auto", "cpu", "cuda"),
+        f"`device` among auto, cpu, cuda, got {name!r}.",
+    )
     has_gpu = torch.cuda.is_available()
     expect(
-        has_gpu or name != "cuda", "a GPU for `device` cuda, got none that PyTorch can use. Use cpu or auto."
+        has_gpu or name != "cuda",
+        "a GPU for `device` cuda, got none that PyTorch can use. Use cpu or auto.",
     )
     return torch.device("cuda" if has_gpu and name != "cpu" else "cpu")
 
@@ -65,7 +71,9 @@ def gpu_name(device: str | torch.device) -> str | None:
 
 
 def exact_convolutions() -> AbstractContextManager[None]:
-    """A context in which a GPU convolves in full float32, the same way each time, as the CPU does."""
+    """A context in which a GPU convolves in full float32, the same way each time, as
+    the CPU does.
+    """
     flags: AbstractContextManager[None] = torch.backends.cudnn.flags(
         enabled=True, benchmark=False, deterministic=True, allow_tf32=False
     )

@@ -1,4 +1,5 @@
-"""The errors BenchNav raises on purpose; `benchnav.core.command` prints them as one line, and exits with their status.
+"""The errors BenchNav raises on purpose; `benchnav.core.command` prints them as one
+line, and exits with their status.
 
 A message names the argument, what was expected, what came, and what to do.
 """
@@ -33,7 +34,8 @@ def expect(holds: object, what: str) -> None:
 
     Args:
         holds: whether it is.
-        what: the argument, what was expected, what came and what to do, in a sentence that goes on from "Expected".
+        what: the argument, what was expected, what came and what to do, in a sentence
+            that goes on from "Expected".
 
     Raises:
         ConfigError: it is not.
@@ -43,10 +45,12 @@ def expect(holds: object, what: str) -> None:
 
 
 def choose(what: str, asked: Collection[str] | None, known: Iterable[str]) -> list[str]:
-    """Gives what is asked for of what there is, in the order of that; None asks for all.
+    """Gives what is asked for of what there is, in the order of that; None asks for
+    all.
 
     Raises:
-        ConfigError: nothing is asked for, or something that is not there, of the argument `what`.
+        ConfigError: nothing is asked for, or something that is not there, of the
+            argument `what`.
     """
     known = list(known)
     asked = known if asked is None else asked
@@ -55,12 +59,14 @@ def choose(what: str, asked: Collection[str] | None, known: Iterable[str]) -> li
     return [name for name in known if name in asked]
 
 
-# NUL ends a path, others move the cursor of a terminal; surrogates stand for bytes that are no UTF-8.
+# NUL ends a path, others move the cursor of a terminal; surrogates stand for bytes that
+# are no UTF-8.
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 def check_text(text: str, place: str = "") -> None:
-    """Refuse text that no name, path or setting holds: control characters but for tab and line break.
+    """Refuse text that no name, path or setting holds: control characters but for tab
+    and line break.
 
     Args:
         text: what a user wrote.
@@ -72,12 +78,14 @@ def check_text(text: str, place: str = "") -> None:
     where = f" in {place}" if place else ""
     expect(
         not _CONTROL.search(text),
-        f"text in UTF-8 without control characters{where}, got {text!r}. Leave them out.",
+        f"text in UTF-8 without control characters{where}, got {text!r}. Leave them "
+        "out.",
     )
 
 
 def check_label(what: str, text: str) -> None:
-    """Refuse what no table can show: text that is empty, or has a line break or a character that is not printed.
+    """Refuse what no table can show: text that is empty, or has a line break or a
+    character that is not printed.
 
     Args:
         what: what is called by the text.
@@ -86,7 +94,10 @@ def check_label(what: str, text: str) -> None:
     Raises:
         ConfigError: If it is such.
     """
-    expect(text.strip() and text.isprintable(), f"{what} as printable text on one line, got {text!r}.")
+    expect(
+        text.strip() and text.isprintable(),
+        f"{what} as printable text on one line, got {text!r}.",
+    )
 
 
 class OutOfMemoryError(BenchnavError):
@@ -101,7 +112,9 @@ _NO_MEMORY = re.compile(
 
 
 def out_of_memory(error: BaseException) -> OutOfMemoryError | None:
-    """Return what to say where an error, or one that it was raised from, is that memory ran out; else None."""
+    """Return what to say where an error, or one that it was raised from, is that memory
+    ran out; else None.
+    """
     if isinstance(error, BenchnavError) and _NO_MEMORY.search(str(error)):
         return None  # which says so
     cause: BaseException | None = error
@@ -110,11 +123,19 @@ def out_of_memory(error: BaseException) -> OutOfMemoryError | None:
         seen.add(id(cause))
         if isinstance(cause, OutOfMemoryError):
             return cause
-        is_known = isinstance(cause, MemoryError) or getattr(cause, "errno", None) == errno.ENOMEM
-        if is_known or (isinstance(cause, RuntimeError | OSError) and _NO_MEMORY.search(str(cause))):
-            said = " ".join(str(cause).split())[:200].rstrip(".") or type(cause).__name__
+        is_known = (
+            isinstance(cause, MemoryError)
+            or getattr(cause, "errno", None) == errno.ENOMEM
+        )
+        if is_known or (
+            isinstance(cause, RuntimeError | OSError) and _NO_MEMORY.search(str(cause))
+        ):
+            said = (
+                " ".join(str(cause).split())[:200].rstrip(".") or type(cause).__name__
+            )
             return OutOfMemoryError(
-                f"Memory ran out ({said}). Ask for less at once: fewer `jobs`, samples or maps of a batch, smaller "
+                f"Memory ran out ({said}). Ask for less at once: fewer `jobs`, "
+                "samples or maps of a batch, smaller "
                 "maps or a smaller network."
             )
         cause = cause.__cause__
@@ -122,7 +143,9 @@ def out_of_memory(error: BaseException) -> OutOfMemoryError | None:
 
 
 class DatasetError(BenchnavError):
-    """A dataset file is missing, damaged, of another format, or lacks what was asked for."""
+    """A dataset file is missing, damaged, of another format, or lacks what was asked
+    for.
+    """
 
 
 class CheckpointError(BenchnavError):

@@ -1,7 +1,8 @@
 """The grid of a map: from positions to cells and back.
 
 Conventions: maps are indexed [row = y, column = x]; cell (i, j) is centred at
-((j + ½)·res, (i + ½)·res); a position belongs to the cell it lies in; outside the map is not free
+((j + ½)·res, (i + ½)·res); a position belongs to the cell it lies in; outside the map
+is not free
 space. Letters in shapes: B maps, H×W cells.
 
 PyTorch is imported where it is called: making and listing datasets does without.
@@ -37,12 +38,18 @@ class Grid:
 
     def __post_init__(self) -> None:
         """Refuses empty grids and resolutions that are not positive."""
-        expect(min(self.shape) >= 3, f"a grid of at least 3×3 cells, got {self.height}×{self.width}.")
+        expect(
+            min(self.shape) >= 3,
+            f"a grid of at least 3×3 cells, got {self.height}×{self.width}.",
+        )
         expect(
             self.height * self.width <= MAX_CELLS,
             f"a map of at most {MAX_CELLS:,} cells, got {self.height}×{self.width}.",
         )
-        expect(0 < self.resolution_m < float("inf"), f"`resolution_m` > 0, got {self.resolution_m}.")
+        expect(
+            0 < self.resolution_m < float("inf"),
+            f"`resolution_m` > 0, got {self.resolution_m}.",
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -64,7 +71,8 @@ class Grid:
         return (x_m >= 0) & (x_m < extent_x) & (y_m >= 0) & (y_m < extent_y)
 
     def cell_of(self, x_m: "Tensor", y_m: "Tensor") -> "tuple[Tensor, Tensor]":
-        """Finds the cell of each position; positions off the map give the nearest border cell.
+        """Finds the cell of each position; positions off the map give the nearest
+        border cell.
 
         Returns:
             Row and column, int64, each of the shape of `x_m`.
@@ -92,7 +100,8 @@ class Grid:
         return torch.nn.functional.pad(maps, (1, 1, 1, 1), value=outside).flatten(-2)
 
     def lookup(self, padded: "Tensor", x_m: "Tensor", y_m: "Tensor") -> "Tensor":
-        """Reads each member's map at positions; one that is not a number reads as off the map.
+        """Reads each member's map at positions; one that is not a number reads as off
+        the map.
 
         Args:
             padded: maps from `pad`, shape [B, (H + 2)·(W + 2)].
@@ -104,21 +113,30 @@ class Grid:
         """
         import torch
 
-        row, column = (y_m / self.resolution_m).floor() + 1, (x_m / self.resolution_m).floor() + 1
-        # Not `clamp(0, …)`: a comparison with what is not a number is false, so that it gives 0.
+        row, column = (
+            (y_m / self.resolution_m).floor() + 1,
+            (x_m / self.resolution_m).floor() + 1,
+        )
+        # Not `clamp(0, …)`: a comparison with what is not a number is false, so that it
+        # gives 0.
         row = torch.where(row > 0, row, 0).clamp(max=self.height + 1).long()
         column = torch.where(column > 0, column, 0).clamp(max=self.width + 1).long()
         index = row * (self.width + 2) + column
-        return torch.gather(padded, 1, index.reshape(len(padded), -1)).reshape(x_m.shape)
+        return torch.gather(padded, 1, index.reshape(len(padded), -1)).reshape(
+            x_m.shape
+        )
 
 
 def is_azimuth(layer: str) -> bool:
-    """Tells by its name a layer of directions: in degrees from +x towards +y, which turn with the map."""
+    """Tells by its name a layer of directions: in degrees from +x towards +y, which
+    turn with the map.
+    """
     return layer.endswith("_azimuth_deg")
 
 
 def outline(region: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Finds the edges between cells of a region and those that are not of it, the map's border among them.
+    """Finds the edges between cells of a region and those that are not of it, the map's
+    border among them.
 
     Args:
         region: bool, shape [H, W].

@@ -15,7 +15,9 @@ from benchnav.core.mixture import TraversabilityMixture
 
 FORMAT = "benchnav-ground-1"
 SEEN = "seen"
-"""Layer of an observation that is 1 where a cell was seen and 0 elsewhere, for models that declare it as an input."""
+"""Layer of an observation that is 1 where a cell was seen and 0 elsewhere, for models
+that declare it as an input.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,13 +25,15 @@ class GroundStatistics:
     """Statistics of all training maps together.
 
     Args:
-        weights: of the Gaussian mixture of λ, clipped to [0, 1], over all cells, K numbers.
+        weights: of the Gaussian mixture of λ, clipped to [0, 1], over all cells, K
+            numbers.
         means: of its components, before clipping.
         stds: of its components, before clipping.
-        layer_means: mean of each channel of each layer of an `Observation`, by the layer's name; of `rgb` three, 0–255.
+        layer_means: mean of each channel of each layer of an `Observation`, by the
+            layer's name; of `rgb` three, 0–255.
         look_alikes: pairs of classes of one colour, by their names.
-        potts_strength: β of the two-state random field over which of a pair's classes a cell is of: the log odds that a
-            neighbour (of four) of one class adds.
+        potts_strength: β of the two-state random field over which of a pair's classes a
+            cell is of: the log odds that a neighbour (of four) of one class adds.
     """
 
     weights: tuple[float, ...]
@@ -52,7 +56,9 @@ class GroundStatistics:
         )
         expect(min(self.stds) >= 0, f"`stds` ≥ 0, got {self.stds}.")
 
-    def mixture(self, shape: Sequence[int], like: torch.Tensor) -> TraversabilityMixture:
+    def mixture(
+        self, shape: Sequence[int], like: torch.Tensor
+    ) -> TraversabilityMixture:
         """The mixture in each cell of maps.
 
         Args:
@@ -61,7 +67,9 @@ class GroundStatistics:
         """
         *batch, height, width = shape
         weights, means, stds = (
-            like.new_tensor(values)[:, None, None].expand(*batch, len(values), height, width)
+            like.new_tensor(values)[:, None, None].expand(
+                *batch, len(values), height, width
+            )
             for values in (self.weights, self.means, self.stds)
         )
         return TraversabilityMixture(weights, means, stds)
@@ -80,12 +88,17 @@ class GroundStatistics:
         try:
             about: dict[str, Any] = json.loads(text)
             found = about.pop("format", None)
-            expect(found == FORMAT, f"ground statistics of the format {FORMAT}, got {found!r}.")
+            expect(
+                found == FORMAT,
+                f"ground statistics of the format {FORMAT}, got {found!r}.",
+            )
             made = cls(
                 weights=tuple(about["weights"]),
                 means=tuple(about["means"]),
                 stds=tuple(about["stds"]),
-                layer_means={name: tuple(values) for name, values in about["layer_means"].items()},
+                layer_means={
+                    name: tuple(values) for name, values in about["layer_means"].items()
+                },
                 look_alikes=tuple((one, other) for one, other in about["look_alikes"]),
                 potts_strength=about["potts_strength"],
             )
@@ -100,6 +113,7 @@ class GroundStatistics:
             raise
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ConfigError(
-                f"Expected ground statistics as `benchnav-datagen ground` writes them, got {type(error).__name__} "
+                "Expected ground statistics as `benchnav-datagen ground` writes "
+                f"them, got {type(error).__name__} "
                 f"{error}. Make them again."
             ) from error

@@ -1,7 +1,9 @@
-"""Progress of work that takes long: what is done, the rate, and the time left, in a terminal and in plain logs.
+"""Progress of work that takes long: what is done, the rate, and the time left, in a
+terminal and in plain logs.
 
-The rate is that of this command: what was there before it does not count, and its start-up does. So early estimates are
-too slow rather than too quick; a line says "about".
+The rate is that of this command: what was there before it does not count, and its
+start-up does. So early estimates are too slow rather than too quick; a line says
+"about".
 """
 
 import signal
@@ -16,7 +18,8 @@ from benchnav.core.command import tell
 
 # Before that an estimate is of the start-up alone.
 _ESTIMATED_FROM_S = 5.0
-# Plain lines come at each tenth, and at least this often: more rarely the longer the work has taken.
+# Plain lines come at each tenth, and at least this often: more rarely the longer the
+# work has taken.
 _QUIET_S, _MOST_QUIET_S = 60.0, 600.0
 _LOOK_S = 1.0
 
@@ -67,7 +70,9 @@ class Watch:
         self._tenth = -1
 
     def update(self, step: Progress | tuple[int, int]) -> None:
-        """Takes the next step; what the first one says to be done is not of this command."""
+        """Takes the next step; what the first one says to be done is not of this
+        command.
+        """
         self.step = step if isinstance(step, Progress) else Progress(*step)
         if self._first is None:
             self._first = self.step.amount[0]
@@ -87,10 +92,14 @@ class Watch:
 
     def line(self) -> str:
         """A line of a log."""
-        return ", ".join([f"{self.what}: {self.step.done}/{self.step.total}", *self.words()])
+        return ", ".join(
+            [f"{self.what}: {self.step.done}/{self.step.total}", *self.words()]
+        )
 
     def words(self) -> list[str]:
-        """The rate, the time left or taken, and what is being done; what is not known is left out."""
+        """The rate, the time left or taken, and what is being done; what is not known
+        is left out.
+        """
         return [*self._pace(), *([self.step.doing] if self.step.doing else [])]
 
     def _pace(self) -> list[str]:
@@ -108,7 +117,9 @@ class Watch:
 
 
 def _rate(per_s: float, unit: str) -> str:
-    """A rate with two digits that count, in the largest unit of time in which it is 1 or more."""
+    """A rate with two digits that count, in the largest unit of time in which it is 1
+    or more.
+    """
     for seconds, name in ((1, "s"), (60, "min")):
         if per_s * seconds >= 1:
             return f"{_two_digits(per_s * seconds)} {unit}/{name}"
@@ -131,7 +142,8 @@ def in_words(seconds: float) -> str:
 
 
 def show_progress(steps: Iterable[Progress | tuple[int, int]], what: str) -> None:
-    """Runs work to its end while showing how far it is: a bar in a terminal, plain lines elsewhere.
+    """Runs work to its end while showing how far it is: a bar in a terminal, plain
+    lines elsewhere.
 
     Args:
         steps: the work, yielding its progress as it goes, first what is done already.
@@ -149,7 +161,13 @@ def show_progress(steps: Iterable[Progress | tuple[int, int]], what: str) -> Non
 
 @contextmanager
 def _bar(watch: Watch, console: Any) -> Iterator[Any]:
-    from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        ProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+    )
     from rich.progress import Progress as Bar
     from rich.table import Column
     from rich.text import Text
@@ -159,10 +177,17 @@ def _bar(watch: Watch, console: Any) -> Iterator[Any]:
             return Text(", ".join(watch.words()), no_wrap=True, overflow="ellipsis")
 
     words = Words(Column(no_wrap=True, overflow="ellipsis", ratio=1))
-    columns = [TextColumn("{task.description}"), BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn()]
+    columns = [
+        TextColumn("{task.description}"),
+        BarColumn(20),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    ]
     with Bar(*columns, words, console=console, expand=True) as bar:
         task = bar.add_task(watch.what, total=None)
-        yield lambda: bar.update(task, completed=watch.step.done, total=watch.step.total)
+        yield lambda: bar.update(
+            task, completed=watch.step.done, total=watch.step.total
+        )
 
 
 @contextmanager
@@ -175,7 +200,8 @@ def _lines(watch: Watch) -> Iterator[Any]:
                 tell(watch.line())
 
     def look() -> None:
-        # An interruption is for the main thread, which would not wake if this one took it.
+        # An interruption is for the main thread, which would not wake if this one took
+        # it.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
         while not ended.wait(_LOOK_S):
             show()

@@ -1,4 +1,6 @@
-"""What a column of numbers holds: its name, its unit, and which way is better; for tables, tests and figures."""
+"""What a column of numbers holds: its name, its unit, and which way is better; for
+tables, tests and figures.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -13,14 +15,16 @@ class Quantity:
     Args:
         name: word by which suites and commands name it.
         column: its column in tables of episodes.
-        suffix: the unit that ends the column's name, such as `_s`; empty if it has none.
+        suffix: the unit that ends the column's name, such as `_s`; empty if it has
+            none.
         words: what sentences call it.
         unit: unit of differences and margins, and of tables; empty if it has none.
         scale: that unit over the column's, such as 100 for points over a fraction.
         heading: of its column in a report.
         meaning: what one value is, a phrase without its full stop.
         better: which way is better.
-        of_arrivals: conditions are compared only over the episodes in which both reached the goal.
+        of_arrivals: conditions are compared only over the episodes in which both
+            reached the goal.
     """
 
     name: str

@@ -1,24 +1,29 @@
-"""The one registry: how every replaceable part is named, found, configured and identified.
+"""The one registry: how every replaceable part is named, found, configured and
+identified.
 
-Parts are planners, models, risk measures, robots, objectives, sensors of appearance (`sensor`) and of the ground
-(`ground`), beliefs, metrics of episodes, layers of recipes, and figures of a report. A part is named by one of four
-forms:
+Parts are planners, models, risk measures, robots, objectives, sensors of appearance
+(`sensor`) and of the ground (`ground`), beliefs, metrics of episodes, layers of
+recipes, and figures of a report. A part is named by one of four forms:
 
-- a shipped name (`mppi`) or the name of an entry point of the group `benchnav.<kind>s` of an installed
-  package; the shipped parts are entry points too;
+- a shipped name (`mppi`) or the name of an entry point of the group `benchnav.<kind>s`
+  of an installed package; the shipped parts are entry points too;
 - `package.module:Name`, from anything that can be imported;
 - `path/to/file.py:Name`, from a file that stands alone;
-- any of these followed by `:VALUE`, which sets its first option: `cvar:0.5` is `cvar` at level 0.5.
+- any of these followed by `:VALUE`, which sets its first option: `cvar:0.5` is `cvar`
+  at level 0.5.
 
-What stands at the name is a class or a function. Its keyword parameters are its options; where the one
-parameter is a dataclass named `config`, the fields of that are. A class is made with them; a risk measure
-that is a function is called with them beside its mixture.
+What stands at the name is a class or a function. Its keyword parameters are its
+options; where the one parameter is a dataclass named `config`, the fields of that are.
+A class is made with them; a risk measure that is a function is called with them beside
+its mixture.
 
-A part is identified by its source and all that this imports, by every file or folder that an option names, and by
-those that its class or function lists as `files`, relative to its own file: `files = ("weights.npz",)`. Options that
-name what it writes stand in `writes`: `writes = ("log",)`. Options that came later stand in `added`, as
-`added = ("explore",)`, on the class or on that of its `config`: at their default they are left out of what is recorded,
-so that what was recorded before they came is still the same part.
+A part is identified by its source and all that this imports, by every file or folder
+that an option names, and by those that its class or function lists as `files`, relative
+to its own file: `files = ("weights.npz",)`. Options that
+name what it writes stand in `writes`: `writes = ("log",)`. Options that came later
+stand in `added`, as `added = ("explore",)`, on the class or on that of its `config`: at
+their default they are left out of what is recorded, so that what was recorded before
+they came is still the same part.
 """
 
 import importlib
@@ -80,7 +85,8 @@ KINDS = (
     "figure",
 )
 
-# What a part of each kind is a subclass of, and where users import that from. A risk measure is any function.
+# What a part of each kind is a subclass of, and where users import that from. A risk
+# measure is any function.
 _BASES = {
     "planner": ("benchnav.planning", "Planner"),
     "model": ("benchnav.models", "TraversabilityModel"),
@@ -121,9 +127,13 @@ class Part:
 
     @property
     def object(self) -> Any:
-        """The object. A process creates it once; it is asked for its properties and keeps no state."""
+        """The object. A process creates it once; it is asked for its properties and
+        keeps no state.
+        """
         target = self.found.target
-        description = json.dumps([self.kind, self.part, plain(self.options)], sort_keys=True)
+        description = json.dumps(
+            [self.kind, self.part, plain(self.options)], sort_keys=True
+        )
         known, created = _CREATED.get(description, (None, None))
         if known is not target:
             created = self.create()
@@ -135,7 +145,8 @@ class Part:
         return make(self.kind, self, **given)
 
 
-# By description, with the class or function that the object was created by: that of a file changes with the file.
+# By description, with the class or function that the object was created by: that of a
+# file changes with the file.
 _CREATED: dict[str, tuple[Any, Any]] = {}
 
 
@@ -146,8 +157,8 @@ class Found:
     Args:
         target: the class or function.
         origin: where it comes from, for people.
-        source_digest: gives the digest of its source and of what that imports; empty for the parts of this
-            package, and where no source is to be had.
+        source_digest: gives the digest of its source and of what that imports; empty
+            for the parts of this package, and where no source is to be had.
         shipped: it is one of ours.
         everywhere: other processes find it too.
         instance: the object itself, if nothing describes it.
@@ -162,7 +173,8 @@ class Found:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of its source, of what that imports, and of the `files` that it lists.
+        """SHA-256 of its source, of what that imports, and of the `files` that it
+        lists.
 
         Raises:
             ConfigError: a file that it lists is not there.
@@ -201,13 +213,30 @@ def register_object(kind: str, name: str, instance: Any) -> str:
         The name under which `make` returns it.
     """
     known = names(kind)
-    candidates = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
-    free = next(one for one in candidates if one not in known or _instance_of(kind, one) is instance)
-    # A class is created, a risk measure is called with a distribution; anything else is returned as it is.
-    register(kind, free, instance if kind == "risk" or inspect.isclass(instance) else lambda: instance)
-    source = instance if inspect.isroutine(instance) or inspect.isclass(instance) else type(instance)
+    candidates = (
+        name if number == 1 else f"{name}-{number}" for number in itertools.count(1)
+    )
+    free = next(
+        one
+        for one in candidates
+        if one not in known or _instance_of(kind, one) is instance
+    )
+    # A class is created, a risk measure is called with a distribution; anything else is
+    # returned as it is.
+    register(
+        kind,
+        free,
+        instance if kind == "risk" or inspect.isclass(instance) else lambda: instance,
+    )
+    source = (
+        instance
+        if inspect.isroutine(instance) or inspect.isclass(instance)
+        else type(instance)
+    )
     digest = partial(digest_of_target, source)
-    _REGISTERED[kind, free] = replace(_REGISTERED[kind, free], source_digest=digest, instance=instance)
+    _REGISTERED[kind, free] = replace(
+        _REGISTERED[kind, free], source_digest=digest, instance=instance
+    )
     return free
 
 
@@ -227,20 +256,27 @@ def names(kind: str) -> list[str]:
 
 
 def shipped_names(kind: str) -> list[str]:
-    """Names of the parts of a kind that this package ships, sorted; nothing is imported."""
-    return sorted(point.name for point in entry_points_of(kind) if point.value.startswith("benchnav."))
+    """Names of the parts of a kind that this package ships, sorted; nothing is
+    imported.
+    """
+    return sorted(
+        point.name
+        for point in entry_points_of(kind)
+        if point.value.startswith("benchnav.")
+    )
 
 
 def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
-    """Reads a part as users write it: `NAME`, or `{part: NAME, label: L, options: {…}}`.
+    """Reads a part as users write it: `NAME`, or `{part: NAME, label: L, options:
+    {…}}`.
 
     Args:
         kind: one of `KINDS`.
         given: the text or the mapping.
 
     Returns:
-        The part, with a value after its last colon moved to its options. Without a label it is called as
-        it was written, less the module or file.
+        The part, with a value after its last colon moved to its options. Without a
+        label it is called as it was written, less the module or file.
 
     Raises:
         ConfigError: it is of neither form.
@@ -256,7 +292,8 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
         or isinstance(fields.get("label"), Mapping | list | tuple)
     ):
         raise ConfigError(
-            f"Expected {_a(kind)} as NAME or as {{part: NAME, label: LABEL, options: {{…}}}}, got {given!r}."
+            f"Expected {_a(kind)} as NAME or as {{part: NAME, label: LABEL, options: "
+            f"{{…}}}}, got {given!r}."
         )
     text = fields["part"]
     source, value = _split_value(kind, text)
@@ -264,12 +301,21 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
     if value is not None:
         known = options_of(kind, find(kind, source).target)
         if not known:
-            raise ConfigError(f"Expected {kind} {source!r} without a value, got {text!r}: it has no options.")
+            raise ConfigError(
+                f"Expected {kind} {source!r} without a value, got {text!r}: it has no "
+                "options."
+            )
         name, option = next(iter(known.items()))
         if name in options:
-            raise ConfigError(f"Expected option {name!r} of {kind} {text!r} once, got {options[name]!r} too.")
+            raise ConfigError(
+                f"Expected option {name!r} of {kind} {text!r} once, got "
+                f"{options[name]!r} too."
+            )
         value = read(
-            option.kind, load_yaml(value) if option.kind is Any else value, of(f"{kind} {source!r}"), name
+            option.kind,
+            load_yaml(value) if option.kind is Any else value,
+            of(f"{kind} {source!r}"),
+            name,
         )
         options = {name: value, **options}
     place = source.rpartition(":")[0]
@@ -281,7 +327,8 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
 
 
 def complete(kind: str, part: Part) -> Part:
-    """Checks a part's options and fills in their defaults, so that like parts have like options.
+    """Checks a part's options and fills in their defaults, so that like parts have like
+    options.
 
     Those that the part lists as `added` are left out at their default.
 
@@ -310,13 +357,15 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
     Args:
         kind: one of `KINDS`.
         part: which, in any form that `read_part` reads.
-        given: what the part is made for, such as an objective's `robot`; passed on where a parameter bears the name.
+        given: what the part is made for, such as an objective's `robot`; passed on
+            where a parameter bears the name.
 
     Returns:
         The object; of a risk measure a function of the mixture alone.
 
     Raises:
-        ConfigError: there is no such part or option, it refuses its options, or it is of no such kind.
+        ConfigError: there is no such part or option, it refuses its options, or it is
+            of no such kind.
     """
     part = read_part(kind, part)
     owner = f"{kind} {part.part!r}"
@@ -326,7 +375,9 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
     config = config_class(target, _skipped(kind, target))
     if config:
         arguments = {"config": call(f"options of {owner}", config, arguments)}
-    arguments |= {name: value for name, value in given.items() if name in parameters(target)}
+    arguments |= {
+        name: value for name, value in given.items() if name in parameters(target)
+    }
     if kind == "risk" and not inspect.isclass(target):
         return partial(target, **arguments)
     made = call(owner, target, arguments)
@@ -355,7 +406,8 @@ def check_base(kind: str, made: Any, owner: str) -> None:
         owner: what the message calls it.
 
     Raises:
-        ConfigError: it is not; the line names the base class and where to import it from.
+        ConfigError: it is not; the line names the base class and where to import it
+            from.
     """
     if kind not in _BASES:
         return
@@ -363,7 +415,8 @@ def check_base(kind: str, made: Any, owner: str) -> None:
     if not isinstance(made, getattr(importlib.import_module(place), base)):
         name = type(made).__name__
         raise ConfigError(
-            f"Expected {owner} to be a subclass of {place}.{base}, got {name}. Write class {name}({base})."
+            f"Expected {owner} to be a subclass of {place}.{base}, got {name}. Write "
+            f"class {name}({base})."
         )
 
 
@@ -383,10 +436,13 @@ def find(kind: str, source: str) -> Found:
     points = [point for point in entry_points_of(kind) if point.name == source]
     if len(points) > 1:
         raise ConfigError(
-            f"Expected one {kind} {source!r}, got several: {', '.join(point.value for point in points)}. "
+            f"Expected one {kind} {source!r}, got several: "
+            f"{', '.join(point.value for point in points)}. "
             "Write package.module:Name."
         )
-    place, colon, name = points[0].value.partition(":") if points else source.rpartition(":")
+    place, colon, name = (
+        points[0].value.partition(":") if points else source.rpartition(":")
+    )
     if place.endswith(".py"):
         return _found_in_file(kind, Path(place), name)
     if colon and place:
@@ -403,8 +459,8 @@ def find(kind: str, source: str) -> Found:
 def options_of(kind: str, target: Any) -> dict[str, Option]:
     """Lists the options of a class or function, in order, by name.
 
-    Parameters that are given by the caller (an objective's `robot` and `goal_radius_m`, a risk measure's mixture)
-    are none.
+    Parameters that are given by the caller (an objective's `robot` and `goal_radius_m`,
+    a risk measure's mixture) are none.
     """
     return list_options(target, _skipped(kind, target))
 
@@ -412,7 +468,8 @@ def options_of(kind: str, target: Any) -> dict[str, Option]:
 def _checked(kind: str) -> str:
     if kind not in KINDS:
         raise ConfigError(
-            f"Expected a kind of part among {', '.join(KINDS)}, got {kind!r}.{hint(kind, KINDS)}"
+            f"Expected a kind of part among {', '.join(KINDS)}, got "
+            f"{kind!r}.{hint(kind, KINDS)}"
         )
     return kind
 
@@ -436,14 +493,20 @@ def _split_value(kind: str, text: str) -> tuple[str, str | None]:
 
 
 def _read_options(kind: str, part: Part, target: Any) -> dict[str, Any]:
-    return read_options(options_of(kind, target), part.options, of(f"{kind} {part.part!r}"))
+    return read_options(
+        options_of(kind, target), part.options, of(f"{kind} {part.part!r}")
+    )
 
 
 def later_options(kind: str, source: str) -> dict[str, Any]:
-    """Options that came later than the part, with the defaults at which they are left out of what is recorded."""
+    """Options that came later than the part, with the defaults at which they are left
+    out of what is recorded.
+    """
     target = find(kind, source).target
     known = options_of(kind, target)
-    return {name: known[name].default for name in getattr(_owner(kind, target), "added", ())}
+    return {
+        name: known[name].default for name in getattr(_owner(kind, target), "added", ())
+    }
 
 
 def _owner(kind: str, target: Any) -> Any:
@@ -464,7 +527,8 @@ def given_parameters(kind: str) -> tuple[str, ...]:
 
 
 def label_of(name: str, options: Mapping[str, Any], first: str) -> str:
-    """Label a part by its options: the first option behind a colon, others by their names.
+    """Label a part by its options: the first option behind a colon, others by their
+    names.
 
     Args:
         name: of the part.
@@ -472,7 +536,8 @@ def label_of(name: str, options: Mapping[str, Any], first: str) -> str:
         first: name of the part's first option.
     """
     texts = {
-        option: f"{value:g}" if isinstance(value, float) else str(value) for option, value in options.items()
+        option: f"{value:g}" if isinstance(value, float) else str(value)
+        for option, value in options.items()
     }
     if list(texts) == [first]:
         return f"{name}:{texts[first]}"
@@ -485,7 +550,8 @@ def _a(kind: str) -> str:
 
 def _unknown(kind: str, source: str, remedy: str, reason: str = "") -> ConfigError:
     return ConfigError(
-        f"Expected {_a(kind)} among {', '.join(names(kind))}, package.module:Name or path/to/file.py:Name, "
+        f"Expected {_a(kind)} among {', '.join(names(kind))}, package.module:Name or "
+        "path/to/file.py:Name, "
         f"got {source!r}{reason}.{remedy}"
     )
 
@@ -496,13 +562,19 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
     try:
         module = importlib.import_module(place)
     except (Exception, SystemExit) as error:
-        if not isinstance(error, ModuleNotFoundError) or not f"{place}.".startswith(f"{error.name}."):
+        if not isinstance(error, ModuleNotFoundError) or not f"{place}.".startswith(
+            f"{error.name}."
+        ):
             line = f"{one_line(error)}{moved(error)}"
             raise out_of_memory(error) or ConfigError(
                 f"module {place} could not be imported: {line}"
             ) from error
         file = Path(*place.split(".")).with_suffix(".py")
-        beside = f" Did you mean './{file}:{name}'?" if file.is_file() else hint(place, names(kind))
+        beside = (
+            f" Did you mean './{file}:{name}'?"
+            if file.is_file()
+            else hint(place, names(kind))
+        )
         remedy = moved(error).removeprefix(".") or beside
         raise _unknown(
             kind,
@@ -514,7 +586,11 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
     if place.partition(".")[0] == "benchnav":
         return Found(target=target, origin="benchnav", shipped=True)
     modules = {place, str(getattr(target, "__module__", place))}
-    foreign = [name for name in modules if name.partition(".")[0] not in ("benchnav", "builtins")]
+    foreign = [
+        name
+        for name in modules
+        if name.partition(".")[0] not in ("benchnav", "builtins")
+    ]
     return Found(
         target=target,
         origin=distribution_of(place.partition(".")[0]) or f"module {place}",
@@ -523,7 +599,8 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
 
 
 def _installed_folder(place: str) -> Path | None:
-    """The folder of a package, whose code is a part's although it may lie among installed packages.
+    """The folder of a package, whose code is a part's although it may lie among
+    installed packages.
 
     None of the standard library, which a name may lead to by mistake.
     """
@@ -545,7 +622,8 @@ def _found_in_file(kind: str, path: Path, name: str) -> Found:
     except OSError as error:
         near = hint(path.name, (other.name for other in path.parent.glob("*.py")))
         raise ConfigError(
-            f"Expected {_a(kind)} in a file, got {str(path)!r}, which cannot be read: {error.strerror}.{near}"
+            f"Expected {_a(kind)} in a file, got {str(path)!r}, which cannot be read: "
+            f"{error.strerror}.{near}"
         ) from error
     touched.watch()
     target = attribute(load_file(path.resolve(), content), str(path), name)
@@ -556,7 +634,11 @@ def _found_in_file(kind: str, path: Path, name: str) -> Found:
 def _listed_files(target: Any) -> Iterator[str]:
     """What a part lists as `files`, each followed by its digest."""
     listed = getattr(target, "files", ())
-    if not listed or not isinstance(listed, list | tuple) or "files" in parameters(target):
+    if (
+        not listed
+        or not isinstance(listed, list | tuple)
+        or "files" in parameters(target)
+    ):
         return
     module = sys.modules.get(str(getattr(target, "__module__", "")))
     folder = Path(getattr(module, "__file__", None) or "").parent
@@ -564,29 +646,37 @@ def _listed_files(target: Any) -> Iterator[str]:
         digest = digest_of_path(folder / name)
         if not digest:
             raise ConfigError(
-                f"Expected `files` of {target.__qualname__} in {folder}, got {name!r}, which is not there."
+                f"Expected `files` of {target.__qualname__} in {folder}, got "
+                f"{name!r}, which is not there."
             )
         yield from (name, digest)
 
 
 def option_files(part: Part) -> dict[str, str]:
-    """Digests of what a part's options name: files and folders, by the path as it is written.
+    """Digests of what a part's options name: files and folders, by the path as it is
+    written.
 
-    What reads as a path and is not there is among them, with an empty digest, so that it is seen when it comes or goes.
-    Options that the part lists as `writes` are not.
+    What reads as a path and is not there is among them, with an empty digest, so that
+    it is seen when it comes or goes. Options that the part lists as `writes` are not.
 
     Raises:
         ConfigError: an option names a folder that holds the working folder.
     """
     written = getattr(part.found.target, "writes", ()) if part.options else ()
     found = {}
-    for text in _texts([value for name, value in part.options.items() if name not in written]):
+    for text in _texts(
+        [value for name, value in part.options.items() if name not in written]
+    ):
         path = Path(os.path.expanduser(text))
-        there = os.path.exists(path)  # of what cannot be a path false, where Path raises
+        there = os.path.exists(
+            path
+        )  # of what cannot be a path false, where Path raises
         if there and path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
             raise ConfigError(
-                f"Expected options of {part.kind} {part.part!r} that name files or folders of their own, got {text!r}, "
-                "which holds the working folder. Name the folder that is read, or list the option in its `writes`."
+                f"Expected options of {part.kind} {part.part!r} that name files or "
+                f"folders of their own, got {text!r}, "
+                "which holds the working folder. Name the folder that is read, or "
+                "list the option in its `writes`."
             )
         if there or os.sep in text or re.search(r"\.[A-Za-z]\w*$", text):
             found[text] = digest_of_path(path) if there else ""

@@ -1,4 +1,6 @@
-"""Names of version 1 and those that replace them since version 2: an old name is answered with the new one."""
+"""Names of version 1 and those that replace them since version 2: an old name is
+answered with the new one.
+"""
 
 # What programs import.
 IMPORTS = {

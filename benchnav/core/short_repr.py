@@ -10,12 +10,20 @@ _SPACE = "\0"
 
 
 def short_repr(value: Any) -> str:
-    """Name the fields of a dataclass: of tensors and arrays dtype and shape, of other values their text or type."""
-    shown = [_field(each.name, getattr(value, each.name)) for each in fields(value) if each.repr]
+    """Name the fields of a dataclass: of tensors and arrays dtype and shape, of other
+    values their text or type.
+    """
+    shown = [
+        _field(each.name, getattr(value, each.name))
+        for each in fields(value)
+        if each.repr
+    ]
     # A field stays on one line: its spaces are hidden while lines are broken.
     text = ", ".join(field.replace(" ", _SPACE) for field in shown if field)
     text = f"{type(value).__name__}({text})"
-    lines = textwrap.wrap(text, _WIDTH, subsequent_indent="  ", max_lines=MAX_LINES, placeholder=" …)")
+    lines = textwrap.wrap(
+        text, _WIDTH, subsequent_indent="  ", max_lines=MAX_LINES, placeholder=" …)"
+    )
     return "\n".join(lines).replace(_SPACE, " ")
 
 
@@ -29,7 +37,9 @@ def _field(name: str, value: Any) -> str:
         return f"{name}={text}"
     if is_dataclass(value):
         shape = getattr(value, "shape", None)
-        return f"{name} {type(value).__name__}{'' if shape is None else f' {list(shape)}'}"
+        return (
+            f"{name} {type(value).__name__}{'' if shape is None else f' {list(shape)}'}"
+        )
     size = f" of {len(value)}" if isinstance(value, Sized) else ""
     kind = "mapping" if isinstance(value, Mapping) else type(value).__name__
     return f"{name} {kind}{size}"

@@ -1,4 +1,6 @@
-"""Where a user's code comes from: loading it by file, taking a part of it, and digests of its sources."""
+"""Where a user's code comes from: loading it by file, taking a part of it, and digests
+of its sources.
+"""
 
 import ast
 import hashlib
@@ -25,7 +27,9 @@ from benchnav.core.shipped_files import PACKAGE
 
 
 def moved(error: BaseException) -> str:
-    """Return a sentence with the new name of what an import did not find; empty if none is known."""
+    """Return a sentence with the new name of what an import did not find; empty if none
+    is known.
+    """
     if not isinstance(error, ImportError) or not error.name:
         return ""
     name = re.search(r"cannot import name '(\w+)'", str(error))
@@ -49,17 +53,24 @@ def attribute(module: ModuleType, place: str, name: str) -> Any:
         target = getattr(target, part, None)
     if _is_part(target):
         return target
-    known = {n: v for n, v in vars(module).items() if _is_part(v) and not n.startswith("_")}
-    own = [n for n, v in known.items() if getattr(v, "__module__", "") == module.__name__]
+    known = {
+        n: v for n, v in vars(module).items() if _is_part(v) and not n.startswith("_")
+    }
+    own = [
+        n for n, v in known.items() if getattr(v, "__module__", "") == module.__name__
+    ]
     got = "" if target is None else f", which is an object of {type(target).__name__}"
     listed = f" ({', '.join(own)})" if own else ""
     raise ConfigError(
-        f"Expected a class or function of {place}{listed}, got {name!r}{got}.{hint(name, known)}"
+        f"Expected a class or function of {place}{listed}, got "
+        f"{name!r}{got}.{hint(name, known)}"
     )
 
 
 def _is_part(target: Any) -> bool:
-    """Tells a class, function or wrapped function from an object that can be called, such as a robot."""
+    """Tells a class, function or wrapped function from an object that can be called,
+    such as a robot.
+    """
     return callable(target) and (
         inspect.isclass(target)
         or inspect.isroutine(target)
@@ -82,18 +93,27 @@ def load_file(path: Path, content: bytes) -> ModuleType:
     where = hashlib.sha256(str(path).encode() + b"\0" + content).hexdigest()[:16]
     module = ModuleType(f"benchnav_file_{path.stem}_{where}")
     module.__file__ = str(path)
-    sys.modules[module.__name__] = module  # dataclasses and compiled functions look their module up
+    sys.modules[module.__name__] = (
+        module  # dataclasses and compiled functions look their module up
+    )
     try:
         exec(compile(content, str(path), "exec"), vars(module))
     except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
         if isinstance(error, BenchnavError):
             raise
-        lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
+        lines = [
+            f.lineno
+            for f in traceback.extract_tb(error.__traceback__)
+            if f.filename == str(path)
+        ]
         at = f" (line {lines[-1]})" if lines else ""
         remedy = moved(error)
         if not remedy and isinstance(error, ModuleNotFoundError):
-            remedy = ". A file stands alone: install what it imports, or write it into the file."
+            remedy = (
+                ". A file stands alone: install what it imports, or write it "
+                "into the file."
+            )
         raise out_of_memory(error) or ConfigError(
             f"{path} could not be imported: {one_line(error)}{at}{remedy}"
         ) from error
@@ -109,15 +129,23 @@ def digest_of(contents: Iterable[bytes]) -> str:
 
 
 def digest_of_path(path: Path) -> str:
-    """Digest of a file, or of all files of a folder with their names; empty where there is neither.
+    """Digest of a file, or of all files of a folder with their names; empty where there
+    is neither.
 
     Raises:
         ConfigError: it cannot be read.
     """
     try:
         if path.is_dir():
-            files = sorted(f for f in path.rglob("*") if f.is_file() and "__pycache__" not in f.parts)
-            pairs = ((file.relative_to(path).as_posix(), digest_of_path(file)) for file in files)
+            files = sorted(
+                f
+                for f in path.rglob("*")
+                if f.is_file() and "__pycache__" not in f.parts
+            )
+            pairs = (
+                (file.relative_to(path).as_posix(), digest_of_path(file))
+                for file in files
+            )
             return digest_of(item.encode() for pair in pairs for item in pair)
         if not path.is_file():
             return ""
@@ -130,28 +158,40 @@ def digest_of_path(path: Path) -> str:
 
 
 def digest_of_file_part(path: Path, content: bytes) -> str:
-    """Digest of a file that stands alone and of the modules that it imports; see `imported_sources`."""
-    return _digest_of_sources({"": content} | imported_sources(path.parent, "", content))
+    """Digest of a file that stands alone and of the modules that it imports; see
+    `imported_sources`.
+    """
+    return _digest_of_sources(
+        {"": content} | imported_sources(path.parent, "", content)
+    )
 
 
 def digest_of_target(target: Callable[..., Any]) -> str:
-    """Digest of the file that defines a target and its imports or, in a notebook, of its own source; else empty."""
+    """Digest of the file that defines a target and its imports or, in a notebook, of
+    its own source; else empty.
+    """
     try:
         path = Path(inspect.getfile(target))
-        content = path.read_bytes() if path.is_file() else inspect.getsource(target).encode()
+        content = (
+            path.read_bytes() if path.is_file() else inspect.getsource(target).encode()
+        )
     except (TypeError, OSError):
         return ""
     return digest_of_file_part(path, content)
 
 
 def digest_of_modules(names: Iterable[str]) -> str:
-    """Digest of modules: of all sources of the packages that they are in, and of what they import besides."""
+    """Digest of modules: of all sources of the packages that they are in, and of what
+    they import besides.
+    """
     found: dict[str, bytes] = {}
     for name in sorted(names):
         package = importlib.import_module(name.partition(".")[0])
         folders = [Path(folder) for folder in getattr(package, "__path__", [])]
         files = [
-            (file.relative_to(folder.parent), file) for folder in folders for file in folder.rglob("*.py")
+            (file.relative_to(folder.parent), file)
+            for folder in folders
+            for file in folder.rglob("*.py")
         ]
         if not files and getattr(package, "__file__", None):
             files = [(Path(package.__name__), Path(str(package.__file__)))]
@@ -165,10 +205,12 @@ def digest_of_modules(names: Iterable[str]) -> str:
 
 
 def package_modules(names: Iterable[str]) -> dict[str, str]:
-    """Digests of modules of this package, and of all of it that they import, wherever in the code an import stands.
+    """Digests of modules of this package, and of all of it that they import, wherever
+    in the code an import stands.
 
-    A digest is of the syntax tree without docstrings: comments, layout and documentation do not change it. What a
-    process has once read stays, as what it has imported does. Packages' own faces are left out: they hand names on.
+    A digest is of the syntax tree without docstrings: comments, layout and
+    documentation do not change it. What a process has once read stays, as what it has
+    imported does. Packages' own faces are left out: they hand names on.
 
     Args:
         names: of the modules to begin with.
@@ -189,29 +231,39 @@ def package_modules(names: Iterable[str]) -> dict[str, str]:
 
 @cache
 def _module(name: str) -> tuple[str, tuple[str, ...]] | None:
-    """The digest of a module of this package, and what it imports; None of any other name."""
+    """The digest of a module of this package, and what it imports; None of any other
+    name.
+    """
     path = PACKAGE.parent.joinpath(*name.split(".")).with_suffix(".py")
     if name.partition(".")[0] != PACKAGE.name or not path.is_file():
         return None
     content = path.read_bytes()
     tree = ast.parse(content)
     for node in ast.walk(tree):
-        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+        if not isinstance(
+            node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+        ):
             continue
         if ast.get_docstring(node, clean=False) is not None:
             node.body = node.body[1:]
-    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12], imported_names(content, "")
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12], imported_names(
+        content, ""
+    )
 
 
 def _digest_of_sources(found: Mapping[str, bytes]) -> str:
-    return digest_of(item for name in sorted(found) for item in (name.encode(), found[name]))
+    return digest_of(
+        item for name in sorted(found) for item in (name.encode(), found[name])
+    )
 
 
 def imported_sources(near: Path, package: str, content: bytes) -> dict[str, bytes]:
-    """Sources of all that a module imports, and of what that imports, wherever in the code an import stands.
+    """Sources of all that a module imports, and of what that imports, wherever in the
+    code an import stands.
 
-    The standard library, installed distributions and benchnav itself are left out: `run.json` has their versions and
-    digests. Nothing is imported by this, and names that are put together at run time are not seen.
+    The standard library, installed distributions and benchnav itself are left out:
+    `run.json` has their versions and digests. Nothing is imported by this, and names
+    that are put together at run time are not seen.
 
     Args:
         near: folder in which an imported file may lie besides `sys.path`.
@@ -226,7 +278,10 @@ def imported_sources(near: Path, package: str, content: bytes) -> dict[str, byte
     while todo:
         package, content = todo.pop()
         for name in imported_names(content, package):
-            if name in found or name.partition(".")[0] in (*sys.stdlib_module_names, "benchnav"):
+            if name in found or name.partition(".")[0] in (
+                *sys.stdlib_module_names,
+                "benchnav",
+            ):
                 continue
             spec = _spec(name, near)
             if spec is None or not spec.has_location or not spec.origin:
@@ -242,7 +297,9 @@ def imported_sources(near: Path, package: str, content: bytes) -> dict[str, byte
 
 @cache
 def imported_names(content: bytes, package: str) -> tuple[str, ...]:
-    """Modules that a source may import, with the packages around them; of `from a import b` both a and a.b."""
+    """Modules that a source may import, with the packages around them; of `from a
+    import b` both a and a.b.
+    """
     named = []
     try:
         tree = ast.parse(content)
@@ -252,15 +309,29 @@ def imported_names(content: bytes, package: str) -> tuple[str, ...]:
         if isinstance(node, ast.Import):
             named += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            outer = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            outer = (
+                package.split(".")[: len(package.split(".")) - node.level + 1]
+                if node.level
+                else []
+            )
             base = ".".join([*outer, *([node.module] if node.module else [])])
             named += [base, *(f"{base}.{alias.name}" for alias in node.names)]
-        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+        elif (
+            isinstance(node, ast.Call)
+            and node.args
+            and isinstance(node.args[0], ast.Constant)
+        ):
             called = getattr(node.func, "attr", getattr(node.func, "id", ""))
-            if called in ("import_module", "__import__") and isinstance(node.args[0].value, str):
+            if called in ("import_module", "__import__") and isinstance(
+                node.args[0].value, str
+            ):
                 named.append(node.args[0].value)
     parts = [name.split(".") for name in named if name and not name.startswith(".")]
-    return tuple(dict.fromkeys(".".join(part[: n + 1]) for part in parts for n in range(len(part))))
+    return tuple(
+        dict.fromkeys(
+            ".".join(part[: n + 1]) for part in parts for n in range(len(part))
+        )
+    )
 
 
 def _spec(name: str, near: Path) -> ModuleSpec | None:
@@ -279,12 +350,18 @@ def _spec(name: str, near: Path) -> ModuleSpec | None:
 
 @cache
 def installed_folders() -> frozenset[str]:
-    """Folders of the standard library and of installed distributions, wherever on the path they were put."""
+    """Folders of the standard library and of installed distributions, wherever on the
+    path they were put.
+    """
     known = sysconfig.get_paths()
     return frozenset(
         [known[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
         + [*site.getsitepackages(), site.getusersitepackages()]
-        + [folder for folder in sys.path if folder and any(Path(folder).glob("*.dist-info"))]
+        + [
+            folder
+            for folder in sys.path
+            if folder and any(Path(folder).glob("*.dist-info"))
+        ]
     )
 
 
@@ -292,9 +369,11 @@ _FIRST_READ: dict[Path, bytes] = {}
 
 
 def _read_source(path: Path) -> bytes:
-    """A module's source; where it has changed since this process first read it, with what it was then.
+    """A module's source; where it has changed since this process first read it, with
+    what it was then.
 
-    A module that was imported stays what it was, so that a process with an older one is like no other.
+    A module that was imported stays what it was, so that a process with an older one is
+    like no other.
     """
     content = path.read_bytes()
     first = _FIRST_READ.setdefault(path, content)
@@ -303,6 +382,8 @@ def _read_source(path: Path) -> bytes:
 
 @cache
 def distribution_of(package: str) -> str:
-    """Name and version of the distribution that a package was installed with; empty where there is none."""
+    """Name and version of the distribution that a package was installed with; empty
+    where there is none.
+    """
     distribution = next(iter(packages_distributions().get(package, [])), "")
     return f"{distribution} {version(distribution)}" if distribution else ""

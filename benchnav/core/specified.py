@@ -1,4 +1,6 @@
-"""Objects that remember the arguments they were created with, so that another process can create them again."""
+"""Objects that remember the arguments they were created with, so that another process
+can create them again.
+"""
 
 from typing import Any, Self
 
@@ -8,7 +10,8 @@ _ARGUMENTS = "_arguments"
 class Specified:
     """The base class of all parts: planners, models, risk measures, robots, …
 
-    It changes nothing but that the arguments of the constructor are kept; see `arguments_of`.
+    It changes nothing but that the arguments of the constructor are kept; see
+    `arguments_of`.
     """
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
@@ -22,5 +25,7 @@ class Specified:
 
 
 def arguments_of(instance: Any) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
-    """Return the positional and keyword arguments that an object was created with; None if they are unknown."""
+    """Return the positional and keyword arguments that an object was created with; None
+    if they are unknown.
+    """
     return vars(instance).get(_ARGUMENTS) if isinstance(instance, Specified) else None

@@ -1,6 +1,8 @@
-"""Stored work, of datasets, runs and models alike: held by one writer, written whole or not at all, made in shards.
+"""Stored work, of datasets, runs and models alike: held by one writer, written whole or
+not at all, made in shards.
 
-A file or folder is written under another name beside its own and then renamed. A text that describes a store is
+A file or folder is written under another name beside its own and then renamed. A text
+that describes a store is
 sealed: it holds its own digest, so that an edit is found.
 """
 
@@ -24,14 +26,16 @@ MAX_JOBS = 10_000
 
 @contextmanager
 def replacing(path: Path, durable: bool = True) -> Iterator[Path]:
-    """Gives a name to write to; what stands there at the end takes `path`'s place in one step.
+    """Gives a name to write to; what stands there at the end takes `path`'s place in
+    one step.
 
-    A kill at any moment leaves `path` as it was or as it is to be. The name is the process's own, so
-    that two writers of one file do not mix.
+    A kill at any moment leaves `path` as it was or as it is to be. The name is the
+    process's own, so that two writers of one file do not mix.
 
     Args:
         path: the file to be written; its folder is made.
-        durable: wait until it is on the disk, so that not even a loss of power leaves it damaged.
+        durable: wait until it is on the disk, so that not even a loss of power leaves
+            it damaged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -53,20 +57,27 @@ def check_output(name: str, option: str = "out") -> None:
         option: what it is given as, for messages.
 
     Raises:
-        ConfigError: If it is empty, an address, such as s3://bucket/name, which would become a folder `s3:`, or has
-            characters that no listing shows.
+        ConfigError: If it is empty, an address, such as s3://bucket/name, which would
+            become a folder `s3:`, or has characters that no listing shows.
     """
     expect(name, f"`{option}` as a path, got ''.")
-    expect(name.isprintable(), f"`{option}` as a path of printable characters, got {name!r}.")
+    expect(
+        name.isprintable(),
+        f"`{option}` as a path of printable characters, got {name!r}.",
+    )
     expect(
         not re.match(r"[A-Za-z][A-Za-z0-9+.-]*:/", name),
-        f"`{option}` as a path on this machine, got the address {name!r}. Write to a folder here, and copy it.",
+        f"`{option}` as a path on this machine, got the address {name!r}. Write to a "
+        "folder here, and copy it.",
     )
     path = Path(os.path.expanduser(name))
-    nearest = next((place for place in path.absolute().parents if os.path.lexists(place)), path)
+    nearest = next(
+        (place for place in path.absolute().parents if os.path.lexists(place)), path
+    )
     expect(
         nearest.is_dir(),
-        f"`{option}` as a path in a folder, got {name!r}, and {nearest} is no folder. Choose another `{option}`.",
+        f"`{option}` as a path in a folder, got {name!r}, and {nearest} is no folder. "
+        f"Choose another `{option}`.",
     )
     expect(
         option == "out" or not path.is_dir(),
@@ -81,20 +92,26 @@ def write_text(path: Path, text: str) -> None:
 
 
 def real_place(path: Path) -> Path:
-    """The place that a name stands for: where a link points to; the folder that `.` is, by its own name."""
+    """The place that a name stands for: where a link points to; the folder that `.` is,
+    by its own name.
+    """
     return path.resolve() if path.is_symlink() or path.name in ("", "..") else path
 
 
 @contextmanager
 def sole_writer(path: Path, what: str, shared: bool = False) -> Iterator[None]:
-    """Holds a file or folder for one process, whether or not it exists yet; a kill frees it.
+    """Holds a file or folder for one process, whether or not it exists yet; a kill
+    frees it.
 
-    The lock is a file beside it, so `path` may be moved, replaced or removed while it is held.
+    The lock is a file beside it, so `path` may be moved, replaced or removed while it
+    is held.
 
     Args:
-        path: what is held; its folder is made, and removed at the end where nothing came into it.
+        path: what is held; its folder is made, and removed at the end where nothing
+            came into it.
         what: what is written there, for the message.
-        shared: hold it together with others who share it, and keep out those who do not.
+        shared: hold it together with others who share it, and keep out those who do
+            not.
 
     Raises:
         BenchnavError: another process, or another part of this one, holds it.
@@ -109,7 +126,8 @@ def sole_writer(path: Path, what: str, shared: bool = False) -> Iterator[None]:
     finally:
         with suppress(BlockingIOError):  # others share it still
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Removed while it is still held: whoever opened it meanwhile sees that its name is gone.
+            # Removed while it is still held: whoever opened it meanwhile sees that its
+            # name is gone.
             lock.unlink(missing_ok=True)
         os.close(descriptor)
         with suppress(OSError):  # one is not empty, or was removed by others
@@ -128,7 +146,8 @@ def _take(lock: Path, what: str, kind: int) -> int:
         except BlockingIOError as error:
             os.close(descriptor)
             raise BenchnavError(
-                f"Another run is writing {what}. Wait for it to end, or choose another `out`."
+                f"Another run is writing {what}. Wait for it to end, or choose "
+                "another `out`."
             ) from error
         except BaseException:
             os.close(descriptor)
@@ -144,32 +163,38 @@ def _is_same(descriptor: int, path: Path) -> bool:
 
 
 def refuse_taken(out: Path, overwrite: bool, foreign: Callable[[Path], str]) -> None:
-    """Refuses a place for an output that is taken; one rule for files, folders and checkpoints.
+    """Refuses a place for an output that is taken; one rule for files, folders and
+    checkpoints.
 
     Args:
         out: file or folder that is to be written.
         overwrite: whether what is there may be replaced.
-        foreign: says of a place that is taken why it is of another kind, which no option may replace, such as "holds
-            notes.txt"; empty where it is not.
+        foreign: says of a place that is taken why it is of another kind, which no
+            option may replace, such as "holds notes.txt"; empty where it is not.
 
     Raises:
-        ConfigError: something of another kind is there; or something is there, and may not be replaced.
+        ConfigError: something of another kind is there; or something is there, and may
+            not be replaced.
     """
     if not out.exists() and not out.is_symlink():
         return
     if why := foreign(out):
         raise ConfigError(
-            f"Expected `out` to be new or an earlier result of this command, got {out}, which {why}. "
+            "Expected `out` to be new or an earlier result of this command, got "
+            f"{out}, which {why}. "
             "Choose another `out`."
         )
     if not overwrite and not (out.is_dir() and not any(out.iterdir())):
         raise ConfigError(
-            f"Expected `out` to be new, got {out}, which exists. Pass --overwrite to replace it."
+            f"Expected `out` to be new, got {out}, which exists. Pass --overwrite to "
+            "replace it."
         )
 
 
 def new_folder(place: Path) -> Path:
-    """Makes an empty folder beside a place, to be filled and then given to `take_place`; one that a kill left goes."""
+    """Makes an empty folder beside a place, to be filled and then given to
+    `take_place`; one that a kill left goes.
+    """
     partial = place.with_name(f".{place.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -178,7 +203,9 @@ def new_folder(place: Path) -> Path:
 
 @contextmanager
 def building(place: Path) -> Iterator[Path]:
-    """Gives an empty folder beside a place, to be filled and then given to `take_place`; where it was not, it goes."""
+    """Gives an empty folder beside a place, to be filled and then given to
+    `take_place`; where it was not, it goes.
+    """
     partial = new_folder(place.with_name(f"{place.name}.building"))
     try:
         yield partial
@@ -187,14 +214,17 @@ def building(place: Path) -> Iterator[Path]:
 
 
 def take_place(partial: Path, place: Path, last: str = "") -> None:
-    """Moves a whole folder to where it is to be, in the place of one that is there; see `restore`.
+    """Moves a whole folder to where it is to be, in the place of one that is there; see
+    `restore`.
 
-    An empty folder that is there is filled, since it may be a link, or the one that the user is in.
+    An empty folder that is there is filled, since it may be a link, or the one that the
+    user is in.
 
     Args:
         partial: the folder, beside `place`.
         place: where it is to be.
-        last: file that makes an empty folder what it is to be, which so comes into it last.
+        last: file that makes an empty folder what it is to be, which so comes into it
+            last.
     """
     if place.is_dir() and not any(place.iterdir()):
         for path in sorted(partial.iterdir(), key=lambda path: path.name == last):
@@ -210,7 +240,9 @@ def take_place(partial: Path, place: Path, last: str = "") -> None:
 
 
 def restore(place: Path) -> None:
-    """Gives a folder its name back which `take_place` had taken away, where a kill came before the new one had it."""
+    """Gives a folder its name back which `take_place` had taken away, where a kill came
+    before the new one had it.
+    """
     if _dropped(place).exists() and not place.exists():
         with suppress(FileNotFoundError):  # another process was quicker
             _dropped(place).rename(place)
@@ -242,12 +274,15 @@ def unseal(text: str | bytes) -> dict[str, Any]:
 
 def text_digest(content: Any) -> str:
     """SHA-256 of plain data, whatever the order of its keys."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps(content, sort_keys=True, separators=(",", ":")).encode()
+    ).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shard:
-    """A share of some work that several machines do apart, written 2/5 on the command line.
+    """A share of some work that several machines do apart, written 2/5 on the command
+    line.
 
     Args:
         index: which one, from 1 on.
@@ -268,7 +303,8 @@ class Shard:
 
 
 def read_shard(text: str) -> Shard | None:
-    """Reads a shard as it is written on the command line; None of an empty text, which means all.
+    """Reads a shard as it is written on the command line; None of an empty text, which
+    means all.
 
     Raises:
         ConfigError: it is no such text.
@@ -290,7 +326,8 @@ def check_workers(jobs: int, backend: str, scheduler: str) -> None:
         scheduler: address of a Dask cluster's scheduler; empty for none.
 
     Raises:
-        ConfigError: If there is none or more than `MAX_JOBS`, or a cluster without an address or the reverse.
+        ConfigError: If there is none or more than `MAX_JOBS`, or a cluster without an
+            address or the reverse.
     """
     expect(1 <= jobs <= MAX_JOBS, f"`jobs` in 1–{MAX_JOBS}, got {jobs}.")
     expect(

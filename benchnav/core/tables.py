@@ -1,6 +1,8 @@
-"""Tables as text, and one way of writing each: in Markdown, in LaTeX, and for a terminal.
+"""Tables as text, and one way of writing each: in Markdown, in LaTeX, and for a
+terminal.
 
-The HTML page of a report reads the same value in its template. CSV holds numbers rather than text; pandas writes it.
+The HTML page of a report reads the same value in its template. CSV holds numbers rather
+than text; pandas writes it.
 """
 
 import io
@@ -19,15 +21,44 @@ _WIDEST_LINE = 56  # of a list in a cell, that is not broken
 
 # Words before the characters that they begin with.
 _LATEX = {
-    "λ̄": r"$\bar{\lambda}$", "λ̂": r"$\hat{\lambda}$", "T_total": r"$T_\mathrm{total}$",
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
-    "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}",
-    ">": r"\textgreater{}", "|": r"\textbar{}", "[": "{[}", "±": r"$\pm$", "–": "--", "λ": r"$\lambda$",
-    "ω": r"$\omega$", "θ": r"$\theta$", "α": r"$\alpha$", "ε": r"$\varepsilon$", "σ": r"$\sigma$", "µ": r"$\mu$",
-    "≥": r"$\geq$", "≤": r"$\leq$", "×": r"$\times$", "→": r"$\to$", "·": r"$\cdot$", "Δ": r"$\Delta$", "−": "$-$",
+    "λ̄": r"$\bar{\lambda}$",
+    "λ̂": r"$\hat{\lambda}$",
+    "T_total": r"$T_\mathrm{total}$",
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    "[": "{[}",
+    "±": r"$\pm$",
+    "–": "--",
+    "λ": r"$\lambda$",
+    "ω": r"$\omega$",
+    "θ": r"$\theta$",
+    "α": r"$\alpha$",
+    "ε": r"$\varepsilon$",
+    "σ": r"$\sigma$",
+    "µ": r"$\mu$",
+    "≥": r"$\geq$",
+    "≤": r"$\leq$",
+    "×": r"$\times$",
+    "→": r"$\to$",
+    "·": r"$\cdot$",
+    "Δ": r"$\Delta$",
+    "−": "$-$",
     "¶": r"\P{}",
-}  # fmt: skip
-_LATEX |= {raised: rf"\textsuperscript{{{digit}}}" for digit, raised in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")}
+}
+_LATEX |= {
+    raised: rf"\textsuperscript{{{digit}}}" for digit, raised in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")
+}
 # Digits below the line, with the dots between them.
 _LOWERED = re.compile("[₀-₉]+(?:\\.[₀-₉]+)?")
 _RAISED = str.maketrans("₀₁₂₃₄₅₆₇₈₉", "0123456789")
@@ -47,15 +78,18 @@ class Table:
     """A table as text.
 
     Args:
-        headings: one a column, those of labels first; a line break within one is kept in a terminal alone.
-        rows: a cell a column. What stands in brackets at a cell's end is set smaller in LaTeX.
+        headings: one a column, those of labels first; a line break within one is kept
+            in a terminal alone.
+        rows: a cell a column. What stands in brackets at a cell's end is set smaller in
+            LaTeX.
         labels: number of columns that are labels.
         numbers: whether the other columns hold a number each, which is set right.
         title: over the table, in a terminal alone.
         notes: lines under the table.
         bold_note: what bold means.
         explained: what columns hold, (heading, sentence).
-        groups: titles over the columns that are no labels, each over as many, in LaTeX alone.
+        groups: titles over the columns that are no labels, each over as many, in LaTeX
+            alone.
         rules: rows that a line is drawn over, in LaTeX alone.
     """
 
@@ -76,25 +110,42 @@ def to_markdown(table: Table) -> str:
     right = "---:" if table.numbers else "---"
     lines = [
         _markdown_row(markdown(_one_line(heading)) for heading in table.headings),
-        "|" + "---|" * table.labels + f"{right}|" * (len(table.headings) - table.labels),
+        "|"
+        + "---|" * table.labels
+        + f"{right}|" * (len(table.headings) - table.labels),
     ]
     for row in table.rows:
-        cells = (f"**{markdown(cell)}**" if isinstance(cell, Bold) else markdown(cell) for cell in row)
+        cells = (
+            f"**{markdown(cell)}**" if isinstance(cell, Bold) else markdown(cell)
+            for cell in row
+        )
         lines.append(_markdown_row(cells))
     notes = [*table.notes, *([f"Bold: {table.bold_note}"] if table.bold_note else [])]
     lines += [f"\n{markdown(note)}" for note in notes]
     if table.explained:
-        lines += ["", *(f"- **{markdown(heading)}**: {markdown(text)}" for heading, text in table.explained)]
+        lines += [
+            "",
+            *(
+                f"- **{markdown(heading)}**: {markdown(text)}"
+                for heading, text in table.explained
+            ),
+        ]
     return "\n".join([*lines, ""])
 
 
 def to_latex(
-    tables: Sequence[Table], caption: str, label: str, wide: bool = True, size: str = "scriptsize"
+    tables: Sequence[Table],
+    caption: str,
+    label: str,
+    wide: bool = True,
+    size: str = "scriptsize",
 ) -> str:
-    """Writes a complete environment, with notes under the tables. Needs LaTeX's `booktabs` and nothing else.
+    """Writes a complete environment, with notes under the tables. Needs LaTeX's
+    `booktabs` and nothing else.
 
     Args:
-        tables: one, or several under each other; labels are set left, all else is centred.
+        tables: one, or several under each other; labels are set left, all else is
+            centred.
         caption: what is shown.
         label: what it is referred to by.
         wide: as wide as the page, not as a column.
@@ -120,14 +171,25 @@ def to_latex(
 
 def _tabular(table: Table) -> str:
     numbers = len(table.headings) - table.labels
-    lines = [r"  \begin{tabular}{" + "l" * table.labels + "c" * numbers + "}", r"    \toprule"]
+    lines = [
+        r"  \begin{tabular}{" + "l" * table.labels + "c" * numbers + "}",
+        r"    \toprule",
+    ]
     if table.groups:
         width = numbers // len(table.groups)
-        titles = [rf"\multicolumn{{{width}}}{{c}}{{{latex(title)}}}" for title in table.groups]
+        titles = [
+            rf"\multicolumn{{{width}}}{{c}}{{{latex(title)}}}" for title in table.groups
+        ]
         ends = range(table.labels + width, len(table.headings) + 1, width)
         lines.append(_latex_row([*[""] * table.labels, *titles]))
-        lines.append("    " + " ".join(rf"\cmidrule(lr){{{end - width + 1}-{end}}}" for end in ends))
-    lines += [_latex_row(latex(_one_line(heading)) for heading in table.headings), r"    \midrule"]
+        lines.append(
+            "    "
+            + " ".join(rf"\cmidrule(lr){{{end - width + 1}-{end}}}" for end in ends)
+        )
+    lines += [
+        _latex_row(latex(_one_line(heading)) for heading in table.headings),
+        r"    \midrule",
+    ]
     for place, row in enumerate(table.rows):
         lines += [r"    \midrule"] if place in table.rules else []
         lines.append(_latex_row(map(_latex_cell, row)))
@@ -135,8 +197,12 @@ def _tabular(table: Table) -> str:
 
 
 def _latex_cell(cell: str) -> str:
-    """A cell whose brackets at its end, such as of an interval, are set smaller and never in bold."""
-    value, space, bracket = cell.rpartition(" (") if cell.endswith(")") else (cell, "", "")
+    """A cell whose brackets at its end, such as of an interval, are set smaller and
+    never in bold.
+    """
+    value, space, bracket = (
+        cell.rpartition(" (") if cell.endswith(")") else (cell, "", "")
+    )
     written = rf"\textbf{{{latex(value)}}}" if isinstance(cell, Bold) else latex(value)
     return rf"{written} {{\scriptsize ({latex(bracket)}}}" if space else written
 
@@ -169,19 +235,23 @@ def markdown(text: str) -> str:
 
 
 def to_terminal(table: Table, width: int | None = None, styled: bool = False) -> str:
-    """Draws a table for a terminal, with its notes under it; a colour such as #00ff00 is shown beside its code.
+    """Draws a table for a terminal, with its notes under it; a colour such as #00ff00
+    is shown beside its code.
 
     Args:
         table: what to draw.
         width: columns of the terminal; not limited when not given.
-        styled: set bold cells in bold and show colours; else a star stands behind bold cells.
+        styled: set bold cells in bold and show colours; else a star stands behind bold
+            cells.
     """
     from rich import box
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table as Drawn
 
-    bold_note = [f"{'Bold' if styled else '*'}: {table.bold_note}"] if table.bold_note else []
+    bold_note = (
+        [f"{'Bold' if styled else '*'}: {table.bold_note}"] if table.bold_note else []
+    )
     console = Console(
         file=io.StringIO(),
         width=width or _UNBROKEN,
@@ -210,7 +280,11 @@ def to_terminal(table: Table, width: int | None = None, styled: bool = False) ->
     def drawn_cell(text: str) -> str:
         if isinstance(text, Bold):
             return f"[bold]{escape(text)}[/bold]" if styled else f"{escape(text)}*"
-        return f"[on {text}]  [/] {text}" if styled and _COLOUR.fullmatch(text) else escape(text)
+        return (
+            f"[on {text}]  [/] {text}"
+            if styled and _COLOUR.fullmatch(text)
+            else escape(text)
+        )
 
     for row in table.rows:
         drawn.add_row(*map(drawn_cell, row))

@@ -1,7 +1,9 @@
-"""YAML that users write: plain data in one reading, or one line that says what is wrong with it.
+"""YAML that users write: plain data in one reading, or one line that says what is wrong
+with it.
 
-YAML allows what no setting means: a key twice, a list in itself, a page that stands for a billion values. Such text is
-refused before it is built. Numbers are as in YAML 1.2, so that 1e-3 is one, and a date is text.
+YAML allows what no setting means: a key twice, a list in itself, a page that stands for
+a billion values. Such text is refused before it is built. Numbers are as in YAML 1.2,
+so that 1e-3 is one, and a date is text.
 """
 
 import re
@@ -38,8 +40,9 @@ def load_yaml(text: str, place: str = "") -> Any:
         place: where it stands, for messages.
 
     Raises:
-        ConfigError: If it is no YAML, holds a key twice, an alias within what it stands for, or values that are not
-            plain, or more than `MAX_VALUES` values or `MAX_DEPTH` levels.
+        ConfigError: If it is no YAML, holds a key twice, an alias within what it stands
+            for, or values that are not plain, or more than `MAX_VALUES` values or
+            `MAX_DEPTH` levels.
     """
     import yaml
 
@@ -48,8 +51,15 @@ def load_yaml(text: str, place: str = "") -> Any:
         return None if node is None else loader.construct_document(node)
     except ConfigError:
         raise
-    except (yaml.YAMLError, ValueError, KeyError) as error:  # `!!int many`, `!!bool perhaps`
-        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+    except (
+        yaml.YAMLError,
+        ValueError,
+        KeyError,
+    ) as error:  # `!!int many`, `!!bool perhaps`
+        mark, problem = (
+            getattr(error, "problem_mark", None),
+            getattr(error, "problem", None),
+        )
         raise _refusal(text, place, problem or str(error), mark) from error
 
 
@@ -63,14 +73,18 @@ def read_yaml(path: Path) -> Any:
         return load_yaml(path.read_text(), str(path))
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise ConfigError(f"Expected a YAML file, got {str(path)!r}: {reason}.") from error
+        raise ConfigError(
+            f"Expected a YAML file, got {str(path)!r}: {reason}."
+        ) from error
 
 
 def check_yaml(text: str) -> None:
-    """Raises where text is YAML that `load_yaml` would not build; text that is no YAML passes.
+    """Raises where text is YAML that `load_yaml` would not build; text that is no YAML
+    passes.
 
     Raises:
-        ConfigError: If it holds a key twice, an alias within what it stands for, or too much.
+        ConfigError: If it holds a key twice, an alias within what it stands for, or too
+            much.
     """
     import yaml
 
@@ -93,14 +107,21 @@ def _composed(text: str, place: str) -> tuple[Any, Any]:
         if isinstance(inner, yaml.ScalarNode):
             check_text(inner.value, place)
             if inner.tag == f"{_TAG}int" and len(inner.value) > MAX_DIGITS:
-                raise _refusal(text, place, f"a number of more than {MAX_DIGITS} digits", inner.start_mark)
+                raise _refusal(
+                    text,
+                    place,
+                    f"a number of more than {MAX_DIGITS} digits",
+                    inner.start_mark,
+                )
         elif isinstance(inner, yaml.MappingNode):
             _check_keys(loader, inner, text, place)
     return loader, node
 
 
 def _check_nesting(text: str, place: str) -> None:
-    """Reads events, which build nothing, so that no text is too deep or stands for too much."""
+    """Reads events, which build nothing, so that no text is too deep or stands for too
+    much.
+    """
     import yaml
 
     open_anchors: list[str | None] = []  # of what an event is in
@@ -109,7 +130,12 @@ def _check_nesting(text: str, place: str) -> None:
     for event in yaml.parse(text, Loader=_loader()):
         if isinstance(event, yaml.AliasEvent):
             if event.anchor in open_anchors:
-                raise _refusal(text, place, f"*{event.anchor} is within &{event.anchor}", event.start_mark)
+                raise _refusal(
+                    text,
+                    place,
+                    f"*{event.anchor} is within &{event.anchor}",
+                    event.start_mark,
+                )
             values += sizes[event.anchor or ""]
         elif isinstance(event, yaml.CollectionEndEvent):
             anchor, start = open_anchors.pop(), starts.pop()
@@ -122,9 +148,16 @@ def _check_nesting(text: str, place: str) -> None:
             else:
                 sizes[event.anchor or ""] = 1
         if len(open_anchors) > MAX_DEPTH:
-            raise _refusal(text, place, f"more than {MAX_DEPTH} levels of nesting", event.start_mark)
+            raise _refusal(
+                text,
+                place,
+                f"more than {MAX_DEPTH} levels of nesting",
+                event.start_mark,
+            )
         if values > MAX_VALUES:
-            raise _refusal(text, place, f"more than {MAX_VALUES} values", event.start_mark)
+            raise _refusal(
+                text, place, f"more than {MAX_VALUES} values", event.start_mark
+            )
 
 
 def _nodes(root: Any) -> Iterator[Any]:
@@ -151,9 +184,13 @@ def _check_keys(loader: Any, mapping: Any, text: str, place: str) -> None:
     for node, _ in mapping.value:
         if not isinstance(node, yaml.ScalarNode):
             continue  # which the loader refuses
-        key = node.value if node.tag == f"{_TAG}merge" else loader.construct_object(node)
+        key = (
+            node.value if node.tag == f"{_TAG}merge" else loader.construct_object(node)
+        )
         if key in keys:
-            raise _refusal(text, place, f"the key {key!r} is there twice", node.start_mark)
+            raise _refusal(
+                text, place, f"the key {key!r} is there twice", node.start_mark
+            )
         keys.add(key)
 
 
@@ -169,7 +206,11 @@ def _loader() -> Any:
 
     base = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     resolvers = {
-        first: [(tag, pattern) for tag, pattern in known if tag not in (f"{_TAG}timestamp", f"{_TAG}float")]
+        first: [
+            (tag, pattern)
+            for tag, pattern in known
+            if tag not in (f"{_TAG}timestamp", f"{_TAG}float")
+        ]
         for first, known in base.yaml_implicit_resolvers.items()
     }
     constructors = {

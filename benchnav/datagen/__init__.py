@@ -11,7 +11,12 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.datagen.files.reader": ("TerrainDataset",),
         "benchnav.datagen.layers.layer": ("DrawnMaps", "Layer", "Streams"),
         "benchnav.datagen.recipe.classes": ("TerrainClass",),
-        "benchnav.datagen.recipe.recipe": ("Recipe", "load_recipe", "recipe_from_dict", "shipped_recipes"),
+        "benchnav.datagen.recipe.recipe": (
+            "Recipe",
+            "load_recipe",
+            "recipe_from_dict",
+            "shipped_recipes",
+        ),
         "benchnav.datagen.synth.generate": ("generate",),
     },
 )

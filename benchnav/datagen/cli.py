@@ -1,6 +1,8 @@
-"""The command `benchnav-datagen`: make, list, show, check, combine, import, export and draw datasets.
+"""The command `benchnav-datagen`: make, list, show, check, combine, import, export and
+draw datasets.
 
-What is heavy is imported where it is called, or asked of `datagen` there, so that the command's help is quick.
+What is heavy is imported where it is called, or asked of `datagen` there, so that the
+command's help is quick.
 """
 
 import sys
@@ -38,13 +40,20 @@ def create(
 
     Args:
         recipe: Id of a shipped recipe, such as paper-v1, or path of a YAML file.
-        overrides: Changes to it, such as id=mine splits.train.maps=50 scenarios.hs.severity=0.5.
-        out: File .h5, or a folder for many files; datasets/ID.h5 if not given, datasets/ID for many maps.
-        jobs: Worker processes of this machine; a cluster has its own. The result is the same for any number.
-        seed: Root seed in place of the recipe's; makes other maps of the same classes, under the id ID-seedN.
-        splits: Only these splits, for example [test/std,test/hg]; the same maps as in the whole.
-        first: Number of maps of each split to make, the first of the whole dataset; 0 makes all.
-        shard: Make only this shard of the maps, such as 2/5; the others may be made on other machines.
+        overrides: Changes to it, such as id=mine splits.train.maps=50
+            scenarios.hs.severity=0.5.
+        out: File .h5, or a folder for many files; datasets/ID.h5 if not given,
+            datasets/ID for many maps.
+        jobs: Worker processes of this machine; a cluster has its own. The result is the
+            same for any number.
+        seed: Root seed in place of the recipe's; makes other maps of the same classes,
+            under the id ID-seedN.
+        splits: Only these splits, for example [test/std,test/hg]; the same maps as in
+            the whole.
+        first: Number of maps of each split to make, the first of the whole dataset; 0
+            makes all.
+        shard: Make only this shard of the maps, such as 2/5; the others may be made on
+            other machines.
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
         overwrite: Replace what is there.
@@ -63,8 +72,13 @@ def create(
     for name in choose("splits", splits, chosen.splits):
         spec = chosen.splits[name]
         sizes[name] = replace(spec, maps=min(first or spec.maps, spec.maps))
-    chosen, maps = replace(chosen, splits=sizes), sum(spec.maps for spec in sizes.values())
-    is_folder = own is not None or maps * chosen.height * chosen.width > _MOST_CELLS_OF_A_FILE
+    chosen, maps = (
+        replace(chosen, splits=sizes),
+        sum(spec.maps for spec in sizes.values()),
+    )
+    is_folder = (
+        own is not None or maps * chosen.height * chosen.width > _MOST_CELLS_OF_A_FILE
+    )
     path = Path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}")
     steps = datagen.create_dataset(chosen, path, jobs, scheduler, own, overwrite)
     done, total = next(steps)
@@ -74,7 +88,8 @@ def create(
     if not is_dataset(path):
         print(
             f"{path}: shard {own} is made\n"
-            f"The last shard made in this folder finishes the dataset. Join shards of several folders with\n"
+            "The last shard made in this folder finishes the dataset. Join shards of "
+            "several folders with\n"
             f"benchnav-datagen merge {path} OTHER … --out OUT"
         )
         return
@@ -92,11 +107,16 @@ def list_datasets(folder: str = "") -> None:
     from benchnav.datagen.files.manifest import FOLDER_MANIFEST
     from benchnav.datagen.recipe.recipe import shipped_sizes
 
-    expect(not folder or Path(folder).is_dir(), f"`folder` as a folder that exists, got {folder!r}.")
+    expect(
+        not folder or Path(folder).is_dir(),
+        f"`folder` as a folder that exists, got {folder!r}.",
+    )
     print("recipes:")
     wide = widest(datagen.shipped_recipes())
     for name in datagen.shipped_recipes():
-        sizes = ", ".join(f"{split} {maps}" for split, maps in shipped_sizes(name).items())
+        sizes = ", ".join(
+            f"{split} {maps}" for split, maps in shipped_sizes(name).items()
+        )
         print(f"  {name:{wide}} {sizes}")
     for place in [Path(folder)] if folder else dataset_folders():
         folders = [manifest.parent for manifest in place.glob(f"*/{FOLDER_MANIFEST}")]
@@ -109,13 +129,20 @@ def list_datasets(folder: str = "") -> None:
             except DatasetError as error:
                 print(f"  {path.name:{wide}} not readable: {error}")
                 continue
-            sizes = ", ".join(f"{split} {entry['maps']}" for split, entry in dataset.splits.items())
-            layers = f"; layers {', '.join(dataset.layer_names)}" if dataset.layer_names else ""
+            sizes = ", ".join(
+                f"{split} {entry['maps']}" for split, entry in dataset.splits.items()
+            )
+            layers = (
+                f"; layers {', '.join(dataset.layer_names)}"
+                if dataset.layer_names
+                else ""
+            )
             print(f"  {path.name:{wide}} {dataset.id:14} {sizes}{layers}")
 
 
 def show(file: str, json: bool = False) -> None:
-    """Show what a dataset holds: splits, scenarios, sizes, class table, provenance, digests.
+    """Show what a dataset holds: splits, scenarios, sizes, class table, provenance,
+    digests.
 
     Args:
         file: Path or id of a dataset.
@@ -154,48 +181,62 @@ def validate(file: str) -> int:
         print(line)
     entries = datagen.TerrainDataset(path).splits.values()
     if not faults:
-        print(f"{path}: sound, {sum(entry['maps'] for entry in entries)} maps in {len(entries)} split(s)")
+        print(
+            f"{path}: sound, {sum(entry['maps'] for entry in entries)} maps in "
+            f"{len(entries)} split(s)"
+        )
         return 0
     print(f"{path}: {len(faults)} fault(s)")
     files = sorted({fault.file for fault in faults if fault.file})
     if not all("recipe" in part for entry in entries for part in entry["parts"]):
         print("To mend it, import its maps again.")
     elif files:
-        print(f"To mend it, remove {' '.join(files)} in {path} and give the command that made it again.")
+        print(
+            f"To mend it, remove {' '.join(files)} in {path} and give the command "
+            "that made it again."
+        )
     else:
         print(
-            "To mend it, make the file again with --overwrite. The same recipe and version give the same digests."
+            "To mend it, make the file again with --overwrite. The same recipe and "
+            "version give the same digests."
         )
     return 1
 
 
 def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> None:
-    """Combine datasets of the same grid and classes to one; splits of one name are joined.
+    """Combine datasets of the same grid and classes to one; splits of one name are
+    joined.
 
     Args:
         files: Paths or ids of two or more datasets, or folders with the shards of one.
         out: File .h5 to write, or a folder for many files.
-        id: Id of the new dataset; the name of the file when not given. Shards keep that of their recipe.
+        id: Id of the new dataset; the name of the file when not given. Shards keep that
+            of their recipe.
         overwrite: Replace what is there.
     """
     from benchnav.datagen.files.describe import written
     from benchnav.datagen.files.merge import merge as merge_datasets
 
     path = Path(out)
-    sources = [Path(file) if Path(file).is_dir() else datagen.find_dataset(file) for file in files]
+    sources = [
+        Path(file) if Path(file).is_dir() else datagen.find_dataset(file)
+        for file in files
+    ]
     show_progress(merge_datasets(sources, path, id, overwrite), "maps")
     written(path)
 
 
 def ground(file: str, out: str = "", overwrite: bool = False) -> None:
-    """Write what is known of ground before any of it is seen: statistics of all maps of the split train together.
+    """Write what is known of ground before any of it is seen: statistics of all maps of
+    the split train together.
 
-    Beliefs need them of cells that a robot has not seen yet, and of classes that look alike.
+    Beliefs need them of cells that a robot has not seen yet, and of classes that look
+    alike.
 
     Args:
         file: Path or id of a dataset with a split train.
-        out: File .json to write; beside the dataset, as DATASET.ground.json, when not given. There they are found of
-            any model that brings none of its own.
+        out: File .json to write; beside the dataset, as DATASET.ground.json, when not
+            given. There they are found of any model that brings none of its own.
         overwrite: Replace a file that is there.
     """
     from benchnav.datagen.ground import fit_ground, ground_file
@@ -205,13 +246,21 @@ def ground(file: str, out: str = "", overwrite: bool = False) -> None:
     expect(path.suffix == ".json", f"`out` as a file .json, got {out!r}.")
     expect(
         overwrite or not path.exists(),
-        f"`out` as a new file, got {path}, which exists. Pass --overwrite to replace it.",
+        f"`out` as a new file, got {path}, which exists. Pass --overwrite to replace "
+        "it.",
     )
     found = fit_ground(dataset)
     write_text(path, found.to_json())
     pairs = ", ".join(" and ".join(pair) for pair in found.look_alikes)
-    alike = f"; {pairs} look alike, strength of the field {found.potts_strength:.2f}" if pairs else ""
-    print(f"wrote {path}: λ of {dataset.map_count('train')} maps by {len(found.weights)} Gaussians{alike}")
+    alike = (
+        f"; {pairs} look alike, strength of the field {found.potts_strength:.2f}"
+        if pairs
+        else ""
+    )
+    print(
+        f"wrote {path}: λ of {dataset.map_count('train')} maps by "
+        f"{len(found.weights)} Gaussians{alike}"
+    )
 
 
 def export(
@@ -226,7 +275,8 @@ def export(
     date: str = "",
     overwrite: bool = False,
 ) -> None:
-    """Export a dataset to Parquet files with Croissant metadata, which other tools read without this package.
+    """Export a dataset to Parquet files with Croissant metadata, which other tools read
+    without this package.
 
     Args:
         file: Path or id of a dataset.
@@ -234,8 +284,10 @@ def export(
         splits: Only these splits, for example [test/std,test/hg].
         fields: Only these fields, for example [rgb,class_id].
         maps_per_file: Most maps of a file; 0 makes files of a few hundred MB at most.
-        license: Name in the SPDX list, such as CC-BY-4.0, or a URL; of maps of a shipped recipe MIT when not given.
-        creator: Who made the maps; of maps of a shipped recipe the BenchNav authors when not given.
+        license: Name in the SPDX list, such as CC-BY-4.0, or a URL; of maps of a
+            shipped recipe MIT when not given.
+        creator: Who made the maps; of maps of a shipped recipe the BenchNav authors
+            when not given.
         url: Where the dataset will be found.
         date: Date of publication, YYYY-MM-DD; today when not given.
         overwrite: Replace an exported dataset that is there.
@@ -249,17 +301,23 @@ def export(
     chosen = choose("splits", splits, dataset.splits)
     expect(
         (license and creator) or is_ours(dataset, chosen),
-        f"`license` and `creator` of {dataset.id}, whose maps are not of a shipped recipe, got none. Pass yours; of "
+        f"`license` and `creator` of {dataset.id}, whose maps are not of a shipped "
+        "recipe, got none. Pass yours; of "
         "imported maps those of the elevation model, its classes and photo.",
     )
-    publication = Publication(license=license or "MIT", creator=creator or AUTHORS, url=url, date=date)
+    publication = Publication(
+        license=license or "MIT", creator=creator or AUTHORS, url=url, date=date
+    )
     path = Path(out)
-    steps = export_dataset(dataset, path, publication, chosen, fields, maps_per_file, overwrite)
+    steps = export_dataset(
+        dataset, path, publication, chosen, fields, maps_per_file, overwrite
+    )
     show_progress(steps, "maps")
     files = sorted(path.rglob("*.parquet"))
     size = sum(item.stat().st_size for item in files)
     print(
-        f"wrote {path} ({decimal(size)} in {len(files)} Parquet file{'s' * (len(files) > 1)}, with croissant.json)"
+        f"wrote {path} ({decimal(size)} in {len(files)} Parquet "
+        f"file{'s' * (len(files) > 1)}, with croissant.json)"
     )
 
 
@@ -277,14 +335,20 @@ def preview(
         split: Which split; test/std, or else the first, when not given.
         maps: Which maps; [0, 1, 2] when not given.
         out: Picture to write; preview-SPLIT.png or contact-SPLIT.png when not given.
-        contact_sheet: Thumbnails of the split's maps instead; of a large one, of its first 100.
+        contact_sheet: Thumbnails of the split's maps instead; of a large one, of its
+            first 100.
     """
     from benchnav.datagen.preview import contact_sheet_figure, preview_figure
     from benchnav.viz.style import save
 
     dataset = _opened(file)
-    split = split or ("test/std" if "test/std" in dataset.splits else next(iter(dataset.splits)))
-    path = Path(out or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png")
+    split = split or (
+        "test/std" if "test/std" in dataset.splits else next(iter(dataset.splits))
+    )
+    path = Path(
+        out
+        or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png"
+    )
     expect(
         path.suffix in (".png", ".pdf", ".svg", ".jpg"),
         f"`out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.",
@@ -294,7 +358,11 @@ def preview(
     if contact_sheet:
         figure = contact_sheet_figure(dataset, split)
     else:
-        some = range(min(3, dataset.map_count(split))) if maps is None else sorted(set(maps))
+        some = (
+            range(min(3, dataset.map_count(split)))
+            if maps is None
+            else sorted(set(maps))
+        )
         figure = preview_figure(dataset, split, list(some))
     with replacing(path) as partial:
         save(figure, partial, path.suffix[1:])
@@ -313,7 +381,9 @@ COMMANDS = {
     "validate": Command(validate, ("file",)),
     "merge": Command(merge, ("files",)),
     "import-dem": Command(import_dem, ("dem", "overrides"), repeated=("layer",)),
-    "import-drives": Command(import_drives, ("drives", "overrides"), repeated=("layer",)),
+    "import-drives": Command(
+        import_drives, ("drives", "overrides"), repeated=("layer",)
+    ),
     "ground": Command(ground, ("file",)),
     "export": Command(export, ("file",)),
     "preview": Command(preview, ("file",)),
@@ -322,8 +392,13 @@ COMMANDS = {
 
 def main() -> None:
     """Entry point of `benchnav-datagen`."""
-    description = "Make, list, show, check, combine, import, export and draw terrain datasets."
+    description = (
+        "Make, list, show, check, combine, import, export and draw terrain datasets."
+    )
     status = run("benchnav-datagen", description, COMMANDS)
     if status == INTERRUPTED and sys.argv[1] == "create":
-        tell("benchnav-datagen: finished maps are kept; to go on, give the same command again")
+        tell(
+            "benchnav-datagen: finished maps are kept; to go on, give the same "
+            "command again"
+        )
     sys.exit(status)

@@ -1,11 +1,14 @@
-"""Statistics of the ground of all training maps together: how they are fitted, and where they are found.
+"""Statistics of the ground of all training maps together: how they are fitted, and
+where they are found.
 
-They say what is known of a cell that nobody has seen: one mixture of λ, never keyed by environment, and the mean of
-every layer; and how strongly two classes of one colour hang together. Letters in shapes: B maps, H×W cells, N bins,
-K components, P pairs of classes.
+They say what is known of a cell that nobody has seen: one mixture of λ, never keyed by
+environment, and the mean of every layer; and how strongly two classes of one colour
+hang together. Letters in shapes: B maps, H×W cells, N bins, K components, P pairs of
+    classes.
 
-Sources: Dempster et al. (1977), "Maximum likelihood from incomplete data via the EM algorithm"; Besag (1975),
-"Statistical analysis of non-lattice data" (pseudo-likelihood).
+Sources: Dempster et al. (1977), "Maximum likelihood from incomplete data via the EM
+algorithm"; Besag (1975), "Statistical analysis of non-lattice data"
+(pseudo-likelihood).
 """
 
 from collections.abc import Sequence
@@ -27,20 +30,33 @@ from benchnav.datagen.schema import Maps
 
 TRAIN = "train"
 
-_SEEN_LAYERS = ("rgb", "elevation_m", "slope_deg")  # which an `Observation` has beside those of the dataset
+_SEEN_LAYERS = (
+    "rgb",
+    "elevation_m",
+    "slope_deg",
+)  # which an `Observation` has beside those of the dataset
 _BINS = 1024  # of λ between 0 and 1
 _COMPONENTS = 8
 _STEPS = 1000  # of EM
 _LEAST_STD = 2 / _BINS
-# What lies at 0 and 1 beyond the tails of the others is of two components far outside, which are clipped whole.
+# What lies at 0 and 1 beyond the tails of the others is of two components far outside,
+# which are clipped whole.
 _ATOMS = ((-1.0, 0.1), (2.0, 0.1))
 _DIGITS = 6
-# Settings of recipes that say which ground there is; the scenario of `train` is std in all that are shipped.
+# Settings of recipes that say which ground there is; the scenario of `train` is std in
+# all that are shipped.
 _OF_GROUND = (
-    "synthesis", "classes", "occupancy", "environments", "class_periods_m", "resolution_m", "correlation_m",
+    "synthesis",
+    "classes",
+    "occupancy",
+    "environments",
+    "class_periods_m",
+    "resolution_m",
+    "correlation_m",
     "layers",
-)  # fmt: skip
-_PRIOR_STD = 10.0  # of fields and strength, so that both are finite where classes are never mixed
+)
+# of fields and strength, so that both are finite where classes are never mixed
+_PRIOR_STD = 10.0
 
 
 def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
@@ -64,7 +80,8 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
             neighbours[place] += count_neighbours(maps["class_id"], pair)
     if not inner.sum() + ends.sum():
         raise DatasetError(
-            f"Expected cells of known traversability in split {TRAIN} of {dataset.path}, got none. "
+            f"Expected cells of known traversability in split {TRAIN} of "
+            f"{dataset.path}, got none. "
             "Statistics of the ground need them."
         )
     weights, means, stds = (_rounded(values) for values in fit_mixture(inner, ends))
@@ -80,7 +97,8 @@ def fit_ground(dataset: TerrainDataset) -> GroundStatistics:
 
 
 def layer_means(dataset: TerrainDataset) -> dict[str, tuple[float, ...]]:
-    """Means of the layers of the split `train` over their known cells, by name; of directions the mean direction.
+    """Means of the layers of the split `train` over their known cells, by name; of
+    directions the mean direction.
 
     Returns:
         Of `rgb` three numbers, of any other layer one, in its unit.
@@ -100,10 +118,11 @@ def look_alike_pairs(recipe: Recipe) -> list[tuple[int, int]]:
 
 
 def fit_mixture(inner: ndarray, ends: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Fits a Gaussian mixture clipped to [0, 1] to counts of λ, by expectation and maximisation.
+    """Fits a Gaussian mixture clipped to [0, 1] to counts of λ, by expectation and
+    maximisation.
 
-    What is at 0 or 1 is clipped: it counts by the moments of the components beyond the end. Two more components, far
-    outside, take what the others do not explain there.
+    What is at 0 or 1 is clipped: it counts by the moments of the components beyond the
+    end. Two more components, far outside, take what the others do not explain there.
 
     Args:
         inner: counts of bins of equal width between 0 and 1, shape [N].
@@ -112,7 +131,10 @@ def fit_mixture(inner: ndarray, ends: ndarray) -> tuple[ndarray, ndarray, ndarra
     Returns:
         Weights, means and standard deviations before clipping, each of shape [K + 2].
     """
-    total, share = inner.sum() + ends.sum(), (np.arange(_COMPONENTS) + 0.5) / _COMPONENTS
+    total, share = (
+        inner.sum() + ends.sum(),
+        (np.arange(_COMPONENTS) + 0.5) / _COMPONENTS,
+    )
     centre = (np.arange(len(inner)) + 0.5) / len(inner)
     order = inner.cumsum() / max(inner.sum(), 1)
     means = centre[np.searchsorted(order, share).clip(max=len(inner) - 1)]
@@ -123,7 +145,9 @@ def fit_mixture(inner: ndarray, ends: ndarray) -> tuple[ndarray, ndarray, ndarra
         own = weights[:_COMPONENTS, None]
         z = (centre - means[:, None]) / stds[:, None]
         density = own * _density(z) / stds[:, None]
-        inside = inner * density / density.sum(0).clip(min=1e-300)  # counts that belong to each component
+        inside = (
+            inner * density / density.sum(0).clip(min=1e-300)
+        )  # counts that belong to each component
         # Beyond each end, by its distance in standard deviations outwards.
         reach = np.stack([means, 1 - means], 1) / stds[:, None]
         tail = ndtr(-reach)
@@ -135,9 +159,16 @@ def fit_mixture(inner: ndarray, ends: ndarray) -> tuple[ndarray, ndarray, ndarra
         second = 1 + reach * first
         counts = inside.sum(1) + beyond.sum(1)
         outward = np.array([-1, 1])
-        shift = ((inside * z).sum(1) + (beyond * first * outward).sum(1)) / counts.clip(min=1e-300)
-        square = ((inside * z**2).sum(1) + (beyond * second).sum(1)) / counts.clip(min=1e-300)
-        means, stds = means + stds * shift, stds * np.sqrt((square - shift**2).clip(min=0))
+        shift = ((inside * z).sum(1) + (beyond * first * outward).sum(1)) / counts.clip(
+            min=1e-300
+        )
+        square = ((inside * z**2).sum(1) + (beyond * second).sum(1)) / counts.clip(
+            min=1e-300
+        )
+        means, stds = (
+            means + stds * shift,
+            stds * np.sqrt((square - shift**2).clip(min=0)),
+        )
         stds = stds.clip(min=_LEAST_STD)
         weights = np.concatenate([counts, left]) / total
         atoms = weights[-2:]
@@ -153,39 +184,56 @@ def count_neighbours(class_id: ndarray, pair: tuple[int, int]) -> ndarray:
         pair: ids of the classes a and b.
 
     Returns:
-        How many cells there are by n_a − n_b + 4, the neighbours of the pair alone counted, and by whether they are
-        of a; shape [9, 2].
+        How many cells there are by n_a − n_b + 4, the neighbours of the pair alone
+        counted, and by whether they are of a; shape [9, 2].
     """
     sign = (class_id == pair[0]).astype(np.int8) - (class_id == pair[1]).astype(np.int8)
     framed = np.pad(sign, ((0, 0), (1, 1), (1, 1)))
-    around = framed[:, :-2, 1:-1] + framed[:, 2:, 1:-1] + framed[:, 1:-1, :-2] + framed[:, 1:-1, 2:]
+    around = (
+        framed[:, :-2, 1:-1]
+        + framed[:, 2:, 1:-1]
+        + framed[:, 1:-1, :-2]
+        + framed[:, 1:-1, 2:]
+    )
     own = sign != 0
-    return np.bincount(2 * (around[own] + 4) + (sign[own] > 0), minlength=18).reshape(9, 2)
+    return np.bincount(2 * (around[own] + 4) + (sign[own] > 0), minlength=18).reshape(
+        9, 2
+    )
 
 
 def fit_potts_strength(neighbours: ndarray) -> float:
-    """Fits β of P(cell is a | its neighbours) = σ(h + β·(n_a − n_b)) by maximum pseudo-likelihood, by Newton's method.
+    """Fits β of P(cell is a | its neighbours) = σ(h + β·(n_a − n_b)) by maximum
+    pseudo-likelihood, by Newton's method.
 
     Args:
-        neighbours: counts of each pair, as `count_neighbours` gives them, shape [P, 9, 2]. Each pair has a field h of
-            its own, for the shares of its classes.
+        neighbours: counts of each pair, as `count_neighbours` gives them, shape [P, 9,
+            2]. Each pair has a field h of its own, for the shares of its classes.
     """
     pairs, difference = len(neighbours), np.arange(-4, 5)
     design = np.zeros((pairs, 9, pairs + 1))
     design[..., -1] = difference
     for place in range(pairs):
         design[place, :, place] = 1
-    rows, of_a, count = design.reshape(-1, pairs + 1), neighbours[..., 1].ravel(), neighbours.sum(-1).ravel()
+    rows, of_a, count = (
+        design.reshape(-1, pairs + 1),
+        neighbours[..., 1].ravel(),
+        neighbours.sum(-1).ravel(),
+    )
     found, precision = np.zeros(pairs + 1), 1 / _PRIOR_STD**2
 
     def loss(at: ndarray) -> float:
         logit = rows @ at
-        return float((count * np.logaddexp(0, logit) - of_a * logit).sum() + precision * at @ at / 2)
+        return float(
+            (count * np.logaddexp(0, logit) - of_a * logit).sum()
+            + precision * at @ at / 2
+        )
 
     for _ in range(100):
         chance = expit(rows @ found)
         slope = rows.T @ (of_a - count * chance) - precision * found
-        curvature = (rows.T * (count * chance * (1 - chance))) @ rows + precision * np.eye(pairs + 1)
+        curvature = (
+            rows.T * (count * chance * (1 - chance))
+        ) @ rows + precision * np.eye(pairs + 1)
         step = np.linalg.solve(curvature, slope)
         while loss(found + step) > loss(found) and np.abs(step).max() > 1e-12:
             step = step / 2
@@ -197,11 +245,14 @@ def fit_potts_strength(neighbours: ndarray) -> float:
 
 def ground_file(path: Path) -> Path:
     """Where the statistics of a dataset's ground are kept: beside its file or folder."""
-    return path.with_name(f"{path.stem if path.suffix == '.h5' else path.name}.ground.json")
+    return path.with_name(
+        f"{path.stem if path.suffix == '.h5' else path.name}.ground.json"
+    )
 
 
 def find_ground(dataset: TerrainDataset) -> GroundStatistics | None:
-    """Finds statistics of a dataset's ground: those beside it, else those of the shipped recipe of its maps.
+    """Finds statistics of a dataset's ground: those beside it, else those of the
+    shipped recipe of its maps.
 
     Args:
         dataset: of any splits, of which `train` need not be one.
@@ -219,7 +270,9 @@ def find_ground(dataset: TerrainDataset) -> GroundStatistics | None:
 
 
 def _is_ground_of(shipped: Recipe, recipe: Recipe) -> bool:
-    """Tells whether maps of a recipe are on the ground of a shipped one, whatever their size, number and light."""
+    """Tells whether maps of a recipe are on the ground of a shipped one, whatever their
+    size, number and light.
+    """
     return all(getattr(recipe, name) == getattr(shipped, name) for name in _OF_GROUND)
 
 
@@ -230,7 +283,13 @@ def _sums_of(name: str, maps: Maps) -> ndarray:
         return np.array([*values.sum((0, 2, 3), dtype=np.float64), values[:, 0].size])
     known = values[np.isfinite(values)].astype(np.float64)
     if is_azimuth(name):
-        return np.array([np.cos(np.deg2rad(known)).sum(), np.sin(np.deg2rad(known)).sum(), known.size])
+        return np.array(
+            [
+                np.cos(np.deg2rad(known)).sum(),
+                np.sin(np.deg2rad(known)).sum(),
+                known.size,
+            ]
+        )
     return np.array([known.sum(), 0, known.size])
 
 

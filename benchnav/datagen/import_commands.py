@@ -1,4 +1,5 @@
-"""The commands that import real ground: `benchnav-datagen import-dem` and `import-drives`.
+"""The commands that import real ground: `benchnav-datagen import-dem` and
+`import-drives`.
 
 What is heavy is imported where it is called, so that the command's help is quick.
 """
@@ -30,9 +31,12 @@ class ImportOptions:
     Args:
         out: File .h5 to write, or a folder for many files.
         id: Id of the dataset; the name of the output when not given.
-        recipe: Id or path of a recipe that gives size, resolution, start, goal, class table and light.
-        stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
-        solvable: Keep only maps whose goal can be reached, and store the grid reference time.
+        recipe: Id or path of a recipe that gives size, resolution, start, goal, class
+            table and light.
+        stride: Metres from one map to the next; a map's width when not given. Less
+            makes maps of a split overlap.
+        solvable: Keep only maps whose goal can be reached, and store the grid reference
+            time.
         overwrite: Replace what is there.
     """
 
@@ -55,7 +59,8 @@ def import_dem(
 ) -> None:
     """Make a dataset from a real elevation model; needs the extra benchnav[geo].
 
-    Rasters may be anything that GDAL opens: files, https:// and s3:// addresses, zip:// archives, mosaics (.vrt).
+    Rasters may be anything that GDAL opens: files, https:// and s3:// addresses, zip://
+        archives, mosaics (.vrt).
 
     Args:
         rasters: What there is of the ground beside its elevation.
@@ -63,14 +68,19 @@ def import_dem(
         options: What is made of it.
         dem: Raster of elevations, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
-        splits: Splits and their shares of the maps, such as train:0.7,valid:0.1,test/site:0.2; no two of them touch.
+        splits: Splits and their shares of the maps, such as
+            train:0.7,valid:0.1,test/site:0.2; no two of them touch.
         scenario: Which of the recipe's scenarios lights the maps.
     """
-    dataset = _import(options, overrides, splits, ground, scenario, dem=dem, rasters=rasters)
+    dataset = _import(
+        options, overrides, splits, ground, scenario, dem=dem, rasters=rasters
+    )
     for split, entry in dataset.splits.items():
         left_out = entry["parts"][0]["source"]["left_out"]
         between = left_out.pop("between_splits")
-        reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in left_out.items())
+        reasons = ", ".join(
+            f"{count} {reason.replace('_', ' ')}" for reason, count in left_out.items()
+        )
         print(f"  left out of {split}: {reasons}")
         _tell_unlabelled(dataset, split)
         _tell_groups(dataset, split)
@@ -92,44 +102,68 @@ def import_drives(
     speed: Literal["", "positions", "measured"] = "",
     splits: str = "train:0.6,valid:0.2,test/site:0.2",
 ) -> None:
-    """Make a dataset of measured traversability from a robot's drives; needs the extra benchnav[geo].
+    """Make a dataset of measured traversability from a robot's drives; needs the extra
+    benchnav[geo].
 
-    Traversability is measured over commanded speed, of each cell the mean. Rasters are as for import-dem.
+    Traversability is measured over commanded speed, of each cell the mean. Rasters are
+    as for import-dem.
 
     Args:
         ground: How the elevation model is read and cut.
         options: What is made of them.
-        drives: Log, a file .csv, .tsv, one of these with .gz, or .parquet, with the columns time_s, x_m and y_m (in the
-            coordinate reference system of the elevation model) or longitude_deg and latitude_deg, commanded_m_s,
+        drives: Log, a file .csv, .tsv, one of these with .gz, or .parquet, with the
+            columns time_s, x_m and y_m (in the coordinate reference system of the
+            elevation model) or longitude_deg and latitude_deg, commanded_m_s,
             measured_m_s and, of several drives, drive.
         dem: Raster of elevations, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
         photo: Raster of red, green and blue; painted by the class when not given.
         classes: Raster of terrain classes; no cell has one when not given.
-        class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
-        layer: Optional fields as [NAME=RASTER, NAME=RASTER:UNIT], such as [vegetation_m=canopy.tif].
-        least_speed: Least commanded speed, forward or backward, of rows that are used, m/s.
-        speed: Source of the speed over ground: positions, or measured as logged, whatever positions say. If empty,
-            measured speed that agrees with positions.
-        splits: Splits and their shares of the maps; no two of them touch, and each drive belongs to one.
+        class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}',
+            null for no label; else indices.
+        layer: Optional fields as [NAME=RASTER, NAME=RASTER:UNIT], such as
+            [vegetation_m=canopy.tif].
+        least_speed: Least commanded speed, forward or backward, of rows that are used,
+            m/s.
+        speed: Source of the speed over ground: positions, or measured as logged,
+            whatever positions say. If empty, measured speed that agrees with positions.
+        splits: Splits and their shares of the maps; no two of them touch, and each
+            drive belongs to one.
     """
     from benchnav.datagen.dem.drive_log import Drives
     from benchnav.datagen.dem.importer import REASONS
 
     expect(
         photo or classes,
-        "`photo` or `classes` with `drives`, got neither, so that no input shows where λ is low. Pass --photo RASTER.",
+        "`photo` or `classes` with `drives`, got neither, so that no input shows "
+        "where λ is low. Pass --photo RASTER.",
     )
-    rasters = Rasters(photo=photo, classes=classes, class_ids=class_ids, layer=layer, unlabelled=not classes)
+    rasters = Rasters(
+        photo=photo,
+        classes=classes,
+        class_ids=class_ids,
+        layer=layer,
+        unlabelled=not classes,
+    )
     log = Drives(file=drives, least_speed=least_speed, speed=speed)
-    dataset = _import(options, overrides, splits, ground, dem=dem, rasters=rasters, drives=log)
-    sources = {split: entry["parts"][0]["source"] for split, entry in dataset.splits.items()}
+    dataset = _import(
+        options, overrides, splits, ground, dem=dem, rasters=rasters, drives=log
+    )
+    sources = {
+        split: entry["parts"][0]["source"] for split, entry in dataset.splits.items()
+    }
     about = next(iter(sources.values()))["drives"]
     print(_sum_up(about))
     for split, source in sources.items():
-        print(f"  {split}: {about['used'][split]} rows of {_few(about['drives'][split])}")
+        print(
+            f"  {split}: {about['used'][split]} rows of {_few(about['drives'][split])}"
+        )
         counts = source["left_out"]
-        reasons = [f"{counts[reason]} maps {why}" for reason, why in REASONS.items() if counts.get(reason)]
+        reasons = [
+            f"{counts[reason]} maps {why}"
+            for reason, why in REASONS.items()
+            if counts.get(reason)
+        ]
         if reasons:
             print(f"  left out of {split}: {', '.join(reasons)}")
         if classes:
@@ -141,7 +175,10 @@ def _sum_up(about: Mapping[str, Any]) -> str:
     """What was used of a log and what was not, in sentences."""
     from benchnav.datagen.dem.drive_log import REASONS
 
-    lines = [f"{sum(about['used'].values())} of {about['rows']} rows of {about['file']} were used"]
+    lines = [
+        f"{sum(about['used'].values())} of {about['rows']} rows of {about['file']} "
+        "were used"
+    ]
     lines += [
         f"{count} rows are left out: they {REASONS[reason]}"
         for reason, count in about["left_out"].items()
@@ -151,17 +188,20 @@ def _sum_up(about: Mapping[str, Any]) -> str:
     beyond = about["beyond"]
     if any(beyond.values()):
         lines.append(
-            f"{beyond['below_0']} rows have λ below 0 (sliding back, or noise) and {beyond['above_1']} above 1 (faster "
+            f"{beyond['below_0']} rows have λ below 0 (sliding back, or noise) and "
+            f"{beyond['above_1']} above 1 (faster "
             "than the command); they are stored as 0 and 1"
         )
     if over := beyond["above_1.2"]:
         lines.append(
-            f"{over} rows exceed 1.2 times the command: if steady driving on flat, firm terrain does, scale "
+            f"{over} rows exceed 1.2 times the command: if steady driving on flat, "
+            "firm terrain does, scale "
             "`commanded_m_s`"
         )
     if about["standing"]:
         lines.append(
-            f"{about['standing']} rows have a position that stays the same under command, and no measured speed; the "
+            f"{about['standing']} rows have a position that stays the same under "
+            "command, and no measured speed; the "
             "robot counts as immobilised there"
         )
     return "\n  ".join([*lines, *_doubts(about)])
@@ -175,21 +215,29 @@ def _doubts(about: Mapping[str, Any]) -> list[str]:
     below, period_s = about["beyond"]["below_0"], about["period_s"] or 0
     if by_positions and below > _MOST_BACK * sum(about["used"].values()):
         doubts.append(
-            f"more than {_MOST_BACK:.0%} of rows slide back by their positions, which looks wrong: a robot that "
-            "turned on the spot under its command looks the same. Log a command of 0 there"
+            f"more than {_MOST_BACK:.0%} of rows slide back by their positions, which "
+            "looks wrong: a robot that "
+            "turned on the spot under its command looks the same. Log a command of 0 "
+            "there"
         )
     if by_positions and period_s > MAX_PERIOD_S:
         doubts.append(
-            f"positions come every {period_s:g} s, too seldom to distinguish sliding back from turning, so that "
+            f"positions come every {period_s:g} s, too seldom to distinguish sliding "
+            "back from turning, so that "
             "rows that slide back have λ above 0"
         )
-    if not by_positions and about["reverses"] > _FEW_REVERSES * sum(about["used"].values()):
+    if not by_positions and about["reverses"] > _FEW_REVERSES * sum(
+        about["used"].values()
+    ):
         doubts.append(
-            f"positions reverse in {about['reverses']} rows, measured_m_s never does: where the robot did not turn "
+            f"positions reverse in {about['reverses']} rows, measured_m_s never does: "
+            "where the robot did not turn "
             "round, it slid back, and speed has to be negative"
         )
     if about["resolution_m"] > _COARSE_M:
-        doubts.append(f"positions are multiples of {about['resolution_m']:g} m: log more decimals")
+        doubts.append(
+            f"positions are multiples of {about['resolution_m']:g} m: log more decimals"
+        )
     return doubts
 
 
@@ -197,11 +245,18 @@ def _say_motion(about: Mapping[str, Any]) -> str:
     """Compare positions with both speeds, in a sentence."""
     ratios = (
         f"{about[name]:g} times as far as {column} says"
-        for name, column in (("pace", "measured_m_s"), ("commanded_pace", "commanded_m_s"))
+        for name, column in (
+            ("pace", "measured_m_s"),
+            ("commanded_pace", "commanded_m_s"),
+        )
         if about[name] is not None
     )
     compared = " and ".join(ratios) or "too little to be compared with speeds"
-    source = {"": "", "positions": "; speeds are those of positions", "measured": "; speeds are as logged"}
+    source = {
+        "": "",
+        "positions": "; speeds are those of positions",
+        "measured": "; speeds are as logged",
+    }
     return f"positions move {compared}{source[about['speed']]}"
 
 
@@ -227,8 +282,11 @@ def _import(
 
     path = Path(options.out)
     name = options.id or name_of(path)
-    used = f"splits={{imported: {{scenario: {scenario}, maps: 1}}}}"  # so that others need not fit the maps
-    chosen = datagen.load_recipe(options.recipe, [f"id={name}", used, *overrides] if overrides else [])
+    # so that others need not fit the maps
+    used = f"splits={{imported: {{scenario: {scenario}, maps: 1}}}}"
+    chosen = datagen.load_recipe(
+        options.recipe, [f"id={name}", used, *overrides] if overrides else []
+    )
     if options.id or not overrides:
         chosen = replace(chosen, id=name)
     cut = Cut(
@@ -239,7 +297,12 @@ def _import(
         ground=ground,
     )
     steps = import_maps(
-        out=path, recipe=chosen, cut=cut, overwrite=options.overwrite, announce=print, **settings
+        out=path,
+        recipe=chosen,
+        cut=cut,
+        overwrite=options.overwrite,
+        announce=print,
+        **settings,
     )
     try:
         show_progress(steps, "maps")
@@ -249,10 +312,14 @@ def _import(
 
 
 def _with_command(error: "GroundError", overrides: Sequence[str]) -> ConfigError:
-    """Return an error whose message ends in the user's command with settings that fit the ground."""
+    """Return an error whose message ends in the user's command with settings that fit
+    the ground.
+    """
     if not error.settings and error.stride_m is None:
         return ConfigError(f"{error.problem} Or take a larger raster.")
-    unchanged = [text for text in overrides if text.partition("=")[0] not in error.changes]
+    unchanged = [
+        text for text in overrides if text.partition("=")[0] not in error.changes
+    ]
     words, remaining = [], [word for word in sys.argv[1:] if word not in overrides]
     while remaining:
         word = remaining.pop(0)
@@ -261,18 +328,25 @@ def _with_command(error: "GroundError", overrides: Sequence[str]) -> ConfigError
         elif not word.startswith("--stride="):
             words.append(word)
     stride = [] if error.stride_m is None else ["--stride", f"{error.stride_m:.10g}"]
-    command = shlex.join([Path(sys.argv[0]).name, *words, *unchanged, *error.settings, *stride])
+    command = shlex.join(
+        [Path(sys.argv[0]).name, *words, *unchanged, *error.settings, *stride]
+    )
     return ConfigError(error.advise(command))
 
 
 def _tell_unlabelled(dataset: "datagen.TerrainDataset", split: str) -> None:
     """Print how many cells of maps have no class."""
     entry, grid = dataset.splits[split], dataset.grid
-    counts = [count for part in entry["parts"] for count in part["source"]["unlabelled"]]
+    counts = [
+        count for part in entry["parts"] for count in part["source"]["unlabelled"]
+    ]
     if any(counts):
         maps = sum(count > 0 for count in counts)
         cells = len(counts) * grid.height * grid.width
-        print(f"  unlabelled in {split}: {sum(counts)} of {cells} cells, on {maps} of {len(counts)} maps")
+        print(
+            f"  unlabelled in {split}: {sum(counts)} of {cells} cells, on {maps} of "
+            f"{len(counts)} maps"
+        )
 
 
 def _tell_groups(dataset: "datagen.TerrainDataset", split: str) -> None:
@@ -280,6 +354,7 @@ def _tell_groups(dataset: "datagen.TerrainDataset", split: str) -> None:
     if "group" in dataset.fields:
         groups = len(set(dataset.read(split, fields=["group"])["group"].tolist()))
         print(
-            f"  {dataset.map_count(split)} maps of {split} overlap and form {groups} group(s), the statistical unit. "
+            f"  {dataset.map_count(split)} maps of {split} overlap and form {groups} "
+            "group(s), the statistical unit. "
             "Leave --stride out of test splits, so that their maps do not overlap"
         )

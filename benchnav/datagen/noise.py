@@ -1,6 +1,7 @@
 """Smooth noise of named random streams, which classes and layers are laid out by.
 
-Batched NumPy in float64, the same on every machine. Letters in shapes: B maps, H×W cells.
+Batched NumPy in float64, the same on every machine. Letters in shapes: B maps, H×W
+cells.
 
 Source: Perlin (2002), "Improving noise".
 """
@@ -20,7 +21,8 @@ def fractal_perlin(
     shape: tuple[int, int],
     periods: Sequence[float],
 ) -> ndarray:
-    """Sums octaves of Perlin noise, each weighted by its period, so that large shapes dominate.
+    """Sums octaves of Perlin noise, each weighted by its period, so that large shapes
+    dominate.
 
     Args:
         seed: root of the random streams, one an octave.
@@ -39,20 +41,27 @@ def fractal_perlin(
         key = rng.stream_key(seed, *names, octave)
         draws = rng.uniform(key, indices, (lattice[0] * lattice[1] + 2,))
         angle = 2 * np.pi * draws[:, 2:].reshape(-1, *lattice)
-        # A random phase, so that the lattice does not stand at the same place in every map.
+        # A random phase, so that the lattice does not stand at the same place in every
+        # map.
         rows = (np.arange(height) + 0.5) / period + draws[:, 0, None]
         columns = (np.arange(width) + 0.5) / period + draws[:, 1, None]
-        # Σ over a cell's four corners of fade_y·fade_x·(g_y·Δy + g_x·Δx) is separable: the weights of
-        # rows and of columns are matrices around the lattice's gradients.
+        # Σ over a cell's four corners of fade_y·fade_x·(g_y·Δy + g_x·Δx) is separable:
+        # the weights of rows and of columns are matrices around the lattice's
+        # gradients.
         weight_y, offset_y = _corner_weights(rows, lattice[0])
-        weight_x, offset_x = (np.swapaxes(w, 1, 2) for w in _corner_weights(columns, lattice[1]))
-        noise = offset_y @ (np.sin(angle) @ weight_x) + weight_y @ (np.cos(angle) @ offset_x)
+        weight_x, offset_x = (
+            np.swapaxes(w, 1, 2) for w in _corner_weights(columns, lattice[1])
+        )
+        noise = offset_y @ (np.sin(angle) @ weight_x) + weight_y @ (
+            np.cos(angle) @ offset_x
+        )
         octaves.append(period * noise)
     return sum(octaves[1:], octaves[0]) / sum(periods)
 
 
 def _corner_weights(position: ndarray, lattice: int) -> tuple[ndarray, ndarray]:
-    """Fade weights of the lattice points next to each position, alone and times the signed distance.
+    """Fade weights of the lattice points next to each position, alone and times the
+    signed distance.
 
     Args:
         position: in lattice spacings, shape [B, N].

@@ -1,9 +1,11 @@
-"""Pictures of maps: a sheet for a paper, a row a map, and a contact sheet of a whole split.
+"""Pictures of maps: a sheet for a paper, a row a map, and a contact sheet of a whole
+split.
 
-Lengths are in inches from the upper left corner and text is in points, as printed over the two columns
-of a page. A class has one colour in every map and figure, its own of the class table; of classes that look alike
-all but the first are drawn lighter or darker.
-Where the classes have soft spots, the ground that may hide them is hatched and outlined.
+Lengths are in inches from the upper left corner and text is in points, as printed over
+the two columns of a page. A class has one colour in every map and figure, its own of
+the class table; of classes that look alike all but the first are drawn lighter or
+darker. Where the classes have soft spots, the ground that may hide them is hatched and
+outlined.
 """
 
 import textwrap
@@ -22,7 +24,14 @@ from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.datagen.synth.appearance import light_direction, shade
 from benchnav.datagen.synth.elevation import framed, horn_gradient
-from benchnav.viz.maps import draw_lines, hatching, lacking_handle, mark, mark_handle, show_map
+from benchnav.viz.maps import (
+    draw_lines,
+    hatching,
+    lacking_handle,
+    mark,
+    mark_handle,
+    show_map,
+)
 from benchnav.viz.sheet import (
     LETTER,
     LINE,
@@ -44,8 +53,11 @@ _MAX_THUMBNAILS = 100
 _MARK_SIZE = 0.75
 
 
-def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) -> Figure:
-    """Draws maps of a split, a row each, layers to the right; the panel of a field has the label `FIELD ROW`.
+def preview_figure(
+    dataset: TerrainDataset, split: str, indices: Sequence[int]
+) -> Figure:
+    """Draws maps of a split, a row each, layers to the right; the panel of a field has
+    the label `FIELD ROW`.
 
     Args:
         dataset: where the maps are.
@@ -61,7 +73,8 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     layers = dataset.layer_names
     maps = dataset.read(split, indices, (*FIELDS, *layers, "start_m", "goal_m"))
     maps["rgb"] = np.moveaxis(maps["rgb"], 1, -1)
-    # Heights over each map's lowest point compare between maps; heights over a datum seldom do.
+    # Heights over each map's lowest point compare between maps; heights over a datum
+    # seldom do.
     maps["elevation_m"] -= maps["elevation_m"].min((1, 2), keepdims=True)
     classes, grid = dataset.recipe.classes, dataset.grid
     unlabelled = maps["class_id"] == UNLABELLED
@@ -77,17 +90,33 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     columns = [
         SheetColumn("rgb", "RGB", maps["rgb"]),
         SheetColumn("class_id", "Class", maps["class_id"], class_scale(colours)),
-        SheetColumn("elevation_m", "Elevation [m]", maps["elevation_m"], relief, contours),
+        SheetColumn(
+            "elevation_m", "Elevation [m]", maps["elevation_m"], relief, contours
+        ),
         SheetColumn("slope_deg", "Slope [°]", maps["slope_deg"], slopes, "", "max"),
-        SheetColumn("traversability", "Traversability λ", maps["traversability"], SHARES, ""),
+        SheetColumn(
+            "traversability", "Traversability λ", maps["traversability"], SHARES, ""
+        ),
         *(layer_column(name, maps[name], dataset.fields[name].unit) for name in layers),
     ]
     names = [f"{number} {classes[number].name.replace('_', ' ')}" for number in shown]
-    marks: list[Artist] = [mark_handle(name, scale=_MARK_SIZE) for name in ("start", "goal")]
-    if unlabelled.any() or any(np.isnan(maps[name]).any() for name in ("traversability", *layers)):
+    marks: list[Artist] = [
+        mark_handle(name, scale=_MARK_SIZE) for name in ("start", "goal")
+    ]
+    if unlabelled.any() or any(
+        np.isnan(maps[name]).any() for name in ("traversability", *layers)
+    ):
         marks.append(lacking_handle())
     if soft.any():
-        marks.append(Patch(facecolor="white", ec="black", lw=0.5, hatch=_HATCH, label="may hide soft spots"))
+        marks.append(
+            Patch(
+                facecolor="white",
+                ec="black",
+                lw=0.5,
+                hatch=_HATCH,
+                label="may hide soft spots",
+            )
+        )
     figure = sheet_of_maps(
         columns,
         [f"map {index}" for index in indices],
@@ -106,24 +135,48 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
         crossed = levels[(levels > heights.min()) & (levels < heights.max())]
         if len(crossed):
             panels[f"elevation_m {row}"].contour(
-                x, y, heights, levels=crossed, colors="black", linewidths=0.35, alpha=0.7
+                x,
+                y,
+                heights,
+                levels=crossed,
+                colors="black",
+                linewidths=0.35,
+                alpha=0.7,
             )
         if soft[row].any():
-            draw_lines(panels[f"class_id {row}"], hatching(soft[row], resolution_m), "black", 0.4)
+            draw_lines(
+                panels[f"class_id {row}"],
+                hatching(soft[row], resolution_m),
+                "black",
+                0.4,
+            )
             for name in ("class_id", "traversability"):
-                draw_lines(panels[f"{name} {row}"], outline(soft[row], resolution_m), "black", 0.4, "white")
+                draw_lines(
+                    panels[f"{name} {row}"],
+                    outline(soft[row], resolution_m),
+                    "black",
+                    0.4,
+                    "white",
+                )
         for column in columns:
             for name in ("start", "goal"):
-                mark(panels[f"{column.name} {row}"], name, maps[f"{name}_m"][row], _MARK_SIZE, clip_on=False)
+                mark(
+                    panels[f"{column.name} {row}"],
+                    name,
+                    maps[f"{name}_m"][row],
+                    _MARK_SIZE,
+                    clip_on=False,
+                )
     panels["elevation_m bar"].vlines(levels, 0, 1, color="black", lw=0.35, alpha=0.7)
     return figure
 
 
 def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
-    """Draws a thumbnail of the colour image of every map of a split, of its first hundred, in order, row by row.
+    """Draws a thumbnail of the colour image of every map of a split, of its first
+    hundred, in order, row by row.
 
-    Where the classes have soft spots, the ground that may hide them is outlined, and the stored λ stands
-    to the right of each image.
+    Where the classes have soft spots, the ground that may hide them is outlined, and
+    the stored λ stands to the right of each image.
 
     Args:
         dataset: where the maps are.
@@ -136,48 +189,81 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
         DatasetError: there is no such split, or its data are damaged.
     """
     held, grid, classes = dataset.map_count(split), dataset.grid, dataset.recipe.classes
-    fields = ("rgb", "class_id", "traversability") if any(item.soft for item in classes) else ("rgb",)
+    fields = (
+        ("rgb", "class_id", "traversability")
+        if any(item.soft for item in classes)
+        else ("rgb",)
+    )
     across = grid.width * (2 if len(fields) > 1 else 1)
     count, ratio, gap = min(held, _MAX_THUMBNAILS), grid.height / across, 0.05
     columns = contact_columns(count, ratio)
     wide = min(max((TWO_COLUMNS_IN - gap) / columns, 0.5 / min(1, ratio)), 2.4) - gap
     high, width = wide * ratio, columns * (wide + gap) + gap
     number = f"{held} maps" if count == held else f"first {count} of {held} maps"
-    title = f"{dataset.id}, split {split} (scenario {dataset.splits[split]['scenario']}): {number}"
+    title = (
+        f"{dataset.id}, split {split} (scenario "
+        f"{dataset.splits[split]['scenario']}): {number}"
+    )
     lines = textwrap.wrap(title, int(width / LETTER / 1.25))
     top = 0.1 + LINE * len(lines)
     height = top + -(-count // columns) * (high + gap)
-    # A whole number of dots a cell keeps all cells of one size, unless that takes too many dots.
+    # A whole number of dots a cell keeps all cells of one size, unless that takes too
+    # many dots.
     dots = max(1, round(_DPI * wide / across)) * across / wide
     figure = Figure(figsize=(width, height), dpi=dots if dots <= 2 * _DPI else _DPI)
-    figure.text(gap / width, 1 - 0.05 / height, "\n".join(lines), size=TITLE, va="top", parse_math=False)
+    figure.text(
+        gap / width,
+        1 - 0.05 / height,
+        "\n".join(lines),
+        size=TITLE,
+        va="top",
+        parse_math=False,
+    )
     sheet = figure.add_axes((0, 0, 1, 1))
     sheet.set(xlim=(0, width), ylim=(height, 0), autoscale_on=False)
     sheet.axis("off")
     for index in range(count):
-        stored = {name: values[0] for name, values in dataset.read(split, [index], fields).items()}
-        x, y = gap + index % columns * (wide + gap), top + index // columns * (high + gap)
+        stored = {
+            name: values[0]
+            for name, values in dataset.read(split, [index], fields).items()
+        }
+        x, y = (
+            gap + index % columns * (wide + gap),
+            top + index // columns * (high + gap),
+        )
         image = np.moveaxis(stored["rgb"], 0, -1)
         if "class_id" in stored:
             values = np.ma.masked_invalid(stored["traversability"])
-            image = np.concatenate([image, SHARES["cmap"](values, bytes=True)[..., :3]], axis=1)
-            edges = outline(soft_ground(stored["class_id"], classes), high / grid.height)
+            image = np.concatenate(
+                [image, SHARES["cmap"](values, bytes=True)[..., :3]], axis=1
+            )
+            edges = outline(
+                soft_ground(stored["class_id"], classes), high / grid.height
+            )
             # The page counts inches downward.
             draw_lines(sheet, edges * (1, -1) + (x, y + high), "black", 0.2, "white")
         box = (x, x + wide, y + high, y)
-        sheet.imshow(image, origin="lower", extent=box, aspect="auto", interpolation="none")
-        label = sheet.text(x + 0.03, y + 0.03, str(index), size=TEXT, color="white", va="top")
+        sheet.imshow(
+            image, origin="lower", extent=box, aspect="auto", interpolation="none"
+        )
+        label = sheet.text(
+            x + 0.03, y + 0.03, str(index), size=TEXT, color="white", va="top"
+        )
         label.set_path_effects([withStroke(linewidth=1.4, foreground="black")])
     return figure
 
 
 def soft_ground(class_id: np.ndarray, classes: Sequence[TerrainClass]) -> np.ndarray:
     """Cells whose class has soft spots, bool, shape of `class_id`."""
-    return np.isin(class_id, [number for number, item in enumerate(classes) if item.soft])
+    return np.isin(
+        class_id, [number for number, item in enumerate(classes) if item.soft]
+    )
 
 
 def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
-    """Colours to draw classes in, those of the table but for look-alikes: RGB in [0, 1], shape [C, 3]."""
+    """Colours to draw classes in, those of the table but for look-alikes: RGB in [0,
+    1], shape [C, 3].
+    """
     colours = np.array([item.colour for item in classes]) / 255
     for alike in set(look_alike_classes(tuple(classes))):
         away = 0.0 if colours[alike[0]].mean() > 0.5 else 1.0
@@ -187,7 +273,8 @@ def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
 
 
 def contact_columns(count: int, ratio: float) -> int:
-    """Number of columns that makes a grid about as wide as high, with few places left empty.
+    """Number of columns that makes a grid about as wide as high, with few places left
+    empty.
 
     Args:
         count: number of thumbnails.
@@ -199,13 +286,17 @@ def contact_columns(count: int, ratio: float) -> int:
     return int(columns[np.argmin(uneven.round(6))])
 
 
-def _hillshade(elevation_m: np.ndarray, slope_deg: np.ndarray, resolution_m: float) -> np.ndarray:
+def _hillshade(
+    elevation_m: np.ndarray, slope_deg: np.ndarray, resolution_m: float
+) -> np.ndarray:
     """White and black veils for a light in the north-west, RGBA, shape [B, H, W, 4].
 
-    Level ground gets none, so that it has the colours of the bar. Heights are exaggerated by how steep
-    the maps are, all by the same.
+    Level ground gets none, so that it has the colours of the bar. Heights are
+    exaggerated by how steep the maps are, all by the same.
     """
-    lift = np.clip(0.8 / np.tan(np.radians(np.percentile(slope_deg, 95) + 1e-3)), 0.1, 30)
+    lift = np.clip(
+        0.8 / np.tan(np.radians(np.percentile(slope_deg, 95) + 1e-3)), 0.1, 30
+    )
     light = light_direction(np.array([0.75 * np.pi]), np.array([0.7]))
     ground_m = framed(lift * elevation_m.astype(np.float64))
     lit = shade(*horn_gradient(ground_m, resolution_m), light, 0.0) - light[0, 2]

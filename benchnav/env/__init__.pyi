@@ -2,4 +2,10 @@ from benchnav.env.egocentric import EgocentricEnv, EgocentricVectorEnv
 from benchnav.env.environment import OffRoadEnv, OffRoadVectorEnv
 from benchnav.env.policy import PolicyPlanner
 
-__all__ = ["EgocentricEnv", "EgocentricVectorEnv", "OffRoadEnv", "OffRoadVectorEnv", "PolicyPlanner"]
+__all__ = [
+    "EgocentricEnv",
+    "EgocentricVectorEnv",
+    "OffRoadEnv",
+    "OffRoadVectorEnv",
+    "PolicyPlanner",
+]

@@ -1,4 +1,5 @@
-"""Sub-environments stepped as one batch: maps, noise, rewards and observations of `benchnav/OffRoad-v0`.
+"""Sub-environments stepped as one batch: maps, noise, rewards and observations of
+`benchnav/OffRoad-v0`.
 
 Letters in shapes: B sub-environments, H×W cells, S state and A action dimensions.
 """
@@ -37,7 +38,8 @@ AnyPart = str | Mapping[str, Any] | registry.Part
 
 
 class EnvBatch:
-    """B sub-environments as one batch, a stateful shell over the Simulation; see `OffRoadEnv` for what they are.
+    """B sub-environments as one batch, a stateful shell over the Simulation; see
+    `OffRoadEnv` for what they are.
 
     Args:
         size: B.
@@ -45,8 +47,8 @@ class EnvBatch:
         split: which of its splits; empty for `train`, else the first.
         robot: name or mapping of a registered robot, or one itself.
         objective: likewise of an objective; empty for the shaped reward.
-        world: what λ does: a preset by name, a mapping of changes to one, or a world itself; if empty, the paper's,
-            with a warning.
+        world: what λ does: a preset by name, a mapping of changes to one, or a world
+            itself; if empty, the paper's, with a warning.
         goal_radius_m: a robot this near to its goal has arrived.
     """
 
@@ -63,25 +65,38 @@ class EnvBatch:
         """Loads the maps of the split."""
         guard.limit_threads()
         guard.warn_of_default_world(world)
-        self._world = world if isinstance(world, World) else read_world(world or "paper")[0]
+        self._world = (
+            world if isinstance(world, World) else read_world(world or "paper")[0]
+        )
         made: Any = registry.take("robot", robot)
         self._objective: Any = None
         if objective:
-            self._objective = registry.take("objective", objective, robot=made, goal_radius_m=goal_radius_m)
+            self._objective = registry.take(
+                "objective", objective, robot=made, goal_radius_m=goal_radius_m
+            )
         rules = Rules(goal_radius_m=goal_radius_m)
-        self._task = Task(robot=made, objective=self._objective or GoalDistance(), rules=rules)
+        self._task = Task(
+            robot=made, objective=self._objective or GoalDistance(), rules=rules
+        )
         dataset = self._dataset = TerrainDataset(find_dataset(data))
         if not split:
             split = "train" if "train" in dataset.splits else next(iter(dataset.splits))
             if split != "train":
-                guard.warn(f"{dataset.path} has no split 'train'; its split {split!r} is taken.")
+                guard.warn(
+                    f"{dataset.path} has no split 'train'; its split {split!r} is "
+                    "taken."
+                )
         self._maps = dataset.terrain(split)
         taken = {"state", "goal"} & set(self._maps.layers)
         expect(
-            not taken, f"layers that are not called 'state' or 'goal', got {sorted(taken)} in {dataset.path}."
+            not taken,
+            f"layers that are not called 'state' or 'goal', got {sorted(taken)} in "
+            f"{dataset.path}.",
         )
         places = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
-        self._places = Places(**{name: torch.from_numpy(values) for name, values in places.items()})
+        self._places = Places(
+            **{name: torch.from_numpy(values) for name, values in places.items()}
+        )
         # To be refused at once.
         self._world.budget_s(self._places.reference_time_s, made.top_speed_mps)
         check_known(self._maps, self._world)
@@ -89,7 +104,9 @@ class EnvBatch:
         self._noise_seed = np.zeros(size, dtype=np.int64)
         self._simulation: Simulation | None = None
         self._now: SimulationState | None = None
-        self.action_space = spaces.Box(np.float32(made.action_low), np.float32(made.action_high))
+        self.action_space = spaces.Box(
+            np.float32(made.action_low), np.float32(made.action_high)
+        )
         self.observation_space = self._observation_space()
 
     @property
@@ -98,9 +115,14 @@ class EnvBatch:
         return len(self._maps)
 
     def reset(
-        self, generators: Sequence[np.random.Generator], chosen: np.ndarray, map_index: int | None
+        self,
+        generators: Sequence[np.random.Generator],
+        chosen: np.ndarray,
+        map_index: int | None,
     ) -> None:
-        """Starts new episodes in the chosen sub-environments, bool, shape [B]; maps are drawn if not given."""
+        """Starts new episodes in the chosen sub-environments, bool, shape [B]; maps are
+        drawn if not given.
+        """
         guard.limit_threads()
         members = np.flatnonzero(chosen)
         for i in members.tolist():
@@ -128,14 +150,19 @@ class EnvBatch:
         # Only new episodes are built: the others keep their maps and noise.
         index = torch.from_numpy(members)
         self._simulation.exchange_(index, fresh)
-        self._now = map_tensors(self._now, lambda now, new: now.index_copy(0, index, new), start)
+        self._now = map_tensors(
+            self._now, lambda now, new: now.index_copy(0, index, new), start
+        )
 
-    def read_actions(self, actions: np.ndarray, hold: np.ndarray | None = None) -> np.ndarray:
+    def read_actions(
+        self, actions: np.ndarray, hold: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return actions as float32, clipped to the bounds; nothing else is changed.
 
         Args:
             actions: shape [B, A].
-            hold: sub-environments whose actions are not used, bool, shape [B]; none when not given.
+            hold: sub-environments whose actions are not used, bool, shape [B]; none
+                when not given.
 
         Raises:
             ConfigError: If the actions are of another type or shape, or not finite.
@@ -144,8 +171,13 @@ class EnvBatch:
         self._current()
         read, space = guard.read_numbers(actions), self.action_space
         expected = (len(self._map), *space.shape)
-        expect(read.shape == expected, f"actions of shape {list(expected)}, got {list(read.shape)}.")
-        guard.check_actions(read, np.ones(len(read), dtype=bool) if hold is None else ~hold)
+        expect(
+            read.shape == expected,
+            f"actions of shape {list(expected)}, got {list(read.shape)}.",
+        )
+        guard.check_actions(
+            read, np.ones(len(read), dtype=bool) if hold is None else ~hold
+        )
         return read.clip(space.low, space.high)
 
     def step(
@@ -167,24 +199,38 @@ class EnvBatch:
         guard.limit_threads()
         commanded = self.read_actions(actions, hold)
         simulation, now = self._current()
-        waits = torch.zeros_like(now.running) if hold is None else torch.from_numpy(hold)
+        waits = (
+            torch.zeros_like(now.running) if hold is None else torch.from_numpy(hold)
+        )
         if bool((~now.running & ~waits).any()):
-            raise gymnasium.error.ResetNeeded("The episode has ended. Call reset() before the next step().")
+            raise gymnasium.error.ResetNeeded(
+                "The episode has ended. Call reset() before the next step()."
+            )
         action = self._command(torch.from_numpy(commanded))
         moved, met = simulation.step(now, action)
         self._now = map_tensors(
-            now, lambda old, new: torch.where(waits[:, None] if new.ndim > 1 else waits, old, new), moved
+            now,
+            lambda old, new: torch.where(
+                waits[:, None] if new.ndim > 1 else waits, old, new
+            ),
+            moved,
         )
         outcome = self._now.outcome
         return (
-            torch.where(waits, 0.0, self._reward(now, self._now, action, met)).double().numpy(),
+            torch.where(waits, 0.0, self._reward(now, self._now, action, met))
+            .double()
+            .numpy(),
             ((outcome == Outcome.SUCCESS) | _lost(outcome)).numpy(),
             (outcome == Outcome.TIMEOUT).numpy(),
             torch.where(waits, 1.0, met).numpy(),
         )
 
-    def observe(self, met: np.ndarray | None = None) -> tuple[Observations, Observations]:
-        """What the robots see, and diagnostics with the observed λ, 1 if not given; each array begins with B."""
+    def observe(
+        self, met: np.ndarray | None = None
+    ) -> tuple[Observations, Observations]:
+        """What the robots see, and diagnostics with the observed λ, 1 if not given;
+        each array begins with B.
+        """
         _, now = self._current()
         seen = {
             "state": now.state.numpy().copy(),
@@ -192,7 +238,10 @@ class EnvBatch:
             "rgb": self._maps.rgb[self._map].numpy(),
             "elevation_m": self._maps.elevation_m[self._map].numpy(),
             "slope_deg": self._maps.slope_deg[self._map].numpy(),
-            **{name: layer[self._map].nan_to_num().numpy() for name, layer in self._maps.layers.items()},
+            **{
+                name: layer[self._map].nan_to_num().numpy()
+                for name, layer in self._maps.layers.items()
+            },
         }
         return seen, self._diagnose(met)
 
@@ -203,22 +252,34 @@ class EnvBatch:
             "map": self._map.copy(),
             "outcome": now.outcome.numpy().copy(),
             "is_success": (now.outcome == Outcome.SUCCESS).numpy(),
-            "traversability": np.ones(len(self._map), np.float32) if met is None else met,
+            "traversability": np.ones(len(self._map), np.float32)
+            if met is None
+            else met,
             "distance_m": self._distance_m(now).numpy(),
         }
 
     def _command(self, action: Tensor) -> Tensor:
-        """What the robots are commanded by actions within the bounds, both of shape [B, A]."""
+        """What the robots are commanded by actions within the bounds, both of shape [B,
+        A].
+        """
         return action
 
-    def _reward(self, before: SimulationState, now: SimulationState, action: Tensor, met: Tensor) -> Tensor:
-        """Progress less time, and a prize or fine at the end; or minus J's stage cost; shape [B]."""
+    def _reward(
+        self, before: SimulationState, now: SimulationState, action: Tensor, met: Tensor
+    ) -> Tensor:
+        """Progress less time, and a prize or fine at the end; or minus J's stage cost;
+        shape [B].
+        """
         simulation, _ = self._current()
         lost = _lost(now.outcome)
         if self._objective is None:
             gained_m = self._distance_m(before) - self._distance_m(now)
             driven = gained_m + TIME_REWARD_PER_S * self._task.robot.dt_s
-            return driven + SUCCESS_REWARD * (now.outcome == Outcome.SUCCESS) + LOST_REWARD * lost
+            return (
+                driven
+                + SUCCESS_REWARD * (now.outcome == Outcome.SUCCESS)
+                + LOST_REWARD * lost
+            )
         cost: Tensor = self._objective.stage(before.state, action, met, self._goal_m())
         # Else to be lost would be the cheapest way to end a costly episode.
         return -cost * (1 + (simulation.steps - now.step) * lost)

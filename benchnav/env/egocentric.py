@@ -1,7 +1,9 @@
-"""The Gymnasium environment `benchnav/OffRoad-v1`, single and vectorised: a robot that learns on its way.
+"""The Gymnasium environment `benchnav/OffRoad-v1`, single and vectorised: a robot that
+learns on its way.
 
-Observations hold what the robot knows by now, seen from where it stands; never the truth. Letters in shapes: B
-sub-environments, N×N cells of the crop, S state and A action dimensions.
+Observations hold what the robot knows by now, seen from where it stands; never the
+truth. Letters in shapes: B sub-environments, N×N cells of the crop, S state and A
+    action dimensions.
 """
 
 from collections.abc import Sequence
@@ -42,12 +44,15 @@ if TYPE_CHECKING:
 
 
 class EgocentricEnv(OffRoadEnv):
-    """Drive to the goal over ground of uncertain traversability λ, by what is known of it; partially observed.
+    """Drive to the goal over ground of uncertain traversability λ, by what is known of
+    it; partially observed.
 
     ## Arguments
-    Of `gymnasium.make("benchnav/OffRoad-v1", …)`: those of `benchnav/OffRoad-v0` (`data`, `split`, `robot`,
-    `objective`, `world`, `goal_radius_m`), and those below; `make_vec` takes the same, and `num_envs`. Parts are named
-    as in a suite: a name, `name:VALUE`, `file.py:Name`, `{"part": NAME, "options": {…}}`, or the part itself.
+    Of `gymnasium.make("benchnav/OffRoad-v1", …)`: those of `benchnav/OffRoad-v0`
+    (`data`, `split`, `robot`, `objective`, `world`, `goal_radius_m`), and those below;
+    `make_vec` takes the same, and `num_envs`. Parts are named
+    as in a suite: a name, `name:VALUE`, `file.py:Name`, `{"part": NAME, "options":
+        {…}}`, or the part itself.
 
     | argument             | default     | meaning                                                          |
     |----------------------|-------------|------------------------------------------------------------------|
@@ -63,18 +68,20 @@ class EgocentricEnv(OffRoadEnv):
     | `normalised_actions` | `False`     | actions are in [−1, 1], which stands for the robot's bounds      |
     | `render_mode`        | `None`      | `"rgb_array"`, or `"human"` for a window                         |
 
-    `oracle` is privileged: it knows the true distribution of λ in each cell, and fits every dataset. For results that a
-    robot could have, name a checkpoint that was trained on such maps, such as `model="stakes-v1"`.
+    `oracle` is privileged: it knows the true distribution of λ in each cell, and fits
+    every dataset. For results that a robot could have, name a checkpoint that was
+    trained on such maps, such as `model="stakes-v1"`.
 
     ## Action space
-    A `Box` of the robot's bounds, float32, as of v0; with `normalised_actions` a `Box` of [−1, 1] whose ends stand for
-    the bounds. Actions beyond it are clipped.
+    A `Box` of the robot's bounds, float32, as of v0; with `normalised_actions` a `Box`
+    of [−1, 1] whose ends stand for the bounds. Actions beyond it are clipped.
 
     ## Observation space
-    A `Dict` of two keys, float32. `crop`, shape (4, N, N), is the ground around the robot, turned with it. The centre
-    of its cell [i, j] is (j + ½)·res − `crop_behind`·N·res ahead of the robot and (i + ½)·res − ½·N·res to its left,
-    where res is the edge length of the map's cells. Its value is that of the map's cell in which this centre lies; all
-    channels are 0 off the map.
+    A `Dict` of two keys, float32. `crop`, shape (4, N, N), is the ground around the
+    robot, turned with it. The centre of its cell [i, j] is (j + ½)·res −
+    `crop_behind`·N·res ahead of the robot and (i + ½)·res − ½·N·res to its left, where
+    res is the edge length of the map's cells. Its value is that of the map's cell in
+    which this centre lies; all channels are 0 off the map.
 
     | channel | range    | meaning                                                                      |
     |---------|----------|------------------------------------------------------------------------------|
@@ -83,7 +90,8 @@ class EgocentricEnv(OffRoadEnv):
     | 2       | [−1, 1]  | elevation less that under the robot, over ½·N·res, clipped; 0 where not seen |
     | 3       | {0, 1}   | known: 1 where the ground was seen                                           |
 
-    `state`, shape (5 + S − 3,), where S is the number of the robot's states (3 for the unicycle and the bicycle):
+    `state`, shape (5 + S − 3,), where S is the number of the robot's states (3 for the
+    unicycle and the bicycle):
 
     | place | range   | meaning                                                                       |
     |-------|---------|-------------------------------------------------------------------------------|
@@ -94,32 +102,38 @@ class EgocentricEnv(OffRoadEnv):
     | 5 …   | [−1, 1] | what the robot's state has beyond (x, y, θ), such as velocities: x / (1 + \\|x\\|) |
 
     ## What is hidden
-    λ of all cells but what the sensors measure; its true distribution, unless the model is privileged;
-    the dwell time on immobilising terrain, after which the episode ends; T, of which only the fraction left is
-    observed; the position and heading on the map; what is known of terrain beyond the crop; and the time until the
-    next update.
+    λ of all cells but what the sensors measure; its true distribution, unless the model
+    is privileged; the dwell time on immobilising terrain, after which the episode ends;
+    T, of which only the fraction left is observed; the position and heading on the map;
+    what is known of terrain beyond the crop; and the time until the next update.
 
     ## What is known
-    As in `benchnav-eval`: a belief that learns has λ sensed at each step. The sensor of appearance looks at the start
-    and every `replan_every_s`. Then the model predicts from what was seen, the belief is told what was sensed, and λ̂
-    and spread change. The noise of sensors is the episode's own, so that the same seed gives the same. A
-    belief that learns from λ, such as `"copula"`, needs a world in which λ stays what it is, such as `"stakes"`. What
-    is believed of unseen ground is what the checkpoint knows of its training maps; for privileged models it is what
-    the dataset or its recipe brings.
+    As in `benchnav-eval`: a belief that learns has λ sensed at each step. The sensor of
+    appearance looks at the start and every `replan_every_s`. Then the model predicts
+    from what was seen, the belief is told what was sensed, and λ̂ and spread change.
+    The noise of sensors is the episode's own, so that the same seed gives the same. A
+    belief that learns from λ, such as `"copula"`, needs a world in which λ stays what
+    it is, such as `"stakes"`. What is believed of unseen ground is what the checkpoint
+    knows of its training maps; for privileged models it is what the dataset or its
+    recipe brings.
 
     ## Reward, world, start, end and info
     As of `benchnav/OffRoad-v0`, see `OffRoadEnv`.
 
     ## Rendering
-    `render()` gives an image of 640×480 pixels, uint8, shape (480, 640, 3): the map's colours, darker where the ground
-    was not seen yet, with path, robot, goal, and the outline of the crop; beside it λ̂ and spread as they are
-    observed, the robot looking up. With `"human"` it is shown in a window after each reset and step.
+    `render()` gives an image of 640×480 pixels, uint8, shape (480, 640, 3): the map's
+    colours, darker where the ground was not seen yet, with path, robot, goal, and the
+    outline of the crop; beside it λ̂ and spread as they are observed, the robot looking
+    up. With `"human"` it is shown in a window after each reset and step.
 
     ## Version history
     * v1 of benchnav 0.11: first version.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["rgb_array", "human"],
+        "render_fps": 10,
+    }
     _batch: "EgocentricBatch"
 
     def __init__(self, render_mode: str | None = None, **arguments: Any) -> None:
@@ -146,16 +160,22 @@ class EgocentricEnv(OffRoadEnv):
         self._show()
         return answer
 
-    def step(self, action: np.ndarray) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Takes one time step; see the class."""
         answer = super().step(action)
         self._show()
         return answer
 
     def render(self) -> Any:
-        """The image of the last step in `"rgb_array"`; nothing in `"human"`, where it is shown already."""
+        """The image of the last step in `"rgb_array"`; nothing in `"human"`, where it
+        is shown already.
+        """
         if self.render_mode is None:
-            guard.warn('render() draws nothing without `render_mode="rgb_array"` or "human".')
+            guard.warn(
+                'render() draws nothing without `render_mode="rgb_array"` or "human".'
+            )
         return self._batch.draw(0) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
@@ -171,9 +191,11 @@ class EgocentricEnv(OffRoadEnv):
 class EgocentricVectorEnv(OffRoadVectorEnv):
     """Many `EgocentricEnv` stepped as one batch, with next-step autoreset.
 
-    Sub-environment i seeded with s is the single environment seeded with s + i. Arguments, spaces and rewards are those
-    of `EgocentricEnv`; `render()` gives an image of each sub-environment. `reset(options={"reset_mask": mask})` starts
-    anew those of the mask alone, bool, shape [B], which then do not start anew by themselves.
+    Sub-environment i seeded with s is the single environment seeded with s + i.
+    Arguments, spaces and rewards are those of `EgocentricEnv`; `render()` gives an
+    image of each sub-environment. `reset(options={"reset_mask": mask})` starts anew
+    those of the mask alone, bool, shape [B], which then do not start anew by
+    themselves.
 
     Args:
         num_envs: how many.
@@ -188,9 +210,13 @@ class EgocentricVectorEnv(OffRoadVectorEnv):
     }
     _batch: "EgocentricBatch"
 
-    def __init__(self, num_envs: int = 1, render_mode: str | None = None, **arguments: Any) -> None:
+    def __init__(
+        self, num_envs: int = 1, render_mode: str | None = None, **arguments: Any
+    ) -> None:
         """Loads the maps of the split, and the model; see the class."""
-        super().__init__(num_envs, render_mode, **arguments, drawn=render_mode is not None)
+        super().__init__(
+            num_envs, render_mode, **arguments, drawn=render_mode is not None
+        )
         self.render_mode = render_mode
 
     @staticmethod
@@ -206,7 +232,8 @@ class EgocentricVectorEnv(OffRoadVectorEnv):
 
 @dataclass(frozen=True, kw_only=True)
 class Perception:
-    """What robots perceive, predict and believe, and how observations and actions show it; see `EgocentricEnv`.
+    """What robots perceive, predict and believe, and how observations and actions show
+    it; see `EgocentricEnv`.
 
     Args:
         sensor: what of the ground's looks is seen.
@@ -244,7 +271,11 @@ class EgocentricBatch(EnvBatch):
 
     def __init__(self, size: int, *, drawn: bool = False, **arguments: Any) -> None:
         """Loads the maps of the split, and the model."""
-        own = {each.name: arguments.pop(each.name) for each in fields(Perception) if each.name in arguments}
+        own = {
+            each.name: arguments.pop(each.name)
+            for each in fields(Perception)
+            if each.name in arguments
+        }
         perception = Perception(**own)
         self.view = View(cells=perception.crop_cells, behind=perception.crop_behind)
         super().__init__(size, **arguments)
@@ -255,7 +286,9 @@ class EgocentricBatch(EnvBatch):
         if isinstance(model, str) and not model:
             guard.warn_of_default_model()
             model = "oracle"
-        predictor: Any = model if isinstance(model, TraversabilityModel) else load_model(model)
+        predictor: Any = (
+            model if isinstance(model, TraversabilityModel) else load_model(model)
+        )
         if mismatch := class_mismatch(predictor, self._dataset.recipe):
             guard.warn(f"{mismatch}.")
         sees: Any = registry.take("sensor", perception.sensor)
@@ -263,7 +296,8 @@ class EgocentricBatch(EnvBatch):
         clairvoyant = isinstance(predictor, Clairvoyant)
         expect(
             self._world.noise != "resampled" or not (believes.learns or clairvoyant),
-            "a world whose λ stays what it is for a belief that learns, and for `clairvoyant`, got one of `noise` "
+            "a world whose λ stays what it is for a belief that learns, and for "
+            "`clairvoyant`, got one of `noise` "
             "'resampled'. Take world='stakes'.",
         )
         statistics = None
@@ -288,19 +322,26 @@ class EgocentricBatch(EnvBatch):
                 torch.from_numpy(self.action_space.low.copy()),
                 torch.from_numpy(self.action_space.high.copy()),
             )
-            self.action_space = spaces.Box(-1.0, 1.0, self.action_space.shape, np.float32)
+            self.action_space = spaces.Box(
+                -1.0, 1.0, self.action_space.shape, np.float32
+            )
         self._met = np.ones(size, np.float32)
         self._picture = _make_picture(self._maps.grid) if drawn else None
         self._tracks: list[list[np.ndarray]] = [[] for _ in range(size)]
 
     def reset(
-        self, generators: Sequence[np.random.Generator], chosen: np.ndarray, map_index: int | None
+        self,
+        generators: Sequence[np.random.Generator],
+        chosen: np.ndarray,
+        map_index: int | None,
     ) -> None:
         """Starts new episodes in the chosen sub-environments; see `EnvBatch`."""
         super().reset(generators, chosen, map_index)
         _, now = self._current()
         members, field = torch.from_numpy(np.flatnonzero(chosen)), self._field()
-        maps, seeds = (torch.from_numpy(values[chosen]) for values in (self._map, self._noise_seed))
+        maps, seeds = (
+            torch.from_numpy(values[chosen]) for values in (self._map, self._noise_seed)
+        )
         with torch.inference_mode(False), torch.no_grad():
             truth = Truth(
                 terrain=self._maps.select(maps),
@@ -314,7 +355,9 @@ class EgocentricBatch(EnvBatch):
     def step(
         self, actions: np.ndarray, hold: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Takes a time step in all sub-environments but those on hold, and senses there; see `EnvBatch`."""
+        """Takes a time step in all sub-environments but those on hold, and senses
+        there; see `EnvBatch`.
+        """
         _, before = self._current()
         answer = super().step(actions, hold)
         _, now = self._current()
@@ -324,8 +367,12 @@ class EgocentricBatch(EnvBatch):
         self._follow(moved.numpy(), anew=False)
         return answer
 
-    def observe(self, met: np.ndarray | None = None) -> tuple[Observations, Observations]:
-        """What the robots know, seen from where they are, and diagnostics; see `EnvBatch`."""
+    def observe(
+        self, met: np.ndarray | None = None
+    ) -> tuple[Observations, Observations]:
+        """What the robots know, seen from where they are, and diagnostics; see
+        `EnvBatch`.
+        """
         simulation, now = self._current()
         info = self._diagnose(met)
         self._met = info["traversability"]
@@ -364,21 +411,32 @@ class EgocentricBatch(EnvBatch):
             )
         )
 
-    def _law(self, model: TraversabilityModel, statistics: GroundStatistics | None) -> Law:
+    def _law(
+        self, model: TraversabilityModel, statistics: GroundStatistics | None
+    ) -> Law:
         """How the λ of the maps hangs together."""
         recipe, world = self._dataset.recipe, self._world
         return Law(
             grid=self._maps.grid,
-            correlation_m=recipe.correlation_m if world.noise == "stored" else world.correlation_m,
+            correlation_m=recipe.correlation_m
+            if world.noise == "stored"
+            else world.correlation_m,
             nugget=nugget_of(model),
             statistics=statistics,
-            class_names=model.class_names or tuple(item.name for item in recipe.classes),
+            class_names=model.class_names
+            or tuple(item.name for item in recipe.classes),
         )
 
     def _field(self) -> Tensor:
-        """λ of every cell, for sensors; where it is drawn anew at each step none is sensed, and it means nothing."""
+        """λ of every cell, for sensors; where it is drawn anew at each step none is
+        sensed, and it means nothing.
+        """
         simulation, _ = self._current()
-        return self._maps.traversability[self._map] if simulation.field is None else simulation.field
+        return (
+            self._maps.traversability[self._map]
+            if simulation.field is None
+            else simulation.field
+        )
 
     def _command(self, action: Tensor) -> Tensor:
         if self._bounds is None:
@@ -398,7 +456,10 @@ class EgocentricBatch(EnvBatch):
             self._tracks[member].append(place)
 
     def _observation_space(self) -> spaces.Dict:
-        cells, states = self.view.cells, self._task.robot.initial_state(torch.zeros(1, 3)).shape[1]
+        cells, states = (
+            self.view.cells,
+            self._task.robot.initial_state(torch.zeros(1, 3)).shape[1],
+        )
         low = np.zeros((len(CHANNELS), cells, cells), np.float32)
         low[CHANNELS.index("rise")] = -1
         least, most = (np.array(ends, np.float32) for ends in bounds(states))

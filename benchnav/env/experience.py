@@ -1,8 +1,11 @@
-"""What the robots of an environment know of the ground, and how they learn on their way.
+"""What the robots of an environment know of the ground, and how they learn on their
+way.
 
-A shell over `benchnav.planning.sensing.knowledge`, by which robots learn in evaluations too: λ is sensed at each
-step, and what is known is updated every `replan_every_s` of an episode. Here episodes begin at different times. Letters
-in shapes: B episodes, M of them, S state dimensions, H×W cells, N cells of all maps together.
+A shell over `benchnav.planning.sensing.knowledge`, by which robots learn in evaluations
+too: λ is sensed at each step, and what is known is updated every `replan_every_s` of an
+    episode. Here episodes begin at different times. Letters
+in shapes: B episodes, M of them, S state dimensions, H×W cells, N cells of all maps
+    together.
 """
 
 from collections import OrderedDict
@@ -23,14 +26,17 @@ _MOST_KEPT = 256  # maps, of up to a megabyte each
 
 @dataclass(frozen=True, kw_only=True)
 class _First(Batch):
-    """What is known of whole maps before a robot set out: the prediction, and all but the belief."""
+    """What is known of whole maps before a robot set out: the prediction, and all but
+    the belief.
+    """
 
     prior: TraversabilityDistribution
     knowledge: Knowledge
 
 
 class Experience:
-    """What the robots of B sub-environments know, from their first step to their last; a stateful shell.
+    """What the robots of B sub-environments know, from their first step to their last;
+    a stateful shell.
 
     Args:
         learner: how they learn.
@@ -59,7 +65,9 @@ class Experience:
             seen=knowledge.seen,
         )
 
-    def begin(self, members: Tensor, maps: Sequence[int], truth: Truth, state: Tensor) -> None:
+    def begin(
+        self, members: Tensor, maps: Sequence[int], truth: Truth, state: Tensor
+    ) -> None:
         """Begins new episodes in some sub-environments; in all of them at first.
 
         Args:
@@ -68,7 +76,11 @@ class Experience:
             truth: of these episodes.
             state: where the robots are, shape [M, S].
         """
-        knowledge = self._begun_on(maps, truth, state) if self._alike else self._begun(truth, state)
+        knowledge = (
+            self._begun_on(maps, truth, state)
+            if self._alike
+            else self._begun(truth, state)
+        )
         if self._knowledge is None or len(members) == len(self._knowledge.free):
             self._knowledge, self._truth = knowledge, truth
             return
@@ -77,7 +89,8 @@ class Experience:
             self._truth = self._truth.put(members, truth)
 
     def learn(self, step: Tensor, state: Tensor, field: Tensor, which: Tensor) -> None:
-        """Senses in some sub-environments, and updates what is known in those of them where that is due.
+        """Senses in some sub-environments, and updates what is known in those of them
+        where that is due.
 
         Args:
             step: steps that each episode has taken, int64, shape [B].
@@ -89,7 +102,9 @@ class Experience:
             return
         truth = replace(self._truth, field=field)
         due = which & (step % self._every == 0)
-        self._knowledge = self._learner.sense(self._current(), truth, state, step.tolist(), due, which)
+        self._knowledge = self._learner.sense(
+            self._current(), truth, state, step.tolist(), due, which
+        )
         if bool(due.any()):
             self._update(due, truth)
 
@@ -100,7 +115,9 @@ class Experience:
         if bool(news.any()):
             # Taken apart, since a prediction costs more than that.
             members = news.nonzero()[:, 0]
-            part, _ = learner.update(learner.select(now, members), truth.select(members))
+            part, _ = learner.update(
+                learner.select(now, members), truth.select(members)
+            )
             now = learner.put(now, members, part)
         told = (due & ~news)[:, None, None]
         sensed, news = now.sensed, now.news
@@ -112,14 +129,18 @@ class Experience:
         self._knowledge = now
 
     def _begun_on(self, maps: Sequence[int], truth: Truth, state: Tensor) -> Knowledge:
-        """What is known at the start of maps that are seen as a whole; kept, since no episode changes it."""
+        """What is known at the start of maps that are seen as a whole; kept, since no
+        episode changes it.
+        """
         every = []
         for place, number in enumerate(maps):
             if number not in self._kept:
                 own = torch.tensor([place])
                 knowledge = self._begun(truth.select(own), state[own])
                 prior = self._learner.distribution(knowledge)
-                self._kept[number] = _First(prior=prior, knowledge=replace(knowledge, believed=None))
+                self._kept[number] = _First(
+                    prior=prior, knowledge=replace(knowledge, believed=None)
+                )
             self._kept.move_to_end(number)
             every.append(self._kept[number])
         while len(self._kept) > _MOST_KEPT:
@@ -142,5 +163,9 @@ class Experience:
 
 
 def _only(sensed: Sensed, which: Tensor) -> Sensed:
-    """What was sensed in some episodes, bool, shape [B, 1, 1], and nothing in the others."""
-    return replace(sensed, traversability=sensed.traversability.masked_fill(~which, torch.nan))
+    """What was sensed in some episodes, bool, shape [B, 1, 1], and nothing in the
+    others.
+    """
+    return replace(
+        sensed, traversability=sensed.traversability.masked_fill(~which, torch.nan)
+    )

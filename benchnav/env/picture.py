@@ -79,12 +79,18 @@ class Picture:
     def draw(self, scene: Scene) -> np.ndarray:
         """Draw the image, uint8, shape [480, 640, 3]."""
         self._figure.clear()
-        panels = self._figure.subplot_mosaic([["map", "risk"], ["map", "spread"]], gridspec_kw=_PANELS)
+        panels = self._figure.subplot_mosaic(
+            [["map", "risk"], ["map", "spread"]], gridspec_kw=_PANELS
+        )
         for panel in panels.values():
             panel.set(xticks=[], yticks=[])
         self._draw_map(panels["map"], scene)
-        self._draw_crop(panels["risk"], scene, "risk", "λ̂ ahead", maps.TRAVERSABILITY_COLOURS)
-        self._draw_crop(panels["spread"], scene, "spread", "spread of λ", maps.SPREAD_COLOURS)
+        self._draw_crop(
+            panels["risk"], scene, "risk", "λ̂ ahead", maps.TRAVERSABILITY_COLOURS
+        )
+        self._draw_crop(
+            panels["spread"], scene, "spread", "spread of λ", maps.SPREAD_COLOURS
+        )
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
@@ -93,28 +99,51 @@ class Picture:
         shown = (scene.rgb.transpose(1, 2, 0) * light).astype(np.uint8)
         maps.show_map(panel, shown, self._grid.extent_m)
         for colour, line in (("black", 2.4), ("white", 1.2)):
-            panel.add_patch(Polygon(scene.corners_m, closed=True, fill=False, ec=colour, lw=line))
+            panel.add_patch(
+                Polygon(scene.corners_m, closed=True, fill=False, ec=colour, lw=line)
+            )
         outcome = scene.outcome.replace("running", "")
         track = np.vstack((scene.track, scene.state[:2]))
-        drive = maps.Drive(track=track, goal_m=scene.goal_m, outcome=outcome, heading_rad=scene.state[2])
+        drive = maps.Drive(
+            track=track,
+            goal_m=scene.goal_m,
+            outcome=outcome,
+            heading_rad=scene.state[2],
+        )
         maps.draw_drive(panel, drive, 1.6, _MARKS)
-        words = f"t = {scene.time_s:.1f} s    λ = {scene.observed:.2f}    {outcome.replace('_', ' ')}"
+        words = (
+            f"t = {scene.time_s:.1f} s    λ = {scene.observed:.2f}    "
+            f"{outcome.replace('_', ' ')}"
+        )
         panel.set_title(words, fontsize=_TEXT + 1, loc="left", pad=5)
 
-    def _draw_crop(self, panel: Axes, scene: Scene, channel: str, title: str, colours: str) -> None:
-        values, known, spread = (scene.crop[CHANNELS.index(name)] for name in (channel, "known", "spread"))
-        shown = matplotlib.colormaps[colours](values)[..., :3] * np.where(known > 0, 1.0, _UNSEEN)[..., None]
-        shown[(known <= 0) & (spread == 0) & (scene.crop[0] == 0)] = to_rgb(maps.LACKING)
+    def _draw_crop(
+        self, panel: Axes, scene: Scene, channel: str, title: str, colours: str
+    ) -> None:
+        values, known, spread = (
+            scene.crop[CHANNELS.index(name)] for name in (channel, "known", "spread")
+        )
+        shown = (
+            matplotlib.colormaps[colours](values)[..., :3]
+            * np.where(known > 0, 1.0, _UNSEEN)[..., None]
+        )
+        shown[(known <= 0) & (spread == 0) & (scene.crop[0] == 0)] = to_rgb(
+            maps.LACKING
+        )
         cells = len(values)
         # Ahead is up, and the robot's left is left.
         maps.show_map(panel, shown.transpose(1, 0, 2)[:, ::-1], (cells, cells))
         ahead = maps.robot_marker(np.pi / 2)
-        maps.mark(panel, "robot", (cells / 2, scene.behind * cells), _MARKS, marker=ahead)
+        maps.mark(
+            panel, "robot", (cells / 2, scene.behind * cells), _MARKS, marker=ahead
+        )
         panel.set_title(title, fontsize=_TEXT, loc="left", pad=4)
         bar = panel.inset_axes((0.72, 1.03, 0.2, 0.06), xticks=[], yticks=[])
         bar.imshow(np.linspace(0, 1, 32)[None], cmap=colours, aspect="auto")
         for x, end, side in ((-0.1, "0", "right"), (1.1, "1", "left")):
-            bar.text(x, 0.4, end, size=_TEXT, ha=side, va="center", transform=bar.transAxes)
+            bar.text(
+                x, 0.4, end, size=_TEXT, ha=side, va="center", transform=bar.transAxes
+            )
 
 
 class Window:
@@ -124,7 +153,8 @@ class Window:
         """Opens the window.
 
         Raises:
-            ConfigError: there is no display, and `MPLBACKEND` names no backend that does without.
+            ConfigError: there is no display, and `MPLBACKEND` names no backend that
+                does without.
         """
         # Imported here, since it looks for a display.
         from matplotlib import pyplot
@@ -132,10 +162,14 @@ class Window:
         self._pyplot: Any = pyplot
         if pyplot.get_backend().lower() == "agg" and not os.environ.get("MPLBACKEND"):
             raise ConfigError(
-                'Expected a display for `render_mode` "human", got none that Matplotlib can use. Take "rgb_array", or '
-                "install a toolkit of Matplotlib's, such as PyQt6, where there is a display."
+                'Expected a display for `render_mode` "human", got none that '
+                'Matplotlib can use. Take "rgb_array", or '
+                "install a toolkit of Matplotlib's, such as PyQt6, where there is a "
+                "display."
             )
-        self._figure = pyplot.figure("benchnav", figsize=(SIZE[0] / _DPI, SIZE[1] / _DPI), dpi=_DPI)
+        self._figure = pyplot.figure(
+            "benchnav", figsize=(SIZE[0] / _DPI, SIZE[1] / _DPI), dpi=_DPI
+        )
         panel = self._figure.add_axes((0, 0, 1, 1))
         panel.set_axis_off()
         self._image = panel.imshow(np.full((SIZE[1], SIZE[0], 3), 255, np.uint8))

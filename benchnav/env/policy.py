@@ -1,4 +1,6 @@
-"""Policies as planners: what was trained in `benchnav/OffRoad-v1` meets the same episodes as any planner."""
+"""Policies as planners: what was trained in `benchnav/OffRoad-v1` meets the same
+episodes as any planner.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,14 +36,16 @@ class PolicyState(Batch):
 class PolicyPlanner(Planner[PolicyState]):
     """Drives as a policy says that is given the observations of `benchnav/OffRoad-v1`.
 
-    A policy in a file is named on the command line through a subclass, whose constructor's parameters are its options:
+    A policy in a file is named on the command line through a subclass, whose
+    constructor's parameters are its options:
 
         class Mine(PolicyPlanner):
             def __init__(self, path: str = "policy.zip"):
                 super().__init__(load(path), normalised_actions=True)
 
     Args:
-        policy: gives actions, shape [B, A], from a batch of observations; each is for its own observation alone.
+        policy: gives actions, shape [B, A], from a batch of observations; each is for
+            its own observation alone.
         crop_cells: as the environment had in training.
         crop_behind: likewise.
         normalised_actions: likewise.
@@ -66,7 +70,9 @@ class PolicyPlanner(Planner[PolicyState]):
         """Keeps what is predicted; draws nothing. See `Planner`."""
         return PolicyState(problem=problem, known=_known_of(problem))
 
-    def plan(self, step: Step, plan_state: PolicyState) -> tuple[Tensor, PolicyState, Plan]:
+    def plan(
+        self, step: Step, plan_state: PolicyState
+    ) -> tuple[Tensor, PolicyState, Plan]:
         """Asks the policy; see `Planner`."""
         problem = plan_state.problem
         given = self.observe(step, plan_state)
@@ -80,7 +86,11 @@ class PolicyPlanner(Planner[PolicyState]):
         action = torch.from_numpy(answer).to(step.state)
         if self.normalised_actions:
             action = low + (action + 1) / 2 * (high - low)
-        return action.clamp(low, high), plan_state, Plan.empty(len(problem), action.device)
+        return (
+            action.clamp(low, high),
+            plan_state,
+            Plan.empty(len(problem), action.device),
+        )
 
     def observe(self, step: Step, plan_state: PolicyState) -> dict[str, np.ndarray]:
         """The observations of `benchnav/OffRoad-v1`, of B episodes.
@@ -92,7 +102,12 @@ class PolicyPlanner(Planner[PolicyState]):
         problem = plan_state.problem
         time_left = 1 - step.time_s / problem.time_budget_s
         seen = self.view.observe(
-            problem.grid, plan_state.known, step.state, problem.goal_m, step.traversability, time_left
+            problem.grid,
+            plan_state.known,
+            step.state,
+            problem.goal_m,
+            step.traversability,
+            time_left,
         )
         return {name: values.cpu().numpy() for name, values in seen.items()}
 

@@ -1,4 +1,6 @@
-"""What can be named in a suite: parts of each kind and worlds, with purpose and options; and checkpoints."""
+"""What can be named in a suite: parts of each kind and worlds, with purpose and
+options; and checkpoints.
+"""
 
 import inspect
 import json
@@ -11,7 +13,13 @@ from typing import Any, NamedTuple
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.registry import Option
-from benchnav.core.settings import check_known, config_class, dataclass_in, list_options, plain
+from benchnav.core.settings import (
+    check_known,
+    config_class,
+    dataclass_in,
+    list_options,
+    plain,
+)
 from benchnav.core.tables import Bold, Table, print_table
 
 TITLES = {
@@ -29,7 +37,8 @@ TITLES = {
     "world": "worlds, each with its rules of the task",
 }
 HELP = (
-    "Parts of your own are named package.module:Name or path/to/file.py:Name. NAME:VALUE sets the first option, "
+    "Parts of your own are named package.module:Name or path/to/file.py:Name. "
+    "NAME:VALUE sets the first option, "
     "{part: NAME, label: LABEL, options: {...}} sets any."
 )
 
@@ -49,7 +58,8 @@ class Entry(NamedTuple):
 
 
 def print_catalogue(*kinds: str) -> None:
-    """Prints what can be named in a suite: as tables in a terminal, as plain lines elsewhere.
+    """Prints what can be named in a suite: as tables in a terminal, as plain lines
+    elsewhere.
 
     Args:
         kinds: some of the keys of `TITLES`; all of them when none is named.
@@ -70,7 +80,9 @@ def print_catalogue(*kinds: str) -> None:
 
 
 def list_entries(kind: str) -> list[Entry]:
-    """Lists the parts of a kind that are known by name, for models also the checkpoints found; or worlds."""
+    """Lists the parts of a kind that are known by name, for models also the checkpoints
+    found; or worlds.
+    """
     if kind == "world":
         return list(_worlds())
     found = [_describe(kind, name) for name in registry.names(kind)]
@@ -78,7 +90,9 @@ def list_entries(kind: str) -> list[Entry]:
 
 
 def plain_lines(kind: str) -> list[str]:
-    """The catalogue of a kind as lines that other programs can read: `KIND NAME: PURPOSE`, then options."""
+    """The catalogue of a kind as lines that other programs can read: `KIND NAME:
+    PURPOSE`, then options.
+    """
     lines = []
     for entry in list_entries(kind):
         lines.append(f"{kind} {entry.name}: {entry.purpose}")
@@ -92,22 +106,30 @@ def make_table(kind: str) -> Table:
         title=TITLES[kind],
         headings=("name", "purpose", "options"),
         rows=tuple(
-            (Bold(entry.name), entry.purpose, "\n".join(entry.options)) for entry in list_entries(kind)
+            (Bold(entry.name), entry.purpose, "\n".join(entry.options))
+            for entry in list_entries(kind)
         ),
     )
 
 
 def _describe(kind: str, name: str) -> Entry:
-    """Describes a part; one that cannot be imported is told as such, and hides no other."""
+    """Describes a part; one that cannot be imported is told as such, and hides no
+    other.
+    """
     from benchnav.models.base import is_family
 
     try:
         target = registry.find(kind, name).target
         if kind == "model" and is_family(target):
-            settings = tuple(_option_lines(list_options(target))) if config_class(target) else ()
+            settings = (
+                tuple(_option_lines(list_options(target)))
+                if config_class(target)
+                else ()
+            )
             return Entry(
                 name,
-                f"{_purpose(target)} Trained by `benchnav-train fit {name}`; name a checkpoint.",
+                f"{_purpose(target)} Trained by `benchnav-train fit {name}`; name a "
+                "checkpoint.",
                 settings,
             )
         options = tuple(_option_lines(registry.options_of(kind, target)))
@@ -122,10 +144,17 @@ def _purpose(target: Any) -> str:
     return "" if line.startswith(f"{getattr(target, '__name__', '')}(") else line
 
 
-def _option_lines(options: dict[str, Option], prefix: str = "", holder: Any = None) -> Iterator[str]:
-    """Options with types and defaults, those of a dataclass one by one, with the fields of a holder for defaults."""
+def _option_lines(
+    options: dict[str, Option], prefix: str = "", holder: Any = None
+) -> Iterator[str]:
+    """Options with types and defaults, those of a dataclass one by one, with the fields
+    of a holder for defaults.
+    """
     for name, option in options.items():
-        config, default = dataclass_in(option.kind), getattr(holder, name, option.default)
+        config, default = (
+            dataclass_in(option.kind),
+            getattr(holder, name, option.default),
+        )
         if config and default is not None:
             yield from _option_lines(list_options(config), f"{prefix}{name}.", default)
         else:
@@ -134,10 +163,14 @@ def _option_lines(options: dict[str, Option], prefix: str = "", holder: Any = No
 
 
 def _type_words(kind: Any) -> str:
-    """A type as people write it in code, classes without their modules, words and unions by bars."""
+    """A type as people write it in code, classes without their modules, words and
+    unions by bars.
+    """
     words = re.sub(r"(\w+\.)+", "", inspect.formatannotation(kind))
     words = re.sub(r"Literal\[(.*?)\]", lambda found: found[1].replace("'", ""), words)
-    return re.sub(r"^Union\[(.*)\]$", lambda found: found[1].replace(", ", " | "), words)
+    return re.sub(
+        r"^Union\[(.*)\]$", lambda found: found[1].replace(", ", " | "), words
+    )
 
 
 def _default(value: Any) -> str:
@@ -161,7 +194,9 @@ def _worlds() -> Iterator[Entry]:
 def _setting_lines(settings: Mapping[str, Any]) -> Iterator[str]:
     for name, value in settings.items():
         if isinstance(value, Mapping):
-            yield from _setting_lines({f"{name}.{key}": inner for key, inner in value.items()})
+            yield from _setting_lines(
+                {f"{name}.{key}": inner for key, inner in value.items()}
+            )
         else:
             yield f"{name}{_default(value)}"
 
@@ -175,7 +210,9 @@ def _checkpoints() -> Iterator[Entry]:
             config = read_config(folder)
             classes = len(config.get("class_names") or ())
             told = f", {classes} classes" if classes else ""
-            purpose = f"Checkpoint of the family {config.get('model')} in {folder}{told}."
+            purpose = (
+                f"Checkpoint of the family {config.get('model')} in {folder}{told}."
+            )
         except BenchnavError as error:
             purpose = f"cannot be used: {error}"
         yield Entry(folder.name, purpose)

@@ -1,4 +1,6 @@
-"""The command `benchnav-eval`: run suites, merge and repeat runs, list parts, report, replay episodes."""
+"""The command `benchnav-eval`: run suites, merge and repeat runs, list parts, report,
+replay episodes.
+"""
 
 import json
 import os
@@ -40,15 +42,16 @@ def run_command(
         out: Run folder.
         jobs: Worker processes. The result is the same for any number.
         overwrite: Delete the run that is there first.
-        planner_limit_s: Seconds that a planner may take for one answer; planners then run in processes of
-            their own. 0 sets no limit.
+        planner_limit_s: Seconds that a planner may take for one answer; planners then
+            run in processes of their own. 0 sets no limit.
         shard: I/N runs only the I-th of N shards of the run; `merge` joins them.
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
-        device: Where maps are predicted and episodes run; auto takes CUDA where there is a GPU.
+        device: Where maps are predicted and episodes run; auto takes CUDA where there
+            is a GPU.
         reuse_code: Use finished units of other code too, and mark their rows.
-        check_determinism: First run a unit of each condition twice, in fresh processes and another order; if rows
-            differ, name them and end with status 1.
+        check_determinism: First run a unit of each condition twice, in fresh processes
+            and another order; if rows differ, name them and end with status 1.
     """
     from benchnav.eval.run.runner import run_suite
     from benchnav.eval.run.unit import Settings
@@ -56,21 +59,30 @@ def run_command(
     _check_workers(jobs, backend, scheduler)
     own = read_shard(shard)
     expect(
-        0 <= planner_limit_s <= _MAX_LIMIT_S, f"`planner_limit_s` in 0–{_MAX_LIMIT_S}, got {planner_limit_s}."
+        0 <= planner_limit_s <= _MAX_LIMIT_S,
+        f"`planner_limit_s` in 0–{_MAX_LIMIT_S}, got {planner_limit_s}.",
     )
     folder = _own_folder(out)
     if check_determinism and not _repeats(suite, planner_limit_s, device):
         return 1
     settings = Settings.on(device, planner_limit_s)
-    steps = run_suite(suite, folder, scheduler or jobs, overwrite, settings, _say, own, reuse_code)
+    steps = run_suite(
+        suite, folder, scheduler or jobs, overwrite, settings, _say, own, reuse_code
+    )
     show_progress(steps, "units")
     if not _is_whole(folder):
-        print(f"so far:  {program('benchnav-eval')} report {shlex.quote(str(folder))} --partial")
+        print(
+            f"so far:  {program('benchnav-eval')} report {shlex.quote(str(folder))} "
+            "--partial"
+        )
         return _failed(folder)
     if own is None:
         return _finish(folder)
     print(f"shard {own} is finished in {folder}")
-    print(f"merge:   {program('benchnav-eval')} merge OUT PART …, once all {own.of} shards are finished")
+    print(
+        f"merge:   {program('benchnav-eval')} merge OUT PART …, once all {own.of} "
+        "shards are finished"
+    )
     return _failed(folder)
 
 
@@ -111,7 +123,9 @@ def rerun(
     _check_workers(jobs, backend, scheduler)
     original = _own_folder(folder)
     repeated = _own_folder(out or f"{original.resolve()}-rerun")
-    show_progress(rerun.rerun(original, repeated, scheduler or jobs, overwrite, _say), "units")
+    show_progress(
+        rerun.rerun(original, repeated, scheduler or jobs, overwrite, _say), "units"
+    )
     same, lines = rerun.compare(original, repeated)
     print("\n".join(lines))
     return 0 if same else 1
@@ -134,7 +148,8 @@ def verify(folder: str) -> int:
         print(f"{folder}: no file is damaged")
     elif not damage[0].startswith("run.json"):
         print(
-            "Give the run's command again: it runs damaged units again and writes tables, figures and playback."
+            "Give the run's command again: it runs damaged units again and writes "
+            "tables, figures and playback."
         )
     return 1 if damage else 0
 
@@ -143,23 +158,28 @@ def list_command(kinds: list[str]) -> None:
     """List parts of each kind, metrics, layers, figures and worlds, with their options.
 
     Args:
-        kinds: Some of planner, model, risk, robot, objective, sensor, ground, belief, metric, layer, figure and world;
-            all if empty.
+        kinds: Some of planner, model, risk, robot, objective, sensor, ground, belief,
+            metric, layer, figure and world; all if empty.
     """
     from benchnav.eval.catalogue import print_catalogue
 
     print_catalogue(*kinds)
 
 
-def report(folder: str, out: str = "", partial: bool = False, figures: tuple[str, ...] = ()) -> int:
+def report(
+    folder: str, out: str = "", partial: bool = False, figures: tuple[str, ...] = ()
+) -> int:
     """Write the report of a run again (tables, figures, page), and print it.
 
     Args:
         folder: Run folder.
-        out: Folder for them, for a run that cannot be written; if empty, the run folder, or FOLDER/partial.
-        partial: Also of a run that is not finished, while it is running too; every table and figure says so.
-        figures: Figures of your own, with commas between, such as path/to/file.py:Name. If one cannot be drawn, the
-            report is written without it, a line says why, and the status is 1.
+        out: Folder for them, for a run that cannot be written; if empty, the run
+            folder, or FOLDER/partial.
+        partial: Also of a run that is not finished, while it is running too; every
+            table and figure says so.
+        figures: Figures of your own, with commas between, such as path/to/file.py:Name.
+            If one cannot be drawn, the report is written without it, a line says why,
+            and the status is 1.
     """
     if out:
         other_folder(folder, out)
@@ -176,31 +196,43 @@ def compare(
     allow_different: Literal["nothing", "code"] = "nothing",
     out: str = "",
 ) -> None:
-    """Compare conditions that met the same maps with the same draws of λ, with intervals and corrected tests.
+    """Compare conditions that met the same maps with the same draws of λ, with
+    intervals and corrected tests.
 
     Args:
         labels: Of the conditions to compare.
         folders: Folders of finished runs, one or more.
-        against: Label that all others are compared with, such as mean or straight; all pairs when not given.
-        by: The one thing in which the conditions of a pair differ: risk, planner, model, objective, robot, sensor,
-            ground, belief, world or run. When not given: the kind of `against`; run where runs share conditions; else
-            risk.
-        points: Difference of success in percentage points; a note tells how many maps it needs.
-        metric: Name of the metric to compare, such as path_length or energy; if empty, success and T_total.
-        allow_different: code also compares conditions made by different code, and says so under the table.
+        against: Label that all others are compared with, such as mean or straight; all
+            pairs when not given.
+        by: The one thing in which the conditions of a pair differ: risk, planner,
+            model, objective, robot, sensor, ground, belief, world or run. When not
+            given: the kind of `against`; run where runs share conditions; else risk.
+        points: Difference of success in percentage points; a note tells how many maps
+            it needs.
+        metric: Name of the metric to compare, such as path_length or energy; if empty,
+            success and T_total.
+        allow_different: code also compares conditions made by different code, and says
+            so under the table.
         out: Path without a suffix, to which .csv, .md and .tex are added.
     """
     from benchnav.core.tables import print_table
     from benchnav.eval.compare import compare_runs, write_comparison
 
     if out and (out.endswith(os.sep) or Path(out).name in ("", "..")):
-        raise ConfigError(f"Expected `out` as the path of files without a suffix, got the folder {out}.")
+        raise ConfigError(
+            "Expected `out` as the path of files without a suffix, got the folder "
+            f"{out}."
+        )
     runs = [Path(folder) for folder in folders]
     different = allow_different == "code"
-    table, shown = compare_runs(runs, by, against, labels.asked, points / 100, different, metric)
+    table, shown = compare_runs(
+        runs, by, against, labels.asked, points / 100, different, metric
+    )
     print_table(shown)
     if out:
-        print("written:", ", ".join(map(str, write_comparison(Path(out), table, shown))))
+        print(
+            "written:", ", ".join(map(str, write_comparison(Path(out), table, shown)))
+        )
     else:
         print("columns: --out NAME writes NAME.md, which explains them")
 
@@ -216,7 +248,8 @@ def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
     check_workers(jobs, backend, scheduler)
     if scheduler and jobs > 1:
         raise ConfigError(
-            f"Expected no `jobs` with `backend` dask, got {jobs}. The cluster has its own workers: leave `jobs` out."
+            f"Expected no `jobs` with `backend` dask, got {jobs}. The cluster has its "
+            "own workers: leave `jobs` out."
         )
 
 
@@ -258,14 +291,23 @@ def _is_whole(folder: Path) -> bool:
     run = open_run(folder)
     if run.shard is None:
         return (folder / EPISODES).exists()
-    own = [finished for unit, finished in newest_units(run) if unit.shard(run.shard.of) == run.shard]
+    own = [
+        finished
+        for unit, finished in newest_units(run)
+        if unit.shard(run.shard.of) == run.shard
+    ]
     return all(own)
 
 
 def _report(
-    folder: Path, out: Path | None = None, unfinished: bool = False, figures: Sequence[str] = ()
+    folder: Path,
+    out: Path | None = None,
+    unfinished: bool = False,
+    figures: Sequence[str] = (),
 ) -> int:
-    """Write and print a report; return the exit status: 1 where a figure of the user could not be drawn."""
+    """Write and print a report; return the exit status: 1 where a figure of the user
+    could not be drawn.
+    """
     from benchnav.core import registry
     from benchnav.eval.folder.results import read_results
     from benchnav.eval.report.write import PAGE, PARTIAL, print_report, write_report
@@ -276,18 +318,27 @@ def _report(
     made = [registry.make("figure", figure) for figure in figures]
     place = out or (folder / PARTIAL if mark else folder)
     _say(f"writing the report{f' ({mark})' if mark else ''}")
-    written = write_report(folder, partial(record_driven, folder), place, unfinished, made)
+    written = write_report(
+        folder, partial(record_driven, folder), place, unfinished, made
+    )
     print_report(written)
     print(f"report:  {place / PAGE}")
     return 1 if written.faults else 0
 
 
 def _print_recorded(folder: Path) -> None:
-    files = [path for path in (folder / "playback").glob("*") if path.suffix in (".npz", ".rrd")]
+    files = [
+        path
+        for path in (folder / "playback").glob("*")
+        if path.suffix in (".npz", ".rrd")
+    ]
     episodes = sum(path.suffix == ".npz" for path in files)
     if episodes:
         size = sum(path.stat().st_size for path in files) / 1e6
-        print(f"recorded: {episodes} episode{'s' * (episodes > 1)} in {folder / 'playback'}, {size:.1f} MB")
+        print(
+            f"recorded: {episodes} episode{'s' * (episodes > 1)} in "
+            f"{folder / 'playback'}, {size:.1f} MB"
+        )
 
 
 def _print_replay(folder: Path) -> None:
@@ -301,7 +352,10 @@ def _print_replay(folder: Path) -> None:
     shown, place = propose(folder)
     words = ["replay", str(folder)]
     for name, labels in shown.items():
-        several = name in ("planner", "scenario") or len({one[name] for one in every} - {NOT_USED}) > 1
+        several = (
+            name in ("planner", "scenario")
+            or len({one[name] for one in every} - {NOT_USED}) > 1
+        )
         if labels != [NOT_USED] and several:
             text = ",".join(labels)
             is_plain = yaml.safe_load(f"[{text}]") == labels
@@ -313,7 +367,9 @@ def _print_replay(folder: Path) -> None:
 
 
 def _failed(folder: Path) -> int:
-    """Exit status of a finished run or shard: 1 where a part failed in some episode, which one line says."""
+    """Exit status of a finished run or shard: 1 where a part failed in some episode,
+    which one line says.
+    """
     from benchnav.eval.folder.run_folder import EPISODES, ERRORS, read_table
     from benchnav.planning.world.outcome import ERROR_OUTCOMES
 
@@ -345,11 +401,16 @@ COMMANDS = {
 
 def main() -> None:
     """Entry point of `benchnav-eval`."""
-    description = "Evaluate planners under risk settings; report, replay, merge, repeat."
+    description = (
+        "Evaluate planners under risk settings; report, replay, merge, repeat."
+    )
     status = run("benchnav-eval", description, COMMANDS)
     if status == INTERRUPTED and sys.argv[1] in ("run", "rerun"):
         anew = any(word.startswith("--overwrite") for word in sys.argv)
-        _say(f"finished units are kept; to go on, give the same command{' without --overwrite' * anew} again")
+        _say(
+            "finished units are kept; to go on, give the same "
+            f"command{' without --overwrite' * anew} again"
+        )
     sys.exit(status)
 
 

@@ -29,30 +29,36 @@ def evaluate(
     verbose: bool = True,
     **experiment: Any,
 ) -> Results:
-    """Run every combination of planners, models, risk settings, … on the test maps of a dataset.
+    """Run every combination of planners, models, risk settings, … on the test maps of a
+    dataset.
 
-    Parts are objects, such as `AStarDWA()` and `CVaR(0.8)`, or names as in suites. An object that other processes
-    cannot create again (a function without a name, a class of a notebook) runs in this process only: the rows of its
-    conditions are marked as not reproducible, and their folder cannot be resumed.
+    Parts are objects, such as `AStarDWA()` and `CVaR(0.8)`, or names as in suites. An
+    object that other processes cannot create again (a function without a name, a class
+    of a notebook) runs in this process only: the rows of its conditions are marked as
+    not reproducible, and their folder cannot be resumed.
 
     Args:
-        terrain: a dataset, by path, id or object; or a recipe, whose test maps are generated first.
-        folder: run folder, which is resumed or extended if it holds a run. If None, results are kept in a temporary
-            folder as long as the returned object exists; see `Results.save`.
+        terrain: a dataset, by path, id or object; or a recipe, whose test maps are
+            generated first.
+        folder: run folder, which is resumed or extended if it holds a run. If None,
+            results are kept in a temporary folder as long as the returned object
+            exists; see `Results.save`.
         jobs: number of worker processes; the results are the same for any number.
         device: "cpu", "cuda", or "auto" for CUDA if there is a GPU.
         verbose: whether to show progress and notes on stderr.
-        **experiment: what is evaluated, by the fields of `Suite`: `models`, `planners`, `risks`, `robots`,
-            `objectives`, `sensors`, `grounds`, `beliefs`, `world` (such as `World.stakes()`), `task` (or `rules`, a
-            `Rules`), `scenarios`, `maps`, `seed` or `seeds`, `realisations`, `record`, `conditions`, `hypotheses`,
-            `metrics` besides those that every run has (such as `Energy(power_w=120)`), and `figures` of your own for
-            the report.
+        **experiment: what is evaluated, by the fields of `Suite`: `models`, `planners`,
+            `risks`, `robots`, `objectives`, `sensors`, `grounds`, `beliefs`, `world`
+            (such as `World.stakes()`), `task` (or `rules`, a `Rules`), `scenarios`,
+            `maps`, `seed` or `seeds`, `realisations`, `record`, `conditions`,
+            `hypotheses`, `metrics` besides those that every run has (such as
+            `Energy(power_w=120)`), and `figures` of your own for the report.
 
     Returns:
         The results of the run.
 
     Raises:
-        ConfigError: If the combination of parts cannot be run; the message names the part and the remedy.
+        ConfigError: If the combination of parts cannot be run; the message names the
+            part and the remedy.
         DatasetError: If there is no such dataset, or it lacks what is asked for.
     """
     for name in experiment:
@@ -63,16 +69,20 @@ def evaluate(
         experiment["task"] = plain(rules) if isinstance(rules, Rules) else rules
     expect(
         "model" in experiment or "models" in experiment or "conditions" in experiment,
-        '`models`, such as [load_model("stakes-v1")], got none. Blind planners take models=["oracle"].',
+        '`models`, such as [load_model("stakes-v1")], got none. Blind planners take '
+        'models=["oracle"].',
     )
     temporary = None if folder else tempfile.TemporaryDirectory(prefix="benchnav-")
     place = Path(temporary.name, "run") if temporary else Path(str(folder))
     suite = Suite(
-        data=_path_of(terrain, place), **{name: _as_tuple(value) for name, value in experiment.items()}
+        data=_path_of(terrain, place),
+        **{name: _as_tuple(value) for name, value in experiment.items()},
     )
     notes: list[str] = []
     settings = Settings.on(device)
-    steps = run_suite(suite, place, jobs, settings=settings, say=print if verbose else notes.append)
+    steps = run_suite(
+        suite, place, jobs, settings=settings, say=print if verbose else notes.append
+    )
     if verbose:
         show_progress(steps, "units")
     else:
@@ -86,12 +96,18 @@ def _as_tuple(value: Any) -> Any:
 
 
 def _path_of(terrain: Any, place: Path) -> str:
-    """Return the path or id of a dataset; generate the test maps of a recipe next to the run folder."""
+    """Return the path or id of a dataset; generate the test maps of a recipe next to
+    the run folder.
+    """
     if isinstance(terrain, TerrainDataset):
         return str(terrain.path)
     if not isinstance(terrain, Recipe):
         return str(terrain)
-    splits = {name: split for name, split in terrain.splits.items() if name.startswith("test/")}
+    splits = {
+        name: split
+        for name, split in terrain.splits.items()
+        if name.startswith("test/")
+    }
     path = place.with_name(f"{place.name}-terrain.h5")
     path.parent.mkdir(parents=True, exist_ok=True)
     for _ in create(replace(terrain, splits=splits), path):

@@ -39,35 +39,59 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         episodes: its rows.
 
     Returns:
-        A row a failure: `condition`, `planner`, `risk`, `model`, `scenario`, `world`, `seed`, `realisation`,
-        `map`, `outcome`, `end_time_s`, `code`; `x_m`, `y_m`, where it ended; `end_traversability`, the observed λ
-        in the last step; and `last_traversability`, the mean of observed λ in the last 2 s. The last four are NaN where
-        steps were not kept.
+        A row a failure: `condition`, `planner`, `risk`, `model`, `scenario`, `world`,
+        `seed`, `realisation`, `map`, `outcome`, `end_time_s`, `code`; `x_m`, `y_m`,
+        where it ended; `end_traversability`, the observed λ in the last step; and
+        `last_traversability`, the mean of observed λ in the last 2 s. The last four are
+        NaN where steps were not kept.
     """
-    columns = ["condition", "planner", "risk", "model", "scenario", "world", *_KEYS[1:], "outcome"]
-    failed = episodes.loc[~episodes["success"].astype(bool), [*columns, "end_time_s", "code"]].reset_index(
-        drop=True
-    )
+    columns = [
+        "condition",
+        "planner",
+        "risk",
+        "model",
+        "scenario",
+        "world",
+        *_KEYS[1:],
+        "outcome",
+    ]
+    failed = episodes.loc[
+        ~episodes["success"].astype(bool), [*columns, "end_time_s", "code"]
+    ].reset_index(drop=True)
     read = [*_KEYS, "time_s", "x_m", "y_m", "traversability"]
     steps = [rows[read] for rows in step_files(folder, set(failed["condition"]))]
     if not steps:
         return failed.assign(**dict.fromkeys(_ENDS, np.nan))
-    return failed.merge(_ends(pd.concat(steps, ignore_index=True)), on=_KEYS, how="left")
+    return failed.merge(
+        _ends(pd.concat(steps, ignore_index=True)), on=_KEYS, how="left"
+    )
 
 
 def _ends(steps: pd.DataFrame) -> pd.DataFrame:
-    """The last place of each episode, and λ at its end; the last state of an episode has no λ of its own."""
+    """The last place of each episode, and λ at its end; the last state of an episode
+    has no λ of its own.
+    """
     groups = steps.groupby(_KEYS, sort=False)
     last = groups[["x_m", "y_m"]].last()
     met = steps[steps["traversability"].notna()]
-    end = met.groupby(_KEYS, sort=False)["traversability"].last().rename("end_traversability")
+    end = (
+        met.groupby(_KEYS, sort=False)["traversability"]
+        .last()
+        .rename("end_traversability")
+    )
     from_s = groups["time_s"].transform("max") - _LAST_S
     late = met[met["time_s"] >= from_s.loc[met.index] - 1e-9]
-    mean = late.groupby(_KEYS, sort=False)["traversability"].mean().rename("last_traversability")
+    mean = (
+        late.groupby(_KEYS, sort=False)["traversability"]
+        .mean()
+        .rename("last_traversability")
+    )
     return (
         last.join([end, mean])
         .reset_index()
-        .astype({"x_m": np.float64, "y_m": np.float64, "end_traversability": np.float64})
+        .astype(
+            {"x_m": np.float64, "y_m": np.float64, "end_traversability": np.float64}
+        )
     )
 
 
@@ -116,21 +140,33 @@ def collect_sheets(
     placed = failures[failures["x_m"].notna()]
     if record_driven is None or placed.empty:
         asked = record_driven is not None and not failures.empty
-        why = "there is no figure of failures, since the run kept no steps" if asked else ""
+        why = (
+            "there is no figure of failures, since the run kept no steps"
+            if asked
+            else ""
+        )
         return Sheets(shown=(), predicted={}, left_out=why)
     shown, predicted, left_out = [], {}, []
     if len(every := blocks(with_names(summary))) > _MOST_BLOCKS:
-        left_out.append(f"figures of failures show the first {_MOST_BLOCKS} of {len(every)} blocks")
+        left_out.append(
+            f"figures of failures show the first {_MOST_BLOCKS} of {len(every)} blocks"
+        )
     for title, rows in every[:_MOST_BLOCKS]:
         lines = []
         try:
             for row in _looked_at(rows):
                 condition = row["condition"]
-                own = placed[placed["condition"] == condition].head(_MOST_FAILURES).reset_index(drop=True)
+                own = (
+                    placed[placed["condition"] == condition]
+                    .head(_MOST_FAILURES)
+                    .reset_index(drop=True)
+                )
                 if own.empty:
                     continue
                 recordings, chosen = record_driven(own), choose_failures(own)
-                predicted[condition] = np.array([recording.predicted_at_end for recording in recordings])
+                predicted[condition] = np.array(
+                    [recording.predicted_at_end for recording in recordings]
+                )
                 lines.append(
                     FailedLine(
                         name=row["name"],
@@ -144,7 +180,11 @@ def collect_sheets(
             continue
         if lines:
             shown.append((title, tuple(lines)))
-    return Sheets(shown=tuple(shown), predicted=predicted, left_out="; ".join(dict.fromkeys(left_out)))
+    return Sheets(
+        shown=tuple(shown),
+        predicted=predicted,
+        left_out="; ".join(dict.fromkeys(left_out)),
+    )
 
 
 def _looked_at(rows: pd.DataFrame) -> list[dict[Any, Any]]:
@@ -156,8 +196,14 @@ def _looked_at(rows: pd.DataFrame) -> list[dict[Any, Any]]:
 
 
 def choose_failures(failures: pd.DataFrame) -> pd.DataFrame:
-    """Chooses failures to be shown: each outcome once before any twice, the most frequent outcome first."""
+    """Chooses failures to be shown: each outcome once before any twice, the most
+    frequent outcome first.
+    """
     placed = failures[failures["x_m"].notna()]
     turn = placed.groupby("outcome", sort=False).cumcount()
     often = -placed.groupby("outcome")["outcome"].transform("size")
-    return placed.assign(turn=turn, often=often).sort_values(["turn", "often"], kind="stable").head(ACROSS)
+    return (
+        placed.assign(turn=turn, often=often)
+        .sort_values(["turn", "often"], kind="stable")
+        .head(ACROSS)
+    )

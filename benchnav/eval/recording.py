@@ -1,6 +1,7 @@
 """An episode with all that is shown of it, and the file that holds it.
 
-Running fills it. Viewer files, videos, comparisons and figures are made of it alone, without dataset or prediction.
+Running fills it. Viewer files, videos, comparisons and figures are made of it alone,
+without dataset or prediction.
 Letters in shapes: N steps, H×W cells, S state and A action dimensions, P points.
 """
 
@@ -22,10 +23,11 @@ from benchnav.planning.world.outcome import Outcome
 GROUND = "ground.npz"
 # What one map under one draw of λ is known by.
 MAP = ["data", "scenario", "world", "seed", "realisation", "map"]
-# The moment that figures show: about half-way for most episodes; the paper shows 25 s, when robots here have mostly
-# arrived.
+# The moment that figures show: about half-way for most episodes; the paper shows 25 s,
+# when robots here have mostly arrived.
 MOMENT_S = 15.0
-# Of a layer of a plan in a recording: keeps long episodes of planners with many thoughts within 3 MB.
+# Of a layer of a plan in a recording: keeps long episodes of planners with many
+# thoughts within 3 MB.
 MOST_POINTS = 160
 
 _DRAW_EVERY_S = 0.5
@@ -40,7 +42,8 @@ class DrawnPlan:
 
     Args:
         step: the step.
-        lines: by layer its polylines, (x, y) in metres, each of shape [P, 2] with P ≥ 2.
+        lines: by layer its polylines, (x, y) in metres, each of shape [P, 2] with P ≥
+            2.
     """
 
     step: int
@@ -59,8 +62,8 @@ class KnownMap:
         spread: half of the range from the 16 % to the 84 % quantile of λ, shape [H, W].
         seen: cells whose appearance was seen by then, bool, shape [H, W].
         sensed: cells whose λ was sensed by then, bool, shape [H, W].
-        outline: of the ground that the sensors reached at that step, (x, y) in metres, shape [P, 2]; rows of NaN part
-            one line from the next.
+        outline: of the ground that the sensors reached at that step, (x, y) in metres,
+            shape [P, 2]; rows of NaN part one line from the next.
     """
 
     step: int
@@ -88,7 +91,9 @@ def reach_outline(cells: np.ndarray, resolution_m: float) -> np.ndarray:
         resolution_m: edge length of a cell.
     """
     edges = outline(cells, resolution_m)
-    return np.pad(edges, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 2)
+    return np.pad(edges, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(
+        -1, 2
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,10 +101,12 @@ class Ground:
     """A map under one draw of λ: what driven paths are shown on.
 
     Args:
-        about: what it is known by: labels of a condition, `seed`, `realisation` and `map` among them.
+        about: what it is known by: labels of a condition, `seed`, `realisation` and
+            `map` among them.
         resolution_m: edge length of a cell.
         rgb: uint8, shape [3, H, W].
-        field: λ of every cell in the episode, shape [H, W]; None where it was resampled.
+        field: λ of every cell in the episode, shape [H, W]; None where it was
+            resampled.
         immobilising: cells of the field that immobilise a robot, bool, shape [H, W].
         goal_m: (x, y).
     """
@@ -120,10 +127,16 @@ class Ground:
         return Grid(height, width, self.resolution_m)
 
     def save(self, path: Path) -> None:
-        """Writes it to an `.npz` file, whole or not at all: arrays by their names, all else as JSON."""
+        """Writes it to an `.npz` file, whole or not at all: arrays by their names, all
+        else as JSON.
+        """
         stored = self._stored()
-        arrays: dict[str, Any] = {name: v for name, v in stored.items() if isinstance(v, np.ndarray)}
-        rest = json.dumps({name: value for name, value in stored.items() if name not in arrays})
+        arrays: dict[str, Any] = {
+            name: v for name, v in stored.items() if isinstance(v, np.ndarray)
+        }
+        rest = json.dumps(
+            {name: value for name, value in stored.items() if name not in arrays}
+        )
         with replacing(path) as partial, open(partial, "wb") as file:
             np.savez_compressed(file, scalars=np.array(rest), **arrays)
 
@@ -148,7 +161,8 @@ class Ground:
 
 @dataclass(frozen=True, kw_only=True)
 class Recording(Ground):
-    """An episode of any robot, from its start to its end; `about` holds `condition` and `outcome` too, all as text.
+    """An episode of any robot, from its start to its end; `about` holds `condition` and
+    `outcome` too, all as text.
 
     Args:
         elevation_m: shape [H, W].
@@ -164,9 +178,11 @@ class Recording(Ground):
         states: robot states beginning with (x, y, θ), shape [N + 1, S].
         actions: shape [N, A].
         traversability: observed λ, shape [N].
-        plans: what was planned, in order of steps; those after the episode's end are left out.
+        plans: what was planned, in order of steps; those after the episode's end are
+            left out.
         layers: optional fields of the map, by name, each of shape [H, W].
-        known: what the robot knew of its map, in order of steps; empty where it learnt nothing on the way.
+        known: what the robot knew of its map, in order of steps; empty where it learnt
+            nothing on the way.
     """
 
     elevation_m: np.ndarray
@@ -211,30 +227,44 @@ class Recording(Ground):
 
     @property
     def immobilised_at(self) -> np.ndarray | None:
-        """Where it ended on ground that immobilises a robot, (x, y); None where it ended otherwise."""
-        return self.track[-1] if self.about["outcome"] == Outcome.IMMOBILISED.name.lower() else None
+        """Where it ended on ground that immobilises a robot, (x, y); None where it
+        ended otherwise.
+        """
+        return (
+            self.track[-1]
+            if self.about["outcome"] == Outcome.IMMOBILISED.name.lower()
+            else None
+        )
 
     @property
     def predicted_at_end(self) -> float:
         """λ̂ where it ended; NaN outside the map."""
-        column, row = np.floor(self.track[-1].astype(np.float64) / self.resolution_m).astype(int)
+        column, row = np.floor(
+            self.track[-1].astype(np.float64) / self.resolution_m
+        ).astype(int)
         inside = 0 <= row < self.grid.height and 0 <= column < self.grid.width
         return float(self.predicted[row, column]) if inside else float("nan")
 
     @property
     def own_plans(self) -> list[DrawnPlan]:
-        """Plans up to the last step that was taken; the first is one of them, also where none was taken."""
+        """Plans up to the last step that was taken; the first is one of them, also
+        where none was taken.
+        """
         last = max(len(self.traversability) - 1, 0)
         return [plan for plan in self.plans if plan.step <= last]
 
     @property
     def plan(self) -> DrawnPlan:
-        """The plan that figures show: that of `MOMENT_S`, or of half-way where the episode was short."""
+        """The plan that figures show: that of `MOMENT_S`, or of half-way where the
+        episode was short.
+        """
         return self.plan_at(min(MOMENT_S, self.end_s / 2))
 
     @property
     def now(self) -> int:
-        """The step that figures show: that of the plan; the last where none was recorded."""
+        """The step that figures show: that of the plan; the last where none was
+        recorded.
+        """
         last = len(self.traversability)
         return min(self.plan.step, last) if self.own_plans else last
 
@@ -246,37 +276,62 @@ class Recording(Ground):
 
     def known_at(self, step: int) -> KnownMap | None:
         """What was known at a step; None where the robot learnt nothing on the way."""
-        return next((known for known in reversed(self.known) if known.step <= step), None)
+        return next(
+            (known for known in reversed(self.known) if known.step <= step), None
+        )
 
     def given_at(self, step: int) -> tuple[np.ndarray, np.ndarray]:
         """λ̂ and S_free as the planner had them at a step, each of shape [H, W]."""
         known = self.known_at(step)
-        return (self.predicted, self.free) if known is None else (known.predicted, known.free)
+        return (
+            (self.predicted, self.free)
+            if known is None
+            else (known.predicted, known.free)
+        )
 
     def _stored(self) -> dict[str, Any]:
-        """Its values; plans are thinned but the one of figures, and packed into few arrays, as what was known is."""
+        """Its values; plans are thinned but the one of figures, and packed into few
+        arrays, as what was known is.
+        """
         values, shown = super()._stored(), self.plan.step
         del values["plans"]
         values |= _pack_known(values.pop("known"))
-        values |= {f"layers:{name}": layer for name, layer in values.pop("layers").items()}
-        return values | _pack([plan if plan.step == shown else thinned(plan) for plan in self.own_plans])
+        values |= {
+            f"layers:{name}": layer for name, layer in values.pop("layers").items()
+        }
+        return values | _pack(
+            [plan if plan.step == shown else thinned(plan) for plan in self.own_plans]
+        )
 
     @classmethod
     def _read(cls, values: dict[str, Any]) -> Self:
-        layers, plans, known = (_under(prefix, values) for prefix in ("layers:", "plans:", "known:"))
+        layers, plans, known = (
+            _under(prefix, values) for prefix in ("layers:", "plans:", "known:")
+        )
         own = {name: value for name, value in values.items() if ":" not in name}
         own["action_names"] = tuple(own["action_names"])
-        return cls(**own, layers=layers, plans=_unpack(plans), known=_unpack_known(known) if known else ())
+        return cls(
+            **own,
+            layers=layers,
+            plans=_unpack(plans),
+            known=_unpack_known(known) if known else (),
+        )
 
 
 def _under(prefix: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values whose names begin with a prefix, by the rest of their names."""
-    return {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
+    return {
+        name.removeprefix(prefix): value
+        for name, value in values.items()
+        if name.startswith(prefix)
+    }
 
 
 def read_recordings(folder: Path) -> list[Recording]:
     """Reads every recorded episode of a run."""
-    return [Recording.load(path) for path in sorted((folder / "playback").glob("*.npz"))]
+    return [
+        Recording.load(path) for path in sorted((folder / "playback").glob("*.npz"))
+    ]
 
 
 def drawing_interval(dt_s: float) -> int:
@@ -285,21 +340,27 @@ def drawing_interval(dt_s: float) -> int:
 
 
 def drawn_plan(step: int, layers: Mapping[str, Tensor]) -> DrawnPlan:
-    """Keeps of a plan what can be drawn: points that are numbers, lines of at least two of them.
+    """Keeps of a plan what can be drawn: points that are numbers, lines of at least two
+    of them.
 
     Args:
         step: when it was planned.
-        layers: from `Plan.lines`, polylines of shape [lines, P, 2] by layer; unused points are NaN.
+        layers: from `Plan.lines`, polylines of shape [lines, P, 2] by layer; unused
+            points are NaN.
     """
     lines = {}
     for name, layer in layers.items():
-        kept = [line[np.isfinite(line).all(axis=1)] for line in layer.detach().cpu().numpy()]
+        kept = [
+            line[np.isfinite(line).all(axis=1)] for line in layer.detach().cpu().numpy()
+        ]
         lines[name] = [line for line in kept if len(line) > 1]
     return DrawnPlan(step=step, lines=lines)
 
 
 def thinned(plan: DrawnPlan) -> DrawnPlan:
-    """Leaves out lines and points within lines where a layer has too many; what is thin stays as it is."""
+    """Leaves out lines and points within lines where a layer has too many; what is thin
+    stays as it is.
+    """
     layers = {}
     for name, lines in plan.lines.items():
         shown = [lines[place] for place in _spread(len(lines), MOST_POINTS // 2)]
@@ -309,7 +370,9 @@ def thinned(plan: DrawnPlan) -> DrawnPlan:
 
 
 def _spread(count: int, most: int) -> np.ndarray:
-    """Indices of so many, evenly spread, the first and the last among them; of all where they are few."""
+    """Indices of so many, evenly spread, the first and the last among them; of all
+    where they are few.
+    """
     return np.linspace(0, count - 1, min(count, most)).round().astype(int)
 
 
@@ -317,24 +380,38 @@ def _pack(plans: Sequence[DrawnPlan]) -> dict[str, np.ndarray]:
     """Packs plans, in order of steps, into few arrays, which `_unpack` takes apart.
 
     Returns:
-        `plans:steps`; by layer all points as `plans:points/LAYER`, points of each line as `plans:sizes/LAYER`, and
-        lines of each plan as `plans:counts/LAYER`.
+        `plans:steps`; by layer all points as `plans:points/LAYER`, points of each line
+        as `plans:sizes/LAYER`, and lines of each plan as `plans:counts/LAYER`.
     """
-    arrays: dict[str, np.ndarray] = {"plans:steps": np.array([plan.step for plan in plans], np.int64)}
+    arrays: dict[str, np.ndarray] = {
+        "plans:steps": np.array([plan.step for plan in plans], np.int64)
+    }
     for name in dict.fromkeys(name for plan in plans for name in plan.lines):
         layers = [plan.lines.get(name, ()) for plan in plans]
         lines = [line for layer in layers for line in layer]
-        arrays[f"plans:points/{name}"] = np.concatenate([np.empty((0, 2), np.float32), *lines])
-        arrays[f"plans:sizes/{name}"] = np.array([len(line) for line in lines], np.int64)
-        arrays[f"plans:counts/{name}"] = np.array([len(layer) for layer in layers], np.int64)
+        arrays[f"plans:points/{name}"] = np.concatenate(
+            [np.empty((0, 2), np.float32), *lines]
+        )
+        arrays[f"plans:sizes/{name}"] = np.array(
+            [len(line) for line in lines], np.int64
+        )
+        arrays[f"plans:counts/{name}"] = np.array(
+            [len(layer) for layer in layers], np.int64
+        )
     return arrays
 
 
 def _unpack(arrays: Mapping[str, np.ndarray]) -> list[DrawnPlan]:
-    points, sizes, counts = (_under(kind, arrays) for kind in ("points/", "sizes/", "counts/"))
-    layers = {name: _cut(_cut(points[name], sizes[name]), counts[name]) for name in points}
+    points, sizes, counts = (
+        _under(kind, arrays) for kind in ("points/", "sizes/", "counts/")
+    )
+    layers = {
+        name: _cut(_cut(points[name], sizes[name]), counts[name]) for name in points
+    }
     return [
-        DrawnPlan(step=int(step), lines={name: lines[place] for name, lines in layers.items()})
+        DrawnPlan(
+            step=int(step), lines={name: lines[place] for name, lines in layers.items()}
+        )
         for place, step in enumerate(arrays["steps"])
     ]
 
@@ -346,21 +423,33 @@ def _cut(values: Any, sizes: np.ndarray) -> list[Any]:
 
 
 def _pack_known(known: Sequence[KnownMap]) -> dict[str, np.ndarray]:
-    """Packs what was known into few arrays, which `_unpack_known` takes apart; none where there is none.
+    """Packs what was known into few arrays, which `_unpack_known` takes apart; none
+    where there is none.
 
-    Of each map only its difference from the one before is kept, which compresses well: most cells stay as they were.
+    Of each map only its difference from the one before is kept, which compresses well:
+    most cells stay as they were.
 
     Returns:
-        `known:steps`; by field of λ `known:NAME`, uint8, and by mask the same in bits; the outlines' points as
-        `known:outline`, and how many each map has as `known:sizes`.
+        `known:steps`; by field of λ `known:NAME`, uint8, and by mask the same in bits;
+        the outlines' points as `known:outline`, and how many each map has as
+        `known:sizes`.
     """
     if not known:
         return {}
-    arrays: dict[str, np.ndarray] = {"known:steps": np.array([each.step for each in known], np.int64)}
+    arrays: dict[str, np.ndarray] = {
+        "known:steps": np.array([each.step for each in known], np.int64)
+    }
     for name in NUMBERS:
-        levels = np.stack([getattr(each, name) for each in known]).astype(np.float32).clip(0, 1) * _LEVELS
+        levels = (
+            np.stack([getattr(each, name) for each in known])
+            .astype(np.float32)
+            .clip(0, 1)
+            * _LEVELS
+        )
         # Differences of whole numbers modulo 256, which sums take back.
-        arrays[f"known:{name}"] = np.diff(levels.round().astype(np.uint8), axis=0, prepend=np.uint8(0))
+        arrays[f"known:{name}"] = np.diff(
+            levels.round().astype(np.uint8), axis=0, prepend=np.uint8(0)
+        )
     for name in _MASKS:
         masks = np.stack([getattr(each, name) for each in known])
         changed = np.diff(masks, axis=0, prepend=False)
@@ -375,12 +464,20 @@ def _unpack_known(arrays: Mapping[str, np.ndarray]) -> tuple[KnownMap, ...]:
     values = dict(arrays)
     width = values[NUMBERS[0]].shape[-1]
     for name in NUMBERS:
-        values[name] = values[name].cumsum(axis=0, dtype=np.uint8).astype(np.float32) / _LEVELS
+        values[name] = (
+            values[name].cumsum(axis=0, dtype=np.uint8).astype(np.float32) / _LEVELS
+        )
     for name in _MASKS:
         changed = np.unpackbits(values[name], axis=-1, count=width)
         values[name] = np.logical_xor.accumulate(changed.astype(bool), axis=0)
     outlines = _cut(values["outline"], values["sizes"])
     return tuple(
-        KnownMap(step=int(step), outline=lines, **{name: values[name][place] for name in (*NUMBERS, *_MASKS)})
-        for place, (step, lines) in enumerate(zip(values["steps"], outlines, strict=True))
+        KnownMap(
+            step=int(step),
+            outline=lines,
+            **{name: values[name][place] for name in (*NUMBERS, *_MASKS)},
+        )
+        for place, (step, lines) in enumerate(
+            zip(values["steps"], outlines, strict=True)
+        )
     )

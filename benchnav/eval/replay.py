@@ -33,8 +33,8 @@ def replay(
 ) -> int:
     """Play back an episode, or several on one map; missing recordings are made first.
 
-    Several labels of a column, such as --risk mean,cvar:0.9, show their conditions together. Of a column that is not
-    named the run's first label that fits is taken.
+    Several labels of a column, such as --risk mean,cvar:0.9, show their conditions
+    together. Of a column that is not named the run's first label that fits is taken.
 
     Args:
         labels: Of the conditions.
@@ -44,8 +44,10 @@ def replay(
         map: Number of the map in the scenario.
         view: Open the viewer; false makes the recording only.
         web: Serve the viewer to a browser on this machine until Ctrl-C.
-        video: Write a video to this file, .mp4, in place of opening the viewer; conditions stand side by side.
-        out: Folder for recordings, for a run that cannot be written; the run folder when not given.
+        video: Write a video to this file, .mp4, in place of opening the viewer;
+            conditions stand side by side.
+        out: Folder for recordings, for a run that cannot be written; the run folder
+            when not given.
     """
     from benchnav.eval.find_episodes import find_episodes
 
@@ -59,13 +61,16 @@ def replay(
         from benchnav.core.progress import show_progress
         from benchnav.eval.report.playback.video import write_video
 
-        show_progress(write_video(_recordings(run, found, place), Path(video)), "frames")
+        show_progress(
+            write_video(_recordings(run, found, place), Path(video)), "frames"
+        )
         print(f"video:   {video}")
         return 0
     worlds = dict.fromkeys(unit.condition.labels["world"] for unit, _ in found)
     if len({repr(unit.condition.world) for unit, _ in found}) > 1:
         raise ConfigError(
-            f"Expected conditions of one world to show on one map, got {', '.join(worlds)}. Pass --video FILE.mp4, "
+            "Expected conditions of one world to show on one map, got "
+            f"{', '.join(worlds)}. Pass --video FILE.mp4, "
             "which shows them side by side."
         )
     path = _viewer_file(run, found, place)
@@ -75,14 +80,23 @@ def replay(
 
         serve(path)
         return 0
-    shown = sys.platform != "linux" or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    shown = (
+        sys.platform != "linux"
+        or "DISPLAY" in os.environ
+        or "WAYLAND_DISPLAY" in os.environ
+    )
     if view and shown:
         return (
-            1 if subprocess.run([sys.executable, "-m", "rerun_cli", str(path)], check=False).returncode else 0
+            1
+            if subprocess.run(
+                [sys.executable, "-m", "rerun_cli", str(path)], check=False
+            ).returncode
+            else 0
         )
     lacking = "no display was found; " if view else ""
     print(
-        f"{lacking}view it with: {program('rerun')} {path}, in a browser with --web, or as --video FILE{VIDEO}"
+        f"{lacking}view it with: {program('rerun')} {path}, in a browser with --web, "
+        f"or as --video FILE{VIDEO}"
     )
     return 0
 
@@ -90,13 +104,19 @@ def replay(
 def program(name: str) -> str:
     """How a program of this environment is called from here."""
     path = Path(sys.executable).parent / name
-    if any(Path(folder) == path.parent for folder in os.environ.get("PATH", "").split(os.pathsep)):
+    if any(
+        Path(folder) == path.parent
+        for folder in os.environ.get("PATH", "").split(os.pathsep)
+    ):
         return name
-    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
+    return str(
+        path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+    )
 
 
 def other_folder(run: str, out: str) -> Path:
-    """Where something made of a run is written: into it, or into a folder that is no other run.
+    """Where something made of a run is written: into it, or into a folder that is no
+    other run.
 
     Args:
         run: the run folder.
@@ -107,18 +127,24 @@ def other_folder(run: str, out: str) -> Path:
     """
     place = Path(out or run)
     if (place / "run.json").exists() and place.resolve() != Path(run).resolve():
-        raise ConfigError(f"Expected `out` as a folder that holds no other run, got {out}.")
+        raise ConfigError(
+            f"Expected `out` as a folder that holds no other run, got {out}."
+        )
     return place
 
 
-def _recordings(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> "list[Recording]":
+def _recordings(
+    folder: Path, found: "list[tuple[Unit, int]]", out: Path
+) -> "list[Recording]":
     from benchnav.eval.run.recordings import find_recording
 
     return [find_recording(folder, unit, member, out) for unit, member in found]
 
 
 def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> Path:
-    """The viewer's file of the episodes, which is made in a folder where it is not there."""
+    """The viewer's file of the episodes, which is made in a folder where it is not
+    there.
+    """
     from benchnav.eval.folder.checksums import is_as_noted, note_checksums
     from benchnav.eval.report.playback.viewer_file import write_rerun
 
@@ -127,7 +153,13 @@ def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> Pa
     if len(found) > 1:
         conditions = "".join(other.condition.id for other, _ in found)
         digest = hashlib.sha256(conditions.encode()).hexdigest()[:8]
-        words = (unit.condition.scenario, digest, unit.seed, unit.realisation, f"{unit.maps[member]:05d}")
+        words = (
+            unit.condition.scenario,
+            digest,
+            unit.seed,
+            unit.realisation,
+            f"{unit.maps[member]:05d}",
+        )
         path = path.with_name(f"together-{'-'.join(map(str, words))}.rrd")
     if len(found) > 1 or not path.exists() or not is_as_noted(out, path):
         write_rerun(_recordings(folder, found, out), path)

@@ -43,7 +43,10 @@ class Comparison:
 
     def __repr__(self) -> str:
         """Return the size, in one line."""
-        return f"Comparison of {len(self.numbers)} pairs; .numbers is a DataFrame, print() shows the table"
+        return (
+            f"Comparison of {len(self.numbers)} pairs; .numbers is a DataFrame, "
+            "print() shows the table"
+        )
 
     def __str__(self) -> str:
         """Return the table as text."""
@@ -58,10 +61,15 @@ class Results:
 
     Args:
         folder: a run folder.
-        temporary: the temporary folder that holds it, which is deleted together with this object.
+        temporary: the temporary folder that holds it, which is deleted together with
+            this object.
     """
 
-    def __init__(self, folder: str | Path, temporary: tempfile.TemporaryDirectory[str] | None = None) -> None:
+    def __init__(
+        self,
+        folder: str | Path,
+        temporary: tempfile.TemporaryDirectory[str] | None = None,
+    ) -> None:
         """Open a run folder.
 
         Raises:
@@ -81,66 +89,106 @@ class Results:
         """One row per condition, by its id: the labels of its parts."""
         about = self._rows.conditions
         labels = [entry["labels"] for entry in about.values()]
-        return pd.DataFrame(labels, index=pd.Index(about, name="condition"), columns=list(LABELS))
+        return pd.DataFrame(
+            labels, index=pd.Index(about, name="condition"), columns=list(LABELS)
+        )
 
     @property
     def notes(self) -> list[str]:
-        """What a reader of the results must know: warnings, combinations that were left out."""
+        """What a reader of the results must know: warnings, combinations that were left
+        out.
+        """
         return [*self._rows.notes(), *caveats(self._rows.run.about)]
 
     @property
     def summary(self) -> pd.DataFrame:
-        """One row per condition: rates, means and intervals, and the comparison with the best of its block."""
+        """One row per condition: rates, means and intervals, and the comparison with
+        the best of its block.
+        """
         return self._report.summary.copy()
 
     def best(self) -> pd.DataFrame:
-        """Return the conditions of each block that are not significantly worse than its best, best first.
+        """Return the conditions of each block that are not significantly worse than its
+        best, best first.
 
-        The test is the max-T bootstrap test by map; see docs/concepts/statistics.md. In a block where nothing is
-        significantly worse, these are all conditions that compete.
+        The test is the max-T bootstrap test by map; see docs/concepts/statistics.md. In
+        a block where nothing is significantly worse, these are all conditions that
+        compete.
         """
-        competing = self._report.summary[self._report.summary["best_alike"].astype(bool)]
-        columns = [*LABELS, "success_rate", "success_low", "success_high", "total_time_mean_s", "best_p"]
-        return competing.sort_values("success_rate", ascending=False, kind="stable")[columns].reset_index(
-            drop=True
-        )
+        competing = self._report.summary[
+            self._report.summary["best_alike"].astype(bool)
+        ]
+        columns = [
+            *LABELS,
+            "success_rate",
+            "success_low",
+            "success_high",
+            "total_time_mean_s",
+            "best_p",
+        ]
+        return competing.sort_values("success_rate", ascending=False, kind="stable")[
+            columns
+        ].reset_index(drop=True)
 
     def compare(
-        self, by: str = "", against: str = "", points: float = 5.0, **labels: str | Sequence[str]
+        self,
+        by: str = "",
+        against: str = "",
+        points: float = 5.0,
+        **labels: str | Sequence[str],
     ) -> Comparison:
-        """Compare conditions that were evaluated on the same maps with the same draws of λ.
+        """Compare conditions that were evaluated on the same maps with the same draws
+        of λ.
 
         Args:
-            by: the one label in which the conditions of a pair differ, such as "risk"; if empty, that of `against`,
-                or "risk".
+            by: the one label in which the conditions of a pair differ, such as "risk";
+                if empty, that of `against`, or "risk".
             against: label that all others are compared with; if empty, all pairs.
-            points: difference of success in percentage points, for which the table counts the maps needed.
-            **labels: which conditions are compared: by column one label or several, such as planner="mppi".
+            points: difference of success in percentage points, for which the table
+                counts the maps needed.
+            **labels: which conditions are compared: by column one label or several,
+                such as planner="mppi".
 
         Raises:
             ConfigError: If there is nothing to compare, or conditions cannot be paired.
         """
-        asked = {name: [value] if isinstance(value, str) else list(value) for name, value in labels.items()}
+        asked = {
+            name: [value] if isinstance(value, str) else list(value)
+            for name, value in labels.items()
+        }
         for name in asked:
             expect(name in LABELS, f"labels among {', '.join(LABELS)}, got {name!r}.")
-        return Comparison(*compare_runs([self.folder], by, against, asked, points / 100))
+        return Comparison(
+            *compare_runs([self.folder], by, against, asked, points / 100)
+        )
 
     @property
     def plot(self) -> "Plots":
-        """The figures of the report, each a method that returns a matplotlib figure; see `Plots`."""
+        """The figures of the report, each a method that returns a matplotlib figure;
+        see `Plots`.
+        """
         return Plots(self)
 
-    def report(self, folder: str | Path | None = None, figures: Sequence[Figure] = ()) -> Path:
+    def report(
+        self, folder: str | Path | None = None, figures: Sequence[Figure] = ()
+    ) -> Path:
         """Write the report (page, tables, figures), and return the path of its page.
 
         Args:
             folder: where to; if None, the run folder.
-            figures: of your own, after the shipped ones. One that raises is left out, and the page says why.
+            figures: of your own, after the shipped ones. One that raises is left out,
+                and the page says why.
         """
         out = Path(folder) if folder else self.folder
         if out == self.folder and not self._rows.is_partial:
             write_viewer_files(self.folder)
-        write_report(self.folder, partial(record_driven, self.folder), out, self._rows.is_partial, figures)
+        write_report(
+            self.folder,
+            partial(record_driven, self.folder),
+            out,
+            self._rows.is_partial,
+            figures,
+        )
         return out / PAGE
 
     def save(self, folder: str | Path) -> "Results":
@@ -151,9 +199,14 @@ class Results:
         """
         target = Path(folder)
         if is_taken(target):
-            raise ConfigError(f"Expected `folder` to be new or empty, got {target}, which holds something.")
+            raise ConfigError(
+                f"Expected `folder` to be new or empty, got {target}, which holds "
+                "something."
+            )
         target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as copied:
+        with tempfile.TemporaryDirectory(
+            dir=target.parent, prefix=f".{target.name}-"
+        ) as copied:
             whole = Path(copied, "run")
             shutil.copytree(self.folder, whole)
             whole.replace(target)
@@ -165,13 +218,18 @@ class Results:
 
     def __repr__(self) -> str:
         """Return up to six lines: size, place, success, what to read first."""
-        n_conditions, n_maps = len(self._rows.conditions), self._rows.episodes["map"].nunique()
+        n_conditions, n_maps = (
+            len(self._rows.conditions),
+            self._rows.episodes["map"].nunique(),
+        )
         rate = 100 * self._rows.episodes["success"].mean()
         lines = [
-            f"Results of {len(self._rows.episodes)} episodes: {n_conditions} conditions on {n_maps} maps",
+            f"Results of {len(self._rows.episodes)} episodes: {n_conditions} "
+            f"conditions on {n_maps} maps",
             f"success {rate:.1f} % over all; folder {self.folder}",
             *([self._rows.mark] if self._rows.mark else []),
-            ".episodes .summary .conditions .notes; .best() .compare(by=…) .plot.… .report() .save(folder)",
+            ".episodes .summary .conditions .notes; .best() .compare(by=…) .plot.… "
+            ".report() .save(folder)",
         ]
         return "\n".join(lines)
 
@@ -180,7 +238,8 @@ class Results:
 
 
 class Plots:
-    """Figures of a run, by the names of their files with `_` for `-`; called with a figure, it draws that one.
+    """Figures of a run, by the names of their files with `_` for `-`; called with a
+    figure, it draws that one.
 
     A figure with several variants, such as `over`, is drawn in all of them, as a list.
     """
@@ -198,7 +257,8 @@ class Plots:
         variants = figure.variants(self._results._report)
         if not variants:
             raise ConfigError(
-                f"Expected a run with what figure {figure.name!r} needs, got {self._results.folder}."
+                f"Expected a run with what figure {figure.name!r} needs, got "
+                f"{self._results.folder}."
             )
         return self._draw_all(variants)
 
@@ -208,7 +268,10 @@ class Plots:
 
     @cached_property
     def _figures(self) -> dict[str, Figure]:
-        return {figure.name.replace("-", "_"): figure for figure in figures_of(self._results._report)}
+        return {
+            figure.name.replace("-", "_"): figure
+            for figure in figures_of(self._results._report)
+        }
 
     def __getattr__(self, name: str) -> Any:
         """Return the function that draws a figure."""
@@ -220,10 +283,15 @@ class Plots:
         """Draw the figure of a name, or all variants of a figure of that name."""
         known = self._figures
         named = [
-            figure for own, figure in known.items() if name in (own, type(figure).name.replace("-", "_"))
+            figure
+            for own, figure in known.items()
+            if name in (own, type(figure).name.replace("-", "_"))
         ]
         if not named:
-            raise ConfigError(f"Expected a figure among {', '.join(known)}, got {name!r}.{hint(name, known)}")
+            raise ConfigError(
+                f"Expected a figure among {', '.join(known)}, got "
+                f"{name!r}.{hint(name, known)}"
+            )
         return self._draw_all(named)
 
     def _draw_all(self, figures: Sequence[Figure]) -> Drawing | list[Drawing]:

@@ -1,4 +1,6 @@
-"""Metrics of episodes: one column of the episodes' table each, with what tables, tests and reports say of it."""
+"""Metrics of episodes: one column of the episodes' table each, with what tables, tests
+and reports say of it.
+"""
 
 from benchnav.core.public_names import face
 

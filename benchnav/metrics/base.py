@@ -1,6 +1,8 @@
-"""Metrics of episodes: what is computed of one finished episode, and what tables, tests and reports say of it.
+"""Metrics of episodes: what is computed of one finished episode, and what tables, tests
+and reports say of it.
 
-Letters in shapes: N steps, S state and A action dimensions. A state begins with (x, y, θ) in metres and radians.
+Letters in shapes: N steps, S state and A action dimensions. A state begins with (x, y,
+    θ) in metres and radians.
 """
 
 import math
@@ -25,9 +27,10 @@ class Learnt:
         revisions: how often its planner was given another map.
         seen_cells: cells whose appearance it saw.
         sensed_cells: cells whose λ it sensed.
-        ahead: RMSE of the believed E[λ], and mean log score of the belief, over the cells ahead of the robot; NaN at
-            steps without an update, shape [N, 2].
-        step_s: wall time of sensing and belief for one step, in seconds; NaN if no step was planned.
+        ahead: RMSE of the believed E[λ], and mean log score of the belief, over the
+            cells ahead of the robot; NaN at steps without an update, shape [N, 2].
+        step_s: wall time of sensing and belief for one step, in seconds; NaN if no step
+            was planned.
     """
 
     revisions: int
@@ -39,28 +42,34 @@ class Learnt:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Episode:
-    """A finished episode: all that a metric may look at. Arrays are float64 and cannot be written to.
+    """A finished episode: all that a metric may look at. Arrays are float64 and cannot
+    be written to.
 
     Args:
-        states: of the robot, the first at the start and the last where it ended, shape [N + 1, S].
+        states: of the robot, the first at the start and the last where it ended, shape
+            [N + 1, S].
         actions: commanded in each step, shape [N, A].
         action_names: what each of the A actions is, such as `speed_mps`.
-        speed_mps: speed that each action would have given on ground of λ = 1, shape [N].
+        speed_mps: speed that each action would have given on ground of λ = 1, shape
+            [N].
         turn_rate_radps: turn rate, likewise, shape [N].
         traversability: observed λ of each step, in [0, 1], shape [N].
         outcome: how it ended, such as `success` or `immobilised`.
         dt_s: time step in seconds.
         time_budget_s: time budget T in seconds.
-        reference_time_s: least travel time over the grid at 1 m/s, in seconds; NaN if there is none.
+        reference_time_s: least travel time over the grid at 1 m/s, in seconds; NaN if
+            there is none.
         goal_m: position of the goal (x, y) in metres, shape [2].
         goal_radius_m: a robot this near to the goal has reached it.
         stuck_traversability: λ_stuck, at or under which a step counts as stuck.
         robot: F.
-        planning_s: wall time of planning of each step, a batch's over its episodes, shape [N].
+        planning_s: wall time of planning of each step, a batch's over its episodes,
+            shape [N].
         preparing_s: wall time of what the planner prepared, likewise, in seconds.
         learnt: what the robot learnt; None if it learnt nothing.
         rejected_draws: draws of λ without a feasible path, before the one that was met.
-        lower_bound_s: time to the goal that no trajectory undercuts, infinite if none reaches it; NaN if unknown.
+        lower_bound_s: time to the goal that no trajectory undercuts, infinite if none
+            reaches it; NaN if unknown.
     """
 
     states: np.ndarray
@@ -84,7 +93,9 @@ class Episode:
     lower_bound_s: float = math.nan
 
     def __post_init__(self) -> None:
-        """Makes the arrays read-only, so that no metric changes what the next one is given."""
+        """Makes the arrays read-only, so that no metric changes what the next one is
+        given.
+        """
         for own in fields(self):
             value = getattr(self, own.name)
             if isinstance(value, np.ndarray):
@@ -93,7 +104,10 @@ class Episode:
     def __repr__(self) -> str:
         """One line: how it ended, and when."""
         robot = type(self.robot).__name__
-        return f"Episode(outcome={self.outcome!r}, steps={self.steps}, end_time_s={self.end_time_s:g}, robot={robot})"
+        return (
+            f"Episode(outcome={self.outcome!r}, steps={self.steps}, "
+            f"end_time_s={self.end_time_s:g}, robot={robot})"
+        )
 
     @property
     def steps(self) -> int:
@@ -126,15 +140,16 @@ class MetricError(BenchnavError):
 
 
 class Metric(Specified, ABC):
-    """A number for each episode: one column of the episodes' table, and what is said of it.
+    """A number for each episode: one column of the episodes' table, and what is said of
+    it.
 
-    What is listed below is a class attribute, or a property of an object with options. Whatever else a metric needs are
-    keyword parameters of its constructor, its options.
+    What is listed below is a class attribute, or a property of an object with options.
+    Whatever else a metric needs are keyword parameters of its constructor, its options.
 
     Attributes:
         name: word by which suites and commands name it.
-        column: its column in tables of episodes. A wall time begins with `planning_` or `learning_`, so that repeated
-            runs are not compared by it.
+        column: its column in tables of episodes. A wall time begins with `planning_` or
+            `learning_`, so that repeated runs are not compared by it.
         suffix: the unit that ends the column's name, such as `_s`.
         words: what sentences call it; if empty, its name with spaces.
         unit: unit of differences, margins and tables.
@@ -142,7 +157,8 @@ class Metric(Specified, ABC):
         heading: of its column in the report; if empty, its words and unit.
         meaning: what one value is, a phrase.
         better: `higher`, `lower` or `neither`.
-        of_arrivals: conditions are compared only over the episodes in which both reached the goal.
+        of_arrivals: conditions are compared only over the episodes in which both
+            reached the goal.
         min_steps: steps that an episode must have; of a shorter one the value is NaN.
     """
 
@@ -170,7 +186,9 @@ class Metric(Specified, ABC):
         """
 
     def value(self, episode: Episode) -> float:
-        """Returns what `compute` returns, or NaN for an episode with fewer than `min_steps` steps."""
+        """Returns what `compute` returns, or NaN for an episode with fewer than
+        `min_steps` steps.
+        """
         return self.compute(episode) if episode.steps >= self.min_steps else math.nan
 
     @property
@@ -179,7 +197,9 @@ class Metric(Specified, ABC):
         words = self.words or str(self.name).replace("_", " ")
         unit = f" [{self.unit}]" if self.unit else ""
         known = {own.name: getattr(self, own.name) for own in fields(Quantity)}
-        return Quantity(**known | {"words": words, "heading": self.heading or f"{words}{unit}"})
+        return Quantity(
+            **known | {"words": words, "heading": self.heading or f"{words}{unit}"}
+        )
 
 
 class Recorded(Metric):
@@ -207,7 +227,9 @@ def measure(metric: Metric, episode: Episode) -> float:
         MetricError: If the metric raises, or returns anything else.
     """
     try:
-        value = metric.compute(episode) if episode.steps >= metric.min_steps else math.nan
+        value = (
+            metric.compute(episode) if episode.steps >= metric.min_steps else math.nan
+        )
     except Exception as error:
         raise out_of_memory(error) or _no_number(metric, fault(error)) from error
     if not isinstance(value, Real | np.bool_) or math.isinf(value):
@@ -217,6 +239,7 @@ def measure(metric: Metric, episode: Episode) -> float:
 
 def _no_number(metric: Metric, got: str) -> MetricError:
     return MetricError(
-        f"Expected a finite number or NaN from metric {metric.name!r}, got {got}. Return NaN for an episode that "
+        f"Expected a finite number or NaN from metric {metric.name!r}, got {got}. "
+        "Return NaN for an episode that "
         "has no such value."
     )

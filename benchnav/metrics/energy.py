@@ -9,10 +9,11 @@ from benchnav.metrics.base import Episode, Metric
 class Energy(Metric):
     """Energy E = ∫ P/λ dt that the drive draws along the path.
 
-    Wheels that turn at the commanded speed u and push with a force F draw F·u. The robot moves at v = λ·u, since slip
-    is 1 − λ, so that P = F·v = λ·F·u of it moves the robot and the rest is lost in slip. A drive that keeps P draws
-    P/λ. It cannot draw without limit: λ counts as at least `min_traversability`, and the greatest power is
-    P/`min_traversability`. Steps whose action commands no motion draw nothing.
+    Wheels that turn at the commanded speed u and push with a force F draw F·u. The
+    robot moves at v = λ·u, since slip is 1 − λ, so that P = F·v = λ·F·u of it moves the
+    robot and the rest is lost in slip. A drive that keeps P draws P/λ. It cannot draw
+    without limit: λ counts as at least `min_traversability`, and the greatest power is
+        P/`min_traversability`. Steps whose action commands no motion draw nothing.
 
     Args:
         power_w: P, the power that moves the robot over ground, in watts; constant.
@@ -23,16 +24,23 @@ class Energy(Metric):
     column = "energy_j"
     suffix = "_j"
     unit = "J"
-    meaning = "energy ∫ P/λ dt that the drive draws along the path, λ at least `min_traversability`"
+    meaning = (
+        "energy ∫ P/λ dt that the drive draws along the path, λ at least "
+        "`min_traversability`"
+    )
     better = "lower"
     of_arrivals = True
 
     def __init__(self, power_w: float = 100.0, min_traversability: float = 0.1) -> None:
         """Validates the options."""
-        expect(0 < power_w < np.inf, f"`power_w` of metric 'energy' above 0 and finite, got {power_w}.")
+        expect(
+            0 < power_w < np.inf,
+            f"`power_w` of metric 'energy' above 0 and finite, got {power_w}.",
+        )
         expect(
             0 < min_traversability <= 1,
-            f"`min_traversability` of metric 'energy' in (0, 1], got {min_traversability}.",
+            "`min_traversability` of metric 'energy' in (0, 1], got "
+            f"{min_traversability}.",
         )
         self.power_w = power_w
         self.min_traversability = min_traversability
@@ -40,5 +48,7 @@ class Energy(Metric):
     def compute(self, episode: Episode) -> float:
         """Return the energy in joules."""
         moves = (episode.speed_mps != 0) | (episode.turn_rate_radps != 0)
-        traversability = np.maximum(episode.traversability[moves], self.min_traversability)
+        traversability = np.maximum(
+            episode.traversability[moves], self.min_traversability
+        )
         return float((self.power_w / traversability).sum() * episode.dt_s)

@@ -17,7 +17,9 @@ class _OfLearnt(Metric):
         return math.nan if episode.learnt is None else float(self.of(episode.learnt))
 
     def of(self, learnt: Learnt) -> float:
-        """Return the value of a robot that learnt: what it holds under the name of the column."""
+        """Return the value of a robot that learnt: what it holds under the name of the
+        column.
+        """
         value: float = getattr(learnt, self.column)
         return value
 
@@ -65,7 +67,8 @@ class AheadRmse(_Ahead):
     better = "lower"
     index = 0
     meaning = (
-        "root mean square error of the believed E[λ] over the cells ahead of the robot of which λ was not sensed, mean "
+        "root mean square error of the believed E[λ] over the cells ahead of the "
+        "robot of which λ was not sensed, mean "
         "over updates"
     )
 
@@ -88,7 +91,9 @@ class LearningTime(_OfLearnt):
     unit = "ms"
     heading = "belief [ms]"
     better = "lower"
-    meaning = "time of a step for sensing and belief, of a batch divided by its episodes"
+    meaning = (
+        "time of a step for sensing and belief, of a batch divided by its episodes"
+    )
 
     def of(self, learnt: Learnt) -> float:
         """Return the time in milliseconds."""

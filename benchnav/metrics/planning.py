@@ -1,4 +1,6 @@
-"""Metrics of planning time: wall times of a batch over the number of episodes that it was for."""
+"""Metrics of planning time: wall times of a batch over the number of episodes that it
+was for.
+"""
 
 import numpy as np
 
@@ -24,7 +26,11 @@ class PlanningTime(_LaterSteps):
     name = "planning_time"
     column = "planning_ms"
     percent = 50
-    meaning = "planning time of a step of a batch, per episode of it, from the second step on: median"
+    meaning = (
+        "planning time of a step of a batch, per episode of it, from the "
+        "second "
+        "step on: median"
+    )
 
 
 class HighPlanningTime(_LaterSteps):
@@ -34,7 +40,9 @@ class HighPlanningTime(_LaterSteps):
     column = "planning_ms_p95"
     percent = 95
     meaning = (
-        "planning time of a step of a batch, per episode of it, from the second step on: 95th percentile"
+        "planning time of a step of a batch, per episode of it, from the "
+        "second "
+        "step on: 95th percentile"
     )
 
 
@@ -45,7 +53,9 @@ class StartTime(Metric):
     column = "planning_start_ms"
     unit = "ms"
     better = "lower"
-    meaning = "time of preparing, compiling and the first step, per episode of the batch"
+    meaning = (
+        "time of preparing, compiling and the first step, per episode of the batch"
+    )
 
     def compute(self, episode: Episode) -> float:
         """Return the time in milliseconds."""

@@ -1,4 +1,6 @@
-"""The metrics that every run has, in the order of its columns; others are named in a suite's `metrics`."""
+"""The metrics that every run has, in the order of its columns; others are named in a
+suite's `metrics`.
+"""
 
 from collections.abc import Mapping
 
@@ -23,8 +25,27 @@ LEARNING_TIME = learning.LearningTime()
 LOWER_BOUND = draw.LowerBound()
 
 SHIPPED: tuple[Metric, ...] = (
-    *(SUCCESS, TOTAL_TIME, times.EndTime(), TRAVERSABILITY, times.ReferenceTime(), TIME_RATIO, SCORE),
-    *(PATH_LENGTH, STUCK_SHARE, ROUGHNESS, *PLANNING, REVISIONS, SEEN_CELLS, SENSED_CELLS, *AHEAD),
+    *(
+        SUCCESS,
+        TOTAL_TIME,
+        times.EndTime(),
+        TRAVERSABILITY,
+        times.ReferenceTime(),
+        TIME_RATIO,
+        SCORE,
+    ),
+    *(
+        PATH_LENGTH,
+        STUCK_SHARE,
+        ROUGHNESS,
+        *PLANNING,
+        REVISIONS,
+        SEEN_CELLS,
+        SENSED_CELLS,
+        *AHEAD,
+    ),
     *(LEARNING_TIME, draw.RejectedDraws(), LOWER_BOUND),
 )
-QUANTITIES: Mapping[str, Quantity] = {metric.name: metric.quantity for metric in SHIPPED}
+QUANTITIES: Mapping[str, Quantity] = {
+    metric.name: metric.quantity for metric in SHIPPED
+}

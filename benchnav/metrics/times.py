@@ -1,7 +1,7 @@
 """Metrics of success and time.
 
-Sources: Endo, Honda and Ishigami (2024), IV-A, for success rate and total time; Perille et al. (2020), "Benchmarking
-metric ground navigation" (BARN), for the score.
+Sources: Endo, Honda and Ishigami (2024), IV-A, for success rate and total time; Perille
+et al. (2020), "Benchmarking metric ground navigation" (BARN), for the score.
 """
 
 import math
@@ -66,18 +66,27 @@ class TimeRatio(Metric):
 
     def compute(self, episode: Episode) -> float:
         """Return the ratio; NaN for a failure."""
-        return episode.end_time_s / episode.reference_at_top_speed_s if episode.success else math.nan
+        return (
+            episode.end_time_s / episode.reference_at_top_speed_s
+            if episode.success
+            else math.nan
+        )
 
 
 class Score(Metric):
     """BARN's score: OT over the time, kept within 2 OT and 8 OT; 0 for a failure.
 
-    OT is half the reference time at the robot's top speed, so that arriving in that time is the best.
+    OT is half the reference time at the robot's top speed, so that arriving in that
+    time is the best.
     """
 
     name = column = "score"
     better = "higher"
-    meaning = "BARN's: OT / clip(time, 2 OT, 8 OT), OT half the reference time at top speed; 0 for failures"
+    meaning = (
+        "BARN's: OT / clip(time, 2 OT, 8 OT), OT half the reference time at "
+        "top "
+        "speed; 0 for failures"
+    )
     min_steps = 0
 
     def compute(self, episode: Episode) -> float:

@@ -1,4 +1,6 @@
-"""Models that predict traversability: their base classes, checkpoints, training and quality."""
+"""Models that predict traversability: their base classes, checkpoints, training and
+quality.
+"""
 
 from benchnav.core.public_names import face
 
@@ -9,9 +11,23 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.models.config": ("TrainOptions", "TrainingConfig"),
         "benchnav.models.nets.trainable": ("TrainableModel",),
         "benchnav.models.training.networks": ("fit_model",),
-        "benchnav.models.checkpoint": ("Checkpoint", "Part", "load_checkpoint", "save_checkpoint"),
-        "benchnav.models.predictor": ("find_checkpoint", "list_checkpoints", "load_model"),
+        "benchnav.models.checkpoint": (
+            "Checkpoint",
+            "Part",
+            "load_checkpoint",
+            "save_checkpoint",
+        ),
+        "benchnav.models.predictor": (
+            "find_checkpoint",
+            "list_checkpoints",
+            "load_model",
+        ),
         "benchnav.models.quality.measure": ("evaluate as evaluate_model",),
-        "benchnav.models.tiles": ("Window", "measure_margin", "predict_tiles", "write_risk_maps"),
+        "benchnav.models.tiles": (
+            "Window",
+            "measure_margin",
+            "predict_tiles",
+            "write_risk_maps",
+        ),
     },
 )

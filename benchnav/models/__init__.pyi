@@ -1,5 +1,10 @@
 from benchnav.models.base import ModelFamily, TraversabilityModel, predict
-from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
+from benchnav.models.checkpoint import (
+    Checkpoint,
+    Part,
+    load_checkpoint,
+    save_checkpoint,
+)
 from benchnav.models.config import TrainingConfig, TrainOptions
 from benchnav.models.nets.trainable import TrainableModel
 from benchnav.models.predictor import find_checkpoint, list_checkpoints, load_model

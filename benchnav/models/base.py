@@ -1,7 +1,10 @@
-"""What a model is: the base classes of models, and the one way to ask any of them for a prediction.
+"""What a model is: the base classes of models, and the one way to ask any of them for a
+prediction.
 
-A model sees an `Observation` and gives a `TraversabilityDistribution`; privileged models alone are given the
-Terrain. Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, C classes.
+A model sees an `Observation` and gives a `TraversabilityDistribution`; privileged
+models alone are given the
+Terrain. Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, C
+    classes.
 """
 
 import inspect
@@ -22,11 +25,13 @@ from benchnav.models.checkpoint import Checkpoint
 
 
 class TraversabilityModel(Specified, ABC):
-    """The base class of models; `benchnav.testing.check_model` tries whether one keeps its contract."""
+    """The base class of models; `benchnav.testing.check_model` tries whether one keeps
+    its contract.
+    """
 
     class_names: tuple[str, ...] = ()
-    """Classes in the order of their ids, of a model that tells them: `class_probabilities` of its predictions are
-    theirs."""
+    """Classes in the order of their ids, of a model that tells them:
+    `class_probabilities` of its predictions are theirs."""
 
     @abstractmethod
     def predict(self, observation: Observation) -> TraversabilityDistribution:
@@ -36,29 +41,34 @@ class TraversabilityModel(Specified, ABC):
             observation: B maps of any size; nothing else is to be known of them.
 
         Returns:
-            The distribution, of shape [B, H, W], on the observation's device: a `TraversabilityMixture`, a
-            `QuantileDistribution`, or any other.
+            The distribution, of shape [B, H, W], on the observation's device: a
+            `TraversabilityMixture`, a `QuantileDistribution`, or any other.
         """
 
     def member_probabilities(self, observation: Observation) -> Tensor | None:
-        """Class probabilities of each member of an ensemble, which is calibrated as a whole.
+        """Class probabilities of each member of an ensemble, which is calibrated as a
+        whole.
 
         Args:
             observation: B maps of any size.
 
         Returns:
-            Shape [M, B, C, H, W]; M = 1 for a single classifier. None, the default, where there are none.
+            Shape [M, B, C, H, W]; M = 1 for a single classifier. None, the default,
+            where there are none.
         """
         return None
 
 
 class ModelFamily(TraversabilityModel):
-    """The base class of models that are kept in checkpoints, under the name by which the class is registered."""
+    """The base class of models that are kept in checkpoints, under the name by which
+    the class is registered.
+    """
 
     @classmethod
     @abstractmethod
     def from_checkpoint(cls, checkpoint: Checkpoint) -> "ModelFamily":
-        """Rebuilds a model; what it raises ends in one line, where `load_model` calls it.
+        """Rebuilds a model; what it raises ends in one line, where `load_model` calls
+        it.
 
         Raises:
             CheckpointError: a part is missing.
@@ -66,7 +76,9 @@ class ModelFamily(TraversabilityModel):
 
 
 class PrivilegedModel(TraversabilityModel):
-    """The base class of this package's models that are given the truth, to tell what failures come from."""
+    """The base class of this package's models that are given the truth, to tell what
+    failures come from.
+    """
 
     @abstractmethod
     def predict_terrain(self, terrain: Terrain) -> TraversabilityDistribution:
@@ -75,20 +87,24 @@ class PrivilegedModel(TraversabilityModel):
     def predict(self, observation: Observation) -> TraversabilityDistribution:
         """Refuses: what a privileged model knows is in no observation."""
         raise ConfigError(
-            f"Expected the Terrain for the privileged model {type(self).__name__}, got an Observation. "
+            f"Expected the Terrain for the privileged model {type(self).__name__}, "
+            "got an Observation. "
             "Call `benchnav.models.predict`."
         )
 
 
 def is_family(target: Any) -> TypeGuard[type[ModelFamily]]:
-    """Tells a class whose models are kept in checkpoints from one that is made with options."""
+    """Tells a class whose models are kept in checkpoints from one that is made with
+    options.
+    """
     return inspect.isclass(target) and issubclass(target, ModelFamily)
 
 
 def layers_of(observation: Observation, names: Collection[str]) -> dict[str, Tensor]:
     """The layers of an observation that a model was trained on, by name.
 
-    The layer `seen`, for models that declare it, is 1 everywhere where the observation does not say what was seen.
+    The layer `seen`, for models that declare it, is 1 everywhere where the observation
+    does not say what was seen.
 
     Raises:
         ConfigError: the maps lack one.
@@ -104,7 +120,8 @@ def layers_of(observation: Observation, names: Collection[str]) -> dict[str, Ten
     lacking = [name for name in names if name not in known]
     expect(
         not lacking,
-        f"maps with the layers that the model was trained on, {' and '.join(lacking)} among them, got "
+        f"maps with the layers that the model was trained on, {' and '.join(lacking)} "
+        "among them, got "
         f"{', '.join(known)}. Take a dataset that has them.",
     )
     return {name: known[name] for name in names}
@@ -113,7 +130,8 @@ def layers_of(observation: Observation, names: Collection[str]) -> dict[str, Ten
 def predict(
     model: TraversabilityModel, terrain: Terrain, observation: Observation | None = None
 ) -> TraversabilityDistribution:
-    """Lets a model predict: the privileged ones from the Terrain, every other from its Observation alone.
+    """Lets a model predict: the privileged ones from the Terrain, every other from its
+    Observation alone.
 
     Args:
         model: any model.
@@ -128,19 +146,28 @@ def predict(
     """
     if isinstance(model, PrivilegedModel):
         return model.predict_terrain(terrain)
-    return predict_observation(model, terrain.observe() if observation is None else observation)
+    return predict_observation(
+        model, terrain.observe() if observation is None else observation
+    )
 
 
-def predict_observation(model: TraversabilityModel, observation: Observation) -> TraversabilityDistribution:
+def predict_observation(
+    model: TraversabilityModel, observation: Observation
+) -> TraversabilityDistribution:
     """As `predict`, where the truth is not at hand; refuses privileged models."""
     with exact_convolutions():
         predicted: Any = model.predict(observation)
-    shape, got = [len(observation.rgb), *observation.grid.shape], type(predicted).__name__
+    shape, got = (
+        [len(observation.rgb), *observation.grid.shape],
+        type(predicted).__name__,
+    )
     if isinstance(predicted, TraversabilityDistribution):
         if list(predicted.shape) == shape:
             return predicted
         got += f" of shape {list(predicted.shape)}"
     raise ConfigError(
-        f"Expected the model to give a TraversabilityDistribution of shape {shape}, got {got}. "
-        "Return a TraversabilityMixture, a QuantileDistribution or a subclass of your own."
+        f"Expected the model to give a TraversabilityDistribution of shape {shape}, "
+        f"got {got}. "
+        "Return a TraversabilityMixture, a QuantileDistribution or a subclass of your "
+        "own."
     )

@@ -1,4 +1,6 @@
-"""The card of a checkpoint, README.md, for hubs and people: what it is, what it was trained on, how to load it."""
+"""The card of a checkpoint, README.md, for hubs and people: what it is, what it was
+trained on, how to load it.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -35,33 +37,50 @@ def card_of(
         Markdown, with the front matter that model hubs read.
     """
     datasets = sorted({part.data_id for part in parts.values()})
-    head = {"library_name": "benchnav", "tags": ["traversability", "robotics"], "datasets": datasets}
-    is_own = code and model not in registry.names("model")  # an installed class is found by its name
+    head = {
+        "library_name": "benchnav",
+        "tags": ["traversability", "robotics"],
+        "datasets": datasets,
+    }
+    is_own = code and model not in registry.names(
+        "model"
+    )  # an installed class is found by its name
     place = f"path/to/file.py:{model}@{name}" if is_own else name
     own = (
-        f"The class `{model}` is a user's own and not in this folder: name the file that holds it. The "
+        f"The class `{model}` is a user's own and not in this folder: name the file "
+        "that holds it. The "
         f"SHA-256 of its code was `{code}`. Loading runs that file.\n\n"
         if is_own
         else ""
     )
-    classes = f"Terrain classes of the maps: {', '.join(classes)}.\n\n" if classes else ""
+    classes = (
+        f"Terrain classes of the maps: {', '.join(classes)}.\n\n" if classes else ""
+    )
     promise = (
-        f"It is recalibrated by {conformal_maps} maps (conformal): on a new map of the same kind λ of a random cell "
-        "falls below the u-quantile with probability u at most. Nothing is promised on other ground.\n\n"
+        f"It is recalibrated by {conformal_maps} maps (conformal): on a new map of "
+        "the same kind λ of a random cell "
+        "falls below the u-quantile with probability u at most. Nothing is promised "
+        "on other ground.\n\n"
         if conformal_maps
         else ""
     )
     return (
         f"---\n{yaml.safe_dump(head, sort_keys=False)}---\n\n# {name}\n\n"
-        f"A model of traversability of the kind `{model}`, trained on {' and '.join(datasets)}. It predicts "
-        f"the distribution of traversability in every cell of a map.{_members(parts, pool_temperature)} This folder "
+        f"A model of traversability of the kind `{model}`, trained on "
+        f"{' and '.join(datasets)}. It predicts "
+        "the distribution of traversability in every cell of a "
+        f"map.{_members(parts, pool_temperature)} This folder "
         "holds tensors and settings, and no code.\n\n"
         f"```sh\nbenchnav-train evaluate {place} --data DATASET\n"
         f"benchnav-eval run --model {place} --data DATASET\n```\n\n"
-        f"```python\nfrom benchnav.models import load_model\n\nmodel = load_model({place!r})\n```\n\n"
-        f"{own}{classes}{promise}## Parts\n\n{_parts_table(parts)}\n\n## Settings\n\n{_settings_table(parts)}\n\n"
-        "Measures are of the validation maps, which early stopping and calibration have seen. `config.json` holds the "
-        "digests of data and tensors, and the versions of the packages. No licence is given here: add one before you "
+        "```python\nfrom benchnav.models import load_model\n\nmodel = "
+        f"load_model({place!r})\n```\n\n"
+        f"{own}{classes}{promise}## Parts\n\n{_parts_table(parts)}\n\n## "
+        f"Settings\n\n{_settings_table(parts)}\n\n"
+        "Measures are of the validation maps, which early stopping and calibration "
+        "have seen. `config.json` holds the "
+        "digests of data and tensors, and the versions of the packages. No licence is "
+        "given here: add one before you "
         "share it.\n"
     )
 
@@ -71,8 +90,14 @@ def _members(parts: Mapping[str, Any], temperature: float) -> str:
     count = sum(name.partition("-")[2] != "" for name in parts) + 1
     if count == 1:
         return ""
-    widened = "" if temperature == 1 else f", and widened by the temperature {temperature:.3g}"
-    return f" It is an ensemble: what its {count} networks predict is averaged{widened}."
+    widened = (
+        ""
+        if temperature == 1
+        else f", and widened by the temperature {temperature:.3g}"
+    )
+    return (
+        f" It is an ensemble: what its {count} networks predict is averaged{widened}."
+    )
 
 
 def _parts_table(parts: Mapping[str, Any]) -> str:
@@ -83,7 +108,15 @@ def _parts_table(parts: Mapping[str, Any]) -> str:
             for metric, value in part.metrics.items()
             if metric.startswith(("valid_", "held_out"))
         )
-        rows.append((name, str(part.seed), part.data_id, measured or "–", part.versions.get("benchnav", "–")))
+        rows.append(
+            (
+                name,
+                str(part.seed),
+                part.data_id,
+                measured or "–",
+                part.versions.get("benchnav", "–"),
+            )
+        )
     headings = ("part", "seed", "trained on", "validation", "by benchnav")
     return to_markdown(Table(title="", headings=headings, rows=tuple(rows)))
 
@@ -96,4 +129,6 @@ def _settings_table(parts: Mapping[str, Any]) -> str:
             shown = list(value) if isinstance(value, tuple) else value
             if setting != "steepest_deg":
                 rows.append((stem, setting, str(shown)))
-    return to_markdown(Table(title="", headings=("part", "setting", "value"), rows=tuple(rows)))
+    return to_markdown(
+        Table(title="", headings=("part", "setting", "value"), rows=tuple(rows))
+    )

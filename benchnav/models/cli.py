@@ -13,7 +13,11 @@ from benchnav.models.config import (
 from benchnav.models.onnx_command import export
 from benchnav.models.quality.command import compare, evaluate_command
 
-_DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
+_DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = (
+    ClassifierConfig(),
+    LatentGPConfig(),
+    MDNConfig(),
+)
 
 
 def fit(
@@ -28,12 +32,14 @@ def fit(
 
     Args:
         options: How.
-        model: NAME of a model that can be trained (fused, mdn, mean_variance, quantile, evidential, mc_dropout, swag),
-            or path/to/file.py:Class or package.module:Class with a TrainableModel.
+        model: NAME of a model that can be trained (fused, mdn, mean_variance, quantile,
+            evidential, mc_dropout, swag), or path/to/file.py:Class or
+            package.module:Class with a TrainableModel.
         data: Path or id of a dataset with splits train and valid.
         out: Checkpoint folder. Logs go to OUT.training.
-        settings: Settings of the model, such as --settings.learning_rate 1e-3 --settings.inputs [rgb,elevation_m];
-            of fused those of its stages, such as --settings.classifier.encoder_depth 3.
+        settings: Settings of the model, such as --settings.learning_rate 1e-3
+            --settings.inputs [rgb,elevation_m]; of fused those of its stages, such as
+            --settings.classifier.encoder_depth 3.
         members: How many to train; their distributions are averaged.
     """
     from benchnav.models.training.networks import fit_model
@@ -53,7 +59,8 @@ def train_classifier(
     Args:
         options: How.
         data: Path or id of a dataset with splits train and valid.
-        out: Checkpoint folder; Gaussian processes in it for the same classes are kept. Logs go to OUT.training.
+        out: Checkpoint folder; Gaussian processes in it for the same classes are kept.
+            Logs go to OUT.training.
         classifier: Settings of the classifier.
         members: How many to train; their probabilities are averaged.
     """
@@ -73,13 +80,14 @@ def train_gp(
     """Train the class-wise Gaussian processes.
 
     Args:
-        data: Path or id of a dataset with splits train and valid; or slip logs, a file .csv, .tsv, one of these
-            with .gz, or .parquet, with the columns class, slope_deg and traversability; and drive, to measure on
-            whole drives.
-        out: Checkpoint folder; classifiers in it for the same classes are kept, and slip logs are read with
-            their class table.
+        data: Path or id of a dataset with splits train and valid; or slip logs, a file
+            .csv, .tsv, one of these with .gz, or .parquet, with the columns class,
+            slope_deg and traversability; and drive, to measure on whole drives.
+        out: Checkpoint folder; classifiers in it for the same classes are kept, and
+            slip logs are read with their class table.
         gp: Settings of the GPs.
-        seed: Root seed of the rows or drives of slip logs that are held out to measure on.
+        seed: Root seed of the rows or drives of slip logs that are held out to measure
+            on.
         device: Where they are trained; auto takes CUDA where there is a GPU.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
@@ -112,7 +120,9 @@ def train_all(
     train_networks(options, data, out, classifier_of(classifier), gp, members)
 
 
-def train_mdn(options: TrainOptions, data: str, out: str, mdn: MDNConfig = _DEFAULT_MDN) -> None:
+def train_mdn(
+    options: TrainOptions, data: str, out: str, mdn: MDNConfig = _DEFAULT_MDN
+) -> None:
     """Train a mixture-density network, which needs no terrain classes.
 
     Args:
@@ -140,4 +150,6 @@ COMMANDS = {
 
 def main() -> None:
     """Entry point of `benchnav-train`."""
-    sys.exit(run("benchnav-train", "Train and measure models of traversability.", COMMANDS))
+    sys.exit(
+        run("benchnav-train", "Train and measure models of traversability.", COMMANDS)
+    )

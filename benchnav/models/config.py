@@ -1,4 +1,6 @@
-"""Settings of models and of their training; light to import, so that commands start fast."""
+"""Settings of models and of their training; light to import, so that commands start
+fast.
+"""
 
 import math
 from dataclasses import asdict, dataclass, field
@@ -18,19 +20,24 @@ class TrainOptions:
     """How networks are trained.
 
     Args:
-        seed: Root seed of weights, order and augmentation; members of an ensemble have SEED, SEED + 1, ….
-        device: Where it is trained and calibrated; auto takes CUDA where there is a GPU.
-        trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
+        seed: Root seed of weights, order and augmentation; members of an ensemble have
+            SEED, SEED + 1, ….
+        device: Where it is trained and calibrated; auto takes CUDA where there is a
+            GPU.
+        trainer: Settings of Lightning's trainer, for example --trainer.devices 2
+            --trainer.precision 32-true.
         workers: Processes that read maps ahead. The result is the same for any number.
         in_memory: Hold all maps in memory instead of reading them when they are needed.
         half_precision: Store the weights of networks as float16.
-        symmetries: Turn and mirror training maps at random; by default all but those with a photo, whose light comes
-            from one direction.
-        crop: Train on squares of so many cells a side, drawn anew each epoch; 0 takes whole maps.
+        symmetries: Turn and mirror training maps at random; by default all but those
+            with a photo, whose light comes from one direction.
+        crop: Train on squares of so many cells a side, drawn anew each epoch; 0 takes
+            whole maps.
         resume: Go on with an interrupted training from its finished parts and epochs.
         overwrite: Replace an existing checkpoint in `out`, or these parts of it.
-        conformal: Recalibrate the model on every second map of valid, which early stopping and temperature then leave
-            out. Its lower quantiles then hold on new maps of the same kind.
+        conformal: Recalibrate the model on every second map of valid, which early
+            stopping and temperature then leave out. Its lower quantiles then hold on
+            new maps of the same kind.
     """
 
     seed: int = 0
@@ -48,16 +55,20 @@ class TrainOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Masking:
-    """What training maps are masked by, as a robot that sees what is near would see them.
+    """What training maps are masked by, as a robot that sees what is near would see
+    them.
 
-    A masked map is known within a radius of a straight path on it, and that the worse the farther from the path.
+    A masked map is known within a radius of a straight path on it, and that the worse
+    the farther from the path.
 
     Args:
         share: of the maps that are masked, those of valid among them; 0 masks none.
-        radius_m: least and greatest radius, between which each map has its own; small ones are as frequent as large
-            ones by their logarithm.
-        colour_noise: standard deviation of each channel of a colour, 0–255, for each metre of distance to the path.
-        elevation_noise: standard deviation of elevation in metres, for each metre of distance to the path.
+        radius_m: least and greatest radius, between which each map has its own; small
+            ones are as frequent as large ones by their logarithm.
+        colour_noise: standard deviation of each channel of a colour, 0–255, for each
+            metre of distance to the path.
+        elevation_noise: standard deviation of elevation in metres, for each metre of
+            distance to the path.
     """
 
     share: float = 0.0
@@ -69,29 +80,38 @@ class Masking:
         """Refuses masks that are none."""
         _check(self, 0 <= self.share <= 1, "share", "in [0, 1]")
         low, high = self.radius_m
-        _check(self, 0 < low <= high < math.inf, "radius_m", "of two radii > 0, ordered and finite")
+        _check(
+            self,
+            0 < low <= high < math.inf,
+            "radius_m",
+            "of two radii > 0, ordered and finite",
+        )
         for name in ("colour_noise", "elevation_noise"):
             _check(self, 0 <= getattr(self, name) < math.inf, name, "≥ 0 and finite")
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig:
-    """What any trainable model is given, and how it is trained; a model of one's own adds its own settings.
+    """What any trainable model is given, and how it is trained; a model of one's own
+    adds its own settings.
 
     Args:
-        inputs: layers of the maps that the network is given: rgb, elevation_m, slope_deg, and others that they have,
-            such as vegetation_m; and seen, 1 where a cell was seen and 0 elsewhere.
-        jitter: largest relative change of brightness, contrast and saturation of a training map. At 0
-            low light stays unseen in training.
-        symmetries: turn and mirror training maps at random. Maps with a photo, whose light comes from one direction,
-            are turned only with `--symmetries true`; `--settings.symmetries true` does not turn them.
+        inputs: layers of the maps that the network is given: rgb, elevation_m,
+            slope_deg, and others that they have, such as vegetation_m; and seen, 1
+            where a cell was seen and 0 elsewhere.
+        jitter: largest relative change of brightness, contrast and saturation of a
+            training map. At 0 low light stays unseen in training.
+        symmetries: turn and mirror training maps at random. Maps with a photo, whose
+            light comes from one direction, are turned only with `--symmetries true`;
+            `--settings.symmetries true` does not turn them.
         crop: cells of a side of the squares that maps are cut to; 0 takes whole maps.
         learning_rate: highest rate of the one-cycle schedule.
         weight_decay: of AdamW.
         batch_size: most maps a batch.
         max_epochs: length of the schedule.
         patience: epochs without a better validation loss after which training stops.
-        masking: what of the maps is seen; a network with the input seen is told which cells these are.
+        masking: what of the maps is seen; a network with the input seen is told which
+            cells these are.
     """
 
     inputs: tuple[str, ...] = ("rgb", "slope_deg")
@@ -119,9 +139,11 @@ class NetworkConfig(TrainingConfig):
     """What a network of segmentation-models-pytorch is and how it is trained.
 
     Args:
-        architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or segformer.
+        architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or
+            segformer.
         encoder: one of its encoders, for example resnet18.
-        pretrained: start from ImageNet weights, which are downloaded; otherwise from random ones.
+        pretrained: start from ImageNet weights, which are downloaded; otherwise from
+            random ones.
     """
 
     architecture: str = "unet"
@@ -134,16 +156,19 @@ class ClassifierConfig(NetworkConfig):
     """What the classifier is and how it is trained.
 
     Args:
-        encoder_depth: stages of the encoder, each of which halves the image; fewer make a smaller network
-            that looks less far around a cell.
-        decoder_channels: channels of the decoder's stages, from coarse to fine, as many as there are of the
-            encoder's; where none are given, the architecture's own.
-        full_resolution: give the last layers the image at full resolution too. Encoders begin by halving
-            it, so that without this every class boundary is guessed from cells twice as large.
-        focal: γ of the focal loss (Lin et al., 2017), which weighs a cell by (1 − p)^γ, p the probability of its class;
-            0 leaves the loss a proper score.
-        dice: weight of a soft Dice loss beside the cross-entropy; 0 leaves the loss a proper score.
-        label_smoothing: probability spread over all classes in the targets of the cross-entropy.
+        encoder_depth: stages of the encoder, each of which halves the image; fewer make
+            a smaller network that looks less far around a cell.
+        decoder_channels: channels of the decoder's stages, from coarse to fine, as many
+            as there are of the encoder's; where none are given, the architecture's own.
+        full_resolution: give the last layers the image at full resolution too. Encoders
+            begin by halving it, so that without this every class boundary is guessed
+            from cells twice as large.
+        focal: γ of the focal loss (Lin et al., 2017), which weighs a cell by (1 − p)^γ,
+            p the probability of its class; 0 leaves the loss a proper score.
+        dice: weight of a soft Dice loss beside the cross-entropy; 0 leaves the loss a
+            proper score.
+        label_smoothing: probability spread over all classes in the targets of the
+            cross-entropy.
     """
 
     inputs: tuple[str, ...] = ("rgb",)
@@ -160,20 +185,28 @@ class ClassifierConfig(NetworkConfig):
         for name in ("focal", "dice"):
             _check(self, 0 <= getattr(self, name) < math.inf, name, "≥ 0")
         _check(self, 0 <= self.label_smoothing < 1, "label_smoothing", "in [0, 1)")
-        _check(self, 1 <= self.encoder_depth <= DEEPEST, "encoder_depth", f"in 1–{DEEPEST}")
-        _check(self, min(self.decoder_channels, default=1) >= 1, "decoder_channels", "≥ 1 each")
+        _check(
+            self, 1 <= self.encoder_depth <= DEEPEST, "encoder_depth", f"in 1–{DEEPEST}"
+        )
+        _check(
+            self,
+            min(self.decoder_channels, default=1) >= 1,
+            "decoder_channels",
+            "≥ 1 each",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class LatentGPConfig:
     """What the class-wise GPs are and how they are trained.
 
-    The prior decides what is predicted of a class without data, and of slopes steeper than any seen.
+    The prior decides what is predicted of a class without data, and of slopes steeper
+    than any seen.
 
     Args:
         likelihood: censored, which fits observations clipped to [0, 1], or gaussian.
-        second_component: give a class a second mode of λ that slope does not explain, where the data show
-            one; with the censored likelihood alone.
+        second_component: give a class a second mode of λ that slope does not explain,
+            where the data show one; with the censored likelihood alone.
         inducing_points: how many, evenly over the slopes of the training data.
         epochs: equal parts of training, after each of which progress is shown.
         epoch_steps: steps an epoch, each over all cells.
@@ -210,9 +243,16 @@ class LatentGPConfig:
         _check_least(self, 2, "inducing_points")
         _check_least(self, 1, "epochs", "epoch_steps")
         for name in ("prior_level", "prior_fall"):
-            _check(self, abs(getattr(self, name)) <= _MAX_PRIOR, name, f"in ±{_MAX_PRIOR}")
+            _check(
+                self, abs(getattr(self, name)) <= _MAX_PRIOR, name, f"in ±{_MAX_PRIOR}"
+            )
         for name in ("prior_fall_std", "noise_spread"):
-            _check(self, 0 < getattr(self, name) <= _MAX_PRIOR, name, f"> 0 and at most {_MAX_PRIOR}")
+            _check(
+                self,
+                0 < getattr(self, name) <= _MAX_PRIOR,
+                name,
+                f"> 0 and at most {_MAX_PRIOR}",
+            )
         for name, limits in (
             ("prior_std", "prior_std_range"),
             ("length_deg", "length_range_deg"),
@@ -220,17 +260,24 @@ class LatentGPConfig:
         ):
             low, high = getattr(self, limits)
             fits = 0 < low < getattr(self, name) < high < math.inf
-            _check(self, fits, name, f"between the bounds of `{limits}`, both > 0, {low} and {high}")
+            _check(
+                self,
+                fits,
+                name,
+                f"between the bounds of `{limits}`, both > 0, {low} and {high}",
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class JoinedConfig(NetworkConfig):
-    """What a network of the image that slope joins cell by cell is and how it is trained.
+    """What a network of the image that slope joins cell by cell is and how it is
+    trained.
 
     Args:
-        encoder_depth: stages of the encoder, each of which halves the image; fewer make a smaller network
-            that looks less far around a cell.
-        hidden: channels of the layers in which slope joins what the image tells of a cell.
+        encoder_depth: stages of the encoder, each of which halves the image; fewer make
+            a smaller network that looks less far around a cell.
+        hidden: channels of the layers in which slope joins what the image tells of a
+            cell.
     """
 
     encoder_depth: int = 5
@@ -240,10 +287,15 @@ class JoinedConfig(NetworkConfig):
     def __post_init__(self) -> None:
         """Refuses numbers that cannot train."""
         super().__post_init__()
-        _check(self, 1 <= self.encoder_depth <= DEEPEST, "encoder_depth", f"in 1–{DEEPEST}")
+        _check(
+            self, 1 <= self.encoder_depth <= DEEPEST, "encoder_depth", f"in 1–{DEEPEST}"
+        )
         _check_least(self, 1, "hidden")
         _check(
-            self, any(name != "slope_deg" for name in self.inputs), "inputs", "with a layer beside slope_deg"
+            self,
+            any(name != "slope_deg" for name in self.inputs),
+            "inputs",
+            "with a layer beside slope_deg",
         )
 
 
@@ -264,13 +316,18 @@ class MDNConfig(JoinedConfig):
 
 
 def plain_config(config: Any) -> dict[str, Any]:
-    """The settings of a network as plain data; without `masking` where no map is masked.
+    """The settings of a network as plain data; without `masking` where no map is
+    masked.
 
     Args:
         config: a `TrainingConfig`.
     """
     data = asdict(config)
-    return {name: value for name, value in data.items() if name != "masking" or config.masking.share}
+    return {
+        name: value
+        for name, value in data.items()
+        if name != "masking" or config.masking.share
+    }
 
 
 def check_seed(seed: int, count: int = 1) -> None:
@@ -293,4 +350,9 @@ def _check(config: object, fits: bool, name: str, expected: str) -> None:
 def _check_least(config: object, least: int, *names: str) -> None:
     for name in names:
         value = getattr(config, name)
-        _check(config, isinstance(value, int) and value >= least, name, f"to be an integer ≥ {least}")
+        _check(
+            config,
+            isinstance(value, int) and value >= least,
+            name,
+            f"to be an integer ≥ {least}",
+        )

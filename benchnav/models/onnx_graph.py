@@ -1,12 +1,14 @@
-"""A model as one ONNX graph: its network, the parameters of what it predicts, and their mean and CVaR.
+"""A model as one ONNX graph: its network, the parameters of what it predicts, and their
+mean and CVaR.
 
-A robot runs the graph with ONNX Runtime alone, without PyTorch. With F the distribution function of λ, v the VaR, which
-40 halvings of [0, 1] find, and p = 1 − α the tail,
+A robot runs the graph with ONNX Runtime alone, without PyTorch. With F the distribution
+function of λ, v the VaR, which 40 halvings of [0, 1] find, and p = 1 − α the tail,
 
     E[λ] = 1 − ∫₀¹ F,    CVaR_α = v − 1/p ∫₀^v F   (see `benchnav.core.cvar`).
 
-The integral of a mixture is of closed form, also where members are averaged. Where a temperature T widens a
-distribution to Φ(Φ⁻¹(F) / T), Gauss-Legendre quadrature is used between nodes about each component.
+The integral of a mixture is of closed form, also where members are averaged. Where a
+temperature T widens a distribution to Φ(Φ⁻¹(F) / T), Gauss-Legendre quadrature is used
+between nodes about each component.
 Letters in shapes: B maps, H×W cells, K components, E nodes.
 """
 
@@ -34,7 +36,12 @@ from benchnav.core.store import replacing
 from benchnav.core.terrain import Observation
 from benchnav.models.base import TraversabilityModel
 from benchnav.models.fused import FusedModel
-from benchnav.models.nets.trainable import Ensemble, TrainableModel, in_single_precision, widened
+from benchnav.models.nets.trainable import (
+    Ensemble,
+    TrainableModel,
+    in_single_precision,
+    widened,
+)
 
 _HALVINGS = 40
 _NEAR = 1e-5  # of what the model itself predicts
@@ -64,7 +71,13 @@ _ACKLAM_C = (
     -7.784894002430293e-03, -3.223964580411365e-01, -2.400758277161838, -2.549732539343734, 4.374664141464968,
     2.938163982698783,
 )  # fmt: skip
-_ACKLAM_D = (7.784695709041462e-03, 3.224671290700398e-01, 2.445134137142996, 3.754408661907416, 1.0)
+_ACKLAM_D = (
+    7.784695709041462e-03,
+    3.224671290700398e-01,
+    2.445134137142996,
+    3.754408661907416,
+    1.0,
+)
 _TRIED = (2, 48, 40)  # B, H, W of the maps that a graph is traced and tried on
 
 
@@ -89,7 +102,8 @@ class Graph(nn.Module):
             members = getattr(model, "members", (model,))
         else:
             raise ConfigError(
-                "Expected a fused model or a benchnav.models.TrainableModel to export, got "
+                "Expected a fused model or a benchnav.models.TrainableModel to "
+                "export, got "
                 f"{type(model).__name__}. Export it by code of your own."
             )
         self.networks = nn.ModuleList(members)
@@ -97,7 +111,8 @@ class Graph(nn.Module):
             lacks = member.no_graph
             expect(
                 not lacks,
-                f"a model that ONNX can hold to export, got {type(member).__name__}, which {lacks}.",
+                f"a model that ONNX can hold to export, got {type(member).__name__}, "
+                f"which {lacks}.",
             )
         slope = ("slope_deg",) if isinstance(model, FusedModel) else ()
         layers = (name for member in members for name in member.inputs)
@@ -108,18 +123,27 @@ class Graph(nn.Module):
     def predict(self, maps: dict[str, Tensor]) -> TraversabilityDistribution:
         """As the model's own `predict`, of layers by name."""
         if isinstance(self.model, FusedModel):
-            members = torch.stack([member(maps).float().softmax(1) for member in self.networks])
+            members = torch.stack(
+                [member(maps).float().softmax(1) for member in self.networks]
+            )
             return self.model.fuse_at(members, maps["slope_deg"])
         pooled = pool([
             member.sharpen(member.to_distribution(in_single_precision(member(maps))))  # type: ignore[operator]
             for member in self.networks
         ])  # fmt: skip
-        return widened(pooled, self.model.temperature) if isinstance(self.model, Ensemble) else pooled
+        return (
+            widened(pooled, self.model.temperature)
+            if isinstance(self.model, Ensemble)
+            else pooled
+        )
 
     def forward(self, *layers: Tensor) -> tuple[Tensor, ...]:
-        """Predicts B maps, given by layer in the order of `layers`; outputs in the order of `names`."""
+        """Predicts B maps, given by layer in the order of `layers`; outputs in the
+        order of `names`.
+        """
         batch, (height, width) = layers[0].shape[0], layers[0].shape[-2:]
-        # Of sizes that padding and cropping have made, expressions as they are, each operation would be slow to write.
+        # Of sizes that padding and cropping have made, expressions as they are, each
+        # operation would be slow to write.
         predicted = map_tensors(
             self.predict(dict(zip(self.layers, layers, strict=True))),
             lambda values: values.reshape(batch, *values.shape[1:-2], height, width),
@@ -130,14 +154,20 @@ class Graph(nn.Module):
         return tuple(value.float() for value in found.values())
 
 
-def parameters_of(distribution: TraversabilityDistribution, prefix: str = "") -> dict[str, Tensor]:
-    """The parameters by name; of members that do not make one mixture `member_1_weights`, ….
+def parameters_of(
+    distribution: TraversabilityDistribution, prefix: str = ""
+) -> dict[str, Tensor]:
+    """The parameters by name; of members that do not make one mixture
+    `member_1_weights`, ….
 
     Raises:
         ConfigError: it is of a class of which no graph is made.
     """
     if isinstance(distribution, TraversabilityMixture):
-        return {f"{prefix}{name}": getattr(distribution, name) for name in ("weights", "means", "stds")}
+        return {
+            f"{prefix}{name}": getattr(distribution, name)
+            for name in ("weights", "means", "stds")
+        }
     if isinstance(distribution, QuantileDistribution):
         return {f"{prefix}quantiles": distribution.values}
     if isinstance(distribution, ConditionedDistribution):
@@ -148,7 +178,8 @@ def parameters_of(distribution: TraversabilityDistribution, prefix: str = "") ->
             found |= parameters_of(member, f"{prefix}member_{number}_")
         return found
     raise ConfigError(
-        "Expected a model that predicts a TraversabilityMixture or a QuantileDistribution to export, got one of "
+        "Expected a model that predicts a TraversabilityMixture or a "
+        "QuantileDistribution to export, got one of "
         f"{type(distribution).__name__}."
     )
 
@@ -175,21 +206,31 @@ def cvar_of(distribution: TraversabilityDistribution, tail: float) -> Tensor:
 def _quantile(distribution: TraversabilityDistribution, share: Tensor) -> Tensor:
     """Least λ that is not exceeded with probabilities, shape [B, H, W]."""
     if isinstance(distribution, ConditionedDistribution):
-        score = distribution.score_mean + distribution.score_std.double() * _normal_score(share)
+        score = (
+            distribution.score_mean
+            + distribution.score_std.double() * _normal_score(share)
+        )
         return _quantile(distribution.base, _normal_cdf(score))
     # Each operation of a halving is written 40 times: what can be is computed before.
     if isinstance(distribution, TraversabilityMixture):
         weights, means, stds = _mixture(distribution)
-        scale, sought = math.sqrt(0.5) / stds, (2 * share - 1).unsqueeze(1)  # Φ = ½ (1 + erf)
+        scale, sought = (
+            math.sqrt(0.5) / stds,
+            (2 * share - 1).unsqueeze(1),
+        )  # Φ = ½ (1 + erf)
 
         def reached(value: Tensor) -> Tensor:
-            erf = torch.erf(((value - means) * scale).float()).double()  # which is ONNX's own
+            erf = torch.erf(
+                ((value - means) * scale).float()
+            ).double()  # which is ONNX's own
             return (weights * erf).sum(1, keepdim=True) >= sought
 
     else:
 
         def reached(value: Tensor) -> Tensor:
-            return _tails(distribution, value[:, 0])[0].unsqueeze(1) >= share.unsqueeze(1)
+            return _tails(distribution, value[:, 0])[0].unsqueeze(1) >= share.unsqueeze(
+                1
+            )
 
     low = torch.zeros_like(share).unsqueeze(1)
     for halving in range(1, _HALVINGS + 1):
@@ -211,7 +252,9 @@ def _mixture(mixture: TraversabilityMixture) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _tails(distribution: TraversabilityDistribution, value: Tensor) -> Tensor:
-    """P(λ ≤ value) and P(λ > value), each to its own last digits, shape [2, *E, B, H, W]."""
+    """P(λ ≤ value) and P(λ > value), each to its own last digits, shape [2, *E, B, H,
+    W].
+    """
     if isinstance(distribution, PooledDistribution):
         return _average([_tails(member, value) for member in distribution.members])
     if isinstance(distribution, ConditionedDistribution):
@@ -236,24 +279,35 @@ def _integral(distribution: TraversabilityDistribution, value: Tensor) -> Tensor
     if isinstance(distribution, TraversabilityMixture):
         weights, means, stds = _mixture(distribution)
         z = torch.stack([-means, value.unsqueeze(1) - means]) / stds
-        below = z * _normal_cdf(z) + torch.exp(-z * z / 2) / math.sqrt(2 * math.pi)  # ∫ of Φ up to z
+        below = z * _normal_cdf(z) + torch.exp(-z * z / 2) / math.sqrt(
+            2 * math.pi
+        )  # ∫ of Φ up to z
         return (weights * stds * (below[1] - below[0])).sum(1)
     edges = _edges(distribution, value)
     low, width = edges[:-1], edges[1:] - edges[:-1]
-    # All nodes at once: a graph of few large operations, which is quicker to write and to run.
-    nodes, weights = (torch.from_numpy(values).view(-1, 1, 1, 1, 1) / 2 for values in (_NODES, _WEIGHTS))
+    # All nodes at once: a graph of few large operations, which is quicker to write and
+    # to run.
+    nodes, weights = (
+        torch.from_numpy(values).view(-1, 1, 1, 1, 1) / 2
+        for values in (_NODES, _WEIGHTS)
+    )
     heights = _tails(distribution, low + (0.5 + nodes) * width)[0]
     return (weights * width * heights).flatten(0, 1).sum(0)
 
 
 def _edges(distribution: TraversabilityDistribution, value: Tensor) -> Tensor:
-    """Ends of intervals over which F is smooth, about each component; shape [E, B, H, W]."""
+    """Ends of intervals over which F is smooth, about each component; shape [E, B, H,
+    W].
+    """
     found = parameters_of(distribution)
     edges = [torch.stack([torch.zeros_like(value), value])]
     steps = torch.tensor(_EDGES, dtype=torch.float64).view(-1, 1, 1, 1, 1)
     for name in found:
         if name.endswith("means"):
-            means, stds = found[name].double(), found[name.removesuffix("means") + "stds"].double()
+            means, stds = (
+                found[name].double(),
+                found[name.removesuffix("means") + "stds"].double(),
+            )
             edges.append((means + steps * stds).movedim(2, 1).flatten(0, 1))
     return torch.cat(edges).clamp(min=0).minimum(value).sort(0).values
 
@@ -265,7 +319,8 @@ def _average(values: Sequence[Tensor]) -> Tensor:
 def _normal_cdf(z: Tensor) -> Tensor:
     """Φ in float64 to 10⁻⁷ of itself, also far below 0.
 
-    Source: Hart's approximation as of West (2005), "Better approximations to cumulative normal functions".
+    Source: Hart's approximation as of West (2005), "Better approximations to cumulative
+        normal functions".
     """
     x = z.abs().clamp(max=_FARTHEST)
     beyond = x + 0.65
@@ -283,7 +338,8 @@ def _normal_cdf(z: Tensor) -> Tensor:
 def _normal_score(share: Tensor) -> Tensor:
     """Φ⁻¹, which ONNX has not, to 10⁻⁸ of itself.
 
-    Source: Acklam (2003), "An algorithm for computing the inverse normal cumulative distribution function".
+    Source: Acklam (2003), "An algorithm for computing the inverse normal cumulative
+        distribution function".
     """
     share = share.clamp(_LEAST_SHARE, 1 - 2**-53)
     centre = share - 0.5
@@ -291,7 +347,9 @@ def _normal_score(share: Tensor) -> Tensor:
     middle = centre * _polynomial(square, _ACKLAM_A) / _polynomial(square, _ACKLAM_B)
     outer = (-2 * share.minimum(1 - share).log()).sqrt()
     below = _polynomial(outer, _ACKLAM_C) / _polynomial(outer, _ACKLAM_D)
-    return torch.where(centre.abs() < 0.47575, middle, torch.where(centre < 0, below, -below))
+    return torch.where(
+        centre.abs() < 0.47575, middle, torch.where(centre < 0, below, -below)
+    )
 
 
 def _polynomial(x: Tensor, coefficients: Sequence[float]) -> Tensor:
@@ -303,7 +361,11 @@ def _polynomial(x: Tensor, coefficients: Sequence[float]) -> Tensor:
 
 
 def export_onnx(
-    model: TraversabilityModel, path: str | Path, about: str, level: float = 0.9, opset: int = 18
+    model: TraversabilityModel,
+    path: str | Path,
+    about: str,
+    level: float = 0.9,
+    opset: int = 18,
 ) -> Graph:
     """Writes a model as an ONNX graph for maps of any number and size.
 
@@ -315,24 +377,34 @@ def export_onnx(
         opset: version of ONNX's operators.
 
     Returns:
-        What was exported, with the names of its inputs, `layers`, and of its outputs, `names`.
+        What was exported, with the names of its inputs, `layers`, and of its outputs,
+        `names`.
 
     Raises:
-        ConfigError: such a model has no graph, or the packages of the extra `onnx` are missing.
+        ConfigError: such a model has no graph, or the packages of the extra `onnx` are
+            missing.
     """
     try:
         import onnx
         import onnxscript  # noqa: F401  torch.onnx needs it
     except ImportError as error:
         raise ConfigError(
-            "Expected the packages of the extra `onnx`, got none. Install them: pip install 'benchnav[onnx]'."
+            "Expected the packages of the extra `onnx`, got none. Install them: pip "
+            "install 'benchnav[onnx]'."
         ) from error
     newest = onnx.defs.onnx_opset_version()
-    expect(18 <= opset <= newest, f"`opset` in 18–{newest}, which torch.onnx writes, got {opset}.")
+    expect(
+        18 <= opset <= newest,
+        f"`opset` in 18–{newest}, which torch.onnx writes, got {opset}.",
+    )
     layers = _tried(graph := Graph(model, level), model)
-    batch, height, width = (torch.export.Dim(name) for name in ("batch", "height", "width"))
+    batch, height, width = (
+        torch.export.Dim(name) for name in ("batch", "height", "width")
+    )
     sizes = [
-        {0: batch, 2: height, 3: width} if layer.ndim == 4 else {0: batch, 1: height, 2: width}
+        {0: batch, 2: height, 3: width}
+        if layer.ndim == 4
+        else {0: batch, 1: height, 2: width}
         for layer in layers
     ]
     try:
@@ -346,11 +418,14 @@ def export_onnx(
             )  # fmt: skip
     except Exception as error:  # of many kinds
         raise out_of_memory(error) or ConfigError(
-            f"Expected a network that PyTorch writes as ONNX, got {type(model).__name__}: "
+            "Expected a network that PyTorch writes as ONNX, got "
+            f"{type(model).__name__}: "
             f"{one_line(error.__cause__ or error)[:300]}"
         ) from error
     assert program is not None
-    program.model.metadata_props["benchnav"] = json.dumps(_described(graph, model, about, level))
+    program.model.metadata_props["benchnav"] = json.dumps(
+        _described(graph, model, about, level)
+    )
     with replacing(Path(path)) as partial:
         program.save(partial)
     return graph
@@ -360,11 +435,14 @@ def _tried(graph: Graph, model: TraversabilityModel) -> list[Tensor]:
     """Tries the graph on random maps, which are given back by layer.
 
     Raises:
-        ConfigError: it does not predict as the model does, whose `predict` does more than its hooks say.
+        ConfigError: it does not predict as the model does, whose `predict` does more
+            than its hooks say.
     """
     count, height, width = _TRIED
     generator = torch.Generator().manual_seed(0)
-    rgb = torch.randint(0, 256, (count, 3, height, width), generator=generator, dtype=torch.uint8)
+    rgb = torch.randint(
+        0, 256, (count, 3, height, width), generator=generator, dtype=torch.uint8
+    )
     others = {
         name: 30 * torch.rand(count, height, width, generator=generator)
         for name in graph.layers
@@ -379,20 +457,26 @@ def _tried(graph: Graph, model: TraversabilityModel) -> list[Tensor]:
     )  # fmt: skip
     layers = [maps[name] for name in graph.layers]
     with torch.no_grad():
-        found, own = dict(zip(("mean", "cvar"), graph(*layers)[-2:], strict=True)), model.predict(observation)
+        found, own = (
+            dict(zip(("mean", "cvar"), graph(*layers)[-2:], strict=True)),
+            model.predict(observation),
+        )
     off = max(
         float((found["mean"] - own.mean()).abs().max()),
         float((found["cvar"] - own.cvar(1 - graph.tail)).abs().max()),
     )
     expect(
         off < _NEAR,
-        f"a model whose `predict` is its network and `to_distribution` alone, got {type(model).__name__}, of which the "
+        "a model whose `predict` is its network and `to_distribution` alone, got "
+        f"{type(model).__name__}, of which the "
         f"graph is off by {off:.2g}.",
     )
     return layers
 
 
-def _described(graph: Graph, model: TraversabilityModel, about: str, level: float) -> dict[str, Any]:
+def _described(
+    graph: Graph, model: TraversabilityModel, about: str, level: float
+) -> dict[str, Any]:
     """What a user has to know beside the graph."""
     return {
         "model": about,

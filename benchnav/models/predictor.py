@@ -1,8 +1,10 @@
-"""How a model is found, by name or by checkpoint, and the privileged ones, which are given the truth.
+"""How a model is found, by name or by checkpoint, and the privileged ones, which are
+given the truth.
 
 Models are parts of the registry (`benchnav.core.registry`, kind `model`): what
-stands at a name is either called with its options and makes a model, or is a family, with
-`from_checkpoint`, for checkpoints that bear its name. The package's own models are in the same registry.
+stands at a name is either called with its options and makes a model, or is a family,
+with `from_checkpoint`, for checkpoints that bear its name. The package's own models are
+in the same registry.
 Letters in shapes: K components.
 """
 
@@ -54,10 +56,12 @@ class Oracle(PrivilegedModel):
 
 
 class Ideal(PrivilegedModel):
-    """Knows all that colours can tell: of look-alikes, the mixture of their true distributions.
+    """Knows all that colours can tell: of look-alikes, the mixture of their true
+    distributions.
 
-    What a model falls short of it is the model's error; what it falls short of the oracle cannot be seen. Its
-    look-alikes weigh the same, so that of them the single-class option keeps the first of the class table.
+    What a model falls short of it is the model's error; what it falls short of the
+    oracle cannot be seen. Its look-alikes weigh the same, so that of them the
+    single-class option keeps the first of the class table.
     """
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
@@ -73,54 +77,78 @@ class Clairvoyant(PrivilegedModel):
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
         """Gives the realised λ of every cell, without doubt, K = 1."""
         means = terrain.traversability.unsqueeze(1)
-        return TraversabilityMixture(torch.ones_like(means), means, torch.zeros_like(means), (0,))
+        return TraversabilityMixture(
+            torch.ones_like(means), means, torch.zeros_like(means), (0,)
+        )
 
 
 _SOURCE = "_source"  # attribute that keeps how a model was found
 Source = str | Path | Mapping[str, Any] | Part
-# `Law.nugget` under a model that learnt; docs/reference/sensing.md has the figures it was chosen by. Without a nugget,
-# scores of neighbouring cells that the model predicts wrongly contradict each other.
+# `Law.nugget` under a model that learnt; docs/reference/sensing.md has the figures it
+# was chosen by. Without a nugget, scores of neighbouring cells that the model predicts
+# wrongly contradict each other.
 MODEL_NUGGET = 0.1
 IN_REPOSITORY_ALONE = "paper-v1"  # a checkpoint that `setup.py` leaves out of wheels
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelPart(Part):
-    """The description of a model: a part of the registry, or a checkpoint, perhaps with the class that rebuilds it."""
+    """The description of a model: a part of the registry, or a checkpoint, perhaps with
+    the class that rebuilds it.
+    """
 
     kind: str = field(default="model", compare=False, repr=False)
 
     @property
     def folder(self) -> Path | None:
-        """Folder of the checkpoint; None for a part of the registry, whose names go first."""
+        """Folder of the checkpoint; None for a part of the registry, whose names go
+        first.
+        """
         is_place = ":" in self.part or self.part.endswith(".py")
         if self.part in registry.names("model"):
             return None
-        if is_place and split_own(self.part) is None and not (Path(self.part) / CONFIG).is_file():
+        if (
+            is_place
+            and split_own(self.part) is None
+            and not (Path(self.part) / CONFIG).is_file()
+        ):
             return None
         folder = find_checkpoint(self.part)
-        expect(not self.options, f"no options for the checkpoint {self.part!r}, got {dict(self.options)}.")
+        expect(
+            not self.options,
+            f"no options for the checkpoint {self.part!r}, got {dict(self.options)}.",
+        )
         return folder
 
     @property
     def found(self) -> Found:
-        """The class or function that creates the model; of a checkpoint the class that rebuilds it."""
+        """The class or function that creates the model; of a checkpoint the class that
+        rebuilds it.
+        """
         folder = self.folder
         if folder is None:
             return registry.find("model", self.part)
         own = split_own(self.part)
-        return registry.find("model", own[0]) if own else find_family(read_config(folder)["model"])
+        return (
+            registry.find("model", own[0])
+            if own
+            else find_family(read_config(folder)["model"])
+        )
 
     @property
     def key(self) -> str:
         """The description as text, with digests of code and files; see `loaded`."""
         folder = self.folder
         files = digests_of(folder) if folder else registry.option_files(self)
-        return json.dumps([self.part, dict(self.options), self.found.digest, files], sort_keys=True)
+        return json.dumps(
+            [self.part, dict(self.options), self.found.digest, files], sort_keys=True
+        )
 
     @property
     def object(self) -> TraversabilityModel:
-        """The model. A process keeps the last two, as long as their code and files stay the same."""
+        """The model. A process keeps the last two, as long as their code and files stay
+        the same.
+        """
         return loaded(self.key)
 
     def create(self, **given: Any) -> TraversabilityModel:
@@ -143,19 +171,23 @@ def read_model(source: Source) -> ModelPart:
     """
     if isinstance(source, ModelPart):
         return source
-    part = registry.read_part("model", str(source) if isinstance(source, Path) else source)
+    part = registry.read_part(
+        "model", str(source) if isinstance(source, Path) else source
+    )
     return ModelPart(part=part.part, label=part.label, options=part.options)
 
 
 @torch.inference_mode(False)  # so that it is the same model wherever it is loaded
 def load_model(source: Source) -> TraversabilityModel:
-    """Finds a model by checkpoint or as a part of the registry; it predicts on the observation's device.
+    """Finds a model by checkpoint or as a part of the registry; it predicts on the
+    observation's device.
 
     Args:
-        source: the folder of a checkpoint, by path or by its name in `checkpoints/` here or
-            among those shipped, or `owner/name@revision` of a hub; or a part, such as `oracle`,
-            `package.module:Name` or `path/to/file.py:Name`, with options where it is a mapping; or the checkpoint of
-            a class that a file or module holds, `path/to/file.py:Name@CHECKPOINT`.
+        source: the folder of a checkpoint, by path or by its name in `checkpoints/`
+            here or among those shipped, or `owner/name@revision` of a hub; or a part,
+            such as `oracle`, `package.module:Name` or `path/to/file.py:Name`, with
+            options where it is a mapping; or the checkpoint of a class that a file or
+            module holds, `path/to/file.py:Name@CHECKPOINT`.
 
     Raises:
         ConfigError: there is no such model, or it refuses its options.
@@ -176,12 +208,17 @@ def load_model(source: Source) -> TraversabilityModel:
 
 def no_model(part: ModelPart) -> ConfigError:
     """Return the error that says what to name in place of a family of models."""
-    same_name = next((path for path in list_checkpoints() if path.name == part.part), None)
+    same_name = next(
+        (path for path in list_checkpoints() if path.name == part.part), None
+    )
     how = (
-        f"path: {same_name}" if same_name else "name or path, a class of your own as FILE.py:Class@CHECKPOINT"
+        f"path: {same_name}"
+        if same_name
+        else "name or path, a class of your own as FILE.py:Class@CHECKPOINT"
     )
     return ConfigError(
-        f"Expected a model, got {part.part!r}, which is a family of models. Name a checkpoint of it, by its {how}."
+        f"Expected a model, got {part.part!r}, which is a family of models. Name a "
+        f"checkpoint of it, by its {how}."
     )
 
 
@@ -192,8 +229,9 @@ def describe_model(model: Any) -> Part:
         model: a model, or what `load_model` takes.
 
     Returns:
-        The part that loads a model with the same weights. A model that was trained in this process, or changed after it
-        was loaded, is known by a name in this process only.
+        The part that loads a model with the same weights. A model that was trained in
+        this process, or changed after it was loaded, is known by a name in this process
+        only.
 
     Raises:
         ConfigError: If it is no model.
@@ -211,8 +249,14 @@ def describe_model(model: Any) -> Part:
 
 
 def _digest_of_weights(model: TraversabilityModel) -> str:
-    tensors = (tensor for network in networks_of(model) for tensor in network.state_dict().values())
-    return digest_of(tensor.detach().cpu().contiguous().numpy().tobytes() for tensor in tensors)
+    tensors = (
+        tensor
+        for network in networks_of(model)
+        for tensor in network.state_dict().values()
+    )
+    return digest_of(
+        tensor.detach().cpu().contiguous().numpy().tobytes() for tensor in tensors
+    )
 
 
 def networks_of(value: Any) -> Iterator[nn.Module]:
@@ -229,23 +273,33 @@ def networks_of(value: Any) -> Iterator[nn.Module]:
 
 
 def split_own(source: str | Path) -> tuple[str, str] | None:
-    """Splits `path/to/file.py:Name@CHECKPOINT` into class and checkpoint; None of what is not of this form."""
+    """Splits `path/to/file.py:Name@CHECKPOINT` into class and checkpoint; None of what
+    is not of this form.
+    """
     named = re.fullmatch(r"(.+?:[A-Za-z_][\w.]*)@(.+)", str(source))
-    return None if named is None or (Path(source) / CONFIG).is_file() else (named[1], named[2])
+    return (
+        None
+        if named is None or (Path(source) / CONFIG).is_file()
+        else (named[1], named[2])
+    )
 
 
 def _checked_checkpoint(part: ModelPart, folder: Path, family: Found) -> Checkpoint:
-    """Read a checkpoint that is finished and, where the user names a class, was trained with it."""
+    """Read a checkpoint that is finished and, where the user names a class, was trained
+    with it.
+    """
     own = split_own(part.part)
     if own and not is_family(family.target):
         raise ConfigError(
-            f"Expected {own[0]} to be a benchnav.models.TrainableModel or ModelFamily, whose models are kept in "
+            f"Expected {own[0]} to be a benchnav.models.TrainableModel or "
+            "ModelFamily, whose models are kept in "
             "checkpoints, got another class or function."
         )
     checkpoint = load_checkpoint(folder)
     if own and checkpoint.model != family.target.__name__:
         raise CheckpointError(
-            f"Expected a checkpoint of the class {family.target.__name__}, got {folder}, which is one of "
+            f"Expected a checkpoint of the class {family.target.__name__}, got "
+            f"{folder}, which is one of "
             f"{checkpoint.model!r}. Name the class that it was trained with."
         )
     if not own and checkpoint.model == FUSED and CLASSIFIER not in checkpoint.parts:
@@ -256,7 +310,8 @@ def _checked_checkpoint(part: ModelPart, folder: Path, family: Found) -> Checkpo
 def find_family(name: str) -> Found:
     """Finds the family that a checkpoint names.
 
-    Names alone are looked up, never a module or file: what a checkpoint says runs no code of its choice.
+    Names alone are looked up, never a module or file: what a checkpoint says runs no
+    code of its choice.
 
     Raises:
         CheckpointError: it is not known here by name.
@@ -265,13 +320,16 @@ def find_family(name: str) -> Found:
     found = registry.find("model", name) if name in known else None
     if found is None or not is_family(found.target):
         raise CheckpointError(
-            f"Expected a checkpoint of a model among {', '.join(known)}, got one of {name!r}. Install the package that "
+            f"Expected a checkpoint of a model among {', '.join(known)}, got one of "
+            f"{name!r}. Install the package that "
             f"registers it, or name the class: path/to/file.py:{name}@CHECKPOINT."
         )
     return found
 
 
-def open_checkpoint(checkpoint: Checkpoint, family: Found | None = None) -> TraversabilityModel:
+def open_checkpoint(
+    checkpoint: Checkpoint, family: Found | None = None
+) -> TraversabilityModel:
     """Rebuild the model of a checkpoint, and warn if its class is of other code now.
 
     Args:
@@ -279,28 +337,35 @@ def open_checkpoint(checkpoint: Checkpoint, family: Found | None = None) -> Trav
         family: the class that rebuilds it; None for that which the checkpoint names.
 
     Raises:
-        CheckpointError: If the family is not known here by name, or cannot rebuild the model.
+        CheckpointError: If the family is not known here by name, or cannot rebuild the
+            model.
     """
     family = family or find_family(checkpoint.model)
     if checkpoint.code and checkpoint.code != family.digest:
         tell(
-            f"benchnav: warning: {checkpoint.model} in {family.origin} has changed since it trained the checkpoint "
-            f"(digest {family.digest[:12]}, then {checkpoint.code[:12]}), so that its predictions may differ"
+            f"benchnav: warning: {checkpoint.model} in {family.origin} has changed "
+            "since it trained the checkpoint "
+            f"(digest {family.digest[:12]}, then {checkpoint.code[:12]}), so that its "
+            "predictions may differ"
         )
     try:
         model = family.target.from_checkpoint(checkpoint)
-        table = ConformalTable.read(checkpoint.conformal) if checkpoint.conformal else None
+        table = (
+            ConformalTable.read(checkpoint.conformal) if checkpoint.conformal else None
+        )
         return ConformalModel(model, table) if table else model
     except CheckpointError:
         raise
     except Exception as error:  # a user's class may raise anything
         raise out_of_memory(error) or CheckpointError(
-            f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
+            "Expected tensors that fit the checkpoint's settings, got: "
+            f"{str(error)[:300]}. Train the model again."
         ) from error
 
 
 def find_checkpoint(source: str | Path) -> Path:
-    """Finds the folder of a checkpoint by path, by name in `checkpoints/` here or among the shipped ones, or on a hub.
+    """Finds the folder of a checkpoint by path, by name in `checkpoints/` here or among
+    the shipped ones, or on a hub.
 
     Of `path/to/file.py:Name@CHECKPOINT` it is the folder of CHECKPOINT.
 
@@ -315,15 +380,19 @@ def find_checkpoint(source: str | Path) -> Path:
         if (path / CONFIG).is_file():
             return path
     if Path(source).is_dir():
-        return Path(source)  # to be refused by the reader, which says what is missing there
+        return Path(
+            source
+        )  # to be refused by the reader, which says what is missing there
     for path in places:
         refuse_unfinished(path)
     if hub.is_address(source):
         return hub.download(str(source), "model", CheckpointError)
     if str(source) == IN_REPOSITORY_ALONE:
         raise ConfigError(
-            f"Expected the checkpoint {source} in checkpoints/, got none: the wheel leaves it out for its size. Copy "
-            f"the folder checkpoints/{source} of the repository there, or name another model, such as stakes-v1."
+            f"Expected the checkpoint {source} in checkpoints/, got none: the wheel "
+            "leaves it out for its size. Copy "
+            f"the folder checkpoints/{source} of the repository there, or name "
+            "another model, such as stakes-v1."
         )
     path, names = Path(source), [path.name for path in list_checkpoints()]
     known = sorted({*registry.names("model"), *names})
@@ -334,13 +403,17 @@ def find_checkpoint(source: str | Path) -> Path:
         or registry.hint(path.name, names)
     )
     raise ConfigError(
-        f"Expected a model among {', '.join(known)}, the folder of a checkpoint, package.module:Name, "
-        f"path/to/file.py:Name or owner/name@revision of a hub, got {str(source)!r}.{near}"
+        f"Expected a model among {', '.join(known)}, the folder of a checkpoint, "
+        "package.module:Name, "
+        "path/to/file.py:Name or owner/name@revision of a hub, got "
+        f"{str(source)!r}.{near}"
     )
 
 
 def list_checkpoints() -> list[Path]:
-    """Folders of the checkpoints in `checkpoints/` here and of those shipped; of one name the first."""
+    """Folders of the checkpoints in `checkpoints/` here and of those shipped; of one
+    name the first.
+    """
     found: dict[str, Path] = {}
     for folder in _checkpoint_folders():
         for path in sorted(config.parent for config in folder.glob(f"*/{CONFIG}")):
@@ -355,8 +428,8 @@ def trained_on(source: Source) -> dict[str, str]:
         source: as `load_model` takes it, which is to have read it.
 
     Returns:
-        By digest of a split its name and that of its dataset, such as "train of paper-v1"; empty of what is no
-        checkpoint.
+        By digest of a split its name and that of its dataset, such as "train of
+        paper-v1"; empty of what is no checkpoint.
     """
     folder = read_model(source).folder
     found, parts = {}, read_config(folder)["parts"] if folder else {}
@@ -368,7 +441,9 @@ def trained_on(source: Source) -> dict[str, str]:
 
 
 def nugget_of(model: TraversabilityModel) -> float:
-    """`Law.nugget` under a model's predictions: 0 where they are each cell's true distribution."""
+    """`Law.nugget` under a model's predictions: 0 where they are each cell's true
+    distribution.
+    """
     return 0.0 if isinstance(model, Oracle | Clairvoyant) else MODEL_NUGGET
 
 
@@ -376,10 +451,10 @@ def find_ground_statistics(source: Source, dataset: TerrainDataset) -> GroundSta
     """Finds what is known of ground before any of it is seen.
 
     Args:
-        source: as `load_model` takes it. The statistics that a checkpoint brings are those of the maps that it was
-            trained on.
-        dataset: the maps that are driven on, for models that bring none: the statistics beside it, else those of the
-            shipped recipe of its maps.
+        source: as `load_model` takes it. The statistics that a checkpoint brings are
+            those of the maps that it was trained on.
+        dataset: the maps that are driven on, for models that bring none: the statistics
+            beside it, else those of the shipped recipe of its maps.
 
     Raises:
         ConfigError: there are none.
@@ -390,19 +465,27 @@ def find_ground_statistics(source: Source, dataset: TerrainDataset) -> GroundSta
     found = found or find_ground(dataset)
     if found is None:
         path = ground_file(dataset.path)
-        how = f"{dataset.path}" if TRAIN in dataset.splits else f"TRAINING_DATA --out {path}"
+        how = (
+            f"{dataset.path}"
+            if TRAIN in dataset.splits
+            else f"TRAINING_DATA --out {path}"
+        )
         raise ConfigError(
-            f"Expected statistics of the ground in {path}, got none. Make them of maps of the split {TRAIN} with "
+            f"Expected statistics of the ground in {path}, got none. Make them of "
+            f"maps of the split {TRAIN} with "
             f"`benchnav-datagen ground {how}`."
         )
     return found
 
 
-def class_mismatch(model: TraversabilityModel | Checkpoint, recipe: Recipe, name: str = "the model") -> str:
+def class_mismatch(
+    model: TraversabilityModel | Checkpoint, recipe: Recipe, name: str = "the model"
+) -> str:
     """Tells in one line when a model knows another class table than that of the data.
 
     Args:
-        model: a model, or a checkpoint, which has a class table even where its model tells no classes.
+        model: a model, or a checkpoint, which has a class table even where its model
+            tells no classes.
         recipe: of the data.
         name: what the line calls the model.
 
@@ -413,7 +496,8 @@ def class_mismatch(model: TraversabilityModel | Checkpoint, recipe: Recipe, name
     if model.class_names in ((), names):
         return ""
     return (
-        f"{name} was trained on other classes than those of {recipe.id}: {', '.join(model.class_names)}; the maps have "
+        f"{name} was trained on other classes than those of {recipe.id}: "
+        f"{', '.join(model.class_names)}; the maps have "
         f"{', '.join(names)}"
     )
 

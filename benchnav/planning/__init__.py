@@ -1,4 +1,6 @@
-"""Planning under predicted traversability: problems, planners, robots, objectives, risk and worlds."""
+"""Planning under predicted traversability: problems, planners, robots, objectives, risk
+and worlds.
+"""
 
 from benchnav.core.public_names import face
 
@@ -6,13 +8,23 @@ __getattr__, __dir__, __all__ = face(
     __name__,
     {
         "benchnav.planning.free_space": ("FreeSpace", "Rules"),
-        "benchnav.planning.objective": ("GoalDistance", "Objective", "TravelTime", "distance"),
+        "benchnav.planning.objective": (
+            "GoalDistance",
+            "Objective",
+            "TravelTime",
+            "distance",
+        ),
         "benchnav.planning.planners.astar.astar_dwa": ("AStarDWA",),
         "benchnav.planning.planners.astar.astar_mppi": ("AStarMPPI",),
         "benchnav.planning.planners.cl_rrt.cl_rrt": ("CLRRT",),
         "benchnav.planning.planners.mppi": ("MPPI", "MPPIConfig"),
         "benchnav.planning.planners.optimal.optimal": ("NearOptimal", "Optimal"),
-        "benchnav.planning.planners.planner": ("LocalPlanner", "Plan", "PlanStatus", "Planner"),
+        "benchnav.planning.planners.planner": (
+            "LocalPlanner",
+            "Plan",
+            "PlanStatus",
+            "Planner",
+        ),
         "benchnav.planning.planners.straight": ("Straight",),
         "benchnav.planning.problem": ("Prediction", "Problem", "Task", "pose_problem"),
         "benchnav.planning.risk": (

@@ -8,13 +8,39 @@ from benchnav.planning.planners.optimal.optimal import NearOptimal, Optimal
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, PlanStatus
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Prediction, Problem, Task, pose_problem
-from benchnav.planning.risk import Chance, CVaR, ExpectedTime, Mean, RiskMeasure, SingleClass, TimeCVaR, VaR
-from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Bicycle, DifferentialDrive, Robot, Unicycle
+from benchnav.planning.risk import (
+    Chance,
+    CVaR,
+    ExpectedTime,
+    Mean,
+    RiskMeasure,
+    SingleClass,
+    TimeCVaR,
+    VaR,
+)
+from benchnav.planning.robots import (
+    SPEED,
+    STEERING,
+    TURN_RATE,
+    Bicycle,
+    DifferentialDrive,
+    Robot,
+    Unicycle,
+)
 from benchnav.planning.sensing.belief import Belief, Law, Static
 from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.near import Near
-from benchnav.planning.sensing.sensor import Appearance, Contact, Full, Moment, Probe, Sensed, Sensor, Step
+from benchnav.planning.sensing.sensor import (
+    Appearance,
+    Contact,
+    Full,
+    Moment,
+    Probe,
+    Sensed,
+    Sensor,
+    Step,
+)
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import Places, World
 

@@ -1,11 +1,13 @@
 """Objectives J: what a planner minimises.
 
-An objective is an `Objective`, with `stage` and `terminal`; with `path_cost` it also tells what a metre of a
-path costs, which planners that search paths minimise. `target` is the goal, or a local planner's way-point;
-traversability is read at the state before the move, as the risk setting gives it: the least λ̂ that motion
-is given does not bound it. In the Gymnasium environment J is given the λ that the robot met.
-Ground that is not free is no concern of J: the `Problem` adds its penalty. An objective whose constructor
-has a parameter `robot` or `goal_radius_m` is given the task's. Source: paper III-C and IV-A. Letters in
+An objective is an `Objective`, with `stage` and `terminal`; with `path_cost` it also
+tells what a metre of a path costs, which planners that search paths minimise. `target`
+is the goal, or a local planner's way-point; traversability is read at the state before
+the move, as the risk setting gives it: the least λ̂ that motion is given does not bound
+it. In the Gymnasium environment J is given the λ that the robot met. Ground that is not
+free is no concern of J: the `Problem` adds its penalty. An objective whose constructor
+    has a parameter `robot` or `goal_radius_m` is given the task's. Source: paper III-C
+    and IV-A. Letters in
 shapes: *B any leading dimensions, S state and A action dimensions.
 """
 
@@ -29,13 +31,16 @@ class Objective(Specified, ABC):
     """
 
     @abstractmethod
-    def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
+    def stage(
+        self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor
+    ) -> Tensor:
         """Cost of one step.
 
         Args:
             state: shape [*B, S], beginning with (x, y, θ).
             action: shape [*B, A].
-            traversability: λ̂ at the state, in [0, 1] and not clamped, 0 off the map, shape [*B].
+            traversability: λ̂ at the state, in [0, 1] and not clamped, 0 off the map,
+                shape [*B].
             target: (x, y) to be reached, shape [*B, 2].
 
         Returns:
@@ -47,7 +52,8 @@ class Objective(Specified, ABC):
         """Cost of the last state, shape [*B]; arguments as for `stage`."""
 
     def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
-        """What a horizontal metre of a path costs; by default its length in 3D. A path's cost sums its pieces'.
+        """What a horizontal metre of a path costs; by default its length in 3D. A
+        path's cost sums its pieces'.
 
         Args:
             traversability: the λ̂ that motion is planned with, shape [*B].
@@ -62,7 +68,9 @@ class Objective(Specified, ABC):
 class GoalDistance(Objective):
     """The paper's: distance to the target in metres, at each step. Source: paper IV-A."""
 
-    def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
+    def stage(
+        self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor
+    ) -> Tensor:
         """Cost of one step; see `Objective`."""
         return distance(state, target)
 
@@ -71,13 +79,16 @@ class GoalDistance(Objective):
         return distance(state, target)
 
     def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
-        """Metres in 3D, which the paper's A* minimises; see `Objective`. Source: paper IV-A1."""
+        """Metres in 3D, which the paper's A* minimises; see `Objective`. Source: paper
+        IV-A1.
+        """
         return super().path_cost(traversability, grade)
 
 
 @dataclass(frozen=True)
 class TravelTime(Objective):
-    """Seconds until the target: those of the steps before arrival, and at top speed for what is left.
+    """Seconds until the target: those of the steps before arrival, and at top speed for
+    what is left.
 
     Args:
         robot: gives time step and top speed.
@@ -89,29 +100,41 @@ class TravelTime(Objective):
 
     def __post_init__(self) -> None:
         """Refuses a distance at which nothing arrives."""
-        expect(self.goal_radius_m > 0, f"`goal_radius_m` > 0, got {self.goal_radius_m}.")
+        expect(
+            self.goal_radius_m > 0, f"`goal_radius_m` > 0, got {self.goal_radius_m}."
+        )
 
-    def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
+    def stage(
+        self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor
+    ) -> Tensor:
         """Cost of one step; see `Objective`."""
         away = distance(state, target)
         return self.robot.dt_s * (away > self.goal_radius_m).to(away.dtype)
 
     def terminal(self, state: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of the last state; see `Objective`."""
-        return (distance(state, target) - self.goal_radius_m).clamp(min=0) / self.robot.top_speed_mps
+        return (distance(state, target) - self.goal_radius_m).clamp(
+            min=0
+        ) / self.robot.top_speed_mps
 
     def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
-        """Seconds at top speed under λ̂; see `Objective`. Grade costs nothing: robots drive in the plane."""
+        """Seconds at top speed under λ̂; see `Objective`. Grade costs nothing: robots
+        drive in the plane.
+        """
         return 1 / (traversability * self.robot.top_speed_mps)
 
 
 def toward_waypoints(objective: Objective) -> Objective:
-    """J of a local planner: a way-point is reached at the point itself, not within the goal's radius of it.
+    """J of a local planner: a way-point is reached at the point itself, not within the
+    goal's radius of it.
 
-    Else a way-point that is nearer than that radius, as in narrow places, would draw no robot. A dataclass with
-    a field `goal_radius_m` is remade with the smaller radius; another objective is used as it is.
+    Else a way-point that is nearer than that radius, as in narrow places, would draw no
+    robot. A dataclass with a field `goal_radius_m` is remade with the smaller radius;
+    another objective is used as it is.
     """
-    if not is_dataclass(objective) or "goal_radius_m" not in {entry.name for entry in fields(objective)}:
+    if not is_dataclass(objective) or "goal_radius_m" not in {
+        entry.name for entry in fields(objective)
+    }:
         return objective
     radius: float = objective.goal_radius_m
     return replace(objective, goal_radius_m=min(radius, _WAYPOINT_M))

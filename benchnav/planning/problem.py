@@ -1,7 +1,8 @@
 """The navigation problem that a planner is given (paper, equation 2).
 
-It holds what is *predicted* alone: the truth stays with the simulation. Letters in shapes: B episodes, H×W
-cells, S state and A action dimensions, *K any further dimensions.
+It holds what is *predicted* alone: the truth stays with the simulation. Letters in
+shapes: B episodes, H×W cells, S state and A action dimensions, *K any further
+    dimensions.
 """
 
 from dataclasses import dataclass, field, replace
@@ -20,7 +21,8 @@ from benchnav.planning.free_space import PENALTY, Immobile, Rules, cells_at_goal
 from benchnav.planning.objective import Objective
 from benchnav.planning.robots import Robot
 
-# Stands for a λ̂ of 0 in maps for lookups, where the sign tells whether ground is free and 0 is off the map.
+# Stands for a λ̂ of 0 in maps for lookups, where the sign tells whether ground is free
+# and 0 is off the map.
 _ZERO = 1e-30
 
 
@@ -63,7 +65,8 @@ class Problem(Batch):
         goal_m: (x, y) of the goals, shape [B, 2].
         time_budget_s: T of each episode, shape [B].
         fields: draws whole fields of λ, whose cells hang together; see `sample_fields`.
-        immobile: what immobilises robots in the world, which planners may plan for; None for nothing.
+        immobile: what immobilises robots in the world, which planners may plan for;
+            None for nothing.
     """
 
     task: Task
@@ -89,7 +92,10 @@ class Problem(Batch):
         }
         for name, shape in expected.items():
             value = getattr(self, name)
-            expect(value.shape == shape, f"`{name}` of shape {list(shape)}, got {list(value.shape)}.")
+            expect(
+                value.shape == shape,
+                f"`{name}` of shape {list(shape)}, got {list(value.shape)}.",
+            )
 
     def __len__(self) -> int:
         """Number of episodes B."""
@@ -125,34 +131,45 @@ class Problem(Batch):
         """Time step of the robot."""
         return self.robot.dt_s
 
-    def sample_fields(self, count: int, key: int, cells: Tensor | None = None) -> Tensor:
-        """Draws fields of λ as what is believed has them, each whole: its cells hang together.
+    def sample_fields(
+        self, count: int, key: int, cells: Tensor | None = None
+    ) -> Tensor:
+        """Draws fields of λ as what is believed has them, each whole: its cells hang
+        together.
 
         Args:
             count: M.
             key: a stream key, see `benchnav.core.rng`; another key draws other fields.
-            cells: which are asked for, bool, shape [B, H, W], which may save time; what others hold means nothing then.
+            cells: which are asked for, bool, shape [B, H, W], which may save time; what
+                others hold means nothing then.
 
         Returns:
-            λ in [0, 1], shape [B, M, H, W]; those of an episode do not depend on the others.
+            λ in [0, 1], shape [B, M, H, W]; those of an episode do not depend on the
+            others.
 
         Raises:
             ConfigError: nothing was said of how λ hangs together.
         """
         if self.fields is None:
             raise ConfigError(
-                "Expected a problem with `fields` to draw from, got None. Pass them to `pose_problem`."
+                "Expected a problem with `fields` to draw from, got None. Pass them "
+                "to `pose_problem`."
             )
         return self.fields.sample(count, key, cells).to(self.risk_map)
 
     def select(self, members: Tensor) -> "Problem":
         """Keeps some episodes, by index, int64."""
         kept = super().select(members)
-        return kept if self.fields is None else replace(kept, fields=self.fields.select(members))
+        return (
+            kept
+            if self.fields is None
+            else replace(kept, fields=self.fields.select(members))
+        )
 
     @cached_property
     def traversability(self) -> Tensor:
-        """The λ̂ that motion and path costs are given: at least `min_traversability`, shape [B, H, W].
+        """The λ̂ that motion and path costs are given: at least `min_traversability`,
+        shape [B, H, W].
 
         J is given `risk_map` itself, so that a cost of low λ̂ is not lost.
         """
@@ -160,10 +177,11 @@ class Problem(Batch):
 
     @cached_property
     def padded_ground(self) -> Tensor:
-        """λ̂ and free space in one map framed for lookups: λ̂ where free, −λ̂ where not, −0 off the map.
+        """λ̂ and free space in one map framed for lookups: λ̂ where free, −λ̂ where
+        not, −0 off the map.
 
-        One lookup a step serves motion, J and the penalty of ground that is not free; see `motion_traversability`,
-        `stage_cost` and `free_at`.
+        One lookup a step serves motion, J and the penalty of ground that is not free;
+        see `motion_traversability`, `stage_cost` and `free_at`.
         """
         return ground_map(self.grid, self.risk_map, self.free)
 
@@ -178,21 +196,31 @@ class Problem(Batch):
     @property
     def dynamics(self) -> "Dynamics":
         """What a rollout goes by besides its maps."""
-        return Dynamics(self.grid, self.robot, self.objective, self.task.rules.min_traversability)
+        return Dynamics(
+            self.grid, self.robot, self.objective, self.task.rules.min_traversability
+        )
 
     def ground_at(self, state: Tensor) -> Tensor:
-        """Reads `padded_ground` where the robots stand; shape of `state` [B, *K, S] without the last."""
+        """Reads `padded_ground` where the robots stand; shape of `state` [B, *K, S]
+        without the last.
+        """
         return self.grid.lookup(self.padded_ground, state[..., 0], state[..., 1])
 
     def traversability_at(self, state: Tensor) -> Tensor:
-        """λ̂ of motion where the robots stand, 0 off the map; shapes as for `ground_at`."""
-        return motion_traversability(self.ground_at(state), self.task.rules.min_traversability)
+        """λ̂ of motion where the robots stand, 0 off the map; shapes as for
+        `ground_at`.
+        """
+        return motion_traversability(
+            self.ground_at(state), self.task.rules.min_traversability
+        )
 
     def free_at(self, state: Tensor) -> Tensor:
         """Tells which robots stand on free ground, bool; shapes as for `ground_at`."""
         return self.ground_at(state) > 0
 
-    def stage_cost(self, state: Tensor, action: Tensor, ground: Tensor, target: Tensor) -> Tensor:
+    def stage_cost(
+        self, state: Tensor, action: Tensor, ground: Tensor, target: Tensor
+    ) -> Tensor:
         """J of a step, and the penalty of ground that is not free.
 
         Args:
@@ -207,7 +235,9 @@ class Problem(Batch):
         return stage_cost(self.objective, state, action, ground, target)
 
     def terminal_cost(self, state: Tensor, target: Tensor) -> Tensor:
-        """J of the last state, and the penalty of ground that is not free; shapes as for `stage_cost`."""
+        """J of the last state, and the penalty of ground that is not free; shapes as
+        for `stage_cost`.
+        """
         return terminal_cost(self.objective, state, self.ground_at(state), target)
 
 
@@ -247,19 +277,31 @@ def motion_traversability(ground: Tensor, min_traversability: float) -> Tensor:
 
 
 def predicted_traversability(ground: Tensor) -> Tensor:
-    """λ̂ as the risk setting gives it, 0 off the map, from values of `Problem.padded_ground`."""
+    """λ̂ as the risk setting gives it, 0 off the map, from values of
+    `Problem.padded_ground`.
+    """
     magnitude = ground.abs()
     return torch.where(magnitude <= _ZERO, 0, magnitude)
 
 
-def stage_cost(objective: Objective, state: Tensor, action: Tensor, ground: Tensor, target: Tensor) -> Tensor:
+def stage_cost(
+    objective: Objective, state: Tensor, action: Tensor, ground: Tensor, target: Tensor
+) -> Tensor:
     """J of a step and the penalty of ground that is not free; see `Problem.stage_cost`."""
-    return objective.stage(state, action, predicted_traversability(ground), target) + PENALTY * (ground <= 0)
+    return objective.stage(
+        state, action, predicted_traversability(ground), target
+    ) + PENALTY * (ground <= 0)
 
 
-def terminal_cost(objective: Objective, state: Tensor, ground: Tensor, target: Tensor) -> Tensor:
-    """J of the last state and the penalty of ground that is not free; see `Problem.terminal_cost`."""
-    return objective.terminal(state, predicted_traversability(ground), target) + PENALTY * (ground <= 0)
+def terminal_cost(
+    objective: Objective, state: Tensor, ground: Tensor, target: Tensor
+) -> Tensor:
+    """J of the last state and the penalty of ground that is not free; see
+    `Problem.terminal_cost`.
+    """
+    return objective.terminal(
+        state, predicted_traversability(ground), target
+    ) + PENALTY * (ground <= 0)
 
 
 @dataclass(frozen=True)
@@ -270,7 +312,8 @@ class Prediction:
         observation: what the robots saw.
         distribution: the predicted distribution of λ, shape [B, H, W].
         risk_map: λ̂ as the risk setting gives it, shape [B, H, W].
-        free: free terrain, except that at the goal, bool, shape [B, H, W]; None for what the rules derive from λ̂.
+        free: free terrain, except that at the goal, bool, shape [B, H, W]; None for
+            what the rules derive from λ̂.
         fields: draws whole fields of λ; None if no planner asks for them.
     """
 
@@ -311,7 +354,9 @@ def pose_problem(
         free=free | at_goal,
         start=task.robot.initial_state(heading_to(start_m, goal_m)),
         goal_m=goal_m,
-        time_budget_s=torch.as_tensor(time_budget_s, dtype=torch.float64, device=goal_m.device)
+        time_budget_s=torch.as_tensor(
+            time_budget_s, dtype=torch.float64, device=goal_m.device
+        )
         .expand(len(goal_m))
         .clone(),
         fields=prediction.fields,
@@ -322,4 +367,6 @@ def pose_problem(
 def heading_to(position_m: Tensor, goal_m: Tensor) -> Tensor:
     """Poses (x, y, θ) that look at the goal, shape [B, 3], from positions [B, 2]."""
     offset = goal_m - position_m
-    return torch.cat((position_m, torch.atan2(offset[:, 1], offset[:, 0])[:, None]), dim=1)
+    return torch.cat(
+        (position_m, torch.atan2(offset[:, 1], offset[:, 0])[:, None]), dim=1
+    )

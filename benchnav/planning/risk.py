@@ -1,10 +1,13 @@
-"""Risk measures: from the distribution of traversability to the one map a planner is given.
+"""Risk measures: from the distribution of traversability to the one map a planner is
+given.
 
-A measure maps a `TraversabilityDistribution` of shape [B, H, W] to λ̂ in [0, 1] of that shape. The shipped measures are
-values, such as `CVaR(0.8)`; a user's own may be any function of a distribution, whose further keyword parameters are
-its options. In suites and commands a setting is written `name` or `name:level`: `cvar:0.9`, `var:0.95`,
-`expected-time:0.05`, `mean`. Risk means the lower tail of λ; a higher level of CVaR or VaR is more cautious. The
-integrals are the distribution's own. Source: paper II and III-B; `ExpectedTime`, `TimeCVaR` and `Chance` go beyond it.
+A measure maps a `TraversabilityDistribution` of shape [B, H, W] to λ̂ in [0, 1] of that
+shape. The shipped measures are values, such as `CVaR(0.8)`; a user's own may be any
+function of a distribution, whose further keyword parameters are its options. In suites
+and commands a setting is written `name` or `name:level`: `cvar:0.9`, `var:0.95`,
+`expected-time:0.05`, `mean`. Risk means the lower tail of λ; a higher level of CVaR or
+VaR is more cautious. The integrals are the distribution's own. Source: paper II and
+III-B; `ExpectedTime`, `TimeCVaR` and `Chance` go beyond it.
 """
 
 from abc import ABC, abstractmethod
@@ -78,8 +81,9 @@ class CVaR(RiskMeasure):
 class ExpectedTime(RiskMeasure):
     """1 / E[1 / max(λ, floor)], by which a path's length gives its expected time.
 
-    A risk-neutral robot plans with it where the λ field stays the same during an episode: unlike the mean it counts
-    the time that is lost on slow terrain, and it considers no tail. A lower floor makes immobilising terrain dearer.
+    A risk-neutral robot plans with it where the λ field stays the same during an
+    episode: unlike the mean it counts the time that is lost on slow terrain, and it
+        considers no tail. A lower floor makes immobilising terrain dearer.
 
     Args:
         floor: minimum speed, as a fraction of the commanded one, in (0, 1].
@@ -94,7 +98,8 @@ class ExpectedTime(RiskMeasure):
 
 @dataclass(frozen=True)
 class TimeCVaR(RiskMeasure):
-    """1 / CVaR of the time 1 / max(λ, floor): a path's length over it is the path's time on the worst terrain.
+    """1 / CVaR of the time 1 / max(λ, floor): a path's length over it is the path's
+    time on the worst terrain.
 
     CVaR averages λ over its worst fraction; this averages the time over it.
 
@@ -157,8 +162,15 @@ def apply(measure: RiskFunction, distribution: TraversabilityDistribution) -> Te
     """
     risk_map = measure(distribution)
     shape = distribution.shape
-    got = list(risk_map.shape) if isinstance(risk_map, Tensor) else type(risk_map).__name__
-    expect(got == list(shape), f"a risk measure to give λ̂ of shape {list(shape)}, got {got}.")
+    got = (
+        list(risk_map.shape)
+        if isinstance(risk_map, Tensor)
+        else type(risk_map).__name__
+    )
+    expect(
+        got == list(shape),
+        f"a risk measure to give λ̂ of shape {list(shape)}, got {got}.",
+    )
     expect(
         risk_map.is_floating_point(),
         f"a risk measure to give λ̂ as floating-point numbers, got {risk_map.dtype}.",

@@ -4,10 +4,11 @@ A robot is a `Robot`, with the members listed there and
 
     F(state [*B, S], action [*B, A], traversability [*B]) -> state [*B, S]
 
-where a state begins with (x, y, θ) in metres and radians. The same F serves the planners, with predicted
-traversability, and the simulation, with the true one. Sources: paper II and IV-A; Rajamani (2012), "Vehicle
-dynamics and control", section 2.2 (bicycle). Letters in shapes: *B any leading dimensions, S state and A
-action dimensions.
+where a state begins with (x, y, θ) in metres and radians. The same F serves the
+planners, with predicted traversability, and the simulation, with the true one. Sources:
+paper II and IV-A; Rajamani (2012), "Vehicle dynamics and control", section 2.2
+(bicycle). Letters in shapes: *B any leading dimensions, S state and A action
+dimensions.
 """
 
 import math
@@ -25,9 +26,11 @@ SPEED, TURN_RATE, STEERING = "speed_mps", "turn_rate_radps", "steering_rad"
 
 
 class Robot(Specified, ABC):
-    """The base class of robots; `benchnav.testing.check_robot` tries whether one keeps its contract.
+    """The base class of robots; `benchnav.testing.check_robot` tries whether one keeps
+    its contract.
 
-    What is listed as a property may also be a class attribute, or the field of a dataclass that has a default.
+    What is listed as a property may also be a class attribute, or the field of a
+    dataclass that has a default.
     """
 
     @property
@@ -38,7 +41,9 @@ class Robot(Specified, ABC):
     @property
     @abstractmethod
     def action_names(self) -> tuple[str, ...]:
-        """What each of the A actions is, with its unit; planners that steer go by these names."""
+        """What each of the A actions is, with its unit; planners that steer go by these
+        names.
+        """
 
     @property
     @abstractmethod
@@ -57,7 +62,9 @@ class Robot(Specified, ABC):
 
     @property
     def action_rates(self) -> tuple[float, ...] | None:
-        """Greatest change of each action in a second; None where an action is followed at once."""
+        """Greatest change of each action in a second; None where an action is followed
+        at once.
+        """
         return None
 
     @abstractmethod
@@ -80,7 +87,9 @@ class Robot(Specified, ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class _Vehicle(Robot):
-    """What the shipped robots share: a speed within bounds, and a state that is or begins with the pose."""
+    """What the shipped robots share: a speed within bounds, and a state that is or
+    begins with the pose.
+    """
 
     dt_s: float = 0.1
     speed_mps: tuple[float, float] = (0.0, 1.0)
@@ -102,7 +111,8 @@ class _Vehicle(Robot):
 
 @dataclass(frozen=True, kw_only=True)
 class Unicycle(_Vehicle):
-    """The paper's unicycle: traversability scales both the linear and the angular velocity.
+    """The paper's unicycle: traversability scales both the linear and the angular
+    velocity.
 
     State (x, y, θ), action (v, ω). Source: paper IV-A.
 
@@ -132,15 +142,18 @@ class Unicycle(_Vehicle):
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
         """Advances one time step; see `Robot`."""
-        return _stack(_drive(state, action[..., 0], action[..., 1], traversability * self.dt_s))
+        return _stack(
+            _drive(state, action[..., 0], action[..., 1], traversability * self.dt_s)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class DifferentialDrive(Unicycle):
-    """A differential drive: a unicycle whose velocities follow the command within accelerations.
+    """A differential drive: a unicycle whose velocities follow the command within
+    accelerations.
 
-    State (x, y, θ, v, ω), action (v, ω) as commanded. The velocities in the state are those of the wheels;
-    traversability scales the motion over ground.
+    State (x, y, θ, v, ω), action (v, ω) as commanded. The velocities in the state are
+    those of the wheels; traversability scales the motion over ground.
 
     Args:
         dt_s: time step.
@@ -173,17 +186,29 @@ class DifferentialDrive(Unicycle):
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
         """Advances one time step; see `Robot`."""
-        reach, turn_reach = self.acceleration_mps2 * self.dt_s, self.turn_acceleration_radps2 * self.dt_s
+        reach, turn_reach = (
+            self.acceleration_mps2 * self.dt_s,
+            self.turn_acceleration_radps2 * self.dt_s,
+        )
         speed = state[..., 3] + (action[..., 0] - state[..., 3]).clamp(-reach, reach)
-        turn_rate = state[..., 4] + (action[..., 1] - state[..., 4]).clamp(-turn_reach, turn_reach)
-        return _stack((*_drive(state, speed, turn_rate, traversability * self.dt_s), speed, turn_rate))
+        turn_rate = state[..., 4] + (action[..., 1] - state[..., 4]).clamp(
+            -turn_reach, turn_reach
+        )
+        return _stack(
+            (
+                *_drive(state, speed, turn_rate, traversability * self.dt_s),
+                speed,
+                turn_rate,
+            )
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bicycle(_Vehicle):
     """A kinematic bicycle, referred to the rear axle: it turns only while it drives.
 
-    State (x, y, θ), action (v, δ) with θ' = v tan(δ) / wheelbase; traversability scales v, and with it the
+    State (x, y, θ), action (v, δ) with θ' = v tan(δ) / wheelbase; traversability scales
+    v, and with it the
     turn. Source: Rajamani (2012).
 
     Args:
@@ -219,14 +244,22 @@ class Bicycle(_Vehicle):
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
         """Advances one time step; see `Robot`."""
         turn_rate = action[..., 0] * action[..., 1].tan() / self.wheelbase_m
-        return _stack(_drive(state, action[..., 0], turn_rate, traversability * self.dt_s))
+        return _stack(
+            _drive(state, action[..., 0], turn_rate, traversability * self.dt_s)
+        )
 
 
-def _drive(state: Tensor, speed: Tensor, turn_rate: Tensor, scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _drive(
+    state: Tensor, speed: Tensor, turn_rate: Tensor, scale: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """Moves (x, y, θ) for a step; `scale` is λ·dt."""
     x, y, heading = state[..., 0], state[..., 1], state[..., 2]
     moved = scale * speed
-    return x + moved * heading.cos(), y + moved * heading.sin(), heading + scale * turn_rate
+    return (
+        x + moved * heading.cos(),
+        y + moved * heading.sin(),
+        heading + scale * turn_rate,
+    )
 
 
 def steps_in(time_s: float, dt_s: float) -> int:
@@ -235,12 +268,15 @@ def steps_in(time_s: float, dt_s: float) -> int:
 
 
 def component_wise(values: Tensor) -> Tensor:
-    """The same states or actions, shape [*B, S], laid out in memory as `Robot` returns them, see `_stack`."""
+    """The same states or actions, shape [*B, S], laid out in memory as `Robot` returns
+    them, see `_stack`.
+    """
     return values.movedim(-1, 0).contiguous().movedim(0, -1)
 
 
 def _stack(parts: tuple[Tensor, ...]) -> Tensor:
-    # Stacked outermost in memory, each component is contiguous: compiled rollouts are four times faster.
+    # Stacked outermost in memory, each component is contiguous: compiled rollouts are
+    # four times faster.
     return torch.stack(torch.broadcast_tensors(*parts)).movedim(0, -1)
 
 

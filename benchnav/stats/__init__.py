@@ -1,1 +1,3 @@
-"""Statistics of comparisons: paired differences, intervals, tests, the best set, and their tables."""
+"""Statistics of comparisons: paired differences, intervals, tests, the best set, and
+their tables.
+"""

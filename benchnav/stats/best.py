@@ -1,16 +1,21 @@
-"""Which of several conditions are as good as the best: one max-T test of rates over maps.
+"""Which of several conditions are as good as the best: one max-T test of rates over
+maps.
 
-One max-T test looks at all pairs of a block's conditions at once: maps are drawn with replacement for all pairs
-together, so that what the conditions share counts, and each pair's difference is over its standard error in the
-sample (bootstrap-t). To the maps four pseudo-maps are added, on two of which the one condition succeeds and the other
-does not, and on two the reverse. Without them a condition that fails wholly on rare maps, none of which was drawn,
-seems sure. The test does not assume that differences are symmetric, as flipping signs would. It goes step by step, as
-the model confidence set does: the condition that another beats by most is set aside, and the rest are compared again.
-So the chance that any condition which is as good as the best is called worse is at most about 5 % however many there
-are and whatever their shapes (`studies/statistics`).
-Sources: Efron and Tibshirani (1993), "An Introduction to the Bootstrap", 12.5 and 16.4; Silverman and Young (1987),
-"The bootstrap: to smooth or not to smooth?"; Romano and Wolf (2005), "Exact and approximate stepdown methods for
-multiple hypothesis testing"; Hansen, Lunde and Nason (2011), "The model confidence set", for the order.
+One max-T test looks at all pairs of a block's conditions at once: maps are drawn with
+replacement for all pairs together, so that what the conditions share counts, and each
+pair's difference is over its standard error in the sample (bootstrap-t). To the maps
+four pseudo-maps are added, on two of which the one condition succeeds and the other
+does not, and on two the reverse. Without them a condition that fails wholly on rare
+maps, none of which was drawn, seems sure. The test does not assume that differences are
+symmetric, as flipping signs would. It goes step by step, as
+the model confidence set does: the condition that another beats by most is set aside,
+and the rest are compared again. So the chance that any condition which is as good as
+the best is called worse is at most about 5 % however many there are and whatever their
+shapes (`studies/statistics`).
+Sources: Efron and Tibshirani (1993), "An Introduction to the Bootstrap", 12.5 and 16.4;
+Silverman and Young (1987), "The bootstrap: to smooth or not to smooth?"; Romano and
+Wolf (2005), "Exact and approximate stepdown methods for multiple hypothesis testing";
+Hansen, Lunde and Nason (2011), "The model confidence set", for the order.
 """
 
 import math
@@ -22,7 +27,8 @@ from benchnav.stats.bootstrap import bootstrap_counts
 from benchnav.stats.holm import ALPHA
 from benchnav.stats.power import POWER
 
-# On fewer maps nothing is called worse: no sign-flip test of five maps can reach 0.05 either.
+# On fewer maps nothing is called worse: no sign-flip test of five maps can reach 0.05
+# either.
 FEWEST_MAPS = 6
 
 # Pseudo-maps on which a condition of a pair wins, and as many on which it loses.
@@ -34,7 +40,9 @@ _SIDES = slice(_ADDED), slice(_ADDED, None)
 _ROUNDING = 1e-5
 
 
-def best_set_p(wins: np.ndarray, draws: np.ndarray | int) -> tuple[np.ndarray, np.ndarray]:
+def best_set_p(
+    wins: np.ndarray, draws: np.ndarray | int
+) -> tuple[np.ndarray, np.ndarray]:
     """Test of each condition whether it is as good as the best.
 
     Args:
@@ -42,9 +50,11 @@ def best_set_p(wins: np.ndarray, draws: np.ndarray | int) -> tuple[np.ndarray, n
         draws: episodes of a condition on each map, one number or of shape [M].
 
     Returns:
-        p by condition, corrected for their number, shape [K], 1 for the best and all where there are fewer than
-        `FEWEST_MAPS` maps; and by condition the minimum detectable difference to the one with most successes, with
-        80 % power at the level of the first step, infinite where no result would be significant, shape [K].
+        p by condition, corrected for their number, shape [K], 1 for the best and all
+        where there are fewer than `FEWEST_MAPS` maps; and by condition the minimum
+        detectable difference to the one with most successes, with 80 % power at the
+        level of the first step, infinite where no result would be significant, shape
+        [K].
     """
     maps, count = wins.shape
     if maps < FEWEST_MAPS or count < 2:
@@ -55,7 +65,9 @@ def best_set_p(wins: np.ndarray, draws: np.ndarray | int) -> tuple[np.ndarray, n
     # Sums of whole numbers under 2²⁴ are exact in float32, in whatever order.
     dtype = np.float32 if maps * int(size.max()) ** 2 < 2**24 else np.float64
     counts = bootstrap_counts(maps, 2 * _ADDED).astype(dtype)
-    ahead = np.full((count, count), -np.inf)  # t of the row's condition before the column's
+    ahead = np.full(
+        (count, count), -np.inf
+    )  # t of the row's condition before the column's
     for one in range(count - 1):
         rest = np.arange(one + 1, count)
         (t,) = seen.t_of(one, rest, 0.0)
@@ -74,7 +86,9 @@ def best_set_p(wins: np.ndarray, draws: np.ndarray | int) -> tuple[np.ndarray, n
         for step in reversed(range(count - 1)):
             one, rest = steps[step], np.array(steps[step + 1 :])
             (truth,) = seen.centre(one, rest)
-            most = np.maximum(most, np.abs(drawn.t_of(one, rest, truth.astype(dtype))).max(1))
+            most = np.maximum(
+                most, np.abs(drawn.t_of(one, rest, truth.astype(dtype))).max(1)
+            )
             beyond[one] += (most >= statistic[step] * (1 - _ROUNDING)).sum()
         furthest.append(most)
     p = (1 + beyond) / (1 + len(counts))
@@ -82,7 +96,9 @@ def best_set_p(wins: np.ndarray, draws: np.ndarray | int) -> tuple[np.ndarray, n
     shown = np.full(count, np.inf)
     critical = np.quantile(np.concatenate(furthest), 1 - ALPHA)
     always = _Samples(
-        np.stack([size, 0 * size], axis=1).astype(float), size.astype(float), np.ones((1, maps))
+        np.stack([size, 0 * size], axis=1).astype(float),
+        size.astype(float),
+        np.ones((1, maps)),
     )
     if always.t_of(0, np.array([1]), 0.0).item() > critical:
         (error,) = seen.error(0, np.arange(1, count))
@@ -92,7 +108,9 @@ def best_set_p(wins: np.ndarray, draws: np.ndarray | int) -> tuple[np.ndarray, n
 
 
 def _canonical(wins: np.ndarray, episodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Wins and episodes by map, in one order of maps, of repeated episodes as of each once."""
+    """Wins and episodes by map, in one order of maps, of repeated episodes as of each
+    once.
+    """
     table = np.column_stack([wins, episodes]).astype(np.int64)
     table //= max(np.gcd.reduce(table, axis=None), 1)
     table = table[np.lexsort(table.T)]
@@ -102,35 +120,50 @@ def _canonical(wins: np.ndarray, episodes: np.ndarray) -> tuple[np.ndarray, np.n
 class _Samples:
     """Differences of conditions in samples of maps and pseudo-maps.
 
-    A pseudo-map has as many episodes as a map (the root mean square of their numbers). Rates are ratios of sums over
+    A pseudo-map has as many episodes as a map (the root mean square of their numbers).
+    Rates are ratios of sums over
     maps. Letters in shapes: R samples; J pairs.
 
     Args:
         values: successes by map and condition, shape [M, K].
         size: episodes by map, shape [M].
-        counts: how often each map is in a sample and, after them, each pseudo-map where these are drawn too, shape
-            [R, M] or [R, M + 2 · `_ADDED`].
+        counts: how often each map is in a sample and, after them, each pseudo-map where
+            these are drawn too, shape [R, M] or [R, M + 2 · `_ADDED`].
     """
 
-    def __init__(self, values: np.ndarray, size: np.ndarray, counts: np.ndarray) -> None:
+    def __init__(
+        self, values: np.ndarray, size: np.ndarray, counts: np.ndarray
+    ) -> None:
         maps = len(values)
         added = np.sqrt((size**2).mean())
         won, lost = (counts[:, maps:][:, part].sum(1, keepdims=True) for part in _SIDES)
         self.values, self.counts = values, np.ascontiguousarray(counts[:, :maps])
         self.sums, self.more = self.counts @ values, (won - lost) * added
-        self.products, self.more_products = self.counts @ (values * size[:, None]), self.more * added
+        self.products, self.more_products = (
+            self.counts @ (values * size[:, None]),
+            self.more * added,
+        )
         self.size = self.counts @ size[:, None] + (won + lost) * added
         self.size_with_added = self.size + 2 * _ADDED * added
-        self.squares = self.counts @ size[:, None] ** 2 + (won + lost) * added**2 + 2 * _ADDED * added**2
+        self.squares = (
+            self.counts @ size[:, None] ** 2
+            + (won + lost) * added**2
+            + 2 * _ADDED * added**2
+        )
         self.more_squares = (won + lost + 2 * _ADDED) * added**2
 
     def centre(self, one: int, rest: np.ndarray) -> np.ndarray:
-        """Difference of rates of one condition and each of the rest with the pseudo-maps, shape [R, J]."""
+        """Difference of rates of one condition and each of the rest with the
+        pseudo-maps, shape [R, J].
+        """
         return self._difference(self.sums, one, rest, self.more) / self.size_with_added
 
     def error(self, one: int, rest: np.ndarray) -> np.ndarray:
         """Its standard error, shape [R, J]."""
-        return np.sqrt(self._spread(one, rest, self.centre(one, rest))) / self.size_with_added
+        return (
+            np.sqrt(self._spread(one, rest, self.centre(one, rest)))
+            / self.size_with_added
+        )
 
     def t_of(self, one: int, rest: np.ndarray, truth: float | np.ndarray) -> np.ndarray:
         """By how many standard errors a difference is above the truth, shape [R, J]."""
@@ -157,7 +190,9 @@ class _Samples:
         return spread
 
     @staticmethod
-    def _difference(sums: np.ndarray, one: int, rest: np.ndarray, more: np.ndarray) -> np.ndarray:
+    def _difference(
+        sums: np.ndarray, one: int, rest: np.ndarray, more: np.ndarray
+    ) -> np.ndarray:
         difference = sums[:, [one]] - sums[:, rest]
         difference += more
         return difference

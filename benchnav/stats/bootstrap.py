@@ -21,17 +21,21 @@ def bootstrap_counts(maps: int, added: int = 0) -> np.ndarray:
         added: pseudo-maps that samples are drawn from too.
 
     Returns:
-        Whole numbers whose rows add up to M, float64, read-only, shape [2000, M + added].
+        Whole numbers whose rows add up to M, float64, read-only, shape [2000, M +
+        added].
     """
     drawn_from = maps + added
     generator = np.random.default_rng(0)
-    counts = generator.multinomial(maps, np.full(drawn_from, 1 / drawn_from), _RESAMPLES).astype(float)
+    counts = generator.multinomial(
+        maps, np.full(drawn_from, 1 / drawn_from), _RESAMPLES
+    ).astype(float)
     counts.flags.writeable = False
     return counts
 
 
 def percentile_interval(values: np.ndarray) -> tuple[float, float]:
-    """Return the ends of the 95 % percentile interval; NaN if a sample has no finite value.
+    """Return the ends of the 95 % percentile interval; NaN if a sample has no finite
+    value.
 
     Args:
         values: one a sample, shape [R].

@@ -1,8 +1,9 @@
 """Paired differences of two conditions over episodes, with intervals and tests.
 
-All functions take `rows`: episodes that both conditions have in common, one a row. `success`, `total_time_s`,
-`time_budget_s` and other columns are of the first condition, those that end in `_other` of the second. `group` is the
-statistical unit, a map or a group of maps. A difference is of the first less the second.
+All functions take `rows`: episodes that both conditions have in common, one a row.
+`success`, `total_time_s`, `time_budget_s` and other columns are of the first condition,
+those that end in `_other` of the second. `group` is the statistical unit, a map or a
+group of maps. A difference is of the first less the second.
 Letters in shapes: M maps.
 """
 
@@ -11,30 +12,44 @@ import pandas as pd
 
 from benchnav.stats.by_map import by_map, sums_by_map
 from benchnav.stats.flips import mean_flip_p, sign_flip_p
-from benchnav.stats.intervals import mean_interval, success_interval, total_time_interval
+from benchnav.stats.intervals import (
+    mean_interval,
+    success_interval,
+    total_time_interval,
+)
 
 Interval = tuple[float, float, float]
 
 
 def gain_by_map(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Return the difference of the number of successes, and the number of episodes, by map, both of shape [M]."""
+    """Return the difference of the number of successes, and the number of episodes, by
+    map, both of shape [M].
+    """
     gain = rows["success"].astype(int) - rows["success_other"].astype(int)
     by_unit = gain.groupby(rows["group"].to_numpy())
     return by_unit.sum().to_numpy(), by_unit.size().to_numpy()
 
 
 def mean_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.ndarray:
-    """Return the difference of a column as one number a map whose mean is that over episodes, shape [M]."""
+    """Return the difference of a column as one number a map whose mean is that over
+    episodes, shape [M].
+    """
     return by_map(*_differences(rows, column))
 
 
 def summed_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.ndarray:
-    """Return the difference of a column as tests by signs and ranks need it: `sums_by_map`, shape [M]."""
+    """Return the difference of a column as tests by signs and ranks need it:
+    `sums_by_map`, shape [M].
+    """
     return sums_by_map(*_differences(rows, column))
 
 
-def _differences(rows: pd.DataFrame, column: str) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return differences by episode, their maps, and the largest value that they are computed from."""
+def _differences(
+    rows: pd.DataFrame, column: str
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return differences by episode, their maps, and the largest value that they are
+    computed from.
+    """
     sides = rows[[column, f"{column}_other"]].to_numpy(dtype=float)
     scale = float(np.abs(sides).max(initial=0))
     return sides[:, 0] - sides[:, 1], rows["group"].to_numpy(), scale
@@ -45,12 +60,13 @@ def interval_of(rows: pd.DataFrame, column: str, confidence: float = 0.95) -> In
 
     Args:
         rows: see the module.
-        column: `success` has the interval of `success_interval`, `total_time_s` that of `time_difference`, others
-            Student's.
+        column: `success` has the interval of `success_interval`, `total_time_s` that of
+            `time_difference`, others Student's.
         confidence: nominal coverage.
 
     Returns:
-        Difference and ends in the column's unit; the ends are NaN if there are too few maps.
+        Difference and ends in the column's unit; the ends are NaN if there are too few
+        maps.
     """
     if column == "total_time_s" and len(rows):
         return time_difference(rows, confidence)
@@ -66,7 +82,8 @@ def interval_of(rows: pd.DataFrame, column: str, confidence: float = 0.95) -> In
 
 
 def difference_p(rows: pd.DataFrame, column: str, direction: str = "") -> float:
-    """Return p of no difference of a column by flipping the signs of maps; 1 if there is no episode.
+    """Return p of no difference of a column by flipping the signs of maps; 1 if there
+    is no episode.
 
     Args:
         rows: see the module.
@@ -79,7 +96,8 @@ def difference_p(rows: pd.DataFrame, column: str, direction: str = "") -> float:
 
 
 def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> Interval:
-    """Return the difference of T_total, a failure counted as T, with the interval of `total_time_interval`.
+    """Return the difference of T_total, a failure counted as T, with the interval of
+    `total_time_interval`.
 
     Args:
         rows: see the module.
@@ -101,16 +119,22 @@ def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> Interval:
     _, low, high = success_interval(gain, draws, confidence)
     failed = rows["success_other"].astype(float) - rows["success"]
     mean, low_s, high_s = total_time_interval(
-        mean_differences(rows), by_map(failed.to_numpy(), rows["group"].to_numpy()), (-high, -low),
-        pd.concat(budget_s).mean() - arrival, len(set.intersection(*arrived)), confidence,
-    )  # fmt: skip
+        mean_differences(rows),
+        by_map(failed.to_numpy(), rows["group"].to_numpy()),
+        (-high, -low),
+        pd.concat(budget_s).mean() - arrival,
+        len(set.intersection(*arrived)),
+        confidence,
+    )
     return float(mean), float(low_s), float(high_s)
 
 
 def budgets_differ(rows: pd.DataFrame) -> bool:
     """Return whether T of the two conditions differs on some map."""
     one, other = rows["time_budget_s"], rows["time_budget_s_other"]
-    known = one.notna() & other.notna()  # of an episode that began at its goal T is unknown
+    known = (
+        one.notna() & other.notna()
+    )  # of an episode that began at its goal T is unknown
     return not np.allclose(one[known], other[known], rtol=1e-6)
 
 
@@ -120,5 +144,8 @@ def in_budgets(rows: pd.DataFrame) -> pd.DataFrame:
     for suffix in ("", "_other"):
         # An episode that began at its goal took nothing of a T that is unknown.
         taken = rows[f"total_time_s{suffix}"] / rows[f"time_budget_s{suffix}"]
-        fractions |= {f"total_time_s{suffix}": taken.fillna(0), f"time_budget_s{suffix}": 1.0}
+        fractions |= {
+            f"total_time_s{suffix}": taken.fillna(0),
+            f"time_budget_s{suffix}": 1.0,
+        }
     return rows.assign(**fractions)

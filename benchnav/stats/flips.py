@@ -1,10 +1,13 @@
-"""Tests of paired differences: signs of maps are flipped, or two contestants are exchanged on each map.
+"""Tests of paired differences: signs of maps are flipped, or two contestants are
+exchanged on each map.
 
-Under the hypothesis the two are exchangeable on each map. All ways are counted where that is possible, else 9 999
-drawn ones with a fixed seed. Before signs are drawn, maps are put into an order that neither their own order nor that
-of the two contestants decides, so p depends on neither. Maps without a difference do not count.
-Sources: Fisher (1935), "The Design of Experiments", 21; Phipson and Smyth (2010), "Permutation p-values should never be
-zero", for the way that was observed, which counts too.
+Under the hypothesis the two are exchangeable on each map. All ways are counted where
+that is possible, else 9 999 drawn ones with a fixed seed. Before signs are drawn, maps
+are put into an order that neither their own order nor that of the two contestants
+decides, so p depends on neither. Maps without a difference do not count.
+Sources: Fisher (1935), "The Design of Experiments", 21; Phipson and Smyth (2010),
+"Permutation p-values should never be zero", for the way that was observed, which counts
+too.
 Letters in shapes: M maps, P parts of a difference, R ways.
 """
 
@@ -25,19 +28,27 @@ def _signs(maps: int) -> np.ndarray:
     if maps <= _EXACT:
         bits = np.arange(2**maps)[:, None] >> np.arange(maps) & 1
         return 1.0 - 2.0 * bits
-    return 1.0 - 2.0 * np.random.default_rng(0).integers(0, 2, (_DRAWN, maps), dtype=np.int8)
+    return 1.0 - 2.0 * np.random.default_rng(0).integers(
+        0, 2, (_DRAWN, maps), dtype=np.int8
+    )
 
 
 def exchange_p(
-    one: np.ndarray, other: np.ndarray, difference: Callable[..., np.ndarray], direction: str = ""
+    one: np.ndarray,
+    other: np.ndarray,
+    difference: Callable[..., np.ndarray],
+    direction: str = "",
 ) -> float:
-    """Return p of no difference in any function of sums over maps: the fraction of ways that are as far out.
+    """Return p of no difference in any function of sums over maps: the fraction of ways
+    that are as far out.
 
     Args:
         one: parts of the first contestant by map, shape [M, P].
         other: those of the second.
-        difference: of two sums of parts, each of shape [..., P]: shape [...]; antisymmetric.
-        direction: in which the first is thought to lie, `higher` or `lower`; two-sided if empty.
+        difference: of two sums of parts, each of shape [..., P]: shape [...];
+            antisymmetric.
+        direction: in which the first is thought to lie, `higher` or `lower`; two-sided
+            if empty.
     """
     gap, total = one - other, (one + other).sum(0)
     gap = gap[gap.any(1)]
@@ -56,7 +67,9 @@ def exchange_p(
 
 
 def _half(total: np.ndarray, gap: np.ndarray) -> np.ndarray:
-    """Return half of their sum; what rounding leaves of 0, whose root would be far from 0, is 0."""
+    """Return half of their sum; what rounding leaves of 0, whose root would be far from
+    0, is 0.
+    """
     half = (total + gap) / 2
     return np.where(np.abs(half) < 1e-12 * np.abs(total), 0, half)
 
@@ -73,13 +86,16 @@ def mean_flip_p(differences: np.ndarray, direction: str = "") -> float:
 
 
 def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
-    """Return p of no difference in counts, such as successes, over all ways however many maps there are.
+    """Return p of no difference in counts, such as successes, over all ways however
+    many maps there are.
 
-    Of n maps with the same size of gain the number of those kept positive is binomial, so that the sum over all maps
-    is a convolution of as many binomials as there are sizes. With one episode a map it is the exact McNemar test.
+    Of n maps with the same size of gain the number of those kept positive is binomial,
+    so that the sum over all maps is a convolution of as many binomials as there are
+    sizes. With one episode a map it is the exact McNemar test.
 
     Args:
-        gain: count of the first less that of the second by map, whole numbers, shape [M].
+        gain: count of the first less that of the second by map, whole numbers, shape
+            [M].
         direction: `higher` or `lower` for a one-sided test; two-sided if empty.
     """
     gain = gain // max(np.gcd.reduce(gain), 1)  # repeated episodes count once
@@ -100,8 +116,8 @@ def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
 def signed_rank_p(differences: np.ndarray) -> float:
     """Return two-sided p of Wilcoxon's signed-rank test; 1 if no map differs.
 
-    If few maps differ the test is exact with ties too: the ranks' signs are flipped in all ways. SciPy's p is the same
-    there, but it calls a function for each way.
+    If few maps differ the test is exact with ties too: the ranks' signs are flipped in
+    all ways. SciPy's p is the same there, but it calls a function for each way.
 
     Args:
         differences: by map without rounding, as from `by_map.sums_by_map`, shape [M].

@@ -8,7 +8,8 @@ ALPHA = 0.05
 def holm(p: np.ndarray) -> np.ndarray:
     """Correct p-values for their number.
 
-    statsmodels' `multipletests` returns the same, but collects garbage at each call, which takes longer than the tests.
+    statsmodels' `multipletests` returns the same, but collects garbage at each call,
+    which takes longer than the tests.
     Source: Holm (1979), "A simple sequentially rejective multiple test procedure".
 
     Args:

@@ -1,9 +1,9 @@
 """Tests of a difference against a margin: non-inferiority, superiority and equivalence.
 
 Each is decided by where the interval of the difference ends (two one-sided tests).
-Sources: Schuirmann (1987), "A comparison of the two one-sided tests procedure and the power approach for assessing the
-equivalence of average bioavailability"; Wellek (2010), "Testing Statistical Hypotheses of Equivalence and
-Noninferiority", 1.
+Sources: Schuirmann (1987), "A comparison of the two one-sided tests procedure and the
+power approach for assessing the equivalence of average bioavailability"; Wellek (2010),
+"Testing Statistical Hypotheses of Equivalence and Noninferiority", 1.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,10 @@ _MAX = 1 - 1e-12
 
 
 def margin_p(
-    interval: Callable[[float], tuple[float, float, float]], kind: str, direction: str, margin: float
+    interval: Callable[[float], tuple[float, float, float]],
+    kind: str,
+    direction: str,
+    margin: float,
 ) -> float:
     """Return p of a hypothesis with a margin; 1 if the difference has no interval.
 
@@ -31,10 +34,14 @@ def margin_p(
     return max(_side_p(interval, bound, side) for side in sides)
 
 
-def _side_p(interval: Callable[[float], tuple[float, float, float]], margin: float, side: float) -> float:
-    """Return p that the difference is beyond a margin, below −margin (side −1) or above it (side 1).
+def _side_p(
+    interval: Callable[[float], tuple[float, float, float]], margin: float, side: float
+) -> float:
+    """Return p that the difference is beyond a margin, below −margin (side −1) or above
+    it (side 1).
 
-    It is the level at which the end of the one-sided interval comes to lie on the margin.
+    It is the level at which the end of the one-sided interval comes to lie on the
+    margin.
     """
 
     def end(signed: float) -> float:

@@ -1,7 +1,10 @@
-"""What a number of maps can show of a mean difference that is nearly normal, which it is from some twenty maps on.
+"""What a number of maps can show of a mean difference that is nearly normal, which it
+is from some twenty maps on.
 
-A difference d with standard deviation σ is significant with probability `POWER` if d·√M/σ is the quantile of 1 − α/2
-plus that of `POWER`. Source: Chow, Shao and Wang (2008), "Sample Size Calculations in Clinical Research", 3.1.
+A difference d with standard deviation σ is significant with probability `POWER` if
+d·√M/σ is the quantile of 1 − α/2
+plus that of `POWER`. Source: Chow, Shao and Wang (2008), "Sample Size Calculations in
+    Clinical Research", 3.1.
 """
 
 import math
@@ -17,10 +20,12 @@ def smallest_difference(std: float, maps: int, alpha: float) -> float:
     Args:
         std: standard deviation over maps of the difference, in its unit.
         maps: number of maps.
-        alpha: p under which a difference counts as shown; after a correction over K pairs, that of the first, 0.05/K.
+        alpha: p under which a difference counts as shown; after a correction over K
+            pairs, that of the first, 0.05/K.
 
     Returns:
-        In the unit of `std`; infinite where no sign-flip test of so many maps can reach `alpha`, whatever they show.
+        In the unit of `std`; infinite where no sign-flip test of so many maps can reach
+        `alpha`, whatever they show.
     """
     if 2.0 ** (1 - maps) >= alpha:
         return math.inf

@@ -1,9 +1,11 @@
-"""Scores of several contestants on the same maps: intervals, differences of each pair with a test, and the best.
+"""Scores of several contestants on the same maps: intervals, differences of each pair
+with a test, and the best.
 
-A score is any function of sums over maps, so one way serves means, roots, ratios and distances alike. The map is the
-unit, or the group of maps where a dataset has groups:
+A score is any function of sums over maps, so one way serves means, roots, ratios and
+distances alike. The map is the unit, or the group of maps where a dataset has groups:
 
-- an interval is that of the bootstrap by percentiles, over maps in an order that their sums decide;
+- an interval is that of the bootstrap by percentiles, over maps in an order that their
+  sums decide;
 - a test exchanges the two contestants on each map (`flips.exchange_p`);
 - Holm's correction is over all pairs of contestants that compete, within a score.
 
@@ -35,9 +37,11 @@ class Score:
     Args:
         name: of its columns.
         parts: names of the sums that it is computed from.
-        of: their function, of one argument a part, each of shape [..., C]: values, shape [...].
+        of: their function, of one argument a part, each of shape [..., C]: values,
+            shape [...].
         better: whether higher or lower values are better; empty if neither is.
-        target: the value whose distance is compared, lower being better; None if the score itself is.
+        target: the value whose distance is compared, lower being better; None if the
+            score itself is.
         heading: of its column in tables, in two lines.
         meaning: what the column holds.
     """
@@ -64,8 +68,12 @@ class Score:
         table, of = self.split(sums)
         return float(of(table.sum(0)))
 
-    def split(self, sums: Sums) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        """Return the parts by map in one table, shape [M, P], and the score of their sums, [..., P] to [...]."""
+    def split(
+        self, sums: Sums
+    ) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+        """Return the parts by map in one table, shape [M, P], and the score of their
+        sums, [..., P] to [...].
+        """
         columns = [sums[part].reshape(len(sums[part]), -1) for part in self.parts]
         ends = np.cumsum([part.shape[1] for part in columns])[:-1]
 
@@ -84,8 +92,9 @@ def summarise(scores: Sequence[Score], sums: Mapping[str, Sums]) -> pd.DataFrame
         sums: by contestant and part, over M maps, shape [M] or [M, C].
 
     Returns:
-        A row a contestant: `units`, M; and of each score that its sums have `NAME` and its 95 % interval `NAME_low`,
-        `NAME_high`, NaN under `bootstrap.LEAST_MAPS` maps.
+        A row a contestant: `units`, M; and of each score that its sums have `NAME` and
+        its 95 % interval `NAME_low`, `NAME_high`, NaN under `bootstrap.LEAST_MAPS`
+        maps.
     """
     rows = {}
     for contestant, own in sums.items():
@@ -93,13 +102,20 @@ def summarise(scores: Sequence[Score], sums: Mapping[str, Sums]) -> pd.DataFrame
         for score in _known(scores, own):
             table, of = score.split(own)
             low, high = _bootstrap(table[np.lexsort(table.T)], of)
-            row |= {score.name: float(of(table.sum(0))), f"{score.name}_low": low, f"{score.name}_high": high}
+            row |= {
+                score.name: float(of(table.sum(0))),
+                f"{score.name}_low": low,
+                f"{score.name}_high": high,
+            }
         rows[contestant] = row
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
 def compare_pairs(
-    scores: Sequence[Score], sums: Mapping[str, Sums], competing: Sequence[str], same: str
+    scores: Sequence[Score],
+    sums: Mapping[str, Sums],
+    competing: Sequence[str],
+    same: str,
 ) -> pd.DataFrame:
     """Compare all pairs of contestants, map by map.
 
@@ -107,12 +123,14 @@ def compare_pairs(
         scores: what is compared.
         sums: as in `summarise`, of the same M maps each.
         competing: the contestants whose pairs Holm's correction is over.
-        same: name of a sum, such as a number of cells, in which the maps of two must agree.
+        same: name of a sum, such as a number of cells, in which the maps of two must
+            agree.
 
     Returns:
-        A row a pair and score: `measure`, its name; `one`, `other`; `difference` of what is judged, `one` less `other`,
-        with its 95 % interval `low`, `high`; `p`; and, of competing contestants only, `p_holm`. Pairs that lack the
-        score or differ in `same` are left out.
+        A row a pair and score: `measure`, its name; `one`, `other`; `difference` of
+        what is judged, `one` less `other`, with its 95 % interval `low`, `high`; `p`;
+        and, of competing contestants only, `p_holm`. Pairs that lack the score or
+        differ in `same` are left out.
     """
     found = []
     for one, other in combinations(sums, 2):
@@ -140,15 +158,28 @@ def _compare(score: Score, one: Sums, other: Sums) -> dict[str, float]:
         return {}
     both = np.hstack([table, other_table])
     order = _order_of_pairs(table, other_table)
-    low, high = _bootstrap(both[order], lambda sums: difference(*np.split(sums, 2, axis=-1)))
-    return {"difference": observed, "low": low, "high": high, "p": exchange_p(table, other_table, difference)}
+    low, high = _bootstrap(
+        both[order], lambda sums: difference(*np.split(sums, 2, axis=-1))
+    )
+    return {
+        "difference": observed,
+        "low": low,
+        "high": high,
+        "p": exchange_p(table, other_table, difference),
+    }
 
 
 def _known(scores: Sequence[Score], *sums: Sums) -> list[Score]:
-    return [score for score in scores if all(part in own for part in score.parts for own in sums)]
+    return [
+        score
+        for score in scores
+        if all(part in own for part in score.parts for own in sums)
+    ]
 
 
-def _bootstrap(table: np.ndarray, of: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:
+def _bootstrap(
+    table: np.ndarray, of: Callable[[np.ndarray], np.ndarray]
+) -> tuple[float, float]:
     """Return the ends of the interval of a function of sums over maps."""
     if len(table) < LEAST_MAPS:
         return np.nan, np.nan
@@ -159,11 +190,15 @@ def _order_of_pairs(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return an order of maps that stays the same when the two change places."""
     keys = [np.hstack([one + other, gap]) for gap in (one - other, other - one)]
     orders = [np.lexsort(key.T) for key in keys]
-    first, second = (key[order].ravel().tolist() for key, order in zip(keys, orders, strict=True))
+    first, second = (
+        key[order].ravel().tolist() for key, order in zip(keys, orders, strict=True)
+    )
     return orders[first > second]
 
 
-def against_best(scores: Sequence[Score], summary: pd.DataFrame, pairs: pd.DataFrame) -> pd.DataFrame:
+def against_best(
+    scores: Sequence[Score], summary: pd.DataFrame, pairs: pd.DataFrame
+) -> pd.DataFrame:
     """Find the best contestant by each score, and which are significantly worse.
 
     Args:
@@ -172,13 +207,18 @@ def against_best(scores: Sequence[Score], summary: pd.DataFrame, pairs: pd.DataF
         pairs: from `compare_pairs`.
 
     Returns:
-        Rows by contestant, one for each score that it has: `measure`, `best`; of all but the best `difference`, the
-        contestant less the best, `low`, `high`, `p_holm` as from `compare_pairs`; `alike`, true if it is not
-        significantly worse; and `marked`, true if it is alike and another contestant is not.
+        Rows by contestant, one for each score that it has: `measure`, `best`; of all
+        but the best `difference`, the contestant less the best, `low`, `high`, `p_holm`
+        as from `compare_pairs`; `alike`, true if it is not significantly worse; and
+        `marked`, true if it is alike and another contestant is not.
     """
     swapped = pairs.assign(
-        one=pairs["other"], other=pairs["one"], difference=-pairs["difference"], low=-pairs["high"], high=-pairs["low"]
-    )  # fmt: skip
+        one=pairs["other"],
+        other=pairs["one"],
+        difference=-pairs["difference"],
+        low=-pairs["high"],
+        high=-pairs["low"],
+    )
     both = pd.concat([pairs, swapped])
     found = []
     for score in scores:
@@ -192,5 +232,9 @@ def against_best(scores: Sequence[Score], summary: pd.DataFrame, pairs: pd.DataF
         rows = both[(both["measure"] == score.name) & (both["other"] == best)]
         rows = rows.set_index("one")[list(_TO_BEST)].reindex(loss.index)
         alike = ~(rows["p_holm"] < ALPHA)
-        found.append(rows.assign(measure=score.name, best=best, alike=alike, marked=alike & ~alike.all()))
+        found.append(
+            rows.assign(
+                measure=score.name, best=best, alike=alike, marked=alike & ~alike.all()
+            )
+        )
     return pd.concat(found)

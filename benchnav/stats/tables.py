@@ -1,4 +1,6 @@
-"""Tables of comparisons: columns that write their own cells, and how numbers are written."""
+"""Tables of comparisons: columns that write their own cells, and how numbers are
+written.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -81,4 +83,6 @@ def signed(value: float, digits: int = 1) -> str:
 
 def signed_interval(low: float, high: float, digits: int = 1) -> str:
     """Write the ends of an interval of a difference; a dash for NaN."""
-    return NOTHING if np.isnan(low) else f"{signed(low, digits)} to {signed(high, digits)}"
+    return (
+        NOTHING if np.isnan(low) else f"{signed(low, digits)} to {signed(high, digits)}"
+    )

@@ -1,4 +1,6 @@
-"""Checks for the tests of whoever writes a planner, model, robot, objective, risk measure, sensor, belief or metric."""
+"""Checks for the tests of whoever writes a planner, model, robot, objective, risk
+measure, sensor, belief or metric.
+"""
 
 from benchnav.core.public_names import face
 

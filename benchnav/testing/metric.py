@@ -1,5 +1,6 @@
 """The contract of metrics, tried on episodes that a robot drives without a planner."""
 
+from functools import partial
 from typing import Any
 
 from benchnav.core import registry
@@ -11,9 +12,9 @@ from benchnav.testing.breaches import NOTHING, Breaches
 def check_metric(metric: Any, robot: Any = "unicycle") -> None:
     """Tries whether a metric keeps the contract.
 
-    The contract: attributes as `benchnav.metrics.Metric` lists them; for a success, a failure that stood and a failure
-    of one step a finite number or NaN, which is the same when computed again; arguments and global generators left as
-    they were.
+    The contract: attributes as `benchnav.metrics.Metric` lists them; for a success, a
+    failure that stood and a failure of one step a finite number or NaN, which is the
+    same when computed again; arguments and global generators left as they were.
 
     Args:
         metric: any metric, or the name, file or mapping of one as suites have it.
@@ -30,7 +31,7 @@ def check_metric(metric: Any, robot: Any = "unicycle") -> None:
     for episode in sample_episodes(registry.take("robot", robot)):
         breaches.place = f"{episode}"
         value, again = (
-            breaches.watch("compute", lambda given=episode: measure(made, given), metric=made)  # type: ignore[misc]
+            breaches.watch("compute", partial(measure, made, episode), metric=made)
             for _ in range(2)
         )
         breaches.expect(

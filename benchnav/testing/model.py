@@ -33,36 +33,48 @@ _CLASSES = tuple(map(str, range(10)))  # more than any map of the contract shows
 
 
 def check_model(
-    model: TraversabilityModel | type[TraversabilityModel] | str | Path | Mapping[str, Any],
+    model: TraversabilityModel
+    | type[TraversabilityModel]
+    | str
+    | Path
+    | Mapping[str, Any],
     shapes: Sequence[tuple[int, int]] = ((32, 32), (20, 37)),
     recipe: str = "tiny-v1",
     device: torch.device | str = "cpu",
     tolerance: float = 1e-4,
 ) -> None:
-    """Tries whether a model keeps the contract, by letting it predict one map and three.
+    """Tries whether a model keeps the contract, by letting it predict one map and
+    three.
 
-    A model that passes can be evaluated and planned with like any other. The contract: a TraversabilityDistribution
-    of shape [B, H, W] for maps of any size, on the observation's device, of one floating-point dtype; a CDF that
-    ascends from 0 to 1, quantiles in [0, 1] that are its inverse, and integrals that are theirs; of a mixture finite
-    parameters, weights ≥ 0 that sum to 1, standard deviations ≥ 0; the observation left as it was, and with it
-    the global generators of Python, NumPy and PyTorch; the same answer when asked again, and for a map alone
-    what it is in a batch; `class_names`, where given, one a class, whose probabilities the distribution gives: of a
-    mixture a component, or what `group` sums up; `member_probabilities`, where given, of shape [M, B, C, H, W],
-    and the class probabilities, in each cell, in the order of their average, which may have been calibrated as a
-    whole.
+    A model that passes can be evaluated and planned with like any other. The contract:
+    a TraversabilityDistribution of shape [B, H, W] for maps of any size, on the
+    observation's device, of one floating-point dtype; a CDF that ascends from 0 to 1,
+    quantiles in [0, 1] that are its inverse, and integrals that are theirs; of a
+    mixture finite parameters, weights ≥ 0 that sum to 1, standard deviations ≥ 0; the
+    observation left as it was, and with it the global generators of Python, NumPy and
+    PyTorch; the same answer when asked again, and for a map alone what it is in a
+    batch; `class_names`, where given, one a class, whose probabilities the distribution
+    gives: of a mixture a component, or what `group` sums up; `member_probabilities`,
+        where given, of shape [M, B, C, H, W], and the class probabilities, in each
+        cell, in the order of their average, which may have been calibrated as a whole.
 
-    A class of trainable models is tried as training uses it: its hooks fit, a step changes its weights, cells whose λ
-    was not observed are left out of a finite loss, and settings and tensors give the same model back. Layers that it
-    asks for and the recipe's maps do not have are drawn at random.
+    A class of trainable models is tried as training uses it: its hooks fit, a step
+    changes its weights, cells whose λ was not observed are left out of a finite loss,
+    and settings and tensors give the same model back. Layers that it asks for and the
+    recipe's maps do not have are drawn at random.
 
     Args:
-        model: any model, or what `load_model` takes; the oracle is given the Terrain. Or a class of trainable models,
-            by itself, as path/to/file.py:Class or by name.
-        shapes: (H, W) of the maps to try; a model that takes maps of one size alone names it here.
-        recipe: of the maps, a shipped id or the path of a YAML file; its first scenario is used.
+        model: any model, or what `load_model` takes; the oracle is given the Terrain.
+            Or a class of trainable models, by itself, as path/to/file.py:Class or by
+            name.
+        shapes: (H, W) of the maps to try; a model that takes maps of one size alone
+            names it here.
+        recipe: of the maps, a shipped id or the path of a YAML file; its first scenario
+            is used.
         device: where the observations are.
-        tolerance: by how much sums, averages, λ, probabilities, and a map's parameters alone and in a batch may differ;
-            batches of other sizes are worked out in another order.
+        tolerance: by how much sums, averages, λ, probabilities, and a map's parameters
+            alone and in a batch may differ; batches of other sizes are worked out in
+            another order.
 
     Raises:
         ConfigError: the model breaks the contract; every breach is named.
@@ -70,7 +82,11 @@ def check_model(
     fresh = untrained(model)
     made: Any = fresh
     if fresh is None:
-        made = load_model(model) if isinstance(model, str | Path | Mapping) else registry.take("model", model)
+        made = (
+            load_model(model)
+            if isinstance(model, str | Path | Mapping)
+            else registry.take("model", model)
+        )
     breaches = Breaches("model", type(made).__name__)
     for height, width in shapes:
         breaches.place = f"{height}×{width}"
@@ -79,7 +95,9 @@ def check_model(
             terrain = with_inputs(terrain, made)
         if fresh is not None and not try_training(fresh, terrain, _CLASSES, breaches):
             continue
-        is_sound = partial(_is_sound, device=terrain.rgb.device, tolerance=tolerance, breaches=breaches)
+        is_sound = partial(
+            _is_sound, device=terrain.rgb.device, tolerance=tolerance, breaches=breaches
+        )
         predicted = breaches.try_function(
             "predict",
             lambda observation: predict(made, observation),
@@ -93,11 +111,20 @@ def check_model(
 
 
 def _is_sound(
-    predicted: TraversabilityDistribution, device: torch.device, tolerance: float, breaches: Breaches
+    predicted: TraversabilityDistribution,
+    device: torch.device,
+    tolerance: float,
+    breaches: Breaches,
 ) -> bool:
-    """Tells what is wrong with a distribution whose shape is known to fit; false where it lies elsewhere."""
+    """Tells what is wrong with a distribution whose shape is known to fit; false where
+    it lies elsewhere.
+    """
     if isinstance(predicted, TraversabilityMixture):
-        values = {"weights": predicted.weights, "means": predicted.means, "stds": predicted.stds}
+        values = {
+            "weights": predicted.weights,
+            "means": predicted.means,
+            "stds": predicted.stds,
+        }
         if not _are_on(device, list(values.values()), breaches):
             return False
         if not _are_parameters(values, tolerance, breaches):
@@ -109,14 +136,21 @@ def _is_sound(
 
 
 def _are_on(
-    device: torch.device, values: Sequence[Tensor | TraversabilityDistribution], breaches: Breaches
+    device: torch.device,
+    values: Sequence[Tensor | TraversabilityDistribution],
+    breaches: Breaches,
 ) -> bool:
     others = [value.device for value in values if value.device != device]
-    found = f"Expected parameters on the observation's device {device}, got {others[0] if others else ''}."
+    found = (
+        f"Expected parameters on the observation's device {device}, got "
+        f"{others[0] if others else ''}."
+    )
     return breaches.expect(not others, found)
 
 
-def _are_parameters(values: Mapping[str, Tensor], tolerance: float, breaches: Breaches) -> bool:
+def _are_parameters(
+    values: Mapping[str, Tensor], tolerance: float, breaches: Breaches
+) -> bool:
     """Tells whether a mixture can be made of its parameters."""
     expect, weights = breaches.expect, values["weights"]
     dtypes = sorted({str(value.dtype) for value in values.values()})
@@ -125,7 +159,10 @@ def _are_parameters(values: Mapping[str, Tensor], tolerance: float, breaches: Br
         f"Expected parameters of one floating-point dtype, got {', '.join(dtypes)}.",
     )
     for name, value in values.items():
-        sound &= expect(bool(value.isfinite().all()), f"Expected finite `{name}`, got some that are not.")
+        sound &= expect(
+            bool(value.isfinite().all()),
+            f"Expected finite `{name}`, got some that are not.",
+        )
         below = name != "means" and bool((value < 0).any())
         sound &= expect(not below, f"Expected `{name}` ≥ 0, got some below.")
     sums = weights.double().sum(1)
@@ -136,24 +173,34 @@ def _are_parameters(values: Mapping[str, Tensor], tolerance: float, breaches: Br
 
 
 def _fit_names(names: int, predicted: TraversabilityDistribution) -> str:
-    """Says where a distribution does not have the classes that a model names; empty where it does."""
+    """Says where a distribution does not have the classes that a model names; empty
+    where it does.
+    """
     if not isinstance(predicted, TraversabilityMixture):
         try:
             got: Any = list(predicted.class_probabilities(names).shape) if names else []
         except ConfigError:
             got = f"a {type(predicted).__name__} without classes"
         shape = [*predicted.shape[:-2], names, *predicted.shape[-2:]] if names else []
-        return "" if got == shape else f"Expected class probabilities of shape {shape}, got {got}."
+        return (
+            ""
+            if got == shape
+            else f"Expected class probabilities of shape {shape}, got {got}."
+        )
     group, components = predicted.group, predicted.weights.shape[1]
     if group is None:
         fits = names in (0, components)
         return (
             ""
             if fits
-            else f"Expected a name in `class_names` for each of {components} components, got {names}."
+            else f"Expected a name in `class_names` for each of {components} "
+            f"components, got {names}."
         )
     fits = names == 0 or names > max(group)
-    breach = f"Expected classes in `group` under {names}, the number of `class_names`, got {max(group)}."
+    breach = (
+        f"Expected classes in `group` under {names}, the number of "
+        f"`class_names`, got {max(group)}."
+    )
     return "" if fits else breach
 
 
@@ -171,7 +218,9 @@ def _check_classes(
         return
     seen = terrain.observe()
     members = breaches.watch(
-        "member_probabilities", lambda: model.member_probabilities(seen), observation=seen
+        "member_probabilities",
+        lambda: model.member_probabilities(seen),
+        observation=seen,
     )
     if members is None or members is NOTHING:
         return
@@ -183,16 +232,26 @@ def _check_classes(
     else:
         return
     got = list(members.shape) if isinstance(members, Tensor) else type(members).__name__
-    fits = isinstance(members, Tensor) and members.shape[1:] == weights.shape and len(members) > 0
+    fits = (
+        isinstance(members, Tensor)
+        and members.shape[1:] == weights.shape
+        and len(members) > 0
+    )
     shape = f"[M, {str(list(weights.shape))[1:]}"
     if expect(fits, f"Expected `member_probabilities` of shape {shape}, got {got}."):
-        # A class that weighs more on average does not weigh less in the end, in any cell.
-        falls = weights.gather(1, members.mean(0).argsort(1, descending=True)).diff(dim=1) <= tolerance
+        # A class that weighs more on average does not weigh less in the end, in any
+        # cell.
+        falls = (
+            weights.gather(1, members.mean(0).argsort(1, descending=True)).diff(dim=1)
+            <= tolerance
+        )
         order = "in the order of the average of `member_probabilities`"
         expect(bool(falls.all()), f"Expected class probabilities {order}, got another.")
 
 
-def _make_terrain(recipe: str, height: int, width: int, device: torch.device) -> Terrain:
+def _make_terrain(
+    recipe: str, height: int, width: int, device: torch.device
+) -> Terrain:
     """Makes three maps of a recipe's first scenario on another grid."""
     made = load_recipe(recipe)
     name, scenario = next(iter(made.scenarios.items()))

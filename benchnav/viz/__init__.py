@@ -1,4 +1,6 @@
-"""Drawing: the base class of figures, and the sizes, colours, names, maps and panels that all of them share."""
+"""Drawing: the base class of figures, and the sizes, colours, names, maps and panels
+that all of them share.
+"""
 
 from benchnav.core.public_names import face
 
@@ -7,7 +9,13 @@ __getattr__, __dir__, __all__ = face(
     {
         "benchnav.viz.figure": ("Figure",),
         "benchnav.viz.maps": ("Drive", "draw_drive", "draw_path", "mark", "show_map"),
-        "benchnav.viz.panels": ("Curves", "draw_estimates", "draw_interval", "line_looks", "panel_grid"),
+        "benchnav.viz.panels": (
+            "Curves",
+            "draw_estimates",
+            "draw_interval",
+            "line_looks",
+            "panel_grid",
+        ),
         "benchnav.viz.style": (
             "condition_colours",
             "legend_outside",

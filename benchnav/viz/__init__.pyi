@@ -1,6 +1,12 @@
 from benchnav.viz.figure import Figure
 from benchnav.viz.maps import Drive, draw_drive, draw_path, mark, show_map
-from benchnav.viz.panels import Curves, draw_estimates, draw_interval, line_looks, panel_grid
+from benchnav.viz.panels import (
+    Curves,
+    draw_estimates,
+    draw_interval,
+    line_looks,
+    panel_grid,
+)
 from benchnav.viz.style import (
     condition_colours,
     legend_outside,

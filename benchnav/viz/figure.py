@@ -1,7 +1,8 @@
-"""The base class of figures: an object that says what it needs, what it shows, and draws it.
+"""The base class of figures: an object that says what it needs, what it shows, and
+draws it.
 
-A figure knows no path and writes nothing. `data` is one value for all figures of a kind; for those of runs it is
-`benchnav.eval.figures.RunData`.
+A figure knows no path and writes nothing. `data` is one value for all figures of a
+kind; for those of runs it is `benchnav.eval.figures.RunData`.
 """
 
 from abc import ABC, abstractmethod
@@ -31,7 +32,9 @@ class Figure(Specified, ABC):
     trim: bool = False
 
     def variants(self, data: Any) -> Sequence[Self]:
-        """Return the figures to draw, each with a name of its own: itself where `needs` is met, else none."""
+        """Return the figures to draw, each with a name of its own: itself where `needs`
+        is met, else none.
+        """
         return [self] if self.needs(data) else []
 
     def variant(self, **changes: Any) -> Self:
@@ -41,9 +44,17 @@ class Figure(Specified, ABC):
         return made
 
     def numbered(self, count: int) -> list[Self]:
-        """Return so many variants with their `place`, named with a number from 1 where there are several."""
-        names = [self.name] if count == 1 else [f"{self.name}-{number}" for number in range(1, count + 1)]
-        return [self.variant(place=place, name=name) for place, name in enumerate(names)]
+        """Return so many variants with their `place`, named with a number from 1 where
+        there are several.
+        """
+        names = (
+            [self.name]
+            if count == 1
+            else [f"{self.name}-{number}" for number in range(1, count + 1)]
+        )
+        return [
+            self.variant(place=place, name=name) for place, name in enumerate(names)
+        ]
 
     def needs(self, data: Any) -> bool:
         """Return whether the data hold what it draws."""

@@ -1,4 +1,5 @@
-"""Maps in metres, once for datasets, models, runs, playback and pages: colours, marks, paths, and kinds of terrain.
+"""Maps in metres, once for datasets, models, runs, playback and pages: colours, marks,
+paths, and kinds of terrain.
 
 Letters in shapes: H×W cells, N positions, M lines.
 """
@@ -43,11 +44,19 @@ _HATCH_CELLS = 4
 _LENGTHS_M = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500)  # of scale bars
 _SCALE_FRACTION = 0.35  # of a map's width, which a scale bar stays under
 
-# A tick, an hourglass and an arrowhead along x; a shape says in grey too how an episode ended.
+# A tick, an hourglass and an arrowhead along x; a shape says in grey too how an episode
+# ended.
 _TICK, _HOURGLASS, _ARROWHEAD = (
     MarkerPath([*corners, corners[0]], closed=True)
     for corners in (
-        [(-1, 0.05), (-0.62, 0.43), (-0.25, 0.05), (0.66, 0.95), (1, 0.6), (-0.25, -0.75)],
+        [
+            (-1, 0.05),
+            (-0.62, 0.43),
+            (-0.25, 0.05),
+            (0.66, 0.95),
+            (1, 0.6),
+            (-0.25, -0.75),
+        ],
         [(-0.8, 1), (0.8, 1), (-0.8, -1), (0.8, -1)],
         [(1, 0), (-0.8, 0.7), (-0.4, 0), (-0.8, -0.7)],
     )
@@ -58,13 +67,21 @@ _END: dict[str, Any] = {**_WHITE_EDGED, "color": "black", "ms": 6, "zorder": 4}
 MARKS: dict[str, dict[str, Any]] = {
     "start": {**_WHITE_EDGED, "marker": "o", "color": "#e61e1e", "ms": 5},
     "goal": {**_WHITE_EDGED, "marker": "*", "color": "#ff00ff", "ms": 9},
-    "robot": {**_WHITE_EDGED, "marker": _ARROWHEAD, "color": ROBOT, "mec": "black", "ms": 8, "zorder": 3.5},
+    "robot": {
+        **_WHITE_EDGED,
+        "marker": _ARROWHEAD,
+        "color": ROBOT,
+        "mec": "black",
+        "ms": 8,
+        "zorder": 3.5,
+    },
     "success": {**_END, "marker": _TICK, "ms": 7},
     "immobilised": {**_END, "marker": "X"},
     "out of time": {**_END, "marker": _HOURGLASS},
     "failed": {**_END, "marker": "s", "ms": 5},
 }
-# Which of `MARKS` stands where an episode ended, by its outcome; `failed` for all others.
+# Which of `MARKS` stands where an episode ended, by its outcome; `failed` for all
+# others.
 _END_MARKS = {
     **{name: name for name in ("success", "immobilised")},
     **dict.fromkeys(("timeout", "stuck", "stalled"), "out of time"),
@@ -90,9 +107,15 @@ class Drive:
 
 
 def draw_drive(
-    panel: Axes, drive: Drive, width: float = 1.4, scale: float = 1.0, colour: Any = "black", **style: Any
+    panel: Axes,
+    drive: Drive,
+    width: float = 1.4,
+    scale: float = 1.0,
+    colour: Any = "black",
+    **style: Any,
 ) -> None:
-    """Draw a driven path with its start, its goal, and the robot or how the episode ended.
+    """Draw a driven path with its start, its goal, and the robot or how the episode
+    ended.
 
     Args:
         panel: in metres.
@@ -116,7 +139,9 @@ def draw_drive(
         right, up = 0.9 * drawn.get_markersize() / 72 * away / np.linalg.norm(away)
         figure = panel.get_figure(root=True)
         assert figure is not None
-        drawn.set_transform(panel.transData + ScaledTranslation(right, up, figure.dpi_scale_trans))
+        drawn.set_transform(
+            panel.transData + ScaledTranslation(right, up, figure.dpi_scale_trans)
+        )
 
 
 def draw_path(
@@ -134,11 +159,17 @@ def draw_path(
     Returns:
         The edge and the path.
     """
-    edge = panel.plot(*track.T, color="white", lw=width + 1.4, solid_capstyle="round", zorder=1.9)
-    return edge + panel.plot(*track.T, color=colour, lw=width, solid_capstyle="round", **style)
+    edge = panel.plot(
+        *track.T, color="white", lw=width + 1.4, solid_capstyle="round", zorder=1.9
+    )
+    return edge + panel.plot(
+        *track.T, color=colour, lw=width, solid_capstyle="round", **style
+    )
 
 
-def mark(panel: Axes, name: str, position_m: Any, scale: float = 1.0, **style: Any) -> Line2D:
+def mark(
+    panel: Axes, name: str, position_m: Any, scale: float = 1.0, **style: Any
+) -> Line2D:
     """Mark a position on a map; return the mark.
 
     Args:
@@ -146,7 +177,8 @@ def mark(panel: Axes, name: str, position_m: Any, scale: float = 1.0, **style: A
         name: of `MARKS`.
         position_m: (x, y).
         scale: of the mark's size.
-        **style: what differs, as in `Axes.plot`; a legend calls the mark by its name if `label` is not given.
+        **style: what differs, as in `Axes.plot`; a legend calls the mark by its name if
+            `label` is not given.
     """
     (drawn,) = panel.plot(*position_m, **_looks(name, scale) | style)
     return drawn
@@ -162,14 +194,20 @@ def _looks(name: str, scale: float) -> dict[str, Any]:
 
 
 def end_mark(outcome: str) -> str:
-    """Return which of `MARKS` stands where an episode ended, by its outcome as tables of episodes have it."""
+    """Return which of `MARKS` stands where an episode ended, by its outcome as tables
+    of episodes have it.
+    """
     return _END_MARKS.get(outcome, "failed")
 
 
 def mark_ends(
-    panel: Axes, tracks: Sequence[np.ndarray], outcomes: Sequence[str], colours: Sequence[Any]
+    panel: Axes,
+    tracks: Sequence[np.ndarray],
+    outcomes: Sequence[str],
+    colours: Sequence[Any],
 ) -> None:
-    """Mark how several episodes on one map ended; marks that would overlap stand around, with a line to their end.
+    """Mark how several episodes on one map ended; marks that would overlap stand
+    around, with a line to their end.
 
     Args:
         panel: in metres.
@@ -181,22 +219,44 @@ def mark_ends(
     figure = panel.get_figure(root=True)
     assert figure is not None
     figure.draw_without_rendering()  # so that the size of a point on the map is known
-    metre_pt = np.diff(panel.transData.transform([(0, 0), (1, 0)])[:, 0])[0] * 72 / figure.dpi
+    metre_pt = (
+        np.diff(panel.transData.transform([(0, 0), (1, 0)])[:, 0])[0] * 72 / figure.dpi
+    )
     apart_m = 1.3 * MARKS["immobilised"]["ms"] / metre_pt
     distances = np.linalg.norm(ends[:, None] - ends, axis=-1)
     _, labels = connected_components(distances < apart_m)
     for label in np.unique(labels):
         group = np.flatnonzero(labels == label).tolist()
         centre = ends[group].mean(axis=0)
-        radius_m = 0.0 if len(group) == 1 else max(1.6 * apart_m, apart_m * len(group) / np.pi)
+        radius_m = (
+            0.0 if len(group) == 1 else max(1.6 * apart_m, apart_m * len(group) / np.pi)
+        )
         for turn, index in enumerate(group):
             # Beginning above, where most paths do not come from below.
             angle = 2 * np.pi * turn / len(group) + np.pi / 2
             position = centre + radius_m * np.array([np.cos(angle), np.sin(angle)])
             if len(group) > 1:
-                draw_path(panel, np.stack((ends[index], position)), 0.7, colours[index], zorder=3.6)
-                panel.plot(*ends[index], "o", ms=2.4, color=colours[index], mec="white", mew=0.5, zorder=3.7)
-            looks: dict[str, Any] = {"color": colours[index], "label": "_end", "clip_on": False}
+                draw_path(
+                    panel,
+                    np.stack((ends[index], position)),
+                    0.7,
+                    colours[index],
+                    zorder=3.6,
+                )
+                panel.plot(
+                    *ends[index],
+                    "o",
+                    ms=2.4,
+                    color=colours[index],
+                    mec="white",
+                    mew=0.5,
+                    zorder=3.7,
+                )
+            looks: dict[str, Any] = {
+                "color": colours[index],
+                "label": "_end",
+                "clip_on": False,
+            }
             mark(panel, end_mark(outcomes[index]), position, **looks)
 
 
@@ -206,7 +266,8 @@ def robot_marker(heading_rad: float) -> MarkerStyle:
 
 
 def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) -> Any:
-    """Draw a map with its first row at the bottom and its axes in metres, which end where it ends.
+    """Draw a map with its first row at the bottom and its axes in metres, which end
+    where it ends.
 
     Args:
         panel: where.
@@ -219,7 +280,13 @@ def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) 
     """
     width, height = map(float, extent_m)
     panel.set(xlim=(0, width), ylim=(0, height))
-    return panel.imshow(values, origin="lower", extent=(0, width, 0, height), interpolation="none", **style)
+    return panel.imshow(
+        values,
+        origin="lower",
+        extent=(0, width, 0, height),
+        interpolation="none",
+        **style,
+    )
 
 
 def draw_bar(
@@ -245,11 +312,19 @@ def draw_bar(
 
 
 def overlay(
-    panel: Axes, region: np.ndarray, extent_m: Iterable[float], colour: Any, opacity: float = 1.0
+    panel: Axes,
+    region: np.ndarray,
+    extent_m: Iterable[float],
+    colour: Any,
+    opacity: float = 1.0,
 ) -> Any:
-    """Draw a region of a map, bool of shape [H, W], in one colour over what is there; return the image."""
+    """Draw a region of a map, bool of shape [H, W], in one colour over what is there;
+    return the image.
+    """
     shown = np.ma.masked_equal(np.asarray(region, float), 0)
-    return show_map(panel, shown, extent_m, cmap=ListedColormap([to_rgba(colour, opacity)]))
+    return show_map(
+        panel, shown, extent_m, cmap=ListedColormap([to_rgba(colour, opacity)])
+    )
 
 
 def frame_map(panel: Axes) -> None:
@@ -264,14 +339,18 @@ def name_terrain(panel: Axes, label: str, **look: Any) -> None:
 
 
 def name_immobilising(panel: Axes, immobilising: np.ndarray) -> None:
-    """Give cells that immobilise a robot their entry in the legend, where a map has some."""
+    """Give cells that immobilise a robot their entry in the legend, where a map has
+    some.
+    """
     if immobilising.any():
         name_terrain(panel, "immobilises a robot", color=IMMOBILISING)
 
 
 def scale_length(width_m: float) -> float:
     """Return the length of a scale bar for a map of a width, in metres."""
-    return max(length for length in _LENGTHS_M if length < max(_SCALE_FRACTION * width_m, 1))
+    return max(
+        length for length in _LENGTHS_M if length < max(_SCALE_FRACTION * width_m, 1)
+    )
 
 
 def draw_scale(panel: Axes, extent_m: tuple[float, float], size: float = 7.0) -> None:
@@ -284,7 +363,14 @@ def draw_scale(panel: Axes, extent_m: tuple[float, float], size: float = 7.0) ->
     """
     width, height = extent_m
     length, below = scale_length(width), -0.05 * height
-    panel.plot([0, length], [below, below], color="black", lw=2, solid_capstyle="butt", clip_on=False)
+    panel.plot(
+        [0, length],
+        [below, below],
+        color="black",
+        lw=2,
+        solid_capstyle="butt",
+        clip_on=False,
+    )
     panel.text(length + 0.02 * width, below, f"{length:g} m", va="center", size=size)
 
 
@@ -304,7 +390,9 @@ def hatching(region: np.ndarray, resolution_m: float) -> np.ndarray:
     return (np.stack((corners, corners + 1), axis=1) * resolution_m).astype(np.float32)
 
 
-def draw_lines(panel: Axes, lines: np.ndarray, colour: Any, width: float, edge: Any = None) -> None:
+def draw_lines(
+    panel: Axes, lines: np.ndarray, colour: Any, width: float, edge: Any = None
+) -> None:
     """Draw lines on a map.
 
     Args:
@@ -316,11 +404,14 @@ def draw_lines(panel: Axes, lines: np.ndarray, colour: Any, width: float, edge: 
     """
     for look, line_width in ((edge, 2.5 * width), (colour, width)):
         if look is not None:
-            panel.add_collection(LineCollection(list(lines), colors=[look], linewidths=line_width))
+            panel.add_collection(
+                LineCollection(list(lines), colors=[look], linewidths=line_width)
+            )
 
 
 def layer_scale(name: str, values: np.ndarray) -> dict[str, Any]:
-    """Return how a layer is coloured, as keywords of `imshow`: from 0 or below to its maximum, or around the compass.
+    """Return how a layer is coloured, as keywords of `imshow`: from 0 or below to its
+    maximum, or around the compass.
 
     Args:
         name: of the layer; one that ends in `_azimuth_deg` has directions.
@@ -328,13 +419,25 @@ def layer_scale(name: str, values: np.ndarray) -> dict[str, Any]:
     """
     if is_azimuth(name):
         return {"cmap": with_lacking(_DIRECTION_COLOURS), "vmin": 0.0, "vmax": 360.0}
-    low, high = (float(end(values[np.isfinite(values)], initial=0.0)) for end in (np.min, np.max))
-    return {"cmap": with_lacking(_LAYER_COLOURS), "vmin": low, "vmax": high if high > low else low + 1.0}
+    low, high = (
+        float(end(values[np.isfinite(values)], initial=0.0)) for end in (np.min, np.max)
+    )
+    return {
+        "cmap": with_lacking(_LAYER_COLOURS),
+        "vmin": low,
+        "vmax": high if high > low else low + 1.0,
+    }
 
 
 def with_lacking(colours: str | np.ndarray) -> Colormap:
-    """Return a colour map, by its name or by its colours of shape [C, 3], in which masked cells are grey."""
-    named = matplotlib.colormaps[colours] if isinstance(colours, str) else ListedColormap(list(colours))
+    """Return a colour map, by its name or by its colours of shape [C, 3], in which
+    masked cells are grey.
+    """
+    named = (
+        matplotlib.colormaps[colours]
+        if isinstance(colours, str)
+        else ListedColormap(list(colours))
+    )
     return named.with_extremes(bad=LACKING)
 
 
@@ -351,7 +454,8 @@ class LayerStyle(NamedTuple):
         colour: red, green, blue and opacity, in hexadecimal digits.
         width: over the thinnest line's.
         dashes: of the line, where lines can be dashed.
-        effects: of the line, where it can have such: a white edge parts it from dark terrain.
+        effects: of the line, where it can have such: a white edge parts it from dark
+            terrain.
     """
 
     label: str
@@ -386,13 +490,22 @@ def draw_plan(panel: Axes, lines: Mapping[str, Sequence[np.ndarray]]) -> None:
             panel.add_collection(layer)
 
 
-def driven_colours(track: np.ndarray, traversability: np.ndarray, width: float) -> LineCollection:
-    """Return a driven path, positions of shape [N, 2], in the colours of observed λ, shape [N − 1] or longer.
+def driven_colours(
+    track: np.ndarray, traversability: np.ndarray, width: float
+) -> LineCollection:
+    """Return a driven path, positions of shape [N, 2], in the colours of observed λ,
+    shape [N − 1] or longer.
 
     It can be put on a map, and on a colour bar.
     """
     pieces = list(np.stack((track[:-1], track[1:]), axis=1))
-    path = LineCollection(pieces, cmap=TRAVERSABILITY_COLOURS, linewidths=width, capstyle="round", zorder=2.5)
+    path = LineCollection(
+        pieces,
+        cmap=TRAVERSABILITY_COLOURS,
+        linewidths=width,
+        capstyle="round",
+        zorder=2.5,
+    )
     path.set_clim(0, 1)
     path.set_array(traversability[: len(pieces)])
     return path
@@ -400,28 +513,43 @@ def driven_colours(track: np.ndarray, traversability: np.ndarray, width: float) 
 
 def shades(values: np.ndarray, colours: str = TRAVERSABILITY_COLOURS) -> np.ndarray:
     """Colour λ, or what else lies in [0, 1]: uint8, from any shape to [..., 3]."""
-    return np.round(255 * matplotlib.colormaps[colours](values)[..., :3]).astype(np.uint8)
+    return np.round(255 * matplotlib.colormaps[colours](values)[..., :3]).astype(
+        np.uint8
+    )
 
 
 def layer_colours(name: str, layer: np.ndarray) -> np.ndarray:
     """Colour a layer of shape [H, W], grey where unknown, as `field_colours` does."""
     scale = layer_scale(name, layer)
     shown = layer % 360 if is_azimuth(name) else layer
-    fraction = (np.ma.masked_invalid(shown) - scale["vmin"]) / (scale["vmax"] - scale["vmin"])
+    fraction = (np.ma.masked_invalid(shown) - scale["vmin"]) / (
+        scale["vmax"] - scale["vmin"]
+    )
     return np.round(255 * scale["cmap"](fraction)[..., :3]).astype(np.uint8)
 
 
 def veiled(colours: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Lay a veil over colours, uint8 of shape [H, W, 3], where the map was not seen, bool of shape [H, W]."""
+    """Lay a veil over colours, uint8 of shape [H, W, 3], where the map was not seen,
+    bool of shape [H, W].
+    """
     veil = (1 - VEIL) * colours + VEIL * np.array(bytes_of(UNSEEN)[:3])
     return np.where(seen[..., None], colours, veil).round().astype(np.uint8)
 
 
 def draw_reach(panel: Axes, outline_m: np.ndarray) -> None:
-    """Draw how far sensors reach, lines of shape [N, 2] with NaN between them, on a map."""
+    """Draw how far sensors reach, lines of shape [N, 2] with NaN between them, on a
+    map.
+    """
     edge = [withStroke(linewidth=1.1, foreground="black"), Normal()]
     # One line with gaps, so that no piece has its edge on another.
-    panel.plot(*outline_m.T, color=REACH, lw=0.6, path_effects=edge, label="reach of the sensors", zorder=2.2)
+    panel.plot(
+        *outline_m.T,
+        color=REACH,
+        lw=0.6,
+        path_effects=edge,
+        label="reach of the sensors",
+        zorder=2.2,
+    )
 
 
 def field_colours(field: np.ndarray, immobilising: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Sheets of maps for a page: a row a map and a column a layer.
 
-Lengths are in inches from the upper left corner and text is in points, as printed over the two columns of a page.
+Lengths are in inches from the upper left corner and text is in points, as printed over
+the two columns of a page.
 Letters in shapes: R rows, C classes, H×W cells.
 """
 
@@ -15,7 +16,14 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from benchnav.core.grid import is_azimuth
-from benchnav.viz.maps import LACKING, LAMBDA, frame_map, layer_scale, show_map, with_lacking
+from benchnav.viz.maps import (
+    LACKING,
+    LAMBDA,
+    frame_map,
+    layer_scale,
+    show_map,
+    with_lacking,
+)
 from benchnav.viz.style import TEXT, TWO_COLUMNS_IN, legend_outside, styled
 
 _PAGE, _DPI = 9.4, 300.0
@@ -50,10 +58,14 @@ class SheetColumn(NamedTuple):
 def layer_column(name: str, values: np.ndarray, unit: str) -> SheetColumn:
     """A layer as a column of a sheet, of shape [R, H, W]."""
     words = name.removesuffix(f"_{unit}").replace("_", " ")
-    title = words[:1].upper() + words[1:] + {"1": "", "deg": " [°]"}.get(unit, f" [{unit}]")
+    title = (
+        words[:1].upper() + words[1:] + {"1": "", "deg": " [°]"}.get(unit, f" [{unit}]")
+    )
     title = textwrap.fill(title, _TITLE_LETTERS, break_long_words=False)
     shown = values % 360 if is_azimuth(name) else values
-    return SheetColumn(name, title, np.ma.masked_invalid(shown), layer_scale(name, values), "")
+    return SheetColumn(
+        name, title, np.ma.masked_invalid(shown), layer_scale(name, values), ""
+    )
 
 
 @styled()
@@ -65,7 +77,8 @@ def sheet_of_maps(
     classes: Sequence[Artist],
     marks: Sequence[Artist] = (),
 ) -> Figure:
-    """Draws maps side by side, a row a map and a column a layer, for the page of a paper.
+    """Draws maps side by side, a row a map and a column a layer, for the page of a
+    paper.
 
     Args:
         columns: of R rows each.
@@ -76,7 +89,8 @@ def sheet_of_maps(
         marks: entries of a legend beside the heading.
 
     Returns:
-        A figure as wide as a page; narrower where panels shrink to fit one, wider where columns are many.
+        A figure as wide as a page; narrower where panels shrink to fit one, wider where
+        columns are many.
     """
     ratio, across = extent_m[1] / extent_m[0], len(columns)
     widest = max((TWO_COLUMNS_IN - _SIDES) / across, _COLUMN)
@@ -96,13 +110,23 @@ def sheet_of_maps(
         below[0].set_title(column.title)
         if column.unit is not None:
             bar = figure.colorbar(
-                image, ax=list(below), location="bottom", extend=column.extend, aspect=14, panchor=False,
-                ticks=MaxNLocator(column.most, steps=[1, 2, 2.5, 5, 10]), format="%g",
-            )  # fmt: skip
+                image,
+                ax=list(below),
+                location="bottom",
+                extend=column.extend,
+                aspect=14,
+                panchor=False,
+                ticks=MaxNLocator(column.most, steps=[1, 2, 2.5, 5, 10]),
+                format="%g",
+            )
             bar.set_label(column.unit, size=TEXT)
             bar.ax.set_label(f"{column.name} bar")
-    for axis, inches in ((panels[0, 0].xaxis, high / ratio), (panels[0, 0].yaxis, high)):
-        # A tick at the very end is left out, as its number would touch the next panel's first.
+    for axis, inches in (
+        (panels[0, 0].xaxis, high / ratio),
+        (panels[0, 0].yaxis, high),
+    ):
+        # A tick at the very end is left out, as its number would touch the next panel's
+        # first.
         most = min(max(int(inches / 0.2), 1), 4)
         axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10], prune="upper"))
     for panel, name in zip(panels[:, 0], rows, strict=True):
@@ -110,7 +134,10 @@ def sheet_of_maps(
     panels[-1, across // 2].set_xlabel("x [m]", size=TEXT)
     figure.supylabel("y [m]", size=TEXT, y=0.5 + (ends / 2 - 0.45) / height)
     figure.suptitle(heading, x=0.01, ha="left", parse_math=False)
-    for handles, count, side in ((marks, len(marks), "upper right"), (classes, legend_columns, "lower left")):
+    for handles, count, side in (
+        (marks, len(marks), "upper right"),
+        (classes, legend_columns, "lower left"),
+    ):
         if handles:
             for text in legend_outside(figure, handles, count, side).get_texts():
                 text.set_parse_math(False)
@@ -119,11 +146,15 @@ def sheet_of_maps(
 
 def class_patches(names: Sequence[str], colours: np.ndarray) -> list[Artist]:
     """Entries of a legend for classes, whose colours are of shape [C, 3]."""
-    return [Patch(facecolor=c, ec="0.3", lw=0.4, label=n) for c, n in zip(colours, names, strict=True)]
+    return [
+        Patch(facecolor=c, ec="0.3", lw=0.4, label=n)
+        for c, n in zip(colours, names, strict=True)
+    ]
 
 
 def class_scale(colours: np.ndarray) -> dict[str, Any]:
-    """Return how class ids are coloured, as keywords of `imshow`; masked cells have no class.
+    """Return how class ids are coloured, as keywords of `imshow`; masked cells have no
+    class.
 
     Args:
         colours: of the classes, shape [C, 3].

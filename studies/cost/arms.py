@@ -1,4 +1,6 @@
-"""Arms of risk on the cost: the table of their differences, and success over time through their levels."""
+"""Arms of risk on the cost: the table of their differences, and success over time
+through their levels.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +14,14 @@ from benchnav.eval.compare import read_conditions
 from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import Compared, Pair, check_maps, side_by_side
-from benchnav.viz import draw_estimates, legend_outside, line_looks, panel_grid, planner_name, styled
+from benchnav.viz import (
+    draw_estimates,
+    legend_outside,
+    line_looks,
+    panel_grid,
+    planner_name,
+    styled,
+)
 from studies.curves import SUCCESS, in_units
 from studies.tables import success, table
 
@@ -21,16 +30,23 @@ _MEASURES = ("success", "total_time_s", "time_budget_s")
 
 
 _HEADINGS = (
-    "planner", "risk", "success [%] (95 %)", "T_total [s]", "ms a step", "Δ success [points] (95 %)", "p",
+    "planner",
+    "risk",
+    "success [%] (95 %)",
+    "T_total [s]",
+    "ms a step",
+    "Δ success [points] (95 %)",
+    "p",
     "Δ time where both arrive [s] (95 %)",
-)  # fmt: skip
+)
 
 
 def arms(run: Path) -> Table:
     """Return success, time and computing of each arm, and what it gains on another.
 
-    The other is CVaR of time on the map with the same planner, or the same arm with the shared time to go; both may be
-    in the run `cost-primary` next to this one. p is after Holm's correction over all rows that have one.
+    The other is CVaR of time on the map with the same planner, or the same arm with the
+    shared time to go; both may be in the run `cost-primary` next to this one. p is
+    after Holm's correction over all rows that have one.
     """
     arms_of_run = _by_arm(run)
     others = arms_of_run
@@ -42,15 +58,27 @@ def arms(run: Path) -> Table:
         if one is not other:  # the two may differ in planner and risk setting alike
             check_maps(one, other, f"{planner} and {other.labels['planner']}")
             both = side_by_side(one.episodes, other.episodes, _MEASURES)
-            pairs[planner, risk] = Pair(one=planner, other=other.labels["planner"], shared={}, episodes=both)
-    compared = dict(zip(pairs, compare(list(pairs.values())).to_dict("records"), strict=True))
+            pairs[planner, risk] = Pair(
+                one=planner, other=other.labels["planner"], shared={}, episodes=both
+            )
+    compared = dict(
+        zip(pairs, compare(list(pairs.values())).to_dict("records"), strict=True)
+    )
     rows = []
     for row in pd.read_csv(run / "summary.csv").to_dict("records"):
         arm, differences = (row["planner"], row["risk"]), ["", "", ""]
         if found := compared.get(arm):
-            points = [100 * found[f"success_{end}"] for end in ("difference", "low", "high")]
-            seconds = [found[f"arrival_time_{end}_s"] for end in ("difference", "low", "high")]
-            differences = [_interval(points), f"{found['success_p_holm']:.2g}", _interval(seconds)]
+            points = [
+                100 * found[f"success_{end}"] for end in ("difference", "low", "high")
+            ]
+            seconds = [
+                found[f"arrival_time_{end}_s"] for end in ("difference", "low", "high")
+            ]
+            differences = [
+                _interval(points),
+                f"{found['success_p_holm']:.2g}",
+                _interval(seconds),
+            ]
         times = f"{row['total_time_mean_s']:.1f}", f"{row['planning_ms_median']:.1f}"
         rows.append([*arm, success(row), *times, *differences])
     return table(_HEADINGS, rows, 2)
@@ -67,15 +95,24 @@ def _interval(values: list[float]) -> str:
 
 def _compared_with(planner: str, risk: str) -> tuple[str, str]:
     if planner.endswith(" own"):
-        return planner.removesuffix(" own"), "expected-time" if "cost" in planner else risk
+        return planner.removesuffix(
+            " own"
+        ), "expected-time" if "cost" in planner else risk
     return f"{planner.split()[0]} map", "time-cvar:0.5"
 
 
 def arm_of(row: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return planner, arm and level of a condition, and whether it has entrapment; other conditions have no arm."""
+    """Return planner, arm and level of a condition, and whether it has entrapment;
+    other conditions have no arm.
+    """
     part, _, kind = row["planner"].partition(" ")
     name, _, level = row["risk"].partition(":")
-    found = {"planner": planner_name(part), "held": "held" in kind, "arm": "", "level": 0.0}
+    found = {
+        "planner": planner_name(part),
+        "held": "held" in kind,
+        "arm": "",
+        "level": 0.0,
+    }
     if not kind or row["model"] == "clairvoyant":
         return found
     if "cost" in kind:
@@ -86,11 +123,16 @@ def arm_of(row: Mapping[Any, Any]) -> dict[str, Any]:
 
 @styled()
 def frontier(summary: pd.DataFrame) -> Figure:
-    """Draw success over the time to the goal, a curve an arm through its levels; markers grow with the level.
+    """Draw success over the time to the goal, a curve an arm through its levels;
+    markers grow with the level.
 
     A panel a planner; in the row below with entrapment.
     """
-    rows = summary.assign(**pd.DataFrame([arm_of(row) for row in summary.to_dict("records")], summary.index))
+    rows = summary.assign(
+        **pd.DataFrame(
+            [arm_of(row) for row in summary.to_dict("records")], summary.index
+        )
+    )
     rows = rows[rows["arm"] != ""].sort_values(["held", "arm", "level"], kind="stable")
     kind = rows["held"].map({True: ", entrapment", False: ""})
     rows = rows.assign(panel=rows["planner"] + kind, x=rows["success_time_mean_s"])
@@ -99,9 +141,19 @@ def frontier(summary: pd.DataFrame) -> Figure:
     for title, (panel,) in zip(titles, places, strict=True):
         for arm, curve in rows[rows["panel"] == title].groupby("arm", sort=False):
             look, (success_rate, low, high) = looks[arm], in_units(curve, SUCCESS)
-            draw_estimates(panel, curve["x"], success_rate, low, high, look, str(arm), bars=True)
+            draw_estimates(
+                panel, curve["x"], success_rate, low, high, look, str(arm), bars=True
+            )
             sizes = (3 + 5 * curve["level"]) ** 2
-            panel.scatter(curve["x"], success_rate, sizes, look["color"], look["marker"], lw=0, zorder=3)
+            panel.scatter(
+                curve["x"],
+                success_rate,
+                sizes,
+                look["color"],
+                look["marker"],
+                lw=0,
+                zorder=3,
+            )
         panel.set_xlabel("mean time of those that arrive [s]")
     places[0][0].set_ylabel(SUCCESS[-1])
     legend_outside(figure)

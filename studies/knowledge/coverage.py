@@ -1,18 +1,21 @@
 """Coverage of the intervals of a belief, with `oracle` and a trained model.
 
-Robots drive by A*+DWA under `expected-time` and learn by `copula`. At four times of each episode, drawn beforehand, the
-belief is asked of all cells within 2ℓ of the robot whose λ was not sensed: does λ lie in the central 90 % of what is
-believed of it? Where λ has an atom, a rank in it is drawn (randomised PIT). The table has the fraction of cells with
-its 95 % interval by maps (of a ratio of sums over maps), the fractions under and over the interval, and the mean log
-score next to that of the prediction.
+Robots drive by A*+DWA under `expected-time` and learn by `copula`. At four times of
+each episode, drawn beforehand, the belief is asked of all cells within 2ℓ of the robot
+whose λ was not sensed: does λ lie in the central 90 % of what is believed of it? Where
+λ has an atom, a rank in it is drawn (randomised PIT). The table has the fraction of
+cells with its 95 % interval by maps (of a ratio of sums over maps), the fractions under
+and over the interval, and the mean log score next to that of the prediction.
 
-In the world `stakes` draws of λ without a feasible path are rejected, which the covariance model does not know.
-`no draw rejected` rejects none, and immobilises no robot. The table `rejection` says what rejection changes of λ: over
-40 draws of each map, the differences of E[λ] and P(λ < 0.1) between accepted draws and all, near the straight line from
-start to goal (3 m) and elsewhere.
+In the world `stakes` draws of λ without a feasible path are rejected, which the
+covariance model does not know. `no draw rejected` rejects none, and immobilises no
+robot. The table `rejection` says what rejection changes of λ: over 40 draws of each
+map, the differences of E[λ] and P(λ < 0.1) between accepted draws and all, near the
+straight line from start to goal (3 m) and elsewhere.
 
-Sums of each unit are stored in the run's folder, so that a run that was interrupted resumes. Delete the folder when the
-code has changed. 25 minutes of a core with 400 maps' first 200, and 15 with the fine maps.
+Sums of each unit are stored in the run's folder, so that a run that was interrupted
+resumes. Delete the folder when the code has changed. 25 minutes of a core with 400
+maps' first 200, and 15 with the fine maps.
 """
 
 from collections.abc import Sequence
@@ -47,45 +50,74 @@ DRAWS = 40  # of each map, of the table on rejection
 
 
 class Coverage:
-    """What was found in the episodes of a unit: sums by map, shape [B, 6], the first of them of cells."""
+    """What was found in the episodes of a unit: sums by map, shape [B, 6], the first of
+    them of cells.
+    """
 
     def __init__(self, unit: Unit, built: Built) -> None:
         """Draws the times."""
         assert built.learning is not None
         assert built.simulation.field is not None
-        self._built, self._learner, self._field = built, built.learning.learner, built.simulation.field
+        self._built, self._learner, self._field = (
+            built,
+            built.learning.learner,
+            built.simulation.field,
+        )
         maps = np.array(unit.maps)
         every = round(unit.condition.rules.replan_every_s / built.problem.dt_s)
         drawn = rng.uniform(rng.stream_key(0, "coverage"), maps, (TIMES,))
-        self._steps = torch.from_numpy(every * np.ceil(drawn * LATEST_S / built.problem.dt_s / every)).long()
-        self._rank = torch.from_numpy(rng.uniform(rng.stream_key(0, "rank"), maps, built.problem.grid.shape))
+        self._steps = torch.from_numpy(
+            every * np.ceil(drawn * LATEST_S / built.problem.dt_s / every)
+        ).long()
+        self._rank = torch.from_numpy(
+            rng.uniform(rng.stream_key(0, "rank"), maps, built.problem.grid.shape)
+        )
         self.sums = torch.zeros(len(maps), 6, dtype=torch.float64)
 
     def __call__(self, step: int, knowing: Knowing) -> None:
         """Asks what is believed where a time was drawn; of robots that are left."""
         known, members = knowing.known, knowing.members
         asked = (self._steps[members] == step).any(1) & known.reached.flatten(1).any(1)
-        cells = _near(known.reached, self._built.problem.grid.resolution_m) & ~known.ever_sensed
+        cells = (
+            _near(known.reached, self._built.problem.grid.resolution_m)
+            & ~known.ever_sensed
+        )
         cells &= asked[:, None, None]
         if not bool(cells.any()):
             return
-        value, member = self._field[members][cells][None], members[cells.nonzero()[:, 0]]
+        value, member = (
+            self._field[members][cells][None],
+            members[cells.nonzero()[:, 0]],
+        )
         believed = self._learner.distribution(known).at(cells)
         low, high = believed.cdf_limits(value)
         pit = torch.lerp(low.double(), high.double(), self._rank[members][cells][None])
         predicted = self._built.problem.distribution.select(members).at(cells)
         told = (
-            torch.ones_like(pit), (pit - 0.5).abs() <= 0.45, pit < 0.05, pit > 0.95,
-            believed.log_prob(value).clamp(min=-10), predicted.log_prob(value).clamp(min=-10),
-        )  # fmt: skip
-        self.sums.index_add_(0, member, torch.stack([part[0].double() for part in told], 1))
+            torch.ones_like(pit),
+            (pit - 0.5).abs() <= 0.45,
+            pit < 0.05,
+            pit > 0.95,
+            believed.log_prob(value).clamp(min=-10),
+            predicted.log_prob(value).clamp(min=-10),
+        )
+        self.sums.index_add_(
+            0, member, torch.stack([part[0].double() for part in told], 1)
+        )
 
 
 def _near(reached: Tensor, resolution_m: float) -> Tensor:
-    """Cells within `NEAR_M` of the middle of those that sensors told of, bool, shape [B, H, W]."""
-    row, column = (torch.arange(size, dtype=torch.float64) for size in reached.shape[1:])
+    """Cells within `NEAR_M` of the middle of those that sensors told of, bool, shape
+    [B, H, W].
+    """
+    row, column = (
+        torch.arange(size, dtype=torch.float64) for size in reached.shape[1:]
+    )
     count = reached.flatten(1).sum(1).clamp(min=1)
-    middle = [(reached.sum(axis) * line).sum(1) / count for axis, line in ((2, row), (1, column))]
+    middle = [
+        (reached.sum(axis) * line).sum(1) / count
+        for axis, line in ((2, row), (1, column))
+    ]
     down = (row - middle[0][:, None])[:, :, None]
     across = (column - middle[1][:, None])[:, None]
     return torch.hypot(down, across) * resolution_m <= NEAR_M
@@ -95,12 +127,16 @@ def suite_of(data: Path, models: Sequence[str] = MODELS) -> Suite:
     """Return who learns by what, in which world."""
     common: dict[str, Any] = {"grounds": list(GROUNDS), "beliefs": ("copula",)}
     return stakes_suite(
-        data, planners=("astar_dwa",), risks=("expected-time",), seeds=(), world="paper",
+        data,
+        planners=("astar_dwa",),
+        risks=("expected-time",),
+        seeds=(),
+        world="paper",
         conditions=(
             {"models": list(models), "world": "stakes", **common},
             {"models": ["oracle"], "world": LAW, **common},
         ),
-    )  # fmt: skip
+    )
 
 
 def sums_of(unit: Unit, settings: Settings, out: Path) -> Tensor:
@@ -133,17 +169,23 @@ def measured(suite: Suite, maps: int, out: Path) -> Rows:
         # A ratio of sums over maps: its error by the residuals of the maps.
         residual = sums[:, 1] - inside * sums[:, 0]
         error = 1.96 * np.sqrt((residual**2).sum()) / cells
-        rows.append({
-            "model": labels["model"],
-            "λ": "no draw rejected" if "immobile" in labels["world"] else "with rejection",
-            "ground": labels["ground"],
-            "cells": f"{cells:.0f}",
-            "inside 90 % (95 % interval)": f"{inside:.3f} ({inside - error:.3f} to {inside + error:.3f})",
-            "under": f"{under:.3f}",
-            "over": f"{over:.3f}",
-            "log score": f"{score:.2f}",
-            "of the prediction": f"{of_prediction:.2f}",
-        })  # fmt: skip
+        rows.append(
+            {
+                "model": labels["model"],
+                "λ": "no draw rejected"
+                if "immobile" in labels["world"]
+                else "with rejection",
+                "ground": labels["ground"],
+                "cells": f"{cells:.0f}",
+                "inside 90 % (95 % interval)": f"{inside:.3f} ({inside - error:.3f} "
+                "to "
+                f"{inside + error:.3f})",
+                "under": f"{under:.3f}",
+                "over": f"{over:.3f}",
+                "log score": f"{score:.2f}",
+                "of the prediction": f"{of_prediction:.2f}",
+            }
+        )
     return rows
 
 
@@ -173,7 +215,12 @@ def rejection(data: Path, maps: int) -> Rows:
         # Maps with no draw that is kept say nothing.
         for index in sums[1, 0].flatten(1).amax(1).nonzero()[:, 0].tolist():
             change = (kept_draws - all_draws)[:, index]
-            changes.append([change[:, cells].mean(1).tolist() for cells in (near[index], ~near[index])])
+            changes.append(
+                [
+                    change[:, cells].mean(1).tolist()
+                    for cells in (near[index], ~near[index])
+                ]
+            )
     return [
         {
             "draws rejected": f"{n_rejected / DRAWS / maps:.1%}",
@@ -182,23 +229,38 @@ def rejection(data: Path, maps: int) -> Rows:
             f"of P(λ < {world.immobile.below:g})": f"{probability:+.4f}",
         }
         for cells, (mean, probability) in zip(
-            ("near the straight line", "elsewhere"), np.mean(changes, axis=0), strict=True
+            ("near the straight line", "elsewhere"),
+            np.mean(changes, axis=0),
+            strict=True,
         )
     ]
 
 
 def _near_line(start_m: Tensor, goal_m: Tensor, grid: Grid) -> Tensor:
-    """Return the cells within `NEAR_M` of the straight line from start to goal, bool, shape [B, H, W]."""
+    """Return the cells within `NEAR_M` of the straight line from start to goal, bool,
+    shape [B, H, W].
+    """
     row, column = torch.meshgrid(*map(torch.arange, grid.shape), indexing="ij")
     cell = torch.stack(grid.centre_of(row, column), -1)[None].double()
-    start, line = start_m.double()[:, None, None], (goal_m - start_m).double()[:, None, None]
+    start, line = (
+        start_m.double()[:, None, None],
+        (goal_m - start_m).double()[:, None, None],
+    )
     part = (((cell - start) * line).sum(-1) / line.square().sum(-1)).clamp(0, 1)
-    return torch.linalg.vector_norm(cell - start - part[..., None] * line, dim=-1) <= NEAR_M
+    return (
+        torch.linalg.vector_norm(cell - start - part[..., None] * line, dim=-1)
+        <= NEAR_M
+    )
 
 
 def coverage(
     work: Work, folder: Path, data: str, maps: int, models: Sequence[str] = MODELS
 ) -> dict[str, Rows]:
-    """Return coverage of the belief on the first maps of a dataset, and what rejection of draws changes."""
+    """Return coverage of the belief on the first maps of a dataset, and what rejection
+    of draws changes.
+    """
     path = work.maps_in / f"{data}.h5"
-    return {"rejection": rejection(path, maps), "coverage": measured(suite_of(path, models), maps, folder)}
+    return {
+        "rejection": rejection(path, maps),
+        "coverage": measured(suite_of(path, models), maps, folder),
+    }

@@ -20,23 +20,33 @@ ALL_KNOWN = "all of λ"
 
 
 def known_of(row: Mapping[Any, Any]) -> str:
-    """Return what is known in a condition; empty where it is none of the study's main series."""
+    """Return what is known in a condition; empty where it is none of the study's main
+    series.
+    """
     if row["model"] == "clairvoyant":
         return ALL_KNOWN
-    return KNOWN.get((row["ground"], row["belief"]), "") if row["sensor"] == "full" else ""
+    return (
+        KNOWN.get((row["ground"], row["belief"]), "") if row["sensor"] == "full" else ""
+    )
 
 
 @styled()
 def known(summary: pd.DataFrame) -> Figure:
     """Draw the figure from the rows of `known` and `known-mppi`."""
-    rows = summary[(summary["world"] == "stakes") & summary["planner"].isin(("astar_dwa", "astar_mppi"))]
+    rows = summary[
+        (summary["world"] == "stakes")
+        & summary["planner"].isin(("astar_dwa", "astar_mppi"))
+    ]
     rows = rows.assign(known=[known_of(row) for row in rows.to_dict("records")])
     rows = rows[rows["known"] != ""]
     # The clairvoyant has one row, which is of all models and risk settings.
     is_told = rows["model"] == "clairvoyant"
     settings = rows.loc[~is_told, ["planner", "model", "risk"]].drop_duplicates()
     rows = pd.concat(
-        [rows[~is_told], rows[is_told].drop(columns=["model", "risk"]).merge(settings, on="planner")]
+        [
+            rows[~is_told],
+            rows[is_told].drop(columns=["model", "risk"]).merge(settings, on="planner"),
+        ]
     )
     names = [*KNOWN.values(), ALL_KNOWN]
     risks = list(dict.fromkeys(rows["risk"]))
@@ -46,7 +56,9 @@ def known(summary: pd.DataFrame) -> Figure:
         line=rows["risk"].map(risk_name),
         x=rows["known"].map(names.index) + beside,
     )
-    figure, panels = draw_curves(rows.sort_values("x"), {"success": SUCCESS}, high_in=2.3)
+    figure, panels = draw_curves(
+        rows.sort_values("x"), {"success": SUCCESS}, high_in=2.3
+    )
     for panel in panels.values():
         panel.set_xticks(range(len(names)), names)
     return figure

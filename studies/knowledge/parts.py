@@ -1,7 +1,8 @@
-"""Controls of the study of knowledge: a robot that learns what is not so, and one that plans anew for nothing.
+"""Controls of the study of knowledge: a robot that learns what is not so, and one that
+plans anew for nothing.
 
-`primary.yaml` names them as `benchmarks/knowledge_parts.py:NAME`, where they were when it was fixed; `study.yaml` says
-where they are.
+`primary.yaml` names them as `benchmarks/knowledge_parts.py:NAME`, where they were when
+it was fixed; `study.yaml` says where they are.
 """
 
 from dataclasses import dataclass, replace
@@ -21,10 +22,11 @@ from benchnav.planning.robots import steps_in
 
 @dataclass(frozen=True)
 class Elsewhere(Probe):
-    """The probe, of another draw of λ than the one that is driven on: what it tells is as plausible, and not so.
+    """The probe, of another draw of λ than the one that is driven on: what it tells is
+    as plausible, and not so.
 
-    The draw has the true distribution of each cell and the world's correlation; it is not rejected where no path is
-    feasible.
+    The draw has the true distribution of each cell and the world's correlation; it is
+    not rejected where no path is feasible.
 
     Args:
         correlation_m: ℓ of the draw.
@@ -32,10 +34,14 @@ class Elsewhere(Probe):
 
     correlation_m: float = 1.5
 
-    def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
+    def sense(
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
+    ) -> Sensed:
         near = self._near(terrain, robot_state)
         cells = self.correlation_m / terrain.grid.resolution_m
-        scores = np.stack([_scores(key, terrain.grid.shape, cells) for key in moment.keys])
+        scores = np.stack(
+            [_scores(key, terrain.grid.shape, cells) for key in moment.keys]
+        )
         other = torch.full_like(field, torch.nan)
         drawn = torch.from_numpy(scores).to(field)[near]
         other[near] = terrain.truth.at(near).from_normal(drawn[None])[0].to(field.dtype)
@@ -45,18 +51,23 @@ class Elsewhere(Probe):
 @lru_cache(maxsize=256)
 def _scores(key: int, shape: tuple[int, int], correlation_cells: float) -> np.ndarray:
     """Normal scores of an episode's other draw; kept, since every step asks for them."""
-    return correlated_normal(rng.stream_key(key, "elsewhere"), np.arange(1), shape, correlation_cells)[0]
+    return correlated_normal(
+        rng.stream_key(key, "elsewhere"), np.arange(1), shape, correlation_cells
+    )[0]
 
 
 class Revising(AStarDWA):
-    """A\\*+DWA that revises its plan as often as a robot that learns, though nothing is learnt."""
+    """A\\*+DWA that revises its plan as often as a robot that learns, though nothing is
+    learnt.
+    """
 
     def plan(self, step: Any, plan_state: Any) -> Any:
         problem = plan_state.problem
         every = steps_in(problem.task.rules.replan_every_s, problem.dt_s)
         if round(step.time_s / problem.dt_s) % every == 0:
             problem = replace(problem, start=step.state)
-            # Maps are searched that have changed: all have, if all ground was of the other kind.
+            # Maps are searched that have changed: all have, if all ground was of the
+            # other kind.
             changed = replace(plan_state, problem=replace(problem, free=~problem.free))
             plan_state = self.revise(changed, problem)
         return super().plan(step, plan_state)

@@ -1,7 +1,7 @@
 """Success and time of planners over how long they compute: a curve a planner.
 
-Drives one robot on each of three maps by each planner of the run `matched`, and takes the mean time of a step but for
-the first ten, in which code is compiled.
+Drives one robot on each of three maps by each planner of the run `matched`, and takes
+the mean time of a step but for the first ten, in which code is compiled.
 """
 
 import json
@@ -29,14 +29,21 @@ def computing(work: Work, folder: Path) -> dict[str, Rows | Figure]:
     run = work.out / "matched"
     conditions = json.loads((run / "run.json").read_text())["conditions"]
     rows = pd.read_csv(run / "summary.csv")
-    rows["ms"] = [step_ms(conditions[condition]) for condition in track(rows["condition"], "measuring")]
+    rows["ms"] = [
+        step_ms(conditions[condition])
+        for condition in track(rows["condition"], "measuring")
+    ]
     rows["family"] = rows["planner"].str.replace(r" \d+( x \d+)?$", "", regex=True)
     table = [
         {
             "planner": row["planner"],
             "ms a step": f"{row['ms']:.2g}",
-            "success [%] (95 %)": "{:.0f} ({:.0f}–{:.0f})".format(*in_units(row, SUCCESS)),
-            "T_total [s] (95 %)": "{:.1f} ({:.1f}–{:.1f})".format(*in_units(row, TOTAL_TIME)),
+            "success [%] (95 %)": "{:.0f} ({:.0f}–{:.0f})".format(
+                *in_units(row, SUCCESS)
+            ),
+            "T_total [s] (95 %)": "{:.1f} ({:.1f}–{:.1f})".format(
+                *in_units(row, TOTAL_TIME)
+            ),
         }
         for row in rows.to_dict("records")
     ]
@@ -57,7 +64,9 @@ def step_ms(about: dict[str, Any]) -> float:
 def matched_figure(rows: pd.DataFrame) -> Figure:
     """Draw success and T_total over the time of a step."""
     measures = {"success": SUCCESS, "time": TOTAL_TIME}
-    rows = rows.assign(panel="", line=rows["family"], x=rows["ms"]).sort_values(["line", "x"])
+    rows = rows.assign(panel="", line=rows["family"], x=rows["ms"]).sort_values(
+        ["line", "x"]
+    )
     figure, panels = draw_curves(rows, measures, "ms a step of one robot")
     panels["", "success"].set_xscale("log")
     return figure

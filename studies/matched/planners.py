@@ -1,8 +1,10 @@
-"""Two planners that sample action sequences otherwise than MPPI does, to be compared at equal computing.
+"""Two planners that sample action sequences otherwise than MPPI does, to be compared at
+equal computing.
 
-Smooth MPPI: Kim, Park, Choi and Ha (2022), "Smooth model predictive path integral control without smoothing". iCEM:
-Pinneri et al. (2020), "Sample-efficient cross-entropy method for real-time planning", algorithm 1. Letters in shapes
-are those of `benchnav/planning/planners/mppi.py`, and E elites.
+Smooth MPPI: Kim, Park, Choi and Ha (2022), "Smooth model predictive path integral
+control without smoothing". iCEM: Pinneri et al. (2020), "Sample-efficient cross-entropy
+method for real-time planning", algorithm 1. Letters in shapes are those of
+`benchnav/planning/planners/mppi.py`, and E elites.
 """
 
 from dataclasses import dataclass, replace
@@ -14,7 +16,13 @@ from torch import Tensor
 from benchnav.core import rng
 from benchnav.planning import MPPI, MPPIConfig, Plan, Problem
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.mppi import Ends, MPPIState, advance_chunk, roll_out, total_cost
+from benchnav.planning.planners.mppi import (
+    Ends,
+    MPPIState,
+    advance_chunk,
+    roll_out,
+    total_cost,
+)
 from benchnav.planning.planners.noise_bank import NoiseBank, Sampled, perturb
 from benchnav.planning.robots import component_wise
 
@@ -24,8 +32,10 @@ class SmoothConfig(MPPIConfig):
     """Settings of Smooth MPPI.
 
     Args:
-        noise_share: standard deviation of what each step adds to an action, as a share of its range.
-        smoothness: weight of the squared changes of actions from step to step, each as a share of its range.
+        noise_share: standard deviation of what each step adds to an action, as a share
+            of its range.
+        smoothness: weight of the squared changes of actions from step to step, each as
+            a share of its range.
     """
 
     noise_share: float = 0.1
@@ -53,8 +63,13 @@ class SmoothMPPI(MPPI):
     ) -> tuple[Tensor, MPPIState, Plan]:
         problem, mean, config = plan_state.problem, plan_state.mean, self.config
         noise, (low, high) = plan_state.noise.at(plan_state.step), problem.action_bounds
-        states, cost, _ = roll_out(problem, step.state, mean, noise, target_m, self._advance)
-        changes = perturb(mean[..., None], noise, low, high).diff(dim=1) / (high - low)[:, None]
+        states, cost, _ = roll_out(
+            problem, step.state, mean, noise, target_m, self._advance
+        )
+        changes = (
+            perturb(mean[..., None], noise, low, high).diff(dim=1)
+            / (high - low)[:, None]
+        )
         cost = cost + config.smoothness * changes.square().sum((1, 2))
         ends = self._ends(plan_state, target_m, problem.padded_ground, None)
         _, updated = self._weigh(
@@ -93,12 +108,16 @@ class ICEMConfig(MPPIConfig):
 
 @dataclass(frozen=True)
 class Coloured:
-    """Noise of variance 1 that all episodes share, of which each iteration takes a part, shape [T, A, 4K]."""
+    """Noise of variance 1 that all episodes share, of which each iteration takes a
+    part, shape [T, A, 4K].
+    """
 
     values: Tensor
 
     def take(self, key: int, count: int) -> Tensor:
-        """Return so many sequences from an index that a key decides, shape [T, A, count]."""
+        """Return so many sequences from an index that a key decides, shape [T, A,
+        count].
+        """
         first = key % (self.values.shape[2] - count + 1)
         return self.values[..., first : first + count]
 
@@ -117,11 +136,15 @@ class ICEMState(MPPIState):
 
 
 class ICEM(MPPI):
-    """The improved cross-entropy method: coloured noise, and the best sequences are kept."""
+    """The improved cross-entropy method: coloured noise, and the best sequences are
+    kept.
+    """
 
     def __init__(self, config: ICEMConfig | None = None) -> None:
         super().__init__(config or ICEMConfig())
-        self._roll = Fused(_advance, self.config.samples, self.worth_compiling, batched=(0, 1, 2, 5, 6))
+        self._roll = Fused(
+            _advance, self.config.samples, self.worth_compiling, batched=(0, 1, 2, 5, 6)
+        )
 
     @property
     def _kept(self) -> int:
@@ -131,34 +154,51 @@ class ICEM(MPPI):
         base, config = super().init(problem, generator), self.config
         horizon, actions = base.mean.shape[1:]
         own = rng.generator(rng.stream_key(base.key, "coloured"))
-        coloured = coloured_noise(horizon, (actions, 4 * config.samples), config.colour, own).to(base.mean)
+        coloured = coloured_noise(
+            horizon, (actions, 4 * config.samples), config.colour, own
+        ).to(base.mean)
         elites = base.mean[..., None].expand(-1, -1, -1, self._kept)
         return ICEMState(**vars(base), elites=elites, coloured=Coloured(coloured))
 
-    def plan_toward(self, step: Any, plan_state: Any, target_m: Tensor) -> tuple[Tensor, Any, Plan]:
+    def plan_toward(
+        self, step: Any, plan_state: Any, target_m: Tensor
+    ) -> tuple[Tensor, Any, Plan]:
         problem, config, mean = plan_state.problem, self.config, plan_state.mean
         low, high = problem.action_bounds
         std = (config.noise_share * (high - low)).expand_as(mean)
         tried = plan_state.elites
         for iteration in range(config.iterations):
-            count = max(2 * config.elites, int(config.samples / config.decay**iteration))
+            count = max(
+                2 * config.elites, int(config.samples / config.decay**iteration)
+            )
             key = rng.stream_key(plan_state.key, plan_state.step, iteration)
             noise = plan_state.coloured.take(key, count)
-            samples = torch.clamp(mean[..., None] + std[..., None] * noise, low[:, None], high[:, None])
+            samples = torch.clamp(
+                mean[..., None] + std[..., None] * noise, low[:, None], high[:, None]
+            )
             last = [mean[..., None]] if iteration == config.iterations - 1 else []
             samples = torch.cat((samples, tried, *last), dim=3)
             cost = self._cost(problem, step.state, samples, target_m, plan_state.to_go)
             best = cost.topk(config.elites, dim=1, largest=False).indices
-            elites = samples.gather(3, best[:, None, None].expand(-1, *samples.shape[1:3], -1))
+            elites = samples.gather(
+                3, best[:, None, None].expand(-1, *samples.shape[1:3], -1)
+            )
             mean = config.momentum * mean + (1 - config.momentum) * elites.mean(3)
             std = config.momentum * std + (1 - config.momentum) * elites.std(3)
             tried = elites[..., : self._kept]
-        shifted, kept = (torch.cat((each[:, 1:], each[:, -1:]), dim=1) for each in (mean, tried))
+        shifted, kept = (
+            torch.cat((each[:, 1:], each[:, -1:]), dim=1) for each in (mean, tried)
+        )
         after = replace(plan_state, mean=shifted, elites=kept, step=plan_state.step + 1)
         return elites[:, 0, :, 0], after, Plan.empty(len(problem), step.state.device)
 
     def _cost(
-        self, problem: Problem, state: Tensor, samples: Tensor, target_m: Tensor, to_go: Tensor | None
+        self,
+        problem: Problem,
+        state: Tensor,
+        samples: Tensor,
+        target_m: Tensor,
+        to_go: Tensor | None,
     ) -> Tensor:
         """Return what sequences cost, shape [B, K]."""
         ground, target = problem.padded_ground, target_m[:, None].contiguous()
@@ -166,26 +206,45 @@ class ICEM(MPPI):
         cost = state.new_zeros(states.shape[:2])
         for chunk in samples.split(10, dim=1):
             states, cost = self._roll(
-                states, cost, chunk.contiguous(), *problem.action_bounds, ground, target, problem.dynamics
+                states,
+                cost,
+                chunk.contiguous(),
+                *problem.action_bounds,
+                ground,
+                target,
+                problem.dynamics,
             )
-        return total_cost(states, cost, Ends(ground, target, problem.grid, problem.objective, to_go=to_go))[0]
+        return total_cost(
+            states,
+            cost,
+            Ends(ground, target, problem.grid, problem.objective, to_go=to_go),
+        )[0]
 
 
 def _advance(
     states: Tensor, cost: Tensor, actions: Tensor, low: Tensor, high: Tensor, *rest: Any
 ) -> tuple[Tensor, Tensor]:
-    """Roll samples out whose actions, [B, T, A, K], differ by episode: as deviations from a mean of 0."""
-    sampled = Sampled(torch.zeros_like(actions[..., 0]), actions.movedim(1, 0), low, high)
+    """Roll samples out whose actions, [B, T, A, K], differ by episode: as deviations
+    from a mean of 0.
+    """
+    sampled = Sampled(
+        torch.zeros_like(actions[..., 0]), actions.movedim(1, 0), low, high
+    )
     return advance_chunk(states, cost, sampled, *rest)
 
 
-def coloured_noise(steps: int, shape: tuple[int, ...], colour: float, generator: torch.Generator) -> Tensor:
-    """Normal noise of mean 0 and variance 1 whose spectrum over time falls as 1 / f^colour, shape [steps, *shape].
+def coloured_noise(
+    steps: int, shape: tuple[int, ...], colour: float, generator: torch.Generator
+) -> Tensor:
+    """Normal noise of mean 0 and variance 1 whose spectrum over time falls as 1 /
+    f^colour, shape [steps, *shape].
 
     Source: Timmer and König (1995), "On generating power law noise".
     """
     frequencies = torch.fft.rfftfreq(steps)
-    frequencies[0] = frequencies[1]  # as the lowest that a sequence of this length can tell
+    frequencies[0] = frequencies[
+        1
+    ]  # as the lowest that a sequence of this length can tell
     scale = frequencies ** (-colour / 2)
     real, imaginary = torch.randn((2, len(scale), *shape), generator=generator)
     imaginary[0] = 0

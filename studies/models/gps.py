@@ -1,7 +1,9 @@
-"""Errors of the class-wise Gaussian processes where each cell is read with its true class.
+"""Errors of the class-wise Gaussian processes where each cell is read with its true
+class.
 
-No number has to do with the classifier. Other priors than the default are tried too, on all slopes and on flat ground
-only, to see how much of what is predicted of steeper terrain is the prior's.
+No number has to do with the classifier. Other priors than the default are tried too, on
+all slopes and on flat ground only, to see how much of what is predicted of steeper
+terrain is the prior's.
 """
 
 import contextlib
@@ -30,15 +32,22 @@ BEYOND_DEG = (5.0, 10.0)
 BANDS_DEG = ((0, 10), (10, 15), (15, 18), (18, 21), (21, 24), (24, 27), (27, 90))
 
 
-def distributions(table: SlopeTable, terrain: Terrain) -> tuple[TraversabilityMixture, TraversabilityMixture]:
+def distributions(
+    table: SlopeTable, terrain: Terrain
+) -> tuple[TraversabilityMixture, TraversabilityMixture]:
     """Predicted and true distribution of λ in each cell, its class known."""
     predicted = table.own(terrain.class_id, terrain.slope_deg.double())
-    truth = [v.double() for v in (terrain.truth.weights, terrain.truth.means, terrain.truth.stds)]
+    truth = [
+        v.double()
+        for v in (terrain.truth.weights, terrain.truth.means, terrain.truth.stds)
+    ]
     return predicted, TraversabilityMixture(*truth)
 
 
 def errors(table: SlopeTable, dataset: TerrainDataset) -> Rows:
-    """Return of each class RMSE of E[λ] over bins of 1° of the validation maps, and relative error of the noise."""
+    """Return of each class RMSE of E[λ] over bins of 1° of the validation maps, and
+    relative error of the noise.
+    """
     terrain = dataset.terrain("valid")
     predicted, true = distributions(table, terrain)
     gap = predicted.mean() - true.mean()
@@ -50,11 +59,13 @@ def errors(table: SlopeTable, dataset: TerrainDataset) -> Rows:
         means = bins.bincount(gap[is_class]) / cells.clamp(min=1)
         rmse = means[cells >= LEAST_CELLS].square().mean().sqrt()
         noise = float(table.noise_std[index]) / kind.noise - 1
-        rows.append({
-            "class": kind.name,
-            "RMSE of E[λ] over bins of 1°": f"{rmse:.4f}",
-            "error of the noise": f"{noise:+.1%}",
-        })  # fmt: skip
+        rows.append(
+            {
+                "class": kind.name,
+                "RMSE of E[λ] over bins of 1°": f"{rmse:.4f}",
+                "error of the noise": f"{noise:+.1%}",
+            }
+        )
     return rows
 
 
@@ -77,12 +88,22 @@ def bands(table: SlopeTable, dataset: TerrainDataset, split: str) -> Rows:
     for low, high in BANDS_DEG:
         is_between = (terrain.slope_deg >= low) & (terrain.slope_deg < high)
         covered = f"{coverage(transformed[is_between]):.1%}"
-        rows.append({"slope": f"{low}–{high}°", "cells": int(is_between.sum()), "coverage of 90 %": covered})
+        rows.append(
+            {
+                "slope": f"{low}–{high}°",
+                "cells": int(is_between.sum()),
+                "coverage of 90 %": covered,
+            }
+        )
     return rows
 
 
-def prior_error(table: SlopeTable, classes: tuple[TerrainClass, ...], low: float, high: float) -> str:
-    """Return RMSE and bias of E[λ] over all classes and slopes in a range, every tenth of a degree alike."""
+def prior_error(
+    table: SlopeTable, classes: tuple[TerrainClass, ...], low: float, high: float
+) -> str:
+    """Return RMSE and bias of E[λ] over all classes and slopes in a range, every tenth
+    of a degree alike.
+    """
     slopes = torch.arange(low, high, 0.1, dtype=torch.float64).expand(len(classes), -1)
     ids = torch.arange(len(classes)).unsqueeze(1).expand_as(slopes)
     mean = torch.from_numpy(latent_mean(ids.numpy(), slopes.numpy(), classes))[None]
@@ -93,17 +114,29 @@ def prior_error(table: SlopeTable, classes: tuple[TerrainClass, ...], low: float
 
 
 def prior_table(
-    changes: Sequence[dict[str, Any]], short: SlopeSums, whole: SlopeSums, classes: tuple[TerrainClass, ...]
+    changes: Sequence[dict[str, Any]],
+    short: SlopeSums,
+    whole: SlopeSums,
+    classes: tuple[TerrainClass, ...],
 ) -> Rows:
-    """Return how much of what is predicted is the prior's, within the slopes of the data and beyond."""
+    """Return how much of what is predicted is the prior's, within the slopes of the
+    data and beyond.
+    """
     near, far = (EDGE_DEG + beyond for beyond in BEYOND_DEG)
     rows = []
     for change in changes:
-        of_whole, of_short = (fitted(sums, second_component=False, **change) for sums in (whole, short))
+        of_whole, of_short = (
+            fitted(sums, second_component=False, **change) for sums in (whole, short)
+        )
         name = ", ".join(f"{key} {value}" for key, value in change.items()) or "default"
-        row = {"prior": name, "all slopes: 0–12°": prior_error(of_whole, classes, 0.0, EDGE_DEG)}
+        row = {
+            "prior": name,
+            "all slopes: 0–12°": prior_error(of_whole, classes, 0.0, EDGE_DEG),
+        }
         for low, high in ((0.0, EDGE_DEG), (EDGE_DEG, near), (near, far)):
-            row[f"slopes < 12°: {low:.0f}–{high:.0f}°"] = prior_error(of_short, classes, low, high)
+            row[f"slopes < 12°: {low:.0f}–{high:.0f}°"] = prior_error(
+                of_short, classes, low, high
+            )
         rows.append(row)
     return rows
 
@@ -111,16 +144,25 @@ def prior_table(
 def fitted(sums: SlopeSums, **options: Any) -> SlopeTable:
     """Return the table of Gaussian processes that were fitted to sums."""
     with contextlib.redirect_stderr(io.StringIO()):
-        return fit_gps(read(LatentGPConfig, options, of("the options")), sums).tabulate()
+        return fit_gps(
+            read(LatentGPConfig, options, of("the options")), sums
+        ).tabulate()
 
 
-def tables(work: Work, folder: Path, priors: Sequence[dict[str, Any]]) -> dict[str, Rows]:
-    """Return errors by class, scores of two likelihoods, coverage by slope, and errors of other priors."""
+def tables(
+    work: Work, folder: Path, priors: Sequence[dict[str, Any]]
+) -> dict[str, Rows]:
+    """Return errors by class, scores of two likelihoods, coverage by slope, and errors
+    of other priors.
+    """
     dataset = TerrainDataset(work.maps_in / "paper-v1.h5")
     classes = dataset.recipe.classes
     sums = sum_split(dataset, "train")
     kinds = {kind: fitted(sums, likelihood=kind) for kind in ("censored", "gaussian")}
-    flat = (cells.select(cells.slope_deg < EDGE_DEG) for cells in read_cells(dataset, "train"))
+    flat = (
+        cells.select(cells.slope_deg < EDGE_DEG)
+        for cells in read_cells(dataset, "train")
+    )
     cut = sum_cells(flat, len(classes))
     return {
         "classes": errors(kinds["censored"], dataset),

@@ -1,10 +1,13 @@
-"""Tightness of the lower bound of the time to the goal, and a search for planners that are earlier than it.
+"""Tightness of the lower bound of the time to the goal, and a search for planners that
+are earlier than it.
 
-`gap` takes λ fields of the shipped test maps in the world `stakes`, and the near-optimal reference. The gap between the
-two is split by bounds that leave a cause out: the excess of slopes that W is divided by; that a step reaches from quick
-cells into slow ones; that robots may dip into immobilising terrain. The rest are turns, dwell time, and what the
-reference loses. `walls` draws small worlds with a wall of slow cells across, some of which immobilise a robot before it
-is over, and drives planners that are given λ.
+`gap` takes λ fields of the shipped test maps in the world `stakes`, and the
+near-optimal reference. The gap between the two is split by bounds that leave a cause
+out: the excess of slopes that W is divided by; that a step reaches from quick cells
+into slow ones; that robots may dip into immobilising terrain. The rest are turns, dwell
+time, and what the reference loses. `walls` draws small worlds with a wall of slow cells
+across, some of which immobilise a robot before it is over, and drives planners that are
+given λ.
 """
 
 import time
@@ -22,7 +25,16 @@ from benchnav import Grid
 from benchnav.core import rng
 from benchnav.core.registry import make, read_part
 from benchnav.eval.run.rollout import run_episodes
-from benchnav.planning import FreeSpace, Places, Rules, Simulation, Task, TravelTime, Unicycle, World
+from benchnav.planning import (
+    FreeSpace,
+    Places,
+    Rules,
+    Simulation,
+    Task,
+    TravelTime,
+    Unicycle,
+    World,
+)
 from benchnav.planning.free_space import Immobile
 from benchnav.planning.world import lower_bound
 from benchnav.planning.world.lower_bound import Mesh, Motion, lower_bound_s
@@ -42,7 +54,8 @@ _BLOCK = 10  # worlds of one wall
 _LIMIT_S = 60.0
 
 
-# --- the gap on shipped fields ------------------------------------------------------------------------
+# --- the gap on shipped fields
+# ------------------------------------------------------------------------
 
 
 @contextmanager
@@ -50,7 +63,9 @@ def without(**changes: Any) -> Iterator[None]:
     """Exchange parts of the bound, which then holds for a robot that is less able."""
     with ExitStack() as stack:
         for name, value in changes.items():
-            stack.enter_context(patch.object(Mesh if name == "excess" else lower_bound, name, value))
+            stack.enter_context(
+                patch.object(Mesh if name == "excess" else lower_bound, name, value)
+            )
         yield
 
 
@@ -61,11 +76,17 @@ def no_reach(fine: ndarray, squares: Grid, step_m: float, error_m: float) -> nda
 
 def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
     """Return fractions of the reference's time between it and the bound, by cause."""
-    suite = stakes_suite(DATA, planners=(REFERENCE,), models=("clairvoyant",), risks=("mean",))
+    suite = stakes_suite(
+        DATA, planners=(REFERENCE,), models=("clairvoyant",), risks=("mean",)
+    )
     times_s, built = drive_unit(one_unit(suite, maps))
     problem, field = built.problem, built.simulation.field
     assert field is not None
-    motion = Motion(robot=problem.robot, goal_radius_m=problem.goal_radius_m, immobile=problem.immobile)
+    motion = Motion(
+        robot=problem.robot,
+        goal_radius_m=problem.goal_radius_m,
+        immobile=problem.immobile,
+    )
     found, seconds = [], 0.0
     for number in np.flatnonzero(np.isfinite(times_s)):
         ends = problem.start[number, :2].numpy(), problem.goal_m[number].numpy()
@@ -73,20 +94,31 @@ def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
         begun = time.process_time()
         least = lower_bound_s(*given)
         seconds += time.process_time() - begun
-        with without(excess=lambda mesh, value: 1.0, _CHECK_EVERY=lower_bound._MOST_STEPS):
+        with without(
+            excess=lambda mesh, value: 1.0, _CHECK_EVERY=lower_bound._MOST_STEPS
+        ):
             converged = lower_bound_s(*given)
         with without(_reached=no_reach):
             reads = lower_bound_s(*given)
         with without(_reached=no_reach, _deepest_m=lambda motion, immobile: -1.0):
             dry = lower_bound_s(*given)
         whole = times_s[number]
-        steps = (least, converged, max(converged, reads), min(max(reads, dry), whole), whole)
+        steps = (
+            least,
+            converged,
+            max(converged, reads),
+            min(max(reads, dry), whole),
+            whole,
+        )
         found.append(np.diff(steps) / whole)
     parts = np.array(found)
     names = (
-        "slopes in excess", "steps reach into slow cells", "dips into immobilising terrain", "turns, and the reference",
+        "slopes in excess",
+        "steps reach into slow cells",
+        "dips into immobilising terrain",
+        "turns, and the reference",
         "all",
-    )  # fmt: skip
+    )
     print(f"{len(parts)} fields, {seconds / len(parts):.1f} CPU-s each")
     rows = [
         {
@@ -99,11 +131,16 @@ def gap(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
     return {"gap": rows}
 
 
-# --- planners in worlds with walls --------------------------------------------------------------------
+# --- planners in worlds with walls
+# --------------------------------------------------------------------
 
 
-def walled(generator: np.random.Generator, grid: Grid, count: int) -> tuple[ndarray, Immobile]:
-    """λ of worlds with a wall that takes 0.5 to 1.2 of the time that immobilises a robot, with gaps at times."""
+def walled(
+    generator: np.random.Generator, grid: Grid, count: int
+) -> tuple[ndarray, Immobile]:
+    """λ of worlds with a wall that takes 0.5 to 1.2 of the time that immobilises a
+    robot, with gaps at times.
+    """
     fields = generator.choice([0.6, 0.8, 0.95], (count, *grid.shape))
     thickness, slow = int(generator.integers(1, 5)), float(generator.uniform(0.1, 0.9))
     first = int(generator.integers(6, grid.width - 10))
@@ -111,22 +148,41 @@ def walled(generator: np.random.Generator, grid: Grid, count: int) -> tuple[ndar
     holes = generator.random(fields.shape) < generator.choice([0.0, 0.02, 0.1])
     fields[holes] = 0.95
     crossing_s = thickness * grid.resolution_m / slow
-    immobile = Immobile(below=min(1.0, slow * 1.05), for_s=crossing_s / float(generator.uniform(0.5, 1.2)))
+    immobile = Immobile(
+        below=min(1.0, slow * 1.05),
+        for_s=crossing_s / float(generator.uniform(0.5, 1.2)),
+    )
     return fields, immobile
 
 
 def drive_worlds(fields: ndarray, immobile: Immobile, grid: Grid, name: str) -> ndarray:
-    """Return seconds to the goal of a planner that is given λ, infinite if it does not arrive, shape [B]."""
+    """Return seconds to the goal of a planner that is given λ, infinite if it does not
+    arrive, shape [B].
+    """
     ground, robot = torch.from_numpy(fields).float(), Unicycle()
     rules = Rules(free_space=FreeSpace(by="mean", above=0.05), min_traversability=0.02)
-    task = Task(robot=robot, objective=TravelTime(robot, rules.goal_radius_m), rules=rules)
-    start_m, goal_m = (torch.from_numpy(end).float().repeat(len(ground), 1) for end in ends_of(grid))
-    problem, terrain = pose_on(ground, grid, (start_m, goal_m), task, _LIMIT_S, immobile=immobile)
-    places = Places(start_m=start_m, goal_m=goal_m, reference_time_s=torch.full((len(ground),), torch.nan))
+    task = Task(
+        robot=robot, objective=TravelTime(robot, rules.goal_radius_m), rules=rules
+    )
+    start_m, goal_m = (
+        torch.from_numpy(end).float().repeat(len(ground), 1) for end in ends_of(grid)
+    )
+    problem, terrain = pose_on(
+        ground, grid, (start_m, goal_m), task, _LIMIT_S, immobile=immobile
+    )
+    places = Places(
+        start_m=start_m,
+        goal_m=goal_m,
+        reference_time_s=torch.full((len(ground),), torch.nan),
+    )
     world = World(noise="stored", immobile=immobile, time_budget_s=_LIMIT_S)
     simulation = Simulation(terrain, task, world, places, 1, range(len(ground)))
-    planner = make("planner", read_part("planner", {"part": name, "options": PLANNERS[name]}))
-    return seconds_of(run_episodes(planner, problem, simulation, rng.generator(0)), robot.dt_s)
+    planner = make(
+        "planner", read_part("planner", {"part": name, "options": PLANNERS[name]})
+    )
+    return seconds_of(
+        run_episodes(planner, problem, simulation, rng.generator(0)), robot.dt_s
+    )
 
 
 def ends_of(grid: Grid) -> tuple[ndarray, ndarray]:
@@ -136,13 +192,19 @@ def ends_of(grid: Grid) -> tuple[ndarray, ndarray]:
 
 
 def walls(work: Work, folder: Path, maps: int = 500) -> dict[str, Rows]:
-    """Return whether a planner is earlier than the bound in worlds with walls, or arrives where it is infinite."""
+    """Return whether a planner is earlier than the bound in worlds with walls, or
+    arrives where it is infinite.
+    """
     grid, generator = Grid(13, 26, 0.5), np.random.default_rng(0)
     blocks = [walled(generator, grid, _BLOCK) for _ in range(max(1, maps // _BLOCK))]
     bounds = []
     for fields, immobile in blocks:
-        motion = Motion(robot=Unicycle(), goal_radius_m=Rules().goal_radius_m, immobile=immobile)
-        bounds += [lower_bound_s(field, grid, motion, *ends_of(grid)) for field in fields]
+        motion = Motion(
+            robot=Unicycle(), goal_radius_m=Rules().goal_radius_m, immobile=immobile
+        )
+        bounds += [
+            lower_bound_s(field, grid, motion, *ends_of(grid)) for field in fields
+        ]
     least = np.array(bounds)
     print(f"{len(least)} worlds; in {np.isinf(least).sum()} the bound is infinite")
     rows = []
@@ -150,11 +212,13 @@ def walls(work: Work, folder: Path, maps: int = 500) -> dict[str, Rows]:
         times = np.concatenate([drive_worlds(*block, grid, name) for block in blocks])
         has_arrived = np.isfinite(times)
         both = has_arrived & np.isfinite(least)
-        rows.append({
-            "planner, given λ": name,
-            "arrived": has_arrived.sum(),
-            "earlier than the bound": (times[both] < least[both]).sum(),
-            "where it is infinite": (has_arrived & np.isinf(least)).sum(),
-            "bound over its time: median": f"{np.median(least[both] / times[both]):.3f}",
-        })  # fmt: skip
+        rows.append(
+            {
+                "planner, given λ": name,
+                "arrived": has_arrived.sum(),
+                "earlier than the bound": (times[both] < least[both]).sum(),
+                "where it is infinite": (has_arrived & np.isinf(least)).sum(),
+                "bound over its time: median": f"{np.median(least[both] / times[both]):.3f}",
+            }
+        )
     return {"walls": rows}

@@ -1,10 +1,13 @@
-"""Error of the optimal planners: their grid, dwell time, and whether another planner is quicker.
+"""Error of the optimal planners: their grid, dwell time, and whether another planner is
+quicker.
 
-On λ fields of maps of `stakes-v1 --seed 1`, drawn without rejection, which the planners are given (`clairvoyant`). The
-first table compares the time from start to goal with that at twice the resolution, and whether both find a path; the
-second says how much more it is where immobilising terrain counts as loss at once (`levels: 0`). The third drives the
-other planners on the same fields, which immobilise no robot: a planner is quicker where it takes less than the optimal
-planner by more than the difference to twice the resolution on that map.
+On λ fields of maps of `stakes-v1 --seed 1`, drawn without rejection, which the planners
+are given (`clairvoyant`). The first table compares the time from start to goal with
+that at twice the resolution, and whether both find a path; the second says how much
+more it is where immobilising terrain counts as loss at once (`levels: 0`). The third
+drives the other planners on the same fields, which immobilise no robot: a planner is
+quicker where it takes less than the optimal planner by more than the difference to
+twice the resolution on that map.
 """
 
 import time
@@ -26,21 +29,31 @@ from studies.units import STAKES, build_unit, one_unit, stakes_suite
 
 # λ is given, and immobilises no robot.
 GIVEN: dict[str, Any] = {
-    "models": ("clairvoyant",), "risks": ("mean",), "world": {"preset": "stakes", "immobile": None},
+    "models": ("clairvoyant",),
+    "risks": ("mean",),
+    "world": {"preset": "stakes", "immobile": None},
     "task": {"min_traversability": 0.01},
-}  # fmt: skip
+}
 HOLDS = Immobile(below=0.1, for_s=2.0)
 PLANNERS = ("optimal", "astar_dwa", "astar_mppi", "cl_rrt", "mppi")
 
 
-def cost_from_start(problem: Problem, planner: str, **options: Any) -> tuple[np.ndarray, float]:
-    """Return the time from start to goal, infinite if there is no path, shape [B], and seconds of a map."""
+def cost_from_start(
+    problem: Problem, planner: str, **options: Any
+) -> tuple[np.ndarray, float]:
+    """Return the time from start to goal, infinite if there is no path, shape [B], and
+    seconds of a map.
+    """
     made = make("planner", read_part("planner", {"part": planner, "options": options}))
     begun = time.perf_counter()
     state = Optimal.init(made, problem, rng.generator(0))  # value iteration only
     took = time.perf_counter() - begun
-    cost = ways_from(problem.start, state.held, state).cost.min(1).values.double().numpy()
-    return np.where(cost < made.no_way(state.costs).double().numpy(), cost, np.inf), took / len(problem)
+    cost = (
+        ways_from(problem.start, state.held, state).cost.min(1).values.double().numpy()
+    )
+    return np.where(
+        cost < made.no_way(state.costs).double().numpy(), cost, np.inf
+    ), took / len(problem)
 
 
 def more_time(times: np.ndarray, base: np.ndarray) -> np.ndarray:
@@ -50,7 +63,9 @@ def more_time(times: np.ndarray, base: np.ndarray) -> np.ndarray:
 
 
 def grid_table(problem: Problem) -> tuple[Rows, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return differences to twice the resolution, and of each row the times at both, each of shape [B]."""
+    """Return differences to twice the resolution, and of each row the times at both,
+    each of shape [B].
+    """
     immobilising, rows, times = replace(problem, immobile=HOLDS), [], []
     cases: tuple[tuple[str, str, Problem, dict[str, Any]], ...] = (
         ("optimal", "optimal", problem, {}),
@@ -61,15 +76,17 @@ def grid_table(problem: Problem) -> tuple[Rows, list[tuple[np.ndarray, np.ndarra
         coarse, took = cost_from_start(posed, planner, **options)
         fine, longer = cost_from_start(posed, planner, refine=2, headings=64, **options)
         more = more_time(coarse, fine)
-        rows.append({
-            "planner": name,
-            "more time than at twice the resolution: median": f"{np.median(more):+.1%}",
-            "difference: median": f"{np.median(np.abs(more)):.1%}",
-            "90th percentile": f"{np.quantile(np.abs(more), 0.9):.1%}",
-            "a path is found or not: agrees": f"{np.mean(np.isfinite(coarse) == np.isfinite(fine)):.0%}",
-            "s a map": f"{took:.2f}",
-            "at twice the resolution": f"{longer:.2f}",
-        })  # fmt: skip
+        rows.append(
+            {
+                "planner": name,
+                "more time than at twice the resolution: median": f"{np.median(more):+.1%}",
+                "difference: median": f"{np.median(np.abs(more)):.1%}",
+                "90th percentile": f"{np.quantile(np.abs(more), 0.9):.1%}",
+                "a path is found or not: agrees": f"{np.mean(np.isfinite(coarse) == np.isfinite(fine)):.0%}",
+                "s a map": f"{took:.2f}",
+                "at twice the resolution": f"{longer:.2f}",
+            }
+        )
         times.append((coarse, fine))
     return rows, times
 
@@ -77,42 +94,58 @@ def grid_table(problem: Problem) -> tuple[Rows, list[tuple[np.ndarray, np.ndarra
 def loss_table(reference: np.ndarray, entry: np.ndarray) -> Rows:
     """Return what counting entry as loss adds to the time of the reference."""
     more = more_time(entry, reference)
-    return [{
-        "entry as loss": f"{len(reference)} fields",
-        "more time: median": f"{np.median(more):.1%}",
-        "90th percentile": f"{np.quantile(more, 0.9):.1%}",
-        "maximum": f"{more.max():.1%}",
-        "paths lost": (np.isfinite(reference) & ~np.isfinite(entry)).sum(),
-    }]  # fmt: skip
+    return [
+        {
+            "entry as loss": f"{len(reference)} fields",
+            "more time: median": f"{np.median(more):.1%}",
+            "90th percentile": f"{np.quantile(more, 0.9):.1%}",
+            "maximum": f"{more.max():.1%}",
+            "paths lost": (np.isfinite(reference) & ~np.isfinite(entry)).sum(),
+        }
+    ]
 
 
 def drive(data: Path, maps: int) -> pd.DataFrame:
-    """Return seconds to the goal, infinite if it was not reached, a row a map and a column a planner."""
-    results = evaluate(data, planners=PLANNERS, maps=maps, verbose=False, **STAKES | GIVEN)
-    seconds = results.episodes["total_time_s"].where(results.episodes["success"], np.inf)
-    return results.episodes.assign(seconds=seconds).pivot(index="map", columns="planner", values="seconds")
+    """Return seconds to the goal, infinite if it was not reached, a row a map and a
+    column a planner.
+    """
+    results = evaluate(
+        data, planners=PLANNERS, maps=maps, verbose=False, **STAKES | GIVEN
+    )
+    seconds = results.episodes["total_time_s"].where(
+        results.episodes["success"], np.inf
+    )
+    return results.episodes.assign(seconds=seconds).pivot(
+        index="map", columns="planner", values="seconds"
+    )
 
 
 def planner_table(seconds: pd.DataFrame, gap_s: np.ndarray) -> Rows:
-    """Return whether planners are quicker than the optimal one, by more than its grid's difference on that map."""
+    """Return whether planners are quicker than the optimal one, by more than its grid's
+    difference on that map.
+    """
     best, rows = seconds["optimal"], []
     for planner in PLANNERS:
         own = seconds[planner]
         has_arrived = np.isfinite(own)
-        rows.append({
-            "planner": planner,
-            "arrived": f"{has_arrived.sum()} of {len(own)}",
-            "time over that of optimal: median": f"{1 + np.median(more_time(own, best)):.3f}",
-            "quicker": f"{np.mean(has_arrived & (own < best)):.0%}",
-            "quicker by more than the grid": f"{np.mean(has_arrived & (own < best - gap_s)):.0%}",
-        })  # fmt: skip
+        rows.append(
+            {
+                "planner": planner,
+                "arrived": f"{has_arrived.sum()} of {len(own)}",
+                "time over that of optimal: median": f"{1 + np.median(more_time(own, best)):.3f}",
+                "quicker": f"{np.mean(has_arrived & (own < best)):.0%}",
+                "quicker by more than the grid": f"{np.mean(has_arrived & (own < best - gap_s)):.0%}",
+            }
+        )
     return rows
 
 
 def tables(work: Work, folder: Path, maps: int = 50) -> dict[str, Rows]:
     """Return the tables of the grid, of entry as loss and of the other planners."""
     data = work.maps_in / "stakes-v1-seed1.h5"
-    problem = build_unit(one_unit(stakes_suite(data, planners=("optimal",), **GIVEN), maps)).problem
+    problem = build_unit(
+        one_unit(stakes_suite(data, planners=("optimal",), **GIVEN), maps)
+    ).problem
     grid, ((coarse, fine), (reference, _), (entry, _)) = grid_table(problem)
     has_both = np.isfinite(coarse) & np.isfinite(fine)
     gap_s = np.abs(np.where(has_both, coarse, 0.0) - np.where(has_both, fine, 0.0))

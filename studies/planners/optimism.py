@@ -1,11 +1,16 @@
-"""Optimism of MPPI with risk on the cost: chosen actions cost more on fresh fields of λ than on its own.
+"""Optimism of MPPI with risk on the cost: chosen actions cost more on fresh fields of λ
+than on its own.
 
-MPPI chooses actions that cost little on the M fields that it drew, so that they could cost more on others (the optimism
-of a chosen minimum). Robots begin on maps of `stakes-v1 --seed 1` under the prediction of `stakes-v1`, with the time to
-go of `expected-time`, and drive on the mean of the prediction. After 0, 2 and 4 seconds the chosen actions are rolled
-out on 1 024 fresh fields. The table has the mean of fresh less own cost over maps and moments with its 95 % interval by
-maps (Student's t), in seconds, and how long a solve takes for one robot of a batch. CVaR of few fields is too low for
-any actions: so it has the same of those of the step before, which these fields did not choose.
+MPPI chooses actions that cost little on the M fields that it drew, so that they could
+cost more on others (the optimism of a chosen minimum). Robots begin on maps of
+`stakes-v1 --seed 1` under the prediction of `stakes-v1`, with the time to go of
+`expected-time`, and drive on the mean of the prediction. After 0, 2 and 4 seconds the
+chosen actions are rolled out on 1 024 fresh fields. The table has the mean of fresh
+less own cost over maps and moments with its 95 % interval by maps (Student's t), in
+seconds, and how long a solve takes for one robot of a batch. CVaR of few fields is too
+low for
+any actions: so it has the same of those of the step before, which these fields did not
+    choose.
 """
 
 import time
@@ -29,27 +34,47 @@ MOMENTS, FRESH, AT_ONCE = (0, 20, 40), 1024, 512
 CASES = ((0.0, (1, 4, 16, 64, 256)), (0.5, (20, 64, 256)), (0.8, (50, 64, 128, 256)))
 
 
-def costs_on(problem: Problem, state: Tensor, actions: Tensor, ground: Tensor, to_go: Tensor) -> Tensor:
-    """What a sequence of actions [B, T, A] costs on each of M fields, [B·M, N], shape [B, M]."""
+def costs_on(
+    problem: Problem, state: Tensor, actions: Tensor, ground: Tensor, to_go: Tensor
+) -> Tensor:
+    """What a sequence of actions [B, T, A] costs on each of M fields, [B·M, N], shape
+    [B, M].
+    """
     noise = actions.new_zeros(actions.shape[1], actions.shape[2], 1)
-    states, cost, _ = roll_out(problem, state, actions, noise, problem.goal_m, advance_chunk, ground)
+    states, cost, _ = roll_out(
+        problem, state, actions, noise, problem.goal_m, advance_chunk, ground
+    )
     ends = states.unflatten(0, (len(problem), -1))[:, :, 0]
     paths = astar.cost_at(problem.grid, to_go, ends[..., 0], ends[..., 1])
     return cost.view(len(problem), -1) + paths
 
 
-def optimism(problem: Problem, level: float, count: int, samples: int) -> tuple[np.ndarray, float]:
-    """Fresh less own cost in seconds, of what was chosen and of the step before, [B, moments, 2]; ms of a solve."""
+def optimism(
+    problem: Problem, level: float, count: int, samples: int
+) -> tuple[np.ndarray, float]:
+    """Fresh less own cost in seconds, of what was chosen and of the step before, [B,
+    moments, 2]; ms of a solve.
+    """
     planner = MPPI(
-        MPPIConfig(risk_on="cost", level=level, fields=count, samples=samples, cost_to_go="expected-time")
+        MPPIConfig(
+            risk_on="cost",
+            level=level,
+            fields=count,
+            samples=samples,
+            cost_to_go="expected-time",
+        )
     )
-    plan_state: MPPIState = planner.init(problem, rng.generator(rng.stream_key(0, "cost risk")))
+    plan_state: MPPIState = planner.init(
+        problem, rng.generator(rng.stream_key(0, "cost risk"))
+    )
     assert plan_state.to_go is not None
     state, found, took = problem.start, [], []
     observed = torch.full_like(state[:, 0], torch.nan)
 
     def fields(count: int, *key: Any) -> Tensor:
-        return framed_fields(problem, problem.sample_fields(count, rng.stream_key(*key)))
+        return framed_fields(
+            problem, problem.sample_fields(count, rng.stream_key(*key))
+        )
 
     for step in range(MOMENTS[-1] + 1):
         # The fields that it is about to draw.
@@ -65,19 +90,28 @@ def optimism(problem: Problem, level: float, count: int, samples: int) -> tuple[
                 own = costs_on(problem, state, actions, own_fields, plan_state.to_go)
                 fresh = [
                     costs_on(
-                        problem, state, actions, fields(AT_ONCE, 7, "fresh", step, part), plan_state.to_go
+                        problem,
+                        state,
+                        actions,
+                        fields(AT_ONCE, 7, "fresh", step, part),
+                        plan_state.to_go,
                     )
                     for part in range(FRESH // AT_ONCE)
                 ]
                 fresh_cost, own_cost = (
-                    tail_cost(cost[..., None], level)[:, 0] for cost in (torch.cat(fresh, 1), own)
+                    tail_cost(cost[..., None], level)[:, 0]
+                    for cost in (torch.cat(fresh, 1), own)
                 )
                 gaps.append(fresh_cost - own_cost)
             found.append(torch.stack(gaps, 1))
         mean = problem.distribution.mean().to(state)
-        traversability = problem.grid.lookup(problem.grid.pad(mean, outside=0.0), state[:, 0], state[:, 1])
+        traversability = problem.grid.lookup(
+            problem.grid.pad(mean, outside=0.0), state[:, 0], state[:, 1]
+        )
         state, plan_state = problem.robot(state, action, traversability), after
-    return torch.stack(found, 1).double().numpy(), 1000 * float(np.median(took)) / len(problem)
+    return torch.stack(found, 1).double().numpy(), 1000 * float(np.median(took)) / len(
+        problem
+    )
 
 
 def with_interval(values: np.ndarray) -> str:
@@ -86,22 +120,30 @@ def with_interval(values: np.ndarray) -> str:
     return f"{mean:+.2f} ({low:+.2f} to {high:+.2f})"
 
 
-def table(work: Work, folder: Path, maps: int = 20, samples: int = 1024) -> dict[str, Rows]:
-    """Return what chosen actions cost more on fresh fields, by level and number of fields."""
+def table(
+    work: Work, folder: Path, maps: int = 20, samples: int = 1024
+) -> dict[str, Rows]:
+    """Return what chosen actions cost more on fresh fields, by level and number of
+    fields.
+    """
     data = work.maps_in / "stakes-v1-seed1.h5"
-    suite = stakes_suite(data, planners=("mppi",), models=("stakes-v1",), risks=("expected-time",))
+    suite = stakes_suite(
+        data, planners=("mppi",), models=("stakes-v1",), risks=("expected-time",)
+    )
     problem = build_unit(one_unit(suite, maps)).problem
     rows = []
     for level, counts in CASES:
         for count in counts:
             gaps, solve_ms = optimism(problem, level, count, samples)
             chosen, before = gaps.mean(1).T
-            rows.append({
-                "level": f"{level:g}",
-                "fields": count,
-                "fresh less own cost [s] (95 %)": with_interval(chosen),
-                "the same of the actions of the step before": with_interval(before),
-                "chosen less before": with_interval(chosen - before),
-                "ms a solve": f"{solve_ms:.1f}",
-            })  # fmt: skip
+            rows.append(
+                {
+                    "level": f"{level:g}",
+                    "fields": count,
+                    "fresh less own cost [s] (95 %)": with_interval(chosen),
+                    "the same of the actions of the step before": with_interval(before),
+                    "chosen less before": with_interval(chosen - before),
+                    "ms a solve": f"{solve_ms:.1f}",
+                }
+            )
     return {"optimism": rows}

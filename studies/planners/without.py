@@ -1,4 +1,6 @@
-"""A\\*+DWA and CL-RRT, each without one of its parts: what the part is worth, by the suite `without.yaml`."""
+"""A\\*+DWA and CL-RRT, each without one of its parts: what the part is worth, by the
+suite `without.yaml`.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -12,9 +14,13 @@ from benchnav.planning.planners.astar import guided
 
 
 def farthest(ground: Any, points: Tensor, lookahead_m: float) -> tuple[Tensor, Tensor]:
-    """Return the farthest point of the path within the look-ahead, whatever lies between, and that it is straight."""
+    """Return the farthest point of the path within the look-ahead, whatever lies
+    between, and that it is straight.
+    """
     along_m = torch.linalg.vector_norm(points.diff(dim=1), dim=2).cumsum(dim=1)
-    index = torch.where(along_m <= lookahead_m, torch.arange(along_m.shape[1]), 0).amax(dim=1)
+    index = torch.where(along_m <= lookahead_m, torch.arange(along_m.shape[1]), 0).amax(
+        dim=1
+    )
     target = points[:, 1:].gather(1, index[:, None, None].expand(-1, 1, 2))[:, 0]
     return target, torch.ones(len(points), dtype=torch.bool)
 
@@ -32,4 +38,6 @@ class NoHalving(CLRRT):
 
     def _closed_loop(self, *given: Any) -> Any:
         loop = super()._closed_loop(*given)
-        return replace(loop, radius_m=torch.full_like(loop.radius_m, self.config.turning_radius_m))
+        return replace(
+            loop, radius_m=torch.full_like(loop.radius_m, self.config.turning_radius_m)
+        )

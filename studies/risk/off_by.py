@@ -24,7 +24,9 @@ class OffBy(TraversabilityModel):
         assert mixture.group is not None
         classes = len(self.model.class_names)
         weights = mixture.weights.clone()
-        for k in range(classes, weights.shape[1]):  # soft spots stand behind the classes
+        for k in range(
+            classes, weights.shape[1]
+        ):  # soft spots stand behind the classes
             more = (self.factor - 1) * mixture.weights[:, k]
             weights[:, k] += more
             weights[:, mixture.group[k]] -= more

@@ -1,4 +1,6 @@
-"""Figures of the series: examples of maps, distributions of their cells, and curves over severity."""
+"""Figures of the series: examples of maps, distributions of their cells, and curves
+over severity.
+"""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -33,9 +35,12 @@ SOURCES = {
     "true": ("true classes", "s", "--"),
 }
 EXAMPLES = {
-    "hg-100": "hg, severity 1", "hg-050": "hg, severity 0.5", "std": "std (severity 0)", "hs-050": "hs, severity 0.5",
+    "hg-100": "hg, severity 1",
+    "hg-050": "hg, severity 0.5",
+    "std": "std (severity 0)",
+    "hs-050": "hs, severity 0.5",
     "hs-100": "hs, severity 1",
-}  # fmt: skip
+}
 LAYERS: dict[str, tuple[str, dict[str, Any]]] = {
     "slope_deg": ("slope [°]", {"cmap": "cividis", "vmin": 0, "vmax": 25}),
     "error predicted": ("error of E[λ]", {"cmap": "PuOr", "vmin": -0.4, "vmax": 0.4}),
@@ -54,7 +59,9 @@ TINTS: dict[str, Any] = {
 }
 
 
-def _show_row(panels: Iterable[Axes], maps: Iterable[np.ndarray], extent_m: Any, **style: Any) -> Any:
+def _show_row(
+    panels: Iterable[Axes], maps: Iterable[np.ndarray], extent_m: Any, **style: Any
+) -> Any:
     """Draw maps in a row of panels; return the last image."""
     for panel, values in zip(panels, maps, strict=True):
         image = show_map(panel, values, extent_m, **style)
@@ -69,13 +76,17 @@ def _picture(rgb: np.ndarray) -> np.ndarray:
 
 @styled()
 def draw_examples(pairs: Mapping[str, Maps], extent_m: tuple[float, float]) -> Figure:
-    """Draw one map in hg, std and hs: its picture, its slope, and the error of its predicted E[λ]."""
+    """Draw one map in hg, std and hs: its picture, its slope, and the error of its
+    predicted E[λ].
+    """
     figure = Figure(figsize=(7.2, 4.25), layout="compressed")
     panels = figure.subplots(3, len(EXAMPLES), sharex=True, sharey=True)
     shown = [pairs[name] for name in EXAMPLES]
     _show_row(panels[0], (_picture(maps["rgb"][EXAMPLE]) for maps in shown), extent_m)
     for row, (layer, (label, style)) in zip(panels[1:], LAYERS.items(), strict=True):
-        image = _show_row(row, (maps[layer][EXAMPLE] for maps in shown), extent_m, **style)
+        image = _show_row(
+            row, (maps[layer][EXAMPLE] for maps in shown), extent_m, **style
+        )
         figure.colorbar(image, ax=row, label=label, extend="both", pad=0.015, aspect=14)
     for panel, title in zip(panels[0], EXAMPLES.values(), strict=True):
         panel.set_title(title)
@@ -91,8 +102,12 @@ def draw_tints(work: Work, folder: Path) -> dict[str, Figure]:
     splits = {"test/std": {"scenario": "one", "maps": EXAMPLE + 1}}
     pictures = []
     for title, entry in TINTS.items():
-        recipe = recipe_from_dict(data | {"scenarios": {"one": entry}, "splits": splits}, title)
-        pictures.append(_picture(generate(recipe, "test/std", np.array([EXAMPLE]))["rgb"][0]))
+        recipe = recipe_from_dict(
+            data | {"scenarios": {"one": entry}, "splits": splits}, title
+        )
+        pictures.append(
+            _picture(generate(recipe, "test/std", np.array([EXAMPLE]))["rgb"][0])
+        )
     figure, places = panel_grid(list(TINTS), len(TINTS), 1.5, 0.25, sharey=True)
     _show_row([panel for (panel,) in places], pictures, recipe.grid.extent_m)
     figure.supxlabel("x [m]")
@@ -101,7 +116,9 @@ def draw_tints(work: Work, folder: Path) -> dict[str, Figure]:
 
 @styled()
 def draw_distributions(series: Mapping[str, Maps], steepest: float) -> Figure:
-    """Draw which fractions of all cells in std, hg and hs are above each slope, λ and brightness."""
+    """Draw which fractions of all cells in std, hg and hs are above each slope, λ and
+    brightness.
+    """
     labels = ("(a) slope [°]", "(b) realised λ", "(c) brightness (1 is full light)")
     figure, places = panel_grid(labels, 3, 2.0)
     panels = [panel for (panel,) in places]
@@ -114,9 +131,20 @@ def draw_distributions(series: Mapping[str, Maps], steepest: float) -> Figure:
         )
         for panel, (count, edges) in zip(panels, counts, strict=True):
             above = 1 - np.r_[0, count.sum(0).cumsum()] / count.sum()
-            panel.plot(edges, above, color=COLOURS[name[:3].strip("-")], ls=dashes, lw=1.3, label=name)
-    panels[0].axvline(steepest, color="0.5", lw=0.8, ls=":", label="steepest in training")
-    panels[0].set(xlim=(0, 38), yscale="log", ylim=(1e-5, 1.1), ylabel="fraction of cells above")
+            panel.plot(
+                edges,
+                above,
+                color=COLOURS[name[:3].strip("-")],
+                ls=dashes,
+                lw=1.3,
+                label=name,
+            )
+    panels[0].axvline(
+        steepest, color="0.5", lw=0.8, ls=":", label="steepest in training"
+    )
+    panels[0].set(
+        xlim=(0, 38), yscale="log", ylim=(1e-5, 1.1), ylabel="fraction of cells above"
+    )
     panels[2].set_xlim(0.2, 1)
     legend_outside(figure)
     return figure
@@ -124,27 +152,55 @@ def draw_distributions(series: Mapping[str, Maps], steepest: float) -> Figure:
 
 @styled()
 def draw_series(series: Mapping[str, Maps]) -> Figure:
-    """Draw accuracy and error over severity, and the accuracy of each map in low light over its brightness."""
+    """Draw accuracy and error over severity, and the accuracy of each map in low light
+    over its brightness.
+    """
     figure, places = panel_grid(["(a)", "(b)", "(c)"], 3, 2.2)
     accuracy, error, of_maps = (panel for (panel,) in places)
     for preset in ("hg", "hs"):
-        own = {_severity(name): maps for name, maps in series.items() if name.startswith((preset, "std"))}
+        own = {
+            _severity(name): maps
+            for name, maps in series.items()
+            if name.startswith((preset, "std"))
+        }
         for source, (words, marker, dashes) in SOURCES.items():
-            look = {"color": COLOURS[preset], "marker": marker, "ls": dashes, "ms": 3.5, "lw": 1.2}
-            _draw_estimates(error, own, f"square {source}", rms, look, f"{preset}, {words}")
+            look = {
+                "color": COLOURS[preset],
+                "marker": marker,
+                "ls": dashes,
+                "ms": 3.5,
+                "lw": 1.2,
+            }
+            _draw_estimates(
+                error, own, f"square {source}", rms, look, f"{preset}, {words}"
+            )
         predicted = {"color": COLOURS[preset], "marker": "o", "ms": 3.5, "lw": 1.2}
         _draw_estimates(accuracy, own, "right", first, predicted)
-    dark = {_severity(name): maps for name, maps in series.items() if name.startswith("hs")}
-    light = np.concatenate([np.median(maps["brightness"], axis=(1, 2)) for maps in dark.values()])
+    dark = {
+        _severity(name): maps for name, maps in series.items() if name.startswith("hs")
+    }
+    light = np.concatenate(
+        [np.median(maps["brightness"], axis=(1, 2)) for maps in dark.values()]
+    )
     right = np.concatenate([maps["right"].mean(axis=(1, 2)) for maps in dark.values()])
-    severity = np.concatenate([np.full(len(maps["right"]), value) for value, maps in dark.items()])
-    points = of_maps.scatter(light, 100 * right, c=severity, cmap="viridis_r", s=4, lw=0)
+    severity = np.concatenate(
+        [np.full(len(maps["right"]), value) for value, maps in dark.items()]
+    )
+    points = of_maps.scatter(
+        light, 100 * right, c=severity, cmap="viridis_r", s=4, lw=0
+    )
     figure.colorbar(points, ax=of_maps, label="severity of hs")
     lit = np.median(series["std"]["brightness"], axis=(1, 2))
-    of_maps.axvspan(lit.min(), lit.max(), color="0.88", lw=0, zorder=0, label="light of std")
+    of_maps.axvspan(
+        lit.min(), lit.max(), color="0.88", lw=0, zorder=0, label="light of std"
+    )
     accuracy.set(xlabel="severity", ylabel="pixel accuracy [%]", ylim=(0, 100))
     error.set(xlabel="severity", ylabel="RMS error of E[λ] [%]", ylim=(0, 15))
-    of_maps.set(xlabel="median brightness of a map", ylabel="pixel accuracy of a map [%]", ylim=(-2, 102))
+    of_maps.set(
+        xlabel="median brightness of a map",
+        ylabel="pixel accuracy of a map [%]",
+        ylim=(-2, 102),
+    )
     legend_outside(figure)
     return figure
 
@@ -158,8 +214,12 @@ def _draw_estimates(
     label: str = "",
 ) -> None:
     """Draw a statistic in per cent over severity, with standard errors."""
-    value, error = 100 * np.array([estimate([maps[key]], statistic) for maps in own.values()]).T
-    draw_estimates(panel, list(own), value, value - error, value + error, look, label, bars=True)
+    value, error = (
+        100 * np.array([estimate([maps[key]], statistic) for maps in own.values()]).T
+    )
+    draw_estimates(
+        panel, list(own), value, value - error, value + error, look, label, bars=True
+    )
 
 
 def _severity(name: str) -> float:

@@ -1,7 +1,8 @@
 """The series of shifts `shift-v1`, measured for docs/studies/scenarios.md.
 
-Every statistic is a function of means over maps, so that one bootstrap over maps gives the standard error of each. It
-takes some minutes on one thread. Letters in shapes: B maps, H×W cells, C classes, K numbers a map.
+Every statistic is a function of means over maps, so that one bootstrap over maps gives
+the standard error of each. It takes some minutes on one thread. Letters in shapes: B
+maps, H×W cells, C classes, K numbers a map.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +30,9 @@ from studies.study import Rows, Work
 MODEL = "paper-v1"
 COLUMNS = yaml.safe_load(Path(__file__).with_name("tables.yaml").read_text())
 PAIRED_MAPS, CHUNK_MAPS = 200, 20
-BEYOND: dict[str, Any] = {f"{preset}-150": {"preset": preset, "severity": 1.5} for preset in ("hg", "hs")}
+BEYOND: dict[str, Any] = {
+    f"{preset}-150": {"preset": preset, "severity": 1.5} for preset in ("hg", "hs")
+}
 PAIRS: dict[str, Any] = {
     "std": {"preset": "std"},
     "hg-050": {"preset": "hg", "severity": 0.5},
@@ -41,27 +44,46 @@ PAIRS: dict[str, Any] = {
 }
 
 
-def measure_maps(model: FusedModel, recipe: Recipe, maps: Maps) -> dict[str, np.ndarray]:
-    """Measures ground and prediction: numbers a map by name, shape [B], [B, K] or [B, *, H, W]."""
+def measure_maps(
+    model: FusedModel, recipe: Recipe, maps: Maps
+) -> dict[str, np.ndarray]:
+    """Measures ground and prediction: numbers a map by name, shape [B], [B, K] or [B,
+    *, H, W].
+    """
     pieces = []
     for start in range(0, len(maps["rgb"]), CHUNK_MAPS):
-        chunk = {name: values[start : start + CHUNK_MAPS] for name, values in maps.items()}
+        chunk = {
+            name: values[start : start + CHUNK_MAPS] for name, values in maps.items()
+        }
         pieces.append(_measure_chunk(model, recipe, chunk))
-    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+    return {
+        name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]
+    }
 
 
-def _measure_chunk(model: FusedModel, recipe: Recipe, maps: Maps) -> dict[str, np.ndarray]:
-    slope, ids, count = maps["slope_deg"].astype(np.float64), maps["class_id"], len(recipe.classes)
+def _measure_chunk(
+    model: FusedModel, recipe: Recipe, maps: Maps
+) -> dict[str, np.ndarray]:
+    slope, ids, count = (
+        maps["slope_deg"].astype(np.float64),
+        maps["class_id"],
+        len(recipe.classes),
+    )
     latent = latent_mean(ids, slope, recipe.classes), latent_std(ids, recipe.classes)
     mean, std = (torch.from_numpy(values)[:, None] for values in latent)
     expected = TraversabilityMixture(torch.ones_like(mean), mean, std).mean()
-    rgb, elevation, inclination = (torch.from_numpy(maps[k]) for k in ("rgb", "elevation_m", "slope_deg"))
+    rgb, elevation, inclination = (
+        torch.from_numpy(maps[k]) for k in ("rgb", "elevation_m", "slope_deg")
+    )
     predicted = model.predict(Observation(rgb, elevation, inclination, recipe.grid))
     classes, found = torch.from_numpy(ids.astype(np.int64)), predicted.weights.argmax(1)
-    own = torch.nn.functional.one_hot(classes, count).movedim(-1, 1).to(predicted.weights)
+    own = (
+        torch.nn.functional.one_hot(classes, count).movedim(-1, 1).to(predicted.weights)
+    )
     result = {
         "rgb": maps["rgb"],
-        "brightness": maps["rgb"].sum(1) / np.array([sum(c.colour) for c in recipe.classes])[ids],
+        "brightness": maps["rgb"].sum(1)
+        / np.array([sum(c.colour) for c in recipe.classes])[ids],
         "relief": np.ptp(maps["elevation_m"], axis=(1, 2)),
         "slope": histogram(slope, SLOPE_EDGES),
         "slope_deg": slope,
@@ -72,33 +94,52 @@ def _measure_chunk(model: FusedModel, recipe: Recipe, maps: Maps) -> dict[str, n
         "weights": predicted.weights.numpy(),
         "right": (found == classes).double().numpy(),
         "darker": (found < classes).numpy(),
-        "confusion": histogram((classes * count + found).numpy(), np.arange(count**2 + 1) - 0.5),
-        "wet clay": (found == [c.name for c in recipe.classes].index("wet_clay")).numpy(),
+        "confusion": histogram(
+            (classes * count + found).numpy(), np.arange(count**2 + 1) - 0.5
+        ),
+        "wet clay": (
+            found == [c.name for c in recipe.classes].index("wet_clay")
+        ).numpy(),
     }
-    sources = {"predicted": predicted.weights, "true": own, "none": torch.full_like(own, 1 / count)}
+    sources = {
+        "predicted": predicted.weights,
+        "true": own,
+        "none": torch.full_like(own, 1 / count),
+    }
     for name, weights in sources.items():
-        mixture, draws = replace(predicted, weights=weights), rng.generator(rng.stream_key(0, "docs", "pit"))
+        mixture, draws = (
+            replace(predicted, weights=weights),
+            rng.generator(rng.stream_key(0, "docs", "pit")),
+        )
         place = pit(mixture, torch.from_numpy(maps["traversability"]), draws).numpy()
-        result[f"held {name}"], result[f"tail {name}"] = np.abs(place - 0.5) <= 0.45, place < 0.1
+        result[f"held {name}"], result[f"tail {name}"] = (
+            np.abs(place - 0.5) <= 0.45,
+            place < 0.1,
+        )
         result[f"error {name}"] = (mixture.mean() - expected).numpy()
         result[f"square {name}"] = result[f"error {name}"] ** 2
     return result
 
 
 def by_scenario(pairs: Mapping[str, Maps], name: str) -> Rows:
-    """Return a table with a row a scenario and the columns of its name in `tables.yaml`."""
+    """Return a table with a row a scenario and the columns of its name in
+    `tables.yaml`.
+    """
 
     def cell(maps: Maps, of: Sequence[str], **how: Any) -> str:
         return show([maps[key] for key in of], **how)
 
     return [
-        {"scenario": scenario} | {heading: cell(maps, **column) for heading, column in COLUMNS[name].items()}
+        {"scenario": scenario}
+        | {heading: cell(maps, **column) for heading, column in COLUMNS[name].items()}
         for scenario, maps in pairs.items()
     ]
 
 
 def changes(model: FusedModel, maps: Maps, std: Maps) -> Maps:
-    """Return what changes from std on the same maps, with squared errors by where ground and picture come from."""
+    """Return what changes from std on the same maps, with squared errors by where
+    ground and picture come from.
+    """
 
     def squares(seen: Maps, ground: Maps) -> np.ndarray:
         layers = (
@@ -111,81 +152,138 @@ def changes(model: FusedModel, maps: Maps, std: Maps) -> Maps:
 
     return {
         **{key: maps[key] - std[key] for key in ("expected", "stuck", "right")},
-        "before": squares(std, std), "both": squares(maps, maps), "ground": squares(std, maps),
-        "picture": squares(maps, std), "square true": maps["square true"], "true before": std["square true"],
-    }  # fmt: skip
+        "before": squares(std, std),
+        "both": squares(maps, maps),
+        "ground": squares(std, maps),
+        "picture": squares(maps, std),
+        "square true": maps["square true"],
+        "true before": std["square true"],
+    }
 
 
 def slope_table(std: Maps, hg: Maps) -> Rows:
     """Return where on the slopes of hg-100 the errors are made."""
     rows = []
     for low, high in pairwise((0, 10, 15, 20, 25, 90)):
-        of_std, of_hg = ((low < maps["slope_deg"]) & (maps["slope_deg"] <= high) for maps in (std, hg))
-        inside = {name: [hg[name] * of_hg, of_hg] for name in hg if hg[name].shape == of_hg.shape}
-        rows.append({
-            "slope [°]": f"{low}–{high}",
-            "of std [%]": show([of_std], scale=100, digits=2),
-            "of hg-100 [%]": show([of_hg], scale=100, digits=2),
-            "accuracy [%]": show(inside["right"], "ratio", 100),
-            "predicted": show(inside["square predicted"], "rms", 1000),
-            "true": show(inside["square true"], "rms", 1000),
-            "bias, true": show(inside["error true"], "ratio", 1000),
-            "tail, true [%]": show(inside["tail true"], "ratio", 100),
-        })  # fmt: skip
+        of_std, of_hg = (
+            (low < maps["slope_deg"]) & (maps["slope_deg"] <= high)
+            for maps in (std, hg)
+        )
+        inside = {
+            name: [hg[name] * of_hg, of_hg]
+            for name in hg
+            if hg[name].shape == of_hg.shape
+        }
+        rows.append(
+            {
+                "slope [°]": f"{low}–{high}",
+                "of std [%]": show([of_std], scale=100, digits=2),
+                "of hg-100 [%]": show([of_hg], scale=100, digits=2),
+                "accuracy [%]": show(inside["right"], "ratio", 100),
+                "predicted": show(inside["square predicted"], "rms", 1000),
+                "true": show(inside["square true"], "rms", 1000),
+                "bias, true": show(inside["error true"], "ratio", 1000),
+                "tail, true [%]": show(inside["tail true"], "ratio", 100),
+            }
+        )
     return rows
 
 
 def colour_table(recipe: Recipe) -> Rows:
-    """Return at which brightness a class looks as the next darker ones: the scale of least squared difference."""
-    rows, colours = [], np.array([kind.colour for kind in recipe.classes], dtype=np.float64)
+    """Return at which brightness a class looks as the next darker ones: the scale of
+    least squared difference.
+    """
+    rows, colours = (
+        [],
+        np.array([kind.colour for kind in recipe.classes], dtype=np.float64),
+    )
     for index, (kind, colour) in enumerate(zip(recipe.classes, colours, strict=True)):
-        row = {"class": kind.name.replace("_", " "), "colour": ", ".join(map(str, kind.colour))}
-        for darker, heading in enumerate(("as the next darker", "as the second", "as the third"), 1):
+        row = {
+            "class": kind.name.replace("_", " "),
+            "colour": ", ".join(map(str, kind.colour)),
+        }
+        for darker, heading in enumerate(
+            ("as the next darker", "as the second", "as the third"), 1
+        ):
             target = colours[index - darker]
             scale = target @ colour / (colour @ colour)
             error = np.abs(scale * colour - target).max()
-            row[heading] = f"{scale:.2f} (off by {error:.0f})" if darker <= index else ""
+            row[heading] = (
+                f"{scale:.2f} (off by {error:.0f})" if darker <= index else ""
+            )
         rows.append(row)
     return rows
 
 
-def measure_series(model: FusedModel, recipe: Recipe) -> dict[str, dict[str, np.ndarray]]:
-    """Measures the splits of shift-v1 and, made alike, a severity beyond each end, by name of the scenario."""
+def measure_series(
+    model: FusedModel, recipe: Recipe
+) -> dict[str, dict[str, np.ndarray]]:
+    """Measures the splits of shift-v1 and, made alike, a severity beyond each end, by
+    name of the scenario.
+    """
     data = recipe.to_dict()
     series: dict[str, dict[str, np.ndarray]] = {}
-    splits = {f"test/{name}": {"scenario": name, "maps": 100, "solvable": True} for name in BEYOND}
+    splits = {
+        f"test/{name}": {"scenario": name, "maps": 100, "solvable": True}
+        for name in BEYOND
+    }
     data |= {"scenarios": data["scenarios"] | BEYOND, "splits": data["splits"] | splits}
     longer = recipe_from_dict(data, "of the study")
     for split in ["test/std", *sorted(set(longer.splits) - {"test/std"})]:
         spec = longer.splits[split]
         unasked = replace(longer, splits={split: replace(spec, solvable=False)})
-        maps, drawn_first = (generate(made, split, np.arange(spec.maps)) for made in (longer, unasked))
-        rejected_draws = (maps["elevation_m"] != drawn_first["elevation_m"]).any(axis=(1, 2))
-        series[spec.scenario] = measure_maps(model, longer, maps) | {"rejected_draws": rejected_draws}
+        maps, drawn_first = (
+            generate(made, split, np.arange(spec.maps)) for made in (longer, unasked)
+        )
+        rejected_draws = (maps["elevation_m"] != drawn_first["elevation_m"]).any(
+            axis=(1, 2)
+        )
+        series[spec.scenario] = measure_maps(model, longer, maps) | {
+            "rejected_draws": rejected_draws
+        }
     return series
 
 
 def measure_pairs(model: FusedModel, recipe: Recipe) -> dict[str, Maps]:
-    """Measures the same maps under several scenarios: all are drawn on the random streams of test/std."""
+    """Measures the same maps under several scenarios: all are drawn on the random
+    streams of test/std.
+    """
     pairs: dict[str, Maps] = {}
     for name, entry in PAIRS.items():
         split = {"test/std": {"scenario": name, "maps": PAIRED_MAPS}}
-        one = recipe_from_dict(recipe.to_dict() | {"scenarios": {name: entry}, "splits": split}, name)
-        pairs[name] = measure_maps(model, one, generate(one, "test/std", np.arange(PAIRED_MAPS)))
+        one = recipe_from_dict(
+            recipe.to_dict() | {"scenarios": {name: entry}, "splits": split}, name
+        )
+        pairs[name] = measure_maps(
+            model, one, generate(one, "test/std", np.arange(PAIRED_MAPS))
+        )
     return pairs
 
 
 def measure(work: Work, folder: Path) -> dict[str, Rows | Figure]:
     """Return the tables and the figures of the page."""
-    recipe, checkpoint = load_recipe("shift-v1"), load_checkpoint(find_checkpoint(MODEL))
+    recipe, checkpoint = (
+        load_recipe("shift-v1"),
+        load_checkpoint(find_checkpoint(MODEL)),
+    )
     model = FusedModel.from_checkpoint(checkpoint)
     steepest = max(checkpoint.part("gp").config["steepest_deg"])
     series, pairs = measure_series(model, recipe), measure_pairs(model, recipe)
-    series = {name: maps | {"beyond": maps["slope_deg"] > steepest} for name, maps in series.items()}
-    changed = {name: changes(model, maps, pairs["std"]) for name, maps in pairs.items() if name != "std"}
+    series = {
+        name: maps | {"beyond": maps["slope_deg"] > steepest}
+        for name, maps in series.items()
+    }
+    changed = {
+        name: changes(model, maps, pairs["std"])
+        for name, maps in pairs.items()
+        if name != "std"
+    }
     rejected = ({"rejected": maps["rejected_draws"].sum()} for maps in series.values())
     return {
-        "ground": [row | more for row, more in zip(by_scenario(series, "ground"), rejected, strict=True)],
+        "ground": [
+            row | more
+            for row, more in zip(by_scenario(series, "ground"), rejected, strict=True)
+        ],
         "model": by_scenario(series, "model"),
         "calibration": by_scenario(series, "calibration"),
         "pairs": by_scenario(changed, "pairs"),

@@ -1,4 +1,5 @@
-"""Driving the trials: a loop of its own, in which two independent fields move the robot.
+"""Driving the trials: a loop of its own, in which two independent fields move the
+robot.
 
 None of the simulation of `benchnav` is used. Letters in shapes: B trials.
 """
@@ -19,12 +20,14 @@ from benchnav.planning.problem import Dynamics, motion_traversability
 from benchnav.planning.robots import component_wise
 from studies.validation.task import GOAL_M, GOAL_RADIUS_M, STEPS, Setup
 
-# λ of ground off the map that is free: a rollout stays there, at the `min_traversability` of the setup.
+# λ of ground off the map that is free: a rollout stays there, at the
+# `min_traversability` of the setup.
 _STILL = 1e-30
 
 
 class ManyTrialsMPPI(MPPI):
-    """MPPI that is compiled even at few samples: hundreds of trials of one shape share the compiling.
+    """MPPI that is compiled even at few samples: hundreds of trials of one shape share
+    the compiling.
 
     Args:
         config: settings.
@@ -39,15 +42,22 @@ class ManyTrialsMPPI(MPPI):
         self._is_still = setup.off_map == "still"
         if self._is_paired:
             self._advance = Fused(
-                advance_pair, config.samples * config.fields, self.worth_compiling, batched=OF_EPISODES
+                advance_pair,
+                config.samples * config.fields,
+                self.worth_compiling,
+                batched=OF_EPISODES,
             )
 
     def _ground(self, plan_state: MPPIState, state: Tensor) -> Tensor:
-        """Return what rollouts are on in this step, shape [B·M, N], of pairs of fields [B·M, 2·N]."""
+        """Return what rollouts are on in this step, shape [B·M, N], of pairs of fields
+        [B·M, 2·N].
+        """
         if self._is_paired:
             problem = plan_state.problem
             key = rng.stream_key(plan_state.key, plan_state.step)
-            fields = framed_fields(problem, problem.sample_fields(2 * self.config.fields, key))
+            fields = framed_fields(
+                problem, problem.sample_fields(2 * self.config.fields, key)
+            )
             ground = fields.unflatten(0, (-1, 2)).flatten(1)
         else:
             ground = super()._ground(plan_state, state)
@@ -55,15 +65,23 @@ class ManyTrialsMPPI(MPPI):
 
 
 def advance_pair(
-    states: Tensor, cost: Tensor, sampled: Sampled, padded_ground: Tensor, target: Tensor, dynamics: Dynamics
+    states: Tensor,
+    cost: Tensor,
+    sampled: Sampled,
+    padded_ground: Tensor,
+    target: Tensor,
+    dynamics: Dynamics,
 ) -> tuple[Tensor, Tensor]:
-    """Roll samples out as `mppi.advance_chunk` does, where one field scales v and another ω.
+    """Roll samples out as `mppi.advance_chunk` does, where one field scales v and
+    another ω.
 
-    The motion of `ROVER` and the cost of `TimeAndDistance` are written out, with x, y and θ apart: by `robot` and
-    `objective`, which take whole states, a step takes three times as long.
+    The motion of `ROVER` and the cost of `TimeAndDistance` are written out, with x, y
+    and θ apart: by `robot` and `objective`, which take whole states, a step takes three
+        times as long.
 
     Args:
-        padded_ground: a linear field and then an angular one, shape [B·M, 2·N]; the others are those of `mppi`.
+        padded_ground: a linear field and then an angular one, shape [B·M, 2·N]; the
+            others are those of `mppi`.
     """
     mean, noise, low, high = sampled
     grid, robot, _, min_traversability = dynamics
@@ -71,9 +89,13 @@ def advance_pair(
     x, y, heading = states.unbind(-1)
     away = distance(states, target)
     fields, angular = padded_ground.flatten(), padded_ground.shape[1] // 2
-    first = torch.arange(len(padded_ground), dtype=torch.int32, device=states.device)[:, None] * (2 * angular)
+    first = torch.arange(len(padded_ground), dtype=torch.int32, device=states.device)[
+        :, None
+    ] * (2 * angular)
     for step in range(mean.shape[1]):
-        speed, turn_rate = perturb(mean[:, step, :, None], noise[step], low, high).unbind(1)
+        speed, turn_rate = perturb(
+            mean[:, step, :, None], noise[step], low, high
+        ).unbind(1)
         row, column = (
             (position / grid.resolution_m + 1).clamp(0, size + 1).int()
             for position, size in ((y, grid.height), (x, grid.width))
@@ -81,7 +103,11 @@ def advance_pair(
         cell = first + row * (grid.width + 2) + column
         ground = fields[cell]
         going = away > GOAL_RADIUS_M
-        cost = cost + torch.where(going, robot.dt_s + away**objective.power, 0) + PENALTY * (ground <= 0)
+        cost = (
+            cost
+            + torch.where(going, robot.dt_s + away**objective.power, 0)
+            + PENALTY * (ground <= 0)
+        )
         advance, turn = (
             going * robot.dt_s * motion_traversability(each, min_traversability)
             for each in (ground, fields[cell + angular])
@@ -93,7 +119,9 @@ def advance_pair(
     return component_wise(torch.stack((x, y, heading), dim=-1)), cost
 
 
-def drive(planner: MPPI, problem: Problem, traction: Tensor, generator: torch.Generator) -> Tensor:
+def drive(
+    planner: MPPI, problem: Problem, traction: Tensor, generator: torch.Generator
+) -> Tensor:
     """Drives B trials until they have arrived or their time is over.
 
     Args:
@@ -110,11 +138,14 @@ def drive(planner: MPPI, problem: Problem, traction: Tensor, generator: torch.Ge
     plan_state = planner.init(problem, generator)
     for step in range(STEPS):
         action, plan_state, _ = planner.plan(
-            Step(state=state, traversability=observed, time_s=step * problem.dt_s), plan_state
+            Step(state=state, traversability=observed, time_s=step * problem.dt_s),
+            plan_state,
         )
         observed = traction_at(state, traction)[:, 0]
         running = arrival_s.isinf()
-        state = torch.where(running[:, None], move(state, action, traction, problem.dt_s), state)
+        state = torch.where(
+            running[:, None], move(state, action, traction, problem.dt_s), state
+        )
         arrival_s[running & has_arrived(state)] = (step + 1) * problem.dt_s
         if not arrival_s.isinf().any():
             break
@@ -146,14 +177,23 @@ def move(state: Tensor, action: Tensor, traction: Tensor, dt_s: float) -> Tensor
 
 
 def traction_at(state: Tensor, traction: Tensor) -> Tensor:
-    """Linear and angular λ in the cells of 1 m where robots stand, 0 off the map, shape [B, 2]."""
+    """Linear and angular λ in the cells of 1 m where robots stand, 0 off the map, shape
+    [B, 2].
+    """
     height, width = traction.shape[2:]
     column, row = state[:, 0].floor().long(), state[:, 1].floor().long()
     on_map = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    here = traction[torch.arange(len(state)), :, row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    here = traction[
+        torch.arange(len(state)),
+        :,
+        row.clamp(0, height - 1),
+        column.clamp(0, width - 1),
+    ]
     return torch.where(on_map[:, None], here, 0.0)
 
 
 def has_arrived(state: Tensor) -> Tensor:
     """Tells which robots are at the goal, bool, shape [B]."""
-    return torch.hypot(state[:, 0] - GOAL_M[0], state[:, 1] - GOAL_M[1]) <= GOAL_RADIUS_M
+    return (
+        torch.hypot(state[:, 0] - GOAL_M[0], state[:, 1] - GOAL_M[1]) <= GOAL_RADIUS_M
+    )

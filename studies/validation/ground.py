@@ -1,15 +1,19 @@
-"""The ground of Cai et al.: traction as a mixture of Gaussians, drawn again until it lies in [0, 1].
+"""The ground of Cai et al.: traction as a mixture of Gaussians, drawn again until it
+lies in [0, 1].
 
-Such a draw has the distribution of the mixture *given* that it lies in [0, 1], with the CDF
+Such a draw has the distribution of the mixture *given* that it lies in [0, 1], with the
+CDF
 
     F(x) = (M(x) − M(0)) / (M(1) − M(0)),  M the CDF of the mixture.
 
-A `TraversabilityMixture` is *clipped* instead: what lies below 0 becomes 0, which would give vegetation a mean
-of 0.36 in place of 0.50. `Ground.slices` cuts the distribution into 100 parts of one probability; point masses
-at their means are a mixture of the same mean and of the same CVaR at every whole per cent.
+A `TraversabilityMixture` is *clipped* instead: what lies below 0 becomes 0, which would
+give vegetation a mean of 0.36 in place of 0.50. `Ground.slices` cuts the distribution
+into 100 parts of one probability; point masses at their means are a mixture of the same
+mean and of the same CVaR at every whole per cent.
 
-Source: Cai, Everett, Sharma, Osteen and How (2023), "Probabilistic traversability model for risk-aware motion
-planning in off-road environments", IROS; https://github.com/mit-acl/mppi_numba.
+Source: Cai, Everett, Sharma, Osteen and How (2023), "Probabilistic traversability model
+for risk-aware motion planning in off-road environments", IROS;
+https://github.com/mit-acl/mppi_numba.
 """
 
 from dataclasses import dataclass
@@ -52,15 +56,20 @@ class Ground:
         return low + width / 2
 
     def slices(self) -> np.ndarray:
-        """Means of λ within each of 100 parts of one probability, lowest first, shape [100]."""
+        """Means of λ within each of 100 parts of one probability, lowest first, shape
+        [100].
+        """
         edges = self.quantile(np.arange(1, SLICES) / SLICES)
-        return np.diff(self._partial_mean(np.concatenate(([0.0], edges, [1.0])))) * SLICES
+        return (
+            np.diff(self._partial_mean(np.concatenate(([0.0], edges, [1.0])))) * SLICES
+        )
 
     def histogram_cvar(self, share: float) -> float:
-        """Their tail mean: of a histogram of 20 bins, rounded up to the centre of a bin.
+        """Their tail mean: of a histogram of 20 bins, rounded up to the centre of a
+        bin.
 
-        The bins are taken whole until they hold the share, and centres are cut to hundredths. They fill the
-        histogram with 1 000 draws; here it is exact.
+        The bins are taken whole until they hold the share, and centres are cut to
+        hundredths. They fill the histogram with 1 000 draws; here it is exact.
 
         Args:
             share: of the distribution, from below, in (0, 1]; 1 gives the mean.
@@ -72,10 +81,12 @@ class Ground:
         return float(np.floor(100 * centres[centres >= mean][0])) / 100
 
     def histogram_atoms(self) -> np.ndarray:
-        """Return the point masses of their sampled fields, lowest first, each of probability 1/200, shape [200].
+        """Return the point masses of their sampled fields, lowest first, each of
+        probability 1/200, shape [200].
 
-        Their sampler cuts the mass of each bin to whole per cents and gives the remainder to λ = 1. It then rounds
-        100·u, u uniform in [0, 1], so that 0 and 100 have half the probability of other per cents. The 0 gives λ = 0.
+        Their sampler cuts the mass of each bin to whole per cents and gives the
+        remainder to λ = 1. It then rounds 100·u, u uniform in [0, 1], so that 0 and 100
+        have half the probability of other per cents. The 0 gives λ = 0.
         """
         centres, mass = self._histogram()
         percents = np.floor(_PERCENT * mass + 1e-9).astype(int)

@@ -1,4 +1,5 @@
-"""The experiment of Cai et al. with our planner and risk settings: trials of all densities and risk settings.
+"""The experiment of Cai et al. with our planner and risk settings: trials of all
+densities and risk settings.
 
 What is theirs, what is ours and what differs stands in `docs/studies/validation.md`.
 """
@@ -27,12 +28,17 @@ DENSITIES = (0.1, 0.4, 0.7, 1.0)
 
 
 def run_trials(
-    densities: Sequence[float], settings: Sequence[str], maps: int, realisations: int, seed: int, setup: Setup
+    densities: Sequence[float],
+    settings: Sequence[str],
+    maps: int,
+    realisations: int,
+    seed: int,
+    setup: Setup,
 ) -> Iterator[pd.DataFrame]:
     """Run maps × realisations trials of each density and setting.
 
-    The planner's noise is named by (seed, map, realisation), as the world is: trials of one map and
-    realisation share it, and no others do.
+    The planner's noise is named by (seed, map, realisation), as the world is: trials of
+    one map and realisation share it, and no others do.
 
     Args:
         densities: fractions of vegetation.
@@ -43,7 +49,8 @@ def run_trials(
         setup: how it is planned.
 
     Yields:
-        Rows of one map: `density`, `setting`, `map`, `realisation`, `success`, `time_s` (NaN without arrival).
+        Rows of one map: `density`, `setting`, `map`, `realisation`, `success`, `time_s`
+            (NaN without arrival).
     """
     alike: dict[MPPIConfig, list[str]] = {}
     for setting in settings:
@@ -52,15 +59,29 @@ def run_trials(
     names = [round(1e6 * density) for density in densities]
     for member in range(maps):
         which = np.array([member])
-        vegetation = np.concatenate([draw_vegetation(seed, which, density) for density in densities])
-        problems = {config: pose(vegetation, own, setup, names) for config, own in alike.items()}
+        vegetation = np.concatenate(
+            [draw_vegetation(seed, which, density) for density in densities]
+        )
+        problems = {
+            config: pose(vegetation, own, setup, names) for config, own in alike.items()
+        }
         for realisation in range(realisations):
-            drawn = draw_traction(seed, which.repeat(len(densities)), realisation, vegetation)
+            drawn = draw_traction(
+                seed, which.repeat(len(densities)), realisation, vegetation
+            )
             for config, own in alike.items():
                 traction = torch.from_numpy(drawn.repeat(len(own), axis=0)).float()
-                generator = rng.generator(rng.stream_key(seed, "cai", "planner", member, realisation))
-                arrival_s = drive(planners[config], problems[config], traction, generator).double().numpy()
-                labels = pd.MultiIndex.from_product((densities, own), names=("density", "setting"))
+                generator = rng.generator(
+                    rng.stream_key(seed, "cai", "planner", member, realisation)
+                )
+                arrival_s = (
+                    drive(planners[config], problems[config], traction, generator)
+                    .double()
+                    .numpy()
+                )
+                labels = pd.MultiIndex.from_product(
+                    (densities, own), names=("density", "setting")
+                )
                 yield labels.to_frame(index=False).assign(
                     map=member,
                     realisation=realisation,
@@ -70,12 +91,24 @@ def run_trials(
 
 
 def trials(
-    work: Work, folder: Path, risks: Sequence[str] = SETTINGS, densities: Sequence[float] = DENSITIES, maps: int = 40,
-    realisations: int = 5, seed: int = 0, **setup: Any,
-) -> dict[str, str]:  # fmt: skip
-    """Run trials, store them as trials.csv, and return their tables; options as in `run_trials` and `Setup`."""
+    work: Work,
+    folder: Path,
+    risks: Sequence[str] = SETTINGS,
+    densities: Sequence[float] = DENSITIES,
+    maps: int = 40,
+    realisations: int = 5,
+    seed: int = 0,
+    **setup: Any,
+) -> dict[str, str]:
+    """Run trials, store them as trials.csv, and return their tables; options as in
+    `run_trials` and `Setup`.
+    """
     settings: Setup = read(Setup, setup, of("the options"))
-    made = pd.concat(track(run_trials(densities, risks, maps, realisations, seed, settings), "trials"))
+    made = pd.concat(
+        track(
+            run_trials(densities, risks, maps, realisations, seed, settings), "trials"
+        )
+    )
     for name, order in (("density", densities), ("setting", risks)):
         made[name] = pd.Categorical(made[name], order)
     rows = made.sort_values(["density", "setting", "map", "realisation"])
@@ -89,8 +122,12 @@ def together(work: Work, folder: Path, parts: Sequence[str]) -> dict[str, str]:
 
 
 def compared(work: Work, folder: Path, runs: dict[str, str]) -> dict[str, str]:
-    """Return the table of several parts by a name each, and what each changes on the first."""
-    return {"runs": tabulate_runs({name: _read(work, part) for name, part in runs.items()})}
+    """Return the table of several parts by a name each, and what each changes on the
+    first.
+    """
+    return {
+        "runs": tabulate_runs({name: _read(work, part) for name, part in runs.items()})
+    }
 
 
 def _read(work: Work, part: str) -> pd.DataFrame:

@@ -1,7 +1,8 @@
 """Tables, tests and the figure of the study.
 
-`models` has a row a varied model, by label: `size`, the number of maps that it was trained on, `seed`, `what` is varied
-and its `dose`, which is 1 as trained, and its `loss`.
+`models` has a row a varied model, by label: `size`, the number of maps that it was
+trained on, `seed`, `what` is varied and its `dose`, which is 1 as trained, and its
+`loss`.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,8 +19,24 @@ from benchnav.stats.intervals import mean_interval
 from benchnav.viz import legend_outside, line_looks, panel_grid, risk_name, styled
 
 RISKS, SPLIT = ("expected-time", "cvar:0.8"), "test/std"
-SCORES = ("rmse_expected", "nll", "crps", "pinball", "tail_error", "ause")  # of each the minimum is the best
-SHOWN = ("accuracy", "miou", *SCORES[:4], "coverage", "width", *SCORES[4:], "prediction_ms", "parameters")
+SCORES = (
+    "rmse_expected",
+    "nll",
+    "crps",
+    "pinball",
+    "tail_error",
+    "ause",
+)  # of each the minimum is the best
+SHOWN = (
+    "accuracy",
+    "miou",
+    *SCORES[:4],
+    "coverage",
+    "width",
+    *SCORES[4:],
+    "prediction_ms",
+    "parameters",
+)
 GROUP = ["size", "what", "dose"]
 
 
@@ -38,19 +55,33 @@ def slopes_by_map(loss: pd.Series, success: pd.DataFrame) -> np.ndarray:
     return centred @ (values - values.mean(0)) / (centred @ centred)
 
 
-def doses_results(rows: pd.DataFrame, models: pd.DataFrame, digest: str) -> dict[str, pd.DataFrame | Figure]:
-    """Return the test of the hypothesis, exploratory slopes and contrasts, and success and time against dose."""
+def doses_results(
+    rows: pd.DataFrame, models: pd.DataFrame, digest: str
+) -> dict[str, pd.DataFrame | Figure]:
+    """Return the test of the hypothesis, exploratory slopes and contrasts, and success
+    and time against dose.
+    """
     by_map = _success_by_map(rows)
     loss = models["loss"]
     hypothesis = {
-        "models": len(loss), "maps": by_map.shape[1], "episodes": len(rows), "hypothesis_sha256": digest,
+        "models": len(loss),
+        "maps": by_map.shape[1],
+        "episodes": len(rows),
+        "hypothesis_sha256": digest,
         **_slope(slopes_by_map(loss, by_map), "lower"),
-    }  # fmt: skip
+    }
     explored = [
-        {"slope over": name, "models": len(labels), **_slope(slopes_by_map(loss[labels], by_map))}
+        {
+            "slope over": name,
+            "models": len(labels),
+            **_slope(slopes_by_map(loss[labels], by_map)),
+        }
         for name, labels in exploratory(models)
     ]
-    groups = {key: list(labels) for key, labels in models.groupby(GROUP, sort=False).groups.items()}
+    groups = {
+        key: list(labels)
+        for key, labels in models.groupby(GROUP, sort=False).groups.items()
+    }
     compared = []
     for one, other in contrasts(sorted(set(models["size"].tolist()))):
         a, b = groups[one], groups[other]
@@ -62,16 +93,27 @@ def doses_results(rows: pd.DataFrame, models: pd.DataFrame, digest: str) -> dict
         }
         compared.append({"one": one, "other": other, **difference})
     table = success_table(rows, groups, (models["size"].max(), "temperature", 1.0))
-    table.insert(0, "pinball", models.groupby(GROUP, sort=False)["loss"].mean().to_numpy())
-    table = table.rename_axis(["training maps", "what", "dose"]).reset_index().sort_values("pinball")
+    table.insert(
+        0, "pinball", models.groupby(GROUP, sort=False)["loss"].mean().to_numpy()
+    )
+    table = (
+        table.rename_axis(["training maps", "what", "dose"])
+        .reset_index()
+        .sort_values("pinball")
+    )
     return {
-        "hypothesis": pd.DataFrame([hypothesis]), "exploratory": pd.DataFrame(explored),
-        "contrasts": pd.DataFrame(compared), "table": table, "doses": draw_doses(table),
-    }  # fmt: skip
+        "hypothesis": pd.DataFrame([hypothesis]),
+        "exploratory": pd.DataFrame(explored),
+        "contrasts": pd.DataFrame(compared),
+        "table": table,
+        "doses": draw_doses(table),
+    }
 
 
 def _success_by_map(rows: pd.DataFrame) -> pd.DataFrame:
-    return rows.pivot_table(index="model", columns="map", values="success", aggfunc="mean")
+    return rows.pivot_table(
+        index="model", columns="map", values="success", aggfunc="mean"
+    )
 
 
 def _interval(name: str, values: np.ndarray) -> dict[str, float]:
@@ -81,8 +123,13 @@ def _interval(name: str, values: np.ndarray) -> dict[str, float]:
 
 
 def _slope(slopes: np.ndarray, direction: str = "") -> dict[str, float]:
-    """Return the mean of the maps' slopes in points of success per 0.001 of loss, and p of the exchange test."""
-    return {**_interval("points per 0.001", 0.1 * slopes), "p": mean_flip_p(slopes, direction)}
+    """Return the mean of the maps' slopes in points of success per 0.001 of loss, and p
+    of the exchange test.
+    """
+    return {
+        **_interval("points per 0.001", 0.1 * slopes),
+        "p": mean_flip_p(slopes, direction),
+    }
 
 
 def exploratory(models: pd.DataFrame) -> Iterator[tuple[str, pd.Index]]:
@@ -90,28 +137,43 @@ def exploratory(models: pd.DataFrame) -> Iterator[tuple[str, pd.Index]]:
     yield "training maps alone, temperature as trained", models.query("dose == 1").index
     largest = models[models["size"] == models["size"].max()]
     for what in ("temperature", "soft", "brightness"):
-        yield f"{what} alone, of the largest training set", largest.query("what == @what or dose == 1").index
+        yield (
+            f"{what} alone, of the largest training set",
+            largest.query("what == @what or dose == 1").index,
+        )
     yield "without brightness", models.query("what != 'brightness'").index
     for seed, own in models.groupby("seed"):
         yield f"seed {seed}", own.index
 
 
-def contrasts(sizes: list[int]) -> Iterator[tuple[tuple[int, str, float], tuple[int, str, float]]]:
-    """Yield pairs of doses on both sides of what was trained: too cautious and too bold, too sure and too vague."""
+def contrasts(
+    sizes: list[int],
+) -> Iterator[tuple[tuple[int, str, float], tuple[int, str, float]]]:
+    """Yield pairs of doses on both sides of what was trained: too cautious and too
+    bold, too sure and too vague.
+    """
     yield (sizes[-1], "soft", 2.0), (sizes[-1], "soft", 0.0)
     for size in sizes:
         yield (size, "temperature", 0.25), (size, "temperature", 4.0)
 
 
-def success_table(rows: pd.DataFrame, groups: Mapping[object, list[str]], first: object) -> pd.DataFrame:
-    """Return a row a group of models: success and time under each risk setting, and its gain over the first group.
+def success_table(
+    rows: pd.DataFrame, groups: Mapping[object, list[str]], first: object
+) -> pd.DataFrame:
+    """Return a row a group of models: success and time under each risk setting, and its
+    gain over the first group.
 
-    The gain is in points of success over both risk settings, with its interval and p by maps, corrected by Holm.
+    The gain is in points of success over both risk settings, with its interval and p by
+    maps, corrected by Holm.
     """
     by_map = _success_by_map(rows)
     centre, lines = by_map.loc[groups[first]].mean(0), {}
     for key, labels in groups.items():
-        means = rows[rows["model"].isin(labels)].groupby("risk")[["success", "total_time_s"]].mean()
+        means = (
+            rows[rows["model"].isin(labels)]
+            .groupby("risk")[["success", "total_time_s"]]
+            .mean()
+        )
         gain = 100 * (by_map.loc[labels].mean(0) - centre).to_numpy()
         cells = {}
         for risk in RISKS:
@@ -128,15 +190,24 @@ def success_table(rows: pd.DataFrame, groups: Mapping[object, list[str]], first:
 def draw_doses(table: pd.DataFrame) -> Figure:
     """Draw success over the loss, a mark a dose, a panel a risk setting."""
     sizes = table["training maps"].astype(str)
-    kind = table["what"].where(table["what"] != "temperature", "temperature, " + sizes + " maps")
+    kind = table["what"].where(
+        table["what"] != "temperature", "temperature, " + sizes + " maps"
+    )
     by_size = table.sort_values("training maps", ascending=False, kind="stable").index
     looks = line_looks(list(kind[by_size]))
-    figure, places = panel_grid([risk_name(risk) for risk in RISKS], len(RISKS), 2.3, 0.6, sharey=True)
+    figure, places = panel_grid(
+        [risk_name(risk) for risk in RISKS], len(RISKS), 2.3, 0.6, sharey=True
+    )
     trained = table[table["dose"] == 1]
     for (panel,), risk in zip(places, RISKS, strict=True):
         for name, look in looks.items():
             own = table[kind == name]
-            panel.plot(own["pinball"], own[f"success {risk}"], label=name, **{**look, "ls": "none", "ms": 5})
+            panel.plot(
+                own["pinball"],
+                own[f"success {risk}"],
+                label=name,
+                **{**look, "ls": "none", "ms": 5},
+            )
         circled = {"ms": 10, "mfc": "none", "mec": "0.2", "label": "as trained"}
         panel.plot(trained["pinball"], trained[f"success {risk}"], "o", **circled)
         panel.set_xlabel("pinball loss of the lower fifth")
@@ -146,35 +217,56 @@ def draw_doses(table: pd.DataFrame) -> Figure:
 
 
 def quality(table: pd.DataFrame, against: str = "") -> pd.DataFrame:
-    """Return means over seeds with the half width of their t interval; with `against`, differences to that method."""
+    """Return means over seeds with the half width of their t interval; with `against`,
+    differences to that method.
+    """
     shown = [name for name in SHOWN if name in table and table[name].notna().any()]
     wide = table.set_index(["split", "method", "seed"])[shown]
     if against:
-        first = wide.xs(against, level="method").reindex(wide.index.droplevel("method")).set_axis(wide.index)
+        first = (
+            wide.xs(against, level="method")
+            .reindex(wide.index.droplevel("method"))
+            .set_axis(wide.index)
+        )
         wide = wide - first
-    return wide.groupby(level=["split", "method"], sort=False).agg(_over_seeds).reset_index()
+    return (
+        wide.groupby(level=["split", "method"], sort=False)
+        .agg(_over_seeds)
+        .reset_index()
+    )
 
 
 def _over_seeds(values: pd.Series) -> str:
-    """Write a mean over seeds with the half width of its t interval, if there are several."""
+    """Write a mean over seeds with the half width of its t interval, if there are
+    several.
+    """
     if values.isna().all():
         return NOTHING
     half = t.ppf(0.975, max(1, len(values) - 1)) * values.std() / len(values) ** 0.5
     return f"{values.mean():.4f}" + (f" ±{half:.4f}" if len(values) > 1 else "")
 
 
-def ranked(rows: pd.DataFrame, table: pd.DataFrame, labels: Iterable[str]) -> dict[str, pd.DataFrame]:
-    """Return success of every method, against the first, and how it ranks with each score (Kendall's τ)."""
+def ranked(
+    rows: pd.DataFrame, table: pd.DataFrame, labels: Iterable[str]
+) -> dict[str, pd.DataFrame]:
+    """Return success of every method, against the first, and how it ranks with each
+    score (Kendall's τ).
+    """
     groups: dict[object, list[str]] = {}
     for label in labels:
         groups.setdefault(label.rsplit("-s", maxsplit=1)[0], []).append(label)
     chosen = table[(table["split"] == SPLIT) & ~table["privileged"]]
     scores = chosen.groupby("method")[list(SCORES)].mean()
-    methods = scores.join(success_table(rows, groups, next(iter(groups)))).sort_values("pinball")
+    methods = scores.join(success_table(rows, groups, next(iter(groups)))).sort_values(
+        "pinball"
+    )
     success = methods[[f"success {risk}" for risk in RISKS]].mean(axis=1)
     ranks = []
     for name, values in methods[list(SCORES)].items():
         known = values.dropna()
         tau, p = kendalltau(known, success[known.index])
         ranks.append({"score": name, "methods": len(known), "tau": tau, "p": p})
-    return {"success": methods.reset_index(names="method"), "ranks": pd.DataFrame(ranks)}
+    return {
+        "success": methods.reset_index(names="method"),
+        "ranks": pd.DataFrame(ranks),
+    }

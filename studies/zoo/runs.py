@@ -1,7 +1,8 @@
-"""Quality of models varied on purpose, and what it is worth to a robot; the methods of the zoo.
+"""Quality of models varied on purpose, and what it is worth to a robot; the methods of
+the zoo.
 
-Each step is stored in the folder `zoo` of the runs and not done again. `maps`, `sizes` and `seeds` of a part may be
-changed in study.yaml, to see in minutes that all runs.
+Each step is stored in the folder `zoo` of the runs and not done again. `maps`, `sizes`
+and `seeds` of a part may be changed in study.yaml, to see in minutes that all runs.
 """
 
 import json
@@ -25,7 +26,11 @@ from studies.zoo.report import RISKS, SPLIT, doses_results, quality, ranked
 
 HERE = Path(__file__).parent
 HYPOTHESIS, VARIED = HERE / "hypothesis.yaml", HERE / "varied.py"
-DOSES = {"temperature": (0.25, 0.5, 1.0, 2.0, 4.0), "soft": (0.0, 0.5, 2.0), "brightness": (0.7, 0.85, 1.15)}
+DOSES = {
+    "temperature": (0.25, 0.5, 1.0, 2.0, 4.0),
+    "soft": (0.0, 0.5, 2.0),
+    "brightness": (0.7, 0.85, 1.15),
+}
 FUSED = "fused --settings.classifier.encoder_depth 3"
 TESTS = ("test/std", "test/hs")
 SIZES, SEEDS = (10, 50, 200, 1000), (0, 1, 2)
@@ -34,9 +39,17 @@ Results = dict[str, pd.DataFrame | Figure]
 
 
 def models_of(sizes: Sequence[int], seeds: Sequence[int]) -> pd.DataFrame:
-    """Return all varied models; soft modes and brightness vary at the largest size only."""
+    """Return all varied models; soft modes and brightness vary at the largest size
+    only.
+    """
     rows = [
-        {"label": f"n{size}-s{seed}-{what}-{dose:g}", "size": size, "seed": seed, "what": what, "dose": dose}
+        {
+            "label": f"n{size}-s{seed}-{what}-{dose:g}",
+            "size": size,
+            "seed": seed,
+            "what": what,
+            "dose": dose,
+        }
         for seed in seeds
         for what, doses in DOSES.items()
         for size in (sizes if what == "temperature" else (max(sizes),))
@@ -51,13 +64,25 @@ def make_maps(path: Path, recipe: str, counts: Mapping[str, int]) -> Path:
         sizes = (f"splits.{split}.maps={count}" for split, count in counts.items())
         splits = f"[{','.join(counts)}]"
         command(
-            "benchnav-datagen", "create", recipe, f"id={path.stem}", *sizes, "--splits", splits, "--out", path
+            "benchnav-datagen",
+            "create",
+            recipe,
+            f"id={path.stem}",
+            *sizes,
+            "--splits",
+            splits,
+            "--out",
+            path,
         )
     return path
 
 
-def fit(out: Path, name: str, words: str, size: int, seed: int, recipe: str = RECIPE) -> Path:
-    """Train a checkpoint on so many maps of a recipe, the first of the largest set, if it is not finished."""
+def fit(
+    out: Path, name: str, words: str, size: int, seed: int, recipe: str = RECIPE
+) -> Path:
+    """Train a checkpoint on so many maps of a recipe, the first of the largest set, if
+    it is not finished.
+    """
     place = out / f"{recipe}-n{size}-{name}-s{seed}"
     done = place.with_suffix(".done")
     if not done.exists():
@@ -65,23 +90,40 @@ def fit(out: Path, name: str, words: str, size: int, seed: int, recipe: str = RE
         make_maps(data, recipe, {"train": size, "valid": max(4, size // 4)})
         family, *options = words.split()
         command(
-            "benchnav-train", "fit", family, "--data", data, "--out", place, "--resume", "--seed", seed, *options
-        )  # fmt: skip
+            "benchnav-train",
+            "fit",
+            family,
+            "--data",
+            data,
+            "--out",
+            place,
+            "--resume",
+            "--seed",
+            seed,
+            *options,
+        )
         done.touch()
     return place
 
 
 def fit_fused(out: Path, size: int, seed: int) -> Path:
-    """Train a fused model; on small sets for more epochs, so that every network takes 100 steps or more."""
+    """Train a fused model; on small sets for more epochs, so that every network takes
+    100 steps or more.
+    """
     epochs = max(20, -(-100 // -(-size // 16)))
     longer = (
-        f"--settings.classifier.max_epochs {epochs} --settings.classifier.patience {max(10, epochs // 2)}"
+        f"--settings.classifier.max_epochs {epochs} "
+        f"--settings.classifier.patience {max(10, epochs // 2)}"
     )
     return fit(out, "fused", f"{FUSED} {longer}", size, seed)
 
 
-def measure(path: Path, parts: list[dict[str, Any]], data: Path, maps: int) -> pd.Series:
-    """Return the pinball loss of the lower fifth of every model on the maps that are driven on."""
+def measure(
+    path: Path, parts: list[dict[str, Any]], data: Path, maps: int
+) -> pd.Series:
+    """Return the pinball loss of the lower fifth of every model on the maps that are
+    driven on.
+    """
     found: dict[str, float] = json.loads(path.read_text()) if path.exists() else {}
     dataset = TerrainDataset(data)
     for part in parts:
@@ -89,21 +131,34 @@ def measure(path: Path, parts: list[dict[str, Any]], data: Path, maps: int) -> p
             continue
         model, losses = load_model(registry.read_part("model", part)), []
         for indices, _ in dataset.chunks(SPLIT, fields=()):
-            terrain = dataset.terrain(SPLIT, [index for index in indices if index < maps])
-            loss, _ = lower_fifth_and_width(predict(model, terrain), terrain.traversability)
+            terrain = dataset.terrain(
+                SPLIT, [index for index in indices if index < maps]
+            )
+            loss, _ = lower_fifth_and_width(
+                predict(model, terrain), terrain.traversability
+            )
             losses += loss.mean((1, 2)).tolist()
         found[part["label"]] = sum(losses) / len(losses)
         write_text(path, json.dumps(found, indent=1))
     return pd.Series(found)
 
 
-def drive(out: Path, name: str, models: list[dict[str, Any]], maps: int, draws: int) -> pd.DataFrame:
+def drive(
+    out: Path, name: str, models: list[dict[str, Any]], maps: int, draws: int
+) -> pd.DataFrame:
     """Run a suite, or what is missing of it; return the rows of its episodes."""
     suite = {
-        "data": str(drive_maps(out, maps)), "world": "stakes", "scenarios": [SPLIT.removeprefix("test/")],
-        "objectives": ["travel_time"], "maps": maps, "realisations": draws, "record": "none",
-        "planners": ["astar_dwa"], "risks": list(RISKS), "models": models,
-    }  # fmt: skip
+        "data": str(drive_maps(out, maps)),
+        "world": "stakes",
+        "scenarios": [SPLIT.removeprefix("test/")],
+        "objectives": ["travel_time"],
+        "maps": maps,
+        "realisations": draws,
+        "record": "none",
+        "planners": ["astar_dwa"],
+        "risks": list(RISKS),
+        "models": models,
+    }
     runs.drive(suite, out / name, 2)
     return pd.read_parquet(out / name / "episodes.parquet")
 
@@ -121,9 +176,13 @@ def begin(work: Work) -> Path:
 
 
 def doses(
-    work: Work, folder: Path, maps: int = 200, draws: int = 2, sizes: Sequence[int] = SIZES,
+    work: Work,
+    folder: Path,
+    maps: int = 200,
+    draws: int = 2,
+    sizes: Sequence[int] = SIZES,
     seeds: Sequence[int] = SEEDS,
-) -> Results:  # fmt: skip
+) -> Results:
     """Test the hypothesis: quality varied on purpose, measured and driven with.
 
     Raises:
@@ -134,22 +193,37 @@ def doses(
     if not kept.exists():
         kept.write_text(digest)
     known = kept.read_text()
-    expect(known == digest, f"the hypothesis that {out} was begun under, {known}, got {digest}.")
+    expect(
+        known == digest,
+        f"the hypothesis that {out} was begun under, {known}, got {digest}.",
+    )
     print(f"hypothesis {digest}", flush=True)
     models = models_of(sizes, seeds)
     parts = []
     for label, own in models.to_dict("index").items():
-        options = {"checkpoint": str(fit_fused(out, own["size"], own["seed"])), own["what"]: own["dose"]}
+        options = {
+            "checkpoint": str(fit_fused(out, own["size"], own["seed"])),
+            own["what"]: own["dose"],
+        }
         parts.append({"part": f"{VARIED}:Varied", "label": label, "options": options})
-    models["loss"] = measure(out / f"pinball-{maps}.json", parts, drive_maps(out, maps), maps)
+    models["loss"] = measure(
+        out / f"pinball-{maps}.json", parts, drive_maps(out, maps), maps
+    )
     return doses_results(drive(out, "run", parts, maps, draws), models, digest)
 
 
 def compare(
-    work: Work, folder: Path, methods: dict[str, str], recipes: tuple[str, str] = (RECIPE, RECIPE), maps: int = 200,
-    draws: int = 0, size: int = SIZES[-1], seeds: Sequence[int] = SEEDS,
-) -> Results:  # fmt: skip
-    """Compare methods on the maps of two recipes, to train and to test on; differences are to the first method.
+    work: Work,
+    folder: Path,
+    methods: dict[str, str],
+    recipes: tuple[str, str] = (RECIPE, RECIPE),
+    maps: int = 200,
+    draws: int = 0,
+    size: int = SIZES[-1],
+    seeds: Sequence[int] = SEEDS,
+) -> Results:
+    """Compare methods on the maps of two recipes, to train and to test on; differences
+    are to the first method.
 
     Args:
         work: of the study.
@@ -157,27 +231,44 @@ def compare(
         methods: words of `benchnav-train fit` by name.
         recipes: of the maps to train and to test on.
         maps: number of test maps of each split.
-        draws: of λ on each map, on which robots drive with every model; if 0, none drives.
+        draws: of λ on each map, on which robots drive with every model; if 0, none
+            drives.
         size: number of maps to train on.
         seeds: of training.
     """
     out, part = begin(work), folder.name
-    test = make_maps(out / f"{recipes[1]}-test.h5", recipes[1], dict.fromkeys(TESTS, maps))
+    test = make_maps(
+        out / f"{recipes[1]}-test.h5", recipes[1], dict.fromkeys(TESTS, maps)
+    )
     tables, parts = [], []
     for seed in seeds:
         places = {
-            fit(out, method, words, size, seed, recipes[0]): method for method, words in methods.items()
+            fit(out, method, words, size, seed, recipes[0]): method
+            for method, words in methods.items()
         }
         quality_of = out / f"{part}-quality-s{seed}"
         if not (quality_of / "compare.csv").exists():
             splits = f"[{','.join(TESTS)}]"
             command(
-                "benchnav-train", "compare", *places, "--data", test, "--splits", splits, "--out", quality_of
+                "benchnav-train",
+                "compare",
+                *places,
+                "--data",
+                test,
+                "--splits",
+                splits,
+                "--out",
+                quality_of,
             )
         table = pd.read_csv(quality_of / "compare.csv")
-        names = table["model"].map({place.name: method for place, method in places.items()})
+        names = table["model"].map(
+            {place.name: method for place, method in places.items()}
+        )
         tables.append(table.assign(method=names.fillna(table["model"]), seed=seed))
-        parts += [{"part": str(place), "label": f"{method}-s{seed}"} for place, method in places.items()]
+        parts += [
+            {"part": str(place), "label": f"{method}-s{seed}"}
+            for place, method in places.items()
+        ]
     table = pd.concat(tables, ignore_index=True)
     results: Results = {"quality": quality(table)}
     if len(seeds) > 1:

@@ -14,23 +14,35 @@ class Varied(TraversabilityModel):
 
     Args:
         checkpoint: folder of the fused model.
-        temperature: by which that of its class probabilities is multiplied; under 1 it is surer than it was.
-        soft: by which the weights of its soft modes are multiplied; at 0 it knows of none.
+        temperature: by which that of its class probabilities is multiplied; under 1 it
+            is surer than it was.
+        soft: by which the weights of its soft modes are multiplied; at 0 it knows of
+            none.
         brightness: of the image that it is given; at 1 the image as it is.
     """
 
     def __init__(
-        self, checkpoint: str, temperature: float = 1.0, soft: float = 1.0, brightness: float = 1.0
+        self,
+        checkpoint: str,
+        temperature: float = 1.0,
+        soft: float = 1.0,
+        brightness: float = 1.0,
     ) -> None:
         model = load_model(checkpoint)
         assert isinstance(model, FusedModel), checkpoint
         table = model.table
         if table.soft is not None and soft != 1:
             table = replace(
-                table, soft=table.soft._replace(weight=(soft * table.soft.weight).clamp(max=0.99))
+                table,
+                soft=table.soft._replace(
+                    weight=(soft * table.soft.weight).clamp(max=0.99)
+                ),
             )
         self.model = FusedModel(
-            model.classifiers, table, model.class_names, temperature * model.pool_temperature
+            model.classifiers,
+            table,
+            model.class_names,
+            temperature * model.pool_temperature,
         )
         self.class_names, self.brightness = model.class_names, brightness
 

@@ -1,4 +1,6 @@
-"""Distributions for the tests: some hidden from all but their CDF, and quantiles with atoms and gaps."""
+"""Distributions for the tests: some hidden from all but their CDF, and quantiles with
+atoms and gaps.
+"""
 
 import math
 from dataclasses import dataclass
@@ -36,16 +38,26 @@ def mixture(
     maps: int = 2,
     dtype: torch.dtype = torch.float64,
 ) -> TraversabilityMixture:
-    """Components of weights from few to many and deviations from least to most, means from −0.2 to 1.2."""
+    """Components of weights from few to many and deviations from least to most, means
+    from −0.2 to 1.2.
+    """
     generator = torch.Generator().manual_seed(seed)
-    weights, means, stds = torch.rand(3, maps, components, 5, 7, generator=generator, dtype=torch.float64)
+    weights, means, stds = torch.rand(
+        3, maps, components, 5, 7, generator=generator, dtype=torch.float64
+    )
     weights, stds = weights**2, least * math.exp(1) ** (math.log(most / least) * stds)
     parameters = (weights / weights.sum(1, keepdim=True), 1.4 * means - 0.2, stds)
-    return TraversabilityMixture(*(values.to(dtype) for values in parameters), tuple(range(components)))
+    return TraversabilityMixture(
+        *(values.to(dtype) for values in parameters), tuple(range(components))
+    )
 
 
-def quantiles(seed: int = 0, maps: int = 2, dtype: torch.dtype = torch.float64) -> QuantileDistribution:
-    """Quantiles with an atom at 0, one or two inside and two gaps in most cells, shape [B, 5, 7]."""
+def quantiles(
+    seed: int = 0, maps: int = 2, dtype: torch.dtype = torch.float64
+) -> QuantileDistribution:
+    """Quantiles with an atom at 0, one or two inside and two gaps in most cells, shape
+    [B, 5, 7].
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def drawn() -> Tensor:
@@ -53,8 +65,12 @@ def quantiles(seed: int = 0, maps: int = 2, dtype: torch.dtype = torch.float64) 
 
     levels = torch.tensor(LEVELS, dtype=torch.float64).view(-1, 1, 1)
     values = 1.1 * drawn() * levels ** (0.5 + 2 * drawn()) - 0.1
-    values = values + 0.2 * drawn() * (levels > drawn()) + 0.3 * drawn() * (levels > drawn())
+    values = (
+        values + 0.2 * drawn() * (levels > drawn()) + 0.3 * drawn() * (levels > drawn())
+    )
     for _ in range(2):
         low = drawn() * values.amax(1, keepdim=True)
-        values = torch.where((values > low) & (values < low + 0.05 * (1 + drawn())), low, values)
+        values = torch.where(
+            (values > low) & (values < low + 0.05 * (1 + drawn())), low, values
+        )
     return QuantileDistribution(values.clamp(0, 1).cummax(1).values.to(dtype))

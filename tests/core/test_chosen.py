@@ -14,7 +14,9 @@ from tests.core.distributions import Hidden, mixture, quantiles
 
 SHAPE = (2, 5, 7)
 CHOSEN = torch.rand(SHAPE, generator=torch.Generator().manual_seed(4)) < 0.5
-VALUES = torch.rand(SHAPE, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+VALUES = torch.rand(
+    SHAPE, generator=torch.Generator().manual_seed(5), dtype=torch.float64
+)
 ASKED: dict[str, Callable[[TraversabilityDistribution], Tensor]] = {
     "mean": lambda own: own.mean(),
     "cdf": lambda own: own.cdf(0.3),
@@ -48,7 +50,11 @@ def test_each_cell_has_the_one_or_the_other(pair: str, asked: str) -> None:
     found, ask = choose(CHOSEN, first, second), ASKED[asked]
     assert found.shape == SHAPE
     torch.testing.assert_close(
-        ask(found), torch.where(CHOSEN, ask(first), ask(second)), rtol=1e-6, atol=1e-6, equal_nan=True
+        ask(found),
+        torch.where(CHOSEN, ask(first), ask(second)),
+        rtol=1e-6,
+        atol=1e-6,
+        equal_nan=True,
     )
 
 
@@ -70,10 +76,14 @@ def test_two_mixtures_make_one_whose_second_components_belong_to_no_class() -> N
     assert isinstance(found, TraversabilityMixture)
     assert found.group == (0, 1, 2, NO_CLASS, NO_CLASS)
     seen = found.class_probabilities(3)
-    assert torch.equal(seen.movedim(1, -1)[CHOSEN], first.weights.movedim(1, -1)[CHOSEN])
+    assert torch.equal(
+        seen.movedim(1, -1)[CHOSEN], first.weights.movedim(1, -1)[CHOSEN]
+    )
     assert (seen.movedim(1, -1)[~CHOSEN] == 0).all()
     likely = found.most_likely()
-    torch.testing.assert_close(likely.mean()[CHOSEN], first.most_likely().mean()[CHOSEN])
+    torch.testing.assert_close(
+        likely.mean()[CHOSEN], first.most_likely().mean()[CHOSEN]
+    )
     # Where nothing is of a class, all that is believed stays.
     torch.testing.assert_close(likely.mean()[~CHOSEN], second.mean()[~CHOSEN])
 
@@ -89,10 +99,22 @@ def test_a_mixture_without_classes_stays_one() -> None:
 @pytest.mark.parametrize("pair", PAIRS)
 def test_it_has_the_dtype_of_the_first(pair: str) -> None:
     kinds: dict[str, Any] = {
-        "of mixtures": (mixture(3, 0.02, 0.3, dtype=torch.float32), mixture(2, 0.05, 0.2, seed=1)),
-        "of unlike kinds": (quantiles(dtype=torch.float32), mixture(2, 0.05, 0.2, seed=1)),
-        "of the other order": (mixture(2, 0.05, 0.2, seed=1, dtype=torch.float32), quantiles()),
-        "of hidden ones": (Hidden(mixture(3, 0.02, 0.3, dtype=torch.float32)), Hidden(quantiles())),
+        "of mixtures": (
+            mixture(3, 0.02, 0.3, dtype=torch.float32),
+            mixture(2, 0.05, 0.2, seed=1),
+        ),
+        "of unlike kinds": (
+            quantiles(dtype=torch.float32),
+            mixture(2, 0.05, 0.2, seed=1),
+        ),
+        "of the other order": (
+            mixture(2, 0.05, 0.2, seed=1, dtype=torch.float32),
+            quantiles(),
+        ),
+        "of hidden ones": (
+            Hidden(mixture(3, 0.02, 0.3, dtype=torch.float32)),
+            Hidden(quantiles()),
+        ),
     }
     found = choose(CHOSEN, *kinds[pair])
     assert found.dtype == found.mean().dtype == found.cvar(0.9).dtype == torch.float32

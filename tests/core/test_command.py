@@ -1,4 +1,6 @@
-"""How the commands parse, and what they say of mistakes: one line, status 2, in the user's words."""
+"""How the commands parse, and what they say of mistakes: one line, status 2, in the
+user's words.
+"""
 
 import signal
 import subprocess
@@ -17,7 +19,11 @@ seen: list[Any] = []
 
 
 def work(
-    place: str, rest: list[str], deep_cut: bool = False, much_more: int = 1, some: list[int] | None = None
+    place: str,
+    rest: list[str],
+    deep_cut: bool = False,
+    much_more: int = 1,
+    some: list[int] | None = None,
 ) -> None:
     """Work.
 
@@ -131,16 +137,23 @@ def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
         (["a", "--some=3"], ("a", [], False, 1, 3)),
         (["a", "--some", "3,4", "--deep-cut"], ("a", [], True, 1, 3, 4)),
         (["a", "--some", "[3, 4]"], ("a", [], False, 1, 3, 4)),
-        (["a", "b-c=1", "e", "--much-more", "4", "--deep-cut"], ("a", ["b-c=1", "e"], True, 4)),
+        (
+            ["a", "b-c=1", "e", "--much-more", "4", "--deep-cut"],
+            ("a", ["b-c=1", "e"], True, 4),
+        ),
         (["a", "--much-more", "4", "b", "--deep-cut", "c"], ("a", ["b", "c"], True, 4)),
     ],
 )
-def test_flags_are_spelled_either_way_and_switches_need_no_value(argv: list[str], expected: object) -> None:
+def test_flags_are_spelled_either_way_and_switches_need_no_value(
+    argv: list[str], expected: object
+) -> None:
     status = call("work", *argv)
     assert (seen, status) == (([expected], 0) if expected else ([], 2))
 
 
-@pytest.mark.parametrize("argv", [(), ("--help",), ("-h",), ("go", "--help"), ("work", "-h")])
+@pytest.mark.parametrize(
+    "argv", [(), ("--help",), ("-h",), ("go", "--help"), ("work", "-h")]
+)
 def test_a_bare_command_and_help_print_help(
     argv: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -161,7 +174,9 @@ def test_a_bare_command_and_help_print_help(
 @pytest.mark.parametrize("program", ["datagen", "models", "eval"])
 def test_each_program_prints_its_help_when_bare(program: str) -> None:
     code = f"import sys; sys.argv = ['it']; from benchnav.{program}.cli import main; main()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert "usage: benchnav-" in done.stdout
 
@@ -169,11 +184,20 @@ def test_each_program_prints_its_help_when_bare(program: str) -> None:
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
-        (["wrok"], "Expected a command among work, go, got 'wrok'. Did you mean 'work'?"),
+        (
+            ["wrok"],
+            "Expected a command among work, go, got 'wrok'. Did you mean 'work'?",
+        ),
         (["--maps", "3"], "Expected a command among work, go, got '--maps'."),
-        (["go", "--planer", "a"], "got --planer. Did you mean '--planners'? See `x go --help`."),
+        (
+            ["go", "--planer", "a"],
+            "got --planer. Did you mean '--planners'? See `x go --help`.",
+        ),
         (["go", "--planer=a"], "got --planer. Did you mean '--planners'?"),
-        (["go", "--depth.epoch", "1"], "got --depth.epoch. Did you mean '--depth.epochs'?"),
+        (
+            ["go", "--depth.epoch", "1"],
+            "got --depth.epoch. Did you mean '--depth.epochs'?",
+        ),
         (
             ["go", "--depth", "{epoch: 1}"],
             "keys of --depth among epochs, kind, got 'epoch'. Did you mean 'epochs'?",
@@ -185,21 +209,33 @@ def test_each_program_prints_its_help_when_bare(program: str) -> None:
         (["go", "--maps"], "Expected a value after --maps (a whole number), got none."),
         (["go", "--maps", "--rate", "1"], "Expected a value after --maps"),
         (["go", "--rate", "fast"], "Expected --rate as a number or null, got 'fast'."),
-        (["go", "--depth.epochs", "x"], "Expected --depth.epochs as a whole number, got 'x'."),
+        (
+            ["go", "--depth.epochs", "x"],
+            "Expected --depth.epochs as a whole number, got 'x'.",
+        ),
         (
             ["go", "--depth.kind", "gausian"],
             "'censored' or 'gaussian', got 'gausian'. Did you mean 'gaussian'?",
         ),
         (["go", "--depth.epochs", "0"], "Expected `epochs` ≥ 1, got 0."),
         (["go", "--depth", "3"], "Expected --depth as a mapping, got '3'."),
-        (["go", "--options", "3", "--options.a.b", "1"], "a mapping in which 'a.b' can be set, got '3'."),
+        (
+            ["go", "--options", "3", "--options.a.b", "1"],
+            "a mapping in which 'a.b' can be set, got '3'.",
+        ),
         (["go", "--options", "3"], "Expected --options as a mapping, got '3'."),
         (["go", "--risks", "{a: b}"], "Expected --risks as a list, each text, got"),
         (["go", "more"], "Expected nothing more, got 'more'. See `x go --help`."),
         (["work"], "Expected PLACE, got none. See `x work --help`."),
-        (["go", "--config", "nope.yaml"], "or one of demo, paper, got 'nope.yaml', which is not there."),
+        (
+            ["go", "--config", "nope.yaml"],
+            "or one of demo, paper, got 'nope.yaml', which is not there.",
+        ),
         (["go", "--config", "papr"], "Did you mean 'paper'?"),
-        (["work", "a", "--config", "demo"], "Expected --config as a YAML file, got 'demo'"),
+        (
+            ["work", "a", "--config", "demo"],
+            "Expected --config as a YAML file, got 'demo'",
+        ),
     ],
 )
 def test_mistakes_on_the_line_are_told_in_the_users_words(
@@ -221,7 +257,10 @@ def test_mistakes_on_the_line_are_told_in_the_users_words(
             "depth: {epoch: 3}\n",
             "keys of `depth` of s.yaml among epochs, kind, got 'epoch'. Did you mean 'epochs'?",
         ),
-        ("depth: {epochs: x}\n", "Expected `depth.epochs` of s.yaml as a whole number, got 'x'."),
+        (
+            "depth: {epochs: x}\n",
+            "Expected `depth.epochs` of s.yaml as a whole number, got 'x'.",
+        ),
         ("- a\n", "Expected s.yaml to hold settings as `name: value`, got list."),
         ("a: [1\n", "Expected YAML, got s.yaml, line 2: did not find"),
     ],
@@ -243,7 +282,9 @@ def test_shipped_files_are_found_by_name_where_no_such_file_is_here(
     assert seen[-1][0].maps == 5
     seen.clear()
     Path("mysuite.yaml").write_text("")
-    assert "Did you mean 'mysuite.yaml'?" in refused(capsys, "go", "--config", "mysuit.yaml")
+    assert "Did you mean 'mysuite.yaml'?" in refused(
+        capsys, "go", "--config", "mysuit.yaml"
+    )
     assert call("go", "--config", "mysuite.yaml") == 0
     assert seen[-1][0] == Suite()
 
@@ -275,7 +316,9 @@ def test_flags_have_the_last_word_wherever_they_stand() -> None:
         (["--config", "deep.yaml", "--world.hold.for_s", "2"], {"hold": {"below": 0.001, "for_s": 2}}),
     ],
 )  # fmt: skip
-def test_a_name_and_single_fields_are_one_value(argv: list[str], expected: object) -> None:
+def test_a_name_and_single_fields_are_one_value(
+    argv: list[str], expected: object
+) -> None:
     Path("text.yaml").write_text("world: stakes\n")
     Path("deep.yaml").write_text("world: {hold: {below: 1e-3, for_s: 1}}\n")
     Path("mapping.yaml").write_text("world: {noise: resampled, time_s: 3}\n")
@@ -300,7 +343,10 @@ def test_a_parts_name_stands_under_part() -> None:
         ("./mine.py:Mine:0.5", ("./mine.py:Mine:0.5",)),
         ("{part: b, label: c}", ({"part": "b", "label": "c"},)),
         ("{part: b},c", ({"part": "b"}, "c")),
-        ("[b, {part: c, options: {d: 1e-3}}]", ("b", {"part": "c", "options": {"d": 1e-3}})),
+        (
+            "[b, {part: c, options: {d: 1e-3}}]",
+            ("b", {"part": "c", "options": {"d": 1e-3}}),
+        ),
     ],
 )
 def test_lists_are_given_with_or_without_brackets(text: str, expected: object) -> None:
@@ -312,9 +358,25 @@ def test_lists_are_given_with_or_without_brackets(text: str, expected: object) -
 def test_keys_of_mappings_stay_as_they_are() -> None:
     assert call("go", "--options.single-class.some_thing", "3") == 0
     assert seen[-1][0].options == {"single-class": {"some_thing": 3}}
-    Path("o.yaml").write_text("options: {mppi: {samples: 5, noise: 1e-2}, other: {a: 1}}\n")
-    assert call("go", "--options.mppi.samples", "7", "--options.mppi.horizon", "9", "--config", "o.yaml") == 0
-    assert seen[-1][0].options == {"mppi": {"samples": 7, "noise": 0.01, "horizon": 9}, "other": {"a": 1}}
+    Path("o.yaml").write_text(
+        "options: {mppi: {samples: 5, noise: 1e-2}, other: {a: 1}}\n"
+    )
+    assert (
+        call(
+            "go",
+            "--options.mppi.samples",
+            "7",
+            "--options.mppi.horizon",
+            "9",
+            "--config",
+            "o.yaml",
+        )
+        == 0
+    )
+    assert seen[-1][0].options == {
+        "mppi": {"samples": 7, "noise": 0.01, "horizon": 9},
+        "other": {"a": 1},
+    }
 
 
 @pytest.mark.parametrize(
@@ -325,8 +387,14 @@ def test_keys_of_mappings_stay_as_they_are() -> None:
             "could not use {here}/runs/new/run.json: Permission denied. Choose another place with --out, or "
             "change the permissions of {here}.",
         ),
-        (OSError(30, "Read-only file system", "shipped/x"), "change the permissions of {here}/shipped."),
-        (OSError(28, "No space left on device", "x"), "could not use x: No space left on device"),
+        (
+            OSError(30, "Read-only file system", "shipped/x"),
+            "change the permissions of {here}/shipped.",
+        ),
+        (
+            OSError(28, "No space left on device", "x"),
+            "could not use x: No space left on device",
+        ),
         (OSError("odd"), "could not use a file: odd"),
         (ConfigError("two\nlines"), "two lines"),
     ],
@@ -344,7 +412,9 @@ def test_what_the_system_refuses_is_named_with_a_remedy(
     assert expected.format(here=Path.cwd()) in err
 
 
-@pytest.mark.parametrize(("said", "expected"), [((), ""), (("2 maps are kept",), "; 2 maps are kept")])
+@pytest.mark.parametrize(
+    ("said", "expected"), [((), ""), (("2 maps are kept",), "; 2 maps are kept")]
+)
 def test_an_interruption_ends_with_130_and_says_what_the_command_kept(
     said: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -356,7 +426,9 @@ def test_an_interruption_ends_with_130_and_says_what_the_command_kept(
     assert capsys.readouterr().err == f"x: interrupted{expected}\n"
 
 
-def test_a_schedulers_signal_to_end_is_an_interruption(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_schedulers_signal_to_end_is_an_interruption(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     def stop() -> None:
         """Stop."""
         signal.raise_signal(signal.SIGTERM)
@@ -392,5 +464,11 @@ def test_of_any_other_flag_the_last_one_holds() -> None:
 
 
 def test_what_pytorch_says_of_a_gpu_is_one_sentence_with_one_stop() -> None:
-    for said in ("no memory left.\nand more", "no memory left", "\n no memory left. \n"):
-        assert str(gpu_failed(said)).startswith("The GPU failed: no memory left. Finished work is kept")
+    for said in (
+        "no memory left.\nand more",
+        "no memory left",
+        "\n no memory left. \n",
+    ):
+        assert str(gpu_failed(said)).startswith(
+            "The GPU failed: no memory left. Finished work is kept"
+        )

@@ -1,4 +1,6 @@
-"""Command lines of the three commands, good and bad: what the function receives, or the one line that is said."""
+"""Command lines of the three commands, good and bad: what the function receives, or the
+one line that is said.
+"""
 
 # ruff: noqa: E501 - each message stands on one line, as users see it
 
@@ -20,7 +22,11 @@ from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe
 from tests.commands import call
 
-CLIS = {"datagen": benchnav.datagen.cli, "train": benchnav.models.cli, "eval": benchnav.eval.cli}
+CLIS = {
+    "datagen": benchnav.datagen.cli,
+    "train": benchnav.models.cli,
+    "eval": benchnav.eval.cli,
+}
 
 FILES = {
     "s.yaml": "world: stakes\nmaps: 3\n",
@@ -47,8 +53,16 @@ def changed(given: dict[str, Any], defaults: Callable[[str], Any]) -> dict[str, 
         if value == default and type(value) is type(default):
             continue
         if is_dataclass(value) and not isinstance(value, type):
-            required = [f.name for f in fields(value) if f.default is f.default_factory is MISSING]
-            base = default if is_dataclass(default) else type(value)(**dict.fromkeys(required))
+            required = [
+                f.name
+                for f in fields(value)
+                if f.default is f.default_factory is MISSING
+            ]
+            base = (
+                default
+                if is_dataclass(default)
+                else type(value)(**dict.fromkeys(required))
+            )
             inner = {f.name: getattr(value, f.name) for f in fields(value)}
             value = changed(inner, functools.partial(getattr, base))
             if not value:
@@ -59,7 +73,9 @@ def changed(given: dict[str, Any], defaults: Callable[[str], Any]) -> dict[str, 
 
 @pytest.fixture
 def received(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Calls of the commands' functions, none of which runs; in a folder with some files."""
+    """Calls of the commands' functions, none of which runs; in a folder with some
+    files.
+    """
     monkeypatch.chdir(tmp_path)
     for name, content in FILES.items():
         Path(name).write_text(content)
@@ -72,13 +88,20 @@ def received(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, 
         def record(*places: Any, **names: Any) -> int:
             bound = signature(function).bind(*places, **names)
             parameters = signature(function).parameters
-            calls.append(changed(bound.arguments, lambda name: parameters[name].default))
+            calls.append(
+                changed(bound.arguments, lambda name: parameters[name].default)
+            )
             return 0
 
         return record
 
-    def run(program: str, description: str, commands: dict[str, command.Command]) -> int:
-        kept = {name: replace(one, function=replaced(one.function)) for name, one in commands.items()}
+    def run(
+        program: str, description: str, commands: dict[str, command.Command]
+    ) -> int:
+        kept = {
+            name: replace(one, function=replaced(one.function))
+            for name, one in commands.items()
+        }
         return command.run(program, description, kept)
 
     for cli in CLIS.values():
@@ -193,7 +216,9 @@ def test_a_good_line_reaches_its_function(
 ) -> None:
     assert ended(line) == 0
     assert len(received) == 1
-    assert received == [{name: value for name, value in expected.items() if value != {}}]
+    assert received == [
+        {name: value for name, value in expected.items() if value != {}}
+    ]
 
 
 BAD: list[tuple[str, str]] = [
@@ -262,22 +287,42 @@ def test_a_bad_line_ends_in_one_line(
 OVERRIDES: list[tuple[str, Callable[[Recipe], Any], Any]] = [
     ("seed=3", lambda recipe: recipe.seed, 3),
     ("splits.train.maps=50", lambda recipe: recipe.splits["train"].maps, 50),
-    ("splits.new={scenario: std, maps: 1}", lambda recipe: recipe.splits["new"].maps, 1),
-    ("classes.dune_sand.soft.weight=0.2", lambda recipe: recipe.classes[9].soft.weight, 0.2),
+    (
+        "splits.new={scenario: std, maps: 1}",
+        lambda recipe: recipe.splits["new"].maps,
+        1,
+    ),
+    (
+        "classes.dune_sand.soft.weight=0.2",
+        lambda recipe: recipe.classes[9].soft.weight,
+        0.2,
+    ),
     ("classes.dune_sand.soft=null", lambda recipe: recipe.classes[9].soft, None),
     ("classes.gravel.noise=3e-1", lambda recipe: recipe.classes[4].noise, 0.3),
-    ("scenarios.hs.severity=0", lambda recipe: recipe.scenarios["hs"].light_height, (0.8, 1.0)),
-    ("scenarios.low={preset: hs, ambient: 0.5}", lambda recipe: recipe.scenarios["low"].ambient, 0.5),
+    (
+        "scenarios.hs.severity=0",
+        lambda recipe: recipe.scenarios["hs"].light_height,
+        (0.8, 1.0),
+    ),
+    (
+        "scenarios.low={preset: hs, ambient: 0.5}",
+        lambda recipe: recipe.scenarios["low"].ambient,
+        0.5,
+    ),
     ("places.margin_m=4", lambda recipe: recipe.places.margin_m, 4.0),
 ]
 
 
-@pytest.mark.parametrize(("text", "value", "expected"), OVERRIDES, ids=[row[0] for row in OVERRIDES])
+@pytest.mark.parametrize(
+    ("text", "value", "expected"), OVERRIDES, ids=[row[0] for row in OVERRIDES]
+)
 def test_an_override_reaches_the_recipe(
     text: str, value: Callable[[Recipe], Any], expected: Any, received: list[dict[str, Any]],
 ) -> None:  # fmt: skip
     assert ended(f"datagen create stakes-v1 id=mine '{text}'") == 0
-    assert value(load_recipe(received[0]["recipe"], received[0]["overrides"])) == expected
+    assert (
+        value(load_recipe(received[0]["recipe"], received[0]["overrides"])) == expected
+    )
 
 
 BAD_OVERRIDES = [
@@ -307,7 +352,9 @@ BAD_OVERRIDES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("text", "message"), BAD_OVERRIDES, ids=[text for text, _ in BAD_OVERRIDES])
+@pytest.mark.parametrize(
+    ("text", "message"), BAD_OVERRIDES, ids=[text for text, _ in BAD_OVERRIDES]
+)
 def test_a_bad_override_ends_in_one_line(text: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         load_recipe("stakes-v1", ["id=mine", text])
@@ -320,7 +367,10 @@ SHOWN = [
     ("train mdn --help", "--mdn.components"),
     ("datagen create --seed 3 --help", "recipe"),
     ("eval run --config s.yaml --print_config", "world: stakes"),
-    ("eval run --world stakes --world.correlation_m 2 --print_config", "correlation_m: 2"),
+    (
+        "eval run --world stakes --world.correlation_m 2 --print_config",
+        "correlation_m: 2",
+    ),
     ("train classifier --config train.yaml --print_config", "encoder: resnet18"),
     ("train mdn --mdn.hidden 8 --print_config", "hidden: 8"),
     ("eval run --maps 3 --print-config", "maps: 3"),
@@ -335,7 +385,9 @@ def test_settings_may_be_printed_without_those_that_are_as_they_were(
     assert ended("eval run --config s.yaml --world.noise stored --print_config") == 0
     Path("printed.yaml").write_text(capsys.readouterr().out)
     assert ended("eval run --config printed.yaml") == 0
-    assert received == [{"suite": {"world": {"preset": "stakes", "noise": "stored"}, "maps": 3}}]
+    assert received == [
+        {"suite": {"world": {"preset": "stakes", "noise": "stored"}, "maps": 3}}
+    ]
 
 
 @pytest.mark.parametrize(("line", "expected"), SHOWN, ids=[line for line, _ in SHOWN])

@@ -1,4 +1,6 @@
-"""Describing an object and creating it again gives an equal object, or says that it cannot."""
+"""Describing an object and creating it again gives an equal object, or says that it
+cannot.
+"""
 
 import sys
 from dataclasses import replace
@@ -32,10 +34,17 @@ LEVEL = st.floats(0, 0.99)
 
 
 @given(level=LEVEL, floor=st.floats(0.01, 1))
-def test_a_risk_measure_is_the_part_that_suites_name(level: float, floor: float) -> None:
+def test_a_risk_measure_is_the_part_that_suites_name(
+    level: float, floor: float
+) -> None:
     assert make("risk", describe("risk", CVaR(level))) == CVaR(level)
-    assert make("risk", describe("risk", TimeCVaR(level, floor))) == TimeCVaR(level, floor)
-    assert describe("risk", TimeCVaR(level=level, floor=floor)).options == {"level": level, "floor": floor}
+    assert make("risk", describe("risk", TimeCVaR(level, floor))) == TimeCVaR(
+        level, floor
+    )
+    assert describe("risk", TimeCVaR(level=level, floor=floor)).options == {
+        "level": level,
+        "floor": floor,
+    }
     assert complete("risk", describe("risk", CVaR(level))).options == {"level": level}
 
 
@@ -51,19 +60,29 @@ def test_a_risk_measure_is_the_part_that_suites_name(level: float, floor: float)
         ("planner", MPPI(MPPIConfig(samples=200)), "mppi", "mppi samples=200"),
         ("robot", Unicycle(speed_mps=(0, 2)), "unicycle", "unicycle speed_mps=[0, 2]"),
         ("robot", Bicycle(), "bicycle", "bicycle"),
-        ("objective", TravelTime(robot=Unicycle(), goal_radius_m=2.0), "travel_time", "travel_time"),
+        (
+            "objective",
+            TravelTime(robot=Unicycle(), goal_radius_m=2.0),
+            "travel_time",
+            "travel_time",
+        ),
         ("sensor", Near(8), "near", "near:8"),
         ("ground", Probe(2), "probe", "probe:2"),
         ("belief", Copula(), "copula", "copula"),
         ("belief", Classes(), "classes", "classes"),
     ],
 )
-def test_a_shipped_object_is_described_by_its_name(kind: str, instance: Any, source: str, label: str) -> None:
+def test_a_shipped_object_is_described_by_its_name(
+    kind: str, instance: Any, source: str, label: str
+) -> None:
     part = describe(kind, instance)
     assert (part.part, part.label) == (source, label)
     # The label of an option is what a suite would write, and means the same.
     if ":" in label:
-        assert complete(kind, part).options == complete(kind, describe(kind, label)).options
+        assert (
+            complete(kind, part).options
+            == complete(kind, describe(kind, label)).options
+        )
 
 
 def test_an_object_that_was_changed_is_not_described_by_its_former_arguments() -> None:
@@ -83,7 +102,11 @@ def test_what_nothing_describes_is_known_in_this_process_only() -> None:
         pass
 
     first, second = Mine(), Mine()
-    parts = [describe("planner", first), describe("planner", second), describe("planner", first)]
+    parts = [
+        describe("planner", first),
+        describe("planner", second),
+        describe("planner", first),
+    ]
     assert [make("planner", part) for part in parts] == [first, second, first]
     assert parts[0] == parts[2] != parts[1]
     for risk in (half, lambda distribution: distribution.mean()):
@@ -93,7 +116,9 @@ def test_what_nothing_describes_is_known_in_this_process_only() -> None:
     assert not is_object("risk", "cvar")
 
 
-def test_a_class_of_a_file_is_described_by_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_class_of_a_file_is_described_by_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     Path("halves.py").write_text(
@@ -121,7 +146,9 @@ def test_arguments_that_are_no_plain_data_are_not_described() -> None:
 
 
 def test_a_class_is_described_with_its_defaults() -> None:
-    assert describe("objective", TravelTime) == Part(part="travel_time", label="travel_time")
+    assert describe("objective", TravelTime) == Part(
+        part="travel_time", label="travel_time"
+    )
 
     class Mine(AStarDWA):
         pass
@@ -130,5 +157,7 @@ def test_a_class_is_described_with_its_defaults() -> None:
 
 
 def test_an_object_of_another_kind_is_rejected() -> None:
-    with pytest.raises(ConfigError, match=r"to be a subclass of benchnav\.planning\.Planner, got CVaR"):
+    with pytest.raises(
+        ConfigError, match=r"to be a subclass of benchnav\.planning\.Planner, got CVaR"
+    ):
         describe("planner", CVaR())

@@ -41,14 +41,20 @@ def these(*names: str) -> pytest.MarkDecorator:
 
 def close(found: Tensor, wanted: Tensor, relative: float = 0.0) -> None:
     assert found.dtype == wanted.dtype
-    torch.testing.assert_close(found, wanted, rtol=relative, atol=0 if relative else 1e-4)
+    torch.testing.assert_close(
+        found, wanted, rtol=relative, atol=0 if relative else 1e-4
+    )
 
 
 @EACH
 @pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 0.99])
-def test_the_tail_of_a_cdf_is_that_of_the_exact_form(law: TraversabilityDistribution, level: float) -> None:
+def test_the_tail_of_a_cdf_is_that_of_the_exact_form(
+    law: TraversabilityDistribution, level: float
+) -> None:
     close(Hidden(law).cvar(level), law.cvar(level))
-    torch.testing.assert_close(Hidden(law).var(level), law.var(level), rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        Hidden(law).var(level), law.var(level), rtol=0, atol=1e-9
+    )
 
 
 @EACH
@@ -65,27 +71,41 @@ def test_the_expected_time_of_a_cdf_is_that_of_the_exact_form(
 def test_the_tail_of_the_time_of_a_cdf_is_that_of_the_exact_form(
     law: TraversabilityDistribution, level: float, floor: float
 ) -> None:
-    close(Hidden(law).time_cvar(level, floor), law.time_cvar(level, floor), relative=1e-4)
+    close(
+        Hidden(law).time_cvar(level, floor), law.time_cvar(level, floor), relative=1e-4
+    )
     if level == 0:
         close(law.time_cvar(level, floor), law.expected_time(floor), relative=1e-6)
 
 
 @EACH
 @pytest.mark.parametrize("bound", [0.0, 0.1, 0.35, 1.0])
-def test_the_chance_of_a_cdf_is_that_of_the_exact_form(law: TraversabilityDistribution, bound: float) -> None:
+def test_the_chance_of_a_cdf_is_that_of_the_exact_form(
+    law: TraversabilityDistribution, bound: float
+) -> None:
     close(Hidden(law).chance(bound), law.chance(bound))
 
 
 @these("wide", "narrow", "wide and narrow", "points", "many", "quantiles")
-def test_the_crps_of_a_cdf_is_the_integral_that_defines_it(law: TraversabilityDistribution) -> None:
-    observed = torch.rand(law.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+def test_the_crps_of_a_cdf_is_the_integral_that_defines_it(
+    law: TraversabilityDistribution,
+) -> None:
+    observed = torch.rand(
+        law.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64
+    )
     observed[0, 0, :2] = torch.tensor([0.0, 1.0])
     if isinstance(law, QuantileDistribution):  # whose form is exact
         close(Hidden(law).crps(observed), law.crps(observed))
         return
-    count = 20_000  # a midpoint rule, off by half a step times all rises of a monotone function
-    total, many = torch.zeros_like(observed), law.select(torch.arange(len(observed)).repeat(500))
-    for points in ((torch.arange(count, dtype=torch.float64) + 0.5) / count).view(-1, 500, 1, 1, 1):
+    # a midpoint rule, off by half a step times all rises of a monotone function
+    count = 20_000
+    total, many = (
+        torch.zeros_like(observed),
+        law.select(torch.arange(len(observed)).repeat(500)),
+    )
+    for points in ((torch.arange(count, dtype=torch.float64) + 0.5) / count).view(
+        -1, 500, 1, 1, 1
+    ):
         x = points.expand(-1, *observed.shape)
         below = many.cdf(x.flatten(0, 1)).view_as(x)
         total += (below - (observed <= x).double()).square().sum(0)
@@ -110,13 +130,17 @@ def test_any_cdf_has_the_integrals_of_its_exact_form(
     means: list[float], stds: list[float], share: float, level: float
 ) -> None:
     weights = [share, (1 - share) / 3, 2 * (1 - share) / 3]
-    law = TraversabilityMixture(*torch.tensor([weights, means, stds], dtype=torch.float64)[..., None, None])
+    law = TraversabilityMixture(
+        *torch.tensor([weights, means, stds], dtype=torch.float64)[..., None, None]
+    )
     close(Hidden(law).cvar(level), law.cvar(level))
     close(Hidden(law).expected_time(0.05), law.expected_time(0.05), relative=1e-4)
 
 
 @EACH
-def test_normal_numbers_and_traversability_are_of_one_rank(law: TraversabilityDistribution) -> None:
+def test_normal_numbers_and_traversability_are_of_one_rank(
+    law: TraversabilityDistribution,
+) -> None:
     hidden, normal = (
         Hidden(law),
         torch.linspace(-2, 2, law.shape.numel(), dtype=torch.float64).view(law.shape),
@@ -133,13 +157,18 @@ def test_the_interval_of_normal_numbers_is_that_of_an_atom() -> None:
     law = mixture(1, 0.1, 0.2)
     mean, std = law.means.squeeze(1), law.stds.squeeze(1)
     for own in (law, Hidden(law)):
-        for value, lower, upper in ((0.0, -math.inf, -mean / std), (1.0, (1 - mean) / std, math.inf)):
+        for value, lower, upper in (
+            (0.0, -math.inf, -mean / std),
+            (1.0, (1 - mean) / std, math.inf),
+        ):
             found = own.to_normal(value)
             for side, wanted in zip(found, (lower, upper), strict=True):
                 wanted = torch.as_tensor(wanted, dtype=torch.float64).expand(law.shape)
                 # Of a CDF near 1 not all figures are left.
                 known = (wanted.abs() < 4) | wanted.isinf()
-                torch.testing.assert_close(side[known], wanted[known], atol=1e-6, rtol=0)
+                torch.testing.assert_close(
+                    side[known], wanted[known], atol=1e-6, rtol=0
+                )
     below, above = Hidden(law).to_normal(-0.1), Hidden(law).to_normal(1.1)
     assert bool((below[1] == -math.inf).all())
     assert bool((above[0] == math.inf).all())
@@ -148,7 +177,9 @@ def test_the_interval_of_normal_numbers_is_that_of_an_atom() -> None:
 def test_the_spread_of_a_normal_law_is_its_standard_deviation() -> None:
     mean = torch.full((1, 3, 3), 0.5)
     spread = factories.normal(mean, torch.full_like(mean, 0.1)).spread()
-    torch.testing.assert_close(spread, torch.full_like(mean, 0.99446 * 0.1), rtol=0, atol=5e-5)
+    torch.testing.assert_close(
+        spread, torch.full_like(mean, 0.99446 * 0.1), rtol=0, atol=5e-5
+    )
     assert factories.certain(mean).spread().abs().max() == 0
 
 
@@ -185,10 +216,16 @@ def test_the_integrals_of_a_cell_are_its_own_however_many_others_there_are(
 
 @pytest.mark.parametrize("leading", [(), (3,), (2, 3)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_any_leading_dimensions_and_dtype_are_kept(leading: tuple[int, ...], dtype: torch.dtype) -> None:
+def test_any_leading_dimensions_and_dtype_are_kept(
+    leading: tuple[int, ...], dtype: torch.dtype
+) -> None:
     generator = torch.Generator().manual_seed(0)
-    weights, means, stds = torch.rand(3, *leading, 2, 4, 3, generator=generator, dtype=dtype)
-    law = TraversabilityMixture(weights / weights.sum(-3, keepdim=True), means, 0.1 + stds)
+    weights, means, stds = torch.rand(
+        3, *leading, 2, 4, 3, generator=generator, dtype=dtype
+    )
+    law = TraversabilityMixture(
+        weights / weights.sum(-3, keepdim=True), means, 0.1 + stds
+    )
     hidden, value = Hidden(law), torch.full(law.shape, 0.4, dtype=dtype)
     assert hidden.shape == (*leading, 4, 3)
     assert hidden.dtype == dtype
@@ -201,7 +238,11 @@ def test_any_leading_dimensions_and_dtype_are_kept(leading: tuple[int, ...], dty
             found = getattr(own, name)(*arguments)
             assert (found.shape, found.dtype) == (law.shape, dtype), name
     torch.testing.assert_close(hidden.cvar(0.8), law.cvar(0.8), rtol=0, atol=1e-4)
-    for side in (*law.to_normal(0.4), *hidden.to_normal(value), *hidden.cdf_limits(0.4)):
+    for side in (
+        *law.to_normal(0.4),
+        *hidden.to_normal(value),
+        *hidden.cdf_limits(0.4),
+    ):
         assert (side.shape, side.dtype) == (law.shape, dtype)
 
 
@@ -209,7 +250,9 @@ def test_cells_and_members_are_taken_out_of_what_a_distribution_is_made_of() -> 
     law = Hidden(mixture(2, 0.1, 0.3))
     which = torch.rand(law.shape, generator=torch.Generator().manual_seed(0)) > 0.5
     assert torch.equal(law.at(which).quantile(0.3), law.quantile(0.3)[which][None])
-    assert torch.equal(law.select(torch.tensor([1, 0, 1])).cdf(0.4), law.cdf(0.4)[[1, 0, 1]])
+    assert torch.equal(
+        law.select(torch.tensor([1, 0, 1])).cdf(0.4), law.cdf(0.4)[[1, 0, 1]]
+    )
     assert law.to("meta").device.type == "meta"
     copied = law.clone()
     assert isinstance(copied.own, TraversabilityMixture)
@@ -220,7 +263,9 @@ def test_cells_and_members_are_taken_out_of_what_a_distribution_is_made_of() -> 
 @pytest.mark.parametrize("kind", ["mixture", "quantiles", "pooled"])
 def test_cells_are_told_in_which_two_predictions_differ(kind: str) -> None:
     base: Any = quantiles() if kind == "quantiles" else mixture(3, 0.1, 0.4)
-    base = PooledDistribution((base, mixture(2, 0.1, 0.4))) if kind == "pooled" else base
+    base = (
+        PooledDistribution((base, mixture(2, 0.1, 0.4))) if kind == "pooled" else base
+    )
     cells = torch.zeros(base.shape, dtype=torch.bool)
     cells[0, 2, 3] = cells[1, 4] = True
     moved = map_tensors(base, lambda values: values + 1e-3)

@@ -1,4 +1,6 @@
-"""What ran out of memory is told from what is wrong, wherever it was raised and whatever wrapped it."""
+"""What ran out of memory is told from what is wrong, wherever it was raised and
+whatever wrapped it.
+"""
 
 import errno
 
@@ -7,7 +9,12 @@ import pytest
 import torch
 
 from benchnav.core.command import Command, run
-from benchnav.core.errors import CheckpointError, ConfigError, OutOfMemoryError, out_of_memory
+from benchnav.core.errors import (
+    CheckpointError,
+    ConfigError,
+    OutOfMemoryError,
+    out_of_memory,
+)
 from benchnav.core.settings import call
 from benchnav.eval.folder.run_folder import damaged
 from benchnav.models import predictor
@@ -17,7 +24,9 @@ TOO_MUCH = {
     "python": lambda: bytearray(2**62),
     "numpy": lambda: np.empty(2**60, np.uint8),
     "torch": lambda: torch.empty(2**60, dtype=torch.uint8),
-    "system": lambda: (_ for _ in ()).throw(OSError(errno.ENOMEM, "Cannot allocate memory")),
+    "system": lambda: (_ for _ in ()).throw(
+        OSError(errno.ENOMEM, "Cannot allocate memory")
+    ),
     "cuda": lambda: (_ for _ in ()).throw(
         torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9 GiB")
     ),
@@ -46,7 +55,9 @@ def faulty(work: str) -> None:
 
 
 @pytest.mark.parametrize("kind", TOO_MUCH)
-def test_a_command_says_that_memory_ran_out(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_says_that_memory_ran_out(
+    kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run("x", "Does.", {"w": Command(wrapped, ("work",))}, ["w", kind]) == 2
     line = capsys.readouterr().err
     assert line.startswith("x: error: Memory ran out (")

@@ -6,25 +6,36 @@ from scipy.ndimage import generate_binary_structure, label
 from benchnav.core import gridgraph
 
 
-def networkx_costs(costs: np.ndarray, goals: np.ndarray, shape: tuple[int, int]) -> dict[int, float]:
+def networkx_costs(
+    costs: np.ndarray, goals: np.ndarray, shape: tuple[int, int]
+) -> dict[int, float]:
     source, target, _ = gridgraph.neighbour_pairs(*shape)
     graph = networkx.DiGraph()
     graph.add_nodes_from(range(shape[0] * shape[1]))
     keep = np.isfinite(costs)
     # Turned round, as a search from the goals.
     graph.add_weighted_edges_from(
-        zip(target[keep].tolist(), source[keep].tolist(), costs[keep].tolist(), strict=True)
+        zip(
+            target[keep].tolist(),
+            source[keep].tolist(),
+            costs[keep].tolist(),
+            strict=True,
+        )
     )
     if not goals.any():
         return {}
-    return networkx.multi_source_dijkstra_path_length(graph, set(np.flatnonzero(goals).tolist()))
+    return networkx.multi_source_dijkstra_path_length(
+        graph, set(np.flatnonzero(goals).tolist())
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_cost_to_go_equals_networkx_on_each_map_of_a_batch(seed: int) -> None:
     generator = np.random.default_rng(seed)
     shape, batch = (9, 7), 4
-    costs = generator.uniform(0.1, 3, (batch, len(gridgraph.neighbour_pairs(*shape)[0])))
+    costs = generator.uniform(
+        0.1, 3, (batch, len(gridgraph.neighbour_pairs(*shape)[0]))
+    )
     costs[generator.random(costs.shape) < 0.45] = np.inf
     # Nothing leaves one cell.
     costs[1:, gridgraph.neighbour_pairs(*shape)[0] == 30] = np.inf
@@ -38,11 +49,16 @@ def test_cost_to_go_equals_networkx_on_each_map_of_a_batch(seed: int) -> None:
         np.testing.assert_allclose(cost[b].ravel(), expected)
         # Each pointer leads along an edge that accounts for the difference in cost.
         source, target, _ = gridgraph.neighbour_pairs(*shape)
-        edge = {(int(s), int(t)): c for s, t, c in zip(source, target, costs[b], strict=True)}
+        edge = {
+            (int(s), int(t)): c
+            for s, t, c in zip(source, target, costs[b], strict=True)
+        }
         for cell in range(len(expected)):
             onward = int(following[b, cell])
             if np.isfinite(expected[cell]) and not goals[b].ravel()[cell]:
-                assert expected[cell] == pytest.approx(edge[cell, onward] + expected[onward])
+                assert expected[cell] == pytest.approx(
+                    edge[cell, onward] + expected[onward]
+                )
             else:
                 assert onward == gridgraph.NO_CELL
 
@@ -66,7 +82,9 @@ def test_every_cell_has_its_neighbours() -> None:
     assert len(source) == 2 * (3 * 3 + 2 * 4 + 2 * 2 * 3)
     assert len(set(zip(source.tolist(), target.tolist(), strict=True))) == len(source)
     rows, columns = np.divmod(source, 4), np.divmod(target, 4)
-    np.testing.assert_allclose(np.hypot(rows[0] - columns[0], rows[1] - columns[1]), length)
+    np.testing.assert_allclose(
+        np.hypot(rows[0] - columns[0], rows[1] - columns[1]), length
+    )
 
 
 def test_travel_time_is_half_in_each_cell() -> None:
@@ -91,4 +109,6 @@ def test_steps_join_what_shared_edges_join_and_once_what_corners_do(
     reached = np.isfinite(gridgraph.cost_to_go(costs, goals, shape)[0])
     for b in range(batch):
         parts, _ = label(free[b], generate_binary_structure(2, shared))
-        assert np.array_equal(reached[b], (parts == parts[4, 3]) & free[b] & free[b, 4, 3])
+        assert np.array_equal(
+            reached[b], (parts == parts[4, 3]) & free[b] & free[b, 4, 3]
+        )

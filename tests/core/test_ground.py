@@ -24,7 +24,10 @@ def test_the_mixture_is_the_same_in_every_cell() -> None:
     mixture = GROUND.mixture((2, 3, 4), torch.zeros(1, dtype=torch.float64))
     assert mixture.shape == (2, 3, 4)
     torch.testing.assert_close(
-        mixture.mean(), torch.full((2, 3, 4), 0.575, dtype=torch.float64), atol=0.01, rtol=0
+        mixture.mean(),
+        torch.full((2, 3, 4), 0.575, dtype=torch.float64),
+        atol=0.01,
+        rtol=0,
     )
 
 
@@ -36,9 +39,18 @@ def test_the_mixture_is_the_same_in_every_cell() -> None:
         ('{"format": "other"}', "'other'"),
         ('{"format": "benchnav-ground-1"}', "'weights'"),
         (json.dumps(json.loads(GROUND.to_json()) | {"stds": [1.0]}), "2, 2 and 1"),
-        (json.dumps(json.loads(GROUND.to_json()) | {"stds": [1.0, -1.0]}), "`stds` ≥ 0"),
-        (json.dumps(json.loads(GROUND.to_json()) | {"weights": [0.3, 0.3]}), "sum to 1"),
-        (json.dumps(json.loads(GROUND.to_json()) | {"layer_means": {"rgb": [1.0]}}), "so many channels"),
+        (
+            json.dumps(json.loads(GROUND.to_json()) | {"stds": [1.0, -1.0]}),
+            "`stds` ≥ 0",
+        ),
+        (
+            json.dumps(json.loads(GROUND.to_json()) | {"weights": [0.3, 0.3]}),
+            "sum to 1",
+        ),
+        (
+            json.dumps(json.loads(GROUND.to_json()) | {"layer_means": {"rgb": [1.0]}}),
+            "so many channels",
+        ),
     ],
 )
 def test_what_is_no_statistics_is_refused_in_one_line(text: str, named: str) -> None:

@@ -39,10 +39,16 @@ class Hub(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         self.asked.append(self.path)
         path = self.path.partition("?")[0]
-        if found := re.fullmatch(r"/api/(models|datasets)/([^/]+/[^/]+)/(revision|tree)/([^/]+)", path):
+        if found := re.fullmatch(
+            r"/api/(models|datasets)/([^/]+/[^/]+)/(revision|tree)/([^/]+)", path
+        ):
             return self._about(found[1], found[2], found[3], found[4])
-        if found := re.fullmatch(r"/(datasets/)?([^/]+/[^/]+)/resolve/([^/]+)/(.+)", path):
-            return self._file(f"{'datasets' if found[1] else 'models'}/{found[2]}", found[4])
+        if found := re.fullmatch(
+            r"/(datasets/)?([^/]+/[^/]+)/resolve/([^/]+)/(.+)", path
+        ):
+            return self._file(
+                f"{'datasets' if found[1] else 'models'}/{found[2]}", found[4]
+            )
         return self._answer(404, b"", {})
 
     def _about(self, kind: str, name: str, what: str, revision: str) -> None:
@@ -54,17 +60,34 @@ class Hub(BaseHTTPRequestHandler):
         files = sorted(path for path in folder.iterdir() if path.is_file())
         siblings = [{"rfilename": path.name} for path in files]
         tree = [
-            {"type": "file", "path": path.name, "size": path.stat().st_size, "oid": digest(path)}
+            {
+                "type": "file",
+                "path": path.name,
+                "size": path.stat().st_size,
+                "oid": digest(path),
+            }
             for path in files
         ]
-        about = {"id": name, "sha": COMMIT, "siblings": siblings, "tags": [], "private": False}
-        return self._answer(200, json.dumps(tree if what == "tree" else about).encode(), {})
+        about = {
+            "id": name,
+            "sha": COMMIT,
+            "siblings": siblings,
+            "tags": [],
+            "private": False,
+        }
+        return self._answer(
+            200, json.dumps(tree if what == "tree" else about).encode(), {}
+        )
 
     def _file(self, repo: str, name: str) -> None:
         path = self.repos[repo] / name
         if not path.is_file():
             return self._answer(404, b"", {"X-Error-Code": "EntryNotFound"})
-        return self._answer(200, path.read_bytes(), {"ETag": f'"{digest(path)}"', "X-Repo-Commit": COMMIT})
+        return self._answer(
+            200,
+            path.read_bytes(),
+            {"ETag": f'"{digest(path)}"', "X-Repo-Commit": COMMIT},
+        )
 
     def _answer(self, status: int, content: bytes, headers: dict[str, str]) -> None:
         self.send_response(status)
@@ -96,12 +119,17 @@ def server(tmp_path: Path) -> Iterator[tuple[str, type[Hub]]]:
     serving.shutdown()
 
 
-def run(folder: Path, command: str, *words: object, **environment: str) -> subprocess.CompletedProcess[str]:
+def run(
+    folder: Path, command: str, *words: object, **environment: str
+) -> subprocess.CompletedProcess[str]:
     """Runs a command with a cache of its own."""
-    place = (
-        f"import sys; sys.argv[0] = {command!r}; from benchnav.{PACKAGES[command]}.cli import main; main()"
-    )
-    settings = {**os.environ, "HF_HOME": str(folder / "hf"), "HF_HUB_DISABLE_XET": "1", **environment}
+    place = f"import sys; sys.argv[0] = {command!r}; from benchnav.{PACKAGES[command]}.cli import main; main()"
+    settings = {
+        **os.environ,
+        "HF_HOME": str(folder / "hf"),
+        "HF_HUB_DISABLE_XET": "1",
+        **environment,
+    }
     settings.pop("HF_HUB_CACHE", None)
     return subprocess.run(
         [sys.executable, "-c", place, *map(str, words)],
@@ -121,20 +149,35 @@ def test_a_dataset_is_downloaded_once_and_read_without_a_connection(
     shutil.copy(dataset_path, repo / "maps.h5")
     (repo / "evil.py").write_text("raise SystemExit(7)")
     handler.repos["datasets/me/ground"] = repo
-    done = run(tmp_path, "benchnav-datagen", "show", "me/ground@main", HF_ENDPOINT=address)
+    done = run(
+        tmp_path, "benchnav-datagen", "show", "me/ground@main", HF_ENDPOINT=address
+    )
     assert done.returncode == 0, done.stderr
     assert f"me/ground@main is {COMMIT} now and may move" in done.stderr
-    assert not any("evil.py" in path for path in handler.asked)  # data alone is downloaded
+    assert not any(
+        "evil.py" in path for path in handler.asked
+    )  # data alone is downloaded
     local = run(tmp_path, "benchnav-datagen", "show", str(dataset_path))
     assert done.stdout.splitlines()[1:] == local.stdout.splitlines()[1:]
     handler.asked.clear()
-    again = run(tmp_path, "benchnav-datagen", "show", f"me/ground@{COMMIT}", HF_ENDPOINT=address)
-    assert (again.returncode, again.stdout, again.stderr, handler.asked) == (0, done.stdout, "", [])
-    offline = run(tmp_path, "benchnav-datagen", "show", "me/ground@main", HF_HUB_OFFLINE="1")
+    again = run(
+        tmp_path, "benchnav-datagen", "show", f"me/ground@{COMMIT}", HF_ENDPOINT=address
+    )
+    assert (again.returncode, again.stdout, again.stderr, handler.asked) == (
+        0,
+        done.stdout,
+        "",
+        [],
+    )
+    offline = run(
+        tmp_path, "benchnav-datagen", "show", "me/ground@main", HF_HUB_OFFLINE="1"
+    )
     assert (offline.returncode, offline.stdout) == (0, done.stdout)
 
 
-def test_what_a_hub_lacks_is_one_line(server: tuple[str, type[Hub]], tmp_path: Path) -> None:
+def test_what_a_hub_lacks_is_one_line(
+    server: tuple[str, type[Hub]], tmp_path: Path
+) -> None:
     address, handler = server
     handler.repos["datasets/me/empty"] = tmp_path / "empty"
     (tmp_path / "empty").mkdir()
@@ -149,7 +192,9 @@ def test_what_a_hub_lacks_is_one_line(server: tuple[str, type[Hub]], tmp_path: P
         assert done.returncode == 2
         assert said in done.stderr
         assert "Traceback" not in done.stderr
-    offline = run(tmp_path, "benchnav-datagen", "show", "me/none@main", HF_HUB_OFFLINE="1")
+    offline = run(
+        tmp_path, "benchnav-datagen", "show", "me/none@main", HF_HUB_OFFLINE="1"
+    )
     assert offline.returncode == 2
     assert "Try again with a connection, or name a local folder." in offline.stderr
 
@@ -189,7 +234,11 @@ def test_a_checkpoint_is_downloaded_and_what_is_here_goes_first(
     address, handler = server
     shipped = Path(__file__).parents[2] / "checkpoints" / "stakes-v1"
     handler.repos["models/me/stakes"] = shipped
-    settings = {"HF_HOME": str(tmp_path / "hf"), "HF_ENDPOINT": address, "HF_HUB_DISABLE_XET": "1"}
+    settings = {
+        "HF_HOME": str(tmp_path / "hf"),
+        "HF_ENDPOINT": address,
+        "HF_HUB_DISABLE_XET": "1",
+    }
 
     moves, stays = "me/stakes@main", f"me/stakes@{COMMIT}"
     done = subprocess.run(
@@ -223,7 +272,14 @@ def test_addresses_go_through_training_measures_and_suites(
     )
     ground.mkdir(parents=True)
     shutil.copy(dataset_path, ground / "maps.h5")
-    small = ("--settings.encoder_depth", 1, "--settings.hidden", 8, "--settings.max_epochs", 1)
+    small = (
+        "--settings.encoder_depth",
+        1,
+        "--settings.hidden",
+        8,
+        "--settings.max_epochs",
+        1,
+    )
     trained = (
         "fit",
         "mean_variance",
@@ -254,12 +310,22 @@ def test_addresses_go_through_training_measures_and_suites(
     for name, model, data in (
         ("here", "net", dataset_path), ("hub", f"me/net@{COMMIT}", f"me/ground@{COMMIT}"),
     ):  # fmt: skip
-        assert call("train", "evaluate", model, "--data", data, *shown, f"{name}.json") == 0
-        assert call("eval", "run", "--model", model, "--data", data, *task, "--out", name) == 0
+        assert (
+            call("train", "evaluate", model, "--data", data, *shown, f"{name}.json")
+            == 0
+        )
+        assert (
+            call("eval", "run", "--model", model, "--data", data, *task, "--out", name)
+            == 0
+        )
         report = json.loads(Path(f"{name}.json").read_text())
         rows = pd.read_parquet(tmp_path / name / "episodes.parquet")
         drawn = ["map", "outcome", "end_time_s", "traversability", "path_length_m"]
-        found[name] = report["splits"]["test/std"]["crps"], rows[drawn].to_dict("list"), set(rows["model"])
+        found[name] = (
+            report["splits"]["test/std"]["crps"],
+            rows[drawn].to_dict("list"),
+            set(rows["model"]),
+        )
     assert found["hub"][:2] == found["here"][:2]
     assert (found["here"][2], found["hub"][2]) == ({"net"}, {f"net@{COMMIT}"})
     about = (tmp_path / "hub" / "run.json").read_text()

@@ -19,7 +19,9 @@ from tests.factories import draw
 DRAWS = 10**6
 
 
-def random_mixture(components: int = 4, cells: int = 6, seed: int = 0) -> TraversabilityMixture:
+def random_mixture(
+    components: int = 4, cells: int = 6, seed: int = 0
+) -> TraversabilityMixture:
     generator = torch.Generator().manual_seed(seed)
     shape = (2, components, 1, cells)
     weights = torch.rand(shape, generator=generator, dtype=torch.float64)
@@ -30,14 +32,20 @@ def random_mixture(components: int = 4, cells: int = 6, seed: int = 0) -> Traver
     )
 
 
-def single(mean: float, std: float, dtype: torch.dtype = torch.float64) -> TraversabilityMixture:
+def single(
+    mean: float, std: float, dtype: torch.dtype = torch.float64
+) -> TraversabilityMixture:
     one = torch.ones(1, 1, 1, dtype=dtype)
     return TraversabilityMixture(one, mean * one, std * one)
 
 
 @lru_cache
 def monte_carlo() -> torch.Tensor:
-    return draw(random_mixture(), DRAWS, torch.Generator().manual_seed(1)).sort(dim=0).values
+    return (
+        draw(random_mixture(), DRAWS, torch.Generator().manual_seed(1))
+        .sort(dim=0)
+        .values
+    )
 
 
 @pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 0.99])
@@ -47,7 +55,9 @@ def test_risk_measures_match_monte_carlo(level: float) -> None:
     assert draws.shape == (DRAWS, 2, 1, 6)
     torch.testing.assert_close(mixture.mean(), draws.mean(0), atol=2e-3, rtol=0)
     tail = max(1, round((1 - level) * DRAWS))
-    torch.testing.assert_close(mixture.cvar(level), draws[:tail].mean(0), atol=4e-3, rtol=0)
+    torch.testing.assert_close(
+        mixture.cvar(level), draws[:tail].mean(0), atol=4e-3, rtol=0
+    )
     if level > 0:
         reached = (draws <= mixture.var(level) + 1e-9).double().mean(0)
         atom = (draws <= mixture.var(level) - 1e-9).double().mean(0)
@@ -57,8 +67,11 @@ def test_risk_measures_match_monte_carlo(level: float) -> None:
 @pytest.mark.parametrize("mean", [-0.3, 0.0, 0.2, 0.7, 1.0, 1.4])
 @pytest.mark.parametrize("std", [0.01, 0.15, 2.0])
 @pytest.mark.parametrize("level", [0.0, 0.3, 0.9, 0.999])
-def test_single_gaussian_matches_quadrature_of_its_quantiles(mean: float, std: float, level: float) -> None:
-    # clip(F⁻¹(u), 0, 1) integrated in u by scipy: neither our root finding nor our closed forms.
+def test_single_gaussian_matches_quadrature_of_its_quantiles(
+    mean: float, std: float, level: float
+) -> None:
+    # clip(F⁻¹(u), 0, 1) integrated in u by scipy: neither our root finding nor our
+    # closed forms.
     from scipy.integrate import quad
 
     def quantile(u: float) -> float:
@@ -70,7 +83,9 @@ def test_single_gaussian_matches_quadrature_of_its_quantiles(mean: float, std: f
     expected = quad(quantile, 0, tail, points=inside or None, limit=200)[0] / tail
     mixture = single(mean, std)
     assert mixture.cvar(level).item() == pytest.approx(expected, abs=2e-6)
-    assert mixture.var(level).item() == pytest.approx(1.0 if level == 0 else quantile(tail), abs=1e-7)
+    assert mixture.var(level).item() == pytest.approx(
+        1.0 if level == 0 else quantile(tail), abs=1e-7
+    )
 
 
 @pytest.mark.parametrize("level", [1e-6, 0.3, 0.9, 0.99, 1 - 1e-9])
@@ -79,9 +94,13 @@ def test_value_at_risk_is_the_root_that_another_library_finds(level: float) -> N
     shape, tail = (5, 60), 1 - level
     weights = torch.rand(shape, generator=generator, dtype=torch.float64) ** 4
     means = 2 * torch.rand(shape, generator=generator, dtype=torch.float64) - 0.5
-    stds = 10 ** (-6 * torch.rand(shape, generator=generator, dtype=torch.float64))  # from steps to planes
+    stds = 10 ** (
+        -6 * torch.rand(shape, generator=generator, dtype=torch.float64)
+    )  # from steps to planes
     weights = weights / weights.sum(0)
-    found = TraversabilityMixture(*(values.unsqueeze(1) for values in (weights, means, stds))).var(level)
+    found = TraversabilityMixture(
+        *(values.unsqueeze(1) for values in (weights, means, stds))
+    ).var(level)
     inside = 0
     for cell, value in enumerate(found.flatten().tolist()):
         own = [values[:, cell].numpy() for values in (weights, means, stds)]
@@ -93,7 +112,9 @@ def test_value_at_risk_is_the_root_that_another_library_finds(level: float) -> N
             assert value == (0 if excess(0) >= 0 else 1)
         else:
             inside += 1
-            assert value == pytest.approx(optimize.brentq(excess, 0, 1, xtol=1e-13, rtol=1e-14), abs=1e-9)
+            assert value == pytest.approx(
+                optimize.brentq(excess, 0, 1, xtol=1e-13, rtol=1e-14), abs=1e-9
+            )
     assert inside >= 3
 
 
@@ -112,23 +133,38 @@ def test_clipping_leaves_exact_atoms() -> None:
 def test_the_slope_of_cvar_is_that_of_its_differences() -> None:
     mixture, step = random_mixture(), 1e-5
     means = mixture.means.clone().requires_grad_()
-    TraversabilityMixture(mixture.weights, means, mixture.stds).cvar(0.8).sum().backward()
+    TraversabilityMixture(mixture.weights, means, mixture.stds).cvar(
+        0.8
+    ).sum().backward()
     for place in ((0, 1, 0, 2), (1, 3, 0, 5)):
         shift = torch.zeros_like(mixture.means)
         shift[place] = step
         up, down = (
-            TraversabilityMixture(mixture.weights, mixture.means + sign * shift, mixture.stds).cvar(0.8).sum()
+            TraversabilityMixture(
+                mixture.weights, mixture.means + sign * shift, mixture.stds
+            )
+            .cvar(0.8)
+            .sum()
             for sign in (1, -1)
         )
-        assert means.grad[place].item() == pytest.approx((up - down).item() / (2 * step), abs=1e-6)
+        assert means.grad[place].item() == pytest.approx(
+            (up - down).item() / (2 * step), abs=1e-6
+        )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_risk_maps_stay_on_their_device_and_wait_for_nothing(dtype: torch.dtype) -> None:
-    # A fake tensor has a device and no values: what asks for a value, or mixes devices, raises.
+def test_risk_maps_stay_on_their_device_and_wait_for_nothing(
+    dtype: torch.dtype,
+) -> None:
+    # A fake tensor has a device and no values: what asks for a value, or mixes devices,
+    # raises.
     with FakeTensorMode():
-        weights, means, stds = (torch.empty(3, 10, 7, 5, dtype=dtype, device="cuda") for _ in range(3))
-        mixture = TraversabilityMixture(weights, means, stds, (0, 1, 1, 2, 3, 4, 5, 6, 7, 7))
+        weights, means, stds = (
+            torch.empty(3, 10, 7, 5, dtype=dtype, device="cuda") for _ in range(3)
+        )
+        mixture = TraversabilityMixture(
+            weights, means, stds, (0, 1, 1, 2, 3, 4, 5, 6, 7, 7)
+        )
         value = torch.empty(3, 7, 5, dtype=dtype, device="cuda")
         maps = (
             mixture.mean(),
@@ -143,7 +179,11 @@ def test_risk_maps_stay_on_their_device_and_wait_for_nothing(dtype: torch.dtype)
             mixture.log_prob(value),
         )
         for found in maps:
-            assert (found.device.type, found.dtype, found.shape) == ("cuda", dtype, (3, 7, 5))
+            assert (found.device.type, found.dtype, found.shape) == (
+                "cuda",
+                dtype,
+                (3, 7, 5),
+            )
 
 
 def test_unclipped_gaussian_has_the_textbook_cvar() -> None:
@@ -153,13 +193,17 @@ def test_unclipped_gaussian_has_the_textbook_cvar() -> None:
 
 
 @given(
-    weights=st.lists(st.floats(0, 1), min_size=3, max_size=3).filter(lambda w: sum(w) > 1e-3),
+    weights=st.lists(st.floats(0, 1), min_size=3, max_size=3).filter(
+        lambda w: sum(w) > 1e-3
+    ),
     means=st.lists(st.floats(-1, 2), min_size=3, max_size=3),
     stds=st.lists(st.floats(0, 1), min_size=3, max_size=3),
     levels=st.tuples(st.floats(0, 1 - 1e-12), st.floats(0, 1 - 1e-12)),
 )
 @settings(max_examples=300, deadline=None)
-def test_risk_measures_are_ordered_finite_and_in_range(weights, means, stds, levels) -> None:
+def test_risk_measures_are_ordered_finite_and_in_range(
+    weights, means, stds, levels
+) -> None:
     total = sum(weights)
     shaped = [
         torch.tensor(values, dtype=torch.float64)[:, None, None]
@@ -177,8 +221,14 @@ def test_risk_measures_are_ordered_finite_and_in_range(weights, means, stds, lev
 
 
 @given(
-    weights=st.lists(st.floats(0, 1), min_size=1, max_size=5).filter(lambda w: sum(w) > 1e-3),
-    means=st.lists(st.sampled_from([-3.0, -0.1, 0.0, 0.3, 0.5, 1.0, 1.2, 4.0]), min_size=5, max_size=5),
+    weights=st.lists(st.floats(0, 1), min_size=1, max_size=5).filter(
+        lambda w: sum(w) > 1e-3
+    ),
+    means=st.lists(
+        st.sampled_from([-3.0, -0.1, 0.0, 0.3, 0.5, 1.0, 1.2, 4.0]),
+        min_size=5,
+        max_size=5,
+    ),
     std=st.sampled_from([0.0, 1e-3, 0.2]),
     off=st.floats(-1e-4, 1e-4),
     dtype=st.sampled_from([torch.float32, torch.float64]),
@@ -216,7 +266,9 @@ def test_ground_surely_at_an_end_is_there_whatever_the_weights_sum_to(
     mean: float, value: float, off: float
 ) -> None:
     weights = (1 + off) * torch.tensor([0.3, 0.6, 0.1])[:, None, None]
-    mixture = TraversabilityMixture(weights, torch.full_like(weights, mean), torch.full_like(weights, 0.01))
+    mixture = TraversabilityMixture(
+        weights, torch.full_like(weights, mean), torch.full_like(weights, 0.01)
+    )
     for found in (
         mixture.mean(),
         mixture.var(1e-5),
@@ -232,26 +284,42 @@ def test_ground_surely_at_an_end_is_there_whatever_the_weights_sum_to(
 
 
 def test_var_at_level_0_is_the_supremum_whatever_the_weights_sum_to() -> None:
-    weights = torch.softmax(torch.randn(50, 6, 1, 1, generator=torch.Generator().manual_seed(0)), dim=1)
-    mixture = TraversabilityMixture(weights, torch.full_like(weights, 0.2), torch.full_like(weights, 0.01))
+    weights = torch.softmax(
+        torch.randn(50, 6, 1, 1, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    mixture = TraversabilityMixture(
+        weights, torch.full_like(weights, 0.2), torch.full_like(weights, 0.01)
+    )
     assert (mixture.var(0.0) == 1).all()
-    torch.testing.assert_close(mixture.mean(), torch.full((50, 1, 1), 0.2), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        mixture.mean(), torch.full((50, 1, 1), 0.2), atol=1e-6, rtol=0
+    )
 
 
 def test_float32_keeps_its_dtype_and_agrees_with_float64() -> None:
     exact = random_mixture()
-    short = TraversabilityMixture(exact.weights.float(), exact.means.float(), exact.stds.float())
+    short = TraversabilityMixture(
+        exact.weights.float(), exact.means.float(), exact.stds.float()
+    )
     assert short.cvar(0.9).dtype == torch.float32
-    torch.testing.assert_close(short.cvar(0.9).double(), exact.cvar(0.9), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        short.cvar(0.9).double(), exact.cvar(0.9), atol=1e-5, rtol=0
+    )
 
 
 def test_log_prob_integrates_to_one_with_its_atoms() -> None:
     mixture = random_mixture(cells=1)
     grid = torch.linspace(0, 1, 20001, dtype=torch.float64)[1:-1]
-    density = torch.stack([mixture.log_prob(torch.full((2, 1, 1), x)).exp() for x in grid.tolist()[::4]])
+    density = torch.stack(
+        [mixture.log_prob(torch.full((2, 1, 1), x)).exp() for x in grid.tolist()[::4]]
+    )
     inside = density.mean(0)
-    atoms = sum(mixture.log_prob(torch.full((2, 1, 1), edge)).exp() for edge in (0.0, 1.0))
-    torch.testing.assert_close(inside + atoms, torch.ones(2, 1, 1, dtype=torch.float64), atol=2e-3, rtol=0)
+    atoms = sum(
+        mixture.log_prob(torch.full((2, 1, 1), edge)).exp() for edge in (0.0, 1.0)
+    )
+    torch.testing.assert_close(
+        inside + atoms, torch.ones(2, 1, 1, dtype=torch.float64), atol=2e-3, rtol=0
+    )
     assert (mixture.log_prob(torch.full((2, 1, 1), 1.2)) == -math.inf).all()
 
 
@@ -272,10 +340,15 @@ def test_most_likely_keeps_the_heaviest_class_where_each_has_one_component() -> 
 
 
 def test_most_likely_keeps_the_heaviest_class_whole() -> None:
-    """Class 7 has two components that are together heavier than the heaviest one, which is of class 2."""
+    """Class 7 has two components that are together heavier than the heaviest one, which
+    is of class 2.
+    """
     mixture = random_mixture(components=4)
     weights = (
-        torch.tensor([0.3, 0.4, 0.25, 0.05], dtype=torch.float64).view(1, 4, 1, 1).expand(2, 4, 1, 6).clone()
+        torch.tensor([0.3, 0.4, 0.25, 0.05], dtype=torch.float64)
+        .view(1, 4, 1, 1)
+        .expand(2, 4, 1, 6)
+        .clone()
     )
     weights[1, :, 0, 0] = torch.tensor([0.1, 0.85, 0.04, 0.01])
     of_classes = replace(mixture, weights=weights, group=(7, 2, 7, 3))
@@ -289,8 +362,12 @@ def test_most_likely_keeps_the_heaviest_class_whole() -> None:
     other = TraversabilityMixture(
         torch.ones(2, 1, 1, 6).double(), mixture.means[:, [1]], mixture.stds[:, [1]]
     )
-    assert kept.mean()[1, 0, 0].item() == pytest.approx(other.mean()[1, 0, 0].item(), abs=1e-12)
-    assert kept.mean()[1, 0, 1].item() == pytest.approx(alone.mean()[1, 0, 1].item(), abs=1e-12)
+    assert kept.mean()[1, 0, 0].item() == pytest.approx(
+        other.mean()[1, 0, 0].item(), abs=1e-12
+    )
+    assert kept.mean()[1, 0, 1].item() == pytest.approx(
+        alone.mean()[1, 0, 1].item(), abs=1e-12
+    )
     torch.testing.assert_close(kept.weights.sum(1), torch.ones(2, 1, 6).double())
     # It is one class, so that it may be asked again.
     torch.testing.assert_close(kept.most_likely().mean(), kept.mean())
@@ -324,10 +401,15 @@ COMPONENTS: list[Components] = [
 
 
 def exactly(components: Components, work: str, at: float) -> float:
-    """`expected_time` with a floor, or `crps` of an observation, by quadrature with 30 digits."""
+    """`expected_time` with a floor, or `crps` of an observation, by quadrature with 30
+    digits.
+    """
     with mpmath.workdps(30):
         weights = WEIGHTS[len(components)]
-        parts = [(w, mpmath.mpf(m), mpmath.mpf(s)) for w, (m, s) in zip(weights, components, strict=True)]
+        parts = [
+            (w, mpmath.mpf(m), mpmath.mpf(s))
+            for w, (m, s) in zip(weights, components, strict=True)
+        ]
 
         def cdf(x: Any) -> Any:
             return sum(weight * mpmath.ncdf(x, m, s) for weight, m, s in parts)
@@ -336,7 +418,9 @@ def exactly(components: Components, work: str, at: float) -> float:
             return (cdf(x) - (x >= at)) ** 2
 
         least = at if work == "expected_time" else 0
-        edges = {m + z * s for _, m, s in parts for z in (-12, -7, -4, -2, 0, 2, 4, 7, 12)}
+        edges = {
+            m + z * s for _, m, s in parts for z in (-12, -7, -4, -2, 0, 2, 4, 7, 12)
+        }
         edges |= {mpmath.mpf(at), mpmath.mpf(1), mpmath.mpf(least)}
         edges |= {mpmath.mpf(at) * mpmath.mpf(2) ** k for k in range(12)}
         edges = sorted(edge for edge in edges if least <= edge <= 1)
@@ -345,14 +429,20 @@ def exactly(components: Components, work: str, at: float) -> float:
         return float(sum(mpmath.quad(squared, [a, b]) for a, b in pairwise(edges)))
 
 
-def mixture_of(components: Components, dtype: torch.dtype = torch.float64) -> TraversabilityMixture:
+def mixture_of(
+    components: Components, dtype: torch.dtype = torch.float64
+) -> TraversabilityMixture:
     values = WEIGHTS[len(components)], *zip(*components, strict=True)
-    weights, means, stds = (torch.tensor(row, dtype=dtype).view(-1, 1, 1) for row in values)
+    weights, means, stds = (
+        torch.tensor(row, dtype=dtype).view(-1, 1, 1) for row in values
+    )
     return TraversabilityMixture(weights, means, stds)
 
 
 @pytest.mark.parametrize("components", COMPONENTS)
-def test_the_expected_time_is_exact_to_a_millionth_for_small_floors(components: Components) -> None:
+def test_the_expected_time_is_exact_to_a_millionth_for_small_floors(
+    components: Components,
+) -> None:
     for floor in (0.001, 0.01, 0.05, 0.5):
         expected = exactly(components, "expected_time", floor)
         time = mixture_of(components).expected_time(floor).item()
@@ -363,14 +453,24 @@ def test_the_expected_time_is_exact_to_a_millionth_for_small_floors(components: 
 def test_the_crps_is_exact_for_narrow_components(components: Components) -> None:
     for observed in (0.0, 0.4, 0.997):
         expected = exactly(components, "crps", observed)
-        score = mixture_of(components).crps(torch.tensor([[observed]], dtype=torch.float64)).item()
+        score = (
+            mixture_of(components)
+            .crps(torch.tensor([[observed]], dtype=torch.float64))
+            .item()
+        )
         assert score == pytest.approx(expected, abs=1e-5, rel=0)
 
 
 def test_float32_parameters_lose_no_more_than_their_rounding() -> None:
     components, eps = COMPONENTS[-1], torch.finfo(torch.float32).eps
     rounded = mixture_of(components, torch.float32)
-    read = tuple(zip(rounded.means.flatten().tolist(), rounded.stds.flatten().tolist(), strict=True))
+    read = tuple(
+        zip(
+            rounded.means.flatten().tolist(),
+            rounded.stds.flatten().tolist(),
+            strict=True,
+        )
+    )
     expected = exactly(read, "expected_time", 0.001)
     time = rounded.expected_time(0.001)
     assert time.dtype == torch.float32
@@ -381,20 +481,32 @@ def test_float32_parameters_lose_no_more_than_their_rounding() -> None:
 
 @pytest.mark.parametrize("floor", [0.02, 0.05, 0.5, 1.0])
 def test_the_expected_time_is_that_of_an_adaptive_integrator(floor: float) -> None:
-    """From needles to planes, by their densities and the atoms at 0 and 1; our form integrates the CDF."""
+    """From needles to planes, by their densities and the atoms at 0 and 1; our form
+    integrates the CDF.
+    """
     from scipy.integrate import quad
 
     for mean in (-0.3, 0.0, 0.04, 0.06, 0.5, 0.97, 1.3):
         for std in (1e-4, 0.01, 0.05, 0.2, 1.0):
             law = stats.norm(mean, std)
-            edges = [x for x in (mean + z * std for z in (-8, -4, -1, 0, 1, 4, 8)) if floor < x < 1]
+            edges = [
+                x
+                for x in (mean + z * std for z in (-8, -4, -1, 0, 1, 4, 8))
+                if floor < x < 1
+            ]
 
             def slow(x: float, law=law) -> float:  # type: ignore[no-untyped-def]
                 return float(law.pdf(x)) / x
 
-            inside = quad(slow, floor, 1, points=edges or None, limit=500)[0] if floor < 1 else 0.0
+            inside = (
+                quad(slow, floor, 1, points=edges or None, limit=500)[0]
+                if floor < 1
+                else 0.0
+            )
             time = law.cdf(floor) / floor + inside + law.sf(1)
-            assert single(mean, std).expected_time(floor).item() == pytest.approx(time, rel=1e-6)
+            assert single(mean, std).expected_time(floor).item() == pytest.approx(
+                time, rel=1e-6
+            )
 
 
 @pytest.mark.parametrize("floor", [0.001, 0.02, 0.3, 1.0])
@@ -414,13 +526,17 @@ def test_the_tail_of_the_time_is_that_of_an_adaptive_integrator_over_ranks(
                 return 1 / min(max(float(law.ppf(rank)), floor), 1)
 
             wanted = quad(time, 0, tail, points=edges or None, limit=500)[0] / tail
-            assert single(mean, std).time_cvar(level, floor).item() == pytest.approx(wanted, rel=2e-6)
+            assert single(mean, std).time_cvar(level, floor).item() == pytest.approx(
+                wanted, rel=2e-6
+            )
 
 
 def test_the_tail_of_the_time_of_a_mixture_is_that_of_its_worst_draws() -> None:
     draws = monte_carlo()[:, 1, 0, 3].clamp(0, 1).sort().values
     found = random_mixture().time_cvar(0.8, 0.05)[1, 0, 3].item()
-    assert found == pytest.approx((1 / draws[: len(draws) // 5].clamp(min=0.05)).mean().item(), rel=5e-3)
+    assert found == pytest.approx(
+        (1 / draws[: len(draws) // 5].clamp(min=0.05)).mean().item(), rel=5e-3
+    )
 
 
 def test_the_expected_time_of_a_mixture_is_that_of_its_components_in_the_mean() -> None:
@@ -428,7 +544,9 @@ def test_the_expected_time_of_a_mixture_is_that_of_its_components_in_the_mean() 
     times = sum(
         mixture.weights[:, k]
         * TraversabilityMixture(
-            torch.ones_like(mixture.weights[:, [k]]), mixture.means[:, [k]], mixture.stds[:, [k]]
+            torch.ones_like(mixture.weights[:, [k]]),
+            mixture.means[:, [k]],
+            mixture.stds[:, [k]],
         ).expected_time(0.05)
         for k in range(4)
     )
@@ -437,7 +555,9 @@ def test_the_expected_time_of_a_mixture_is_that_of_its_components_in_the_mean() 
     assert mixture.expected_time(0.05)[1, 0, 3].item() == pytest.approx(
         (1 / draws[:, 1, 0, 3].clamp(min=0.05)).mean().item(), rel=5e-3
     )
-    assert (1 / mixture.expected_time(0.05) <= mixture.mean().clamp(min=0.05) + 0.05).all()
+    assert (
+        1 / mixture.expected_time(0.05) <= mixture.mean().clamp(min=0.05) + 0.05
+    ).all()
 
 
 @pytest.mark.parametrize("floor", [0.0, -0.1, 1.1, math.nan])
@@ -451,7 +571,9 @@ def test_a_least_speed_out_of_range_is_refused(floor: float) -> None:
 @pytest.mark.parametrize("bound", [0.0, 0.1, 0.5, 0.9, 1.0])
 def test_the_chance_is_the_share_of_draws_at_the_bound_or_above(bound: float) -> None:
     expected = (monte_carlo() >= bound).double().mean(0)
-    torch.testing.assert_close(random_mixture().chance(bound), expected, atol=3e-3, rtol=0)
+    torch.testing.assert_close(
+        random_mixture().chance(bound), expected, atol=3e-3, rtol=0
+    )
 
 
 def test_normal_numbers_go_through_each_cells_quantile_function() -> None:
@@ -461,7 +583,9 @@ def test_normal_numbers_go_through_each_cells_quantile_function() -> None:
         found = mixture.from_normal(z)
         share = torch.from_numpy(stats.norm.cdf(z.numpy()))
         inside = (found > 0) & (found < 1)
-        torch.testing.assert_close(mixture.cdf(found)[inside], share[inside], atol=1e-7, rtol=0)
+        torch.testing.assert_close(
+            mixture.cdf(found)[inside], share[inside], atol=1e-7, rtol=0
+        )
         assert (mixture.cdf(0.0)[found == 0] >= share[found == 0]).all()
         assert (mixture.chance(1.0)[found == 1] >= 1 - share[found == 1] - 1e-12).all()
     alone = single(0.5, 0.3)
@@ -470,8 +594,12 @@ def test_normal_numbers_go_through_each_cells_quantile_function() -> None:
             *(t.expand(2, 1, 1) for t in (alone.weights / 2, alone.means, alone.stds))
         )
         at = torch.full((1, 1), z, dtype=torch.float64)
-        assert alone.from_normal(at).item() == pytest.approx(min(max(0.5 + 0.3 * z, 0), 1))
-        assert both.from_normal(at).item() == pytest.approx(alone.from_normal(at).item(), abs=1e-8)
+        assert alone.from_normal(at).item() == pytest.approx(
+            min(max(0.5 + 0.3 * z, 0), 1)
+        )
+        assert both.from_normal(at).item() == pytest.approx(
+            alone.from_normal(at).item(), abs=1e-8
+        )
 
 
 def test_maps_are_selected_with_their_classes() -> None:
@@ -488,23 +616,35 @@ def test_bad_arguments_are_refused() -> None:
         with pytest.raises(ConfigError, match="level"):
             mixture.cvar(level)
     with pytest.raises(ConfigError, match="one shape"):
-        TraversabilityMixture(torch.ones(1, 2, 3), torch.ones(1, 2, 3), torch.ones(1, 2, 4))
+        TraversabilityMixture(
+            torch.ones(1, 2, 3), torch.ones(1, 2, 3), torch.ones(1, 2, 4)
+        )
 
 
 @pytest.mark.parametrize("shape", [(2, 3, 9, 5), (4, 1, 7, 3), (1, 2, 3, 8, 2)])
-def test_rows_at_a_time_change_no_bit(shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_at_a_time_change_no_bit(
+    shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     drawn = torch.Generator().manual_seed(1)
     weights, means, stds = (torch.rand(shape, generator=drawn) for _ in range(3))
-    mixture = TraversabilityMixture(weights / weights.sum(-3, keepdim=True), means, 0.2 * stds)
+    mixture = TraversabilityMixture(
+        weights / weights.sum(-3, keepdim=True), means, 0.2 * stds
+    )
     whole = mixture.cvar(0.7), mixture.var(0.6), mixture.mean()
     for numbers in (1, 2 * mixture.weights.numel() // shape[-2]):
         monkeypatch.setattr("benchnav.core.mixture._NUMBERS_AT_ONCE", numbers)
-        for found, wanted in zip((mixture.cvar(0.7), mixture.var(0.6), mixture.mean()), whole, strict=True):
+        for found, wanted in zip(
+            (mixture.cvar(0.7), mixture.var(0.6), mixture.mean()), whole, strict=True
+        ):
             assert torch.equal(found, wanted)
 
 
-def grouped(group: tuple[int, ...] | None, components: int = 3) -> TraversabilityMixture:
-    weights = torch.rand(2, components, 4, 5, generator=torch.Generator().manual_seed(0))
+def grouped(
+    group: tuple[int, ...] | None, components: int = 3
+) -> TraversabilityMixture:
+    weights = torch.rand(
+        2, components, 4, 5, generator=torch.Generator().manual_seed(0)
+    )
     weights = weights / weights.sum(1, keepdim=True)
     return TraversabilityMixture(weights, weights, weights, group)
 
@@ -536,8 +676,12 @@ def test_components_of_no_class_are_none_of_the_classes_and_together_one_more() 
     alone = made.weights[:, [1, 3]] / made.weights[:, [1, 3]].sum(1, keepdim=True)
     wanted = (alone * made.means[:, [1, 3]]).sum(1)
     best = torch.gather(made.means[:, [0, 2]], 1, classes.argmax(1, keepdim=True))[:, 0]
-    exact = TraversabilityMixture(alone, made.means[:, [1, 3]], made.stds[:, [1, 3]]).mean()
+    exact = TraversabilityMixture(
+        alone, made.means[:, [1, 3]], made.stds[:, [1, 3]]
+    ).mean()
     torch.testing.assert_close(likely.mean()[without], exact[without])
     assert wanted.shape == exact.shape
-    one = TraversabilityMixture(torch.ones_like(best)[:, None], best[:, None], best[:, None]).mean()
+    one = TraversabilityMixture(
+        torch.ones_like(best)[:, None], best[:, None], best[:, None]
+    ).mean()
     torch.testing.assert_close(likely.mean()[~without], one[~without])

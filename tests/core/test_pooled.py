@@ -13,7 +13,11 @@ from benchnav.testing.breaches import Breaches
 from benchnav.testing.distribution import check_functions
 from tests.core.distributions import Hidden, mixture, quantiles
 
-MEMBERS = mixture(3, 0.01, 0.3), mixture(3, 0.01, 0.3, seed=1), mixture(3, 0.01, 0.3, seed=2)
+MEMBERS = (
+    mixture(3, 0.01, 0.3),
+    mixture(3, 0.01, 0.3, seed=1),
+    mixture(3, 0.01, 0.3, seed=2),
+)
 OBSERVED = torch.full(MEMBERS[0].shape, 0.4, dtype=torch.float64)
 
 
@@ -22,7 +26,12 @@ def average(name: str, *arguments: object) -> torch.Tensor:
 
 
 def test_mixtures_of_the_same_classes_become_one_mixture() -> None:
-    found = pool([replace(own, weights=2 * own.weights) if own is MEMBERS[0] else own for own in MEMBERS])
+    found = pool(
+        [
+            replace(own, weights=2 * own.weights) if own is MEMBERS[0] else own
+            for own in MEMBERS
+        ]
+    )
     assert isinstance(found, TraversabilityMixture)
     assert found.group == (0, 1, 2) * 3
     for name, arguments in (
@@ -32,7 +41,10 @@ def test_mixtures_of_the_same_classes_become_one_mixture() -> None:
         ("class_probabilities", (3,)),
     ):
         torch.testing.assert_close(
-            getattr(found, name)(*arguments), average(name, *arguments), rtol=1e-6, atol=1e-6
+            getattr(found, name)(*arguments),
+            average(name, *arguments),
+            rtol=1e-6,
+            atol=1e-6,
         )
     bare = pool([replace(own, group=None) for own in MEMBERS])
     assert isinstance(bare, TraversabilityMixture)
@@ -41,7 +53,9 @@ def test_mixtures_of_the_same_classes_become_one_mixture() -> None:
 
 @pytest.mark.parametrize("hide", [True, False])
 def test_any_others_average_their_cdfs(hide: bool) -> None:
-    law = pool([Hidden(MEMBERS[0]) if hide else replace(MEMBERS[0], group=None), *MEMBERS[1:]])
+    law = pool(
+        [Hidden(MEMBERS[0]) if hide else replace(MEMBERS[0], group=None), *MEMBERS[1:]]
+    )
     exact = pool(MEMBERS)
     assert isinstance(law, PooledDistribution)
     for name, arguments in (
@@ -50,9 +64,15 @@ def test_any_others_average_their_cdfs(hide: bool) -> None:
     ):  # fmt: skip
         # The mixture's own CRPS is less exact where components are narrow.
         wanted = getattr(Hidden(exact) if name == "crps" else exact, name)(*arguments)
-        torch.testing.assert_close(getattr(law, name)(*arguments), wanted, rtol=0, atol=1e-4)
-    torch.testing.assert_close(law.expected_time(0.05), exact.expected_time(0.05), rtol=1e-4, atol=0)
-    torch.testing.assert_close(law.time_cvar(0.8, 0.05), exact.time_cvar(0.8, 0.05), rtol=1e-4, atol=0)
+        torch.testing.assert_close(
+            getattr(law, name)(*arguments), wanted, rtol=0, atol=1e-4
+        )
+    torch.testing.assert_close(
+        law.expected_time(0.05), exact.expected_time(0.05), rtol=1e-4, atol=0
+    )
+    torch.testing.assert_close(
+        law.time_cvar(0.8, 0.05), exact.time_cvar(0.8, 0.05), rtol=1e-4, atol=0
+    )
     density = law.log_prob(OBSERVED)
     if hide:
         assert bool(density.isnan().all())
@@ -72,14 +92,22 @@ def test_its_quantiles_are_the_inverse_of_a_cdf_that_jumps() -> None:
         assert bool((law.cdf(value - 1e-9) <= probability + 1e-9).all())
         atoms += int((upper - lower > 1e-3).sum())
     assert atoms > 10
-    certain = [replace(own, means=torch.full_like(own.means, -1.0), stds=0 * own.stds) for own in MEMBERS[:2]]
+    certain = [
+        replace(own, means=torch.full_like(own.means, -1.0), stds=0 * own.stds)
+        for own in MEMBERS[:2]
+    ]
     assert bool((pool([Hidden(certain[0]), certain[1]]).quantile(0.7) == 0).all())
-    firm = [replace(own, means=torch.full_like(own.means, 2.0), stds=0 * own.stds) for own in MEMBERS[:2]]
+    firm = [
+        replace(own, means=torch.full_like(own.means, 2.0), stds=0 * own.stds)
+        for own in MEMBERS[:2]
+    ]
     assert bool((pool([Hidden(firm[0]), firm[1]]).quantile(0.7) == 1).all())
 
 
 def test_members_count_by_their_weights_in_each_cell() -> None:
-    shares = torch.rand(2, 2, 5, 7, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    shares = torch.rand(
+        2, 2, 5, 7, generator=torch.Generator().manual_seed(3), dtype=torch.float64
+    )
     shares = torch.stack((shares[:, 0], 1 - shares[:, 0]), 1)
     one, other = MEMBERS[:2]
     law = PooledDistribution((one, other), shares)
@@ -93,7 +121,9 @@ def test_members_count_by_their_weights_in_each_cell() -> None:
         ("log_prob", (OBSERVED,)), ("chance", (1.0,)),
     ):  # fmt: skip
         found, wanted = getattr(law, name)(*arguments), getattr(whole, name)(*arguments)
-        torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-4 if name == "cvar" else 1e-6)
+        torch.testing.assert_close(
+            found, wanted, rtol=1e-5, atol=1e-4 if name == "cvar" else 1e-6
+        )
     breaches = Breaches("distribution", "pooled")
     check_functions(law, 1e-4, breaches)
     breaches.refuse()

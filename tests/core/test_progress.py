@@ -50,7 +50,9 @@ def test_parts_of_unlike_size_count_by_their_size(clock: Clock) -> None:
     assert tuple(watch.step) == (2, 4)
 
 
-def test_a_log_has_a_line_a_tenth_and_at_least_one_a_minute_but_never_thousands(clock: Clock) -> None:
+def test_a_log_has_a_line_a_tenth_and_at_least_one_a_minute_but_never_thousands(
+    clock: Clock,
+) -> None:
     watch = Watch("units")
     watch.update((0, 1000))
     told = [0.0] if watch.is_due() else []
@@ -74,7 +76,14 @@ def test_a_log_has_a_line_a_tenth_and_at_least_one_a_minute_but_never_thousands(
 
 @pytest.mark.parametrize(
     ("seconds", "words"),
-    [(0, "0 s"), (89, "89 s"), (90, "2 min"), (3600, "60 min"), (5400, "1.5 h"), (172_800, "2.0 days")],
+    [
+        (0, "0 s"),
+        (89, "89 s"),
+        (90, "2 min"),
+        (3600, "60 min"),
+        (5400, "1.5 h"),
+        (172_800, "2.0 days"),
+    ],
 )
 def test_a_duration_is_said_as_people_say_it(seconds: float, words: str) -> None:
     assert in_words(seconds) == words
@@ -111,7 +120,9 @@ def test_a_terminal_shows_a_bar_with_the_same_words(
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", str(columns))
-    show_progress(iter([Progress(0, 3), Progress(3, 3, "finished hard mppi cvar")]), "units")
+    show_progress(
+        iter([Progress(0, 3), Progress(3, 3, "finished hard mppi cvar")]), "units"
+    )
     err = capsys.readouterr().err
     assert "3/3" in err
     assert ("finished hard mppi cvar" in err) == (columns == 200)
@@ -128,7 +139,9 @@ class Unread:
         raise BrokenPipeError
 
 
-def test_work_goes_on_where_no_one_reads_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_work_goes_on_where_no_one_reads_how_far_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(sys, "stderr", Unread())
     reached = []
 

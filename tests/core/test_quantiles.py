@@ -1,4 +1,6 @@
-"""Exact forms of quantile distributions, against the quantile function integrated otherwise."""
+"""Exact forms of quantile distributions, against the quantile function integrated
+otherwise.
+"""
 
 import math
 from dataclasses import replace
@@ -12,17 +14,22 @@ from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from tests.core.distributions import quantiles
 
 LAW = quantiles(4)
-# Within each interval of the levels midpoints of equal shares: exact of what is linear there.
+# Within each interval of the levels midpoints of equal shares: exact of what is linear
+# there.
 SPLITS = 400
 EDGES = np.array(LEVELS)
-NODES = (EDGES[:-1, None] + np.diff(EDGES)[:, None] * (np.arange(SPLITS) + 0.5) / SPLITS).ravel()
+NODES = (
+    EDGES[:-1, None] + np.diff(EDGES)[:, None] * (np.arange(SPLITS) + 0.5) / SPLITS
+).ravel()
 SHARES = np.repeat(np.diff(EDGES) / SPLITS, SPLITS)
 
 
 def sampled(law: QuantileDistribution) -> torch.Tensor:
     """λ at the nodes by NumPy's interpolation, shape [N, *B, H, W]."""
     knots = law.values.double().movedim(-3, -1)
-    found = [np.interp(NODES, EDGES, own) for own in knots.reshape(-1, len(LEVELS)).numpy()]
+    found = [
+        np.interp(NODES, EDGES, own) for own in knots.reshape(-1, len(LEVELS)).numpy()
+    ]
     return torch.from_numpy(np.stack(found, -1)).view(-1, *law.shape)
 
 
@@ -41,22 +48,32 @@ def test_the_levels_are_dense_where_risk_is() -> None:
 def test_quantiles_are_linear_between_the_levels() -> None:
     for probability in (0.0, 0.001, 0.0042, 0.1, 0.333, 0.98, 1.0):
         wanted = [
-            np.interp(probability, EDGES, own) for own in LAW.values.movedim(1, -1).reshape(-1, 72).numpy()
+            np.interp(probability, EDGES, own)
+            for own in LAW.values.movedim(1, -1).reshape(-1, 72).numpy()
         ]
         torch.testing.assert_close(
-            LAW.quantile(probability).flatten(), torch.tensor(wanted, dtype=torch.float64)
+            LAW.quantile(probability).flatten(),
+            torch.tensor(wanted, dtype=torch.float64),
         )
         found = LAW.quantile(torch.full(LAW.shape, probability, dtype=torch.float64))
-        torch.testing.assert_close(found.flatten(), torch.tensor(wanted, dtype=torch.float64))
+        torch.testing.assert_close(
+            found.flatten(), torch.tensor(wanted, dtype=torch.float64)
+        )
 
 
 @pytest.mark.parametrize("value", [-0.1, 0.0, 0.05, 0.2, 0.5, 0.9, 1.0, 1.2])
 def test_the_cdf_is_the_share_of_quantiles_up_to_a_value(value: float) -> None:
     draws = sampled(LAW)
     lower, upper = LAW.cdf_limits(value)
-    torch.testing.assert_close(upper, weighted((draws <= value).double()), rtol=0, atol=1e-3)
-    torch.testing.assert_close(lower, weighted((draws < value).double()), rtol=0, atol=1e-3)
-    torch.testing.assert_close(LAW.chance(value), weighted((draws >= value).double()), rtol=0, atol=1e-3)
+    torch.testing.assert_close(
+        upper, weighted((draws <= value).double()), rtol=0, atol=1e-3
+    )
+    torch.testing.assert_close(
+        lower, weighted((draws < value).double()), rtol=0, atol=1e-3
+    )
+    torch.testing.assert_close(
+        LAW.chance(value), weighted((draws >= value).double()), rtol=0, atol=1e-3
+    )
     assert torch.equal(LAW.cdf(value), upper)
 
 
@@ -72,7 +89,9 @@ def test_an_atom_is_all_in_the_cdf_and_not_under_it() -> None:
     ):
         found = [share.item() for share in law.cdf_limits(value)]
         assert found == pytest.approx([lower, upper], abs=1e-12)
-    assert [score.item() for score in law.to_normal(0.2)] == pytest.approx([-0.8416, 0.0], abs=1e-4)
+    assert [score.item() for score in law.to_normal(0.2)] == pytest.approx(
+        [-0.8416, 0.0], abs=1e-4
+    )
     assert law.quantile(0.35).item() == pytest.approx(0.2)
 
 
@@ -89,7 +108,9 @@ def test_all_in_one_place_is_a_point() -> None:
 def test_the_cvar_is_the_mean_of_the_lowest_quantiles(level: float) -> None:
     nodes = (np.arange(20_000) + 0.5) / 20_000 * (1 - level)
     knots = LAW.values.movedim(1, -1).reshape(-1, 72).numpy()
-    wanted = torch.tensor([np.interp(nodes, EDGES, own).mean() for own in knots], dtype=torch.float64)
+    wanted = torch.tensor(
+        [np.interp(nodes, EDGES, own).mean() for own in knots], dtype=torch.float64
+    )
     torch.testing.assert_close(LAW.cvar(level).flatten(), wanted, rtol=0, atol=1e-5)
     if level == 0:
         torch.testing.assert_close(LAW.mean().flatten(), wanted, rtol=0, atol=1e-5)
@@ -98,12 +119,16 @@ def test_the_cvar_is_the_mean_of_the_lowest_quantiles(level: float) -> None:
 
 @pytest.mark.parametrize("floor", [0.05, 0.3])
 @pytest.mark.parametrize("level", [0.0, 0.5, 0.83])
-def test_the_tail_of_the_time_is_that_of_the_least_ranks(level: float, floor: float) -> None:
+def test_the_tail_of_the_time_is_that_of_the_least_ranks(
+    level: float, floor: float
+) -> None:
     nodes = (np.arange(20_000) + 0.5) / 20_000 * (1 - level)
     knots = LAW.values.movedim(1, -1).reshape(-1, 72).numpy()
     times = [(1 / np.interp(nodes, EDGES, own).clip(floor)).mean() for own in knots]
     found = LAW.time_cvar(level, floor).flatten()
-    torch.testing.assert_close(found, torch.tensor(times, dtype=torch.float64), rtol=1e-4, atol=0)
+    torch.testing.assert_close(
+        found, torch.tensor(times, dtype=torch.float64), rtol=1e-4, atol=0
+    )
 
 
 @pytest.mark.parametrize("floor", [0.01, 0.05, 0.3, 1.0])
@@ -127,7 +152,9 @@ def test_quantiles_have_no_density_and_learn_by_their_integrals() -> None:
     assert bool(LAW.log_prob(torch.full(LAW.shape, 0.5)).isnan().all())
     values = LAW.values.clone().requires_grad_()
     law = replace(LAW, values=values)
-    (law.crps(torch.full(LAW.shape, 0.5)) + law.cvar(0.9) + law.expected_time(0.05)).sum().backward()
+    (
+        law.crps(torch.full(LAW.shape, 0.5)) + law.cvar(0.9) + law.expected_time(0.05)
+    ).sum().backward()
     assert values.grad is not None
     assert bool(values.grad.isfinite().all())
 
@@ -147,7 +174,9 @@ SPACED = tuple(np.linspace(0, 1, 80).tolist())
         (SPACED, "at most 0.01 apart up to 0.1, where risk is, got 0.0127"),
     ],
 )
-def test_levels_that_are_none_are_refused(levels: tuple[float, ...], expected: str) -> None:
+def test_levels_that_are_none_are_refused(
+    levels: tuple[float, ...], expected: str
+) -> None:
     with pytest.raises(ConfigError, match=expected):
         QuantileDistribution(torch.zeros(2, len(levels), 3, 3), levels)
 

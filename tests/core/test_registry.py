@@ -1,4 +1,6 @@
-"""The registry: each form of a name, options and their types, what is said of mistakes, and digests."""
+"""The registry: each form of a name, options and their types, what is said of mistakes,
+and digests.
+"""
 
 import contextlib
 import importlib
@@ -13,7 +15,17 @@ from joblib import Parallel, delayed
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
-from benchnav.core.registry import Part, complete, find, make, names, options_of, read_part, register, take
+from benchnav.core.registry import (
+    Part,
+    complete,
+    find,
+    make,
+    names,
+    options_of,
+    read_part,
+    register,
+    take,
+)
 from benchnav.planning.planners.mppi import MPPI
 from benchnav.planning.robots import Unicycle
 
@@ -125,14 +137,18 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A user's package on the path, with an entry point in two groups, as an installed one has."""
+    """A user's package on the path, with an entry point in two groups, as an installed
+    one has.
+    """
     place = tmp_path / "site"
     (place / "plugged").mkdir(parents=True)
     (place / "plugged" / "__init__.py").write_text("")
     (place / "plugged" / "parts.py").write_text(SOURCE)
     info = place / "plugged_parts-3.1.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plugged-parts\nVersion: 3.1\n")
+    (info / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: plugged-parts\nVersion: 3.1\n"
+    )
     (info / "top_level.txt").write_text("plugged\n")
     (info / "entry_points.txt").write_text(
         "[benchnav.planners]\nplugged = plugged.parts:Planner\nbroken = plugged.absent:Planner\n"
@@ -158,14 +174,22 @@ def refusal(call: Callable[[], object]) -> str:
     return message
 
 
-# --- the four forms ---------------------------------------------------------------------------------
+# --- the four forms
+# ---------------------------------------------------------------------------------
 
 
 def test_a_shipped_name_is_found_and_its_value_sets_its_first_option() -> None:
     assert read_part("risk", "cvar") == Part(part="cvar", label="cvar")
-    assert read_part("risk", "cvar:0.5") == Part(part="cvar", label="cvar:0.5", options={"level": 0.5})
+    assert read_part("risk", "cvar:0.5") == Part(
+        part="cvar", label="cvar:0.5", options={"level": 0.5}
+    )
     found = find("risk", "cvar")
-    assert (found.target.__name__, found.shipped, found.everywhere, found.digest) == ("CVaR", True, True, "")
+    assert (found.target.__name__, found.shipped, found.everywhere, found.digest) == (
+        "CVaR",
+        True,
+        True,
+        "",
+    )
     assert found.origin == "benchnav"
 
 
@@ -174,7 +198,11 @@ def test_an_entry_point_of_an_installed_package_is_found(package: Path) -> None:
     assert "plugged" not in names("risk")
     found = find("planner", "plugged")
     assert found.target.__name__ == "Planner"
-    assert (found.origin, found.shipped, found.everywhere) == ("plugged-parts 3.1", False, True)
+    assert (found.origin, found.shipped, found.everywhere) == (
+        "plugged-parts 3.1",
+        False,
+        True,
+    )
     assert make("planner", "plugged:4").config.reach_m == 4
     assert make("risk", "worst:0.1")("mixture") == ("mixture", 0.1, 0.0)
 
@@ -183,7 +211,9 @@ def test_a_name_that_two_packages_have_is_refused(package: Path) -> None:
     other = package / "other-1.dist-info"
     other.mkdir()
     (other / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1\n")
-    (other / "entry_points.txt").write_text("[benchnav.planners]\nplugged = other:Planner\n")
+    (other / "entry_points.txt").write_text(
+        "[benchnav.planners]\nplugged = other:Planner\n"
+    )
     registry._points_on.cache_clear()
     message = refusal(lambda: find("planner", "plugged"))
     assert "plugged.parts:Planner" in message
@@ -198,27 +228,49 @@ def test_a_name_that_two_packages_have_is_refused(package: Path) -> None:
         ("plugged.parts:worst:1", "worst:1", {"share": 1.0}),
     ],
 )
-def test_a_part_of_a_module_is_found(package: Path, text: str, label: str, options: dict[str, float]) -> None:
+def test_a_part_of_a_module_is_found(
+    package: Path, text: str, label: str, options: dict[str, float]
+) -> None:
     part = read_part("risk", text)
     assert part == Part(part="plugged.parts:worst", label=label, options=options)
     found = find("risk", part.part)
-    assert (found.origin, found.shipped, found.everywhere) == ("plugged-parts 3.1", False, True)
+    assert (found.origin, found.shipped, found.everywhere) == (
+        "plugged-parts 3.1",
+        False,
+        True,
+    )
     assert make("risk", text)("m") == ("m", options.get("share", 0.25), 0.0)
 
 
-def test_a_part_of_this_package_may_be_named_by_its_module_and_a_class_within_a_class(package: Path) -> None:
+def test_a_part_of_this_package_may_be_named_by_its_module_and_a_class_within_a_class(
+    package: Path,
+) -> None:
     assert find("risk", "benchnav.planning.risk:Mean").shipped
-    assert type(make("robot", "plugged.parts:Holder.Inner")).__qualname__ == "Holder.Inner"
+    assert (
+        type(make("robot", "plugged.parts:Holder.Inner")).__qualname__ == "Holder.Inner"
+    )
 
 
 def test_a_part_of_a_file_is_found(file: str) -> None:
-    assert read_part("risk", f"{file}:worst") == Part(part="./mine.py:worst", label="worst")
+    assert read_part("risk", f"{file}:worst") == Part(
+        part="./mine.py:worst", label="worst"
+    )
     part = read_part("risk", f"{file}:worst:0.5")
-    assert part == Part(part="./mine.py:worst", label="worst:0.5", options={"share": 0.5})
+    assert part == Part(
+        part="./mine.py:worst", label="worst:0.5", options={"share": 0.5}
+    )
     found = find("risk", part.part)
-    assert (found.origin, found.shipped, found.everywhere) == ("file mine.py", False, True)
+    assert (found.origin, found.shipped, found.everywhere) == (
+        "file mine.py",
+        False,
+        True,
+    )
     assert make("risk", part)("m") == ("m", 0.5, 0.0)
-    assert make("risk", Path("mine.py").absolute().as_posix() + ":worst")("m") == ("m", 0.25, 0.0)
+    assert make("risk", Path("mine.py").absolute().as_posix() + ":worst")("m") == (
+        "m",
+        0.25,
+        0.0,
+    )
     assert not list(Path().rglob("*.pyc"))
 
 
@@ -232,7 +284,11 @@ def test_what_is_registered_is_known_in_this_process_alone() -> None:
     assert "mine" not in names("robot")
     assert make("planner", "mine:2").speed == 2
     found = find("planner", "mine")
-    assert (found.everywhere, found.shipped, found.origin) == (False, False, "this process")
+    assert (found.everywhere, found.shipped, found.origin) == (
+        False,
+        False,
+        "this process",
+    )
     assert found.digest
 
 
@@ -241,8 +297,14 @@ def test_parts_are_written_as_text_or_as_mappings(file: str) -> None:
     part = read_part("risk", given)
     assert part == Part(part="./mine.py:worst", label="mine", options={"floor": 0.1})
     assert read_part("risk", part) is part
-    assert given == {"part": f"{file}:worst", "label": "mine", "options": {"floor": 0.1}}
-    both = read_part("risk", {"part": f"{file}:worst:0.5", "label": None, "options": {"floor": 0.1}})
+    assert given == {
+        "part": f"{file}:worst",
+        "label": "mine",
+        "options": {"floor": 0.1},
+    }
+    both = read_part(
+        "risk", {"part": f"{file}:worst:0.5", "label": None, "options": {"floor": 0.1}}
+    )
     assert (both.options, both.label) == ({"share": 0.5, "floor": 0.1}, "worst:0.5")
 
 
@@ -262,13 +324,19 @@ def test_anything_else_is_no_part(given: object) -> None:
     assert "{part: NAME, label: LABEL" in refusal(lambda: read_part("planner", given))  # type: ignore[arg-type]
 
 
-# --- options ----------------------------------------------------------------------------------------
+# --- options
+# ----------------------------------------------------------------------------------------
 
 
-def test_options_are_parameters_of_a_function_class_or_dataclass_and_fields_of_a_config(file: str) -> None:
+def test_options_are_parameters_of_a_function_class_or_dataclass_and_fields_of_a_config(
+    file: str,
+) -> None:
     def listed(kind: str, name: str) -> dict[str, object]:
         return {
-            n: option.default for n, option in options_of(kind, find(kind, f"{file}:{name}").target).items()
+            n: option.default
+            for n, option in options_of(
+                kind, find(kind, f"{file}:{name}").target
+            ).items()
         }
 
     assert listed("risk", "worst") == {"share": 0.25, "floor": 0.0}
@@ -277,26 +345,47 @@ def test_options_are_parameters_of_a_function_class_or_dataclass_and_fields_of_a
     assert listed("planner", "Plain") == {
         "count": registry.NO_DEFAULT, "mode": "a", "name": "x", "limit": None, "fast": False, "anything": None
     }  # fmt: skip
-    assert list(listed("planner", "Planner")) == ["reach_m", "follower", "second", "widths"]
+    assert list(listed("planner", "Planner")) == [
+        "reach_m",
+        "follower",
+        "second",
+        "widths",
+    ]
     assert listed("robot", "Bare") == {"size": 4, "names": ["u"]}
     assert listed("objective", "NeedsRobot") == {"margin_m": 0.5}
 
 
-def test_types_are_known_even_where_one_is_imported_for_type_checkers_alone(file: str) -> None:
+def test_types_are_known_even_where_one_is_imported_for_type_checkers_alone(
+    file: str,
+) -> None:
     target = find("objective", f"{file}:NeedsRobot").target
     assert options_of("objective", target)["margin_m"].kind is float
 
 
 def test_a_part_is_made_with_its_options(file: str) -> None:
-    given = {"reach_m": 2, "follower": {"gain": 5}, "widths": [3, 4], "second": {"corners": 1}}
+    given = {
+        "reach_m": 2,
+        "follower": {"gain": 5},
+        "widths": [3, 4],
+        "second": {"corners": 1},
+    }
     config = make("planner", {"part": f"{file}:Planner", "options": given}).config
     assert (config.reach_m, config.widths) == (2.0, (3.0, 4.0))
     assert (config.follower.gain, config.follower.corners) == (5.0, 3)
     assert (config.second.gain, config.second.corners) == (2.0, 1)
     assert isinstance(config.reach_m, float)
     assert isinstance(config.widths, tuple)
-    plain = {"count": 1, "mode": "b", "name": "y", "limit": 0.5, "fast": True, "anything": [1]}
-    assert make("planner", {"part": f"{file}:Plain", "options": plain}).given == tuple(plain.values())
+    plain = {
+        "count": 1,
+        "mode": "b",
+        "name": "y",
+        "limit": 0.5,
+        "fast": True,
+        "anything": [1],
+    }
+    assert make("planner", {"part": f"{file}:Plain", "options": plain}).given == tuple(
+        plain.values()
+    )
     assert type(make("robot", f"{file}:robot")).__name__ == "Inner"
 
 
@@ -313,7 +402,10 @@ def test_what_is_no_subclass_is_refused_with_the_base_class_and_where_it_is(
     file: str, kind: str, place: str, base: str
 ) -> None:
     rest = f"to be a subclass of benchnav.{place}.{base}, got Duck. Write class Duck({base})."
-    assert refusal(lambda: make(kind, f"{file}:Duck")) == f"Expected {kind} './mine.py:Duck' {rest}"
+    assert (
+        refusal(lambda: make(kind, f"{file}:Duck"))
+        == f"Expected {kind} './mine.py:Duck' {rest}"
+    )
     duck = find("planner", f"{file}:Duck").target()
     assert refusal(lambda: take(kind, duck)) == f"Expected the {kind} {rest}"
 
@@ -322,13 +414,18 @@ def test_a_part_is_taken_as_it_is_or_made_by_its_name() -> None:
     robot = Unicycle()
     assert take("robot", robot) is robot
     assert take("robot", {"part": "unicycle", "options": {"dt_s": 0.2}}).dt_s == 0.2
-    assert take("objective", "travel_time", robot=robot, goal_radius_m=1.0).robot is robot
+    assert (
+        take("objective", "travel_time", robot=robot, goal_radius_m=1.0).robot is robot
+    )
 
 
 @pytest.mark.parametrize(
-    ("text", "value"), [("0.5", 0.5), ("1e-3", 0.001), ("3", 3), ("true", True), ("far", "far")]
+    ("text", "value"),
+    [("0.5", 0.5), ("1e-3", 0.001), ("3", 3), ("true", True), ("far", "far")],
 )
-def test_a_value_for_an_option_without_a_type_is_what_it_looks_like(text: str, value: object) -> None:
+def test_a_value_for_an_option_without_a_type_is_what_it_looks_like(
+    text: str, value: object
+) -> None:
     register("risk", "untyped", lambda mixture, share=0.25: share)
     found = make("risk", f"untyped:{text}")(None)
     assert found == value
@@ -341,12 +438,21 @@ def test_what_a_part_is_made_for_is_given_where_it_is_asked_for(file: str) -> No
     assert make("objective", f"{file}:Bare", robot="the robot").size == 4
 
 
-def test_complete_fills_in_defaults_as_plain_data_so_that_like_parts_are_alike(file: str) -> None:
+def test_complete_fills_in_defaults_as_plain_data_so_that_like_parts_are_alike(
+    file: str,
+) -> None:
     part = complete("planner", read_part("planner", f"{file}:Planner"))
     follower = {"gain": 2.0, "corners": 3}
-    assert part.options == {"reach_m": 1.5, "follower": follower, "second": None, "widths": [1.0, 2.0]}
+    assert part.options == {
+        "reach_m": 1.5,
+        "follower": follower,
+        "second": None,
+        "widths": [1.0, 2.0],
+    }
     written = {"reach_m": 1.5, "follower": {"gain": 2}, "widths": [1, 2]}
-    again = complete("planner", read_part("planner", {"part": f"{file}:Planner", "options": written}))
+    again = complete(
+        "planner", read_part("planner", {"part": f"{file}:Planner", "options": written})
+    )
     assert again.options == part.options
     assert isinstance(again.options["follower"]["gain"], float)
     assert (
@@ -365,7 +471,10 @@ def test_options_that_came_later_are_left_out_at_their_default(tmp_path: Path) -
     )
 
     def options(name: str, **given: object) -> object:
-        return complete("planner", read_part("planner", {"part": f"{path}:{name}", "options": given})).options
+        return complete(
+            "planner",
+            read_part("planner", {"part": f"{path}:{name}", "options": given}),
+        ).options
 
     assert options("Planner") == options("Planner", extra=2) == {"first": 1.0}
     assert options("Planner", extra=2.5) == {"first": 1.0, "extra": 2.5}
@@ -425,16 +534,21 @@ def test_what_a_part_says_of_its_options_is_told_in_one_line(file: str) -> None:
         ("cvarr:half", "Did you mean 'cvar'?"),
     ],
 )
-def test_values_after_a_name_that_do_not_fit_are_refused(text: str, expected: str) -> None:
+def test_values_after_a_name_that_do_not_fit_are_refused(
+    text: str, expected: str
+) -> None:
     assert expected in refusal(lambda: make("risk", text))
 
 
 def test_an_option_given_twice_is_refused() -> None:
     given = {"part": "cvar:0.5", "options": {"level": 0.9}}
-    assert "option 'level' of risk 'cvar:0.5' once" in refusal(lambda: read_part("risk", given))
+    assert "option 'level' of risk 'cvar:0.5' once" in refusal(
+        lambda: read_part("risk", given)
+    )
 
 
-# --- what is not there ------------------------------------------------------------------------------
+# --- what is not there
+# ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -445,7 +559,10 @@ def test_an_option_given_twice_is_refused() -> None:
         ("mine", "Did you mean './mine.py:Name'?"),
         ("./mine.py", "Say which class or function of it: ./mine.py:Name."),
         ("mine:Planner", "Did you mean './mine.py:Planner'?"),
-        ("./mien.py:Planner", "cannot be read: No such file or directory. Did you mean 'mine.py'?"),
+        (
+            "./mien.py:Planner",
+            "cannot be read: No such file or directory. Did you mean 'mine.py'?",
+        ),
         ("./mine.py:Plannr", "Did you mean 'Planner'?"),
         ("./mine.py:thing", "got 'thing', which is an object of Bare"),
         ("nowhere.at.all:Planner", "there is no module 'nowhere'"),
@@ -455,7 +572,9 @@ def test_an_option_given_twice_is_refused() -> None:
         ("", "Expected a planner among"),
     ],
 )
-def test_what_is_not_there_gets_a_hint(file: str, package: Path, name: str, expected: str) -> None:
+def test_what_is_not_there_gets_a_hint(
+    file: str, package: Path, name: str, expected: str
+) -> None:
     assert expected in refusal(lambda: find("planner", name))
 
 
@@ -466,8 +585,14 @@ def test_an_unknown_kind_is_refused() -> None:
 @pytest.mark.parametrize(
     ("source", "expected"),
     [
-        ("x = 1\nraise RuntimeError('of no\\nuse')\n", "RuntimeError: of no use (line 2)"),
-        ("import absent_helper\n", "No module named 'absent_helper' (line 1). A file stands alone"),
+        (
+            "x = 1\nraise RuntimeError('of no\\nuse')\n",
+            "RuntimeError: of no use (line 2)",
+        ),
+        (
+            "import absent_helper\n",
+            "No module named 'absent_helper' (line 1). A file stands alone",
+        ),
         ("class :\n", "SyntaxError"),
         ("import sys\nsys.exit('done')\n", "SystemExit: done (line 2)"),
     ],
@@ -485,7 +610,8 @@ def test_a_file_or_module_that_raises_is_told_in_one_line(
     assert expected.split(" (")[0] in refusal(lambda: find("planner", "broken"))
 
 
-# --- files change, and their digests with them --------------------------------------------------------
+# --- files change, and their digests with them
+# --------------------------------------------------------
 
 
 def test_a_file_that_changed_is_loaded_anew_even_within_a_second(file: str) -> None:
@@ -537,7 +663,9 @@ def test_the_digest_of_a_module_is_that_of_its_file_and_of_where_the_part_is_def
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     base, front = tmp_path / "base_of_it.py", tmp_path / "front_of_it.py"
-    front.write_text("from base_of_it import Planner\nfrom benchnav.planning.risk import Mean\n")
+    front.write_text(
+        "from base_of_it import Planner\nfrom benchnav.planning.risk import Mean\n"
+    )
     seen = set()
     for content in ("class Planner:\n    a = 1\n", "class Planner:\n    a = 22\n"):
         base.write_text(content)
@@ -561,7 +689,8 @@ def test_the_digest_of_what_is_registered_is_that_of_its_source(file: str) -> No
     assert find("robot", "none").digest == ""
 
 
-# --- other processes, and weight ----------------------------------------------------------------------
+# --- other processes, and weight
+# ----------------------------------------------------------------------
 
 
 def test_workers_find_parts_of_files_and_modules(
@@ -569,9 +698,12 @@ def test_workers_find_parts_of_files_and_modules(
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(package))
     texts = ["./mine.py:Planner:3", "plugged.parts:Planner:3", "plugged:3"]
-    # Workers may be older than this test: they are told where names of files and packages begin.
+    # Workers may be older than this test: they are told where names of files and
+    # packages begin.
     here = Path.cwd()
-    made = Parallel(n_jobs=2)(delayed(_reach)(text, os.getpid(), here, package) for text in texts)
+    made = Parallel(n_jobs=2)(
+        delayed(_reach)(text, os.getpid(), here, package) for text in texts
+    )
     assert made == [3.0, 3.0, 3.0]
 
 
@@ -587,7 +719,9 @@ def test_the_registry_is_light_to_import() -> None:
         "import sys, benchnav.core.registry as r; r.names('planner'); r.read_part('risk', 'cvar'); "
         "print(sorted({'torch', 'pandas', 'jsonargparse', 'joblib'} & set(sys.modules)))"
     )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert ran.stdout.strip() == "[]"
 
 
@@ -595,5 +729,7 @@ def test_the_registry_is_light_to_import() -> None:
 def test_a_label_is_printable_text(label: object) -> None:
     with pytest.raises(ConfigError, match="label"):
         registry.read_part("planner", {"part": "mppi", "label": label})
-    assert registry.read_part("planner", {"part": "mppi", "label": None}).label == "mppi"
+    assert (
+        registry.read_part("planner", {"part": "mppi", "label": None}).label == "mppi"
+    )
     assert registry.read_part("planner", {"part": "mppi", "label": 3}).label == "3"

@@ -8,11 +8,15 @@ from benchnav.core import rng
 
 @given(st.lists(st.integers(0, 500), min_size=1, max_size=20), st.integers(1, 9))
 @settings(deadline=None)
-def test_an_element_is_the_same_in_any_batch_and_order(indices: list[int], count: int) -> None:
+def test_an_element_is_the_same_in_any_batch_and_order(
+    indices: list[int], count: int
+) -> None:
     key = rng.stream_key(3, "a")
     batch = rng.random_bits(key, np.array(indices), count)
     for row, index in zip(batch, indices, strict=True):
-        np.testing.assert_array_equal(row, rng.random_bits(key, np.array([index]), count)[0])
+        np.testing.assert_array_equal(
+            row, rng.random_bits(key, np.array([index]), count)[0]
+        )
 
 
 def test_elements_and_streams_share_no_words() -> None:
@@ -32,8 +36,14 @@ def test_names_are_not_confused_by_joining() -> None:
 
 def test_transforms_have_their_distributions() -> None:
     key = rng.stream_key(1, "x")
-    assert stats.kstest(rng.normal(key, np.arange(200), (100,)).ravel(), "norm").pvalue > 1e-3
-    assert stats.kstest(rng.uniform(key, np.arange(200), (100,)).ravel(), "uniform").pvalue > 1e-3
+    assert (
+        stats.kstest(rng.normal(key, np.arange(200), (100,)).ravel(), "norm").pvalue
+        > 1e-3
+    )
+    assert (
+        stats.kstest(rng.uniform(key, np.arange(200), (100,)).ravel(), "uniform").pvalue
+        > 1e-3
+    )
     orders = rng.permutation(key, np.arange(6000), 3)
     _, counts = np.unique(orders, axis=0, return_counts=True)
     assert len(counts) == 6
@@ -41,7 +51,10 @@ def test_transforms_have_their_distributions() -> None:
 
 
 def test_numpys_bit_generator_has_not_changed() -> None:
-    assert rng.random_bits(7, np.array([2]), 2)[0].tolist() == [260241063655440860, 14515071666965347364]
+    assert rng.random_bits(7, np.array([2]), 2)[0].tolist() == [
+        260241063655440860,
+        14515071666965347364,
+    ]
 
 
 @given(seed=st.integers(0, 2**63), count=st.integers(1, 9))
@@ -51,7 +64,8 @@ def test_many_streams_at_once_are_the_same_streams(seed: int, count: int) -> Non
     stream, indices = draw.integers(0, 4, 12), draw.integers(0, 2**40, 12)
     found = rng.normal_of_each(keys, stream, indices, count)
     one_by_one = [
-        rng.normal(keys[own], np.array([i]), (count,)) for own, i in zip(stream, indices, strict=True)
+        rng.normal(keys[own], np.array([i]), (count,))
+        for own, i in zip(stream, indices, strict=True)
     ]
     assert np.array_equal(found, np.concatenate(one_by_one))
     assert rng.normal_of_each(keys, stream[:0], indices[:0], count).shape == (0, count)

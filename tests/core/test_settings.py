@@ -1,4 +1,6 @@
-"""Settings by type: what becomes of plain data, which key a message names, and the way back."""
+"""Settings by type: what becomes of plain data, which key a message names, and the way
+back.
+"""
 
 # ruff: noqa: E501 - each message stands on one line, as users see it
 
@@ -76,7 +78,9 @@ def test_plain_data_becomes_nested_dataclasses_and_comes_back() -> None:
 def test_what_is_not_given_stays_as_it_is_in_the_value_that_is_changed() -> None:
     whole = rover(FULL)
     assert rover({"path": "3,4"}, whole) == rover(FULL | {"path": [3, 4]})
-    assert rover({"spare": {"kind": "soft"}}, whole).spare == Wheel(radius_m=0.5, kind="soft")
+    assert rover({"spare": {"kind": "soft"}}, whole).spare == Wheel(
+        radius_m=0.5, kind="soft"
+    )
     assert rover({"spare": None}, whole).spare is None
     assert rover({}, whole) == whole
 
@@ -120,7 +124,9 @@ def test_only_a_mapping_is_a_dataclass_even_where_all_has_defaults(value: Any) -
         with pytest.raises(ConfigError, match=r"^Expected easy as a mapping, got"):
             read(Easy, value, of("easy"), now=now)
         if value is not None:
-            with pytest.raises(ConfigError, match=r"^Expected easy as a mapping or null, got"):
+            with pytest.raises(
+                ConfigError, match=r"^Expected easy as a mapping or null, got"
+            ):
                 read(Easy | None, value, of("easy"), now=now)
 
 
@@ -128,23 +134,36 @@ def test_a_default_of_none_may_be_given_whatever_the_type_says() -> None:
     def part(limit: float = None, count: int = 1) -> None:  # type: ignore[assignment]  # noqa: RUF013 - as users write it
         pass
 
-    assert read_options(list_options(part), {"limit": None}, of("part")) == {"limit": None}
-    with pytest.raises(ConfigError, match="Expected `count` of part as a whole number, got null"):
+    assert read_options(list_options(part), {"limit": None}, of("part")) == {
+        "limit": None
+    }
+    with pytest.raises(
+        ConfigError, match="Expected `count` of part as a whole number, got null"
+    ):
         read_options(list_options(part), {"count": None}, of("part"))
 
 
 def test_a_value_is_set_in_a_copy_of_plain_data() -> None:
-    data = {"a": {"b": 1}, "items": [{"name": "x", "n": 1}, {"name": "y", "n": 2}], "row": [1, 2]}
+    data = {
+        "a": {"b": 1},
+        "items": [{"name": "x", "n": 1}, {"name": "y", "n": 2}],
+        "row": [1, 2],
+    }
     before = json.dumps(data)
     assert changed(data, ["a", "b"], 2)["a"] == {"b": 2}
     assert changed(data, ["new", "deep"], 2)["new"] == {"deep": 2}
-    assert changed(data, ["items", "y", "n"], 3)["items"] == [{"name": "x", "n": 1}, {"name": "y", "n": 3}]
+    assert changed(data, ["items", "y", "n"], 3)["items"] == [
+        {"name": "x", "n": 1},
+        {"name": "y", "n": 3},
+    ]
     assert changed(data, ["row", "1"], 3)["row"] == [1, 3]
     assert changed(None, ["a"], 1) == {"a": 1}
     assert json.dumps(data) == before
     with pytest.raises(ConfigError, match=r"Expected a name among x, y, got 'z'\."):
         changed(data, ["items", "z", "n"], 3)
-    with pytest.raises(ConfigError, match=r"Expected a mapping in which 'c\.d' can be set, got 1"):
+    with pytest.raises(
+        ConfigError, match=r"Expected a mapping in which 'c\.d' can be set, got 1"
+    ):
         changed(data, ["a", "b", "c", "d"], 3)
 
 
@@ -152,8 +171,16 @@ def test_plain_data_is_what_json_reads_back() -> None:
     class Colour(Enum):
         RED = 1
 
-    given = {"colour": Colour.RED, 3: (Path("a/b"), None, True, 1.5), "wheel": Wheel(radius_m=1.0)}
-    wanted = {"colour": "RED", "3": ["a/b", None, True, 1.5], "wheel": {"radius_m": 1.0, "kind": "rigid"}}
+    given = {
+        "colour": Colour.RED,
+        3: (Path("a/b"), None, True, 1.5),
+        "wheel": Wheel(radius_m=1.0),
+    }
+    wanted = {
+        "colour": "RED",
+        "3": ["a/b", None, True, 1.5],
+        "wheel": {"radius_m": 1.0, "kind": "rigid"},
+    }
     assert plain(given) == wanted == json.loads(json.dumps(plain(given)))
     with pytest.raises(ConfigError, match="Expected plain data"):
         plain({"a": print})

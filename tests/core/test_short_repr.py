@@ -25,23 +25,38 @@ class Pair(Batch):
 
 def test_tensors_are_shown_by_dtype_and_shape_and_the_rest_by_value_or_size() -> None:
     assert repr(Pair(first=torch.zeros(2, 3))) == "Pair(first float32 [2, 3], names=())"
-    many = Pair(first=torch.zeros(1, dtype=torch.int64), names=tuple("abcdefghijklmnop"))
+    many = Pair(
+        first=torch.zeros(1, dtype=torch.int64), names=tuple("abcdefghijklmnop")
+    )
     assert repr(many) == "Pair(first int64 [1], names tuple of 16)"
     assert "hidden" not in repr(many)
 
 
 def test_a_field_stays_on_one_line_and_lines_are_few() -> None:
     values = {f"field_{i}": torch.zeros(2, 3) for i in range(60)}
-    Wide = dataclass(type("Wide", (), {"__annotations__": dict.fromkeys(values, torch.Tensor)}))
+    Wide = dataclass(
+        type("Wide", (), {"__annotations__": dict.fromkeys(values, torch.Tensor)})
+    )
     shown = short_repr(Wide(**values))
     assert len(shown.splitlines()) == MAX_LINES
     assert shown.endswith(", …)")
-    named = [part.strip() for part in re.split(r",\s+(?=field_)", shown.removesuffix(", …)"))]
+    named = [
+        part.strip() for part in re.split(r",\s+(?=field_)", shown.removesuffix(", …)"))
+    ]
     assert all(part.endswith(" float32 [2, 3]") for part in named)
 
 
 @pytest.mark.parametrize(
-    "name", ["terrain", "observation", "distribution", "dataset", "recipe", "checkpoint", "rest"]
+    "name",
+    [
+        "terrain",
+        "observation",
+        "distribution",
+        "dataset",
+        "recipe",
+        "checkpoint",
+        "rest",
+    ],
 )
 def test_public_values_are_short(name: str) -> None:
     dataset = TerrainDataset(find_dataset("stakes-v1"))
@@ -52,7 +67,10 @@ def test_public_values_are_short(name: str) -> None:
         "distribution": [predict(load_model("oracle"), terrain)],
         "dataset": [dataset],
         "recipe": [load_recipe("full-v1")],
-        "checkpoint": [load_checkpoint(find_checkpoint("stakes-v1")), load_model("stakes-v1")],
+        "checkpoint": [
+            load_checkpoint(find_checkpoint("stakes-v1")),
+            load_model("stakes-v1"),
+        ],
         "rest": [
             Suite(),
             World.stakes(),

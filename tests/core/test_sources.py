@@ -1,4 +1,6 @@
-"""What identifies a part: its source and what that imports, the files that it lists, and those that options name."""
+"""What identifies a part: its source and what that imports, the files that it lists,
+and those that options name.
+"""
 
 import importlib.util
 import os
@@ -85,7 +87,9 @@ def refusal(call: Callable[[], object]) -> str:
 
 
 @pytest.mark.parametrize("name", IMPORTED)
-def test_a_change_of_any_file_that_is_imported_changes_the_digest(part: Path, name: str) -> None:
+def test_a_change_of_any_file_that_is_imported_changes_the_digest(
+    part: Path, name: str
+) -> None:
     before = digest(part)
     assert digest(part) == before
     changed = part.parent / name
@@ -100,7 +104,9 @@ def test_what_is_not_imported_does_not(part: Path, name: str) -> None:
     assert digest(part) == before
 
 
-def test_the_standard_library_and_what_is_installed_have_versions_instead(part: Path) -> None:
+def test_the_standard_library_and_what_is_installed_have_versions_instead(
+    part: Path,
+) -> None:
     content = PART + "import torch.nn, json, pytest, benchnav.core.errors\n"
     modules = imported_sources(part.parent, "", content.encode())
     assert "late_aid" in modules
@@ -129,25 +135,35 @@ def test_what_was_installed_into_a_folder_of_its_own_is_left_out_too(
         sources.installed_folders.cache_clear()
 
 
-def test_the_same_files_elsewhere_have_the_same_digest(part: Path, tmp_path: Path) -> None:
+def test_the_same_files_elsewhere_have_the_same_digest(
+    part: Path, tmp_path: Path
+) -> None:
     """A fresh process says so, which has imported neither."""
     other = tmp_path / "copy"
     part.parent.rename(other)
     ran = subprocess.run(
-        [sys.executable, "-c", _DIGEST, str(other / "part.py")], capture_output=True, text=True, check=True
+        [sys.executable, "-c", _DIGEST, str(other / "part.py")],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     other.rename(part.parent)
     assert ran.stdout.strip() == digest(part)
 
 
 def test_a_process_that_has_imported_an_older_file_is_like_no_other(part: Path) -> None:
-    """Python imports a module once: what a long-lived worker runs is not what now lies on the disk."""
+    """Python imports a module once: what a long-lived worker runs is not what now lies
+    on the disk.
+    """
     helper = part.parent / "lib" / "second_aid.py"
     older = digest(part)
     helper.write_text("x = 2\n")
     with_both = digest(part)
     fresh = subprocess.run(
-        [sys.executable, "-c", _DIGEST, str(part)], capture_output=True, text=True, check=True
+        [sys.executable, "-c", _DIGEST, str(part)],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert len({older, with_both, fresh.stdout.strip()}) == 3
     helper.write_text("x = 1\n")
@@ -159,7 +175,9 @@ def test_a_part_of_a_module_is_its_package_and_what_that_imports(
 ) -> None:
     monkeypatch.syspath_prepend(part.parent)
     inner = part.parent / "aid_package" / "planner.py"
-    inner.write_text("import late_aid\n\n\nclass Planner:\n    files = ('planner.txt',)\n")
+    inner.write_text(
+        "import late_aid\n\n\nclass Planner:\n    files = ('planner.txt',)\n"
+    )
     inner.with_suffix(".txt").write_text("1")
     importlib.invalidate_caches()
 
@@ -185,21 +203,31 @@ def test_files_that_a_part_lists_are_in_its_digest(part: Path) -> None:
         (part.parent / changed).write_bytes(b"22")
         seen.add(digest(part))
     assert len(seen) == 4
-    part.write_text("class Planner:\n    def __init__(self, files: tuple[str, ...] = ('x',)) -> None: ...\n")
+    part.write_text(
+        "class Planner:\n    def __init__(self, files: tuple[str, ...] = ('x',)) -> None: ...\n"
+    )
     assert digest(part)  # an option of that name lists nothing
 
 
-def test_files_and_folders_that_options_name_are_known_by_what_they_hold(part: Path) -> None:
+def test_files_and_folders_that_options_name_are_known_by_what_they_hold(
+    part: Path,
+) -> None:
     Path("weights.npz").write_bytes(b"1")
     Path("tables").mkdir()
     Path("tables", "a").write_bytes(b"1")
-    options = {"weights": "weights.npz", "inner": {"tables": ["tables", "", "mean"], "level": 0.5}}
+    options = {
+        "weights": "weights.npz",
+        "inner": {"tables": ["tables", "", "mean"], "level": 0.5},
+    }
     asked = Part(part=f"{part}:Planner", label="", kind="planner", options=options)
     seen = [option_files(asked)]
     assert set(seen[0]) == {"weights.npz", "tables"}
     Path("weights.npz").write_bytes(b"2")
     seen.append(option_files(asked))
-    assert [seen[1][name] == seen[0][name] for name in ("weights.npz", "tables")] == [False, True]
+    assert [seen[1][name] == seen[0][name] for name in ("weights.npz", "tables")] == [
+        False,
+        True,
+    ]
     os.rename("tables/a", "tables/b")
     assert option_files(asked)["tables"] != seen[0]["tables"]
     Path("weights.npz").unlink()
@@ -208,16 +236,26 @@ def test_files_and_folders_that_options_name_are_known_by_what_they_hold(part: P
 
 def test_what_a_part_writes_is_not_what_it_reads(part: Path) -> None:
     Path("log").mkdir()
-    asked = Part(part=f"{part}:Planner", label="", kind="planner", options={"weights": "log"})
+    asked = Part(
+        part=f"{part}:Planner", label="", kind="planner", options={"weights": "log"}
+    )
     assert set(option_files(asked)) == {"log"}
-    part.write_text(PART.replace("class Planner:\n", "class Planner:\n    writes = ('weights',)\n"))
+    part.write_text(
+        PART.replace("class Planner:\n", "class Planner:\n    writes = ('weights',)\n")
+    )
     assert option_files(asked) == {}
 
 
 @pytest.mark.parametrize("folder", [".", "..", "/"])
-def test_a_folder_that_holds_the_working_folder_is_refused(part: Path, folder: str) -> None:
-    asked = Part(part=f"{part}:Planner", label="", kind="planner", options={"weights": folder})
-    assert f"got {folder!r}, which holds the working folder" in refusal(lambda: option_files(asked))
+def test_a_folder_that_holds_the_working_folder_is_refused(
+    part: Path, folder: str
+) -> None:
+    asked = Part(
+        part=f"{part}:Planner", label="", kind="planner", options={"weights": folder}
+    )
+    assert f"got {folder!r}, which holds the working folder" in refusal(
+        lambda: option_files(asked)
+    )
 
 
 MOVED = {
@@ -231,24 +269,32 @@ def test_a_name_of_an_earlier_version_is_answered_with_that_of_today(
     line: str, remedy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "old_part.py").write_text(f"import math\n{line}\n\n\nclass Mine:\n    pass\n")
+    (tmp_path / "old_part.py").write_text(
+        f"import math\n{line}\n\n\nclass Mine:\n    pass\n"
+    )
     for source in (f"{tmp_path / 'old_part.py'}:Mine", "old_part:Mine"):
         with pytest.raises(ConfigError) as caught:
             find("planner", source)
         assert remedy in str(caught.value)
         assert "\n" not in str(caught.value)
-    assert "old_part.py could not be imported" in str(caught.value) or "module old_part" in str(caught.value)
+    assert "old_part.py could not be imported" in str(
+        caught.value
+    ) or "module old_part" in str(caught.value)
 
 
 def test_the_new_names_can_be_imported() -> None:
     for old, new in IMPORTS.items():
         place, _, name = new.rpartition(".")
-        assert hasattr(importlib.import_module(place), name) or importlib.util.find_spec(new), old
+        assert hasattr(
+            importlib.import_module(place), name
+        ) or importlib.util.find_spec(new), old
 
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A package in place of this one: `unit` imports `rows`, late; nothing imports `drawing`."""
+    """A package in place of this one: `unit` imports `rows`, late; nothing imports
+    `drawing`.
+    """
     place = tmp_path / "benchnav"
     place.mkdir()
     (place / "__init__.py").write_text("from benchnav import drawing\n")
@@ -274,9 +320,13 @@ def test_modules_of_the_package_are_those_that_a_unit_imports(package: Path) -> 
     assert list(digests()) == ["benchnav.rows", "benchnav.unit"]
 
 
-def test_docstrings_comments_and_layout_change_no_module_digest_and_code_does(package: Path) -> None:
+def test_docstrings_comments_and_layout_change_no_module_digest_and_code_does(
+    package: Path,
+) -> None:
     before, rows = digests(), package / "rows.py"
-    rows.write_text('def row():\n    """The one row, in other words."""\n\n    return (\n        1\n    )\n')
+    rows.write_text(
+        'def row():\n    """The one row, in other words."""\n\n    return (\n        1\n    )\n'
+    )
     assert digests() == before
     rows.write_text(rows.read_text().replace("1", "2"))
     after = digests()

@@ -10,7 +10,14 @@ from pathlib import Path
 import pytest
 
 from benchnav.core.errors import BenchnavError, ConfigError
-from benchnav.core.store import building, refuse_taken, replacing, sole_writer, take_place, write_text
+from benchnav.core.store import (
+    building,
+    refuse_taken,
+    replacing,
+    sole_writer,
+    take_place,
+    write_text,
+)
 
 HOLD = """
 import sys, time
@@ -21,7 +28,8 @@ with sole_writer(Path(sys.argv[1]), "it"):
     time.sleep(60)
 """
 
-# Each adds 1 to a number as often as it gets hold of it, with a pause between reading and writing.
+# Each adds 1 to a number as often as it gets hold of it, with a pause between reading
+# and writing.
 COUNT = """
 import sys, time
 from pathlib import Path
@@ -52,7 +60,9 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     assert [item.name for item in path.parent.iterdir()] == ["file"]
 
 
-def test_a_folder_is_held_before_it_exists_and_nothing_stays_behind(tmp_path: Path) -> None:
+def test_a_folder_is_held_before_it_exists_and_nothing_stays_behind(
+    tmp_path: Path,
+) -> None:
     folder = tmp_path / "runs" / "new"
     with sole_writer(folder, "the run"):
         assert not folder.exists()
@@ -79,13 +89,20 @@ def test_a_folder_may_be_replaced_while_it_is_held(tmp_path: Path) -> None:
             pass
 
 
-def test_all_names_of_a_folder_have_one_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_names_of_a_folder_have_one_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
     (tmp_path / "link").symlink_to(folder)
     monkeypatch.chdir(folder)
     with sole_writer(folder, "it"):
-        for name in (tmp_path / "link", Path("."), Path("../run"), tmp_path / "run/x/.."):
+        for name in (
+            tmp_path / "link",
+            Path("."),
+            Path("../run"),
+            tmp_path / "run/x/..",
+        ):
             with pytest.raises(BenchnavError), sole_writer(name, "it"):
                 pass
 
@@ -99,7 +116,9 @@ def test_an_error_within_frees_it(tmp_path: Path) -> None:
 
 def test_a_killed_holder_frees_it(tmp_path: Path) -> None:
     holder = subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(tmp_path / "run")], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", HOLD, str(tmp_path / "run")],
+        stdout=subprocess.PIPE,
+        text=True,
     )
     try:
         assert holder.stdout is not None
@@ -141,7 +160,9 @@ def test_a_lock_that_is_removed_while_one_waits_for_it_is_not_taken(
 def test_racing_processes_never_hold_it_at_once(tmp_path: Path) -> None:
     number = tmp_path / "number"
     number.write_text("0")
-    racers = [subprocess.Popen([sys.executable, "-c", COUNT, str(number)]) for _ in range(2)]
+    racers = [
+        subprocess.Popen([sys.executable, "-c", COUNT, str(number)]) for _ in range(2)
+    ]
     assert [racer.wait(timeout=120) for racer in racers] == [0, 0]
     assert number.read_text() == "400"
     assert [item.name for item in tmp_path.iterdir()] == ["number"]
@@ -173,7 +194,9 @@ def test_a_place_is_taken_by_what_is_no_output_always_and_else_unless_it_is_to_b
         refuse_taken(out, False, foreign)
     (out / "notes").touch()
     for overwrite in (False, True):
-        with pytest.raises(ConfigError, match=r"out, which holds notes\. Choose another"):
+        with pytest.raises(
+            ConfigError, match=r"out, which holds notes\. Choose another"
+        ):
             refuse_taken(out, overwrite, foreign)
 
 

@@ -85,8 +85,14 @@ def test_terminal_shows_brackets_and_notes_and_breaks_only_where_it_has_to() -> 
 def test_bold_cells_and_what_bold_means() -> None:
     lines = to_markdown(BOLD).splitlines()
     assert lines[3] == r"| [bold] a\|b & 50% | **–** | – |"
-    assert lines[-3:] == [r"Bold: the best \| all", "", r"- **failures**: how \<it> ended."]
-    assert r"{[}bold] a\textbar{}b \& 50\% & \textbf{--} & -- \\" in to_latex([BOLD], "", "")
+    assert lines[-3:] == [
+        r"Bold: the best \| all",
+        "",
+        r"- **failures**: how \<it> ended.",
+    ]
+    assert r"{[}bold] a\textbar{}b \& 50\% & \textbf{--} & -- \\" in to_latex(
+        [BOLD], "", ""
+    )
     plain = to_terminal(BOLD)
     assert "–*" in plain
     assert plain.count("*") == 2

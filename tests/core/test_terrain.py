@@ -17,8 +17,12 @@ def test_a_position_lies_in_the_cell_it_is_looked_up_in(
     height: int, width: int, resolution: float, data
 ) -> None:
     grid = Grid(height, width, resolution)
-    x = torch.tensor([data.draw(st.floats(0.001, 0.999)) * width * resolution], dtype=torch.float64)
-    y = torch.tensor([data.draw(st.floats(0.001, 0.999)) * height * resolution], dtype=torch.float64)
+    x = torch.tensor(
+        [data.draw(st.floats(0.001, 0.999)) * width * resolution], dtype=torch.float64
+    )
+    y = torch.tensor(
+        [data.draw(st.floats(0.001, 0.999)) * height * resolution], dtype=torch.float64
+    )
     row, column = grid.cell_of(x, y)
     centre_x, centre_y = grid.centre_of(row, column)
     assert (centre_x - x).abs() <= resolution * 0.5001
@@ -41,7 +45,13 @@ def test_rows_are_y_and_off_the_map_is_outside() -> None:
 def test_observation_holds_what_a_robot_sees_and_nothing_else() -> None:
     observation = factories.terrain(torch.rand(2, 16, 16)).observe()
     assert isinstance(observation, Observation)
-    assert set(vars(observation)) == {"rgb", "elevation_m", "slope_deg", "grid", "layers"}
+    assert set(vars(observation)) == {
+        "rgb",
+        "elevation_m",
+        "slope_deg",
+        "grid",
+        "layers",
+    }
     assert observation.layers == {}
 
 
@@ -57,7 +67,9 @@ def test_layers_that_do_not_fit_are_named() -> None:
 
 def layered() -> Terrain:
     ground = factories.terrain(torch.rand(3, 16, 16))
-    return replace(ground, layers={"moss": torch.rand(3, 16, 16), "dust": torch.rand(3, 16, 16)})
+    return replace(
+        ground, layers={"moss": torch.rand(3, 16, 16), "dust": torch.rand(3, 16, 16)}
+    )
 
 
 def test_layers_go_with_their_maps() -> None:
@@ -75,17 +87,31 @@ def test_layers_go_with_their_maps() -> None:
 def test_several_batches_are_changed_together_layer_by_layer() -> None:
     one, other = layered().observe(), layered().observe()
     joined = map_tensors(one, lambda first, second: torch.cat((first, second)), other)
-    assert torch.equal(joined.layers["dust"], torch.cat((one.layers["dust"], other.layers["dust"])))
+    assert torch.equal(
+        joined.layers["dust"], torch.cat((one.layers["dust"], other.layers["dust"]))
+    )
 
 
 @pytest.mark.parametrize(
     ("layers", "expected"),
     [
-        ({"moss": torch.zeros(3, 16, 15)}, "`moss` of shape [3, 16, 16], got [3, 16, 15]"),
-        ({"moss": torch.zeros(2, 16, 16)}, "`moss` of shape [3, 16, 16], got [2, 16, 16]"),
+        (
+            {"moss": torch.zeros(3, 16, 15)},
+            "`moss` of shape [3, 16, 16], got [3, 16, 15]",
+        ),
+        (
+            {"moss": torch.zeros(2, 16, 16)},
+            "`moss` of shape [3, 16, 16], got [2, 16, 16]",
+        ),
         ({"moss": torch.zeros(3, 16, 16).double()}, "layer `moss` as float32"),
-        ({"slope_deg": torch.zeros(3, 16, 16)}, "layer `slope_deg` as float32 under a name of its own"),
-        ({"rgb": torch.zeros(3, 16, 16)}, "layer `rgb` as float32 under a name of its own"),
+        (
+            {"slope_deg": torch.zeros(3, 16, 16)},
+            "layer `slope_deg` as float32 under a name of its own",
+        ),
+        (
+            {"rgb": torch.zeros(3, 16, 16)},
+            "layer `rgb` as float32 under a name of its own",
+        ),
     ],
 )
 def test_layers_fit_the_grid(layers: dict[str, torch.Tensor], expected: str) -> None:

@@ -35,11 +35,15 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.parametrize(("of_this", "printed"), [(True, "done\n"), (False, "")])
-def test_a_worker_lives_as_long_as_the_process_it_was_given(of_this: bool, printed: str) -> None:
+def test_a_worker_lives_as_long_as_the_process_it_was_given(
+    of_this: bool, printed: str
+) -> None:
     # One whose parent was killed before it came up has another parent from the first.
     parent, seconds = (os.getpid(), 1.2) if of_this else (os.getppid(), 60)
     code = LIVES.format(parent=parent, seconds=seconds)
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120
+    )
     assert ended.stdout == printed
 
 
@@ -80,7 +84,10 @@ def test_a_worker_that_is_killed_is_one_line_and_the_next_calls_have_others() ->
 
     with pytest.raises(BenchnavError, match="A worker was killed"):
         list(run_calls([partial(end, number) for number in range(2)], jobs=2))
-    assert len(list(run_calls([partial(square, number) for number in range(2)], jobs=2))) == 2
+    assert (
+        len(list(run_calls([partial(square, number) for number in range(2)], jobs=2)))
+        == 2
+    )
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
@@ -128,8 +135,13 @@ def test_a_cluster_makes_the_calls() -> None:
             list(run_calls([lambda: 1 / 0], scheduler=cluster.scheduler_address))  # type: ignore[list-item]
 
 
-def test_a_cluster_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_that_is_not_there_is_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(workers, "_REACH_S", 0.2)
-    for scheduler, message in (("127.0.0.1:8786", "tcp://HOST:PORT"), ("tcp://127.0.0.1:9", "no answer")):
+    for scheduler, message in (
+        ("127.0.0.1:8786", "tcp://HOST:PORT"),
+        ("tcp://127.0.0.1:9", "no answer"),
+    ):
         with pytest.raises(ConfigError, match=message):
             list(run_calls([partial(square, 1)], scheduler=scheduler))

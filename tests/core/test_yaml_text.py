@@ -14,18 +14,28 @@ from benchnav.core.yaml_text import MAX_DEPTH, MAX_VALUES, load_yaml, read_yaml
 KEYS = st.from_regex(r"k[a-z0-9]{0,4}", fullmatch=True)
 DATA = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | KEYS,
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=4),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=4)
+    ),
     max_leaves=20,
 )
 
 
-def test_yaml_has_numbers_with_exponents_and_mappings_without_values(tmp_path: Path) -> None:
-    assert load_yaml("{a: 1e-3, b: yes, c: 2024-01-01}") == {"a": 0.001, "b": True, "c": "2024-01-01"}
+def test_yaml_has_numbers_with_exponents_and_mappings_without_values(
+    tmp_path: Path,
+) -> None:
+    assert load_yaml("{a: 1e-3, b: yes, c: 2024-01-01}") == {
+        "a": 0.001,
+        "b": True,
+        "c": "2024-01-01",
+    }
     assert load_yaml("a:\n") == {"a": None}
     assert load_yaml("{0: null}") == {0: None}
     path = tmp_path / "a.yaml"
     path.write_text("a: 1\nb: [\n")
-    with pytest.raises(ConfigError, match=r"^Expected YAML, got .*a.yaml, line 3: did not find"):
+    with pytest.raises(
+        ConfigError, match=r"^Expected YAML, got .*a.yaml, line 3: did not find"
+    ):
         read_yaml(path)
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(ConfigError, match=r"a\.yaml': it is no text"):
@@ -42,7 +52,9 @@ def test_what_is_written_as_yaml_is_read_back(data: Any) -> None:
 
 @settings(deadline=None)
 @given(st.dictionaries(KEYS, st.integers(), min_size=1, max_size=6), st.data())
-def test_a_key_twice_is_refused_wherever_it_stands(data: dict[str, int], draw: st.DataObject) -> None:
+def test_a_key_twice_is_refused_wherever_it_stands(
+    data: dict[str, int], draw: st.DataObject
+) -> None:
     lines = yaml.safe_dump(data).splitlines()
     again = draw.draw(st.sampled_from(lines))
     lines.insert(draw.draw(st.integers(0, len(lines))), again)

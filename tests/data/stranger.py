@@ -1,4 +1,6 @@
-"""An evidential U-Net on colour, elevation and vegetation, as a stranger would write it (Amini et al., 2020)."""
+"""An evidential U-Net on colour, elevation and vegetation, as a stranger would write it
+(Amini et al., 2020).
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +27,9 @@ class Evidential(TrainableModel):
     stride = 32
 
     def configure_network(self, channels: int) -> nn.Module:
-        return smp.Unet("resnet18", encoder_weights=None, in_channels=channels, classes=4)
+        return smp.Unet(
+            "resnet18", encoder_weights=None, in_channels=channels, classes=4
+        )
 
     def configure_losses(self) -> Callable[[Tensor, Tensor], Tensor]:
         return self.evidential_loss
@@ -43,7 +47,8 @@ class Evidential(TrainableModel):
             - (alpha + 0.5).lgamma()
         )
         return (
-            (nll + self.config.regulariser * (y - gamma).abs() * (2 * nu + alpha)) * seen
+            (nll + self.config.regulariser * (y - gamma).abs() * (2 * nu + alpha))
+            * seen
         ).sum() / seen.sum()
 
     def to_distribution(self, outputs: Tensor) -> TraversabilityMixture:

@@ -34,8 +34,13 @@ def datagen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
     return partial(call, "datagen")
 
 
-def test_a_dataset_from_making_to_mending(datagen: Call, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
-    assert datagen("create", "tiny-v1", "--out", "d.h5", "--splits", "[test/std,test/hg]") == 0
+def test_a_dataset_from_making_to_mending(
+    datagen: Call, tmp_path: Path, capsys
+) -> None:  # type: ignore[no-untyped-def]
+    assert (
+        datagen("create", "tiny-v1", "--out", "d.h5", "--splits", "[test/std,test/hg]")
+        == 0
+    )
     assert datagen("create", "tiny-v1", "--out", "d.h5") == 2
     capsys.readouterr()
     assert datagen("show", "d.h5") == 0
@@ -48,7 +53,12 @@ def test_a_dataset_from_making_to_mending(datagen: Call, tmp_path: Path, capsys)
     assert described["classes"][5]["name"] == "scree"
     assert 0 < described["splits"]["test/hg"]["stored_bytes"] < described["bytes"]
     assert datagen("validate", "d.h5") == 0
-    assert datagen("preview", "d.h5", "--split", "test/hg", "--maps", "[1]", "--out", "p.png") == 0
+    assert (
+        datagen(
+            "preview", "d.h5", "--split", "test/hg", "--maps", "[1]", "--out", "p.png"
+        )
+        == 0
+    )
     assert datagen("preview", "d.h5", "--split", "test/hg", "--contact-sheet") == 0
     for picture in ("p.png", "contact-test-hg.png"):
         assert (tmp_path / picture).stat().st_size > 5_000
@@ -68,7 +78,10 @@ def test_a_dataset_from_making_to_mending(datagen: Call, tmp_path: Path, capsys)
 
 
 def test_damage_is_one_line_for_every_command(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
-    assert datagen("create", "tiny-v1", *SMALL, "--splits", "[train]", "--out", "d.h5") == 0
+    assert (
+        datagen("create", "tiny-v1", *SMALL, "--splits", "[train]", "--out", "d.h5")
+        == 0
+    )
     with h5py.File("d.h5", "r+") as file:
         del file["train/slope_deg"], file["train/entry_digests"]
     for arguments in (["show", "d.h5"], ["merge", "d.h5", "d.h5", "--out", "m.h5"]):
@@ -83,8 +96,24 @@ def test_damage_is_one_line_for_every_command(datagen: Call, capsys) -> None:  #
 
 
 def test_parts_made_apart_are_merged(datagen: Call) -> None:
-    assert datagen("create", "tiny-v1", *SMALL, "--splits", "[train]", "--out", "a.h5") == 0
-    assert datagen("create", "tiny-v1", *SMALL, "--splits", "[valid]", "--out", "b.h5", "--jobs", "2") == 0
+    assert (
+        datagen("create", "tiny-v1", *SMALL, "--splits", "[train]", "--out", "a.h5")
+        == 0
+    )
+    assert (
+        datagen(
+            "create",
+            "tiny-v1",
+            *SMALL,
+            "--splits",
+            "[valid]",
+            "--out",
+            "b.h5",
+            "--jobs",
+            "2",
+        )
+        == 0
+    )
     assert datagen("merge", "a.h5", "b.h5", "--out", "c.h5") == 0
     assert TerrainDataset("c.h5").id == "c"
     assert set(TerrainDataset("c.h5").splits) == {"train", "valid"}
@@ -94,7 +123,12 @@ def test_parts_made_apart_are_merged(datagen: Call) -> None:
 def test_shards_made_apart_are_one_dataset(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
     assert datagen("create", "tiny-v1", *SMALL, "--out", "whole.h5") == 0
     for index, folder in ((1, "part1"), (2, "part2")):
-        assert datagen("create", "tiny-v1", *SMALL, "--shard", f"{index}/2", "--out", folder) == 0
+        assert (
+            datagen(
+                "create", "tiny-v1", *SMALL, "--shard", f"{index}/2", "--out", folder
+            )
+            == 0
+        )
         assert f"{folder}: shard {index}/2 is made" in capsys.readouterr().out
     assert datagen("show", "part1") == 2
     assert "merge" in capsys.readouterr().err
@@ -102,7 +136,9 @@ def test_shards_made_apart_are_one_dataset(datagen: Call, capsys) -> None:  # ty
     assert " files)" in capsys.readouterr().out
     assert datagen("merge", "part1", "part2", "--out", "one.h5") == 0
     assert (
-        TerrainDataset("big").digest == TerrainDataset("one.h5").digest == TerrainDataset("whole.h5").digest
+        TerrainDataset("big").digest
+        == TerrainDataset("one.h5").digest
+        == TerrainDataset("whole.h5").digest
     )
     assert (TerrainDataset("big").id, TerrainDataset("one.h5").id) == ("small", "small")
     for command in (["show"], ["validate"], ["preview", "--out", "p.png"]):
@@ -119,12 +155,17 @@ def test_shards_made_apart_are_one_dataset(datagen: Call, capsys) -> None:  # ty
     (shard,) = Path("big").glob("train*")
     shard.unlink()
     assert datagen("validate", "big") == 1
-    assert f"remove {shard.name} in big and give the command that made it again" in capsys.readouterr().out
+    assert (
+        f"remove {shard.name} in big and give the command that made it again"
+        in capsys.readouterr().out
+    )
     assert datagen("create", "tiny-v1", *SMALL, "--out", "big") == 0
     assert datagen("validate", "big") == 0
 
 
-def test_options_of_create_reach_it(datagen: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_of_create_reach_it(
+    datagen: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen = []
 
     def watched(recipe: Recipe, path: Path, *how: object) -> Iterator[tuple[int, int]]:
@@ -144,11 +185,27 @@ def test_options_of_create_reach_it(datagen: Call, monkeypatch: pytest.MonkeyPat
     ]  # fmt: skip
 
 
-def test_a_large_dataset_is_a_folder(datagen: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_dataset_is_a_folder(
+    datagen: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cli, "_MOST_CELLS_OF_A_FILE", 32 * 32 * 4)
     Path("datasets").mkdir()
-    assert datagen("create", "tiny-v1", "--first", "2", "--splits", "[train,valid]") == 0
-    assert datagen("create", "tiny-v1", "--first", "3", "--splits", "[train,valid]", "--seed", "1") == 0
+    assert (
+        datagen("create", "tiny-v1", "--first", "2", "--splits", "[train,valid]") == 0
+    )
+    assert (
+        datagen(
+            "create",
+            "tiny-v1",
+            "--first",
+            "3",
+            "--splits",
+            "[train,valid]",
+            "--seed",
+            "1",
+        )
+        == 0
+    )
     assert TerrainDataset("datasets/tiny-v1.h5").map_count("train") == 2
     assert TerrainDataset("datasets/tiny-v1-seed1").map_count("train") == 3
 
@@ -168,7 +225,10 @@ def test_real_ground_is_imported(datagen: Call, capsys) -> None:  # type: ignore
     ground = np.linspace(0, 2, 70 * 40, dtype=np.float32).reshape(1, 40, 70)
     ground[0, 20, 60] = -9999
     write_ground("site.tif", ground)
-    assert datagen("import-dem", "site.tif", "--out", "site.h5", "--recipe", "tiny-v1") == 0
+    assert (
+        datagen("import-dem", "site.tif", "--out", "site.h5", "--recipe", "tiny-v1")
+        == 0
+    )
     assert "left out of test/real: 1 missing elevation" in capsys.readouterr().out
     made = TerrainDataset("site.h5")
     assert made.splits["test/real"]["maps"] == 1
@@ -177,7 +237,9 @@ def test_real_ground_is_imported(datagen: Call, capsys) -> None:  # type: ignore
     assert "1 of site.tif" in capsys.readouterr().out
     assert datagen("validate", "site.h5") == 0
     assert datagen("import-dem", "nope.tif", "--out", "x.h5") == 2
-    assert "`dem` as a raster that GDAL can read, got nope.tif" in capsys.readouterr().err
+    assert (
+        "`dem` as a raster that GDAL can read, got nope.tif" in capsys.readouterr().err
+    )
 
 
 def test_an_import_passes_every_setting_on(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
@@ -194,7 +256,15 @@ def test_an_import_passes_every_setting_on(datagen: Call, capsys) -> None:  # ty
         "class_periods_m=[4,2]",
         "scenarios.hg.crater_count=[0,0]",
     )
-    common = ("import-dem", "site.tif", *changes, "--recipe", "tiny-v1", "--scenario", "hs")
+    common = (
+        "import-dem",
+        "site.tif",
+        *changes,
+        "--recipe",
+        "tiny-v1",
+        "--scenario",
+        "hs",
+    )
     splits = ("--splits", "train:0.7,valid:0.1,test/site:0.2", "--stride", "4")
     real = ("--photo", "photo.tif", "--traversability", "lambda.tif")
     assert datagen(*common, *splits, *real, "--out", "out") == 2
@@ -206,7 +276,10 @@ def test_an_import_passes_every_setting_on(datagen: Call, capsys) -> None:  # ty
     assert made.path.is_dir()
     assert made.id == "out"
     sources = {name: entry["parts"][0]["source"] for name, entry in made.splits.items()}
-    tried = {name: len(s["kept"]) + s["left_out"]["not_solvable"] for name, s in sources.items()}
+    tried = {
+        name: len(s["kept"]) + s["left_out"]["not_solvable"]
+        for name, s in sources.items()
+    }
     assert tried == {"train": 16, "valid": 2, "test/site": 5}
     assert sources["train"]["left_out"]["not_solvable"] > 0
     assert {entry["scenario"] for entry in made.splits.values()} == {"hs"}
@@ -218,7 +291,19 @@ def test_an_import_passes_every_setting_on(datagen: Call, capsys) -> None:  # ty
     assert (maps["traversability"] == 0.25).all()
     assert np.isfinite(maps["reference_time_s"]).all()
     assert datagen(*common, *splits, "--out", "out") == 2
-    assert datagen(*common, *real, "--random-classes", "--out", "out", "--overwrite", "--id", "mine") == 0
+    assert (
+        datagen(
+            *common,
+            *real,
+            "--random-classes",
+            "--out",
+            "out",
+            "--overwrite",
+            "--id",
+            "mine",
+        )
+        == 0
+    )
     made = TerrainDataset("out")
     assert (made.id, list(made.splits)) == ("mine", ["test/real"])
     assert datagen(*common, "id=named", "--out", "d.h5") == 0
@@ -242,7 +327,12 @@ def test_an_import_that_cannot_be_ends_in_one_line(
     capsys,  # type: ignore[no-untyped-def]
 ) -> None:
     write_ground("site.tif", np.zeros((1, 40, 40), np.float32))
-    assert datagen("import-dem", "site.tif", *words, "--out", "x.h5", "--recipe", "tiny-v1") == 2
+    assert (
+        datagen(
+            "import-dem", "site.tif", *words, "--out", "x.h5", "--recipe", "tiny-v1"
+        )
+        == 2
+    )
     message = capsys.readouterr().err
     assert said in message
     assert message.count("\n") == 1
@@ -251,7 +341,16 @@ def test_an_import_that_cannot_be_ends_in_one_line(
 
 def test_overrides_and_seeds_name_what_they_make(datagen: Call) -> None:
     splits = ("--splits", "[train]")
-    assert datagen("create", "tiny-v1", *SMALL, "scenarios.std={preset: hs, severity: 0.5}", *splits) == 0
+    assert (
+        datagen(
+            "create",
+            "tiny-v1",
+            *SMALL,
+            "scenarios.std={preset: hs, severity: 0.5}",
+            *splits,
+        )
+        == 0
+    )
     made = TerrainDataset("datasets/small.h5")
     assert made.splits["train"]["maps"] == 3
     assert made.recipe.scenarios["std"].light_height == pytest.approx((0.55, 0.9))
@@ -262,15 +361,22 @@ def test_overrides_and_seeds_name_what_they_make(datagen: Call) -> None:
     assert sibling.digest != made.digest
 
 
-def test_overrides_of_a_recipe_of_ones_own_need_an_id_too(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_overrides_of_a_recipe_of_ones_own_need_an_id_too(
+    datagen: Call, capsys
+) -> None:  # type: ignore[no-untyped-def]
     Path("r.yaml").write_text(RECIPE.replace("id: tiny-v1", "id: mine"))
     assert datagen("create", "r.yaml", "splits.train.maps=3", "--out", "d.h5") == 2
     assert "id=NAME" in capsys.readouterr().err
-    assert datagen("create", "r.yaml", "splits.train.maps=3", "id=m", "--splits", "train") == 0
+    assert (
+        datagen("create", "r.yaml", "splits.train.maps=3", "id=m", "--splits", "train")
+        == 0
+    )
 
 
 def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
-    assert datagen("create", "tiny-v1", *SMALL, "--splits", "train", "--out", "d.h5") == 0
+    assert (
+        datagen("create", "tiny-v1", *SMALL, "--splits", "train", "--out", "d.h5") == 0
+    )
     with h5py.File("d.h5", "r+") as file:
         file["train/start_m"][...] = 0
     capsys.readouterr()
@@ -297,9 +403,17 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
             "{preset: hs, reliefs_m",
             "got 'reliefs_m'. Did you mean 'relief_m'?",
         ),
-        ("occupancy: [0.3, 0.3, 0.2, 0.2]", "occupancy: [0.3, 0.3, 0.2, 0.1]", "summing to 1"),
+        (
+            "occupancy: [0.3, 0.3, 0.2, 0.2]",
+            "occupancy: [0.3, 0.3, 0.2, 0.1]",
+            "summing to 1",
+        ),
         ("crater_count: [1, 2]", "crater_count: [30, 40]", "cover at most 40%"),
-        ("crater_radius_m: [1.5, 3.0]", "crater_radius_m: [1.5, 30.0]", "crater_radius_m"),
+        (
+            "crater_radius_m: [1.5, 3.0]",
+            "crater_radius_m: [1.5, 30.0]",
+            "crater_radius_m",
+        ),
         ("maps: 40", "maps: 0", "`maps` ≥ 1"),
         ("resolution_m: 0.5", "resolution_m: .nan", "resolution_m"),
         ("relief_m: [1.0, 1.2]", "relief_m: [1.0, .nan]", "relief_m"),
@@ -309,7 +423,11 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
         ("stuck_threshold: 0.3", "stuck_threshold: 5", "Expected `stuck_threshold`"),
         ("relief_m: [1.0, 1.2]", "relief_m: [20000, 20000]", "relief_m"),
         ("environments: 5", "environments: 40000", "environments"),
-        ("class_periods_m: [6, 3]", "class_periods_m: [0.000000001]", "class_periods_m"),
+        (
+            "class_periods_m: [6, 3]",
+            "class_periods_m: [0.000000001]",
+            "class_periods_m",
+        ),
         ("  train:", "  1:", "Quote numbers"),
         ("  train:", "  test:", "side by side"),
         ("classes: default", "classes: []", "`classes`"),
@@ -334,7 +452,11 @@ def test_a_bad_recipe_is_one_clear_line_and_status_2(
     assert text != RECIPE
     Path("r.yaml").write_text(text)
     assert datagen("create", "r.yaml", "--out", "d.h5") == 2
-    lines = [line for line in capsys.readouterr().err.strip().splitlines() if not line.startswith("maps: ")]
+    lines = [
+        line
+        for line in capsys.readouterr().err.strip().splitlines()
+        if not line.startswith("maps: ")
+    ]
     assert len(lines) == 1
     assert said in lines[0]
     assert not Path("d.h5").exists()
@@ -366,7 +488,9 @@ def test_a_bad_recipe_is_one_clear_line_and_status_2(
     ],
     ids=" ".join,
 )
-def test_bad_arguments_are_one_line_and_status_2(datagen: Call, capsys, arguments: list[str]) -> None:  # type: ignore[no-untyped-def]
+def test_bad_arguments_are_one_line_and_status_2(
+    datagen: Call, capsys, arguments: list[str]
+) -> None:  # type: ignore[no-untyped-def]
     assert datagen(*arguments) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
     assert not Path("d.h5").exists()
@@ -377,7 +501,10 @@ def test_shipped_recipes_load_and_full_has_the_papers_maps() -> None:
     assert {"paper-v1", "full-v1", "tiny-v1", "shift-v1"} <= set(recipes)
     assert all(recipe.id == name for name, recipe in recipes.items())
     paper, full = recipes["paper-v1"], recipes["full-v1"]
-    assert full.to_dict() | {"id": 0, "splits": 0} == paper.to_dict() | {"id": 0, "splits": 0}
+    assert full.to_dict() | {"id": 0, "splits": 0} == paper.to_dict() | {
+        "id": 0,
+        "splits": 0,
+    }
     assert {name: split.maps for name, split in full.splits.items()} == {
         "train": 1000, "valid": 250, "test/std": 200, "test/hg": 200, "test/hs": 200,
     }  # fmt: skip
@@ -385,7 +512,9 @@ def test_shipped_recipes_load_and_full_has_the_papers_maps() -> None:
         load_recipe("full")
 
 
-def test_a_dataset_with_stakes_from_making_to_mending(datagen: Call, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_a_dataset_with_stakes_from_making_to_mending(
+    datagen: Call, tmp_path: Path, capsys
+) -> None:  # type: ignore[no-untyped-def]
     changes = [
         "id=mine", "height=32", "width=32", "places={least_distance_m: 8, margin_m: 1}",
         "splits={train: {scenario: std, maps: 3}, test/hg: {scenario: hg, maps: 2, solvable: true}}",
@@ -416,8 +545,13 @@ def test_a_dataset_with_stakes_from_making_to_mending(datagen: Call, tmp_path: P
     assert datagen("preview", "d.h5", "--split", "train", "--contact-sheet") == 0
 
 
-def test_show_of_a_dataset_of_synthesis_1_tells_of_no_soft_spots(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
-    assert datagen("create", "tiny-v1", *SMALL, "--splits", "[train]", "--out", "d.h5") == 0
+def test_show_of_a_dataset_of_synthesis_1_tells_of_no_soft_spots(
+    datagen: Call, capsys
+) -> None:  # type: ignore[no-untyped-def]
+    assert (
+        datagen("create", "tiny-v1", *SMALL, "--splits", "[train]", "--out", "d.h5")
+        == 0
+    )
     capsys.readouterr()
     assert datagen("show", "d.h5") == 0
     shown = capsys.readouterr().out
@@ -443,7 +577,9 @@ def test_show_of_a_dataset_of_synthesis_1_tells_of_no_soft_spots(datagen: Call, 
         ),
     ],
 )
-def test_bad_stakes_are_one_line(datagen: Call, capsys, change: str, expected: str) -> None:  # type: ignore[no-untyped-def]
+def test_bad_stakes_are_one_line(
+    datagen: Call, capsys, change: str, expected: str
+) -> None:  # type: ignore[no-untyped-def]
     assert datagen("create", "stakes-v1", "id=mine", change) == 2
     told = capsys.readouterr().err.strip().splitlines()
     assert expected in told[-1]
@@ -451,20 +587,52 @@ def test_bad_stakes_are_one_line(datagen: Call, capsys, change: str, expected: s
     assert not list(Path().iterdir())
 
 
-def test_the_first_maps_of_each_split_are_those_of_the_whole(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
-    assert datagen("create", "tiny-v1", "--splits", "[test/std,valid]", "--out", "whole.h5") == 0
+def test_the_first_maps_of_each_split_are_those_of_the_whole(
+    datagen: Call, capsys
+) -> None:  # type: ignore[no-untyped-def]
     assert (
-        datagen("create", "tiny-v1", "--splits", "[test/std,valid]", "--first", "3", "--out", "few.h5") == 0
+        datagen(
+            "create", "tiny-v1", "--splits", "[test/std,valid]", "--out", "whole.h5"
+        )
+        == 0
+    )
+    assert (
+        datagen(
+            "create",
+            "tiny-v1",
+            "--splits",
+            "[test/std,valid]",
+            "--first",
+            "3",
+            "--out",
+            "few.h5",
+        )
+        == 0
     )
     whole, few = TerrainDataset("whole.h5"), TerrainDataset("few.h5")
-    assert {name: split["maps"] for name, split in few.splits.items()} == {"test/std": 3, "valid": 3}
+    assert {name: split["maps"] for name, split in few.splits.items()} == {
+        "test/std": 3,
+        "valid": 3,
+    }
     for split in few.splits:
         for name, values in few.read(split).items():
             np.testing.assert_array_equal(values, whole.read(split, range(3))[name])
     assert few.id == "tiny-v1"
     assert datagen("create", "tiny-v1", "--first", "-1", "--out", "x.h5") == 2
     assert "`first` ≥ 0" in capsys.readouterr().err
-    assert datagen("create", "tiny-v1", "--splits", "[test/hs]", "--first", "9", "--out", "all.h5") == 0
+    assert (
+        datagen(
+            "create",
+            "tiny-v1",
+            "--splits",
+            "[test/hs]",
+            "--first",
+            "9",
+            "--out",
+            "all.h5",
+        )
+        == 0
+    )
     assert TerrainDataset("all.h5").map_count("test/hs") == 4
 
 
@@ -474,7 +642,9 @@ def test_an_interrupted_create_goes_on_and_says_what_was_there(
     asked = ("create", "tiny-v1", "--splits", "[test/std,valid]", "--out", "d.h5")
     make = create.make
 
-    def interrupted(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, bytes]:
+    def interrupted(
+        recipe: Recipe, shard: ShardFile, version: str
+    ) -> tuple[ShardFile, bytes]:
         if shard.split.startswith("test"):
             raise KeyboardInterrupt
         return make(recipe, shard, version)
@@ -492,7 +662,9 @@ def test_an_interrupted_create_goes_on_and_says_what_was_there(
     assert "already" not in capsys.readouterr().err
 
 
-def test_a_folder_without_datasets_is_told(datagen: Call, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_datasets_is_told(
+    datagen: Call, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert datagen("list", "--folder", ".") == 0
     assert capsys.readouterr().out.splitlines()[-1] == "no files in ."
     assert datagen("create", "tiny-v1", "--splits", "train", "--out", "d.h5") == 0
@@ -503,7 +675,8 @@ def test_a_folder_without_datasets_is_told(datagen: Call, capsys: pytest.Capture
 
 def test_an_override_names_an_item_of_a_list_by_its_name() -> None:
     recipe = load_recipe(
-        "stakes-v1", ["id=deep", "classes.dune_sand.soft.weight=0.2", "classes.gravel.noise=0.3"]
+        "stakes-v1",
+        ["id=deep", "classes.dune_sand.soft.weight=0.2", "classes.gravel.noise=0.3"],
     )
     by_name = {item.name: item for item in recipe.classes}
     whole = {item.name: item for item in load_recipe("stakes-v1").classes}
@@ -530,7 +703,11 @@ def test_datasets_are_made_listed_and_shown_without_pytorch(tmp_path: Path) -> N
         ["validate", "d.h5"],
     ):
         ran = subprocess.run(
-            [sys.executable, "-c", code, *words], capture_output=True, text=True, cwd=tmp_path, check=True
+            [sys.executable, "-c", code, *words],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            check=True,
         )
         assert ran.stdout.splitlines()[-1] == "False", words
 
@@ -538,7 +715,10 @@ def test_datasets_are_made_listed_and_shown_without_pytorch(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("create", "tiny-v1", "--seed", "-1"), "Expected `seed` in 0–2^63 − 1, got -1."),
+        (
+            ("create", "tiny-v1", "--seed", "-1"),
+            "Expected `seed` in 0–2^63 − 1, got -1.",
+        ),
         (("create", "tiny-v1", "--seed", "99999999999999999999999"), "at most 64 bits"),
         (
             ("create", "tiny-v1", "--splits", "{a: 1}"),
@@ -547,7 +727,10 @@ def test_datasets_are_made_listed_and_shown_without_pytorch(tmp_path: Path) -> N
     ],
 )
 def test_what_was_taken_or_told_in_jargon_is_one_line(
-    datagen: Call, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], said: str
+    datagen: Call,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    said: str,
 ) -> None:
     assert datagen(*arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()

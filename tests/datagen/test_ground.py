@@ -30,7 +30,9 @@ from tests.factories import tiny_dataset
 
 @pytest.fixture(scope="module")
 def stakes(tmp_path_factory: pytest.TempPathFactory) -> TerrainDataset:
-    return TerrainDataset(tiny_dataset(tmp_path_factory.mktemp("ground") / "stakes.h5", small_stakes()))
+    return TerrainDataset(
+        tiny_dataset(tmp_path_factory.mktemp("ground") / "stakes.h5", small_stakes())
+    )
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +40,19 @@ def fitted(stakes: TerrainDataset) -> GroundStatistics:
     return fit_ground(stakes)
 
 
-def gap(weights: np.ndarray, means: np.ndarray, stds: np.ndarray, values: np.ndarray) -> float:
-    """Largest distance of a clipped mixture's distribution function from that of values, left limits at 1."""
+def gap(
+    weights: np.ndarray, means: np.ndarray, stds: np.ndarray, values: np.ndarray
+) -> float:
+    """Largest distance of a clipped mixture's distribution function from that of
+    values, left limits at 1.
+    """
     at = np.linspace(0, 1, 2001)[:-1]
     fit = (weights * ndtr((at[:, None] - means) / stds)).sum(1)
-    return float(np.abs(fit - np.searchsorted(np.sort(values), at, side="right") / len(values)).max())
+    return float(
+        np.abs(
+            fit - np.searchsorted(np.sort(values), at, side="right") / len(values)
+        ).max()
+    )
 
 
 def counted(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -56,7 +66,9 @@ def uniform(*names: str, count: int = 20000) -> np.ndarray:
 
 
 LAWS = {
-    "clipped at both ends": lambda: (0.5 + 0.5 * rng.normal(7, np.arange(20000))).clip(0, 1),
+    "clipped at both ends": lambda: (0.5 + 0.5 * rng.normal(7, np.arange(20000))).clip(
+        0, 1
+    ),
     "uniform": lambda: uniform("value"),
     "atoms alone": lambda: (uniform("value") < 0.3).astype(float),
     "an atom beside a narrow mode": lambda: np.where(
@@ -85,26 +97,43 @@ def test_a_single_value_is_met_by_a_narrow_component() -> None:
 def test_statistics_of_a_dataset_are_those_of_its_training_maps(
     stakes: TerrainDataset, fitted: GroundStatistics
 ) -> None:
-    maps = stakes.read("train", fields=("traversability", "rgb", "elevation_m", "slope_deg"))
-    parameters = (np.array(values) for values in (fitted.weights, fitted.means, fitted.stds))
+    maps = stakes.read(
+        "train", fields=("traversability", "rgb", "elevation_m", "slope_deg")
+    )
+    parameters = (
+        np.array(values) for values in (fitted.weights, fitted.means, fitted.stds)
+    )
     assert gap(*parameters, maps["traversability"].ravel()) < 0.01
-    np.testing.assert_allclose(fitted.layer_means["rgb"], maps["rgb"].mean((0, 2, 3)), atol=1e-5)
+    np.testing.assert_allclose(
+        fitted.layer_means["rgb"], maps["rgb"].mean((0, 2, 3)), atol=1e-5
+    )
     for name in ("elevation_m", "slope_deg"):
-        np.testing.assert_allclose(fitted.layer_means[name], maps[name].astype(float).mean(), atol=1e-5)
-    assert fitted.look_alikes == (("packed_soil", "crusted_soil"), ("firm_sand", "drift_sand"))
+        np.testing.assert_allclose(
+            fitted.layer_means[name], maps[name].astype(float).mean(), atol=1e-5
+        )
+    assert fitted.look_alikes == (
+        ("packed_soil", "crusted_soil"),
+        ("firm_sand", "drift_sand"),
+    )
     assert fitted.potts_strength > 1
     given = fitted.mixture((1, 1, 1), torch.zeros(1, dtype=torch.float64))
-    assert float(given.cdf(0.0)) == pytest.approx((maps["traversability"] == 0).mean(), abs=0.01)
+    assert float(given.cdf(0.0)) == pytest.approx(
+        (maps["traversability"] == 0).mean(), abs=0.01
+    )
 
 
-def test_layers_of_the_dataset_are_among_the_means_by_what_is_known_of_them(tmp_path: Path) -> None:
+def test_layers_of_the_dataset_are_among_the_means_by_what_is_known_of_them(
+    tmp_path: Path,
+) -> None:
     recipe = replace(
         load_recipe("vegetation-v1"), id="grown", height=32, width=32, class_periods_m=(6, 3),
         places=small_stakes().places, splits={"train": Split(scenario="std", maps=2)},
     )  # fmt: skip
     dataset = TerrainDataset(tiny_dataset(tmp_path / "grown.h5", recipe))
     stored = dataset.read("train", fields=("vegetation_m",))["vegetation_m"]
-    np.testing.assert_allclose(fit_ground(dataset).layer_means["vegetation_m"], stored.mean(), atol=1e-5)
+    np.testing.assert_allclose(
+        fit_ground(dataset).layer_means["vegetation_m"], stored.mean(), atol=1e-5
+    )
 
 
 def test_colours_of_their_own_are_no_look_alikes() -> None:
@@ -112,22 +141,33 @@ def test_colours_of_their_own_are_no_look_alikes() -> None:
     assert look_alike_pairs(load_recipe("stakes-v1")) == [(2, 10), (8, 11)]
 
 
-def gibbs(strength: float, field: float, maps: int = 16, side: int = 48, sweeps: int = 100) -> np.ndarray:
-    """Labels of P(x) ∝ exp(h·#a + β·#(neighbours alike)), by Gibbs sampling on the two colours of a chessboard."""
+def gibbs(
+    strength: float, field: float, maps: int = 16, side: int = 48, sweeps: int = 100
+) -> np.ndarray:
+    """Labels of P(x) ∝ exp(h·#a + β·#(neighbours alike)), by Gibbs sampling on the two
+    colours of a chessboard.
+    """
     random = np.random.default_rng(0)
     is_a = random.random((maps, side, side)) < 0.5
     black = np.indices((side, side)).sum(0) % 2 == 0
     for _ in range(sweeps):
         for colour in (black, ~black):
             sign = np.pad(np.where(is_a, 1, -1), ((0, 0), (1, 1), (1, 1)))
-            around = sign[:, :-2, 1:-1] + sign[:, 2:, 1:-1] + sign[:, 1:-1, :-2] + sign[:, 1:-1, 2:]
+            around = (
+                sign[:, :-2, 1:-1]
+                + sign[:, 2:, 1:-1]
+                + sign[:, 1:-1, :-2]
+                + sign[:, 1:-1, 2:]
+            )
             chance = 1 / (1 + np.exp(-(field + strength * around)))
             is_a = np.where(colour, random.random(is_a.shape) < chance, is_a)
     return np.where(is_a, 3, 5)
 
 
 @pytest.mark.parametrize(("strength", "field"), [(0.0, 0.3), (0.4, 0.0), (0.7, -0.1)])
-def test_the_strength_of_a_sampled_field_is_found(strength: float, field: float) -> None:
+def test_the_strength_of_a_sampled_field_is_found(
+    strength: float, field: float
+) -> None:
     labels = gibbs(strength, field)
     labels[:, :, 20:22] = 7  # of neither class: a wall that counts on no side
     counts = count_neighbours(labels, (3, 5))
@@ -135,7 +175,9 @@ def test_the_strength_of_a_sampled_field_is_found(strength: float, field: float)
 
 
 def test_pairs_share_a_strength_and_have_fields_of_their_own() -> None:
-    counts = np.stack([count_neighbours(gibbs(0.4, field), (3, 5)) for field in (0.6, -0.6)])
+    counts = np.stack(
+        [count_neighbours(gibbs(0.4, field), (3, 5)) for field in (0.6, -0.6)]
+    )
     assert fit_potts_strength(counts) == pytest.approx(0.4, abs=0.03)
     assert abs(fit_potts_strength(counts.sum(0)[None]) - 0.4) > 0.05
 
@@ -144,7 +186,8 @@ def test_neighbours_are_counted_by_the_four_beside_a_cell() -> None:
     a, b, other = 1, 2, 0
     labels = np.array([[[other, a, other], [b, a, a], [other, b, b]]])
     counts = count_neighbours(labels, (a, b))
-    # (0, 1): a below. (1, 1): a above and right, b left and below. (1, 2): a left, b below. (1, 0): a right.
+    # (0, 1): a below. (1, 1): a above and right, b left and below. (1, 2): a left, b
+    # below. (1, 0): a right.
     assert counts[4 + 1, 1] == 1
     assert counts[4, 1] == 2
     assert counts[4 + 1, 0] == 1
@@ -171,11 +214,20 @@ def test_a_dataset_without_observed_traversability_has_no_statistics(
         fit_ground(stakes)
 
 
-def test_statistics_beside_a_dataset_come_before_those_of_a_shipped_recipe(tmp_path: Path) -> None:
+def test_statistics_beside_a_dataset_come_before_those_of_a_shipped_recipe(
+    tmp_path: Path,
+) -> None:
     recipe = load_recipe("stakes-v1")
-    sibling = replace(recipe, id="stakes-v1-seed1", seed=1, splits={"test/hg": Split(scenario="hg", maps=1)})
+    sibling = replace(
+        recipe,
+        id="stakes-v1-seed1",
+        seed=1,
+        splits={"test/hg": Split(scenario="hg", maps=1)},
+    )
     dataset = TerrainDataset(tiny_dataset(tmp_path / "sibling.h5", sibling))
-    shipped = GroundStatistics.from_json((RECIPES / "ground" / "stakes-v1.json").read_text())
+    shipped = GroundStatistics.from_json(
+        (RECIPES / "ground" / "stakes-v1.json").read_text()
+    )
     assert find_ground(dataset) == shipped
     own = replace(shipped, potts_strength=0.5)
     ground_file(dataset.path).write_text(own.to_json())
@@ -192,7 +244,9 @@ def test_a_folder_of_files_has_its_statistics_beside_it() -> None:
 
 
 def test_every_shipped_recipe_with_training_maps_has_statistics() -> None:
-    with_train = {name for name in shipped_recipes() if "train" in load_recipe(name).splits}
+    with_train = {
+        name for name in shipped_recipes() if "train" in load_recipe(name).splits
+    }
     assert {path.stem for path in (RECIPES / "ground").glob("*.json")} == with_train
 
 

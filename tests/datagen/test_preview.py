@@ -42,7 +42,10 @@ def dataset(dataset_path: Path) -> TerrainDataset:
 
 def train_only(maps: int = 3, **changes: Any) -> Recipe:
     recipe = tiny_recipe(train=maps)
-    kept = {"splits": {"train": recipe.splits["train"]}, "scenarios": {"std": recipe.scenarios["std"]}}
+    kept = {
+        "splits": {"train": recipe.splits["train"]},
+        "scenarios": {"std": recipe.scenarios["std"]},
+    }
     return replace(recipe, **kept | changes)
 
 
@@ -63,24 +66,39 @@ def seen_texts(figure: Figure) -> list[Text]:
             for tick in [*axis.get_major_ticks(), *axis.get_minor_ticks()]:
                 if not low <= tick.get_loc() <= high or not panel.axison:
                     hidden |= {tick.label1, tick.label2}
-    texts = figure.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible())
+    texts = figure.findobj(
+        lambda artist: isinstance(artist, Text) and artist.get_visible()
+    )
     return [text for text in texts if text.get_text().strip() and text not in hidden]
 
 
 def check_texts(figure: Figure) -> None:
-    """All text is of a legible size, on the page, and clear of other text and of the panels of others."""
+    """All text is of a legible size, on the page, and clear of other text and of the
+    panels of others.
+    """
     texts = seen_texts(figure)
     page = figure.bbox
     boxes = [text.get_window_extent().padded(-0.5) for text in texts]
     for text, box in zip(texts, boxes, strict=True):
         assert text.get_fontsize() >= 7
-        inside = page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1
+        inside = (
+            page.x0 <= box.x0
+            and box.x1 <= page.x1
+            and page.y0 <= box.y0
+            and box.y1 <= page.y1
+        )
         assert inside, f"{text.get_text()!r} leaves the page"
-    for (one, first), (other, second) in combinations(zip(texts, boxes, strict=True), 2):
-        assert not first.overlaps(second), f"{one.get_text()!r} is on {other.get_text()!r}"
+    for (one, first), (other, second) in combinations(
+        zip(texts, boxes, strict=True), 2
+    ):
+        assert not first.overlaps(second), (
+            f"{one.get_text()!r} is on {other.get_text()!r}"
+        )
 
 
-def test_a_panel_per_field_and_row_shows_what_is_stored(dataset: TerrainDataset) -> None:
+def test_a_panel_per_field_and_row_shows_what_is_stored(
+    dataset: TerrainDataset,
+) -> None:
     indices = [1, 0]
     figure = preview_figure(dataset, "test/hg", indices)
     drawn, stored = panels(figure), dataset.read("test/hg", indices)
@@ -100,9 +118,20 @@ def test_a_panel_per_field_and_row_shows_what_is_stored(dataset: TerrainDataset)
             assert (panel.get_xlim(), panel.get_ylim()) == ((0, 16), (0, 16))
             marked = [tuple(np.concatenate(line.get_data())) for line in panel.lines]
             assert not any(line.get_clip_on() for line in panel.lines)
-            assert marked == [tuple(stored["start_m"][row]), tuple(stored["goal_m"][row])]
+            assert marked == [
+                tuple(stored["start_m"][row]),
+                tuple(stored["goal_m"][row]),
+            ]
     texts = [text.get_text() for text in seen_texts(figure)]
-    for once in ("tiny-v1, split test/hg", "map 1", "map 0", "x [m]", "y [m]", "start", "goal"):
+    for once in (
+        "tiny-v1, split test/hg",
+        "map 1",
+        "map 0",
+        "x [m]",
+        "y [m]",
+        "start",
+        "goal",
+    ):
         assert texts.count(once) == 1
     for title in ("RGB", "Class", "Elevation [m]", "Slope [°]", "Traversability λ"):
         assert texts.count(title) == 1
@@ -114,19 +143,31 @@ def test_axes_are_numbered_once(dataset: TerrainDataset) -> None:
     for label, panel in panels(figure).items():
         field, row = label.split()
         if row != "bar":
-            assert panel.yaxis.get_major_ticks()[0].label1.get_visible() == (field == "rgb")
+            assert panel.yaxis.get_major_ticks()[0].label1.get_visible() == (
+                field == "rgb"
+            )
             assert panel.xaxis.get_major_ticks()[0].label1.get_visible() == (row == "1")
 
 
-def test_a_class_has_one_colour_in_every_map_and_figure(dataset: TerrainDataset) -> None:
+def test_a_class_has_one_colour_in_every_map_and_figure(
+    dataset: TerrainDataset,
+) -> None:
     colours = class_colours(dataset.recipe.classes)
     for split, indices in (("train", [0, 1, 2, 3, 4]), ("test/hs", [1])):
-        figure, stored = preview_figure(dataset, split, indices), dataset.read(split, indices)["class_id"]
+        figure, stored = (
+            preview_figure(dataset, split, indices),
+            dataset.read(split, indices)["class_id"],
+        )
         for row in range(len(indices)):
             image = panels(figure)[f"class_id {row}"].images[0]
-            np.testing.assert_allclose(image.to_rgba(stored[row])[..., :3], colours[stored[row]])
+            np.testing.assert_allclose(
+                image.to_rgba(stored[row])[..., :3], colours[stored[row]]
+            )
         shown = np.unique(stored)
-        names = [f"{number} {dataset.recipe.classes[number].name.replace('_', ' ')}" for number in shown]
+        names = [
+            f"{number} {dataset.recipe.classes[number].name.replace('_', ' ')}"
+            for number in shown
+        ]
         legend = figure.legends[1]
         assert [text.get_text() for text in legend.get_texts()] == names
         for patch, number in zip(legend.get_patches(), shown, strict=True):
@@ -135,7 +176,9 @@ def test_a_class_has_one_colour_in_every_map_and_figure(dataset: TerrainDataset)
 
 def test_classes_are_drawn_in_their_own_colours_and_look_alikes_apart() -> None:
     classes = load_recipe("paper-v1").classes
-    np.testing.assert_allclose(class_colours(classes), np.array([item.colour for item in classes]) / 255)
+    np.testing.assert_allclose(
+        class_colours(classes), np.array([item.colour for item in classes]) / 255
+    )
     alike = [replace(classes[0], colour=(40, 60, 50)) for _ in range(3)]
     colours = class_colours([*classes, *alike])
     np.testing.assert_allclose(colours[len(classes)], np.array([40, 60, 50]) / 255)
@@ -175,9 +218,13 @@ def test_grids_of_any_shape(tmp_path: Path, height: int, width: int) -> None:
         box = panel.get_window_extent()
         assert box.height / box.width == pytest.approx(height / width)
         for axis, cells in ((panel.xaxis, width), (panel.yaxis, height)):
-            numbered = [place for place in axis.get_ticklocs() if 0 <= place <= cells / 2]
+            numbered = [
+                place for place in axis.get_ticklocs() if 0 <= place <= cells / 2
+            ]
             assert numbered, "an axis has no number"
-            assert max(numbered) < cells / 2, "a number at the end touches the next panel's first"
+            assert max(numbered) < cells / 2, (
+                "a number at the end touches the next panel's first"
+            )
     sheet = contact_sheet_figure(shaped, "train")
     check_texts(sheet)
     box = sheet.axes[0].images[2].get_window_extent()
@@ -185,14 +232,22 @@ def test_grids_of_any_shape(tmp_path: Path, height: int, width: int) -> None:
 
 
 def with_values(
-    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch, **changed: Callable[..., Any]
+    dataset: TerrainDataset,
+    monkeypatch: pytest.MonkeyPatch,
+    **changed: Callable[..., Any],
 ) -> None:
     """Lets a dataset read what `changed` makes of its arrays."""
     read = dataset.read
 
-    def reading(split: str, indices: Sequence[int], fields: Iterable[str]) -> dict[str, np.ndarray]:
+    def reading(
+        split: str, indices: Sequence[int], fields: Iterable[str]
+    ) -> dict[str, np.ndarray]:
         stored = read(split, indices, fields)
-        return stored | {name: change(stored[name]) for name, change in changed.items() if name in stored}
+        return stored | {
+            name: change(stored[name])
+            for name, change in changed.items()
+            if name in stored
+        }
 
     monkeypatch.setattr(dataset, "read", reading)
 
@@ -219,20 +274,29 @@ def test_unobserved_traversability_is_grey_and_explained(
     np.testing.assert_array_equal((rgba == grey).all(-1), hole)
 
 
-def test_hillshade_lights_the_north_west(dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hillshade_lights_the_north_west(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     y, x = np.mgrid[:32, :32]
     dome = 3 - np.hypot(x - 15.5, y - 15.5)[None] / 10
     with_values(dataset, monkeypatch, elevation_m=lambda z: dome)
-    veil = panels(preview_figure(dataset, "train", [0]))["elevation_m 0"].images[1].get_array()
+    veil = (
+        panels(preview_figure(dataset, "train", [0]))["elevation_m 0"]
+        .images[1]
+        .get_array()
+    )
     assert veil[24, 8, 0] == 1
     assert veil[8, 24, 0] == 0
 
 
 @pytest.mark.usefixtures("whole_fonts")
 @pytest.mark.parametrize(
-    ("kind", "magic"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml"), ("jpg", b"\xff\xd8")]
+    ("kind", "magic"),
+    [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml"), ("jpg", b"\xff\xd8")],
 )
-def test_pictures_are_written(dataset: TerrainDataset, tmp_path: Path, kind: str, magic: bytes) -> None:
+def test_pictures_are_written(
+    dataset: TerrainDataset, tmp_path: Path, kind: str, magic: bytes
+) -> None:
     settings = dict(matplotlib.rcParams)
     save(preview_figure(dataset, "test/std", [0, 1]), tmp_path / "sheet", kind)
     save(contact_sheet_figure(dataset, "test/std"), tmp_path / "contact", kind)
@@ -250,7 +314,9 @@ def test_a_contact_sheet_has_every_map_in_order(
 ) -> None:
     stored, asked = dataset.read("train")["rgb"], []
     read = dataset.read
-    monkeypatch.setattr(dataset, "read", lambda *given: asked.append(given) or read(*given))
+    monkeypatch.setattr(
+        dataset, "read", lambda *given: asked.append(given) or read(*given)
+    )
     figure = contact_sheet_figure(dataset, "train")
     (sheet,) = figure.axes
     assert [list(indices) for _, indices, _ in asked] == [[index] for index in range(8)]
@@ -258,7 +324,9 @@ def test_a_contact_sheet_has_every_map_in_order(
     assert len(sheet.images) == 8
     corners = []
     for index, (image, label) in enumerate(zip(sheet.images, sheet.texts, strict=True)):
-        np.testing.assert_array_equal(image.get_array(), stored[index].transpose(1, 2, 0))
+        np.testing.assert_array_equal(
+            image.get_array(), stored[index].transpose(1, 2, 0)
+        )
         assert image.get_interpolation() == "none"
         assert label.get_text() == str(index)
         left, right, bottom, top = image.get_extent()
@@ -268,11 +336,16 @@ def test_a_contact_sheet_has_every_map_in_order(
         assert top <= label.get_position()[1] < bottom
         corners.append((round(top, 6), left))
     assert corners == sorted(corners)
-    assert figure.texts[0].get_text().replace("\n", " ") == "tiny-v1, split train (scenario std): 8 maps"
+    assert (
+        figure.texts[0].get_text().replace("\n", " ")
+        == "tiny-v1, split train (scenario std): 8 maps"
+    )
     check_texts(figure)
 
 
-def test_a_contact_sheet_stops_at_most(dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_contact_sheet_stops_at_most(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert "first" not in contact_sheet_figure(dataset, "train").texts[0].get_text()
     monkeypatch.setattr("benchnav.datagen.preview._MAX_THUMBNAILS", 5)
     figure = contact_sheet_figure(dataset, "train")
@@ -290,7 +363,11 @@ def test_contact_grids_are_nearly_square_and_full(count: int, ratio: float) -> N
 
 
 @pytest.mark.parametrize(
-    "draw", [lambda d: preview_figure(d, "nope", [0]), lambda d: contact_sheet_figure(d, "nope")]
+    "draw",
+    [
+        lambda d: preview_figure(d, "nope", [0]),
+        lambda d: contact_sheet_figure(d, "nope"),
+    ],
 )
 def test_an_unknown_split_is_refused(
     dataset: TerrainDataset, draw: Callable[[TerrainDataset], Figure]
@@ -306,7 +383,9 @@ def test_a_map_that_is_not_there_is_refused(dataset: TerrainDataset) -> None:
 
 @pytest.fixture(scope="module")
 def stakes(tmp_path_factory: pytest.TempPathFactory) -> TerrainDataset:
-    return TerrainDataset(tiny_dataset(tmp_path_factory.mktemp("stakes") / "d.h5", small_stakes()))
+    return TerrainDataset(
+        tiny_dataset(tmp_path_factory.mktemp("stakes") / "d.h5", small_stakes())
+    )
 
 
 def lines_of(panel: Axes) -> list[np.ndarray]:
@@ -324,7 +403,9 @@ def test_soft_ground_is_hatched_and_outlined(stakes: TerrainDataset) -> None:
     for row in range(2):
         edges = outline(soft[row], stakes.grid.resolution_m)
         hatched, *outlines = lines_of(drawn[f"class_id {row}"])
-        np.testing.assert_array_equal(hatched, hatching(soft[row], stakes.grid.resolution_m))
+        np.testing.assert_array_equal(
+            hatched, hatching(soft[row], stakes.grid.resolution_m)
+        )
         for lines in (*outlines, *lines_of(drawn[f"traversability {row}"])):
             np.testing.assert_array_equal(lines, edges)
         assert len(outlines) == len(drawn[f"traversability {row}"].collections) == 2
@@ -334,7 +415,9 @@ def test_soft_ground_is_hatched_and_outlined(stakes: TerrainDataset) -> None:
     check_texts(figure)
 
 
-def test_a_contact_sheet_of_soft_ground_shows_stored_traversability(stakes: TerrainDataset) -> None:
+def test_a_contact_sheet_of_soft_ground_shows_stored_traversability(
+    stakes: TerrainDataset,
+) -> None:
     figure = contact_sheet_figure(stakes, "train")
     maps = stakes.read("train")
     (sheet,) = figure.axes
@@ -342,8 +425,12 @@ def test_a_contact_sheet_of_soft_ground_shows_stored_traversability(stakes: Terr
     for index, image in enumerate(sheet.images):
         shown = np.asarray(image.get_array())
         assert shown.shape == (32, 64, 3)
-        np.testing.assert_array_equal(shown[:, :32], maps["rgb"][index].transpose(1, 2, 0))
-        shade = matplotlib.colormaps["viridis"](maps["traversability"][index], bytes=True)[..., :3]
+        np.testing.assert_array_equal(
+            shown[:, :32], maps["rgb"][index].transpose(1, 2, 0)
+        )
+        shade = matplotlib.colormaps["viridis"](
+            maps["traversability"][index], bytes=True
+        )[..., :3]
         np.testing.assert_array_equal(shown[:, 32:], shade)
         left, right, bottom, top = image.get_extent()
         assert (right - left) == pytest.approx(2 * (bottom - top))
@@ -383,7 +470,12 @@ def test_a_layers_column_says_its_unit_and_where_nothing_is_known() -> None:
     for (name, unit), title in titles.items():
         column = layer_column(name, values, unit)
         assert (column.name, column.title, column.unit) == (name, title, "")
-        assert np.ma.getmaskarray(column.layers).ravel().tolist() == [False, False, True, False]
+        assert np.ma.getmaskarray(column.layers).ravel().tolist() == [
+            False,
+            False,
+            True,
+            False,
+        ]
         limits = (0.0, 360.0) if "azimuth" in name else (-20.0, 350.0)
         assert (column.shades["vmin"], column.shades["vmax"]) == limits
     turned = layer_column("rows_azimuth_deg", values, "deg").layers

@@ -23,7 +23,9 @@ def folder(tmp_path: Path) -> Path:
     commands.mkdir()
     for program in ("datagen", "train", "eval"):
         path = commands / f"benchnav-{program}"
-        path.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m tests.docs.smaller {program} "$@"\n')
+        path.write_text(
+            f'#!/bin/sh\nexec "{sys.executable}" -m tests.docs.smaller {program} "$@"\n'
+        )
         path.chmod(path.stat().st_mode | stat.S_IEXEC)
     return tmp_path
 

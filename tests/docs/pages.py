@@ -21,7 +21,8 @@ class Block:
 
     Args:
         kind: its language.
-        file: the file that it is the content of, from `title="…"`; empty where there is none.
+        file: the file that it is the content of, from `title="…"`; empty where there is
+            none.
         body: the code.
         why_not: why it is not run, from the comment before it; empty where it is.
         line: where it begins.
@@ -36,7 +37,9 @@ class Block:
 
 def pages() -> list[Path]:
     """All pages that are written by hand, README.md first."""
-    written = (path for path in sorted(DOCS.rglob("*.md")) if GENERATED not in path.parents)
+    written = (
+        path for path in sorted(DOCS.rglob("*.md")) if GENERATED not in path.parents
+    )
     return [ROOT / "README.md", *written]
 
 
@@ -50,7 +53,9 @@ def blocks(page: Path) -> Iterator[Block]:
     text = page.read_text()
     for found in _BLOCK.finditer(text):
         indent, title = found["indent"], re.search(r'title="([^"]+)"', found["about"])
-        body = "\n".join(line.removeprefix(indent) for line in found["body"].splitlines())
+        body = "\n".join(
+            line.removeprefix(indent) for line in found["body"].splitlines()
+        )
         yield Block(
             kind=found["kind"],
             file=title[1] if title else "",

@@ -1,4 +1,6 @@
-"""Runs blocks of Python one after the other in one namespace: each line of standard input names a file of one."""
+"""Runs blocks of Python one after the other in one namespace: each line of standard
+input names a file of one.
+"""
 
 import sys
 

@@ -1,6 +1,8 @@
-"""A command of ours with fewer maps and epochs than the words ask for: for `test_blocks.py`, which puts it on the path.
+"""A command of ours with fewer maps and epochs than the words ask for: for
+`test_blocks.py`, which puts it on the path.
 
-BENCHNAV_DOCS_MAPS says how many maps a split and a scenario have; a network is trained for one epoch.
+BENCHNAV_DOCS_MAPS says how many maps a split and a scenario have; a network is trained
+for one epoch.
 """
 
 import os
@@ -19,12 +21,19 @@ def smaller(program: str, words: list[str], maps: int) -> list[str]:
         return words
     if (program, asked) == ("datagen", "create") and rest[0] in shipped_recipes():
         given = {word.partition("=")[0] for word in rest}
-        sizes = {split: max(maps, 4) if split == "valid" else maps for split in shipped_sizes(rest[0])}
+        sizes = {
+            split: max(maps, 4) if split == "valid" else maps
+            for split in shipped_sizes(rest[0])
+        }
         fewer = [
             f"splits.{split}.maps={count}" for split, count in sizes.items()
         ]  # a half of `valid` needs two
         named = [] if "id" in given else [f"id={rest[0]}-small"]
-        out = [] if {"--out", "--seed", "id"} & given else ["--out", f"datasets/{rest[0]}.h5"]
+        out = (
+            []
+            if {"--out", "--seed", "id"} & given
+            else ["--out", f"datasets/{rest[0]}.h5"]
+        )
         return [asked, *rest, *fewer, *named, *out]
     if program == "train" and asked in ("fit", "classifier", "all", "mdn"):
         return [*words, "--trainer.max_epochs", "1"]

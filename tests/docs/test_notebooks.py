@@ -1,4 +1,6 @@
-"""The notebooks are short, keep no outputs, and run from their first cell to their last in a Jupyter kernel."""
+"""The notebooks are short, keep no outputs, and run from their first cell to their last
+in a Jupyter kernel.
+"""
 
 import ast
 import json
@@ -29,7 +31,11 @@ def test_there_are_two() -> None:
 @EACH
 def test_a_cell_is_short_follows_a_sentence_and_keeps_no_output(path: Path) -> None:
     kinds = [cell["cell_type"] for cell in cells(path)]
-    assert kinds == ["markdown", *["markdown", "code"] * ((len(kinds) - 2) // 2), "markdown"]
+    assert kinds == [
+        "markdown",
+        *["markdown", "code"] * ((len(kinds) - 2) // 2),
+        "markdown",
+    ]
     for cell in cells(path):
         if cell["cell_type"] == "code":
             assert (cell["outputs"], cell["execution_count"]) == ([], None)
@@ -45,7 +51,10 @@ def test_what_is_in_a_notebook_can_be_read(path: Path) -> None:
                 assert (path.parent / link).exists(), link
         elif text.startswith("%%bash\n"):
             read = subprocess.run(
-                ["bash", "-n"], input=text.partition("\n")[2], capture_output=True, text=True
+                ["bash", "-n"],
+                input=text.partition("\n")[2],
+                capture_output=True,
+                text=True,
             )
             assert read.returncode == 0, read.stderr
         else:
@@ -66,16 +75,22 @@ def test_a_notebook_runs(path: Path, folder: Path, environment: dict[str, str]) 
     import nbclient
     import nbformat
 
-    place = folder / "examples" / "notebooks"  # a link to ours, until it is a folder to write in
+    place = (
+        folder / "examples" / "notebooks"
+    )  # a link to ours, until it is a folder to write in
     place.unlink()
     place.mkdir()
     shutil.copy(path, place)
     del environment["MPLBACKEND"]  # so that figures are shown in the notebook
     book = nbformat.read(place / path.name, as_version=4)
     nbformat.validate(book)
-    nbclient.NotebookClient(book, timeout=LIMIT_S, resources={"metadata": {"path": str(place)}}).execute(
-        env=environment
-    )
-    shown = [output.get("data", {}) for cell in book.cells for output in cell.get("outputs", [])]
+    nbclient.NotebookClient(
+        book, timeout=LIMIT_S, resources={"metadata": {"path": str(place)}}
+    ).execute(env=environment)
+    shown = [
+        output.get("data", {})
+        for cell in book.cells
+        for output in cell.get("outputs", [])
+    ]
     assert any("text/html" in data for data in shown)
     assert sum("image/png" in data for data in shown) == 2

@@ -1,4 +1,6 @@
-"""Pages are short, their code can be read by what is to run it, and the site shows all of them."""
+"""Pages are short, their code can be read by what is to run it, and the site shows all
+of them.
+"""
 
 import ast
 import re
@@ -28,7 +30,9 @@ def test_blocks_can_be_read(page: Path) -> None:
         if block.kind == "python":
             ast.parse(block.body, where)
         elif block.kind == "sh":
-            read = subprocess.run(["bash", "-n"], input=block.body, capture_output=True, text=True)
+            read = subprocess.run(
+                ["bash", "-n"], input=block.body, capture_output=True, text=True
+            )
             assert read.returncode == 0, f"{where}: {read.stderr}"
         elif block.kind == "yaml":
             list(yaml.safe_load_all(block.body))
@@ -43,10 +47,16 @@ def test_the_site_shows_every_page() -> None:
 
 @pytest.mark.parametrize("page", [*pages(), ROOT / "CONTRIBUTING.md"], ids=name)
 def test_a_list_begins_after_an_empty_line(page: Path) -> None:
-    """Without one a list is set as running text on the site, though not in a repository's view."""
+    """Without one a list is set as running text on the site, though not in a
+    repository's view.
+    """
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     item = re.compile(r"\s*(\d+\.|[-*]) ")
     for paragraph in re.split(r"\n\s*\n", text):
         lines = paragraph.strip("\n").splitlines()
         begun = [bool(item.match(line)) for line in lines]
-        assert not any(begun) or begun[0] or lines[0].startswith(("#", "|", "<", " ", "???", "!!!")), lines[0]
+        assert (
+            not any(begun)
+            or begun[0]
+            or lines[0].startswith(("#", "|", "<", " ", "???", "!!!"))
+        ), lines[0]

@@ -1,7 +1,9 @@
-"""A device that is not there: it computes on the CPU, and otherwise behaves as a GPU does.
+"""A device that is not there: it computes on the CPU, and otherwise behaves as a GPU
+does.
 
-A tensor of this device meets tensors of the CPU only where PyTorch lets those of a GPU do so, and what makes a
-program wait for a GPU is counted. So code can be tried for another device on a machine that has none.
+A tensor of this device meets tensors of the CPU only where PyTorch lets those of a GPU
+do so, and what makes a program wait for a GPU is counted. So code can be tried for
+another device on a machine that has none.
 """
 
 from collections.abc import Iterator
@@ -15,7 +17,9 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 backend = pytest.importorskip("torch.utils.backend_registration")
 if not hasattr(backend, "_setup_privateuseone_for_python_backend"):
-    pytest.skip("this PyTorch cannot be given a device in Python", allow_module_level=True)
+    pytest.skip(
+        "this PyTorch cannot be given a device in Python", allow_module_level=True
+    )
 backend._setup_privateuseone_for_python_backend("elsewhere")
 torch.elsewhere.get_amp_supported_dtype = lambda: [torch.bfloat16]  # type: ignore[attr-defined]
 
@@ -49,7 +53,9 @@ class Far(torch.Tensor):
         return made
 
     @classmethod
-    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        cls, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         return _compute(func, args, kwargs or {})
 
     def __repr__(self) -> str:  # type: ignore[override]
@@ -63,7 +69,9 @@ class Far(torch.Tensor):
 class _Mode(TorchDispatchMode):
     """Makes tensors there when they are asked for."""
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         return _compute(func, args, kwargs or {})
 
 
@@ -71,7 +79,8 @@ class _Mode(TorchDispatchMode):
 def elsewhere() -> Iterator[torch.device]:
     """The device, as long as it is there."""
     waits.clear()
-    # So a module can be moved there: a tensor of the CPU cannot become one of ours in place.
+    # So a module can be moved there: a tensor of the CPU cannot become one of ours in
+    # place.
     torch.__future__.set_swap_module_params_on_conversion(True)
     # Tensors of our kind cannot be made in inference mode.
     inference_mode, torch.inference_mode = torch.inference_mode, torch.no_grad  # type: ignore[misc, assignment]
@@ -84,7 +93,11 @@ def elsewhere() -> Iterator[torch.device]:
 
 
 def _compute(func: Any, args: Any, kwargs: Any) -> Any:
-    tensors = [value for value in tree_leaves((args, kwargs)) if isinstance(value, torch.Tensor)]
+    tensors = [
+        value
+        for value in tree_leaves((args, kwargs))
+        if isinstance(value, torch.Tensor)
+    ]
     far = [value for value in tensors if isinstance(value, Far)]
     near = [value for value in tensors if not isinstance(value, Far) and value.dim()]
     if func in _TAKE_INDICES_OF_THE_CPU and isinstance(args[0], Far):
@@ -95,10 +108,16 @@ def _compute(func: Any, args: Any, kwargs: Any) -> Any:
     goes = bool(far) if asked is None else torch.device(asked).type == ELSEWHERE.type
     generator = kwargs.get("generator")
     if goes and generator is not None and generator.device.type == "cpu":
-        raise RuntimeError(f"Expected a generator of the device, got one of the CPU in {func}.")
+        raise RuntimeError(
+            f"Expected a generator of the device, got one of the CPU in {func}."
+        )
     crosses = func in _COPIES and bool(far) != goes
-    by_mask = func in _TAKE_INDICES_OF_THE_CPU and any(value.dtype == torch.bool for value in tensors[1:])
-    if crosses or (far and (func._schema.name.removeprefix("aten::") in _WAITING or by_mask)):
+    by_mask = func in _TAKE_INDICES_OF_THE_CPU and any(
+        value.dtype == torch.bool for value in tensors[1:]
+    )
+    if crosses or (
+        far and (func._schema.name.removeprefix("aten::") in _WAITING or by_mask)
+    ):
         waits.append(str(func))
     result = func(*tree_map(_here, args), **tree_map(_here, kwargs))
     if func._schema.is_mutable and args and isinstance(args[0], torch.Tensor):
@@ -109,7 +128,11 @@ def _compute(func: Any, args: Any, kwargs: Any) -> Any:
 def _here(value: Any) -> Any:
     if isinstance(value, Far):
         return value.inner
-    return torch.device("cpu") if isinstance(value, torch.device) and value.type == ELSEWHERE.type else value
+    return (
+        torch.device("cpu")
+        if isinstance(value, torch.device) and value.type == ELSEWHERE.type
+        else value
+    )
 
 
 def _there(result: Any, goes: bool) -> Any:
@@ -123,7 +146,9 @@ def _empty(size: Any, stride: Any, dtype: Any = None, **_: Any) -> Far:
     return Far(torch.empty_strided(size, stride, dtype=dtype))
 
 
-def _copy(source: torch.Tensor, target: torch.Tensor, non_blocking: bool = False) -> torch.Tensor:
+def _copy(
+    source: torch.Tensor, target: torch.Tensor, non_blocking: bool = False
+) -> torch.Tensor:
     waits.append("copy")
     _here(target).copy_(_here(source))
     return target

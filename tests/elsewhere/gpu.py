@@ -22,17 +22,36 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is 
     [
         *({"planners": (name,)} for name in names("planner") if name != "near_optimal"),
         {"planners": ("near_optimal",), "model": "clairvoyant", "world": HOLDS},
-        {"planners": ({"part": "optimal", "options": {"hazard": True}},), "world": HOLDS},
+        {
+            "planners": ({"part": "optimal", "options": {"hazard": True}},),
+            "world": HOLDS,
+        },
         {"planners": ({"part": "mppi", "options": ON_COST},), "world": HOLDS},
-        {"planners": ({"part": "mppi", "options": ON_COST | {"entrapment": True}},), "world": HOLDS},
-        {"planners": ({"part": "mppi", "options": HORIZON | {"entrapment": True}},), "world": HOLDS},
-        {"planners": ({"part": "astar_mppi", "options": {"mppi": ON_COST}},), "world": HOLDS},
+        {
+            "planners": ({"part": "mppi", "options": ON_COST | {"entrapment": True}},),
+            "world": HOLDS,
+        },
+        {
+            "planners": ({"part": "mppi", "options": HORIZON | {"entrapment": True}},),
+            "world": HOLDS,
+        },
+        {
+            "planners": ({"part": "astar_mppi", "options": {"mppi": ON_COST}},),
+            "world": HOLDS,
+        },
         {"planners": ("astar_dwa",), "risks": ("time-cvar:0.5",)},
-        {"planners": ("astar_dwa",), "sensors": ("near:8",), "beliefs": ("copula",), "world": HOLDS},
+        {
+            "planners": ("astar_dwa",),
+            "sensors": ("near:8",),
+            "beliefs": ("copula",),
+            "world": HOLDS,
+        },
     ],
     ids=str,
 )
-def test_a_unit_is_the_same_on_a_gpu(changes: dict[str, Any], dataset_path: Path, tmp_path: Path) -> None:
+def test_a_unit_is_the_same_on_a_gpu(
+    changes: dict[str, Any], dataset_path: Path, tmp_path: Path
+) -> None:
     unit = unit_of(dataset_path, **changes)
     run_here(unit, tmp_path / "here")
     run_here(unit, tmp_path / "there", device="cuda")
@@ -43,6 +62,8 @@ def test_a_unit_is_the_same_on_a_gpu(changes: dict[str, Any], dataset_path: Path
         if name.endswith("_ms"):
             continue
         if np.issubdtype(values.dtype, np.floating):
-            np.testing.assert_allclose(values, there[name], rtol=1e-3, atol=1e-3, err_msg=name)
+            np.testing.assert_allclose(
+                values, there[name], rtol=1e-3, atol=1e-3, err_msg=name
+            )
         else:
             np.testing.assert_array_equal(values, there[name], err_msg=name)

@@ -1,4 +1,6 @@
-"""What models are measured and calibrated on is the device that is asked for, and the numbers are the same."""
+"""What models are measured and calibrated on is the device that is asked for, and the
+numbers are the same.
+"""
 
 import sys
 from dataclasses import asdict
@@ -17,7 +19,11 @@ from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.fused import FusedModel
-from benchnav.models.nets.calibration import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.nets.calibration import (
+    fit_pool_temperature,
+    fit_temperature,
+    sample_logits,
+)
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.mdn import MixtureDensityModel
 from benchnav.models.predictor import Ideal, Oracle
@@ -47,7 +53,10 @@ def pair(checkpoint_path: Path) -> FusedModel:
     checkpoint = load_checkpoint(checkpoint_path)
     model = FusedModel.from_checkpoint(checkpoint)
     part = checkpoint.part("classifier")
-    other = {name: value * 1.1 if value.ndim > 1 else value for name, value in part.tensors.items()}
+    other = {
+        name: value * 1.1 if value.ndim > 1 else value
+        for name, value in part.tensors.items()
+    }
     second = TerrainClassifier.from_tensors(part.config, checkpoint.class_names, other)
     return FusedModel((*model.classifiers, second), model.table, model.class_names, 1.5)
 
@@ -63,7 +72,9 @@ def assert_close(found: Any, expected: Any) -> None:
         for one, other in zip(found, expected, strict=True):
             assert_close(one, other)
     elif expected is not None:
-        np.testing.assert_allclose(np.asarray(found, float), np.asarray(expected, float), rtol=1e-6)
+        np.testing.assert_allclose(
+            np.asarray(found, float), np.asarray(expected, float), rtol=1e-6
+        )
 
 
 @pytest.mark.parametrize("name", ["oracle", "ideal", "mdn", "pair"])
@@ -88,12 +99,20 @@ def test_temperatures_are_fitted_on_another_device_as_here(
     dataset: TerrainDataset, checkpoint_path: Path
 ) -> None:
     maps, members = MapDataset(dataset.path, VALID), pair(checkpoint_path).classifiers
-    here = fit_temperature(*sample_logits(members[0], maps, 3)), fit_pool_temperature(members, maps, 3)
+    here = (
+        fit_temperature(*sample_logits(members[0], maps, 3)),
+        fit_pool_temperature(members, maps, 3),
+    )
     with elsewhere() as device:
         logits, class_id = sample_logits(members[0], maps, 3, device)
         assert logits.device == class_id.device == device
-        there = fit_temperature(logits, class_id), fit_pool_temperature(members, maps, 3, device)
-        assert {value.device for member in members for value in member.parameters()} == {device}
+        there = (
+            fit_temperature(logits, class_id),
+            fit_pool_temperature(members, maps, 3, device),
+        )
+        assert {
+            value.device for member in members for value in member.parameters()
+        } == {device}
         for member in members:
             member.cpu()
     np.testing.assert_allclose(there, here, rtol=1e-6)
@@ -114,7 +133,9 @@ def test_networks_are_measured_in_training_on_another_device_as_here(
     assert_close(there, here)
 
 
-@pytest.mark.parametrize("command", ["classifier", "gp", "gp on logs", "all", "mdn", "evaluate"])
+@pytest.mark.parametrize(
+    "command", ["classifier", "gp", "gp on logs", "all", "mdn", "evaluate"]
+)
 def test_each_command_uses_the_device_that_it_is_given(
     command: str,
     dataset: TerrainDataset,
@@ -123,27 +144,39 @@ def test_each_command_uses_the_device_that_it_is_given(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """Asked for a GPU, all that is computed is asked of it; there is none, so that each ends with the first."""
+    """Asked for a GPU, all that is computed is asked of it; there is none, so that each
+    ends with the first.
+    """
     asked: list[torch.device] = []
 
     class Enough(Exception):
         pass
 
     def begin(*given: Any, **named: Any) -> Any:
-        names = [value.device if isinstance(value, FitOptions) else value for value in given]
-        asked.append(find_device(next(name for name in names if name in ("auto", "cpu", "cuda"))))
+        names = [
+            value.device if isinstance(value, FitOptions) else value for value in given
+        ]
+        asked.append(
+            find_device(next(name for name in names if name in ("auto", "cpu", "cuda")))
+        )
         raise Enough
 
-    def measure(model: Any, dataset: Any, splits: Any, seed: int, device: torch.device) -> Any:
+    def measure(
+        model: Any, dataset: Any, splits: Any, seed: int, device: torch.device
+    ) -> Any:
         asked.append(device)
         raise Enough
 
     # A trial of the network would ask the GPU that is not there.
-    monkeypatch.setattr("benchnav.models.training.networks.check_network", lambda *_: None)
+    monkeypatch.setattr(
+        "benchnav.models.training.networks.check_network", lambda *_: None
+    )
     for name in ("networks.fit_network", "gaussian_processes.fit_gps"):
         monkeypatch.setattr(f"benchnav.models.training.{name}", begin)
     monkeypatch.setattr(measure_module, "evaluate", measure)
-    (tmp_path / "logs.csv").write_text("class,slope_deg,traversability\n" + "a,5,0.5\n" * 20)
+    (tmp_path / "logs.csv").write_text(
+        "class,slope_deg,traversability\n" + "a,5,0.5\n" * 20
+    )
     data = str(tmp_path / "logs.csv") if command == "gp on logs" else str(dataset.path)
     cpu, cuda = ("--device", "cpu"), ("--device", "cuda")
     for there, words, expected in (
@@ -156,7 +189,9 @@ def test_each_command_uses_the_device_that_it_is_given(
         out = str(tmp_path / f"{len(asked)}")
         where = (str(checkpoint_path),) if command == "evaluate" else ("--out", out)
         monkeypatch.setattr(
-            sys, "argv", ["benchnav-train", command.split()[0], *where, "--data", data, *words]
+            sys,
+            "argv",
+            ["benchnav-train", command.split()[0], *where, "--data", data, *words],
         )
         with pytest.raises(Enough):
             cli.main()
@@ -214,7 +249,11 @@ def test_what_was_trained_is_measured_and_calibrated_where_it_was(
             MDNConfig(encoder="mobilenet_v2", hidden=16, batch_size=5),
         ):
             trained, _ = fit_network(
-                trainable(config), dataset, 0, FitOptions(device="cpu"), half_precision=True
+                trainable(config),
+                dataset,
+                0,
+                FitOptions(device="cpu"),
+                half_precision=True,
             )
             assert {value.device for value in trained.parameters()} == {CPU}
     # Both networks are measured and calibrated; before, layers are read on the CPU.
@@ -242,5 +281,10 @@ def test_a_pool_is_calibrated_on_the_device(
             holds=lambda *words: True,
             set_pool_temperature=lambda value: None,
         )
-        networks.train_parts(target, trainable(ClassifierConfig()), dataset, ["classifier", "classifier-2"])  # type: ignore[arg-type]
+        networks.train_parts(
+            target,
+            trainable(ClassifierConfig()),
+            dataset,
+            ["classifier", "classifier-2"],
+        )  # type: ignore[arg-type]
     assert [place.type for place in given] == ["cpu", "cuda"]

@@ -1,4 +1,6 @@
-"""Whatever the device, rows and recordings are the same, and nothing waits for it at every step."""
+"""Whatever the device, rows and recordings are the same, and nothing waits for it at
+every step.
+"""
 
 import json
 import pickle
@@ -38,14 +40,21 @@ from tests.core.test_mixture import random_mixture
 from tests.elsewhere.device import elsewhere, waits
 
 SMALL = {"samples": 20, "horizon_s": 0.4}
-DWA = {"part": "astar_dwa", "options": {"dwa": {"speeds": 3, "turn_rates": 3, "horizon_s": 0.4}}}
+DWA = {
+    "part": "astar_dwa",
+    "options": {"dwa": {"speeds": 3, "turn_rates": 3, "horizon_s": 0.4}},
+}
 CL_RRT = {"part": "cl_rrt", "options": {"expansions": 25, "edge_time_s": 3.0}}
 MPPI = {"part": "mppi", "options": SMALL}
 GUIDED = {"part": "astar_mppi", "label": "guided", "options": {"mppi": SMALL}}
 
 
 def faulty(fault: str) -> dict[str, Any]:
-    return {"part": "tests.eval.parts:Faulty", "label": "faulty", "options": {"fault": fault}}
+    return {
+        "part": "tests.eval.parts:Faulty",
+        "label": "faulty",
+        "options": {"fault": fault},
+    }
 
 
 def unit_of(data: Path | str, **changes: Any) -> Unit:
@@ -55,16 +64,27 @@ def unit_of(data: Path | str, **changes: Any) -> Unit:
     } | changes  # fmt: skip
     given["world"] = {"time_budget_s": 1.2} | given.get("world", {})
     (condition,) = conditions_of(Suite(**given), lambda data: ["std"])
-    return Unit(condition=condition, seed=0, realisation=0, maps=(0, 1), record="all", leads=True)
+    return Unit(
+        condition=condition,
+        seed=0,
+        realisation=0,
+        maps=(0, 1),
+        record="all",
+        leads=True,
+    )
 
 
-def run_here(unit: Unit, folder: Path, device: torch.device | str = "cpu", limit_s: float = 0.0) -> None:
+def run_here(
+    unit: Unit, folder: Path, device: torch.device | str = "cpu", limit_s: float = 0.0
+) -> None:
     asked = Settings(planner_limit_s=limit_s, device=str(device))
     run_unit(unit, folder, asked.origins().of(unit), asked)
 
 
 def made(folder: Path) -> dict[str, Any]:
-    """All that a unit has written but wall times and what code it was, of which its device is one, by file."""
+    """All that a unit has written but wall times and what code it was, of which its
+    device is one, by file.
+    """
     found: dict[str, Any] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -74,7 +94,11 @@ def made(folder: Path) -> dict[str, Any]:
         elif path.suffix == ".parquet":
             rows = pd.read_parquet(path).drop(columns="code", errors="ignore")
             kind = name.split("/")[0]
-            found |= {f"{kind} {key}": rows[key].to_numpy() for key in rows if "planning" not in str(key)}
+            found |= {
+                f"{kind} {key}": rows[key].to_numpy()
+                for key in rows
+                if "planning" not in str(key)
+            }
     return found
 
 
@@ -91,19 +115,30 @@ def made(folder: Path) -> dict[str, Any]:
         {"world": {"noise": "frozen", "immobile": {"below": 0.2, "for_s": 0.5}}},
         {"planners": (DWA,), "world": {"noise": "frozen"}, "model": "clairvoyant"},
         {"planners": (DWA,), "risks": ("expected-time",)},
-        {"planners": (DWA,), "world": {"noise": "stored"}, "model": "ideal", "risks": ("var:0.9",)},
+        {
+            "planners": (DWA,),
+            "world": {"noise": "stored"},
+            "model": "ideal",
+            "risks": ("var:0.9",),
+        },
         {"planners": (DWA,), "model": "tests.eval.parts:Broken"},
     ],
 )
 def test_a_unit_is_the_same_on_another_device(
-    changes: dict[str, Any], dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    changes: dict[str, Any],
+    dataset_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     unit = unit_of(dataset_path, **changes)
     used: set[torch.device] = set()
 
     def simulate(unit: Unit, built: Built, *given: Any, **options: Any) -> Any:
         problem = built.problem
-        used.update(value.device for value in (problem.start, problem.risk_map, built.simulation.steps))
+        used.update(
+            value.device
+            for value in (problem.start, problem.risk_map, built.simulation.steps)
+        )
         return simulate_here(unit, built, *given, **options)
 
     simulate_here = units_of_run.simulate
@@ -136,13 +171,20 @@ def test_nothing_waits_for_a_device_at_every_step(
 ) -> None:
     counted = []
     for budget_s in (0.4, 1.2):  # neither is enough to arrive
-        unit = unit_of(dataset_path, planners=(planner,), robots=(robot,), world={"time_budget_s": budget_s})
+        unit = unit_of(
+            dataset_path,
+            planners=(planner,),
+            robots=(robot,),
+            world={"time_budget_s": budget_s},
+        )
         unit = replace(unit, record="steps")
         with elsewhere() as device:
             run_here(unit, tmp_path / f"{budget_s:g}", device=device)
             counted.append(len(waits))
         (path,) = tmp_path.glob(f"{budget_s:g}/units/**/*.parquet")
-        assert pd.read_parquet(path)["end_time_s"].to_list() == pytest.approx([budget_s] * 2)
+        assert pd.read_parquet(path)["end_time_s"].to_list() == pytest.approx(
+            [budget_s] * 2
+        )
     # 8 steps more, and a look at every eighth.
     assert counted[1] - counted[0] <= 8 / 8 + 1
 
@@ -175,14 +217,26 @@ HERE = "tests.elsewhere.units"
 @pytest.mark.parametrize(
     ("changes", "limit_s", "said"),
     [
-        ({"planners": (f"{HERE}:Exhausted",)}, 0.0, r"no memory left\. Finished work is kept"),
-        ({"planners": ({"part": f"{HERE}:Exhausted", "options": {"at": "init"}},)}, 0.0, "no memory left"),
+        (
+            {"planners": (f"{HERE}:Exhausted",)},
+            0.0,
+            r"no memory left\. Finished work is kept",
+        ),
+        (
+            {"planners": ({"part": f"{HERE}:Exhausted", "options": {"at": "init"}},)},
+            0.0,
+            "no memory left",
+        ),
         ({"planners": (f"{HERE}:Exhausted",)}, 60.0, "no memory left"),
         ({"model": f"{HERE}:Large", "planners": (DWA,)}, 0.0, "device-side assert"),
     ],
 )
 def test_a_gpu_that_fails_ends_the_run_and_makes_no_rows(
-    changes: dict[str, Any], limit_s: float, said: str, dataset_path: Path, tmp_path: Path
+    changes: dict[str, Any],
+    limit_s: float,
+    said: str,
+    dataset_path: Path,
+    tmp_path: Path,
 ) -> None:
     with pytest.raises(DeviceError, match=said):
         run_here(unit_of(dataset_path, **changes), tmp_path, limit_s=limit_s)
@@ -190,8 +244,12 @@ def test_a_gpu_that_fails_ends_the_run_and_makes_no_rows(
 
 
 def test_what_a_gpu_said_comes_back_from_a_worker_as_it_is() -> None:
-    failed = gpu_failed(torch.OutOfMemoryError("no memory left.\nwhatever else it says"))
-    assert str(failed).startswith("The GPU failed: no memory left. Finished work is kept")
+    failed = gpu_failed(
+        torch.OutOfMemoryError("no memory left.\nwhatever else it says")
+    )
+    assert str(failed).startswith(
+        "The GPU failed: no memory left. Finished work is kept"
+    )
     assert str(pickle.loads(pickle.dumps(failed))) == str(failed)
 
 
@@ -231,7 +289,9 @@ def test_a_gpu_convolves_as_the_cpu_does() -> None:
 
 
 class Late(Planner[Problem]):
-    """Stands still; raises at a step when all episodes have ended and nobody has looked yet."""
+    """Stands still; raises at a step when all episodes have ended and nobody has looked
+    yet.
+    """
 
     def init(self, problem: Problem, generator: torch.Generator) -> Problem:
         return problem
@@ -239,7 +299,11 @@ class Late(Planner[Problem]):
     def plan(self, step: Step, plan_state: Problem) -> Any:
         if step.time_s > 1.15:
             raise RuntimeError("nobody is left")
-        return torch.zeros_like(step.state[:, :2]), plan_state, Plan.empty(len(step.state), step.state.device)
+        return (
+            torch.zeros_like(step.state[:, :2]),
+            plan_state,
+            Plan.empty(len(step.state), step.state.device),
+        )
 
 
 def test_steps_beyond_the_last_end_harm_nobody() -> None:
@@ -255,7 +319,9 @@ def test_steps_beyond_the_last_end_harm_nobody() -> None:
             0,
             range(2),
         )
-        episodes = run_episodes(Late(), problem.to(device), simulation, torch.Generator())
+        episodes = run_episodes(
+            Late(), problem.to(device), simulation, torch.Generator()
+        )
     assert episodes.steps.tolist() == [10, 10]
     assert episodes.outcome.tolist() == [Outcome.STALLED] * 2
     assert episodes.actions.shape[1] == 12

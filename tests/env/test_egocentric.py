@@ -26,7 +26,9 @@ from benchnav.planning.sensing.sensor import Contact, Probe
 from tests import factories
 
 ID = "benchnav/OffRoad-v1"
-RISK, SPREAD, RISE, KNOWN = (CHANNELS.index(name) for name in ("risk", "spread", "rise", "known"))
+RISK, SPREAD, RISE, KNOWN = (
+    CHANNELS.index(name) for name in ("risk", "spread", "rise", "known")
+)
 AHEAD = np.array([1.0, 0.0], np.float32)
 STAKES = {"preset": "stakes", "time_budget_s": 3.0, "immobile": None}
 CHOSEN: dict[str, Any] = {"split": "train", "world": STAKES, "model": "oracle"}
@@ -49,7 +51,9 @@ def make(path: Path, **settings: Any) -> Any:
 
 def make_vector(path: Path, count: int, **settings: Any) -> Any:
     settings = {"data": path, **CHOSEN, **settings}
-    return gymnasium.make_vec(ID, num_envs=count, vectorization_mode="vector_entry_point", **settings)
+    return gymnasium.make_vec(
+        ID, num_envs=count, vectorization_mode="vector_entry_point", **settings
+    )
 
 
 def batch_of(env: Any) -> EgocentricBatch:
@@ -58,17 +62,25 @@ def batch_of(env: Any) -> EgocentricBatch:
     return batch
 
 
-def drive(env: Any, steps: int, action: np.ndarray = AHEAD, seed: int = 0) -> list[dict[str, np.ndarray]]:
+def drive(
+    env: Any, steps: int, action: np.ndarray = AHEAD, seed: int = 0
+) -> list[dict[str, np.ndarray]]:
     """Observations from the start on."""
     return [env.reset(seed=seed)[0], *(env.step(action)[0] for _ in range(steps))]
 
 
 @pytest.mark.parametrize(
     ("robot", "senses"),
-    [("unicycle", SENSES["full, static"]), ("differential_drive", SENSES["near, contact, copula"])],
+    [
+        ("unicycle", SENSES["full, static"]),
+        ("differential_drive", SENSES["near, contact, copula"]),
+    ],
 )
 def test_the_checkers_of_gymnasium_and_stable_baselines_pass(
-    dataset_path: Path, robot: str, senses: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    dataset_path: Path,
+    robot: str,
+    senses: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("MPLBACKEND", "agg")  # there is no display
     env = make(dataset_path, robot=robot, **senses)
@@ -81,7 +93,9 @@ def test_the_checkers_of_gymnasium_and_stable_baselines_pass(
 
 
 @EACH
-def test_observations_lie_in_the_space_until_the_end(dataset_path: Path, senses: dict[str, Any]) -> None:
+def test_observations_lie_in_the_space_until_the_end(
+    dataset_path: Path, senses: dict[str, Any]
+) -> None:
     env = make(dataset_path, robot="differential_drive", **senses)
     for seen in drive(env, 30):
         assert env.observation_space.contains(seen)
@@ -91,13 +105,20 @@ def test_observations_lie_in_the_space_until_the_end(dataset_path: Path, senses:
 def test_each_vector_member_is_the_single_environment_with_its_seed(
     dataset_path: Path, senses: dict[str, Any]
 ) -> None:
-    senses = {"world": {**STAKES, "time_budget_s": 1.0}, "replan_every_s": 0.3, **senses}
+    senses = {
+        "world": {**STAKES, "time_budget_s": 1.0},
+        "replan_every_s": 0.3,
+        **senses,
+    }
     vector = make_vector(dataset_path, 3, **senses)
     singles = [make(dataset_path, **senses) for _ in range(3)]
     batch, _ = vector.reset(seed=7)
     alone = [env.reset(seed=7 + i)[0] for i, env in enumerate(singles)]
     # One is further on, so that they do not end together.
-    for own, more in ((batch_of(vector), torch.tensor([0, 4, 0])), (batch_of(singles[1]), 4)):
+    for own, more in (
+        (batch_of(vector), torch.tensor([0, 4, 0])),
+        (batch_of(singles[1]), 4),
+    ):
         assert own._now is not None
         own._now = replace(own._now, step=own._now.step + more)
     generator, ended, episodes = np.random.default_rng(0), [False] * 3, 0
@@ -134,12 +155,21 @@ def test_what_is_known_is_what_robots_of_an_evaluation_know(
     terrain = batch._maps.select(chosen)
     keys = batch._experience._truth.keys if batch._experience._truth else (0,)
     truth = Truth(terrain=terrain, field=simulation.field.clone(), keys=keys)
-    whole = learner.predict(terrain, terrain.observe()) if learner.sensor.sees_all else None
+    whole = (
+        learner.predict(terrain, terrain.observe()) if learner.sensor.sees_all else None
+    )
     start = learner.begin(truth, now.state, whole)
-    prediction = Prediction(start.observation, learner.distribution(start), start.risk_map)
+    prediction = Prediction(
+        start.observation, learner.distribution(start), start.risk_map
+    )
     places = batch._places
-    problem = pose_problem(batch._task, prediction, places.start_m[chosen], places.goal_m[chosen], 3.0)
-    knowing, running = Knowing(Learning(learner=learner, start=start, truth=truth), problem), now.running
+    problem = pose_problem(
+        batch._task, prediction, places.start_m[chosen], places.goal_m[chosen], 3.0
+    )
+    knowing, running = (
+        Knowing(Learning(learner=learner, start=start, truth=truth), problem),
+        now.running,
+    )
     changed = 0
     for step in range(13):
         before = knowing.known.risk_map
@@ -153,7 +183,9 @@ def test_what_is_known_is_what_robots_of_an_evaluation_know(
 
 
 @EACH
-def test_the_crop_shows_what_is_believed(dataset_path: Path, senses: dict[str, Any]) -> None:
+def test_the_crop_shows_what_is_believed(
+    dataset_path: Path, senses: dict[str, Any]
+) -> None:
     env = make(dataset_path, risk="cvar:0.8", crop_cells=12, crop_behind=0.5, **senses)
     seen = drive(env, 12)[-1]
     batch = batch_of(env)
@@ -171,7 +203,9 @@ def test_the_crop_shows_what_is_believed(dataset_path: Path, senses: dict[str, A
     assert np.ptp(seen["crop"][RISK]) > 0.1
 
 
-def test_models_measures_and_the_size_of_the_crop_are_those_that_were_asked_for(dataset_path: Path) -> None:
+def test_models_measures_and_the_size_of_the_crop_are_those_that_were_asked_for(
+    dataset_path: Path,
+) -> None:
     class Flat(TraversabilityModel):
         def predict(self, observation: Any) -> Any:
             mean = torch.full_like(observation.elevation_m, 0.5)
@@ -182,15 +216,21 @@ def test_models_measures_and_the_size_of_the_crop_are_those_that_were_asked_for(
     on_map = seen["crop"][KNOWN] > 0
     np.testing.assert_allclose(seen["crop"][RISK][on_map], 0.5, atol=1e-5)
     np.testing.assert_allclose(seen["crop"][SPREAD][on_map], 0.199, atol=1e-3)
-    cautious, _ = make(dataset_path, model=Flat(), crop_cells=4, risk="cvar:0.9").reset(seed=0)
+    cautious, _ = make(dataset_path, model=Flat(), crop_cells=4, risk="cvar:0.9").reset(
+        seed=0
+    )
     # φ(z) / 0.1 at the quantile z of 10 %.
-    np.testing.assert_allclose(cautious["crop"][RISK][on_map], 0.5 - 0.1 * 1.755, atol=1e-3)
+    np.testing.assert_allclose(
+        cautious["crop"][RISK][on_map], 0.5 - 0.1 * 1.755, atol=1e-3
+    )
     behind, _ = make(dataset_path, crop_cells=10, crop_behind=0.0).reset(seed=0)
     middle, _ = make(dataset_path, crop_cells=10, crop_behind=0.5).reset(seed=0)
     np.testing.assert_array_equal(behind["crop"][:, :, :5], middle["crop"][:, :, 5:])
 
 
-def test_a_robot_that_sees_what_is_near_gets_to_know_more_on_its_way(dataset_path: Path) -> None:
+def test_a_robot_that_sees_what_is_near_gets_to_know_more_on_its_way(
+    dataset_path: Path,
+) -> None:
     def known(**settings: Any) -> list[int]:
         env = make(dataset_path, **settings)
         return [int(seen["crop"][KNOWN].sum()) for seen in drive(env, 15)]
@@ -199,12 +239,16 @@ def test_a_robot_that_sees_what_is_near_gets_to_know_more_on_its_way(dataset_pat
     near, far = (known(sensor=Near(range_m=range_m)) for range_m in (1.5, 3.0))
     assert near[0] < far[0] < all_of_it[0]
     assert near[-1] > near[0] + 5
-    narrow = known(sensor={"part": "near", "options": {"range_m": 3.0, "fov_deg": 60.0}})
+    narrow = known(
+        sensor={"part": "near", "options": {"range_m": 3.0, "fov_deg": 60.0}}
+    )
     assert narrow[0] < far[0]
 
 
 def unseen_risk(path: Path, unseen: str, risk: str = "mean") -> float:
-    seen, _ = make(path, sensor=Near(range_m=1.0), unseen=unseen, risk=risk).reset(seed=0)
+    seen, _ = make(path, sensor=Near(range_m=1.0), unseen=unseen, risk=risk).reset(
+        seed=0
+    )
     crop = seen["crop"]
     values = np.unique(crop[RISK][(crop[KNOWN] == 0) & (crop[RISK] > 0)])
     assert len(values) == 1
@@ -213,7 +257,12 @@ def unseen_risk(path: Path, unseen: str, risk: str = "mean") -> float:
 
 def test_unseen_ground_is_believed_to_be_what_was_asked_for(dataset_path: Path) -> None:
     prior = unseen_risk(dataset_path, "prior")
-    assert unseen_risk(dataset_path, "pessimistic") < prior < unseen_risk(dataset_path, "optimistic") == 1
+    assert (
+        unseen_risk(dataset_path, "pessimistic")
+        < prior
+        < unseen_risk(dataset_path, "optimistic")
+        == 1
+    )
     assert unseen_risk(dataset_path, "prior", "cvar:0.9") < prior
 
 
@@ -249,7 +298,9 @@ def test_the_time_left_is_a_share_of_the_budget(dataset_path: Path) -> None:
     np.testing.assert_allclose(left, [1, 2.75 / 3, 2.5 / 3, 2.25 / 3], atol=1e-6)
 
 
-def test_the_belief_is_told_how_the_λ_of_this_world_hangs_together(dataset_path: Path) -> None:
+def test_the_belief_is_told_how_the_λ_of_this_world_hangs_together(
+    dataset_path: Path,
+) -> None:
     def length(**world: Any) -> float:
         env = make(dataset_path, belief="copula", world={**STAKES, **world})
         return batch_of(env)._experience._learner.law.correlation_m
@@ -259,33 +310,56 @@ def test_the_belief_is_told_how_the_λ_of_this_world_hangs_together(dataset_path
     assert length(noise="stored") == 0
 
 
-def test_λ_is_learnt_from_the_start_and_the_more_the_farther_it_is_probed(dataset_path: Path) -> None:
+def test_λ_is_learnt_from_the_start_and_the_more_the_farther_it_is_probed(
+    dataset_path: Path,
+) -> None:
     def spread(**settings: Any) -> float:
-        return float(make(dataset_path, **settings).reset(seed=0)[0]["crop"][SPREAD].sum())
+        return float(
+            make(dataset_path, **settings).reset(seed=0)[0]["crop"][SPREAD].sum()
+        )
 
     static = spread(ground="probe")
     contact, near, far = (
-        spread(belief=Copula(), ground=ground) for ground in (Contact(), Probe(1.0), Probe(2.0))
+        spread(belief=Copula(), ground=ground)
+        for ground in (Contact(), Probe(1.0), Probe(2.0))
     )
     assert far < near < contact < static
     noisy = spread(belief=Copula(), ground=Probe(2.0, noise_std=0.5))
     assert far < noisy < static
 
 
-def test_each_episode_has_sensor_noise_of_its_own_and_the_same_seed_the_same(dataset_path: Path) -> None:
-    env = make(dataset_path, sensor=Near(colour_noise=20.0), ground=Probe(2.0), belief="copula")
-    first, second = (env.reset(seed=seed, options={"map": 1})[0]["crop"] for seed in (0, 1))
+def test_each_episode_has_sensor_noise_of_its_own_and_the_same_seed_the_same(
+    dataset_path: Path,
+) -> None:
+    env = make(
+        dataset_path, sensor=Near(colour_noise=20.0), ground=Probe(2.0), belief="copula"
+    )
+    first, second = (
+        env.reset(seed=seed, options={"map": 1})[0]["crop"] for seed in (0, 1)
+    )
     assert not np.array_equal(first, second)
-    np.testing.assert_array_equal(env.reset(seed=0, options={"map": 1})[0]["crop"], first)
+    np.testing.assert_array_equal(
+        env.reset(seed=0, options={"map": 1})[0]["crop"], first
+    )
 
 
 def lie(values: Tensor, kept: Tensor, other: Tensor) -> Tensor:
-    return torch.where(kept if values.ndim == kept.ndim else kept[:, None], values, other)
+    return torch.where(
+        kept if values.ndim == kept.ndim else kept[:, None], values, other
+    )
 
 
-@pytest.mark.parametrize("ground", ["contact", {"part": "probe", "options": {"radius_m": 1.2}}])
-def test_what_was_not_sensed_changes_no_observation(dataset_path: Path, ground: Any) -> None:
-    settings: dict[str, Any] = {"sensor": Near(range_m=2.0), "ground": ground, "belief": "copula"}
+@pytest.mark.parametrize(
+    "ground", ["contact", {"part": "probe", "options": {"radius_m": 1.2}}]
+)
+def test_what_was_not_sensed_changes_no_observation(
+    dataset_path: Path, ground: Any
+) -> None:
+    settings: dict[str, Any] = {
+        "sensor": Near(range_m=2.0),
+        "ground": ground,
+        "belief": "copula",
+    }
     turning = np.array([1.0, 0.3], np.float32)
     env = make(dataset_path, **settings)
     wanted = drive(env, 16, turning)
@@ -307,7 +381,9 @@ def test_what_was_not_sensed_changes_no_observation(dataset_path: Path, ground: 
         traversability=lie(one.traversability, seen, 1 - one.traversability),
     )
     index = torch.tensor([own])
-    batch_of(other)._maps = map_tensors(maps, lambda old, new: old.index_copy(0, index, new), changed)
+    batch_of(other)._maps = map_tensors(
+        maps, lambda old, new: old.index_copy(0, index, new), changed
+    )
     for before, after in zip(wanted, drive(other, 16, turning), strict=True):
         np.testing.assert_array_equal(before["crop"], after["crop"])
         np.testing.assert_array_equal(before["state"], after["state"])
@@ -324,11 +400,19 @@ def test_what_was_not_sensed_changes_no_observation(dataset_path: Path, ground: 
 def test_normalised_actions_stand_for_the_robots_bounds(dataset_path: Path) -> None:
     robot = {"part": "unicycle", "options": {"speed_mps": [-0.5, 1.5]}}
     plain, scaled = (
-        make(dataset_path, robot=robot, normalised_actions=normalised) for normalised in (False, True)
+        make(dataset_path, robot=robot, normalised_actions=normalised)
+        for normalised in (False, True)
     )
     assert plain.action_space.low.tolist() == [-0.5, -1.0]
-    assert (scaled.action_space.low.tolist(), scaled.action_space.high.tolist()) == ([-1, -1], [1, 1])
-    for given, meant in (((0.5, -0.2), (1.0, -0.2)), ((-1, 1), (-0.5, 1)), ((7, 0), (1.5, 0))):
+    assert (scaled.action_space.low.tolist(), scaled.action_space.high.tolist()) == (
+        [-1, -1],
+        [1, 1],
+    )
+    for given, meant in (
+        ((0.5, -0.2), (1.0, -0.2)),
+        ((-1, 1), (-0.5, 1)),
+        ((7, 0), (1.5, 0)),
+    ):
         wanted = drive(plain, 3, np.array(meant, np.float32))[-1]
         found = drive(scaled, 3, np.array(given, np.float32))[-1]
         np.testing.assert_allclose(found["state"], wanted["state"], atol=1e-6)
@@ -336,7 +420,9 @@ def test_normalised_actions_stand_for_the_robots_bounds(dataset_path: Path) -> N
 
 
 @EACH
-def test_some_members_start_anew_and_the_others_go_on(dataset_path: Path, senses: dict[str, Any]) -> None:
+def test_some_members_start_anew_and_the_others_go_on(
+    dataset_path: Path, senses: dict[str, Any]
+) -> None:
     one, other = (make_vector(dataset_path, 4, **senses) for _ in range(2))
     actions = np.tile(np.array([0.8, 0.3], np.float32), (4, 1))
     mask = np.array([True, False, True, False])
@@ -350,12 +436,16 @@ def test_some_members_start_anew_and_the_others_go_on(dataset_path: Path, senses
     assert len(set(info["map"])) > 1
     for _ in range(8):
         found, wanted = one.step(actions)[0], other.step(actions)[0]
-        np.testing.assert_allclose(found["crop"][~mask], wanted["crop"][~mask], atol=2e-5)
+        np.testing.assert_allclose(
+            found["crop"][~mask], wanted["crop"][~mask], atol=2e-5
+        )
         np.testing.assert_array_equal(found["state"][~mask], wanted["state"][~mask])
         assert not np.array_equal(found["state"][mask], wanted["state"][mask])
 
 
-def test_members_that_were_started_anew_do_not_start_anew_again(dataset_path: Path) -> None:
+def test_members_that_were_started_anew_do_not_start_anew_again(
+    dataset_path: Path,
+) -> None:
     vector = make_vector(dataset_path, 2, world={**STAKES, "time_budget_s": 0.3})
     with pytest.raises(gymnasium.error.ResetNeeded):
         vector.reset(options={"reset_mask": np.array([True, False])})
@@ -395,13 +485,17 @@ def test_the_reward_and_the_world_are_those_of_v0(dataset_path: Path) -> None:
         assert before[1:] == after[1:]
 
 
-def test_the_world_may_resample_λ_where_nothing_is_learnt_of_it(dataset_path: Path) -> None:
+def test_the_world_may_resample_λ_where_nothing_is_learnt_of_it(
+    dataset_path: Path,
+) -> None:
     env = make(dataset_path, world="paper", sensor=Near(range_m=2.0))
     seen = drive(env, 6)
     assert seen[-1]["crop"][KNOWN].sum() > seen[0]["crop"][KNOWN].sum()
 
 
-@pytest.mark.filterwarnings("ignore")  # Gymnasium's, of a render mode that it does not know
+@pytest.mark.filterwarnings(
+    "ignore"
+)  # Gymnasium's, of a render mode that it does not know
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
@@ -439,7 +533,9 @@ def test_the_clairvoyant_is_given_the_λ_of_the_episode(dataset_path: Path) -> N
         torch.testing.assert_close(batch._experience.known.risk_map, field)
 
 
-def test_predictions_of_maps_are_made_once(dataset_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_predictions_of_maps_are_made_once(
+    dataset_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Counts(Oracle):
         calls = 0
 
@@ -467,8 +563,15 @@ def test_a_model_of_other_classes_is_said_to_be_one(dataset_path: Path) -> None:
 
 
 def test_the_noise_of_sensors_is_each_episodes_own(dataset_path: Path) -> None:
-    # On ground that stays what it is, nothing but the sensor's noise differs between seeds.
-    env = make(dataset_path, world={**STAKES, "noise": "stored"}, **SENSES["full, probe, copula"])
-    first, other, again = (env.reset(seed=seed, options={"map": 1})[0]["crop"] for seed in (0, 1, 0))
+    # On ground that stays what it is, nothing but the sensor's noise differs between
+    # seeds.
+    env = make(
+        dataset_path,
+        world={**STAKES, "noise": "stored"},
+        **SENSES["full, probe, copula"],
+    )
+    first, other, again = (
+        env.reset(seed=seed, options={"map": 1})[0]["crop"] for seed in (0, 1, 0)
+    )
     np.testing.assert_array_equal(first, again)
     assert np.abs(first[RISK] - other[RISK]).max() > 0.02

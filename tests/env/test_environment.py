@@ -30,7 +30,9 @@ AHEAD = np.array([1.0, 0.0], np.float32)
 def dataset_of(path: Path, *names: str) -> Path:
     """A dataset of some splits, in this order."""
     recipe = factories.tiny_recipe()
-    return factories.tiny_dataset(path, replace(recipe, splits={name: recipe.splits[name] for name in names}))
+    return factories.tiny_dataset(
+        path, replace(recipe, splits={name: recipe.splits[name] for name in names})
+    )
 
 
 def make(path: Path, world: Any = "paper", **settings: Any) -> Any:
@@ -55,8 +57,12 @@ def drive(env: Any, observation: dict[str, np.ndarray]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("robot", registry.names("robot"))
-def test_the_checkers_of_gymnasium_and_stable_baselines_pass(dataset_path: Path, robot: str) -> None:
-    env = make(dataset_path, world={"time_budget_s": 2.0}, robot=robot, objective="travel_time")
+def test_the_checkers_of_gymnasium_and_stable_baselines_pass(
+    dataset_path: Path, robot: str
+) -> None:
+    env = make(
+        dataset_path, world={"time_budget_s": 2.0}, robot=robot, objective="travel_time"
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         check_env(env)
@@ -72,7 +78,13 @@ def test_the_checkers_of_gymnasium_and_stable_baselines_pass(dataset_path: Path,
         {"robot": "differential_drive", "objective": "goal_distance"},
         {"world": {"noise": "stored", "time_budget_s": 1.0}, "goal_radius_m": 6.0},
         {"world": {"preset": "stakes", "time_budget_s": 1.0, "immobile": None}},
-        {"world": {"noise": "stored", "time_budget_s": 1.0, "immobile": {"below": 1.0, "for_s": 0.5}}},
+        {
+            "world": {
+                "noise": "stored",
+                "time_budget_s": 1.0,
+                "immobile": {"below": 1.0, "for_s": 0.5},
+            }
+        },
     ],
 )
 def test_each_vector_member_is_the_single_environment_with_its_seed(
@@ -84,8 +96,13 @@ def test_each_vector_member_is_the_single_environment_with_its_seed(
     batch, _ = vector.reset(seed=7)
     alone = [env.reset(seed=7 + i)[0] for i, env in enumerate(singles)]
     # One is further on, so that they do not end together.
-    for own, more in ((vector.unwrapped._batch, torch.tensor([0, 4, 0])), (singles[1]._batch, 4)):
-        own._now = replace(own._now, step=own._now.step + more, held=own._now.held + more // 2)
+    for own, more in (
+        (vector.unwrapped._batch, torch.tensor([0, 4, 0])),
+        (singles[1]._batch, 4),
+    ):
+        own._now = replace(
+            own._now, step=own._now.step + more, held=own._now.held + more // 2
+        )
     generator = np.random.default_rng(0)
     ended, episodes = [False] * 3, 0
     for _ in range(45):
@@ -110,7 +127,9 @@ def test_each_vector_member_is_the_single_environment_with_its_seed(
     assert episodes > 3
 
 
-def test_members_that_end_apart_begin_anew_alone(dataset_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_members_that_end_apart_begin_anew_alone(
+    dataset_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     built: list[int] = []
     draw = Realisation.__init__
 
@@ -133,8 +152,12 @@ def test_reward_is_progress_less_time_and_arrival_ends(dataset_path: Path) -> No
     assert info["is_success"] is False
     distance = info["distance_m"]
     for _ in range(1000):
-        observation, reward, terminated, truncated, info = env.step(drive(env, observation))
-        expected = distance - info["distance_m"] - 0.01 + 10 * (info["outcome"] == "success")
+        observation, reward, terminated, truncated, info = env.step(
+            drive(env, observation)
+        )
+        expected = (
+            distance - info["distance_m"] - 0.01 + 10 * (info["outcome"] == "success")
+        )
         assert reward == pytest.approx(expected, abs=1e-4)
         distance = info["distance_m"]
         assert info["is_success"] is (distance < 1)
@@ -147,7 +170,9 @@ def test_reward_is_progress_less_time_and_arrival_ends(dataset_path: Path) -> No
 
 
 def leave(env: Any) -> tuple[int, float, dict[str, Any], float]:
-    """Drives off the map: steps taken, the last one's reward and info, the distance to the goal before it."""
+    """Drives off the map: steps taken, the last one's reward and info, the distance to
+    the goal before it.
+    """
     observation, _ = env.reset(seed=0)
     env._batch._now.state[:, 2] = -np.pi * 0.75
     for count in range(1, 500):
@@ -185,12 +210,16 @@ def test_an_objectives_reward_is_minus_its_stage_cost(dataset_path: Path) -> Non
         assert met[0] == info["traversability"]
 
 
-def test_an_objective_is_taken_by_name_with_options_and_the_robot(dataset_path: Path) -> None:
+def test_an_objective_is_taken_by_name_with_options_and_the_robot(
+    dataset_path: Path,
+) -> None:
     slow = {"part": "unicycle", "options": {"dt_s": 0.5}}
     near = make(dataset_path, objective="travel_time", robot=slow)
     near.reset(seed=0)
     assert near.step(AHEAD)[1] == pytest.approx(-0.5)
-    arrived = make(dataset_path, objective="travel_time", robot=slow, goal_radius_m=500.0)
+    arrived = make(
+        dataset_path, objective="travel_time", robot=slow, goal_radius_m=500.0
+    )
     arrived.reset(seed=0)
     assert arrived.step(AHEAD)[1] == 0
     made = make(dataset_path, objective=TravelTime(Unicycle(dt_s=0.25), 1.0))
@@ -198,15 +227,22 @@ def test_an_objective_is_taken_by_name_with_options_and_the_robot(dataset_path: 
     assert made.step(AHEAD)[1] == pytest.approx(-0.25)
 
 
-def test_leaving_the_map_costs_what_standing_there_until_the_end_would(dataset_path: Path) -> None:
+def test_leaving_the_map_costs_what_standing_there_until_the_end_would(
+    dataset_path: Path,
+) -> None:
     env = make(dataset_path, objective="goal_distance", world={"time_budget_s": 60.0})
     steps, reward, info, distance = leave(env)
     assert info["outcome"] == "out_of_bounds"
     assert reward == pytest.approx(-distance * (1 + 600 - steps), rel=1e-5)
 
 
-def test_a_robot_is_taken_by_name_and_its_state_and_actions_are_seen(dataset_path: Path) -> None:
-    part = {"part": "differential_drive", "options": {"speed_mps": [-0.5, 2.0], "dt_s": 0.2}}
+def test_a_robot_is_taken_by_name_and_its_state_and_actions_are_seen(
+    dataset_path: Path,
+) -> None:
+    part = {
+        "part": "differential_drive",
+        "options": {"speed_mps": [-0.5, 2.0], "dt_s": 0.2},
+    }
     for robot in (part, DifferentialDrive(speed_mps=(-0.5, 2.0), dt_s=0.2)):
         env = make(dataset_path, robot=robot, world={"noise": "stored"})
         assert env.observation_space["state"].shape == (5,)
@@ -229,16 +265,26 @@ def test_the_split_is_train_wherever_there_is_one(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # Gymnasium's, of every version that is not the last.
-        warnings.filterwarnings("ignore", message=".*is out of date", category=DeprecationWarning)
-        np.testing.assert_array_equal(shown(make(path), 2), stored.read("train", [2], ["rgb"])["rgb"][0])
+        warnings.filterwarnings(
+            "ignore", message=".*is out of date", category=DeprecationWarning
+        )
+        np.testing.assert_array_equal(
+            shown(make(path), 2), stored.read("train", [2], ["rgb"])["rgb"][0]
+        )
         first = stored.read("test/std", [1], ["rgb"])["rgb"]
         np.testing.assert_array_equal(shown(make(path, split="test/std"), 1), first[0])
-        np.testing.assert_array_equal(shown(make_vector(path, 1, split="test/std"), 1), first)
+        np.testing.assert_array_equal(
+            shown(make_vector(path, 1, split="test/std"), 1), first
+        )
 
 
-def test_a_dataset_without_train_gives_its_first_split_and_says_so(tmp_path: Path) -> None:
+def test_a_dataset_without_train_gives_its_first_split_and_says_so(
+    tmp_path: Path,
+) -> None:
     path = dataset_of(tmp_path / "tests.h5", "test/hs", "test/std")
-    with pytest.warns(UserWarning, match="no split 'train'; its split 'test/hs' is taken"):
+    with pytest.warns(
+        UserWarning, match="no split 'train'; its split 'test/hs' is taken"
+    ):
         env = make(path)
     stored = TerrainDataset(path).read("test/hs", [1], ["rgb"])["rgb"][0]
     np.testing.assert_array_equal(shown(env, 1), stored)
@@ -253,7 +299,9 @@ def test_time_budget_and_goal_radius_end_episodes(dataset_path: Path) -> None:
     assert env.step(AHEAD)[4]["is_success"] is True
 
 
-def test_each_episode_has_noise_of_its_own_and_stored_noise_has_none(dataset_path: Path) -> None:
+def test_each_episode_has_noise_of_its_own_and_stored_noise_has_none(
+    dataset_path: Path,
+) -> None:
     kinds = {}
     for noise in ("resampled", "stored", "frozen"):
         env = make(dataset_path, world={"noise": noise})
@@ -269,10 +317,18 @@ def test_each_episode_has_noise_of_its_own_and_stored_noise_has_none(dataset_pat
 
 def test_no_truth_is_observed(dataset_path: Path) -> None:
     env = make(dataset_path)
-    assert set(env.observation_space.spaces) == {"state", "goal", "rgb", "elevation_m", "slope_deg"}
+    assert set(env.observation_space.spaces) == {
+        "state",
+        "goal",
+        "rgb",
+        "elevation_m",
+        "slope_deg",
+    }
 
 
-def test_an_observation_that_is_written_into_changes_nothing(dataset_path: Path) -> None:
+def test_an_observation_that_is_written_into_changes_nothing(
+    dataset_path: Path,
+) -> None:
     vector = make_vector(dataset_path, 2)
     first, _ = vector.reset(seed=0)
     kept = {name: value.copy() for name, value in first.items()}
@@ -316,8 +372,13 @@ def test_misuse_is_named(dataset_path: Path) -> None:
 
 
 def test_the_world_with_stakes_immobilises_a_robot(dataset_path: Path) -> None:
-    # On ground of λ under 1, so everywhere; a frozen world would see to it that the start is no such ground.
-    held = {"noise": "stored", "time_budget_ratio": 3.0, "immobile": {"below": 1.0, "for_s": 0.4}}
+    # On ground of λ under 1, so everywhere; a frozen world would see to it that the
+    # start is no such ground.
+    held = {
+        "noise": "stored",
+        "time_budget_ratio": 3.0,
+        "immobile": {"below": 1.0, "for_s": 0.4},
+    }
     env = make(dataset_path, split="test/std", world=held, objective="goal_distance")
     env._batch._maps.traversability.clamp_(max=0.99)
     for seed in range(4):
@@ -335,7 +396,9 @@ def test_the_world_with_stakes_immobilises_a_robot(dataset_path: Path) -> None:
         shaped = make(dataset_path, split="test/std", world=held)
         shaped._batch._maps.traversability.clamp_(max=0.99)
         shaped.reset(seed=seed)
-        assert [shaped.step(np.zeros(2, np.float32))[1] for _ in range(4)][-1] == pytest.approx(-10.01)
+        assert [shaped.step(np.zeros(2, np.float32))[1] for _ in range(4)][
+            -1
+        ] == pytest.approx(-10.01)
 
 
 def test_a_world_may_be_given_as_itself(dataset_path: Path) -> None:
@@ -355,13 +418,18 @@ def test_maps_without_the_reference_times_that_stakes_need_are_one_line_with_the
 ) -> None:
     recipe = factories.tiny_recipe()
     split = replace(recipe.splits["train"], solvable=False)
-    path = factories.tiny_dataset(tmp_path / "d.h5", replace(recipe, splits={"train": split}))
+    path = factories.tiny_dataset(
+        tmp_path / "d.h5", replace(recipe, splits={"train": split})
+    )
     with pytest.raises(
-        ConfigError, match=r"none on 8 of 8.*create RECIPE id=NAME splits\.SPLIT\.solvable=true"
+        ConfigError,
+        match=r"none on 8 of 8.*create RECIPE id=NAME splits\.SPLIT\.solvable=true",
     ) as told:
         make(path, world="stakes")
     assert "\n" not in str(told.value)
-    made = make(path, world={"preset": "stakes", "time_budget_s": 60})  # as the line says
+    made = make(
+        path, world={"preset": "stakes", "time_budget_s": 60}
+    )  # as the line says
     made.reset(seed=0)
 
 
@@ -369,7 +437,9 @@ def test_layers_are_seen_by_their_names(tmp_path: Path) -> None:
     grass = Growth(height_m=(0.1, 0.8), cover=0.5, colour=(60, 110, 30))
     recipe = small_stakes(splits={"train": Split(scenario="std", maps=4)})
     soft = [item.name for item in recipe.classes if item.soft]
-    path = factories.tiny_dataset(tmp_path / "d.h5", grown(recipe, **dict.fromkeys(soft, grass)))
+    path = factories.tiny_dataset(
+        tmp_path / "d.h5", grown(recipe, **dict.fromkeys(soft, grass))
+    )
     stored = TerrainDataset(path).read("train")["vegetation_m"]
     env = make(path, world={"time_budget_s": 1.0})
     with warnings.catch_warnings():
@@ -379,14 +449,23 @@ def test_layers_are_seen_by_their_names(tmp_path: Path) -> None:
 
         check_env_for_sb3(env)
     seen, _ = env.reset(options={"map": 2})
-    assert set(env.observation_space) == {"state", "goal", "rgb", "elevation_m", "slope_deg", "vegetation_m"}
+    assert set(env.observation_space) == {
+        "state",
+        "goal",
+        "rgb",
+        "elevation_m",
+        "slope_deg",
+        "vegetation_m",
+    }
     np.testing.assert_array_equal(seen["vegetation_m"], stored[2])
     vector = make_vector(path, 3, world={"time_budget_s": 1.0})
     batch, info = vector.reset(seed=1)
     np.testing.assert_array_equal(batch["vegetation_m"], stored[info["map"]])
 
 
-def test_what_a_layer_does_not_know_is_0(dataset_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_layer_does_not_know_is_0(
+    dataset_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     read = TerrainDataset.terrain
 
     def terrain(dataset: TerrainDataset, *given: Any) -> Terrain:
@@ -403,7 +482,13 @@ def test_what_a_layer_does_not_know_is_0(dataset_path: Path, monkeypatch: pytest
 
 
 def test_without_layers_nothing_more_is_seen(dataset_path: Path) -> None:
-    assert set(make(dataset_path).observation_space) == {"state", "goal", "rgb", "elevation_m", "slope_deg"}
+    assert set(make(dataset_path).observation_space) == {
+        "state",
+        "goal",
+        "rgb",
+        "elevation_m",
+        "slope_deg",
+    }
 
 
 @pytest.mark.parametrize("name", ["state", "goal"])
@@ -418,6 +503,7 @@ def test_a_layer_may_not_take_the_name_of_what_is_seen(
 
     monkeypatch.setattr(TerrainDataset, "terrain", terrain)
     with pytest.raises(
-        ConfigError, match=f"layers that are not called 'state' or 'goal', got \\['{name}'\\]"
+        ConfigError,
+        match=f"layers that are not called 'state' or 'goal', got \\['{name}'\\]",
     ):
         make(dataset_path)

@@ -23,7 +23,10 @@ from benchnav.planning.world.world import World
 V0, V1 = "benchnav/OffRoad-v0", "benchnav/OffRoad-v1"
 EACH = pytest.mark.parametrize("name", [V0, V1])
 AHEAD = np.array([1.0, 0.0], np.float32)
-CHOSEN: dict[str, Any] = {"split": "train", "world": {"preset": "stakes", "time_budget_s": 0.3}}
+CHOSEN: dict[str, Any] = {
+    "split": "train",
+    "world": {"preset": "stakes", "time_budget_s": 0.3},
+}
 
 
 def settings_of(name: str, path: Path) -> dict[str, Any]:
@@ -35,10 +38,13 @@ def make(name: str, path: Path, **changes: Any) -> Any:
 
 
 def make_vector(name: str, path: Path, **changes: Any) -> Any:
-    return gymnasium.make_vec(name, num_envs=3, **{**settings_of(name, path), **changes})
+    return gymnasium.make_vec(
+        name, num_envs=3, **{**settings_of(name, path), **changes}
+    )
 
 
-# --- worker processes ------------------------------------------------------------------------------
+# --- worker processes
+# ------------------------------------------------------------------------------
 
 WORKERS = """
 import multiprocessing, os, sys
@@ -71,7 +77,9 @@ print(torch.get_num_threads())
 
 
 def output_of(code: str, limit_s: float = 120, **variables: str) -> tuple[str, str]:
-    """Output and errors of a Python process, which is killed with its workers at the limit."""
+    """Output and errors of a Python process, which is killed with its workers at the
+    limit.
+    """
     process = subprocess.Popen(
         [sys.executable, "-c", code],
         env={**os.environ, "OMP_NUM_THREADS": "4", **variables},
@@ -88,16 +96,28 @@ def output_of(code: str, limit_s: float = 120, **variables: str) -> tuple[str, s
         pytest.fail(f"no end within {limit_s} s, after: {out} {errors}")
 
 
-def test_asynchronous_vectors_step_whatever_threads_ran_before_their_workers_started() -> None:
+def test_asynchronous_vectors_step_whatever_threads_ran_before_their_workers_started() -> (
+    None
+):
     out, errors = output_of(WORKERS)
-    matrix = [f"{context} {threads}" for threads, context in product((1, 4), ("fork", "spawn", "forkserver"))]
-    # One thread in a worker, also for an environment that its parent made; the parent keeps its own.
+    matrix = [
+        f"{context} {threads}"
+        for threads, context in product((1, 4), ("fork", "spawn", "forkserver"))
+    ]
+    # One thread in a worker, also for an environment that its parent made; the parent
+    # keeps its own.
     assert out.splitlines() == [*matrix, "1", "1", "4"], errors
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")  # the model was trained on other classes
-def test_an_environment_with_a_checkpoint_is_pickled_in_the_midst_of_an_episode(dataset_path: Path) -> None:
-    env = gymnasium.make(V1, **{**settings_of(V1, dataset_path), "model": "stakes-v1", "sensor": "near"})
+@pytest.mark.filterwarnings(
+    "ignore::UserWarning"
+)  # the model was trained on other classes
+def test_an_environment_with_a_checkpoint_is_pickled_in_the_midst_of_an_episode(
+    dataset_path: Path,
+) -> None:
+    env = gymnasium.make(
+        V1, **{**settings_of(V1, dataset_path), "model": "stakes-v1", "sensor": "near"}
+    )
     env.reset(seed=0)
     env.step(AHEAD)
     other = pickle.loads(pickle.dumps(env))
@@ -108,7 +128,8 @@ def test_an_environment_with_a_checkpoint_is_pickled_in_the_midst_of_an_episode(
     np.testing.assert_array_equal(other.reset()[0]["crop"], env.reset()[0]["crop"])
 
 
-# --- actions ---------------------------------------------------------------------------------------
+# --- actions
+# ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -145,7 +166,9 @@ def test_an_action_that_is_not_finite_raises_and_changes_nothing(
 ) -> None:
     env, vector = make(name, dataset_path), make_vector(name, dataset_path)
     env.reset(seed=0)
-    with pytest.raises(ConfigError, match=r"finite actions, got \[1\.0, (nan|inf|-inf)\]\."):
+    with pytest.raises(
+        ConfigError, match=r"finite actions, got \[1\.0, (nan|inf|-inf)\]\."
+    ):
         env.step(np.array([1.0, value], np.float32))
     fresh = make(name, dataset_path)
     fresh.reset(seed=0)
@@ -163,7 +186,9 @@ def test_an_action_that_is_not_finite_raises_and_changes_nothing(
 
 
 @EACH
-def test_invalid_actions_leave_ended_sub_environments_as_they_are(dataset_path: Path, name: str) -> None:
+def test_invalid_actions_leave_ended_sub_environments_as_they_are(
+    dataset_path: Path, name: str
+) -> None:
     ahead, still = np.tile(AHEAD, (3, 1)), np.zeros((3, 2), np.float32)
     faulty = ahead.copy()
     faulty[1, 0] = np.nan
@@ -189,8 +214,13 @@ def test_invalid_actions_leave_ended_sub_environments_as_they_are(dataset_path: 
 
 
 @EACH
-def test_a_step_after_the_end_raises_until_a_reset(dataset_path: Path, name: str) -> None:
-    for changes in ({}, {"goal_radius_m": 500.0}):  # a time-out after 3 steps, and the goal after one
+def test_a_step_after_the_end_raises_until_a_reset(
+    dataset_path: Path, name: str
+) -> None:
+    for changes in (
+        {},
+        {"goal_radius_m": 500.0},
+    ):  # a time-out after 3 steps, and the goal after one
         env = make(name, dataset_path, **changes)
         env.reset(seed=0)
         ended = False
@@ -204,7 +234,8 @@ def test_a_step_after_the_end_raises_until_a_reset(dataset_path: Path, name: str
         env.step(AHEAD)
 
 
-# --- options of a reset ----------------------------------------------------------------------------
+# --- options of a reset
+# ----------------------------------------------------------------------------
 
 
 @EACH
@@ -237,7 +268,9 @@ def test_options_that_mean_nothing_are_rejected_and_change_nothing(
 
 
 @EACH
-def test_names_of_options_are_those_of_the_environment(dataset_path: Path, name: str) -> None:
+def test_names_of_options_are_those_of_the_environment(
+    dataset_path: Path, name: str
+) -> None:
     single, vector = make(name, dataset_path), make_vector(name, dataset_path)
     for index in (5, np.int64(5), np.uint8(5)):
         assert single.reset(options={"map": index})[1]["map"] == 5
@@ -248,14 +281,19 @@ def test_names_of_options_are_those_of_the_environment(dataset_path: Path, name:
         vector.reset(options={"reset_maks": np.ones(3, bool)})
 
 
-# --- rendering -------------------------------------------------------------------------------------
+# --- rendering
+# -------------------------------------------------------------------------------------
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")  # Gymnasium's, of a render mode that it does not know
+@pytest.mark.filterwarnings(
+    "ignore::UserWarning"
+)  # Gymnasium's, of a render mode that it does not know
 @pytest.mark.parametrize("mode", ["rgb_array", "human"])
 def test_version_0_says_which_version_draws(dataset_path: Path, mode: str) -> None:
     for build in (make, make_vector):
-        with pytest.raises(ConfigError, match=f"got '{mode}'. Take benchnav/OffRoad-v1"):
+        with pytest.raises(
+            ConfigError, match=f"got '{mode}'. Take benchnav/OffRoad-v1"
+        ):
             build(V0, dataset_path, render_mode=mode)
 
 
@@ -270,10 +308,13 @@ def test_the_checker_of_gymnasium_passes_without_a_display(
         warnings.simplefilter("ignore")
         check_env(make(name, dataset_path))
     monkeypatch.setenv("DISPLAY", ":0")
-    assert ("human" in make(name, dataset_path).metadata["render_modes"]) == (name == V1)
+    assert ("human" in make(name, dataset_path).metadata["render_modes"]) == (
+        name == V1
+    )
 
 
-# --- choices that were not made --------------------------------------------------------------------
+# --- choices that were not made
+# --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -302,7 +343,10 @@ def test_a_world_without_stakes_warns_unless_it_is_chosen(
 
 def test_a_privileged_model_warns_unless_it_is_chosen(dataset_path: Path) -> None:
     for build in (make, make_vector):
-        with pytest.warns(UserWarning, match="`model` is 'oracle' by default.*model='oracle' to choose it"):
+        with pytest.warns(
+            UserWarning,
+            match="`model` is 'oracle' by default.*model='oracle' to choose it",
+        ):
             build(V1, dataset_path, model="")
         for model in ("oracle", "clairvoyant"):
             with warnings.catch_warnings():
@@ -320,10 +364,16 @@ print(torch.get_num_threads())
 """
 
 
-def test_defaults_warn_once_in_a_process_which_keeps_its_threads(dataset_path: Path) -> None:
+def test_defaults_warn_once_in_a_process_which_keeps_its_threads(
+    dataset_path: Path,
+) -> None:
     out, errors = output_of(DEFAULTS.format(path=str(dataset_path)))
     assert out == "3\n"
-    assert (errors.count("WARN"), errors.count("`world` is"), errors.count("`model` is")) == (2, 1, 1), errors
+    assert (
+        errors.count("WARN"),
+        errors.count("`world` is"),
+        errors.count("`model` is"),
+    ) == (2, 1, 1), errors
 
 
 def test_a_warning_keeps_percent_signs() -> None:

@@ -31,15 +31,20 @@ def test_a_picture_shows_the_robot_where_it_is(dataset_path: Path) -> None:
         places.append(np.argwhere(orange).mean(0))
         x, y = env._batch._now.state[0, :2].tolist()
         width, _ = env._batch._maps.grid.extent_m
-        np.testing.assert_allclose(places[-1][::-1], (424 * x / width, 424 * (1 - y / width)), atol=8)
+        np.testing.assert_allclose(
+            places[-1][::-1], (424 * x / width, 424 * (1 - y / width)), atol=8
+        )
     assert np.abs(places[1] - places[0]).max() > 10
 
 
 def test_unseen_ground_is_darker(dataset_path: Path) -> None:
     seen, near = (
-        make(dataset_path, render_mode="rgb_array", sensor=sensor) for sensor in ("full", Near(2.0))
+        make(dataset_path, render_mode="rgb_array", sensor=sensor)
+        for sensor in ("full", Near(2.0))
     )
-    bright, dark = (env.reset(seed=0) and env.render()[MAP].mean() for env in (seen, near))
+    bright, dark = (
+        env.reset(seed=0) and env.render()[MAP].mean() for env in (seen, near)
+    )
     assert dark < 0.6 * bright
 
 
@@ -76,14 +81,20 @@ def test_nothing_is_drawn_without_a_mode(dataset_path: Path) -> None:
     assert vector.render() is None
 
 
-def test_a_window_needs_a_display(dataset_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_needs_a_display(
+    dataset_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("matplotlib.pyplot.get_backend", lambda: "agg")
     monkeypatch.delenv("MPLBACKEND", raising=False)
-    with pytest.raises(ConfigError, match='Expected a display for `render_mode` "human"'):
+    with pytest.raises(
+        ConfigError, match='Expected a display for `render_mode` "human"'
+    ):
         make(dataset_path, render_mode="human")
 
 
-def test_a_window_shows_each_step(dataset_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_shows_each_step(
+    dataset_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("MPLBACKEND", "agg")
     env = make(dataset_path, render_mode="human")
     shown: list[Any] = []
@@ -92,7 +103,9 @@ def test_a_window_shows_each_step(dataset_path: Path, monkeypatch: pytest.Monkey
     env.step(AHEAD)
     assert env.render() is None
     assert len(shown) == 2
-    drawn = gymnasium.make(env.spec.id, **{**env.spec.kwargs, "render_mode": "rgb_array"}).unwrapped
+    drawn = gymnasium.make(
+        env.spec.id, **{**env.spec.kwargs, "render_mode": "rgb_array"}
+    ).unwrapped
     drawn.reset(seed=0)
     drawn.step(AHEAD)
     np.testing.assert_array_equal(shown[1], drawn.render())

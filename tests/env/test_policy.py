@@ -26,23 +26,33 @@ def toward(seen: dict[str, np.ndarray]) -> np.ndarray:
     """Full speed at the goal, slower on ground of low λ̂; normalised."""
     cosine, sine = seen["state"][:, 1], seen["state"][:, 2]
     ahead = seen["crop"][:, CHANNELS.index("risk"), 14:18, 12:16].mean((1, 2))
-    return np.stack((2 * ahead - 1, np.clip(2 * np.arctan2(sine, cosine), -1, 1)), axis=1)
+    return np.stack(
+        (2 * ahead - 1, np.clip(2 * np.arctan2(sine, cosine), -1, 1)), axis=1
+    )
 
 
 def problem_of(batch: EgocentricBatch) -> Problem:
-    """The problem that an evaluation would pose of what an environment's robots know now."""
+    """The problem that an evaluation would pose of what an environment's robots know
+    now.
+    """
     simulation, now = batch._current()
     knowledge, learner = batch._experience._current(), batch._experience._learner
     chosen = torch.from_numpy(batch._map)
-    prediction = Prediction(knowledge.observation, learner.distribution(knowledge), knowledge.risk_map)
+    prediction = Prediction(
+        knowledge.observation, learner.distribution(knowledge), knowledge.risk_map
+    )
     start_m, goal_m = batch._places.start_m[chosen], batch._places.goal_m[chosen]
-    posed = pose_problem(batch._task, prediction, start_m, goal_m, simulation.time_budget_s)
+    posed = pose_problem(
+        batch._task, prediction, start_m, goal_m, simulation.time_budget_s
+    )
     return replace(posed, start=now.state)
 
 
 def test_a_policy_keeps_the_contract_of_planners() -> None:
     check_planner(PolicyPlanner(toward, normalised_actions=True))
-    check_planner(PolicyPlanner(lambda seen: toward(seen) * 9, crop_cells=20, crop_behind=0.5))
+    check_planner(
+        PolicyPlanner(lambda seen: toward(seen) * 9, crop_cells=20, crop_behind=0.5)
+    )
 
 
 @EACH
@@ -77,7 +87,9 @@ def test_it_drives_in_an_evaluation_as_in_the_environment(dataset_path: Path) ->
     seen, _ = env.reset(seed=1)
     same.reset(seed=1)
     problem, (simulation, _) = problem_of(batch_of(same)), batch_of(same)._current()
-    found = run_episodes(PolicyPlanner(toward, normalised_actions=True), problem, simulation, GENERATOR)
+    found = run_episodes(
+        PolicyPlanner(toward, normalised_actions=True), problem, simulation, GENERATOR
+    )
     for count in range(int(found.steps[0])):
         action = toward({name: values[None] for name, values in seen.items()})[0]
         seen, _, terminated, truncated, info = env.step(action.astype(np.float32))
@@ -93,8 +105,12 @@ def test_what_was_not_seen_is_unknown_to_it(dataset_path: Path) -> None:
     env.reset(seed=0)
     problem = problem_of(batch_of(env))
     planner = PolicyPlanner(toward)
-    step = Step(state=problem.start, traversability=torch.tensor([torch.nan]), time_s=0.0)
-    known = planner.observe(step, planner.init(problem, GENERATOR))["crop"][0, CHANNELS.index("known")]
+    step = Step(
+        state=problem.start, traversability=torch.tensor([torch.nan]), time_s=0.0
+    )
+    known = planner.observe(step, planner.init(problem, GENERATOR))["crop"][
+        0, CHANNELS.index("known")
+    ]
     assert 9 <= known.sum() < 60
 
 
@@ -114,7 +130,9 @@ def test_actions_are_the_policys_within_the_bounds(dataset_path: Path) -> None:
     assert action([9.0, -9.0]) == [1.5, -1.0]
     assert action([0.5, -0.5], normalised_actions=True) == [1.0, -0.5]
     assert action([9.0, -9.0], normalised_actions=True) == [1.5, -1.0]
-    with pytest.raises(ConfigError, match=r"actions of shape \[1, 2\] from the policy, got \[1, 3\]"):
+    with pytest.raises(
+        ConfigError, match=r"actions of shape \[1, 2\] from the policy, got \[1, 3\]"
+    ):
         action([1.0, 2.0, 3.0])
 
 
@@ -127,4 +145,6 @@ def test_a_policy_in_a_file_is_a_part(tmp_path: Path) -> None:
         "    def __init__(self, speed: float = 1.0):\n"
         "        super().__init__(lambda seen: np.tile([speed, 0.0], (len(seen['state']), 1)))\n"
     )
-    check_planner({"part": f"{path}:Mine", "options": {"speed": 0.5}}, robots=["unicycle"])
+    check_planner(
+        {"part": f"{path}:Mine", "options": {"speed": 0.5}}, robots=["unicycle"]
+    )

@@ -48,20 +48,30 @@ def test_the_batch_is_what_environments_one_after_the_other_are(
                 ended += 1
                 assert own["TimeLimit.truncated"] == other["TimeLimit.truncated"]
                 for name, values in other["terminal_observation"].items():
-                    np.testing.assert_allclose(own["terminal_observation"][name], values, atol=2e-5)
+                    np.testing.assert_allclose(
+                        own["terminal_observation"][name], values, atol=2e-5
+                    )
     assert ended == 6
 
 
 def test_ppo_trains_and_its_policy_is_a_planner(
-    example: dict[str, Any], dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    example: dict[str, Any],
+    dataset_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(example["train"].__globals__, "KNOWS", {"model": "oracle"})
-    monkeypatch.setattr(example["Batched"], "__init__", _short(example["Batched"].__init__))
+    monkeypatch.setattr(
+        example["Batched"], "__init__", _short(example["Batched"].__init__)
+    )
     path = tmp_path / "ppo.zip"
     ppo = example["train"](str(dataset_path), str(path), steps=64, count=4, rollout=16)
     assert ppo.num_timesteps == 64
     assert ppo.ep_info_buffer
-    check_planner({"part": f"{EXAMPLE}:Policy", "options": {"path": str(path)}}, robots=["unicycle"])
+    check_planner(
+        {"part": f"{EXAMPLE}:Policy", "options": {"path": str(path)}},
+        robots=["unicycle"],
+    )
 
 
 def _short(init: Any) -> Any:

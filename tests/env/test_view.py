@@ -11,14 +11,18 @@ from benchnav.core.grid import Grid
 from benchnav.env.view import CHANNELS, Known, View, bounds
 
 GRID = Grid(13, 17, 0.5)
-RISK, SPREAD, RISE, KNOWN = (CHANNELS.index(name) for name in ("risk", "spread", "rise", "known"))
+RISK, SPREAD, RISE, KNOWN = (
+    CHANNELS.index(name) for name in ("risk", "spread", "rise", "known")
+)
 
 
 def known(batch: int = 1, seed: int = 0) -> Known:
     generator = torch.Generator().manual_seed(seed)
     maps = torch.rand(3, batch, *GRID.shape, generator=generator)
     seen = torch.rand(batch, *GRID.shape, generator=generator) > 0.3
-    return Known(risk_map=maps[0], spread=maps[1] / 2, elevation_m=4 * maps[2], seen=seen)
+    return Known(
+        risk_map=maps[0], spread=maps[1] / 2, elevation_m=4 * maps[2], seen=seen
+    )
 
 
 @settings(max_examples=40, deadline=None)
@@ -35,11 +39,16 @@ def test_a_crop_is_what_lies_around_the_robot(
     ground, length = known(), cells * 0.5
     state = torch.tensor([[x, y, heading]], dtype=torch.float64)
     found = View(cells=cells, behind=behind).crop(GRID, ground, state)[0]
-    own_row, own_column = (min(max(int(at // 0.5), 0), most - 1) for at, most in ((y, 13), (x, 17)))
+    own_row, own_column = (
+        min(max(int(at // 0.5), 0), most - 1) for at, most in ((y, 13), (x, 17))
+    )
     own = float(ground.elevation_m[0, own_row, own_column])
     for i in range(cells):
         for j in range(cells):
-            ahead, left = (j + 0.5) * 0.5 - behind * length, (i + 0.5) * 0.5 - length / 2
+            ahead, left = (
+                (j + 0.5) * 0.5 - behind * length,
+                (i + 0.5) * 0.5 - length / 2,
+            )
             at_x = x + ahead * math.cos(heading) - left * math.sin(heading)
             at_y = y + ahead * math.sin(heading) + left * math.cos(heading)
             if min(abs(2 * at - round(2 * at)) for at in (at_x, at_y)) < 1e-6:
@@ -51,8 +60,12 @@ def test_a_crop_is_what_lies_around_the_robot(
             seen = bool(ground.seen[0, row, column])
             rise = (float(ground.elevation_m[0, row, column]) - own) / (length / 2)
             assert float(found[RISK, i, j]) == float(ground.risk_map[0, row, column])
-            assert float(found[SPREAD, i, j]) == 2 * float(ground.spread[0, row, column])
-            assert float(found[RISE, i, j]) == pytest.approx(max(-1, min(1, rise)) * seen, abs=1e-6)
+            assert float(found[SPREAD, i, j]) == 2 * float(
+                ground.spread[0, row, column]
+            )
+            assert float(found[RISE, i, j]) == pytest.approx(
+                max(-1, min(1, rise)) * seen, abs=1e-6
+            )
             assert float(found[KNOWN, i, j]) == seen
 
 
@@ -63,7 +76,9 @@ def test_each_member_of_a_batch_has_a_crop_of_its_own() -> None:
     assert whole.dtype == torch.float32
     for member in range(3):
         own = torch.tensor([member])
-        assert torch.equal(view.crop(GRID, ground.select(own), state[own])[0], whole[member])
+        assert torch.equal(
+            view.crop(GRID, ground.select(own), state[own])[0], whole[member]
+        )
 
 
 def test_the_corners_enclose_the_crop() -> None:
@@ -95,7 +110,10 @@ def test_what_a_robot_has_beyond_its_pose_follows_within_bounds() -> None:
     torch.testing.assert_close(found[5:], torch.tensor([0.5, -0.75]))
     low, high = bounds(5)
     assert len(low) == len(high) == len(found)
-    assert all(least <= value <= most for least, value, most in zip(low, found.tolist(), high, strict=True))
+    assert all(
+        least <= value <= most
+        for least, value, most in zip(low, found.tolist(), high, strict=True)
+    )
 
 
 @pytest.mark.parametrize("changes", [{"cells": 1}, {"behind": 1.0}, {"behind": -0.1}])

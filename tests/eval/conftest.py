@@ -1,4 +1,6 @@
-"""Runs of tests time a few steps of one robot alone, not a hundred; the tests of latency time what runs time."""
+"""Runs of tests time a few steps of one robot alone, not a hundred; the tests of
+latency time what runs time.
+"""
 
 from benchnav.eval.run import latency
 

@@ -1,4 +1,6 @@
-"""Runs that were made or changed by hand and yet sealed, as if benchnav had written them so."""
+"""Runs that were made or changed by hand and yet sealed, as if benchnav had written
+them so.
+"""
 
 import hashlib
 import json
@@ -11,7 +13,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchnav.eval.folder.provenance import code_digest
-from benchnav.eval.folder.run_folder import EPISODES, FORMAT_VERSION, open_run, write_run
+from benchnav.eval.folder.run_folder import (
+    EPISODES,
+    FORMAT_VERSION,
+    open_run,
+    write_run,
+)
 from benchnav.eval.folder.sealed import with_metadata
 
 CODE: dict[str, dict[str, Any]] = {
@@ -30,15 +37,23 @@ def code_with(**changes: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 def forge_rows(folder: Path, rows: pd.DataFrame) -> None:
     """Replaces the table of a run; success follows the outcome."""
-    _write_rows(folder, rows.assign(success=rows["outcome"] == "success"), open_run(folder).about)
+    _write_rows(
+        folder,
+        rows.assign(success=rows["outcome"] == "success"),
+        open_run(folder).about,
+    )
 
 
 def forge_run(
-    folder: Path, rows: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]], **changes: Any
+    folder: Path,
+    rows: pd.DataFrame,
+    conditions: Mapping[str, Mapping[str, Any]],
+    **changes: Any,
 ) -> Path:
     """Makes a finished run of a table by one code.
 
-    `conditions` are as `run.json` has them, and `changes` other keys, or `code`, which made the rows.
+    `conditions` are as `run.json` has them, and `changes` other keys, or `code`, which
+    made the rows.
     """
     code = changes.pop("code", CODE)
     digest = code_digest(code)
@@ -51,7 +66,9 @@ def forge_run(
         "history": [], "machine": {"processor": "AMD", "cores": 2, "host": "here"},
     }  # fmt: skip
     folder.mkdir(parents=True)
-    _write_rows(folder, rows.assign(code=digest), json.loads(json.dumps(about | changes)))
+    _write_rows(
+        folder, rows.assign(code=digest), json.loads(json.dumps(about | changes))
+    )
     return folder
 
 
@@ -64,4 +81,9 @@ def _write_rows(folder: Path, rows: pd.DataFrame, about: Mapping[str, Any]) -> N
 def forge_steps(path: Path, steps: pd.DataFrame) -> None:
     """Writes a file of steps by hand, sealed as those of a run are."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(with_metadata(pa.Table.from_pandas(steps, preserve_index=False), {"key": "forged"}), path)
+    pq.write_table(
+        with_metadata(
+            pa.Table.from_pandas(steps, preserve_index=False), {"key": "forged"}
+        ),
+        path,
+    )

@@ -48,8 +48,15 @@ class Spy(Planner[Any]):
         note, observed = plan_state
         observed = [*observed, step.traversability]
         if len(observed) == 4:
-            torch.save({**note, "observed": torch.stack(observed[1:])}, self.log / f"{uuid.uuid4().hex}.pt")
-        return torch.zeros(len(step.state), 2), (note, observed), Plan.empty(len(step.state))
+            torch.save(
+                {**note, "observed": torch.stack(observed[1:])},
+                self.log / f"{uuid.uuid4().hex}.pt",
+            )
+        return (
+            torch.zeros(len(step.state), 2),
+            (note, observed),
+            Plan.empty(len(step.state)),
+        )
 
 
 class TwoModes(TraversabilityModel):
@@ -57,11 +64,15 @@ class TwoModes(TraversabilityModel):
 
     def predict(self, observation):  # type: ignore[no-untyped-def]
         half = torch.full((len(observation.rgb), 2, *observation.grid.shape), 0.5)
-        return TraversabilityMixture(half, half + torch.tensor([0.4, 0.1]).view(2, 1, 1), 0.1 * half)
+        return TraversabilityMixture(
+            half, half + torch.tensor([0.4, 0.1]).view(2, 1, 1), 0.1 * half
+        )
 
 
 class Faulty(Planner[Problem]):
-    """Drives straight on until `after_s`, then does something wrong for the episode nearest to its goal."""
+    """Drives straight on until `after_s`, then does something wrong for the episode
+    nearest to its goal.
+    """
 
     def __init__(self, fault: str = "none", after_s: float = 1.0) -> None:
         self.fault, self.after_s = fault, after_s
@@ -137,7 +148,9 @@ class Still(Faulty):
 
 
 class Timed(Faulty):
-    """Takes 80 ms for its first step, then 4 ms and for every tenth 40 ms; notes how many robots it plans for."""
+    """Takes 80 ms for its first step, then 4 ms and for every tenth 40 ms; notes how
+    many robots it plans for.
+    """
 
     writes = ("log",)
 
@@ -163,7 +176,9 @@ class Picky(Faulty):
 
 
 class Held(Faulty):
-    """Writes down which process began it; one that a file beside names, `PID N`, ends nothing from its Nth on."""
+    """Writes down which process began it; one that a file beside names, `PID N`, ends
+    nothing from its Nth on.
+    """
 
     writes = ("log",)
 
@@ -177,7 +192,9 @@ class Held(Faulty):
             log.write(f"{own}\n")
         if hold.exists():
             named, first = hold.read_text().split()
-            while own == named and self.log.read_text().splitlines().count(own) >= int(first):
+            while own == named and self.log.read_text().splitlines().count(own) >= int(
+                first
+            ):
                 time.sleep(0.05)
         return problem
 
@@ -232,7 +249,11 @@ class Noting(Still):
 
     def _noted(self, problem: Problem) -> Problem:
         observation = problem.observation
-        note = {"rgb": observation.rgb, "seen": observation.layers.get("seen"), "risk_map": problem.risk_map}
+        note = {
+            "rgb": observation.rgb,
+            "seen": observation.layers.get("seen"),
+            "risk_map": problem.risk_map,
+        }
         torch.save(note, self.log / f"{len(list(self.log.iterdir())):03d}.pt")
         return problem
 

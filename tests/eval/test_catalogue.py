@@ -1,4 +1,6 @@
-"""What `benchnav-eval list` shows: every part with its options, and nothing hidden by one that is broken."""
+"""What `benchnav-eval list` shows: every part with its options, and nothing hidden by
+one that is broken.
+"""
 
 import json
 import re
@@ -13,7 +15,13 @@ from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.tables import to_terminal
 from benchnav.eval import catalogue
-from benchnav.eval.catalogue import Entry, list_entries, make_table, plain_lines, print_catalogue
+from benchnav.eval.catalogue import (
+    Entry,
+    list_entries,
+    make_table,
+    plain_lines,
+    print_catalogue,
+)
 from benchnav.models.base import is_family
 
 CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
@@ -67,7 +75,9 @@ def test_options_are_told_with_types_defaults_and_those_within() -> None:
 
 
 @pytest.mark.parametrize("kind", registry.KINDS)
-def test_every_known_part_is_listed_with_a_purpose_and_all_its_options(kind: str) -> None:
+def test_every_known_part_is_listed_with_a_purpose_and_all_its_options(
+    kind: str,
+) -> None:
     entries = {entry.name: entry for entry in list_entries(kind)}
     for name in registry.names(kind):
         assert entries[name].purpose
@@ -112,7 +122,9 @@ def test_a_part_that_cannot_be_imported_hides_no_other(
     info = tmp_path / "broken-1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
-    (info / "entry_points.txt").write_text("[benchnav.risks]\nbroken = nowhere_at_all:risk\n")
+    (info / "entry_points.txt").write_text(
+        "[benchnav.risks]\nbroken = nowhere_at_all:risk\n"
+    )
     monkeypatch.syspath_prepend(tmp_path)
     entries = {entry.name: entry.purpose for entry in list_entries("risk")}
     assert entries["broken"].startswith("cannot be used: ")
@@ -130,21 +142,38 @@ def test_checkpoints_here_and_of_this_checkout_are_listed(
     Path("checkpoints/damaged").mkdir()
     Path("checkpoints/damaged/config.json").write_text("{")
     entries = {entry.name: entry.purpose for entry in list_entries("model")}
-    assert entries["mine"] == "Checkpoint of the family theirs in checkpoints/mine, 10 classes."
-    assert entries["damaged"].startswith("cannot be used: checkpoints/damaged/config.json is damaged")
-    assert entries["paper-v1"] == f"Checkpoint of the family fused in {CHECKPOINTS / 'paper-v1'}, 10 classes."
+    assert (
+        entries["mine"]
+        == "Checkpoint of the family theirs in checkpoints/mine, 10 classes."
+    )
+    assert entries["damaged"].startswith(
+        "cannot be used: checkpoints/damaged/config.json is damaged"
+    )
+    assert (
+        entries["paper-v1"]
+        == f"Checkpoint of the family fused in {CHECKPOINTS / 'paper-v1'}, 10 classes."
+    )
 
 
-def test_plain_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_plain_lines_where_there_is_no_terminal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     print_catalogue("planner")
     out = capsys.readouterr().out.splitlines()
     assert out == plain_lines("planner")
     at = out.index("planner mine: Plans [somehow].")
     assert out[at + 1 : at + 3] == ["    count: int (required)", '    mode: str = "a"']
     print_catalogue("risk", "robot")
-    assert capsys.readouterr().out.splitlines() == [*plain_lines("risk"), *plain_lines("robot")]
+    assert capsys.readouterr().out.splitlines() == [
+        *plain_lines("risk"),
+        *plain_lines("robot"),
+    ]
     print_catalogue("")
-    kinds = [line.split()[0] for line in capsys.readouterr().out.splitlines() if not line.startswith(" ")]
+    kinds = [
+        line.split()[0]
+        for line in capsys.readouterr().out.splitlines()
+        if not line.startswith(" ")
+    ]
     assert list(dict.fromkeys(kinds)) == [*registry.KINDS, "world"]
 
 

@@ -30,15 +30,23 @@ def run(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read_all(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, Any]:
-    """What commands read of a run: its table, its warnings and header, a comparison, an episode."""
+    """What commands read of a run: its table, its warnings and header, a comparison, an
+    episode.
+    """
     report = read_report(folder)
     compared, _ = compare_runs([folder], "", "", {}, 0.05)
     find_episodes(folder, {}, None, 0, 0)
-    return report.summary, compared, (report.table, report.header, report.about.get("device"))
+    return (
+        report.summary,
+        compared,
+        (report.table, report.header, report.about.get("device")),
+    )
 
 
 def outcome(folder: Path) -> Any:
-    """What is read; None where it is refused, which commands do in one line. What else is raised fails the test."""
+    """What is read; None where it is refused, which commands do in one line. What else
+    is raised fails the test.
+    """
     try:
         return read_all(folder)
     except BenchnavError:
@@ -50,7 +58,9 @@ def seeds(count: int) -> range:
 
 
 @pytest.mark.parametrize("count", [50, pytest.param(300, marks=pytest.mark.slow)])
-def test_an_edited_run_is_refused_or_read_as_it_was(count: int, run: Path, tmp_path: Path) -> None:
+def test_an_edited_run_is_refused_or_read_as_it_was(
+    count: int, run: Path, tmp_path: Path
+) -> None:
     before, refused = read_all(run), 0
     for seed in seeds(count):
         chance = random.Random(seed)
@@ -62,8 +72,12 @@ def test_an_edited_run_is_refused_or_read_as_it_was(count: int, run: Path, tmp_p
         after = outcome(folder)
         refused += after is None
         if after is not None:
-            pd.testing.assert_frame_equal(after[0], before[0], obj=f"seed {seed}, {said}")
-            pd.testing.assert_frame_equal(after[1], before[1], obj=f"seed {seed}, {said}")
+            pd.testing.assert_frame_equal(
+                after[0], before[0], obj=f"seed {seed}, {said}"
+            )
+            pd.testing.assert_frame_equal(
+                after[1], before[1], obj=f"seed {seed}, {said}"
+            )
             assert after[2] == before[2], f"seed {seed}, {said}"
         shutil.rmtree(folder)
     assert refused > 0.9 * count

@@ -23,9 +23,13 @@ SMALL = (
 )  # fmt: skip
 
 
-def test_run_report_and_replay(dataset_path: Path, tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_run_report_and_replay(
+    dataset_path: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:  # type: ignore[no-untyped-def]
     out = tmp_path / "run"
-    assert call("eval", "run", "--data", str(dataset_path), "--out", str(out), *SMALL) == 0
+    assert (
+        call("eval", "run", "--data", str(dataset_path), "--out", str(out), *SMALL) == 0
+    )
     printed = capsys.readouterr().out
     assert "mppi" in printed
     assert str(out / "report.html") in printed
@@ -40,16 +44,29 @@ def test_run_report_and_replay(dataset_path: Path, tmp_path: Path, monkeypatch, 
     assert call("eval", *again, "--seed", "1") == 0
     assert f"{out} is extended by more episodes" in capsys.readouterr().err
     # A suite that cannot be run drops nothing.
-    monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)  # a report takes longer than a run
+    monkeypatch.setattr(
+        eval_cli, "_finish", eval_cli._failed
+    )  # a report takes longer than a run
     assert call("eval", *again, "--overwrite", "true", "--maps", "99") == 2
     assert (out / "episodes.parquet").exists()
     assert call("eval", *again, "--overwrite") == 0
     assert "already" not in capsys.readouterr().err
 
 
-def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_world_and_task_are_set_field_by_field(
+    dataset_path: Path, tmp_path: Path, monkeypatch
+) -> None:  # type: ignore[no-untyped-def]
     out = tmp_path / "run"
-    arguments = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL, "--world", "paper")
+    arguments = (
+        "run",
+        "--data",
+        str(dataset_path),
+        "--out",
+        str(out),
+        *SMALL,
+        "--world",
+        "paper",
+    )
     arguments += (
         "--world.noise",
         "stored",
@@ -61,9 +78,15 @@ def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Pat
     monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)
     assert call("eval", *arguments) == 0
     for condition, _ in open_run(out).conditions.values():
-        assert (condition.world.noise, condition.world.time_budget_s) == ("stored", 10.0)
+        assert (condition.world.noise, condition.world.time_budget_s) == (
+            "stored",
+            10.0,
+        )
         assert condition.rules.min_traversability == 0.05
-        assert (condition.rules.free_space.by, condition.rules.free_space.above) == ("mean", 0.1)
+        assert (condition.rules.free_space.by, condition.rules.free_space.above) == (
+            "mean",
+            0.1,
+        )
 
 
 @pytest.mark.parametrize(
@@ -71,7 +94,10 @@ def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Pat
     [
         (("--world", "stakes"), "stakes"),
         (("--world", "[paper,stakes]"), ["paper", "stakes"]),
-        (("--world", "stakes", "--world.noise", "stored"), {"preset": "stakes", "noise": "stored"}),
+        (
+            ("--world", "stakes", "--world.noise", "stored"),
+            {"preset": "stakes", "noise": "stored"},
+        ),
     ],
 )
 def test_a_world_is_given_by_name_as_several_or_with_its_fields(
@@ -95,7 +121,10 @@ LIMITED = Settings.on("auto", planner_limit_s=2.5)
     ],
 )  # fmt: skip
 def test_the_options_of_run_are_those_that_the_suite_is_run_with(
-    words: tuple[str, ...], changed: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: tuple[str, ...],
+    changed: dict[str, object],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     given: list[dict[str, object]] = []
 
@@ -116,12 +145,19 @@ def test_the_options_of_run_are_those_that_the_suite_is_run_with(
     assert told["folder"] == tmp_path / "run"
 
 
-def test_a_planner_that_fails_ends_with_status_1(dataset_path: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
-    out, faulty = tmp_path / "run", "{part: tests.eval.parts:Faulty, label: bad, options: {fault: raise}}"
+def test_a_planner_that_fails_ends_with_status_1(
+    dataset_path: Path, tmp_path: Path, capsys
+) -> None:  # type: ignore[no-untyped-def]
+    out, faulty = (
+        tmp_path / "run",
+        "{part: tests.eval.parts:Faulty, label: bad, options: {fault: raise}}",
+    )
     arguments = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL[2:-2])
     assert call("eval", *arguments, "--planners", f"[straight,{faulty}]") == 1
     captured = capsys.readouterr()
-    assert "failed in some episodes (1 planner_error); the first fault: " in captured.err
+    assert (
+        "failed in some episodes (1 planner_error); the first fault: " in captured.err
+    )
     assert "errors.txt" in captured.err
     assert "straight" in captured.out
 
@@ -153,10 +189,15 @@ def test_shipped_suites_are_found_by_name_and_have_the_blind_baseline(capsys) ->
     assert "Did you mean" in capsys.readouterr().err
 
 
-def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_a_config_file_and_print_config(
+    dataset_path: Path, tmp_path: Path, capsys
+) -> None:  # type: ignore[no-untyped-def]
     config = tmp_path / "suite.yaml"
     config.write_text(f"data: {dataset_path}\nmodel: oracle\nrisks: [mean]\n")
-    assert call("eval", "run", "--config", str(config), "--seed", "3", "--print_config") == 0
+    assert (
+        call("eval", "run", "--config", str(config), "--seed", "3", "--print_config")
+        == 0
+    )
     printed = capsys.readouterr().out
     assert "seed: 3" in printed
     assert "- mean" in printed
@@ -182,7 +223,17 @@ def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, caps
         ("run", "--shard", "3/2", "--model", "oracle"),
         ("run", "--backend", "dask", "--model", "oracle"),
         ("run", "--scheduler", "tcp://127.0.0.1:1", "--model", "oracle"),
-        ("run", "--backend", "dask", "--scheduler", "tcp://127.0.0.1:1", "--jobs", "2", "--model", "oracle"),
+        (
+            "run",
+            "--backend",
+            "dask",
+            "--scheduler",
+            "tcp://127.0.0.1:1",
+            "--jobs",
+            "2",
+            "--model",
+            "oracle",
+        ),
         ("merge", "whole"),
         ("merge", "whole", "no-such"),
         ("rerun", "no-such"),
@@ -191,10 +242,16 @@ def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, caps
         ("fly",),
     ],
 )
-def test_bad_input_is_one_line_and_status_2(arguments, dataset_path, tmp_path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_bad_input_is_one_line_and_status_2(
+    arguments, dataset_path, tmp_path, monkeypatch, capsys
+) -> None:  # type: ignore[no-untyped-def]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    extra = ("--data", str(dataset_path)) if arguments[0] == "run" and "--data" not in arguments else ()
+    extra = (
+        ("--data", str(dataset_path))
+        if arguments[0] == "run" and "--data" not in arguments
+        else ()
+    )
     assert call("eval", *arguments, *extra) == 2
     captured = capsys.readouterr()
     assert captured.out == ""

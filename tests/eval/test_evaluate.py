@@ -1,4 +1,6 @@
-"""`evaluate` on objects gives the rows that the command gives by names; results answer without another file."""
+"""`evaluate` on objects gives the rows that the command gives by names; results answer
+without another file.
+"""
 
 import sys
 from importlib import import_module
@@ -13,7 +15,16 @@ from benchnav.core.errors import ConfigError
 from benchnav.eval import Suite, evaluate, open_run, run_suite
 from benchnav.eval.results import Results
 from benchnav.models import load_model
-from benchnav.planning import AStarDWA, CVaR, FreeSpace, Mean, Rules, Straight, Unicycle, World
+from benchnav.planning import (
+    AStarDWA,
+    CVaR,
+    FreeSpace,
+    Mean,
+    Rules,
+    Straight,
+    Unicycle,
+    World,
+)
 from benchnav.planning.world.world import read_world
 from tests.commands import call
 from tests.factories import tiny_recipe
@@ -23,8 +34,12 @@ FAST = Unicycle(speed_mps=(0.0, 2.0))
 
 def results_of(rows: pd.DataFrame) -> pd.DataFrame:
     """What does not depend on the clock."""
-    timed = [name for name in rows if name.startswith("planning_") or name == "learning_ms"]
-    return rows.drop(columns=[*timed, "code"]).sort_values(["condition", "map"], ignore_index=True)
+    timed = [
+        name for name in rows if name.startswith("planning_") or name == "learning_ms"
+    ]
+    return rows.drop(columns=[*timed, "code"]).sort_values(
+        ["condition", "map"], ignore_index=True
+    )
 
 
 @pytest.fixture(scope="module")
@@ -43,14 +58,20 @@ def run(dataset_path: Path) -> Results:
     )
 
 
-def test_objects_give_the_rows_that_names_give(run: Results, dataset_path: Path, tmp_path: Path) -> None:
+def test_objects_give_the_rows_that_names_give(
+    run: Results, dataset_path: Path, tmp_path: Path
+) -> None:
     suite = Suite(
         data=str(dataset_path),
         planners=("astar_dwa", "straight"),
         models=("oracle",),
         risks=("cvar:0.8", "mean"),
         robots=(
-            {"part": "unicycle", "label": "unicycle speed_mps=[0.0, 2.0]", "options": {"speed_mps": [0, 2]}},
+            {
+                "part": "unicycle",
+                "label": "unicycle speed_mps=[0.0, 2.0]",
+                "options": {"speed_mps": [0, 2]},
+            },
         ),
         world={"preset": "stakes", "time_budget_s": 20},
         task={"free_space": {"by": "mean", "above": 0.2}, "min_traversability": 0.3},
@@ -69,13 +90,17 @@ def test_a_world_is_its_preset_by_name(tmp_path: Path) -> None:
     changed = {"preset": "stakes", "time_budget_s": 60.0}
     assert read_world(World.stakes(time_budget_s=60.0)) == read_world(changed)
     assert read_world(World.stakes(immobile=None))[0].immobile is None
-    with pytest.raises(ConfigError, match="either `time_budget_s` or `time_budget_ratio`"):
+    with pytest.raises(
+        ConfigError, match="either `time_budget_s` or `time_budget_ratio`"
+    ):
         World.stakes(time_budget_s=60.0, time_budget_ratio=2.0)
 
 
 def test_results_hold_what_the_folder_holds(run: Results, tmp_path: Path) -> None:
     saved = run.save(tmp_path / "kept")
-    assert results_of(open_run(tmp_path / "kept").episodes).equals(results_of(run.episodes))
+    assert results_of(open_run(tmp_path / "kept").episodes).equals(
+        results_of(run.episodes)
+    )
     with pytest.raises(ConfigError, match="new or empty"):
         run.save(tmp_path / "kept")
     assert list(run.conditions["planner"]) == ["astar_dwa", "straight", "astar_dwa"]
@@ -90,14 +115,28 @@ def test_results_compare_as_the_command_does(run: Results, tmp_path: Path) -> No
     saved = run.save(tmp_path / "kept")
     found = saved.compare(by="risk", against="mean", planner="astar_dwa")
     assert (
-        call("eval", "compare", saved.folder, "--by", "risk", "--against", "mean", "--out", tmp_path / "c")
+        call(
+            "eval",
+            "compare",
+            saved.folder,
+            "--by",
+            "risk",
+            "--against",
+            "mean",
+            "--out",
+            tmp_path / "c",
+        )
         == 0
     )
     written = pd.read_csv(tmp_path / "c.csv")
     assert found.numbers["success_difference"].tolist() == pytest.approx(
         written["success_difference"].tolist()
     )
-    assert [path.name for path in found.save(tmp_path / "d")] == ["d.csv", "d.md", "d.tex"]
+    assert [path.name for path in found.save(tmp_path / "d")] == [
+        "d.csv",
+        "d.md",
+        "d.tex",
+    ]
     with pytest.raises(ConfigError, match="labels among"):
         saved.compare(by="risk", plannr="astar_dwa")
     best = saved.best()
@@ -135,24 +174,50 @@ def test_a_planner_of_a_file_gives_equal_rows_from_a_program_and_from_two_proces
         maps=2,
         verbose=False,
     )
-    words = ["--data", dataset_path, "--model", "oracle", "--scenarios", "[std]", "--maps", 2, "--jobs", 2]
-    planners = '[{part: "slower.py:Slower", label: "Slower:0.25", options: {factor: 0.25}}]'
+    words = [
+        "--data",
+        dataset_path,
+        "--model",
+        "oracle",
+        "--scenarios",
+        "[std]",
+        "--maps",
+        2,
+        "--jobs",
+        2,
+    ]
+    planners = (
+        '[{part: "slower.py:Slower", label: "Slower:0.25", options: {factor: 0.25}}]'
+    )
     assert call("eval", "run", *words, "--planners", planners, "--out", "command") == 0
-    pd.testing.assert_frame_equal(results_of(ours.episodes), results_of(open_run("command").episodes))
+    pd.testing.assert_frame_equal(
+        results_of(ours.episodes), results_of(open_run("command").episodes)
+    )
     del sys.modules["slower"]
 
 
-def test_objects_of_one_process_are_marked_and_not_resumed(dataset_path: Path, tmp_path: Path) -> None:
+def test_objects_of_one_process_are_marked_and_not_resumed(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     class Mine(Straight):
         pass
 
-    given: dict[str, Any] = {"models": ["oracle"], "scenarios": ["std"], "maps": 1, "verbose": False}
+    given: dict[str, Any] = {
+        "models": ["oracle"],
+        "scenarios": ["std"],
+        "maps": 1,
+        "verbose": False,
+    }
     given |= {"terrain": dataset_path, "planners": [{"part": Mine(), "label": "mine"}]}
     results = evaluate(**given, folder=tmp_path / "run")
     assert any("not reproducible: planner mine" in line for line in results.notes)
     page = results.report()
-    assert "Not reproducible: planner mine is an object of one process" in page.read_text()
-    with pytest.raises(ConfigError, match="whose planner mine was an object of one process"):
+    assert (
+        "Not reproducible: planner mine is an object of one process" in page.read_text()
+    )
+    with pytest.raises(
+        ConfigError, match="whose planner mine was an object of one process"
+    ):
         evaluate(**given, folder=tmp_path / "run")
     with pytest.raises(ConfigError, match="which only this process has"):
         evaluate(**given, jobs=2)

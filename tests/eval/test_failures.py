@@ -12,7 +12,9 @@ from tests.eval.forged import forge_steps
 from tests.eval.report import made
 
 
-def steps(condition: str, map_index: int, met: list[float], **changes: Any) -> pd.DataFrame:
+def steps(
+    condition: str, map_index: int, met: list[float], **changes: Any
+) -> pd.DataFrame:
     """An episode of steps of half a second; the last state has no λ."""
     count = len(met) + 1
     columns = {
@@ -32,7 +34,9 @@ def keep(folder: Path, *episodes: pd.DataFrame) -> None:
 def test_where_and_on_what_failures_ended(tmp_path: Path) -> None:
     a, b = made.condition("mppi"), made.condition("cl_rrt")
     rows = made.rows(
-        made.row(a, 0), made.row(a, 1, None, outcome="immobilised", end_time_s=3.0), made.row(b, 1, None)
+        made.row(a, 0),
+        made.row(a, 1, None, outcome="immobilised", end_time_s=3.0),
+        made.row(b, 1, None),
     )
     rows["condition"] = rows["condition"].where(
         rows["condition"] != rows["condition"].iloc[0], "0123456789012345"
@@ -56,14 +60,22 @@ def test_where_and_on_what_failures_ended(tmp_path: Path) -> None:
 
 def test_episodes_are_distinguished_by_seed_and_realisation(tmp_path: Path) -> None:
     labels = made.condition()
-    rows = made.rows(made.row(labels, 0, None, seed=s, realisation=r) for s in (0, 1) for r in (0, 1))
+    rows = made.rows(
+        made.row(labels, 0, None, seed=s, realisation=r) for s in (0, 1) for r in (0, 1)
+    )
     condition = rows["condition"][0]
     keep(
         tmp_path,
-        *(steps(condition, 0, [0.1 * (2 * s + r)], seed=s, realisation=r) for s in (0, 1) for r in (0, 1)),
+        *(
+            steps(condition, 0, [0.1 * (2 * s + r)], seed=s, realisation=r)
+            for s in (0, 1)
+            for r in (0, 1)
+        ),
     )
     np.testing.assert_allclose(
-        failures_table(tmp_path, rows)["end_traversability"], [0, 0.1, 0.2, 0.3], atol=1e-7
+        failures_table(tmp_path, rows)["end_traversability"],
+        [0, 0.1, 0.2, 0.3],
+        atol=1e-7,
     )
 
 
@@ -72,7 +84,8 @@ def test_without_steps_there_is_no_place(tmp_path: Path) -> None:
     (failure,) = failures_table(tmp_path, rows).to_dict("records")
     assert (failure["map"], failure["outcome"]) == (1, "timeout")
     assert all(
-        np.isnan(failure[name]) for name in ("x_m", "y_m", "end_traversability", "last_traversability")
+        np.isnan(failure[name])
+        for name in ("x_m", "y_m", "end_traversability", "last_traversability")
     )
 
 
@@ -92,26 +105,47 @@ def recorded(failures: pd.DataFrame) -> list[Recording]:
     ]
 
 
-def collected(folder: Path, record: Any, steps: bool = True) -> tuple[Sheets, dict[str, str]]:
+def collected(
+    folder: Path, record: Any, steps: bool = True
+) -> tuple[Sheets, dict[str, str]]:
     """Ten maps; robots fail on the last ones, and end at x = 1."""
     blind = made.condition("straight", "–", model="–")
     rows = made.rows(
         *(
-            [made.row(made.condition(risk=r), i, 20.0 if i < n else None) for i in range(10)]
+            [
+                made.row(made.condition(risk=r), i, 20.0 if i < n else None)
+                for i in range(10)
+            ]
             for r, n in RATES.items()
         ),
         (made.row(blind, i, None) for i in range(10)),
     )
     if steps:
-        same = {"seed": 0, "realisation": 0, "step": [0, 1], "time_s": [0.0, 0.1], "x_m": [0.5, 1.0]}
+        same = {
+            "seed": 0,
+            "realisation": 0,
+            "step": [0, 1],
+            "time_s": [0.0, 0.1],
+            "x_m": [0.5, 1.0],
+        }
         parts = [
             pd.DataFrame(
-                {"condition": row["condition"], "map": row["map"], "y_m": 0.1 * row["map"], **same}
+                {
+                    "condition": row["condition"],
+                    "map": row["map"],
+                    "y_m": 0.1 * row["map"],
+                    **same,
+                }
             ).assign(traversability=[0.2, np.nan])
             for row in rows.to_dict("records")
         ]
         for place, part in enumerate(parts):
-            path = folder / "steps" / f"condition={part['condition'].iloc[0]}" / f"{place}.parquet"
+            path = (
+                folder
+                / "steps"
+                / f"condition={part['condition'].iloc[0]}"
+                / f"{place}.parquet"
+            )
             forge_steps(path, part.drop(columns="condition"))
     summary = made.summary(rows)
     sheets = collect_sheets(summary, failures_table(folder, rows), record)
@@ -122,14 +156,26 @@ def test_the_best_and_the_worst_that_sees_are_shown(tmp_path: Path) -> None:
     sheets, conditions = collected(tmp_path, recorded)
     ((title, (best, worst)),) = sheets.shown
     assert title == "std"
-    assert (best.name, best.among, list(best.failures["map"])) == ("MPPI, CVaR", 2, [8, 9])
-    assert (worst.name, worst.among, list(worst.failures["map"])) == ("MPPI, mean", 8, [2, 3, 4, 5])
+    assert (best.name, best.among, list(best.failures["map"])) == (
+        "MPPI, CVaR",
+        2,
+        [8, 9],
+    )
+    assert (worst.name, worst.among, list(worst.failures["map"])) == (
+        "MPPI, mean",
+        8,
+        [2, 3, 4, 5],
+    )
     assert sheets.left_out == ""
     for line in (best, worst):
-        assert [recording.goal_m[0] for recording in line.recordings] == line.failures["map"].tolist()
+        assert [recording.goal_m[0] for recording in line.recordings] == line.failures[
+            "map"
+        ].tolist()
     # What was predicted is that of all failures, shown or not.
     assert set(sheets.predicted) == {conditions["cvar"], conditions["mean"]}
-    np.testing.assert_allclose(sheets.predicted[conditions["mean"]], np.arange(2, 10) / 100)
+    np.testing.assert_allclose(
+        sheets.predicted[conditions["mean"]], np.arange(2, 10) / 100
+    )
 
 
 def test_it_is_left_out_with_a_reason(tmp_path: Path) -> None:
@@ -138,11 +184,16 @@ def test_it_is_left_out_with_a_reason(tmp_path: Path) -> None:
 
     sheets, _ = collected(tmp_path, gone)
     assert (sheets.shown, sheets.predicted) == ((), {})
-    assert sheets.left_out == "a figure of failures is missing: Expected a dataset, got none."
+    assert (
+        sheets.left_out
+        == "a figure of failures is missing: Expected a dataset, got none."
+    )
     assert collected(tmp_path, None)[0].left_out == ""
 
 
 def test_without_steps_there_is_no_sheet(tmp_path: Path) -> None:
     sheets, _ = collected(tmp_path, recorded, steps=False)
     assert sheets.shown == ()
-    assert sheets.left_out == "there is no figure of failures, since the run kept no steps"
+    assert (
+        sheets.left_out == "there is no figure of failures, since the run kept no steps"
+    )

@@ -15,14 +15,22 @@ DRAWS = ((4, 0, 60), (4, 1, 60), (9, 0, 2))
 
 
 def made(path: Path, **draws: tuple[tuple[int, int, int], ...]) -> Path:
-    """What a run is about, without its rows; by planner the draws of noise that are not those of all."""
+    """What a run is about, without its rows; by planner the draws of noise that are not
+    those of all.
+    """
     suite = Suite(
-        model="oracle", planners=("straight", "astar_dwa", "mppi"), risks=("mean", "cvar:0.5", "cvar")
+        model="oracle",
+        planners=("straight", "astar_dwa", "mppi"),
+        risks=("mean", "cvar:0.5", "cvar"),
     )
     entries = {}
     for condition in conditions_of(suite, lambda data: ["std", "hs"]):
         extent = Extent(draws=draws.get(condition.labels["planner"], DRAWS))
-        entries[condition.id] = {"value": condition.value, "labels": condition.labels, "draws": extent.draws}
+        entries[condition.id] = {
+            "value": condition.value,
+            "labels": condition.labels,
+            "draws": extent.draws,
+        }
     maps = {f"test/{scenario}": ["m"] * 60 for scenario in ("std", "hs")}
     about = {
         "format": FORMAT, "format_version": FORMAT_VERSION, "suite": {}, "conditions": entries,
@@ -40,14 +48,25 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def found(
-    folder: Path, seed: int | None = None, realisation: int = 0, map_index: int = 0, **labels: Any
+    folder: Path,
+    seed: int | None = None,
+    realisation: int = 0,
+    map_index: int = 0,
+    **labels: Any,
 ) -> list[Any]:
-    episodes = find_episodes(folder, {n: list(v) for n, v in labels.items()}, seed, realisation, map_index)
+    episodes = find_episodes(
+        folder, {n: list(v) for n, v in labels.items()}, seed, realisation, map_index
+    )
     for unit, member in episodes:
         assert unit.maps[member] == map_index
         assert unit.realisation == realisation
     return [
-        (u.condition.labels["planner"], u.condition.labels["risk"], u.condition.scenario, u.seed)
+        (
+            u.condition.labels["planner"],
+            u.condition.labels["risk"],
+            u.condition.scenario,
+            u.seed,
+        )
         for u, _ in episodes
     ]
 
@@ -73,18 +92,28 @@ def test_several_labels_give_several_conditions_in_their_order(folder: Path) -> 
     assert len(found(folder, planner=["mppi", "astar_dwa"], risk=["cvar", "mean"])) == 4
 
 
-def test_conditions_that_begin_with_other_seeds_are_shown_under_one(tmp_path: Path) -> None:
-    """Of a run that was extended for one planner: all the others are looked for under the first's seed."""
-    folder = made(tmp_path / "run", straight=((7, 0, 2), (9, 0, 2)), mppi=((9, 0, 2), (4, 0, 2)))
+def test_conditions_that_begin_with_other_seeds_are_shown_under_one(
+    tmp_path: Path,
+) -> None:
+    """Of a run that was extended for one planner: all the others are looked for under
+    the first's seed.
+    """
+    folder = made(
+        tmp_path / "run", straight=((7, 0, 2), (9, 0, 2)), mppi=((9, 0, 2), (4, 0, 2))
+    )
     assert found(folder, planner=["mppi", "astar_dwa"], risk=["cvar"]) == [
         ("mppi", "cvar", "std", 9), ("astar_dwa", "cvar", "std", 9)
     ]  # fmt: skip
     assert found(folder, planner=["astar_dwa", "mppi"], risk=["cvar"]) == [
         ("astar_dwa", "cvar", "std", 4), ("mppi", "cvar", "std", 4)
     ]  # fmt: skip
-    with pytest.raises(ConfigError, match=r"got planner 'mppi', realisation 0, map 0, seed 7\."):
+    with pytest.raises(
+        ConfigError, match=r"got planner 'mppi', realisation 0, map 0, seed 7\."
+    ):
         found(folder, planner=["straight", "mppi"])
-    assert [seed for *_, seed in found(folder, seed=9, planner=["straight", "mppi"])] == [9, 9]
+    assert [
+        seed for *_, seed in found(folder, seed=9, planner=["straight", "mppi"])
+    ] == [9, 9]
 
 
 def test_a_blind_planner_stands_once_under_any_risk_setting(folder: Path) -> None:
@@ -93,7 +122,9 @@ def test_a_blind_planner_stands_once_under_any_risk_setting(folder: Path) -> Non
     ]  # fmt: skip
 
 
-def test_a_label_that_no_condition_has_is_refused_also_for_a_blind_planner(folder: Path) -> None:
+def test_a_label_that_no_condition_has_is_refused_also_for_a_blind_planner(
+    folder: Path,
+) -> None:
     with pytest.raises(ConfigError, match=r"risk 'cvarr'.* Did you mean 'cvar'"):
         found(folder, planner=["straight"], risk=["cvarr"])
 
@@ -108,7 +139,9 @@ def test_other_maps_do_not_stand_together(folder: Path) -> None:
     [{"planner": ["no"]}, {"planner": ["mppi", "no"]}, {"map_index": 60}, {"seed": 7}, {"seed": 9, "map_index": 2},
      {"realisation": 2}, {"seed": 9, "realisation": 1}],
 )  # fmt: skip
-def test_what_is_not_there_is_refused_with_what_is(asked: dict[str, Any], folder: Path) -> None:
+def test_what_is_not_there_is_refused_with_what_is(
+    asked: dict[str, Any], folder: Path
+) -> None:
     with pytest.raises(
         ConfigError,
         match=r"Expected an episode of the run, got .* It has .*planner straight, .*; map 0 to \d+\.",

@@ -1,4 +1,6 @@
-"""Parts from outside, each in one file, give equal rows from a program and from the command in two processes."""
+"""Parts from outside, each in one file, give equal rows from a program and from the
+command in two processes.
+"""
 
 import runpy
 import shlex
@@ -26,7 +28,9 @@ PARTS = ("wet", "dry", "headings", "lost", "lost_figure")
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A working folder with the files of the tutorial, which its program imports and its commands name."""
+    """A working folder with the files of the tutorial, which its program imports and
+    its commands name.
+    """
     folder = tmp_path_factory.mktemp("outside")
     for name, body in FILES.items():
         (folder / name).write_text(body)
@@ -54,7 +58,9 @@ def figure(place: Path) -> Figure:
 
 
 def test_rows_are_those_of_the_command_in_two_processes(program: Results) -> None:
-    (commands,) = (block.body for block in PAGE if block.body.startswith("benchnav-datagen"))
+    (commands,) = (
+        block.body for block in PAGE if block.body.startswith("benchnav-datagen")
+    )
     for line in commands.replace("\\\n", " ").splitlines():
         command, *words = shlex.split(line)
         assert call(command.removeprefix("benchnav-"), *words) == 0
@@ -64,7 +70,8 @@ def test_rows_are_those_of_the_command_in_two_processes(program: Results) -> Non
     )
     order = ["scenario", "risk", "map", "lost_m"]
     pd.testing.assert_frame_equal(
-        ours.sort_values(order, ignore_index=True), theirs.sort_values(order, ignore_index=True)
+        ours.sort_values(order, ignore_index=True),
+        theirs.sort_values(order, ignore_index=True),
     )
     assert np.isfinite(ours[["lost_m", "energy_j"]]).all().all()
     assert Path("runs/command/figures/lost-over-time.png").is_file()
@@ -96,7 +103,9 @@ def test_a_figure_whose_needs_are_not_met_is_named(program: Results) -> None:
         program.plot(Nothing())
 
 
-def test_a_metric_of_one_process_is_marked_and_not_resumed(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_metric_of_one_process_is_marked_and_not_resumed(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     class Steps(Metric):
         name = column = "steps"
         meaning = "number of steps"
@@ -104,7 +113,11 @@ def test_a_metric_of_one_process_is_marked_and_not_resumed(dataset_path: Path, t
         def compute(self, episode: Episode) -> float:
             return episode.steps
 
-    given: dict[str, Any] = {"terrain": dataset_path, "planners": ["straight"], "models": ["oracle"]}
+    given: dict[str, Any] = {
+        "terrain": dataset_path,
+        "planners": ["straight"],
+        "models": ["oracle"],
+    }
     given |= {"metrics": [Steps()], "scenarios": ["std"], "maps": 1, "verbose": False}
     results = evaluate(**given, folder=tmp_path / "run")
     assert (results.episodes["steps"] > 0).all()

@@ -1,4 +1,6 @@
-"""Metrics that a suite names: from a file to rows, tables, hypotheses, comparisons and the page of the run."""
+"""Metrics that a suite names: from a file to rows, tables, hypotheses, comparisons and
+the page of the run.
+"""
 
 import re
 from pathlib import Path
@@ -37,11 +39,17 @@ def suite(dataset_path: Path, **changes: Any) -> Suite:
     return Suite(**given)
 
 
-def run(dataset_path: Path, folder: Path, jobs: int = 1, **changes: Any) -> tuple[pd.DataFrame, str]:
+def run(
+    dataset_path: Path, folder: Path, jobs: int = 1, **changes: Any
+) -> tuple[pd.DataFrame, str]:
     """Rows, and what was said."""
     said: list[str] = []
-    options = {name: changes.pop(name) for name in ("reuse_code", "shard") if name in changes}
-    for _ in run_suite(suite(dataset_path, **changes), folder, jobs, say=said.append, **options):
+    options = {
+        name: changes.pop(name) for name in ("reuse_code", "shard") if name in changes
+    }
+    for _ in run_suite(
+        suite(dataset_path, **changes), folder, jobs, say=said.append, **options
+    ):
         pass
     table = folder / "episodes.parquet"
     return pd.read_parquet(table) if table.exists() else pd.DataFrame(), "\n".join(said)
@@ -50,12 +58,16 @@ def run(dataset_path: Path, folder: Path, jobs: int = 1, **changes: Any) -> tupl
 @pytest.fixture(autouse=True)
 def no_latency(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measures no planning time of one robot, which takes longer than a run."""
-    monkeypatch.setattr(runner, "measure_latencies", lambda folder, chosen, settings: None)
+    monkeypatch.setattr(
+        runner, "measure_latencies", lambda folder, chosen, settings: None
+    )
 
 
 @pytest.fixture(scope="module")
 def finished(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of the command in two processes, with a metric of a file, one by name, and hypotheses on them."""
+    """A run of the command in two processes, with a metric of a file, one by name, and
+    hypotheses on them.
+    """
     folder = tmp_path_factory.mktemp("metrics") / "run"
     mppi = "{part: mppi, options: {samples: 64}}"
     words = {
@@ -64,7 +76,14 @@ def finished(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
         "world": "{noise: resampled, time_budget_s: 15}",
         "metrics": f"['{DETOUR}', 'energy:120']", "hypotheses": str(list(HYPOTHESES)), "jobs": 2, "out": folder,
     }  # fmt: skip
-    assert call("eval", "run", *(word for name, value in words.items() for word in (f"--{name}", value))) == 0
+    assert (
+        call(
+            "eval",
+            "run",
+            *(word for name, value in words.items() for word in (f"--{name}", value)),
+        )
+        == 0
+    )
     return folder
 
 
@@ -83,7 +102,9 @@ def test_values_are_those_computed_by_hand_from_the_steps(finished: Path) -> Non
     for key, drive in steps.groupby(["condition", "seed", "realisation", "map"]):
         row, last = rows.loc[key], drive["traversability"].isna()
         met = drive.loc[~last, "traversability"].to_numpy(dtype=float)
-        assert row["energy_j"] == pytest.approx(0.1 * (120 / np.maximum(met, 0.1)).sum(), rel=1e-9)
+        assert row["energy_j"] == pytest.approx(
+            0.1 * (120 / np.maximum(met, 0.1)).sum(), rel=1e-9
+        )
         x, y = (drive[name].to_numpy(dtype=float) for name in ("x_m", "y_m"))
         driven = np.hypot(np.diff(x), np.diff(y)).sum()
         if not row["success"]:
@@ -102,8 +123,13 @@ def _goals(folder: Path, rows: pd.DataFrame) -> dict[int, np.ndarray]:
     return {index: goal.astype(float) for index, goal in enumerate(goals)}
 
 
-def test_the_summary_has_means_with_intervals_over_the_episodes_that_have_it(finished: Path) -> None:
-    rows, summary = pd.read_parquet(finished / "episodes.parquet"), pd.read_csv(finished / "summary.csv")
+def test_the_summary_has_means_with_intervals_over_the_episodes_that_have_it(
+    finished: Path,
+) -> None:
+    rows, summary = (
+        pd.read_parquet(finished / "episodes.parquet"),
+        pd.read_csv(finished / "summary.csv"),
+    )
     for row in summary.to_dict("records"):
         own = rows[rows["condition"] == row["condition"]]
         assert row["energy_mean_j"] == pytest.approx(own["energy_j"].mean(), rel=1e-5)
@@ -123,8 +149,14 @@ def test_the_page_and_the_tables_have_a_column_and_its_meaning(finished: Path) -
         ):
             assert words in text, (file, words)
     about = open_run(finished).about
-    assert [entry["quantity"]["column"] for entry in about["metrics"]] == ["detour", "energy_j"]
-    assert about["metrics"][1]["options"] == {"power_w": 120.0, "min_traversability": 0.1}
+    assert [entry["quantity"]["column"] for entry in about["metrics"]] == [
+        "detour",
+        "energy_j",
+    ]
+    assert about["metrics"][1]["options"] == {
+        "power_w": 120.0,
+        "min_traversability": 0.1,
+    }
     (code,) = about["codes"].values()
     assert set(code["metrics"]) == {"detour", "energy_j"}
 
@@ -133,7 +165,9 @@ def test_hypotheses_on_metrics_are_tested_in_their_unit(finished: Path) -> None:
     tests = pd.read_csv(finished / "hypotheses.csv").set_index("metric")
     energy = tests.loc["energy"]
     assert (energy["unit"], energy["direction"], energy["margin"]) == ("J", "lower", 50)
-    assert energy["claim"] == "energy of cvar is less than 50 J higher than that of mean"
+    assert (
+        energy["claim"] == "energy of cvar is less than 50 J higher than that of mean"
+    )
     rows = pd.read_parquet(finished / "episodes.parquet")
     arrived = rows[rows["success"]].pivot_table(
         index=["map", "realisation"], columns="risk", values=["energy_j", "detour"]
@@ -141,12 +175,19 @@ def test_hypotheses_on_metrics_are_tested_in_their_unit(finished: Path) -> None:
     for name, column in (("energy", "energy_j"), ("detour", "detour")):
         both = arrived[column].dropna()
         assert tests.loc[name, "n_episodes"] == len(both)
-        assert tests.loc[name, "difference"] == pytest.approx((both["cvar"] - both["mean"]).mean(), rel=1e-5)
+        assert tests.loc[name, "difference"] == pytest.approx(
+            (both["cvar"] - both["mean"]).mean(), rel=1e-5
+        )
     assert (finished / "figures" / "forest.png").exists()
 
 
-def test_compare_shows_the_metric_that_is_named(finished: Path, tmp_path: Path, capsys: Any) -> None:
-    assert call("eval", "compare", finished, "--metric", "energy", "--out", tmp_path / "c") == 0
+def test_compare_shows_the_metric_that_is_named(
+    finished: Path, tmp_path: Path, capsys: Any
+) -> None:
+    assert (
+        call("eval", "compare", finished, "--metric", "energy", "--out", tmp_path / "c")
+        == 0
+    )
     table = pd.read_csv(tmp_path / "c.csv").iloc[0]
     tests = pd.read_csv(finished / "hypotheses.csv").set_index("metric").loc["energy"]
     assert (table["one"], table["other"], table["unit"]) == ("cvar", "mean", "J")
@@ -161,25 +202,33 @@ def test_compare_shows_the_metric_that_is_named(finished: Path, tmp_path: Path, 
     assert "Did you mean 'energy'" in capsys.readouterr().err
 
 
-def test_a_comparison_by_any_metric_of_every_run_is_that_of_its_hypothesis(finished: Path) -> None:
+def test_a_comparison_by_any_metric_of_every_run_is_that_of_its_hypothesis(
+    finished: Path,
+) -> None:
     columns = {
         "success": ("success", 100),
         "T_total": ("total_time_s", 1),
         "roughness": ("roughness_radps2", 1),
     }
     for metric, (column, scale) in columns.items():
-        (row,) = compare_runs([finished], "risk", "mean", {}, 0.05, metric=metric)[0].to_dict("records")
+        (row,) = compare_runs([finished], "risk", "mean", {}, 0.05, metric=metric)[
+            0
+        ].to_dict("records")
         rows = pd.read_parquet(finished / "episodes.parquet")
         means = rows.groupby("risk")[column].mean() * scale
         assert row["difference"] == pytest.approx(means["cvar"] - means["mean"])
         assert row["p_holm"] == holm(np.array([row["p"]]))[0]
 
 
-def test_rows_of_one_process_and_of_two_are_equal(dataset_path: Path, tmp_path: Path) -> None:
+def test_rows_of_one_process_and_of_two_are_equal(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     one, _ = run(dataset_path, tmp_path / "one", metrics=(DETOUR, "energy"))
     two, _ = run(dataset_path, tmp_path / "two", jobs=2, metrics=(DETOUR, "energy"))
     timed = [name for name in one if name.startswith("planning_")]
-    pd.testing.assert_frame_equal(one.drop(columns=timed), two.drop(columns=timed), check_exact=True)
+    pd.testing.assert_frame_equal(
+        one.drop(columns=timed), two.drop(columns=timed), check_exact=True
+    )
     assert rerun.compare(tmp_path / "one", tmp_path / "two")[0]
 
 
@@ -194,7 +243,9 @@ def test_a_run_that_is_extended_by_a_metric_runs_its_units_again_and_says_so(
     assert "2 of 2 units are run again for metrics that they lack (energy_j)" in said
     assert set(open_run(folder).conditions) == conditions
     assert list(after.columns) == [*before.columns[:-1], "energy_j", "code"]
-    same = [name for name in before if name != "code" and not name.startswith("planning_")]
+    same = [
+        name for name in before if name != "code" and not name.startswith("planning_")
+    ]
     pd.testing.assert_frame_equal(after[same], before[same], check_exact=True)
     # No less is recorded than was, and what has the metric stays without a word of it.
     assert len(list((folder / "playback").glob("*.npz"))) == 2
@@ -202,11 +253,15 @@ def test_a_run_that_is_extended_by_a_metric_runs_its_units_again_and_says_so(
     assert "2 of 2 units were there already" in said
     assert pd.read_parquet(folder / "episodes.parquet")["energy_j"].notna().all()
     # Units without it are of other code, and are not taken for units that have it.
-    _, said = run(dataset_path, folder, record="none", metrics=(DETOUR,), reuse_code=True)
+    _, said = run(
+        dataset_path, folder, record="none", metrics=(DETOUR,), reuse_code=True
+    )
     assert "2 of 2 units are run again for metrics that they lack (detour)" in said
 
 
-def test_other_units_wait_until_they_have_the_metric_too(dataset_path: Path, tmp_path: Path) -> None:
+def test_other_units_wait_until_they_have_the_metric_too(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     folder = tmp_path / "run"
     run(dataset_path, folder)
     rows, said = run(dataset_path, folder, risks=("mean",), metrics=("energy",))
@@ -266,7 +321,10 @@ def own_metric(folder: Path, value: str, **attributes: str) -> str:
         (("score",), "besides those that every run has, got 'score'. Leave it out"),
         (("enrgy",), "Did you mean 'energy'"),
         (("energy", "energy:5"), "names and columns of their own"),
-        (("benchnav.planning:Unicycle",), "to be a subclass of benchnav.metrics.Metric, got Unicycle"),
+        (
+            ("benchnav.planning:Unicycle",),
+            "to be a subclass of benchnav.metrics.Metric, got Unicycle",
+        ),
     ],
 )
 def test_a_metric_that_cannot_be_had_is_refused_before_the_run(
@@ -289,10 +347,18 @@ def test_a_metric_that_cannot_be_had_is_refused_before_the_run(
     ],
 )
 def test_a_metric_that_breaks_its_contract_is_refused_before_the_run(
-    value: str, attributes: dict[str, str], message: str, dataset_path: Path, tmp_path: Path
+    value: str,
+    attributes: dict[str, str],
+    message: str,
+    dataset_path: Path,
+    tmp_path: Path,
 ) -> None:
     with pytest.raises(ConfigError, match=message):
-        run(dataset_path, tmp_path / "run", metrics=(own_metric(tmp_path, value, **attributes),))
+        run(
+            dataset_path,
+            tmp_path / "run",
+            metrics=(own_metric(tmp_path, value, **attributes),),
+        )
     assert not (tmp_path / "run" / "run.json").exists()
 
 
@@ -303,32 +369,51 @@ def test_a_metric_that_fails_in_the_run_stops_it_with_a_line_and_units_stay(
     folder = tmp_path / "run"
     bad = own_metric(tmp_path, "1.0 if episode.time_budget_s > 90 else math.inf")
     with pytest.raises(
-        BenchnavError, match=r"from metric 'own', got inf.*given an episode of .*seed 0, .*map 0\."
+        BenchnavError,
+        match=r"from metric 'own', got inf.*given an episode of .*seed 0, .*map 0\.",
     ):
         run(dataset_path, folder, metrics=(bad,))
     assert not (folder / "episodes.parquet").exists()
-    rows, _ = run(dataset_path, folder, metrics=(own_metric(tmp_path, "episode.steps"),))
+    rows, _ = run(
+        dataset_path, folder, metrics=(own_metric(tmp_path, "episode.steps"),)
+    )
     assert (rows["own"] == (rows["end_time_s"] / 0.1).round()).all()
     # An edit of the file is other code.
-    rows, said = run(dataset_path, folder, metrics=(own_metric(tmp_path, "2 * episode.steps"),))
+    rows, said = run(
+        dataset_path, folder, metrics=(own_metric(tmp_path, "2 * episode.steps"),)
+    )
     assert "were finished by other code or maps (metric own)" in said
     assert (rows["own"] == 2 * (rows["end_time_s"] / 0.1).round()).all()
 
 
-def test_a_metric_of_this_process_alone_is_refused_for_workers(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_metric_of_this_process_alone_is_refused_for_workers(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     from benchnav import register
     from benchnav.metrics import Energy
 
-    register("metric", "here", type("Here", (Energy,), {"name": "here", "column": "here_j"}))
-    with pytest.raises(ConfigError, match="Expected a metric that other processes can load"):
+    register(
+        "metric", "here", type("Here", (Energy,), {"name": "here", "column": "here_j"})
+    )
+    with pytest.raises(
+        ConfigError, match="Expected a metric that other processes can load"
+    ):
         run(dataset_path, tmp_path / "run", jobs=2, metrics=("here",))
 
 
-def test_shards_merge_and_reruns_repeat_with_the_metric(dataset_path: Path, tmp_path: Path) -> None:
+def test_shards_merge_and_reruns_repeat_with_the_metric(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     parts = []
     for index in (1, 2):
         parts.append(tmp_path / f"part{index}")
-        run(dataset_path, parts[-1], seeds=(0, 1), metrics=("energy",), shard=Shard(index=index, of=2))
+        run(
+            dataset_path,
+            parts[-1],
+            seeds=(0, 1),
+            metrics=("energy",),
+            shard=Shard(index=index, of=2),
+        )
     for _ in merge_shards(parts, tmp_path / "whole"):
         pass
     whole = pd.read_parquet(tmp_path / "whole" / "episodes.parquet")
@@ -338,7 +423,10 @@ def test_shards_merge_and_reruns_repeat_with_the_metric(dataset_path: Path, tmp_
         pass
     assert rerun.compare(tmp_path / "whole", tmp_path / "again") == (
         True,
-        ["all 8 rows came out the same", "no difference between the recorded environments"],
+        [
+            "all 8 rows came out the same",
+            "no difference between the recorded environments",
+        ],
     )
     other = tmp_path / "other"
     run(dataset_path, other, seeds=(0, 1), shard=Shard(index=2, of=2))

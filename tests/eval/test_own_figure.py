@@ -1,4 +1,6 @@
-"""A figure from one file: by the command and by the suite, and what is said of one that cannot be drawn."""
+"""A figure from one file: by the command and by the suite, and what is said of one that
+cannot be drawn.
+"""
 
 from pathlib import Path
 
@@ -48,7 +50,10 @@ def test_the_command_draws_a_figure_of_one_file(folder: Path) -> None:
     assert call("eval", "report", str(folder), "--figures", f"{OWN}:WhenFailed") == 0
     assert matplotlib.image.imread(folder / "figures/when-failed.png").size > 10_000
     assert (folder / "figures/when-failed.pdf").is_file()
-    assert "Times at which 4 failed episodes ended." in (folder / "report.html").read_text()
+    assert (
+        "Times at which 4 failed episodes ended."
+        in (folder / "report.html").read_text()
+    )
 
 
 def test_the_figure_shows_each_failure_once(folder: Path) -> None:
@@ -56,14 +61,18 @@ def test_the_figure_shows_each_failure_once(folder: Path) -> None:
     (figure,) = registry.make("figure", f"{OWN}:WhenFailed").variants(report)
     (panel,) = figure(report).axes
     corners = np.concatenate([patch.get_xy() for patch in panel.patches])
-    assert corners[:, 1].max() == len(report.failures) == 4  # all of one planner, at one time
+    assert (
+        corners[:, 1].max() == len(report.failures) == 4
+    )  # all of one planner, at one time
 
 
 def test_a_suite_names_figures_of_its_report(tmp_path: Path) -> None:
     suite = {"figures": [f"{OWN}:WhenFailed", "success"]}
     folder = run_folder(tmp_path / "run", episodes(), suite=suite)
     assert not write_report(folder).faults
-    assert "![when-failed](figures/when-failed.png)" in (folder / "summary.md").read_text()
+    assert (
+        "![when-failed](figures/when-failed.png)" in (folder / "summary.md").read_text()
+    )
 
 
 @pytest.mark.parametrize(
@@ -71,16 +80,25 @@ def test_a_suite_names_figures_of_its_report(tmp_path: Path) -> None:
     [
         ("Broken", "the figure broken is missing: ValueError: no such column"),
         ("Double", "Expected the name of a figure that no other has, got 'success'."),
-        ("Outside", "Expected the name of a figure that no other has, got '../outside'."),
+        (
+            "Outside",
+            "Expected the name of a figure that no other has, got '../outside'.",
+        ),
     ],
 )
 def test_a_report_is_written_without_a_figure_that_fails(
-    folder: Path, tmp_path: Path, name: str, why: str, capsys: pytest.CaptureFixture[str]
+    folder: Path,
+    tmp_path: Path,
+    name: str,
+    why: str,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "own.py").write_text(BROKEN)
     names = f"{tmp_path / 'own.py'}:{name},{OWN}:WhenFailed"
     assert call("eval", "report", str(folder), "--figures", f"[{names}]") == 1
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if "is missing" in line]
+    (line,) = [
+        line for line in capsys.readouterr().out.splitlines() if "is missing" in line
+    ]
     assert why in line
     assert why.split(":")[0] in (folder / "summary.md").read_text()
     assert (folder / "figures/when-failed.png").is_file()
@@ -99,8 +117,12 @@ def test_what_is_no_figure_is_an_error_before_anything_runs_or_is_written(
         check_suite(Suite(figures=(part,)), elsewhere=False)
 
 
-def test_shipped_figures_have_names_and_needs_and_are_listed_in_order(folder: Path) -> None:
-    assert {registry.find("figure", name).target for name in registry.names("figure")} == set(SHIPPED)
+def test_shipped_figures_have_names_and_needs_and_are_listed_in_order(
+    folder: Path,
+) -> None:
+    assert {
+        registry.find("figure", name).target for name in registry.names("figure")
+    } == set(SHIPPED)
     report = read_report(folder)
     more = [registry.make("figure", name) for name in ("success", f"{OWN}:WhenFailed")]
     names = [figure.name for figure in figures_of(report, more)]

@@ -1,4 +1,6 @@
-"""Runs that are read before they are finished: their rows are those of the finished run, and all says "partial"."""
+"""Runs that are read before they are finished: their rows are those of the finished
+run, and all says "partial".
+"""
 
 import hashlib
 import re
@@ -30,7 +32,9 @@ MARK = "artial: 3 of 6 units"
 
 @pytest.fixture(scope="module")
 def suite(dataset_path: Path) -> Suite:
-    """Three conditions under two seeds; the first two fail, one on steps of other columns than the other."""
+    """Three conditions under two seeds; the first two fail, one on steps of other
+    columns than the other.
+    """
     hypotheses = [
         {"one": {"risk": risk, "planner": "Faulty"}, "other": {"risk": "mean", "planner": "Faulty"}, "metric": metric}
         for risk, metric in (("cvar", "T_total"), ("cvar", "success"), ("var", "success"))
@@ -56,7 +60,9 @@ def running(suite: Suite, tmp_path: Path) -> Iterator[Path]:
     for step in steps:
         if step.done == FINISHED + 1:
             break
-    rows = {path: pd.read_parquet(path) for path in (tmp_path / "run").glob("units/*/*")}
+    rows = {
+        path: pd.read_parquet(path) for path in (tmp_path / "run").glob("units/*/*")
+    }
     (path,) = [path for path, own in rows.items() if set(own["risk"]) == {"var"}]
     path.unlink()
     yield tmp_path / "run"
@@ -72,13 +78,26 @@ def digests(folder: Path) -> dict[str, str]:
     return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def test_rows_of_a_run_that_is_not_finished_are_those_of_the_finished_one(running: Path, whole: Path) -> None:
+def test_rows_of_a_run_that_is_not_finished_are_those_of_the_finished_one(
+    running: Path, whole: Path
+) -> None:
     with pytest.raises(ConfigError, match=r"finished run.* --partial"):
         read_results(running)
-    found, all_rows = read_results(running, partial=True), pd.read_parquet(whole / EPISODES)
-    kept = all_rows.set_index(KEYS).loc[list(found.episodes[KEYS].itertuples(index=False, name=None))]
-    same = [name for name in kept.columns if not name.startswith(("planning_", "learning_ms"))]
-    pd.testing.assert_frame_equal(kept[same].reset_index(), found.episodes[[*KEYS, *same]])
+    found, all_rows = (
+        read_results(running, partial=True),
+        pd.read_parquet(whole / EPISODES),
+    )
+    kept = all_rows.set_index(KEYS).loc[
+        list(found.episodes[KEYS].itertuples(index=False, name=None))
+    ]
+    same = [
+        name
+        for name in kept.columns
+        if not name.startswith(("planning_", "learning_ms"))
+    ]
+    pd.testing.assert_frame_equal(
+        kept[same].reset_index(), found.episodes[[*KEYS, *same]]
+    )
     assert len(found.episodes) == 2 * FINISHED
     assert found.mark == "partial: 3 of 6 units"
     (lacking,) = set(all_rows["condition"]) - set(found.episodes["condition"])
@@ -104,7 +123,9 @@ def test_a_partial_report_says_so_everywhere_and_touches_nothing_of_the_run(
         ),
     )
     before = digests(running)
-    report = write_report(running, lambda rows: record_driven(running, rows), partial=True)
+    report = write_report(
+        running, lambda rows: record_driven(running, rows), partial=True
+    )
     assert digests(running) == before
     place = running / "partial"
     assert len(marked) >= 4
@@ -113,10 +134,16 @@ def test_a_partial_report_says_so_everywhere_and_touches_nothing_of_the_run(
         table = pd.read_csv(path)
         assert list(table.columns)[-1] == "partial"
         assert set(table["partial"]) == {"3 of 6 units"}
-    assert {path.name for path in place.glob("*.csv")} == {"summary.csv", "failures.csv", "hypotheses.csv"}
+    assert {path.name for path in place.glob("*.csv")} == {
+        "summary.csv",
+        "failures.csv",
+        "hypotheses.csv",
+    }
     text, page = (place / "summary.md").read_text(), (place / "report.html").read_text()
     assert MARK in text.splitlines()[0]
-    assert all(MARK in table for table in re.findall(r"\|---.*?\n\n(.*?)\n\n", text, re.DOTALL))
+    assert all(
+        MARK in table for table in re.findall(r"\|---.*?\n\n(.*?)\n\n", text, re.DOTALL)
+    )
     assert page.count(MARK) > 5
     assert MARK in page.partition("</title>")[0]
     for name in ("summary.tex", "hypotheses.tex"):
@@ -131,16 +158,28 @@ def test_a_partial_report_says_so_everywhere_and_touches_nothing_of_the_run(
     assert tests[["p", "p_holm"]].isna().all(axis=None)
     assert not tests["supported"].any()
     for (_, test), (one, metric) in zip(
-        tests.iterrows(), (("cvar", "total_time_s"), ("cvar", "success"), ("var", "success")), strict=True
+        tests.iterrows(),
+        (("cvar", "total_time_s"), ("cvar", "success"), ("var", "success")),
+        strict=True,
     ):
         if one in by_risk and "mean" in by_risk:
             both = by_risk[one].join(by_risk["mean"], rsuffix="_mean", how="inner")
-            expected = (both[metric].astype(float) - both[f"{metric}_mean"].astype(float)).mean()
+            expected = (
+                both[metric].astype(float) - both[f"{metric}_mean"].astype(float)
+            ).mean()
             scale = 100 if metric == "success" else 1
-            assert (test["n_episodes"], test["difference"]) == (len(both), pytest.approx(scale * expected))
+            assert (test["n_episodes"], test["difference"]) == (
+                len(both),
+                pytest.approx(scale * expected),
+            )
         else:
             assert test["n_episodes"] == 0
-    said = [line for lines in report.findings.values() for line in lines if "partial: not yet a test" in line]
+    said = [
+        line
+        for lines in report.findings.values()
+        for line in lines
+        if "partial: not yet a test" in line
+    ]
     assert len(said) == 3
     assert all("partial: not yet a test" in row[-1] for row in report.hypotheses.rows)
     assert not any("significantly" in line or "p =" in line for line in said)
@@ -152,22 +191,30 @@ def png(path: Path) -> None:
     Figure(figsize=(1, 1)).savefig(path)
 
 
-def test_a_run_that_was_read_goes_on_as_if_nobody_had(suite: Suite, tmp_path: Path, whole: Path) -> None:
+def test_a_run_that_was_read_goes_on_as_if_nobody_had(
+    suite: Suite, tmp_path: Path, whole: Path
+) -> None:
     folder = tmp_path / "run"
     steps = run_suite(suite, folder)
     for step in steps:
         if 0 < step.done < step.total:
             write_report(folder, partial=True)
     results = [pd.read_parquet(place / EPISODES) for place in (folder, whole)]
-    same = [name for name in results[0] if not name.startswith(("planning_", "learning_ms"))]
+    same = [
+        name for name in results[0] if not name.startswith(("planning_", "learning_ms"))
+    ]
     pd.testing.assert_frame_equal(results[0][same], results[1][same])
     assert write_report(folder, partial=True).mark == ""
     assert (folder / "report.html").exists()
 
 
-def test_episodes_of_finished_units_are_replayed_while_the_run_goes_on(running: Path, tmp_path: Path) -> None:
+def test_episodes_of_finished_units_are_replayed_while_the_run_goes_on(
+    running: Path, tmp_path: Path
+) -> None:
     known = {
-        unit.condition.labels["risk"]: one for unit, one in newest_units(open_run(running)) if unit.seed == 1
+        unit.condition.labels["risk"]: one
+        for unit, one in newest_units(open_run(running))
+        if unit.seed == 1
     }
     # Of what is not named the first condition that has rows is taken.
     ((unit, member),) = find_episodes(running, {}, 1, 0, 1)
@@ -180,8 +227,15 @@ def test_episodes_of_finished_units_are_replayed_while_the_run_goes_on(running: 
     (tmp_path / "lost").rename(lost)
     recording = find_recording(running, unit, member, tmp_path / "out")
     rows = read_results(running, partial=True).episodes
-    row = rows[(rows["condition"] == unit.condition.id) & (rows["seed"] == 1) & (rows["map"] == 1)].iloc[0]
-    assert (recording.about["outcome"], recording.end_s) == (row["outcome"], pytest.approx(row["end_time_s"]))
+    row = rows[
+        (rows["condition"] == unit.condition.id)
+        & (rows["seed"] == 1)
+        & (rows["map"] == 1)
+    ].iloc[0]
+    assert (recording.about["outcome"], recording.end_s) == (
+        row["outcome"],
+        pytest.approx(row["end_time_s"]),
+    )
     assert not (running / "playback").exists()
     lacking = next(risk for risk, one in known.items() if one is None)
     ((unit, member),) = find_episodes(running, {"risk": [lacking]}, 1, 0, 1)
@@ -219,14 +273,23 @@ def test_steps_of_robots_with_other_actions_are_read_before_they_are_aligned(
     suite: Suite, tmp_path: Path
 ) -> None:
     mixed = replace(
-        suite, robots=("unicycle", "bicycle"), risks=("mean",), seeds=(0,), hypotheses=(), record="steps"
+        suite,
+        robots=("unicycle", "bicycle"),
+        risks=("mean",),
+        seeds=(0,),
+        hypotheses=(),
+        record="steps",
     )
     steps = run_suite(mixed, tmp_path / "run")
     for step in steps:
         if step.done == 2:
             break
     assert {"turn_rate_radps", "steering_rad"} <= set(read_steps(tmp_path / "run"))
-    report = write_report(tmp_path / "run", lambda rows: record_driven(tmp_path / "run", rows), partial=True)
+    report = write_report(
+        tmp_path / "run",
+        lambda rows: record_driven(tmp_path / "run", rows),
+        partial=True,
+    )
     assert not report.sheets.left_out
     assert {one.about["robot"] for _, lines in report.sheets.shown for line in lines for one in line.recordings} == {
         "unicycle", "bicycle"

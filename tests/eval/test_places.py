@@ -1,4 +1,6 @@
-"""Where runs lie: links, the folder that the user is in, copies, and folders that cannot be written."""
+"""Where runs lie: links, the folder that the user is in, copies, and folders that
+cannot be written.
+"""
 
 import json
 import os
@@ -89,7 +91,9 @@ def test_the_folder_that_the_user_is_in_can_be_dropped_and_merged_into(
 
 def test_a_copy_certifies_nothing(run: Path, tmp_path: Path) -> None:
     again = Path(shutil.copytree(run, tmp_path / "again"))
-    with pytest.raises(ConfigError, match=r"again, where 1 of 1 units are copies of that run"):
+    with pytest.raises(
+        ConfigError, match=r"again, where 1 of 1 units are copies of that run"
+    ):
         list(rerun(run, again))
     # Nor under another account of the run.
     write_run(again, {**open_run(again).about, "history": []})
@@ -101,7 +105,9 @@ def test_a_copy_certifies_nothing(run: Path, tmp_path: Path) -> None:
     list(rerun(run, again))
 
 
-def test_merged_copies_of_one_shard_certify_nothing(dataset_path: Path, tmp_path: Path) -> None:
+def test_merged_copies_of_one_shard_certify_nothing(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     list(run_suite(quick(dataset_path), tmp_path / "part", shard=Shard(index=1, of=1)))
     for name in ("one", "two"):
         list(merge_shards([tmp_path / "part"], tmp_path / name))
@@ -118,20 +124,32 @@ def test_a_column_that_one_table_has_is_a_difference(run: Path, tmp_path: Path) 
     assert not any("came out the same" in line for line in lines)
 
 
-def test_a_run_is_reported_and_replayed_without_being_written(run: Path, tmp_path: Path, capsys: Any) -> None:
+def test_a_run_is_reported_and_replayed_without_being_written(
+    run: Path, tmp_path: Path, capsys: Any
+) -> None:
     for path in [run / "report.html", run / "summary.csv"]:
         path.unlink()
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     out = tmp_path / "elsewhere"
     assert call("eval", "report", str(run), "--out", str(out)) == 0
     assert str(out / "report.html") in capsys.readouterr().out
-    assert {"report.html", "summary.csv", "summary.md", "summary.tex", "failures.csv", "figures"} == {
-        path.name for path in out.iterdir()
-    }
+    assert {
+        "report.html",
+        "summary.csv",
+        "summary.md",
+        "summary.tex",
+        "failures.csv",
+        "figures",
+    } == {path.name for path in out.iterdir()}
     assert (out / "figures" / "driven.png").exists()
     assert call("eval", "replay", str(run), "--view", "false", "--out", str(out)) == 0
-    assert sorted(path.suffix for path in (out / "playback").iterdir()) == [".npz", ".rrd"]
-    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+    assert sorted(path.suffix for path in (out / "playback").iterdir()) == [
+        ".npz",
+        ".rrd",
+    ]
+    assert {
+        path: path.read_bytes() for path in run.rglob("*") if path.is_file()
+    } == before
     other = Path(shutil.copytree(run, tmp_path / "other"))
     capsys.readouterr()
     for command in ("report", "replay"):
@@ -159,7 +177,12 @@ def test_a_run_is_reported_and_replayed_without_being_written(run: Path, tmp_pat
     ],
 )
 def test_bad_input_is_one_line_and_status_2(
-    words: tuple[str, ...], made: Path, dataset_path: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
+    words: tuple[str, ...],
+    made: Path,
+    dataset_path: Path,
+    tmp_path: Path,
+    monkeypatch: Any,
+    capsys: Any,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     given = [str(made) if word == "RUN" else word for word in words]
@@ -197,7 +220,11 @@ def test_all_commands_and_suites_stand_in_the_run_with_when_and_where(
         assert entry["host"] == os.uname().nodename
         assert entry["cores"] == os.cpu_count()
     cpuinfo = Path("/proc/cpuinfo")
-    names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
+    names = [
+        line
+        for line in cpuinfo.read_text().splitlines()
+        if line.startswith("model name")
+    ]
     assert not names or names[0].partition(": ")[2].strip() == first["processor"]
     here = Path(cli.__file__).parent
     asked = ["git", "-C", str(here), "rev-parse", "HEAD"]
@@ -205,21 +232,32 @@ def test_all_commands_and_suites_stand_in_the_run_with_when_and_where(
     assert first["commit"].removesuffix("+") == commit
 
 
-def test_one_condition_has_one_label_for_good(dataset_path: Path, tmp_path: Path) -> None:
+def test_one_condition_has_one_label_for_good(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     def suite(label: str | None, *levels: float) -> Suite:
         named = {} if label is None else {"label": label}
-        risk = {"part": "cvar", "options": {"level": list(levels) if len(levels) > 1 else levels[0]}, **named}
+        risk = {
+            "part": "cvar",
+            "options": {"level": list(levels) if len(levels) > 1 else levels[0]},
+            **named,
+        }
         return quick(dataset_path, risks=(risk,))
 
     out = tmp_path / "run"
     list(run_suite(suite("careful", 0.9), out))
     before = json.loads((out / "run.json").read_text())
-    with pytest.raises(ConfigError, match=r"got 'cvar:0\.9' and 'careful' for the same setting"):
+    with pytest.raises(
+        ConfigError, match=r"got 'cvar:0\.9' and 'careful' for the same setting"
+    ):
         list(run_suite(suite(None, 0.5, 0.9), out))
     assert json.loads((out / "run.json").read_text()) == before
     list(run_suite(suite("cautious", 0.5), out))
     rows = pd.read_parquet(out / "episodes.parquet")
-    labels = {i: entry["labels"]["risk"] for i, entry in open_run(out).about["conditions"].items()}
+    labels = {
+        i: entry["labels"]["risk"]
+        for i, entry in open_run(out).about["conditions"].items()
+    }
     assert dict(zip(rows["condition"], rows["risk"], strict=True)) == labels
     assert set(labels.values()) == {"careful", "cautious"}
 

@@ -31,7 +31,9 @@ from tests.eval.report import made
         (42, 0.1, 15.0, 40),  # an episode that had ended by then
     ],
 )
-def test_a_moment_has_the_last_plan_by_its_time(steps: int, dt_s: float, time_s: float, step: int) -> None:
+def test_a_moment_has_the_last_plan_by_its_time(
+    steps: int, dt_s: float, time_s: float, step: int
+) -> None:
     recording = made.recording(steps, dt_s)
     assert recording.plan_at(time_s).step == step
     np.testing.assert_array_equal(recording.track, recording.states[:, :2])
@@ -39,7 +41,10 @@ def test_a_moment_has_the_last_plan_by_its_time(steps: int, dt_s: float, time_s:
 
 
 def test_fifteen_seconds_is_the_moment_and_half_way_of_a_short_episode() -> None:
-    assert (made.recording(400, 0.1).plan.step, made.recording(400, 0.1).now) == (150, 150)
+    assert (made.recording(400, 0.1).plan.step, made.recording(400, 0.1).now) == (
+        150,
+        150,
+    )
     assert made.recording(200, 0.1).now == 100
 
 
@@ -51,7 +56,9 @@ def test_plans_after_the_end_are_not_the_episodes_own() -> None:
     assert [plan.step for plan in at_once.own_plans] == [0]
 
 
-def test_an_episode_that_ended_before_it_was_planned_has_a_moment_all_the_same() -> None:
+def test_an_episode_that_ended_before_it_was_planned_has_a_moment_all_the_same() -> (
+    None
+):
     recording = made.recording(0, plans=())
     assert recording.now == 0
     assert not any(recording.plan.lines.values())
@@ -69,11 +76,14 @@ def crowded(steps: int) -> Recording:
                                     "samples": list(generator.random((40, 30, 2), np.float32))})
         for step in range(0, steps, 5)
     ]  # fmt: skip
-    return made.held_recording(steps, plans=plans, free_by="mean", free_above=0.1, time_budget_s=77.5)
+    return made.held_recording(
+        steps, plans=plans, free_by="mean", free_above=0.1, time_budget_s=77.5
+    )
 
 
 @pytest.mark.parametrize(
-    "recording", [made.recording(60), made.recording(0), made.recording(0, plans=()), crowded(200)]
+    "recording",
+    [made.recording(60), made.recording(0), made.recording(0, plans=()), crowded(200)],
 )
 def test_a_recording_comes_back_as_it_was(recording: Recording, tmp_path: Path) -> None:
     recording.save(tmp_path / "there" / "a.npz")
@@ -104,7 +114,9 @@ def test_thinning_keeps_ends_and_what_was_thinned() -> None:
         np.testing.assert_array_equal(after[[0, -1]], before[[0, -1]])
         assert len(after) == 4
     np.testing.assert_array_equal(once.lines["path"][0], plan.lines["path"][0])
-    for before, after in zip(once.lines["samples"], thinned(once).lines["samples"], strict=True):
+    for before, after in zip(
+        once.lines["samples"], thinned(once).lines["samples"], strict=True
+    ):
         np.testing.assert_array_equal(after, before)
 
 
@@ -112,7 +124,12 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "playback" / "a.npz"
     made.recording(20).save(path)
     whole = path.read_bytes()
-    for damage in (b"", b"no zip", whole[: len(whole) // 2], whole[:500] + bytes(400) + whole[900:]):
+    for damage in (
+        b"",
+        b"no zip",
+        whole[: len(whole) // 2],
+        whole[:500] + bytes(400) + whole[900:],
+    ):
         path.write_bytes(damage)
         for read in (lambda: Recording.load(path), lambda: read_recordings(tmp_path)):
             with pytest.raises(ConfigError, match=r"a\.npz is damaged"):
@@ -122,7 +139,11 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
 def test_points_that_are_not_used_and_lines_without_two_are_left_out() -> None:
     nan = torch.nan
     samples = torch.tensor(
-        [[[0.0, 1.0], [2.0, 3.0], [nan, nan]], [[4.0, 5.0], [nan, nan], [nan, nan]], [[nan, nan]] * 3]
+        [
+            [[0.0, 1.0], [2.0, 3.0], [nan, nan]],
+            [[4.0, 5.0], [nan, nan], [nan, nan]],
+            [[nan, nan]] * 3,
+        ]
     )
     plan = drawn_plan(7, {"samples": samples, "tree": torch.empty(0, 0, 2)})
     assert plan.step == 7
@@ -149,14 +170,21 @@ def test_an_immobilised_robot_is_where_its_episode_ended(outcome: str) -> None:
     recording = made.recording(9)
     recording = replace(recording, about={**recording.about, "outcome": outcome})
     if outcome == "immobilised":
-        np.testing.assert_array_equal(recording.immobilised_at, recording.states[-1, :2])
+        np.testing.assert_array_equal(
+            recording.immobilised_at, recording.states[-1, :2]
+        )
     else:
         assert recording.immobilised_at is None
 
 
 @pytest.mark.parametrize(
     ("place", "cell"),
-    [((29.9, 0.1), (0, 59)), ((0.2, 19.9), (39, 0)), ((30.1, 1.0), None), ((1.0, -0.1), None)],
+    [
+        ((29.9, 0.1), (0, 59)),
+        ((0.2, 19.9), (39, 0)),
+        ((30.1, 1.0), None),
+        ((1.0, -0.1), None),
+    ],
 )
 def test_what_was_predicted_at_the_end_is_that_of_the_cell_it_lies_in(
     place: tuple[float, float], cell: tuple[int, int] | None
@@ -188,8 +216,12 @@ def test_what_was_known_comes_back_within_a_level(tmp_path: Path) -> None:
     recording = made.learning_recording(60)
     first, *others = recording.known
     # Masks and numbers that go both ways, and maps without an outline.
-    flipped = replace(first, step=61, seen=~first.seen, mean=1 - first.mean, outline=np.empty((0, 2)))
-    recording = replace(recording, known=(first, *others, flipped, replace(first, step=62)))
+    flipped = replace(
+        first, step=61, seen=~first.seen, mean=1 - first.mean, outline=np.empty((0, 2))
+    )
+    recording = replace(
+        recording, known=(first, *others, flipped, replace(first, step=62))
+    )
     recording.save(tmp_path / "a.npz")
     again = Recording.load(tmp_path / "a.npz")
     assert len(again.known) == len(recording.known) == 15
@@ -199,27 +231,39 @@ def test_what_was_known_comes_back_within_a_level(tmp_path: Path) -> None:
             assert getattr(after, name).dtype == bool
             np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
         for name in ("predicted", "mean", "spread"):
-            np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=0.5 / 255 + 1e-6)
+            np.testing.assert_allclose(
+                getattr(after, name), getattr(before, name), atol=0.5 / 255 + 1e-6
+            )
         np.testing.assert_array_equal(after.outline, before.outline)
     # Stored again it stays as it is.
     again.save(tmp_path / "b.npz")
-    for one, other in zip(again.known, Recording.load(tmp_path / "b.npz").known, strict=True):
+    for one, other in zip(
+        again.known, Recording.load(tmp_path / "b.npz").known, strict=True
+    ):
         for item in fields(KnownMap):
-            np.testing.assert_array_equal(getattr(one, item.name), getattr(other, item.name))
+            np.testing.assert_array_equal(
+                getattr(one, item.name), getattr(other, item.name)
+            )
 
 
 def test_forty_seconds_of_learning_are_small(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
-    recording = made.recording(400, predicted=generator.random((64, 64)), free=np.ones((64, 64), bool))
+    recording = made.recording(
+        400, predicted=generator.random((64, 64)), free=np.ones((64, 64), bool)
+    )
     recording.save(tmp_path / "without.npz")
     numbers = {
-        name: generator.random((64, 64)).astype(np.float16) for name in ("predicted", "mean", "spread")
+        name: generator.random((64, 64)).astype(np.float16)
+        for name in ("predicted", "mean", "spread")
     }
     masks = {name: np.zeros((64, 64), bool) for name in ("free", "seen", "sensed")}
     known = []
     for place in range(80):
         # Each update changes cells within 4 m, in all that is kept.
-        row, column = (range(max(0, middle - 8), middle + 8) for middle in (place * 48 // 80 + 8, 30))
+        row, column = (
+            range(max(0, middle - 8), middle + 8)
+            for middle in (place * 48 // 80 + 8, 30)
+        )
         cells = np.ix_(list(row), list(column))
         for values in (numbers, masks):
             for name, value in values.items():
@@ -229,7 +273,14 @@ def test_forty_seconds_of_learning_are_small(tmp_path: Path) -> None:
                 )
         for value in numbers.values():
             value[cells] = generator.random((len(row), len(column)))
-        known.append(KnownMap(step=5 * place, **numbers, **masks, outline=reach_outline(masks["seen"], 0.5)))
+        known.append(
+            KnownMap(
+                step=5 * place,
+                **numbers,
+                **masks,
+                outline=reach_outline(masks["seen"], 0.5),
+            )
+        )
     replace(recording, known=tuple(known)).save(tmp_path / "with.npz")
     sizes = [(tmp_path / f"{name}.npz").stat().st_size for name in ("with", "without")]
     assert sizes[0] - sizes[1] < 400_000

@@ -27,7 +27,9 @@ SMALL = (
 @pytest.fixture(scope="module")
 def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("replay") / "run"
-    assert call("eval", "run", "--data", str(dataset_path), "--out", str(out), *SMALL) == 0
+    assert (
+        call("eval", "run", "--data", str(dataset_path), "--out", str(out), *SMALL) == 0
+    )
     return out
 
 
@@ -41,7 +43,9 @@ def shown(printed: str) -> Path:
     return Path(line.removeprefix("recording: "))
 
 
-def test_one_episode_is_shown_alone(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_episode_is_shown_alone(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     asked = ("--planner", "Faulty", "--risk", "cvar:0.5", "--map", "1")
     assert call("eval", "replay", str(folder), *asked, "--view", "no") == 0
     printed = capsys.readouterr().out
@@ -53,18 +57,44 @@ def test_one_episode_is_shown_alone(folder: Path, capsys: pytest.CaptureFixture[
 
 
 @pytest.mark.parametrize("risks", ["mean,cvar:0.5", "[mean, 'cvar:0.5']"])
-def test_several_labels_show_their_conditions_together(risks: str, folder: Path, capsys: Any) -> None:
-    assert call("eval", "replay", str(folder), "--planner", "Faulty", "--risk", risks, "--view", "false") == 0
+def test_several_labels_show_their_conditions_together(
+    risks: str, folder: Path, capsys: Any
+) -> None:
+    assert (
+        call(
+            "eval",
+            "replay",
+            str(folder),
+            "--planner",
+            "Faulty",
+            "--risk",
+            risks,
+            "--view",
+            "false",
+        )
+        == 0
+    )
     path = shown(capsys.readouterr().out)
     assert path.name.startswith("together-std")
-    assert {"/world/conditions/mean/robot", "/world/conditions/CVaR₀.₅/robot"} <= entities(path)
+    assert {
+        "/world/conditions/mean/robot",
+        "/world/conditions/CVaR₀.₅/robot",
+    } <= entities(path)
 
 
 def test_other_episodes_together_are_another_file(folder: Path, capsys: Any) -> None:
     paths = []
     for more in ((), ("--map", "1"), ("--planner", "straight,Faulty")):
         assert (
-            call("eval", "replay", folder, "--planner=Faulty", "--risk=mean,cvar:0.5", *more, "--view=false")
+            call(
+                "eval",
+                "replay",
+                folder,
+                "--planner=Faulty",
+                "--risk=mean,cvar:0.5",
+                *more,
+                "--view=false",
+            )
             == 0
         )
         paths.append(shown(capsys.readouterr().out))
@@ -72,32 +102,54 @@ def test_other_episodes_together_are_another_file(folder: Path, capsys: Any) -> 
 
 
 @pytest.mark.parametrize("seed", ["0", "9"])
-def test_each_option_asks_for_what_it_names(seed: str, folder: Path, capsys: Any) -> None:
+def test_each_option_asks_for_what_it_names(
+    seed: str, folder: Path, capsys: Any
+) -> None:
     """Of an episode that the run does not have, the refusal tells what was looked for."""
-    columns = ("planner", "risk", "scenario", "model", "robot", "objective", "world", "data")
+    columns = (
+        "planner",
+        "risk",
+        "scenario",
+        "model",
+        "robot",
+        "objective",
+        "world",
+        "data",
+    )
     words = [word for name in columns for word in (f"--{name}", f"some {name}")]
     words += ["--seed", seed, "--realisation", "3", "--map", "4"]
     assert call("eval", "replay", str(folder), *words) == 2
     labels = ", ".join(f"{name} 'some {name}'" for name in columns)
-    assert f"got {labels}, realisation 3, map 4, seed {seed}." in capsys.readouterr().err
+    assert (
+        f"got {labels}, realisation 3, map 4, seed {seed}." in capsys.readouterr().err
+    )
 
 
-def test_what_is_proposed_are_unlike_outcomes_on_the_map_where_they_differ_most(folder: Path) -> None:
+def test_what_is_proposed_are_unlike_outcomes_on_the_map_where_they_differ_most(
+    folder: Path,
+) -> None:
     rows = pd.read_parquet(folder / "episodes.parquet")
     faulty = rows["planner"] == "Faulty"
     for arrived in (True, False):
-        rows["success"] = faulty & (rows["map"] == 1) & ((rows["risk"] == "mean") == arrived)
+        rows["success"] = (
+            faulty & (rows["map"] == 1) & ((rows["risk"] == "mean") == arrived)
+        )
         with pytest.MonkeyPatch.context() as patch:
             about = {**Ground.load(folder / GROUND).about, "map": 1}
-            patch.setattr("benchnav.eval.find_episodes.read_table", lambda *_, own=rows: own)
-            patch.setattr(Ground, "load", lambda _, own=about: SimpleNamespace(about=own))
+            patch.setattr(
+                "benchnav.eval.find_episodes.read_table", lambda *_, own=rows: own
+            )
+            patch.setattr(
+                Ground, "load", lambda _, own=about: SimpleNamespace(about=own)
+            )
             labels, place = propose(folder)
         assert (labels["planner"], labels["risk"]) == (["Faulty"], ["mean", "cvar:0.5"])
         assert place == {"map": 1, "seed": 0, "realisation": 0}
     # Settings of the first hypothesis come before others.
     faulty &= rows["map"] == 1
     ids = {
-        risk: rows.loc[faulty & (rows["risk"] == risk), "condition"].iloc[0] for risk in ("mean", "cvar:0.5")
+        risk: rows.loc[faulty & (rows["risk"] == risk), "condition"].iloc[0]
+        for risk in ("mean", "cvar:0.5")
     }
     tests = [{"one": ids["cvar:0.5"], "other": ids["mean"]}]
     with pytest.MonkeyPatch.context() as patch:
@@ -106,7 +158,9 @@ def test_what_is_proposed_are_unlike_outcomes_on_the_map_where_they_differ_most(
             "benchnav.eval.find_episodes.open_run",
             lambda _: replace(run, about=run.about | {"hypotheses": {"tests": tests}}),
         )
-        patch.setattr("benchnav.eval.find_episodes.read_table", lambda *_, own=rows: own)
+        patch.setattr(
+            "benchnav.eval.find_episodes.read_table", lambda *_, own=rows: own
+        )
         patch.setattr(Ground, "load", lambda _, own=about: SimpleNamespace(about=own))
         assert propose(folder)[0]["risk"] == ["cvar:0.5", "mean"]
     rows["success"] = True
@@ -129,7 +183,20 @@ def test_a_video_shows_conditions_side_by_side(
     for name, risk in (("one", "mean"), ("two", "mean,cvar:0.5")):
         path = tmp_path / f"{name}.mp4"
         drawn.clear()
-        assert call("eval", "replay", folder, "--planner", "Faulty", "--risk", risk, "--video", path) == 0
+        assert (
+            call(
+                "eval",
+                "replay",
+                folder,
+                "--planner",
+                "Faulty",
+                "--risk",
+                risk,
+                "--video",
+                path,
+            )
+            == 0
+        )
         assert str(path) in capsys.readouterr().out
         assert drawn == [risk.split(",")]
         with av.open(str(path)) as container:
@@ -149,17 +216,43 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
     dataset_path: Path, tmp_path: Path, capsys: Any
 ) -> None:
     out = tmp_path / "run"
-    assert call("eval", "run", "--data", dataset_path, "--out", out, *SMALL, "--record", "failures") == 0
+    assert (
+        call(
+            "eval",
+            "run",
+            "--data",
+            dataset_path,
+            "--out",
+            out,
+            *SMALL,
+            "--record",
+            "failures",
+        )
+        == 0
+    )
     printed = capsys.readouterr().out.splitlines()
     count = len(list((out / "playback").glob("*.rrd")))
-    assert any(line.startswith(f"recorded: {count} episodes in {out / 'playback'}, ") for line in printed)
+    assert any(
+        line.startswith(f"recorded: {count} episodes in {out / 'playback'}, ")
+        for line in printed
+    )
     (line,) = [line for line in printed if line.startswith("replay:  ")]
     words = shlex.split(line.removeprefix("replay:  "))
     assert "straight" not in words
     assert "--map" in words
     assert call("eval", *words[1:], "--view", "false") == 0
     assert (
-        call("eval", "run", "--data", dataset_path, "--out", tmp_path / "none", *SMALL, "--record", "steps")
+        call(
+            "eval",
+            "run",
+            "--data",
+            dataset_path,
+            "--out",
+            tmp_path / "none",
+            *SMALL,
+            "--record",
+            "steps",
+        )
         == 0
     )
     assert "recorded:" not in capsys.readouterr().out
@@ -168,19 +261,36 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("replay", "RUN", "--video", "a.avi"), "Expected `video` as a file .mp4, got 'a.avi'"),
-        (("replay", "RUN", "--video", "a.mp4", "--web"), "Expected `video` or `web`, got both."),
+        (
+            ("replay", "RUN", "--video", "a.avi"),
+            "Expected `video` as a file .mp4, got 'a.avi'",
+        ),
+        (
+            ("replay", "RUN", "--video", "a.mp4", "--web"),
+            "Expected `video` or `web`, got both.",
+        ),
         (("replay", "RUN", "--video", "mp4"), "Expected `video` as a file .mp4"),
         (("replay", "RUN", "--planner", "mpi"), "planner straight, Faulty; "),
-        (("run", "--record", "some"), "'none' or 'steps' or 'first' or 'failures' or 'all'"),
+        (
+            ("run", "--record", "some"),
+            "'none' or 'steps' or 'first' or 'failures' or 'all'",
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(
-    arguments: tuple[str, ...], told: str, folder: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
+    arguments: tuple[str, ...],
+    told: str,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: Any,
+    capsys: Any,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "old.yaml").write_text("recorded: 4\n")
-    assert call("eval", *(str(folder) if word == "RUN" else word for word in arguments)) == 2
+    assert (
+        call("eval", *(str(folder) if word == "RUN" else word for word in arguments))
+        == 2
+    )
     captured = capsys.readouterr()
     assert captured.out == ""
     (line,) = captured.err.strip().splitlines()

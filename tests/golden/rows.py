@@ -1,9 +1,11 @@
 """Freeze the rows of whole runs as digests, and compare runs of later code with them.
 
-    python -m tests.golden.rows freeze --work FOLDER    # runs the suites, writes tests/golden/rows.json
-    python -m tests.golden.rows check --work FOLDER     # runs them again, names each column that differs
+    python -m tests.golden.rows freeze --work FOLDER    # runs the suites, writes
+    tests/golden/rows.json python -m tests.golden.rows check --work FOLDER     # runs
+    them again, names each column that differs
 
-A row is the same on one kind of machine with one version of PyTorch; `rows.json` says which.
+A row is the same on one kind of machine with one version of PyTorch; `rows.json` says
+which.
 """
 
 import argparse
@@ -34,15 +36,41 @@ SUITES: Mapping[str, tuple[str, str, dict[str, Any]]] = {
 DATASETS = {
     "paper-v1": ["paper-v1"],
     "stakes-v1": ["stakes-v1", "id=stakes-v1-100", "splits.test/std.maps=100"],
-    "stakes-v1-400-seed2026": ["stakes-v1", "id=stakes-v1-400", "splits.test/std.maps=50", "--seed", "2026"],
+    "stakes-v1-400-seed2026": [
+        "stakes-v1",
+        "id=stakes-v1-400",
+        "splits.test/std.maps=50",
+        "--seed",
+        "2026",
+    ],
 }
 SPLITS = {"paper-v1": "[test/std,test/hg,test/hs]"}
 
 # What names a row, by the headings of 1.x.
-LABELS = ("scenario", "world", "robot", "objective", "model", "sensor", "ground", "belief", "planner", "risk")
+LABELS = (
+    "scenario",
+    "world",
+    "robot",
+    "objective",
+    "model",
+    "sensor",
+    "ground",
+    "belief",
+    "planner",
+    "risk",
+)
 DRAW = ["seed", "realisation", "map"]
 # The same rows may have other ids and take another time.
-UNCOMPARED = {*LABELS, *DRAW, "data", "condition", "group", "code", "learning_ms", "compiled"}
+UNCOMPARED = {
+    *LABELS,
+    *DRAW,
+    "data",
+    "condition",
+    "group",
+    "code",
+    "learning_ms",
+    "compiled",
+}
 # Headings of later versions by those of 1.x.
 RENAMED: Mapping[str, str] = {}
 # The first maps have a digest of their own, so that a short run can be compared too.
@@ -51,7 +79,10 @@ FIRST_MAPS = 2
 
 def machine() -> dict[str, str]:
     """What the bits of a result depend on."""
-    return {"torch": torch.__version__.partition("+")[0], "cpu": torch.backends.cpu.get_cpu_capability()}
+    return {
+        "torch": torch.__version__.partition("+")[0],
+        "cpu": torch.backends.cpu.get_cpu_capability(),
+    }
 
 
 def digests_of(episodes: pd.DataFrame) -> dict[str, dict[str, list[str]]]:
@@ -61,35 +92,48 @@ def digests_of(episodes: pd.DataFrame) -> dict[str, dict[str, list[str]]]:
         episodes: rows of a run.
 
     Returns:
-        By the condition's labels, by column: the digest of the first maps and that of all.
+        By the condition's labels, by column: the digest of the first maps and that of
+        all.
     """
     digests = {}
     for labels, rows in episodes.groupby(list(LABELS), sort=True):
         ordered = rows.sort_values(DRAW)
         first = ordered[ordered["map"] < FIRST_MAPS]
-        columns = [name for name in ordered if name not in UNCOMPARED and not name.startswith("planning_")]
+        columns = [
+            name
+            for name in ordered
+            if name not in UNCOMPARED and not name.startswith("planning_")
+        ]
         digests[" ".join(labels)] = {
-            name: [_digest(first[name]), _digest(ordered[name])] for name in sorted(columns)
+            name: [_digest(first[name]), _digest(ordered[name])]
+            for name in sorted(columns)
         }
     return digests
 
 
 def differences(
-    stored: Mapping[str, Mapping[str, list[str]]], episodes: pd.DataFrame, first_maps: bool = False
+    stored: Mapping[str, Mapping[str, list[str]]],
+    episodes: pd.DataFrame,
+    first_maps: bool = False,
 ) -> list[str]:
     """Name what differs from the stored digests, one line each.
 
     Args:
         stored: digests of a suite.
         episodes: rows of conditions of that suite.
-        first_maps: whether the rows are of the first maps only, and perhaps of some conditions only.
+        first_maps: whether the rows are of the first maps only, and perhaps of some
+            conditions only.
     """
     computed = digests_of(episodes)
     which = 0 if first_maps else 1
     lines = [
-        f"{condition}: not in the run" for condition in stored.keys() - computed.keys() if not first_maps
+        f"{condition}: not in the run"
+        for condition in stored.keys() - computed.keys()
+        if not first_maps
     ]
-    lines += [f"{condition}: not frozen" for condition in computed.keys() - stored.keys()]
+    lines += [
+        f"{condition}: not frozen" for condition in computed.keys() - stored.keys()
+    ]
     for condition in sorted(stored.keys() & computed.keys()):
         for name, digests in stored[condition].items():
             column = computed[condition].get(RENAMED.get(name, name))
@@ -108,7 +152,15 @@ def run(work: Path, jobs: int) -> dict[str, pd.DataFrame]:
         path = maps_in / f"{name}.h5"
         if not path.exists():
             splits = SPLITS.get(name, "[test/std]")
-            _command("benchnav-datagen", "create", *words, "--splits", splits, "--out", str(path))
+            _command(
+                "benchnav-datagen",
+                "create",
+                *words,
+                "--splits",
+                splits,
+                "--out",
+                str(path),
+            )
     tables = {}
     for name, (study, part, changes) in SUITES.items():
         suite = Study.load(study).suite(part, Work(out=work, maps_in=maps_in)) | changes
@@ -118,7 +170,16 @@ def run(work: Path, jobs: int) -> dict[str, pd.DataFrame]:
         config = work / f"{name}.yaml"
         config.write_text(yaml.safe_dump(suite, sort_keys=False, allow_unicode=True))
         folder = work / name
-        _command("benchnav-eval", "run", "--config", str(config), "--out", str(folder), "--jobs", str(jobs))
+        _command(
+            "benchnav-eval",
+            "run",
+            "--config",
+            str(config),
+            "--out",
+            str(folder),
+            "--jobs",
+            str(jobs),
+        )
         tables[name] = pd.read_parquet(folder / "episodes.parquet")
     return tables
 
@@ -145,20 +206,27 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("what", choices=["freeze", "check"])
-    parser.add_argument("--work", type=Path, required=True, help="folder of the maps and runs")
+    parser.add_argument(
+        "--work", type=Path, required=True, help="folder of the maps and runs"
+    )
     parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args()
     tables = run(given.work.resolve(), given.jobs)
     if given.what == "freeze":
         suites = {name: digests_of(episodes) for name, episodes in tables.items()}
         STORED.write_text(
-            json.dumps({"machine": machine(), "suites": suites}, indent=1, ensure_ascii=False) + "\n"
+            json.dumps(
+                {"machine": machine(), "suites": suites}, indent=1, ensure_ascii=False
+            )
+            + "\n"
         )
         print(f"wrote {STORED}")
         return
     stored = json.loads(STORED.read_text())
     if stored["machine"] != machine():
-        print(f"frozen on {stored['machine']}, compared on {machine()}: bits may differ only for that reason")
+        print(
+            f"frozen on {stored['machine']}, compared on {machine()}: bits may differ only for that reason"
+        )
     lines = [
         f"{name}: {line}"
         for name, episodes in tables.items()

@@ -56,7 +56,9 @@ DATA = {"risk": "stakes-v1", "knowledge": "stakes-v1-400-seed2026"}
 )
 def test_digests_stay(kind: str, compute: object) -> None:
     if kind == "predictions" and STORED["machine"] != rows.machine():
-        pytest.skip(f"predictions were frozen on {STORED['machine']}, this is {rows.machine()}")
+        pytest.skip(
+            f"predictions were frozen on {STORED['machine']}, this is {rows.machine()}"
+        )
     assert compute() == STORED[kind]  # type: ignore[operator]
 
 
@@ -65,15 +67,24 @@ def test_digests_stay(kind: str, compute: object) -> None:
     reason=f"rows were frozen on {ROWS['machine']}, this is {rows.machine()}",
 )
 @pytest.mark.parametrize("name", CONDITIONS)
-def test_rows_of_the_first_maps_stay(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_of_the_first_maps_stay(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     data = "paper-v1"
     if name in DATA:
         data = "maps.h5"
-        words = [word for word in rows.DATASETS[DATA[name]] if not word.startswith("splits")]
+        words = [
+            word for word in rows.DATASETS[DATA[name]] if not word.startswith("splits")
+        ]
         words += [f"splits.test/std.maps={rows.FIRST_MAPS}", "--splits", "[test/std]"]
         assert call("datagen", "create", *words, "--out", data) == 0
-    suite = {"data": data, "scenarios": ["std"], "maps": rows.FIRST_MAPS, "record": "none"}
+    suite = {
+        "data": data,
+        "scenarios": ["std"],
+        "maps": rows.FIRST_MAPS,
+        "record": "none",
+    }
     Path("suite.yaml").write_text(yaml.safe_dump(suite | CONDITIONS[name]))
     assert call("eval", "run", "--config", "suite.yaml", "--out", "run") == 0
     episodes = pd.read_parquet("run/episodes.parquet")

@@ -13,7 +13,13 @@ import torch
 from safetensors.numpy import load_file
 
 from benchnav.core import registry
-from benchnav.datagen import TerrainDataset, find_dataset, generate, load_recipe, shipped_recipes
+from benchnav.datagen import (
+    TerrainDataset,
+    find_dataset,
+    generate,
+    load_recipe,
+    shipped_recipes,
+)
 from benchnav.models import load_model, predict
 from tests.golden.rows import ROOT, machine
 
@@ -28,7 +34,15 @@ MODELS = {
     "oracle": "stakes-v1",
 }
 MODELS |= {"ideal": "stakes-v1"}
-RISKS = ("mean", "var:0.9", "cvar:0.9", "expected-time", "time-cvar:0.8", "chance", "single-class")
+RISKS = (
+    "mean",
+    "var:0.9",
+    "cvar:0.9",
+    "expected-time",
+    "time-cvar:0.8",
+    "chance",
+    "single-class",
+)
 
 
 def recipe_digests() -> dict[str, str]:
@@ -48,12 +62,16 @@ def weight_digests() -> dict[str, str]:
     for path in sorted((ROOT / "checkpoints").glob("*/*.safetensors")):
         tensors = load_file(path)
         names = np.array(sorted(tensors))
-        digests[f"{path.parent.name}/{path.name}"] = _digest([names, *(tensors[name] for name in names)])
+        digests[f"{path.parent.name}/{path.name}"] = _digest(
+            [names, *(tensors[name] for name in names)]
+        )
     return digests
 
 
 def prediction_digests() -> dict[str, str]:
-    """Digest λ̂ of the shipped models on shipped maps, under each risk measure that the model has."""
+    """Digest λ̂ of the shipped models on shipped maps, under each risk measure that the
+    model has.
+    """
     digests = {}
     for name, data in MODELS.items():
         terrain = TerrainDataset(find_dataset(data)).terrain("test/std", MAPS)
@@ -67,7 +85,11 @@ def prediction_digests() -> dict[str, str]:
 def compute() -> dict[str, dict[str, str]]:
     """Compute all digests with one thread, whose sums have one order."""
     torch.set_num_threads(1)
-    return {"recipes": recipe_digests(), "weights": weight_digests(), "predictions": prediction_digests()}
+    return {
+        "recipes": recipe_digests(),
+        "weights": weight_digests(),
+        "predictions": prediction_digests(),
+    }
 
 
 def _digest(arrays: Iterable[np.ndarray]) -> str:

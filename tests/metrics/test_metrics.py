@@ -62,9 +62,15 @@ def test_a_shipped_metric_is_its_closed_form(
     drive = episode([0.2, 0.8, 0.3, 0.7], **changes)
     values = [
         BY_COLUMN[column].value(one)
-        for one in (drive, replace(drive, outcome="timeout"), episode([], outcome="model_error"))
+        for one in (
+            drive,
+            replace(drive, outcome="timeout"),
+            episode([], outcome="model_error"),
+        )
     ]
-    assert values == [pytest.approx(value, nan_ok=True) for value in (success, failure, at_once)]
+    assert values == [
+        pytest.approx(value, nan_ok=True) for value in (success, failure, at_once)
+    ]
 
 
 @pytest.mark.filterwarnings("error")
@@ -86,7 +92,9 @@ def test_every_shipped_metric_has_a_closed_form() -> None:
     assert [column for column, *_ in mark.args[1]] == list(BY_COLUMN)
 
 
-@pytest.mark.parametrize(("end_s", "score"), [(4, 0.5), (10, 0.5), (20, 0.25), (40, 0.125), (90, 0.125)])
+@pytest.mark.parametrize(
+    ("end_s", "score"), [(4, 0.5), (10, 0.5), (20, 0.25), (40, 0.125), (90, 0.125)]
+)
 def test_score_is_barns(end_s: int, score: float) -> None:
     # OT = 5 s: nothing is better than 10 s, nothing worse than 40 s.
     drive = episode(np.ones(end_s), dt_s=1.0, reference_time_s=10.0)
@@ -102,9 +110,9 @@ def test_times_are_measured_by_the_robots_top_speed() -> None:
 def test_the_path_of_a_circle_is_its_circumference() -> None:
     angle = np.linspace(0, 2 * np.pi, 1001)
     track = np.stack((3 * np.cos(angle), 3 * np.sin(angle), angle), axis=1)
-    assert BY_COLUMN["path_length_m"].value(episode(np.ones(1000), states=track)) == pytest.approx(
-        6 * np.pi, rel=1e-5
-    )
+    assert BY_COLUMN["path_length_m"].value(
+        episode(np.ones(1000), states=track)
+    ) == pytest.approx(6 * np.pi, rel=1e-5)
 
 
 @given(
@@ -122,8 +130,12 @@ def test_energy_on_uniform_terrain_is_power_times_time_over_traversability(
 
 
 def test_energy_is_a_sum_over_steps_that_are_commanded_to_move() -> None:
-    # 100 W for 0.1 s each: λ of 0.5 and 0.25 cost 20 J and 40 J, a turn in place at λ = 1 costs 10 J, a halt nothing.
-    commands = {"speed_mps": np.array([1.0, 1, 0, 0]), "turn_rate_radps": np.array([0.0, 0, 1, 0])}
+    # 100 W for 0.1 s each: λ of 0.5 and 0.25 cost 20 J and 40 J, a turn in place at λ =
+    # 1 costs 10 J, a halt nothing.
+    commands = {
+        "speed_mps": np.array([1.0, 1, 0, 0]),
+        "turn_rate_radps": np.array([0.0, 0, 1, 0]),
+    }
     moving = episode([0.5, 0.25, 1.0, 0.2], **commands)
     assert Energy().value(moving) == pytest.approx(70.0)
     # At λ = 0 the floor limits the power to ten times P.
@@ -134,16 +146,22 @@ def test_energy_is_a_sum_over_steps_that_are_commanded_to_move() -> None:
     ("options", "message"),
     [
         ({"power_w": 0}, "`power_w` of metric 'energy' above 0 and finite, got 0"),
-        ({"min_traversability": 0}, r"`min_traversability` of metric 'energy' in \(0, 1\], got 0"),
+        (
+            {"min_traversability": 0},
+            r"`min_traversability` of metric 'energy' in \(0, 1\], got 0",
+        ),
         ({"min_traversability": 1.5}, r"in \(0, 1\], got 1.5"),
     ],
 )
-def test_energy_rejects_options_without_meaning(options: dict[str, float], message: str) -> None:
+def test_energy_rejects_options_without_meaning(
+    options: dict[str, float], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         registry.make("metric", {"part": "energy", "options": options})
 
 
-# --- the contract -----------------------------------------------------------------------------------
+# --- the contract
+# -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", registry.names("metric"))
@@ -154,7 +172,9 @@ def test_every_registered_metric_keeps_the_contract(name: str, robot: str) -> No
 
 
 def test_the_shipped_metrics_are_registered_and_those_of_every_run() -> None:
-    assert {metric.name for metric in SHIPPED} | {"energy"} <= set(registry.names("metric"))
+    assert {metric.name for metric in SHIPPED} | {"energy"} <= set(
+        registry.names("metric")
+    )
     assert len({metric.name for metric in SHIPPED}) == len(BY_COLUMN) == len(SHIPPED)
 
 
@@ -183,7 +203,9 @@ class Fine(Metric):
         ({"min_steps": -1}, "Expected `min_steps` ≥ 0"),
     ],
 )
-def test_attributes_without_meaning_are_named(changes: dict[str, Any], message: str) -> None:
+def test_attributes_without_meaning_are_named(
+    changes: dict[str, Any], message: str
+) -> None:
     assert attribute_faults(Fine()) == []
     broken = type("Broken", (Fine,), changes)()
     assert [fault.startswith(message) for fault in attribute_faults(broken)] == [True]
@@ -196,7 +218,11 @@ def test_an_attribute_that_is_missing_is_named() -> None:
         def compute(self, episode: Episode) -> float:
             return 0.0
 
-    assert [fault.split("`")[1] for fault in attribute_faults(Bare())] == ["name", "column", "meaning"]
+    assert [fault.split("`")[1] for fault in attribute_faults(Bare())] == [
+        "name",
+        "column",
+        "meaning",
+    ]
 
 
 def changing(compute: Any) -> Metric:
@@ -229,7 +255,9 @@ def test_a_metric_that_counts_its_calls_is_named() -> None:
         check_metric(changing(compute))
 
 
-@pytest.mark.parametrize("value", [True, np.True_, 3, np.float32(0.5), np.int64(2), math.nan])
+@pytest.mark.parametrize(
+    "value", [True, np.True_, 3, np.float32(0.5), np.int64(2), math.nan]
+)
 def test_numbers_of_any_type_are_values(value: Any) -> None:
     found = measure(changing(lambda self, episode: value), episode([1]))
     assert type(found) is float
@@ -254,7 +282,10 @@ def test_an_episode_cannot_be_written_to_and_prints_as_one_line() -> None:
     drive = episode([1, 1])
     with pytest.raises(ValueError, match="read-only"):
         drive.traversability[0] = 0
-    assert repr(drive) == "Episode(outcome='success', steps=2, end_time_s=0.2, robot=Unicycle)"
+    assert (
+        repr(drive)
+        == "Episode(outcome='success', steps=2, end_time_s=0.2, robot=Unicycle)"
+    )
 
 
 @pytest.mark.parametrize("robot", [Unicycle(), Bicycle(), DifferentialDrive()])

@@ -15,7 +15,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> TerrainDataset:
 
 
 @pytest.fixture(scope="session")
-def checkpoint_path(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def checkpoint_path(
+    dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """A checkpoint with both halves, trained for a moment."""
     from benchnav.models.cli import TrainOptions, train_all
     from benchnav.models.config import ClassifierConfig, LatentGPConfig

@@ -41,47 +41,68 @@ def trainable(config: TrainingConfig) -> Trainable:
 
 
 def make_dataset(path: Path, **maps: int) -> TerrainDataset:
-    """Makes a dataset of the recipe tiny-v1 with fewer maps; splits not named are left out."""
+    """Makes a dataset of the recipe tiny-v1 with fewer maps; splits not named are left
+    out.
+    """
     recipe = load_recipe("tiny-v1")
     counts = {name.replace("_", "/"): count for name, count in maps.items()}
-    splits = {name: replace(recipe.splits[name], maps=count) for name, count in counts.items()}
+    splits = {
+        name: replace(recipe.splits[name], maps=count) for name, count in counts.items()
+    }
     for _ in create(replace(recipe, splits=splits), path):
         pass
     return TerrainDataset(path)
 
 
-def make_terrain(batch: int = 2, size: int = 16, classes: int = 3, seed: int = 0) -> Terrain:
-    """Makes terrain whose layers are random and whose traversability follows its mean and std."""
+def make_terrain(
+    batch: int = 2, size: int = 16, classes: int = 3, seed: int = 0
+) -> Terrain:
+    """Makes terrain whose layers are random and whose traversability follows its mean
+    and std.
+    """
     generator = torch.Generator().manual_seed(seed)
     shape = (batch, size, size)
     mean = torch.rand(shape, generator=generator)
     std = 0.1 + 0.1 * torch.rand(shape, generator=generator)
     return Terrain(
-        rgb=torch.randint(0, 256, (batch, 3, size, size), generator=generator, dtype=torch.uint8),
+        rgb=torch.randint(
+            0, 256, (batch, 3, size, size), generator=generator, dtype=torch.uint8
+        ),
         class_id=torch.randint(0, classes, shape, generator=generator),
         elevation_m=torch.rand(shape, generator=generator),
         slope_deg=30 * torch.rand(shape, generator=generator),
         truth=TraversabilityMixture(
-            torch.ones_like(mean).unsqueeze(1), mean.unsqueeze(1), std.unsqueeze(1), (0,)
+            torch.ones_like(mean).unsqueeze(1),
+            mean.unsqueeze(1),
+            std.unsqueeze(1),
+            (0,),
         ),
-        traversability=(mean + std * torch.randn(shape, generator=generator)).clamp(0, 1),
+        traversability=(mean + std * torch.randn(shape, generator=generator)).clamp(
+            0, 1
+        ),
         grid=Grid(size, size, 0.5),
     )
 
 
 def linear_table() -> SlopeTable:
-    """Three classes with means 1 − ψ/90, 0.5 and ψ/90 and standard deviations 0.1, 0.2 and 0.3."""
+    """Three classes with means 1 − ψ/90, 0.5 and ψ/90 and standard deviations 0.1, 0.2
+    and 0.3.
+    """
     slopes = table_slopes().float()
     noise = torch.tensor([0.1, 0.2, 0.3])
     mean = torch.stack([1 - slopes / 90, torch.full_like(slopes, 0.5), slopes / 90])
-    return SlopeTable(mean=mean, std=noise[:, None].expand_as(mean).contiguous(), noise_std=noise)
+    return SlopeTable(
+        mean=mean, std=noise[:, None].expand_as(mean).contiguous(), noise_std=noise
+    )
 
 
 NOISE = torch.tensor([0.10, 0.15, 0.20])
 
 
 def latent(slope_deg: torch.Tensor) -> torch.Tensor:
-    """The true latent functions of three classes; the first is near 1, where half is clipped."""
+    """The true latent functions of three classes; the first is near 1, where half is
+    clipped.
+    """
     return torch.stack(
         [
             1 - 5e-4 * slope_deg**1.5,

@@ -19,7 +19,13 @@ from benchnav.datagen.ground import fit_ground
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models import checkpoint as module
 from benchnav.models.base import predict
-from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpoint, save_checkpoint
+from benchnav.models.checkpoint import (
+    Checkpoint,
+    Part,
+    as_stored,
+    load_checkpoint,
+    save_checkpoint,
+)
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.predictor import find_checkpoint, load_model, open_checkpoint
@@ -45,27 +51,40 @@ def full(part: Part) -> Part:
     return replace(part, half_precision=False)
 
 
-def test_training_keeps_the_statistics_of_its_maps(folder: Path, dataset: TerrainDataset) -> None:
+def test_training_keeps_the_statistics_of_its_maps(
+    folder: Path, dataset: TerrainDataset
+) -> None:
     assert load_checkpoint(folder).ground == fit_ground(dataset)
-    assert GroundStatistics.from_json((folder / "ground.json").read_text()) == fit_ground(dataset)
+    assert GroundStatistics.from_json(
+        (folder / "ground.json").read_text()
+    ) == fit_ground(dataset)
 
 
-def test_statistics_of_the_ground_survive_a_copy_and_a_new_part(folder: Path, tmp_path: Path) -> None:
+def test_statistics_of_the_ground_survive_a_copy_and_a_new_part(
+    folder: Path, tmp_path: Path
+) -> None:
     there = load_checkpoint(folder)
     save_checkpoint(tmp_path / "again", there.with_part("gp", there.part("gp")))
-    assert load_checkpoint(shutil.copytree(tmp_path / "again", tmp_path / "moved")).ground == there.ground
+    assert (
+        load_checkpoint(shutil.copytree(tmp_path / "again", tmp_path / "moved")).ground
+        == there.ground
+    )
     save_checkpoint(folder, replace(there, ground=None))
     assert not (folder / "ground.json").exists()
     assert load_checkpoint(folder).ground is None
 
 
 @pytest.mark.parametrize("harm", ["edit", "drop", "swap"])
-def test_statistics_of_the_ground_are_covered_by_the_checkpoints_digest(folder: Path, harm: str) -> None:
+def test_statistics_of_the_ground_are_covered_by_the_checkpoints_digest(
+    folder: Path, harm: str
+) -> None:
     path = folder / "ground.json"
     if harm == "drop":
         path.unlink()
     elif harm == "edit":
-        path.write_text(path.read_text().replace('"potts_strength": 0.0', '"potts_strength": 1.0'))
+        path.write_text(
+            path.read_text().replace('"potts_strength": 0.0', '"potts_strength": 1.0')
+        )
     else:
         path.write_text("{}")
     with pytest.raises(CheckpointError, match=r"ground\.json is damaged"):
@@ -89,16 +108,24 @@ def test_a_checkpoint_of_before_may_have_statistics_put_beside_it(folder: Path) 
 
 def test_a_round_trip_gives_equal_predictions(folder: Path, tmp_path: Path) -> None:
     there = load_checkpoint(folder)
-    save_checkpoint(tmp_path / "again", there.with_part("classifier", full(there.part("classifier"))))
+    save_checkpoint(
+        tmp_path / "again",
+        there.with_part("classifier", full(there.part("classifier"))),
+    )
     terrain = make_terrain(classes=10)
-    before, after = (predict(load_model(path), terrain) for path in (folder, tmp_path / "again"))
+    before, after = (
+        predict(load_model(path), terrain) for path in (folder, tmp_path / "again")
+    )
     for name in ("weights", "means", "stds"):
         assert torch.equal(getattr(before, name), getattr(after, name))
     again = load_checkpoint(tmp_path / "again")
     assert again.class_names == there.class_names
     assert again.model == there.model == "fused"
     for name in ("classifier", "gp"):
-        before, after = (replace(c.part(name), tensors={}, half_precision=False) for c in (there, again))
+        before, after = (
+            replace(c.part(name), tensors={}, half_precision=False)
+            for c in (there, again)
+        )
         assert before == after
     assert there.part("gp").data_id == "tiny-v1"
     assert there.part("gp").data_digest.startswith("train:")
@@ -108,16 +135,25 @@ def test_a_round_trip_gives_equal_predictions(folder: Path, tmp_path: Path) -> N
 def test_half_precision_is_small_and_close(folder: Path, tmp_path: Path) -> None:
     part = load_checkpoint(folder).part("classifier")
     sharp = {
-        name: value + 1e-5 if value.is_floating_point() else value for name, value in part.tensors.items()
+        name: value + 1e-5 if value.is_floating_point() else value
+        for name, value in part.tensors.items()
     }
     part = replace(part, tensors=sharp)
     for name, one in (("half", part), ("full", full(part))):
-        save_checkpoint(tmp_path / name, load_checkpoint(folder).with_part("classifier", one))
-    sizes = {n: (tmp_path / n / "classifier.safetensors").stat().st_size for n in ("half", "full")}
+        save_checkpoint(
+            tmp_path / name, load_checkpoint(folder).with_part("classifier", one)
+        )
+    sizes = {
+        n: (tmp_path / n / "classifier.safetensors").stat().st_size
+        for n in ("half", "full")
+    }
     assert sizes["half"] < 0.51 * sizes["full"]
     assert sizes["half"] < 30e6
     terrain = make_terrain(classes=10)
-    half, whole = (predict(load_model(tmp_path / name), terrain).weights for name in ("half", "full"))
+    half, whole = (
+        predict(load_model(tmp_path / name), terrain).weights
+        for name in ("half", "full")
+    )
     assert half.dtype == torch.float32
     torch.testing.assert_close(half, whole, rtol=0, atol=0.02)
     assert not torch.equal(half, whole)
@@ -125,31 +161,45 @@ def test_half_precision_is_small_and_close(folder: Path, tmp_path: Path) -> None
     assert all(p.dtype == torch.float32 for p in classifier.parameters())
 
 
-def test_weights_are_measured_as_they_are_read_back(folder: Path, tmp_path: Path) -> None:
+def test_weights_are_measured_as_they_are_read_back(
+    folder: Path, tmp_path: Path
+) -> None:
     part = load_checkpoint(folder).part("classifier")
     sharp = {
-        name: value + 1e-5 if value.is_floating_point() else value for name, value in part.tensors.items()
+        name: value + 1e-5 if value.is_floating_point() else value
+        for name, value in part.tensors.items()
     }
     for half in (True, False):
         kept = replace(part, tensors=sharp, half_precision=half)
-        save_checkpoint(tmp_path / str(half), load_checkpoint(folder).with_part("classifier", kept))
+        save_checkpoint(
+            tmp_path / str(half), load_checkpoint(folder).with_part("classifier", kept)
+        )
         read = load_checkpoint(tmp_path / str(half)).part("classifier").tensors
         stored = as_stored(sharp, half)
         assert read.keys() == stored.keys()
         assert all(torch.equal(read[name], value) for name, value in stored.items())
-    assert all(torch.equal(value, sharp[name]) for name, value in as_stored(sharp, False).items())
+    assert all(
+        torch.equal(value, sharp[name])
+        for name, value in as_stored(sharp, False).items()
+    )
 
 
-def test_the_temperature_of_a_pool_is_kept_until_the_pool_is_another(folder: Path, tmp_path: Path) -> None:
+def test_the_temperature_of_a_pool_is_kept_until_the_pool_is_another(
+    folder: Path, tmp_path: Path
+) -> None:
     there = load_checkpoint(folder)
     assert there.pool_temperature == 1
-    pooled = replace(there.with_part("classifier-2", there.part("classifier")), pool_temperature=0.25)
+    pooled = replace(
+        there.with_part("classifier-2", there.part("classifier")), pool_temperature=0.25
+    )
     save_checkpoint(tmp_path / "pool", pooled)
     again = load_checkpoint(tmp_path / "pool")
     assert again.pool_temperature == 0.25
     assert load_model(tmp_path / "pool").pool_temperature == 0.25  # type: ignore[union-attr]
     assert again.with_part("gp", there.part("gp")).pool_temperature == 0.25
-    assert again.with_part("classifier-3", there.part("classifier")).pool_temperature == 1
+    assert (
+        again.with_part("classifier-3", there.part("classifier")).pool_temperature == 1
+    )
     assert "pool_temperature" not in json.loads((folder / "config.json").read_text())
 
 
@@ -158,7 +208,9 @@ def test_second_modes_are_kept_beside_the_tables(folder: Path, tmp_path: Path) -
     table = SlopeTable.from_tensors(there.part("gp").tensors)
     assert table.soft is None
     soft = SoftModes(
-        weight=torch.full((10,), 0.1), mean=torch.linspace(0, 0.5, 10), std=torch.full((10,), 0.05)
+        weight=torch.full((10,), 0.1),
+        mean=torch.linspace(0, 0.5, 10),
+        std=torch.full((10,), 0.05),
     )
     part = replace(there.part("gp"), tensors=replace(table, soft=soft).to_tensors())
     save_checkpoint(tmp_path / "soft", there.with_part("gp", part))
@@ -178,7 +230,9 @@ def test_a_temperature_that_is_none_is_refused(folder: Path, value: object) -> N
 
 
 def test_a_folder_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"Expected a checkpoint folder with config\.json"):
+    with pytest.raises(
+        CheckpointError, match=r"Expected a checkpoint folder with config\.json"
+    ):
         load_checkpoint(tmp_path)
 
 
@@ -202,18 +256,27 @@ def test_damaged_tensors_are_refused(folder: Path, name: str, damage: str) -> No
 
 def test_a_damaged_config_is_refused(folder: Path) -> None:
     text = (folder / "config.json").read_text()
-    for spoilt in (text[:-30], "[]", "{}", '{"format": "benchnav-checkpoint", "format_version": "2.0"}'):
+    for spoilt in (
+        text[:-30],
+        "[]",
+        "{}",
+        '{"format": "benchnav-checkpoint", "format_version": "2.0"}',
+    ):
         (folder / "config.json").write_text(spoilt)
         with pytest.raises(CheckpointError, match="is damaged"):
             load_checkpoint(folder)
 
 
 @pytest.mark.parametrize(
-    ("version", "remedy"), [("2.4", "pip install --upgrade benchnav"), ("1.0", "Train the model again")]
+    ("version", "remedy"),
+    [("2.4", "pip install --upgrade benchnav"), ("1.0", "Train the model again")],
 )
 def test_another_format_is_refused(folder: Path, version: str, remedy: str) -> None:
     edit(folder, format_version=version)
-    with pytest.raises(CheckpointError, match=rf"Expected format version 2\.3 .* got {version}.*{remedy}"):
+    with pytest.raises(
+        CheckpointError,
+        match=rf"Expected format version 2\.3 .* got {version}.*{remedy}",
+    ):
         load_checkpoint(folder)
 
 
@@ -240,11 +303,15 @@ def test_tensors_that_do_not_fit_their_settings_are_refused(folder: Path) -> Non
 
 def test_no_weights_are_downloaded_for_a_pretrained_checkpoint(folder: Path) -> None:
     part = load_checkpoint(folder).part("classifier")
-    model = TerrainClassifier.from_tensors({**part.config, "pretrained": True}, names(10), part.tensors)
+    model = TerrainClassifier.from_tensors(
+        {**part.config, "pretrained": True}, names(10), part.tensors
+    )
     assert model.config.pretrained is False
 
 
-def test_a_killed_save_leaves_the_old_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_save_leaves_the_old_checkpoint(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     there = load_checkpoint(folder)
 
     def killed(*_: object) -> None:
@@ -258,7 +325,9 @@ def test_a_killed_save_leaves_the_old_checkpoint(folder: Path, monkeypatch: pyte
     assert os.listdir(folder.parent) == [folder.name]
 
 
-def test_a_save_never_replaces_what_is_no_checkpoint(folder: Path, tmp_path: Path) -> None:
+def test_a_save_never_replaces_what_is_no_checkpoint(
+    folder: Path, tmp_path: Path
+) -> None:
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "notes.txt").write_text("keep")
     with pytest.raises(ConfigError, match="something else"):
@@ -274,19 +343,33 @@ def test_settings_of_the_trainer_are_kept_and_absent_of_earlier_versions(
     assert there.part("gp").trainer is None
     clipped = replace(there.part("classifier"), trainer={"gradient_clip_val": 0.5})
     save_checkpoint(tmp_path / "again", there.with_part("classifier", clipped))
-    assert load_checkpoint(tmp_path / "again").part("classifier").trainer == {"gradient_clip_val": 0.5}
-    assert load_checkpoint(find_checkpoint("paper-v1")).part("classifier").trainer is None
+    assert load_checkpoint(tmp_path / "again").part("classifier").trainer == {
+        "gradient_clip_val": 0.5
+    }
+    assert (
+        load_checkpoint(find_checkpoint("paper-v1")).part("classifier").trainer is None
+    )
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Terrain, TraversabilityMixture]:
-    """A small checkpoint of two classifiers that nobody trained, a map, and what it predicts of it."""
+def small(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Path, Terrain, TraversabilityMixture]:
+    """A small checkpoint of two classifiers that nobody trained, a map, and what it
+    predicts of it.
+    """
     classes = load_recipe("tiny-v1").classes
-    config = ClassifierConfig(encoder="mobilenet_v2", encoder_depth=3, decoder_channels=(16, 8, 8))
+    config = ClassifierConfig(
+        encoder="mobilenet_v2", encoder_depth=3, decoder_channels=(16, 8, 8)
+    )
     members = {
         name: Part(
             config={**asdict(config), "temperature": 0.5 + seed},
-            tensors=dict(TerrainClassifier(config).build(map_classes=classes, seed=seed).state_dict()),
+            tensors=dict(
+                TerrainClassifier(config)
+                .build(map_classes=classes, seed=seed)
+                .state_dict()
+            ),
             seed=seed,
             metrics={"valid_loss": 0.5},
             data_id="tiny-v1",
@@ -297,37 +380,81 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Terrain, Trav
         for seed, name in enumerate(("classifier", "classifier-2"))
     }
     gp = replace(
-        members["classifier"], config={}, tensors=true_table(classes).to_tensors(), half_precision=False
+        members["classifier"],
+        config={},
+        tensors=true_table(classes).to_tensors(),
+        half_precision=False,
     )
     folder = tmp_path_factory.mktemp("small") / "small"
     names = tuple(item.name for item in classes)
-    save_checkpoint(folder, Checkpoint(class_names=names, parts={**members, "gp": gp}, pool_temperature=0.8))
+    save_checkpoint(
+        folder,
+        Checkpoint(
+            class_names=names, parts={**members, "gp": gp}, pool_temperature=0.8
+        ),
+    )
     terrain = make_terrain(batch=1, classes=10)
     return folder, terrain, predict(load_model(folder), terrain)
 
 
-ODD = (None, -1, 0, 1, 7, 1e300, float("nan"), "", "x", "../x", True, [], [1], {}, {"a": 1}, 10**30)
+ODD = (
+    None,
+    -1,
+    0,
+    1,
+    7,
+    1e300,
+    float("nan"),
+    "",
+    "x",
+    "../x",
+    True,
+    [],
+    [1],
+    {},
+    {"a": 1},
+    10**30,
+)
 
 
 def spoil(folder: Path, generator: random.Random) -> str:
     """Changes something of a checkpoint and says what."""
     kind = generator.choice(
-        ["value", "value", "value", "key", "text", "text", "bytes", "cut", "gone", "swap"]
+        [
+            "value",
+            "value",
+            "value",
+            "key",
+            "text",
+            "text",
+            "bytes",
+            "cut",
+            "gone",
+            "swap",
+        ]
     )
     config, tensors = folder / "config.json", sorted(folder.glob("*.safetensors"))
     if kind in ("value", "key"):
         content = json.loads(config.read_text())
         place: Any = content
         while True:
-            key = generator.choice(list(place) if isinstance(place, dict) else range(len(place)))
-            if not isinstance(place[key], dict | list) or not place[key] or generator.random() < 0.15:
+            key = generator.choice(
+                list(place) if isinstance(place, dict) else range(len(place))
+            )
+            if (
+                not isinstance(place[key], dict | list)
+                or not place[key]
+                or generator.random() < 0.15
+            ):
                 break
             place = place[key]
         before = place.pop(key)
         if kind == "value":
             near = [before * 1.5, before + 1] if type(before) in (int, float) else []
             odd = generator.choice([*ODD, *near, *near])
-            place.insert(key, odd) if isinstance(place, list) else place.update({key: odd})
+            place.insert(key, odd) if isinstance(place, list) else place.update(
+                {key: odd}
+            )
         config.write_text(json.dumps(content))
         return f"{kind} {key}"
     path = config if kind == "text" else generator.choice([config, *tensors])
@@ -353,7 +480,9 @@ def predicted(folder: Path, terrain: Terrain) -> TraversabilityMixture | str:
 
 
 @pytest.mark.parametrize(
-    "edits", [range(50), pytest.param(range(50, 350), marks=pytest.mark.slow)], ids=["50", "300"]
+    "edits",
+    [range(50), pytest.param(range(50, 350), marks=pytest.mark.slow)],
+    ids=["50", "300"],
 )
 def test_an_edited_checkpoint_is_refused_in_one_line_or_predicts_what_it_did(
     edits: range, small: tuple[Path, Terrain, TraversabilityMixture], tmp_path: Path
@@ -375,17 +504,23 @@ def test_an_edited_checkpoint_is_refused_in_one_line_or_predicts_what_it_did(
 
 
 @pytest.mark.parametrize(
-    "edits", [range(30), pytest.param(range(30, 130), marks=pytest.mark.slow)], ids=["30", "100"]
+    "edits",
+    [range(30), pytest.param(range(30, 130), marks=pytest.mark.slow)],
+    ids=["30", "100"],
 )
 def test_an_edited_checkpoint_of_an_earlier_version_ends_in_no_traceback(
     edits: range, small: tuple[Path, Terrain, TraversabilityMixture], tmp_path: Path
 ) -> None:
-    """Nothing tells there whether a setting was edited, so that it may be another model; it is a model or refused."""
+    """Nothing tells there whether a setting was edited, so that it may be another
+    model; it is a model or refused.
+    """
     folder, terrain, _ = small
     for number in edits:
         copy = Path(shutil.copytree(folder, tmp_path / str(number)))
         config = unseal((copy / "config.json").read_text())
-        (copy / "config.json").write_text(json.dumps({**config, "format_version": "2.1"}))
+        (copy / "config.json").write_text(
+            json.dumps({**config, "format_version": "2.1"})
+        )
         done = spoil(copy, random.Random(1000 + number))
         found = predicted(copy, terrain)
         if not isinstance(found, str):
@@ -407,7 +542,10 @@ def test_the_command_refuses_an_edited_checkpoint_in_one_line(
     edited: list[dict[str, Any]] = [
         {**config, "pool_temperature": 0.5},
         {**config, "class_names": names[::-1]},
-        {**config, "parts": {**parts, "classifier": {**parts["classifier"], "seed": "x"}}},
+        {
+            **config,
+            "parts": {**parts, "classifier": {**parts["classifier"], "seed": "x"}},
+        },
         {**config, "parts": {name: parts[name] for name in ("classifier", "gp")}},
         {**config, "format_version": "2.1", "class_names": ["a", "a", *names[2:]]},
         {**config, "format_version": "2.1", "parts": {**parts, "gp": 5}},

@@ -1,4 +1,6 @@
-"""Conformal recalibration: its promise by simulation over exchangeable maps, and its table by hand."""
+"""Conformal recalibration: its promise by simulation over exchangeable maps, and its
+table by hand.
+"""
 
 from typing import Any
 
@@ -13,7 +15,12 @@ from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.quantiles import LEVELS
 from benchnav.models.checkpoint import Checkpoint
-from benchnav.models.conformal import ConformalModel, ConformalTable, fit_table, recalibrated
+from benchnav.models.conformal import (
+    ConformalModel,
+    ConformalTable,
+    fit_table,
+    recalibrated,
+)
 from tests.factories import normal
 from tests.models.stub import ColourModel
 from tests.models.support import make_terrain
@@ -24,7 +31,8 @@ MAPS = 9
 
 
 def draw_maps(generator: np.random.Generator, count: int) -> list[np.ndarray]:
-    """λ of exchangeable maps that differ, with atoms at 0 and 1; hard maps have few cells.
+    """λ of exchangeable maps that differ, with atoms at 0 and 1; hard maps have few
+    cells.
 
     A model says N(0.5, 0.2) of all of them.
     """
@@ -49,7 +57,9 @@ def share_below(table: ConformalTable, lam: np.ndarray) -> np.ndarray:
 
 
 def simulate(group: bool, draws: int = 1200) -> tuple[np.ndarray, np.ndarray]:
-    """The mean and standard error of `share_below` on a new map; with maps as groups, or each cell as its own."""
+    """The mean and standard error of `share_below` on a new map; with maps as groups,
+    or each cell as its own.
+    """
     generator, found = np.random.default_rng(0), []
     for _ in range(draws):
         *maps, new = draw_maps(generator, MAPS + 1)
@@ -79,18 +89,27 @@ def test_without_the_weight_of_the_new_map_it_would_break() -> None:
         *maps, new = draw_maps(generator, MAPS + 1)
         scores = [scores_of(lam, generator) for lam in maps]
         pooled = np.concatenate(scores)
-        weights = np.concatenate([np.full(len(own), 1 / MAPS / len(own)) for own in scores])
+        weights = np.concatenate(
+            [np.full(len(own), 1 / MAPS / len(own)) for own in scores]
+        )
         order = np.argsort(pooled)
         values = pooled[order][
-            np.searchsorted(weights[order].cumsum(), np.array(LEVELS), side="right").clip(max=len(pooled) - 1)
+            np.searchsorted(
+                weights[order].cumsum(), np.array(LEVELS), side="right"
+            ).clip(max=len(pooled) - 1)
         ]
-        found.append(share_below(ConformalTable(levels=LEVELS, values=tuple(values), maps=MAPS), new))
+        found.append(
+            share_below(
+                ConformalTable(levels=LEVELS, values=tuple(values), maps=MAPS), new
+            )
+        )
     share, error = np.mean(found, 0), np.std(found, 0) / 1200**0.5
     assert share[1] > CHOSEN[1] + 3 * error[1], share
 
 
 def test_the_table_by_hand() -> None:
-    # Two maps, and the new one with 1/3: the share of scores up to each is 1/3 + 1/6, + 1/6, + 1/3.
+    # Two maps, and the new one with 1/3: the share of scores up to each is 1/3 + 1/6, +
+    # 1/6, + 1/3.
     levels = (0.0, 0.3, 0.4, 0.6, 0.7, 0.99, 1.0)
     table = fit_table([np.array([0.2, 0.6]), np.array([0.8]), np.array([])], levels)
     assert table.values == (0.0, 0.0, 0.2, 0.6, 0.8, 0.8, 1.0)
@@ -102,11 +121,15 @@ def test_the_table_by_hand() -> None:
     st.lists(st.lists(st.floats(0, 1), min_size=1, max_size=6), min_size=1, max_size=8),
     st.floats(0, 1),
 )
-def test_the_table_is_the_supremum_of_its_definition(maps: list[list[float]], level: float) -> None:
+def test_the_table_is_the_supremum_of_its_definition(
+    maps: list[list[float]], level: float
+) -> None:
     values = fit_table([np.array(own) for own in maps], (0.0, level, 1.0)).values
 
     def share(value: float) -> float:
-        return (sum(np.mean(np.array(own) < value) for own in maps) + 1) / (len(maps) + 1)
+        return (sum(np.mean(np.array(own) < value) for own in maps) + 1) / (
+            len(maps) + 1
+        )
 
     assert values[0] == 0 or share(values[0]) <= 0
     if values[1] > 0:
@@ -136,9 +159,14 @@ def test_maps_without_a_score_are_refused() -> None:
 
 
 def test_quantiles_are_read_at_the_levels_of_the_table() -> None:
-    table = ConformalTable(levels=LEVELS, values=tuple(level**2 for level in LEVELS), maps=4)
+    table = ConformalTable(
+        levels=LEVELS, values=tuple(level**2 for level in LEVELS), maps=4
+    )
     generator = torch.Generator().manual_seed(0)
-    base = normal(torch.rand(2, 3, 4, generator=generator), 0.1 + torch.rand(2, 3, 4, generator=generator))
+    base = normal(
+        torch.rand(2, 3, 4, generator=generator),
+        0.1 + torch.rand(2, 3, 4, generator=generator),
+    )
     found = recalibrated(base, table)
     assert found.shape == (2, 3, 4)
     for level in (0.0, 0.05, 0.2, 0.5, 0.9, 1.0):
@@ -147,7 +175,9 @@ def test_quantiles_are_read_at_the_levels_of_the_table() -> None:
     inside = found.quantile(0.2)
     free = (inside > 0) & (inside < 1)
     assert bool(free.any())
-    torch.testing.assert_close(found.cdf(inside)[free], torch.full_like(inside, 0.2)[free], atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        found.cdf(inside)[free], torch.full_like(inside, 0.2)[free], atol=1e-4, rtol=0
+    )
 
 
 def test_a_recalibrated_model_tells_no_classes() -> None:
@@ -167,7 +197,9 @@ def changed(**values: Any) -> dict[str, Any]:
 
 
 def test_a_table_is_read_as_it_was_written() -> None:
-    table = ConformalTable(levels=LEVELS, values=tuple(level**2 for level in LEVELS), maps=4)
+    table = ConformalTable(
+        levels=LEVELS, values=tuple(level**2 for level in LEVELS), maps=4
+    )
     assert ConformalTable.read(table.plain()) == table
 
 

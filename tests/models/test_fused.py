@@ -17,7 +17,9 @@ class Linear(nn.Module):
 
     def __init__(self, seed: int) -> None:
         super().__init__()
-        self.weight = torch.randn(3, 3, generator=torch.Generator().manual_seed(seed)) / 100
+        self.weight = (
+            torch.randn(3, 3, generator=torch.Generator().manual_seed(seed)) / 100
+        )
 
     def forward(self, maps: Mapping[str, Tensor]) -> Tensor:
         rgb = maps["rgb"]
@@ -29,7 +31,11 @@ class Certain(nn.Module):
 
     def forward(self, maps: Mapping[str, Tensor]) -> Tensor:
         rgb = maps["rgb"]
-        return torch.tensor([0.0, -1e4, -torch.inf]).view(1, 3, 1, 1).expand(len(rgb), -1, *rgb.shape[-2:])
+        return (
+            torch.tensor([0.0, -1e4, -torch.inf])
+            .view(1, 3, 1, 1)
+            .expand(len(rgb), -1, *rgb.shape[-2:])
+        )
 
 
 def test_probabilities_of_members_are_averaged() -> None:
@@ -37,21 +43,32 @@ def test_probabilities_of_members_are_averaged() -> None:
     members = [Linear(seed) for seed in range(3)]
     ensemble = FusedModel(members, linear_table(), NAMES)
     alone = torch.stack(
-        [FusedModel([one], linear_table(), NAMES).predict(observation).weights for one in members]
+        [
+            FusedModel([one], linear_table(), NAMES).predict(observation).weights
+            for one in members
+        ]
     )
     torch.testing.assert_close(ensemble.predict(observation).weights, alone.mean(0))
     assert torch.equal(ensemble.member_probabilities(observation), alone)
 
 
 def test_the_average_is_calibrated_as_a_whole_and_the_members_are_not() -> None:
-    observation, members = make_terrain(batch=3).observe(), [Linear(seed) for seed in range(2)]
+    observation, members = (
+        make_terrain(batch=3).observe(),
+        [Linear(seed) for seed in range(2)],
+    )
     plain = FusedModel(members, linear_table(), NAMES)
     pool = FusedModel(members, linear_table(), NAMES, pool_temperature=0.5)
     squares = plain.predict(observation).weights ** 2
     torch.testing.assert_close(
-        pool.predict(observation).weights, squares / squares.sum(1, keepdim=True), rtol=1e-4, atol=1e-6
+        pool.predict(observation).weights,
+        squares / squares.sum(1, keepdim=True),
+        rtol=1e-4,
+        atol=1e-6,
     )
-    assert torch.equal(pool.member_probabilities(observation), plain.member_probabilities(observation))
+    assert torch.equal(
+        pool.member_probabilities(observation), plain.member_probabilities(observation)
+    )
 
 
 SOFT = SoftModes(
@@ -64,7 +81,9 @@ SOFT = SoftModes(
 def test_a_class_with_soft_spots_has_a_component_more() -> None:
     observation = make_terrain(batch=3).observe()
     plain = FusedModel([Linear(0)], linear_table(), NAMES).predict(observation)
-    mixture = FusedModel([Linear(0)], replace(linear_table(), soft=SOFT), NAMES).predict(observation)
+    mixture = FusedModel(
+        [Linear(0)], replace(linear_table(), soft=SOFT), NAMES
+    ).predict(observation)
     assert plain.group == (0, 1, 2)
     assert mixture.group == (0, 1, 2, 0, 2)
     torch.testing.assert_close(mixture.class_probabilities(3), plain.weights)
@@ -74,14 +93,20 @@ def test_a_class_with_soft_spots_has_a_component_more() -> None:
     torch.testing.assert_close(mixture.weights[:, 4], 0.05 * plain.weights[:, 2])
     assert torch.equal(mixture.means[:, :3], plain.means)
     assert torch.equal(mixture.stds[:, :3], plain.stds)
-    assert [float(mixture.means[0, k, 0, 0]) for k in (3, 4)] == pytest.approx([0.1, 0.3])
-    assert [float(mixture.stds[0, k, 0, 0]) for k in (3, 4)] == pytest.approx([0.05, 0.1])
+    assert [float(mixture.means[0, k, 0, 0]) for k in (3, 4)] == pytest.approx(
+        [0.1, 0.3]
+    )
+    assert [float(mixture.stds[0, k, 0, 0]) for k in (3, 4)] == pytest.approx(
+        [0.05, 0.1]
+    )
     assert mixture.means.is_contiguous()
 
 
 def test_the_class_that_is_read_alone_brings_its_soft_spots_along() -> None:
     observation = make_terrain().observe()
-    first = FusedModel([Certain()], replace(linear_table(), soft=SOFT), NAMES).predict(observation)
+    first = FusedModel([Certain()], replace(linear_table(), soft=SOFT), NAMES).predict(
+        observation
+    )
     own = replace(linear_table(), soft=SOFT).own(
         torch.zeros(2, 16, 16, dtype=torch.int64), observation.slope_deg
     )
@@ -137,7 +162,9 @@ def test_a_classifier_of_other_classes_is_refused() -> None:
 
 def test_a_temperature_divides_the_logarithms() -> None:
     logits = torch.randn(2, 5, 3, 3, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(sharpen(logits.softmax(1), 0.4), (logits / 0.4).softmax(1))
+    torch.testing.assert_close(
+        sharpen(logits.softmax(1), 0.4), (logits / 0.4).softmax(1)
+    )
     probabilities = logits.softmax(1)
     assert sharpen(probabilities, 1.0) is probabilities
 

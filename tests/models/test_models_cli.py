@@ -13,7 +13,11 @@ from benchnav.core.store import seal
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
 from benchnav.models.fused import FusedModel
-from benchnav.models.nets.calibration import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.nets.calibration import (
+    fit_pool_temperature,
+    fit_temperature,
+    sample_logits,
+)
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
@@ -58,21 +62,42 @@ def test_halves_are_trained_into_one_checkpoint(
     assert call("train", "classifier", *where, *QUICK_CLASSIFIER) == 0
     out, err = capfd.readouterr()
     assert "validation RMSE of the latent mean" in out
-    assert re.search(r"best epoch 1, validation loss [\d.]+, accuracy [\d.]+, miou [\d.]+, temperature", out)
+    assert re.search(
+        r"best epoch 1, validation loss [\d.]+, accuracy [\d.]+, miou [\d.]+, temperature",
+        out,
+    )
     assert "wrote new/mine with classifier and gp" in out
     assert re.search(r"wrote new/mine with gp \(\d+\.\d kB\)", out)
-    assert [line.split(":")[0] for line in err.strip().splitlines()] == ["gp", "classifier"], err
+    assert [line.split(":")[0] for line in err.strip().splitlines()] == [
+        "gp",
+        "classifier",
+    ], err
     there = load_checkpoint("new/mine")
     assert set(there.parts) == {"classifier", "gp"}
     assert there.part("gp").seed == 7
     assert there.part("gp").config["epoch_steps"] == 5
     assert 0 < there.part("classifier").metrics["valid_accuracy"] < 1
     assert there.part("gp").data_id == "tiny-v1"
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["mine", "mine.training"]
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [
+        "mine",
+        "mine.training",
+    ]
 
     again = refuses(capfd, "gp", *where, *QUICK_GP)
     assert "--overwrite" in again
-    assert call("train", "gp", *where, *QUICK_GP, "--overwrite", "true", "--gp.likelihood", "gaussian") == 0
+    assert (
+        call(
+            "train",
+            "gp",
+            *where,
+            *QUICK_GP,
+            "--overwrite",
+            "true",
+            "--gp.likelihood",
+            "gaussian",
+        )
+        == 0
+    )
     after = load_checkpoint("new/mine")
     assert after.part("gp").config["likelihood"] == "gaussian"
     assert after.part("classifier").metrics == there.part("classifier").metrics
@@ -100,9 +125,26 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
     [
         (["evaluate", "oracel", "--data", "DATA"], "Did you mean 'oracle'"),
         (["all", "--data", "DATA"], "out"),
-        (["all", "--data", "DATA", "--out", "x", "--classifier.max_epochs", "0"], "max_epochs"),
-        (["all", "--data", "DATA", "--out", "x", "--gp.likelihood", "cauchy"], "likelihood"),
-        (["classifier", "--data", "DATA", "--out", "x", "--classifier.encoder", "resnet19"], "resnet19"),
+        (
+            ["all", "--data", "DATA", "--out", "x", "--classifier.max_epochs", "0"],
+            "max_epochs",
+        ),
+        (
+            ["all", "--data", "DATA", "--out", "x", "--gp.likelihood", "cauchy"],
+            "likelihood",
+        ),
+        (
+            [
+                "classifier",
+                "--data",
+                "DATA",
+                "--out",
+                "x",
+                "--classifier.encoder",
+                "resnet19",
+            ],
+            "resnet19",
+        ),
         (["gp", "--data", "DATA", "--out", "x", "--gp.max_points", "9"], "max_points"),
         (["gp", "--data", "TEST", "--out", "x"], "train and valid"),
         (["gp", "--data", "DATA", "--out", "."], "something else"),
@@ -114,19 +156,52 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
                     [f"--{NETWORKS[kind]}.encoder", "tu-resnet81"],
                     "got 'tu-resnet81'. Did you mean 'tu-resnet18'?",
                 ),
-                ([f"--{NETWORKS[kind]}.architecture", "DeepLabV3+"], "Did you mean 'deeplabv3plus'?"),
-                (["--trainer.limit_val_batches", "0"], "`trainer.limit_val_batches` that leaves a batch"),
-                (["--trainer.gradient_clip_val", "many"], "`gradient_clip_val` should be"),
+                (
+                    [f"--{NETWORKS[kind]}.architecture", "DeepLabV3+"],
+                    "Did you mean 'deeplabv3plus'?",
+                ),
+                (
+                    ["--trainer.limit_val_batches", "0"],
+                    "`trainer.limit_val_batches` that leaves a batch",
+                ),
+                (
+                    ["--trainer.gradient_clip_val", "many"],
+                    "`gradient_clip_val` should be",
+                ),
                 (["--seed", "99999999999999999999999"], "at most 64 bits"),
                 (["--seed", "-1"], "got -1."),
             )
         ),
-        (["gp", "--data", "DATA", "--out", "x/y", "--seed", "-1"], "Expected `seed` in 0–"),
         (
-            ["classifier", "--data", "DATA", "--out", "x/y", "--classifier.decoder_channels", "many"],
+            ["gp", "--data", "DATA", "--out", "x/y", "--seed", "-1"],
+            "Expected `seed` in 0–",
+        ),
+        (
+            [
+                "classifier",
+                "--data",
+                "DATA",
+                "--out",
+                "x/y",
+                "--classifier.decoder_channels",
+                "many",
+            ],
             "Expected --classifier.decoder_channels as a list, each a whole number, got 'many'.",
         ),
-        (["all", "--data", "DATA", "--out", "x/y", "--members", "2", "--seed", str(2**63 - 1)], "`seed`"),
+        (
+            [
+                "all",
+                "--data",
+                "DATA",
+                "--out",
+                "x/y",
+                "--members",
+                "2",
+                "--seed",
+                str(2**63 - 1),
+            ],
+            "`seed`",
+        ),
     ],
 )
 def test_bad_input_is_refused_in_one_line(
@@ -153,7 +228,9 @@ def test_pretrained_weights_that_cannot_be_had_are_told_with_the_flag_before_any
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(
+        huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache")
+    )
     monkeypatch.chdir(tmp_path)
     for encoder in ("resnet18", "tu-resnet18"):
         asked = ("--classifier.pretrained", "--classifier.encoder", encoder)
@@ -187,11 +264,18 @@ def test_a_log_with_few_rows_of_a_class_is_told_in_one_line(
     header = "class,slope_deg,traversability\n"
     for name, rows in (("few", "mud,3,0.4\nsand,2,0.5\n"), ("enough", "")):
         Path(f"{name}.csv").write_text(header + many + rows)
-        assert call("train", "gp", "--data", f"{name}.csv", "--out", name, *QUICK_GP) == 0
-        told = [line for line in capfd.readouterr().err.splitlines() if "warning" in line]
+        assert (
+            call("train", "gp", "--data", f"{name}.csv", "--out", name, *QUICK_GP) == 0
+        )
+        told = [
+            line for line in capfd.readouterr().err.splitlines() if "warning" in line
+        ]
         assert len(told) == (name == "few")
         if told:
-            assert "few.csv has fewer than 10 rows of 2 of 3 classes (mud 1, sand 1)" in told[0]
+            assert (
+                "few.csv has fewer than 10 rows of 2 of 3 classes (mud 1, sand 1)"
+                in told[0]
+            )
 
 
 def test_gps_are_measured_on_whole_drives_of_a_log(
@@ -201,20 +285,41 @@ def test_gps_are_measured_on_whole_drives_of_a_log(
     rows = [f"rock,{row % 9},0.{5 + row % 3},{row // 10 % 10}\n" for row in range(200)]
     for name, header, own in (
         ("drives", "class,slope_deg,traversability,drive\n", rows),
-        ("one", "class,slope_deg,traversability,drive\n", [row[: row.rindex(",")] + ",a\n" for row in rows]),
-        ("none", "class,slope_deg,traversability\n", [row[: row.rindex(",")] + "\n" for row in rows]),
+        (
+            "one",
+            "class,slope_deg,traversability,drive\n",
+            [row[: row.rindex(",")] + ",a\n" for row in rows],
+        ),
+        (
+            "none",
+            "class,slope_deg,traversability\n",
+            [row[: row.rindex(",")] + "\n" for row in rows],
+        ),
     ):
         Path(f"{name}.csv").write_text(header + "".join(own))
-        assert call("train", "gp", "--data", f"{name}.csv", "--out", name, *QUICK_GP) == 0
-        (said,) = [line for line in capfd.readouterr().out.splitlines() if "held-out" in line]
-        whose = "all of 1 of 10 drives" if name == "drives" else "which follow one another in each class"
+        assert (
+            call("train", "gp", "--data", f"{name}.csv", "--out", name, *QUICK_GP) == 0
+        )
+        (said,) = [
+            line for line in capfd.readouterr().out.splitlines() if "held-out" in line
+        ]
+        whose = (
+            "all of 1 of 10 drives"
+            if name == "drives"
+            else "which follow one another in each class"
+        )
         assert re.search(rf"gp: NLL \S+ on 20 held-out rows, {whose}; ", said)
-    measured = {name: load_checkpoint(name).part("gp").metrics["held_out_nll"] for name in ("one", "none")}
+    measured = {
+        name: load_checkpoint(name).part("gp").metrics["held_out_nll"]
+        for name in ("one", "none")
+    }
     assert measured["one"] == measured["none"]
     for seed in range(1, 4):
         where = ("--data", "drives.csv", "--out", f"drives-{seed}", "--seed", seed)
         assert call("train", "gp", *where, *QUICK_GP) == 0
-        measured[f"{seed}"] = load_checkpoint(f"drives-{seed}").part("gp").metrics["held_out_nll"]
+        measured[f"{seed}"] = (
+            load_checkpoint(f"drives-{seed}").part("gp").metrics["held_out_nll"]
+        )
     assert len({measured[f"{seed}"] for seed in range(1, 4)}) > 1
 
 
@@ -244,12 +349,18 @@ def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_droppe
     command = ["gp", "--data", tmp_path / "logs.csv", "--out", folder, *QUICK_GP]
     assert call("train", *command, "--overwrite") == 0
     first, *rest = capfd.readouterr().err.splitlines()
-    assert f"fewer than 10 rows of 2 of 10 classes ({names[0]} 0, {names[1]} 0); their GPs" in first
+    assert (
+        f"fewer than 10 rows of 2 of 10 classes ({names[0]} 0, {names[1]} 0); their GPs"
+        in first
+    )
     assert f"the GPs that {folder} held for them are dropped" in first
     assert not any("warning" in line for line in rest)
 
     there = load_checkpoint(folder)
-    save_checkpoint(tmp_path / "alone", replace(there, parts={"classifier": there.part("classifier")}))
+    save_checkpoint(
+        tmp_path / "alone",
+        replace(there, parts={"classifier": there.part("classifier")}),
+    )
     assert call("train", *command[:4], tmp_path / "alone", *QUICK_GP) == 0
     err = capfd.readouterr().err
     assert "rows of 2 of 10 classes" in err
@@ -265,7 +376,10 @@ def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_droppe
             "gp kept; to go on, give the same command with --resume in place of --overwrite",
         ),
         (["mdn"], "nothing was finished; give the same command again"),
-        (["classifier", "--overwrite"], "nothing was finished; give the same command again"),
+        (
+            ["classifier", "--overwrite"],
+            "nothing was finished; give the same command again",
+        ),
     ],
 )
 def test_an_interruption_says_what_is_kept_and_how_to_go_on(
@@ -282,7 +396,10 @@ def test_an_interruption_says_what_is_kept_and_how_to_go_on(
     monkeypatch.setattr(networks, "MapData", interrupt)
     out = tmp_path / "c"
     assert call("train", *command, "--data", dataset.path, "--out", out) == 130
-    assert capfd.readouterr().err.splitlines()[-1] == f"benchnav-train: interrupted; {expected}"
+    assert (
+        capfd.readouterr().err.splitlines()[-1]
+        == f"benchnav-train: interrupted; {expected}"
+    )
     assert Path(out, "gp.safetensors").exists() == expected.startswith("gp")
 
 
@@ -290,7 +407,9 @@ def test_epochs_that_were_finished_are_said_to_be_kept(tmp_path: Path) -> None:
     (tmp_path / "classifier").mkdir()
     (tmp_path / "classifier" / STATE).touch()
     target: Any = SimpleNamespace(checkpoint=SimpleNamespace(parts={"gp": None}))
-    said = networks._kept(target, ["gp", "classifier", "classifier-2"], FitOptions(folder=tmp_path))
+    said = networks._kept(
+        target, ["gp", "classifier", "classifier-2"], FitOptions(folder=tmp_path)
+    )
     assert said == (
         "gp and the finished epochs of classifier kept; to go on, give the same command with --resume"
     )
@@ -313,24 +432,48 @@ def test_a_model_is_measured_by_its_file_and_a_folder_without_rights_is_named(
     )
     reports = []
     for source in ("./mine.py:Mine:0.1", "./mine.py:Mine:0.7"):
-        assert call("train", "evaluate", source, "--data", dataset.path, "--json", "report.json") == 0
+        assert (
+            call(
+                "train",
+                "evaluate",
+                source,
+                "--data",
+                dataset.path,
+                "--json",
+                "report.json",
+            )
+            == 0
+        )
         reports.append(json.loads(Path("report.json").read_text()))
-    assert [report["model"] for report in reports] == ["./mine.py:Mine:0.1", "./mine.py:Mine:0.7"]
+    assert [report["model"] for report in reports] == [
+        "./mine.py:Mine:0.1",
+        "./mine.py:Mine:0.7",
+    ]
     assert reports[0]["splits"] != reports[1]["splits"]
 
     def locked(*arguments: object, **_: object) -> object:
         raise PermissionError(13, "Permission denied", "/tmp/a-name-of-ours")
 
     monkeypatch.setattr("tempfile.TemporaryFile", locked)
-    message = refuses(capfd, "evaluate", "oracle", "--data", dataset.path, "--out", "locked/new")
-    assert f"could not use {tmp_path}/locked/new/quality.json: Permission denied" in message
-    assert f"Choose another place with --out, or change the permissions of {tmp_path}." in message
+    message = refuses(
+        capfd, "evaluate", "oracle", "--data", dataset.path, "--out", "locked/new"
+    )
+    assert (
+        f"could not use {tmp_path}/locked/new/quality.json: Permission denied"
+        in message
+    )
+    assert (
+        f"Choose another place with --out, or change the permissions of {tmp_path}."
+        in message
+    )
 
 
 def members_of(folder: Path) -> list[TerrainClassifier]:
     model = load_model(str(folder))
     assert isinstance(model, FusedModel)
-    return [member for member in model.classifiers if isinstance(member, TerrainClassifier)]
+    return [
+        member for member in model.classifiers if isinstance(member, TerrainClassifier)
+    ]
 
 
 def test_an_ensemble_is_calibrated_as_a_whole_and_again_when_a_member_joins(
@@ -339,8 +482,24 @@ def test_an_ensemble_is_calibrated_as_a_whole_and_again_when_a_member_joins(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     folder, valid = tmp_path / "c", MapDataset(dataset.path, "valid")
-    small = ["--classifier.encoder_depth", "3", "--classifier.decoder_channels", "[16, 16, 8]", "--seed", "4"]
-    command = ["all", "--data", dataset.path, "--out", folder, *QUICK_GP, *QUICK_CLASSIFIER, *small]
+    small = [
+        "--classifier.encoder_depth",
+        "3",
+        "--classifier.decoder_channels",
+        "[16, 16, 8]",
+        "--seed",
+        "4",
+    ]
+    command = [
+        "all",
+        "--data",
+        dataset.path,
+        "--out",
+        folder,
+        *QUICK_GP,
+        *QUICK_CLASSIFIER,
+        *small,
+    ]
     found = []
     for members in (1, 2, 3):
         assert call("train", *command, "--members", members, "--resume") == 0
@@ -349,13 +508,19 @@ def test_an_ensemble_is_calibrated_as_a_whole_and_again_when_a_member_joins(
         found.append(load_checkpoint(folder).pool_temperature)
         if members > 1:
             assert found[-1] == fit_pool_temperature(classifiers, valid, 4)
-            assert f"pool of {members} networks: temperature {found[-1]:.3f}" in capfd.readouterr().out
+            assert (
+                f"pool of {members} networks: temperature {found[-1]:.3f}"
+                in capfd.readouterr().out
+            )
     assert found[0] == 1
     assert len(set(found)) == 3
     # A member alone is what its own seed alone would have given.
     first = members_of(folder)[0]
     assert first.config.decoder_channels == (16, 16, 8)
-    assert first.temperature == load_checkpoint(folder).part("classifier").config["temperature"]
+    assert (
+        first.temperature
+        == load_checkpoint(folder).part("classifier").config["temperature"]
+    )
     assert call("train", *command, "--members", 1, "--overwrite") == 0
     assert load_checkpoint(folder).pool_temperature == 1
     alone = members_of(folder)[0]
@@ -367,14 +532,26 @@ def test_what_is_stored_is_what_was_measured_and_calibrated(
     half_precision: bool, dataset: TerrainDataset, tmp_path: Path
 ) -> None:
     where = ["--data", dataset.path, "--out", tmp_path / "c"]
-    small = ["--classifier.encoder_depth", "3", "--half_precision", str(half_precision).lower()]
+    small = [
+        "--classifier.encoder_depth",
+        "3",
+        "--half_precision",
+        str(half_precision).lower(),
+    ]
     assert call("train", "classifier", *where, *QUICK_CLASSIFIER, *small) == 0
-    part, valid = load_checkpoint(tmp_path / "c").part("classifier"), MapDataset(dataset.path, "valid")
+    part, valid = (
+        load_checkpoint(tmp_path / "c").part("classifier"),
+        MapDataset(dataset.path, "valid"),
+    )
     assert part.half_precision == half_precision
-    plain = TerrainClassifier.from_tensors({**part.config, "temperature": 1.0}, names(10), part.tensors)
+    plain = TerrainClassifier.from_tensors(
+        {**part.config, "temperature": 1.0}, names(10), part.tensors
+    )
     assert part.config["temperature"] == fit_temperature(*sample_logits(plain, valid))
     for name, value in plain.measure(valid).items():
-        assert part.metrics[name] == pytest.approx(value, rel=0 if half_precision else 1e-3, abs=1e-12), name
+        assert part.metrics[name] == pytest.approx(
+            value, rel=0 if half_precision else 1e-3, abs=1e-12
+        ), name
 
 
 @pytest.mark.parametrize("kind", ["classifier", "all", "mdn"])

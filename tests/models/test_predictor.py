@@ -18,7 +18,13 @@ from benchnav.datagen.files.find import find_dataset
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models import fused
 from benchnav.models.base import TraversabilityModel, layers_of, predict
-from benchnav.models.checkpoint import Checkpoint, Part, digests_of, load_checkpoint, save_checkpoint
+from benchnav.models.checkpoint import (
+    Checkpoint,
+    Part,
+    digests_of,
+    load_checkpoint,
+    save_checkpoint,
+)
 from benchnav.models.config import MDNConfig
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.mdn import MixtureDensityModel
@@ -72,31 +78,47 @@ def test_one_hot_probabilities_give_the_gp_of_that_class() -> None:
     model = FusedModel([Fixed(1.0, 1e-30, 1e-30)], linear_table(), NAMES)
     mixture = model.predict(terrain.observe())
     expected = TraversabilityMixture(
-        torch.ones(2, 1, 16, 16), (1 - terrain.slope_deg / 90)[:, None], torch.full((2, 1, 16, 16), 0.1)
+        torch.ones(2, 1, 16, 16),
+        (1 - terrain.slope_deg / 90)[:, None],
+        torch.full((2, 1, 16, 16), 0.1),
     )
     for level in (0.0, 0.9):
-        torch.testing.assert_close(mixture.cvar(level), expected.cvar(level), rtol=0, atol=1e-5)
+        torch.testing.assert_close(
+            mixture.cvar(level), expected.cvar(level), rtol=0, atol=1e-5
+        )
 
 
 def test_the_mixture_is_equation_one() -> None:
     terrain = make_terrain()
-    mixture = FusedModel([Fixed(0.5, 0.3, 0.2)], linear_table(), NAMES).predict(terrain.observe())
+    mixture = FusedModel([Fixed(0.5, 0.3, 0.2)], linear_table(), NAMES).predict(
+        terrain.observe()
+    )
     share = terrain.slope_deg / 90
-    parts = [(0.5, 1 - share, 0.1), (0.3, torch.full_like(share, 0.5), 0.2), (0.2, share, 0.3)]
+    parts = [
+        (0.5, 1 - share, 0.1),
+        (0.3, torch.full_like(share, 0.5), 0.2),
+        (0.2, share, 0.3),
+    ]
     for value in (0.2, 0.7):
         by_hand = sum(p * torch.special.ndtr((value - m) / s) for p, m, s in parts)
         torch.testing.assert_close(mixture.cdf(value), by_hand, rtol=0, atol=1e-5)
-    assert all(t.dtype == torch.float32 for t in (mixture.weights, mixture.means, mixture.stds))
+    assert all(
+        t.dtype == torch.float32 for t in (mixture.weights, mixture.means, mixture.stds)
+    )
 
 
 def test_single_class_is_the_gp_of_the_most_likely_class() -> None:
-    mixture = FusedModel([Fixed(0.3, 0.5, 0.2)], linear_table(), NAMES).predict(make_terrain().observe())
+    mixture = FusedModel([Fixed(0.3, 0.5, 0.2)], linear_table(), NAMES).predict(
+        make_terrain().observe()
+    )
     single = mixture.most_likely()
     torch.testing.assert_close(single.means, torch.full((2, 1, 16, 16), 0.5))
     torch.testing.assert_close(single.stds, torch.full((2, 1, 16, 16), 0.2))
 
 
-def test_chunks_change_nothing_and_the_result_is_no_inference_tensor(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_change_nothing_and_the_result_is_no_inference_tensor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     class Bright(nn.Module):
         def forward(self, maps: Mapping[str, Tensor]) -> Tensor:
             return maps["rgb"].float() / 100
@@ -107,7 +129,9 @@ def test_chunks_change_nothing_and_the_result_is_no_inference_tensor(monkeypatch
     monkeypatch.setattr(fused, "CHUNK_CELLS", 2 * 16 * 16)
     pieces = model.predict(terrain.observe())
     assert torch.equal(whole.weights, pieces.weights)
-    assert not any(t.is_inference() for t in (pieces.weights, pieces.means, pieces.stds))
+    assert not any(
+        t.is_inference() for t in (pieces.weights, pieces.means, pieces.stds)
+    )
 
 
 def test_a_model_is_given_an_observation_and_the_oracle_alone_the_terrain(
@@ -139,7 +163,8 @@ def test_a_prediction_that_does_not_fit_the_maps_is_refused() -> None:
             return TraversabilityMixture(ones, ones, ones)
 
     with pytest.raises(
-        ConfigError, match=r"shape \[2, 16, 16\], got TraversabilityMixture of shape \[1, 4, 4\]"
+        ConfigError,
+        match=r"shape \[2, 16, 16\], got TraversabilityMixture of shape \[1, 4, 4\]",
     ):
         predict(Small(), make_terrain())
 
@@ -226,9 +251,12 @@ def test_a_model_whose_training_was_interrupted_is_told_with_the_command_to_go_o
             load_model(source)
         assert f"`benchnav-train {command}`" in str(caught.value)
     save_checkpoint("checkpoints/mdn", replace(whole, model="mdn"))
-    with pytest.raises(ConfigError, match="Name a checkpoint of it, by its path: checkpoints/mdn"):
+    with pytest.raises(
+        ConfigError, match="Name a checkpoint of it, by its path: checkpoints/mdn"
+    ):
         load_model("mdn")
-    # A finished training has left its logs; a member that joins an ensemble may still be trained.
+    # A finished training has left its logs; a member that joins an ensemble may still
+    # be trained.
     Path("checkpoints/whole.training/classifier-2").mkdir()
     save_checkpoint("checkpoints/whole", whole)
     assert isinstance(load_model("whole"), FusedModel)
@@ -258,7 +286,9 @@ def test_a_model_whose_training_was_interrupted_is_told_with_the_command_to_go_o
         ("nothing/like/it", "Expected a model among"),
     ],
 )
-def test_what_is_no_model_gets_a_hint(source: str, expected: str, checkpoint_path: Path) -> None:
+def test_what_is_no_model_gets_a_hint(
+    source: str, expected: str, checkpoint_path: Path
+) -> None:
     for folder in ("checkpoints/mine", "elsewhere/theirs"):
         Path(folder).parent.mkdir()
         Path(folder).symlink_to(checkpoint_path)
@@ -283,15 +313,22 @@ def test_a_checkpoint_has_no_options(checkpoint_path: Path) -> None:
         load_model({**given, "options": {"level": 1}})
 
 
-def test_the_digests_of_a_checkpoint_change_with_its_files(checkpoint_path: Path, tmp_path: Path) -> None:
+def test_the_digests_of_a_checkpoint_change_with_its_files(
+    checkpoint_path: Path, tmp_path: Path
+) -> None:
     copy = Path(shutil.copytree(checkpoint_path, tmp_path / "copy"))
     before = digests_of(copy)
     assert set(before) == {"config.json", "classifier.safetensors", "gp.safetensors"}
-    assert before["config.json"] == hashlib.sha256((copy / "config.json").read_bytes()).hexdigest()
+    assert (
+        before["config.json"]
+        == hashlib.sha256((copy / "config.json").read_bytes()).hexdigest()
+    )
     with open(copy / "gp.safetensors", "ab") as file:
         file.write(b" ")
     after = digests_of(copy)
-    assert {name for name in before if before[name] != after[name]} == {"gp.safetensors"}
+    assert {name for name in before if before[name] != after[name]} == {
+        "gp.safetensors"
+    }
 
 
 def test_statistics_of_the_ground_do_not_move_the_digests_of_a_checkpoint(
@@ -314,13 +351,17 @@ def test_statistics_of_the_ground_are_the_checkpoints_own_first(
     assert find_ground_statistics({"part": "oracle"}, moved) == beside
     assert find_ground_statistics("somewhere.py:Mine", moved) == beside
     (tmp_path / "d.ground.json").unlink()
-    shipped = find_ground_statistics("ideal", moved)  # of tiny-v1, of more maps than these
+    shipped = find_ground_statistics(
+        "ideal", moved
+    )  # of tiny-v1, of more maps than these
     assert shipped not in (own, beside)
     assert shipped.layer_means["rgb"] == pytest.approx(own.layer_means["rgb"], rel=0.1)
 
 
 @pytest.mark.parametrize(("name", "pairs"), [("stakes-v1", 2), ("paper-v1", 0)])
-def test_shipped_checkpoints_bring_the_statistics_of_their_recipe(name: str, pairs: int) -> None:
+def test_shipped_checkpoints_bring_the_statistics_of_their_recipe(
+    name: str, pairs: int
+) -> None:
     dataset = TerrainDataset(find_dataset(f"{name}-test"))
     found = find_ground_statistics(name, dataset)
     assert found == find_ground_statistics("oracle", dataset)
@@ -338,7 +379,8 @@ def test_missing_statistics_of_the_ground_are_refused_with_the_command_that_make
         find_ground_statistics("oracle", moved)
     monkeypatch.setattr(TerrainDataset, "splits", {"test/std": {}})
     with pytest.raises(
-        ConfigError, match=r"`benchnav-datagen ground TRAINING_DATA --out .*/d\.ground\.json`"
+        ConfigError,
+        match=r"`benchnav-datagen ground TRAINING_DATA --out .*/d\.ground\.json`",
     ):
         find_ground_statistics("oracle", moved)
 
@@ -357,15 +399,25 @@ def test_the_layer_seen_is_one_where_nothing_is_said_of_it() -> None:
     assert "seen" not in str(refused.value)
 
 
-def test_another_class_table_is_told_in_one_line(checkpoint_path: Path, dataset: TerrainDataset) -> None:
+def test_another_class_table_is_told_in_one_line(
+    checkpoint_path: Path, dataset: TerrainDataset
+) -> None:
     model = load_model(checkpoint_path)
     assert class_mismatch(model, dataset.recipe) == ""
-    assert class_mismatch(Spy(), dataset.recipe) == class_mismatch(Oracle(), dataset.recipe) == ""
+    assert (
+        class_mismatch(Spy(), dataset.recipe)
+        == class_mismatch(Oracle(), dataset.recipe)
+        == ""
+    )
     classes = dataset.recipe.classes
-    other = replace(dataset.recipe, classes=(replace(classes[0], name="lava"), *classes[1:]))
+    other = replace(
+        dataset.recipe, classes=(replace(classes[0], name="lava"), *classes[1:])
+    )
     for asked in (model, load_checkpoint(checkpoint_path)):
         line = class_mismatch(asked, other, "model 'mine'")
-        assert line.startswith("model 'mine' was trained on other classes than those of tiny-v1: ")
+        assert line.startswith(
+            "model 'mine' was trained on other classes than those of tiny-v1: "
+        )
         assert "lava" in line
         assert "\n" not in line
 
@@ -377,12 +429,16 @@ def test_a_checkpoint_is_found_by_path_and_by_name(
     (tmp_path / "checkpoints" / "mine").symlink_to(checkpoint_path)
     monkeypatch.chdir(tmp_path)
     terrain = make_terrain(classes=10)
-    by_path, by_name = (predict(load_model(source), terrain) for source in (checkpoint_path, "mine"))
+    by_path, by_name = (
+        predict(load_model(source), terrain) for source in (checkpoint_path, "mine")
+    )
     assert torch.equal(by_path.weights, by_name.weights)
     assert by_path.weights.shape == (2, 10, 16, 16)
 
 
-def test_a_checkpoint_with_one_half_says_how_to_train_the_other(checkpoint_path: Path) -> None:
+def test_a_checkpoint_with_one_half_says_how_to_train_the_other(
+    checkpoint_path: Path,
+) -> None:
     whole = load_checkpoint(checkpoint_path)
     half = replace(whole, parts={"gp": whole.part("gp")})
     with pytest.raises(CheckpointError, match="benchnav-train classifier"):
@@ -397,7 +453,9 @@ def test_a_run_with_the_oracle_loads_no_heavy_library() -> None:
         "heavy = 'lightning', 'gpytorch', 'segmentation_models_pytorch', 'torch._dynamo', 'matplotlib', 'rerun'; "
         "print([m for m in heavy if m in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert done.stdout.strip() == "[]"
 
 
@@ -406,7 +464,9 @@ def test_a_run_with_the_oracle_loads_no_heavy_library() -> None:
 def test_a_checkpoint_is_the_same_model_where_gradients_are_switched_off(
     kind: str, without_gradients: type, checkpoint_path: Path, tmp_path: Path
 ) -> None:
-    path = {"deep": checkpoint_path, "shallow": Path("stakes-v1")}.get(kind, tmp_path / kind)
+    path = {"deep": checkpoint_path, "shallow": Path("stakes-v1")}.get(
+        kind, tmp_path / kind
+    )
     if kind == "pool":
         there = load_checkpoint(checkpoint_path)
         save_checkpoint(path, there.with_part("classifier-2", there.part("classifier")))
@@ -421,7 +481,9 @@ def test_a_checkpoint_is_the_same_model_where_gradients_are_switched_off(
             data_id="",
             data_digest="",
         )
-        save_checkpoint(path, Checkpoint(class_names=("a",), model="mdn", parts={"mdn": part}))
+        save_checkpoint(
+            path, Checkpoint(class_names=("a",), model="mdn", parts={"mdn": part})
+        )
     terrain = make_terrain(classes=10)
     wanted = predict(load_model(path.name if kind == "shallow" else path), terrain)
     with without_gradients():
@@ -435,11 +497,15 @@ def test_a_checkpoint_is_the_same_model_where_gradients_are_switched_off(
         assert not getattr(outside, name).is_inference()
 
 
-def test_a_family_is_no_model_and_a_checkpoint_of_an_unknown_one_says_so(checkpoint_path: Path) -> None:
+def test_a_family_is_no_model_and_a_checkpoint_of_an_unknown_one_says_so(
+    checkpoint_path: Path,
+) -> None:
     with pytest.raises(ConfigError, match="'mdn', which is a family of models"):
         load_model("mdn")
     foreign = replace(load_checkpoint(checkpoint_path), model="theirs")
-    with pytest.raises(CheckpointError, match=r"got one of 'theirs'. Install the package"):
+    with pytest.raises(
+        CheckpointError, match=r"got one of 'theirs'. Install the package"
+    ):
         open_checkpoint(foreign)
 
 
@@ -463,8 +529,12 @@ def test_the_oracle_the_ideal_and_the_clairvoyant_know_each_their_own() -> None:
     assert predict(load_model("ideal"), terrain) == terrain.truth
     known = predict(load_model("clairvoyant"), alike)
     for level in (0.0, 0.5, 0.99):
-        torch.testing.assert_close(known.cvar(level), terrain.traversability, atol=1e-6, rtol=0)
-    torch.testing.assert_close(known.most_likely().mean(), terrain.traversability, atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            known.cvar(level), terrain.traversability, atol=1e-6, rtol=0
+        )
+    torch.testing.assert_close(
+        known.most_likely().mean(), terrain.traversability, atol=1e-6, rtol=0
+    )
 
 
 def test_only_true_distributions_have_no_nugget() -> None:

@@ -20,18 +20,24 @@ from benchnav.models.tiles import Window, measure_margin, predict_tiles, write_r
 from tests.models.stub import ColourModel
 
 
-def observe(height: int, width: int, maps: int = 1, block: int = 1, seed: int = 0) -> Observation:
+def observe(
+    height: int, width: int, maps: int = 1, block: int = 1, seed: int = 0
+) -> Observation:
     """Random maps in blocks of one colour and slope."""
     generator = torch.Generator().manual_seed(seed)
     rows, columns = torch.arange(height)[:, None] // block, torch.arange(width) // block
     shape = (maps, 3, height // block + 1, width // block + 1)
-    rgb = torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8)[..., rows, columns]
+    rgb = torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8)[
+        ..., rows, columns
+    ]
     slope = 30 * torch.rand(maps, *shape[2:], generator=generator)[..., rows, columns]
     return Observation(rgb, slope / 10, slope, Grid(height, width, 0.5))
 
 
 class Blur(TraversabilityModel):
-    """Looks so many cells up and left, down and right; keeps the sizes of the maps that it was given."""
+    """Looks so many cells up and left, down and right; keeps the sizes of the maps that
+    it was given.
+    """
 
     def __init__(self, before: int, after: int) -> None:
         self.before, self.after, self.seen = before, after, list[tuple[int, int]]()
@@ -41,8 +47,12 @@ class Blur(TraversabilityModel):
         image = observation.rgb[:, :1].double() / 255
         padded = functional.pad(image, (self.before, self.after) * 2)
         side = self.before + self.after + 1
-        mean = functional.avg_pool2d(functional.avg_pool2d(padded, (side, 1), 1), (1, side), 1)
-        return TraversabilityMixture(torch.ones_like(mean), mean, torch.full_like(mean, 0.1))
+        mean = functional.avg_pool2d(
+            functional.avg_pool2d(padded, (side, 1), 1), (1, side), 1
+        )
+        return TraversabilityMixture(
+            torch.ones_like(mean), mean, torch.full_like(mean, 0.1)
+        )
 
 
 class Pool(TraversabilityModel):
@@ -54,15 +64,24 @@ class Pool(TraversabilityModel):
     def predict(self, observation: Observation) -> TraversabilityMixture:
         image = observation.slope_deg.double()[:, None] / 90
         mean = functional.avg_pool2d(image, self.stride, ceil_mode=True)
-        mean = mean.repeat_interleave(self.stride, -1).repeat_interleave(self.stride, -2)
+        mean = mean.repeat_interleave(self.stride, -1).repeat_interleave(
+            self.stride, -2
+        )
         mean = mean[..., : image.shape[-2], : image.shape[-1]]
-        return TraversabilityMixture(torch.ones_like(mean), mean, torch.full_like(mean, 0.1))
+        return TraversabilityMixture(
+            torch.ones_like(mean), mean, torch.full_like(mean, 0.1)
+        )
 
 
 def greatest_error(
-    model: TraversabilityModel, observation: Observation, tile: int, margin: int | None = None
+    model: TraversabilityModel,
+    observation: Observation,
+    tile: int,
+    margin: int | None = None,
 ) -> float:
-    """Of any parameter of any tile, to the whole map's; every cell has to be in one tile."""
+    """Of any parameter of any tile, to the whole map's; every cell has to be in one
+    tile.
+    """
     whole = predict_observation(model, observation)
     count, error = torch.zeros(observation.grid.shape), 0.0
     for window, part in predict_tiles(model, observation, tile, margin):
@@ -120,7 +139,9 @@ def test_tiles_cover_any_map_and_are_the_whole_maps(
         (200, 230, 256),
     ],
 )
-def test_the_margin_is_as_wide_as_the_model_looks_on_any_side(before: int, after: int, margin: int) -> None:
+def test_the_margin_is_as_wide_as_the_model_looks_on_any_side(
+    before: int, after: int, margin: int
+) -> None:
     assert measure_margin(Blur(before, after), observe(40, 300)) == margin
 
 
@@ -163,14 +184,22 @@ class Picky(Blur):
         self.smooth = smooth
 
     def predict(self, observation: Observation) -> TraversabilityMixture:
-        mixture, image = super().predict(observation), observation.rgb[:, :1].double() / 255
-        most, least = (sign * functional.max_pool2d(sign * image, (1, 9), 1, (0, 4)) for sign in (1, -1))
+        mixture, image = (
+            super().predict(observation),
+            observation.rgb[:, :1].double() / 255,
+        )
+        most, least = (
+            sign * functional.max_pool2d(sign * image, (1, 9), 1, (0, 4))
+            for sign in (1, -1)
+        )
         means = torch.where((most == least) == self.smooth, mixture.means, image)
         return TraversabilityMixture(mixture.weights, means, mixture.stds)
 
 
 @pytest.mark.parametrize("smooth", [True, False])
-def test_a_model_is_tried_on_ground_as_it_lies_and_on_cells_from_all_over_the_map(smooth: bool) -> None:
+def test_a_model_is_tried_on_ground_as_it_lies_and_on_cells_from_all_over_the_map(
+    smooth: bool,
+) -> None:
     observation = observe(300, 500, block=64) if smooth else observe(300, 500)
     if not smooth:
         observation.rgb[..., 10:-10, 10:-10] = 80
@@ -187,8 +216,12 @@ class Everywhere(Blur):
 
 
 @pytest.mark.parametrize("model", [Everywhere(0, 0), Pool(64)])
-def test_a_model_whose_tiles_cannot_be_the_whole_maps_is_refused(model: TraversabilityModel) -> None:
-    with pytest.raises(ConfigError, match=rf"960 cells.*{type(model).__name__}.*`margin`"):
+def test_a_model_whose_tiles_cannot_be_the_whole_maps_is_refused(
+    model: TraversabilityModel,
+) -> None:
+    with pytest.raises(
+        ConfigError, match=rf"960 cells.*{type(model).__name__}.*`margin`"
+    ):
         predict_tiles(model, observe(200, 200), 64)
 
 
@@ -228,21 +261,35 @@ class Vegetation(TraversabilityModel):
     def predict(self, observation: Observation) -> TraversabilityMixture:
         assert isinstance(observation, Layered)
         height = observation.layers["vegetation_m"].unsqueeze(1)
-        return TraversabilityMixture(torch.ones_like(height), height, torch.full_like(height, 0.1))
+        return TraversabilityMixture(
+            torch.ones_like(height), height, torch.full_like(height, 0.1)
+        )
 
 
 def test_layers_are_cut_with_the_map() -> None:
     plain = observe(130, 200)
-    layers = {"vegetation_m": torch.rand(1, 130, 200, generator=torch.Generator().manual_seed(1))}
-    observation = Layered(plain.rgb, plain.elevation_m, plain.slope_deg, plain.grid, layers)
+    layers = {
+        "vegetation_m": torch.rand(
+            1, 130, 200, generator=torch.Generator().manual_seed(1)
+        )
+    }
+    observation = Layered(
+        plain.rgb, plain.elevation_m, plain.slope_deg, plain.grid, layers
+    )
     assert greatest_error(Vegetation(), observation, 64) == 0
 
 
 def test_risk_maps_are_those_of_the_whole_map(tmp_path: Path) -> None:
     model, observation = ColourModel(), observe(90, 200, maps=2)
-    measures = {"cvar:0.9": lambda mixture: mixture.cvar(0.9), "mean": TraversabilityMixture.mean}
+    measures = {
+        "cvar:0.9": lambda mixture: mixture.cvar(0.9),
+        "mean": TraversabilityMixture.mean,
+    }
     paths = write_risk_maps(model, observation, measures, tmp_path / "maps", tile=64)
-    assert paths == {"cvar:0.9": tmp_path / "maps/cvar-0.9.npy", "mean": tmp_path / "maps/mean.npy"}
+    assert paths == {
+        "cvar:0.9": tmp_path / "maps/cvar-0.9.npy",
+        "mean": tmp_path / "maps/mean.npy",
+    }
     whole = predict_observation(model, observation)
     for name, measure in measures.items():
         written = np.load(paths[name], mmap_mode="r")
@@ -252,16 +299,30 @@ def test_risk_maps_are_those_of_the_whole_map(tmp_path: Path) -> None:
 
 def test_tile_and_margin_of_risk_maps_are_those_given(tmp_path: Path) -> None:
     model = Blur(0, 0)
-    write_risk_maps(model, observe(128, 256), {"mean": TraversabilityMixture.mean}, tmp_path, 128, 32)
+    write_risk_maps(
+        model,
+        observe(128, 256),
+        {"mean": TraversabilityMixture.mean},
+        tmp_path,
+        128,
+        32,
+    )
     assert model.seen == [(128, 160), (128, 160)]
 
 
 def test_risk_maps_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
     model, observation = ColourModel(), observe(128, 70)
-    write_risk_maps(model, observation, {"mean": TraversabilityMixture.mean}, tmp_path, tile=64)
+    write_risk_maps(
+        model, observation, {"mean": TraversabilityMixture.mean}, tmp_path, tile=64
+    )
     before = (tmp_path / "mean.npy").read_bytes()
-    bad = {"mean": TraversabilityMixture.mean, "row": lambda mixture: mixture.mean()[..., 0]}
-    with pytest.raises(ConfigError, match=r"measure 'row' to give a tensor of shape \[1, 64, 32\]"):
+    bad = {
+        "mean": TraversabilityMixture.mean,
+        "row": lambda mixture: mixture.mean()[..., 0],
+    }
+    with pytest.raises(
+        ConfigError, match=r"measure 'row' to give a tensor of shape \[1, 64, 32\]"
+    ):
         write_risk_maps(model, observe(128, 70, seed=1), bad, tmp_path, tile=64)
     assert [path.name for path in tmp_path.iterdir()] == ["mean.npy"]
     assert (tmp_path / "mean.npy").read_bytes() == before
@@ -276,7 +337,9 @@ class Small(Blur):
     def predict(self, observation: Observation) -> TraversabilityMixture:
         mixture = super().predict(observation)
         return TraversabilityMixture(
-            mixture.weights[..., 1:, :], mixture.means[..., 1:, :], mixture.stds[..., 1:, :]
+            mixture.weights[..., 1:, :],
+            mixture.means[..., 1:, :],
+            mixture.stds[..., 1:, :],
         )
 
 

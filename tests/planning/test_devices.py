@@ -1,11 +1,13 @@
 """Nothing in the control loop makes a tensor on another device, or waits for a value.
 
-A fake tensor has a device and no values, so that a GPU's code runs where there is none: an operation that
-mixes devices raises, and so does whatever asks for a value. Planners are tried in their own files.
+A fake tensor has a device and no values, so that a GPU's code runs where there is none:
+an operation that mixes devices raises, and so does whatever asks for a value. Planners
+are tried in their own files.
 
-On the host by nature, and so not here: the search of A* (compiled code of SciPy); whether all episodes of a
-batch have ended, looked at once a step; the check of stored λ when a realisation is built, and that of a
-user's risk map, once an episode each; the noise of a realisation, drawn on the host and moved once.
+On the host by nature, and so not here: the search of A* (compiled code of SciPy);
+whether all episodes of a batch have ended, looked at once a step; the check of stored λ
+when a realisation is built, and that of a user's risk map, once an episode each; the
+noise of a realisation, drawn on the host and moved once.
 """
 
 from collections.abc import Callable, Iterator
@@ -54,14 +56,20 @@ def gpu(*shape: int) -> Tensor:
 
 
 def expect(value: Tensor, *shape: int, dtype: torch.dtype = torch.float32) -> None:
-    assert (value.device.type, tuple(value.shape), value.dtype) == ("cuda", shape, dtype)
+    assert (value.device.type, tuple(value.shape), value.dtype) == (
+        "cuda",
+        shape,
+        dtype,
+    )
 
 
 def test_a_tensor_made_on_the_wrong_device_is_seen() -> None:
     """The tests below can fail."""
 
     class OnHost(Unicycle):
-        def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
+        def __call__(
+            self, state: Tensor, action: Tensor, traversability: Tensor
+        ) -> Tensor:
             return super().__call__(state, action * torch.ones(2), traversability)
 
     with pytest.raises(RuntimeError, match="device"):
@@ -77,14 +85,20 @@ def test_robots(name: str) -> None:
     size = state.shape[-1]
     expect(state, BATCH, size)
     for leading in ((BATCH,), (BATCH, SAMPLES)):
-        expect(robot(gpu(*leading, size), gpu(*leading, 2), gpu(*leading)), *leading, size)
+        expect(
+            robot(gpu(*leading, size), gpu(*leading, 2), gpu(*leading)), *leading, size
+        )
 
 
 @pytest.mark.parametrize("name", registry.names("objective"))
 def test_objectives(name: str) -> None:
     objective = registry.make("objective", name, robot=Unicycle(), goal_radius_m=1.0)
     state, target = gpu(BATCH, SAMPLES, 3), gpu(BATCH, 1, 2)
-    expect(objective.stage(state, gpu(BATCH, SAMPLES, 2), gpu(BATCH, SAMPLES), target), BATCH, SAMPLES)
+    expect(
+        objective.stage(state, gpu(BATCH, SAMPLES, 2), gpu(BATCH, SAMPLES), target),
+        BATCH,
+        SAMPLES,
+    )
     expect(objective.terminal(state, gpu(BATCH, SAMPLES), target), BATCH, SAMPLES)
 
 
@@ -122,7 +136,9 @@ def test_a_problem_is_posed_selected_and_copied_where_it_is() -> None:
 
 @pytest.mark.parametrize("noise", ["resampled", "stored"])
 @pytest.mark.parametrize("robot", registry.names("robot"))
-def test_the_simulation(robot: str, noise: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_simulation(
+    robot: str, noise: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # What is asked of the device once, when episodes begin.
     for module in (realisation, world_module):
         monkeypatch.setattr(module, "bool", lambda values: False, raising=False)
@@ -130,7 +146,9 @@ def test_the_simulation(robot: str, noise: str, monkeypatch: pytest.MonkeyPatch)
     problem = make_problem(robot=registry.make("robot", robot))
     world = World(noise=noise, time_budget_s=2.0)
     places = factories.places(problem.goal_m)
-    simulation = Simulation(terrain_on_gpu(), problem.task, world, places, 0, range(BATCH))
+    simulation = Simulation(
+        terrain_on_gpu(), problem.task, world, places, 0, range(BATCH)
+    )
     now = simulation.init(problem.start)
     for _ in range(2):
         now, met = simulation.step(now, gpu(BATCH, 2))
@@ -153,7 +171,12 @@ def step_of(problem: Problem) -> Step:
 
 def test_the_boundary_and_the_blind_planner() -> None:
     problem = make_problem()
-    answer = act(Straight(), step_of(problem), begin(Straight(), problem, torch.Generator()), problem)
+    answer = act(
+        Straight(),
+        step_of(problem),
+        begin(Straight(), problem, torch.Generator()),
+        problem,
+    )
     expect(answer.action, BATCH, 2)
     expect(answer.faulty, BATCH, dtype=torch.bool)
     expect(answer.plan.status, BATCH, dtype=torch.int64)
@@ -164,7 +187,9 @@ def test_the_boundary_and_the_blind_planner() -> None:
     [lambda: torch.empty(BATCH, 2), lambda: gpu(1, 2), lambda: None],
     ids=["on the host", "one for all", "none"],
 )
-def test_what_is_wrong_at_the_boundary_is_told_where_the_states_are(say: Callable[[], Any]) -> None:
+def test_what_is_wrong_at_the_boundary_is_told_where_the_states_are(
+    say: Callable[[], Any],
+) -> None:
     class Wrong(Straight):
         def plan(self, step: Step, plan_state: Problem) -> Any:
             return say(), plan_state, Plan.empty(BATCH, "cuda")

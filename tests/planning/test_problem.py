@@ -24,23 +24,34 @@ BATCH, HEIGHT, WIDTH = 3, 12, 20
 
 
 def varied() -> Problem:
-    """Three problems of which no two tensors or episodes are alike, on a map that is not square."""
+    """Three problems of which no two tensors or episodes are alike, on a map that is
+    not square.
+    """
     grid = Grid(HEIGHT, WIDTH, 0.5)
     means = torch.rand(BATCH, 2, HEIGHT, WIDTH)
-    mixture = TraversabilityMixture(torch.full_like(means, 0.5), means, 0.1 + 0.1 * means)
+    mixture = TraversabilityMixture(
+        torch.full_like(means, 0.5), means, 0.1 + 0.1 * means
+    )
     rgb = torch.randint(255, (BATCH, 3, HEIGHT, WIDTH), dtype=torch.uint8)
-    observation = Observation(rgb, torch.rand(BATCH, HEIGHT, WIDTH), torch.rand(BATCH, HEIGHT, WIDTH), grid)
+    observation = Observation(
+        rgb, torch.rand(BATCH, HEIGHT, WIDTH), torch.rand(BATCH, HEIGHT, WIDTH), grid
+    )
     start_m, goal_m = (
         torch.tensor([[1.0, 2.0], [3.0, 1.5], [6.0, 5.0]]),
         torch.tensor([[9.0, 2.0], [3.0, 5.5], [1.0, 0.5]]),
     )
     task = factories.task(robot=DifferentialDrive())
-    return pose_problem(task, Prediction(observation, mixture, mixture.cvar(0.5)), start_m, goal_m, 42.0)
+    return pose_problem(
+        task, Prediction(observation, mixture, mixture.cvar(0.5)), start_m, goal_m, 42.0
+    )
 
 
 def tensors(problem: Problem) -> dict[str, Tensor]:
     """Every tensor of a problem, those that are derived from it included."""
-    derived = {name: getattr(problem, name) for name in ("traversability", "padded_ground", "elevation_m")}
+    derived = {
+        name: getattr(problem, name)
+        for name in ("traversability", "padded_ground", "elevation_m")
+    }
     held = {
         f"{owner}{field.name}": getattr(value, field.name)
         for owner, value in (
@@ -50,7 +61,11 @@ def tensors(problem: Problem) -> dict[str, Tensor]:
         )
         for field in fields(value)  # type: ignore[arg-type]
     }
-    return {name: value for name, value in {**held, **derived}.items() if torch.is_tensor(value)}
+    return {
+        name: value
+        for name, value in {**held, **derived}.items()
+        if torch.is_tensor(value)
+    }
 
 
 def test_a_problem_is_posed_from_what_is_predicted() -> None:
@@ -105,7 +120,16 @@ def test_ground_is_looked_up_by_row_and_column_of_each_episodes_own_map() -> Non
 def test_off_the_map_nothing_moves_and_nothing_is_free() -> None:
     problem = factories.problem(torch.ones(1, 16, 16))
     state = torch.tensor(
-        [[[-0.1, 1.0], [8.0, 1.0], [1.0, 8.1], [1.0, -5.0], [math.nan, 1.0], [math.inf, 1.0]]]
+        [
+            [
+                [-0.1, 1.0],
+                [8.0, 1.0],
+                [1.0, 8.1],
+                [1.0, -5.0],
+                [math.nan, 1.0],
+                [math.inf, 1.0],
+            ]
+        ]
     )
     assert problem.traversability_at(state).tolist() == [[0.0] * 6]
     assert not problem.free_at(state).any()
@@ -125,7 +149,9 @@ def test_a_clone_shares_no_tensor() -> None:
     problem = varied()
     before = {name: value.clone() for name, value in tensors(problem).items()}
     clone = problem.clone()
-    assert all(torch.equal(value, before[name]) for name, value in tensors(clone).items())
+    assert all(
+        torch.equal(value, before[name]) for name, value in tensors(clone).items()
+    )
     for value in tensors(clone).values():
         value.zero_()
     for bound in clone.action_bounds:
@@ -151,16 +177,28 @@ def test_a_batch_that_is_none_is_refused(name: str) -> None:
 def test_doubles_stay_doubles() -> None:
     ground = torch.rand(1, 16, 16, dtype=torch.float64)
     problem = factories.problem(ground, robot=Unicycle())
-    problem = replace(problem, start=problem.start.double(), goal_m=problem.goal_m.double())
-    cost = problem.stage_cost(
-        problem.start, problem.start[:, :2], problem.ground_at(problem.start), problem.goal_m
+    problem = replace(
+        problem, start=problem.start.double(), goal_m=problem.goal_m.double()
     )
-    assert cost.dtype == problem.action_bounds[0].dtype == problem.padded_ground.dtype == torch.float64
+    cost = problem.stage_cost(
+        problem.start,
+        problem.start[:, :2],
+        problem.ground_at(problem.start),
+        problem.goal_m,
+    )
+    assert (
+        cost.dtype
+        == problem.action_bounds[0].dtype
+        == problem.padded_ground.dtype
+        == torch.float64
+    )
 
 
 def test_any_distribution_is_posed_and_taken_apart_with_the_batch() -> None:
     made, law = varied(), quantiles(maps=BATCH)
-    law = QuantileDistribution(law.values[..., :1, :1].expand(-1, -1, HEIGHT, WIDTH).float().contiguous())
+    law = QuantileDistribution(
+        law.values[..., :1, :1].expand(-1, -1, HEIGHT, WIDTH).float().contiguous()
+    )
     task = replace(made.task, rules=Rules(free_space=FreeSpace(by="mean", above=0.3)))
     prediction = Prediction(made.observation, law, law.cvar(0.9))
     problem = pose_problem(task, prediction, made.start[:, :2], made.goal_m, 42.0)
@@ -172,18 +210,26 @@ def test_any_distribution_is_posed_and_taken_apart_with_the_batch() -> None:
         replace(problem, distribution=law.select(torch.tensor([0])))
 
 
-def drawing(belief: Belief[Any], sensed: Tensor | None = None, correlation_m: float = 1.5) -> Problem:
-    """Three problems whose fields are drawn from a belief, which was told some λ, [B, H, W]."""
+def drawing(
+    belief: Belief[Any], sensed: Tensor | None = None, correlation_m: float = 1.5
+) -> Problem:
+    """Three problems whose fields are drawn from a belief, which was told some λ, [B,
+    H, W].
+    """
     problem = varied()
     law = Law(grid=problem.grid, correlation_m=correlation_m)
     state = belief.init(problem.distribution, law)
     if sensed is not None:
-        state = belief.update(state, Sensed(traversability=sensed, std=torch.full_like(sensed, 0.01)))
+        state = belief.update(
+            state, Sensed(traversability=sensed, std=torch.full_like(sensed, 0.01))
+        )
     return replace(problem, fields=Fields(belief, state, (7, 3, 11)))
 
 
 @pytest.mark.parametrize("correlated", [True, False])
-def test_fields_have_the_prediction_and_hang_together_as_the_belief_says(correlated: bool) -> None:
+def test_fields_have_the_prediction_and_hang_together_as_the_belief_says(
+    correlated: bool,
+) -> None:
     torch.manual_seed(0)
     problem = drawing(Static(correlated))
     drawn = problem.sample_fields(600, 5)
@@ -191,7 +237,8 @@ def test_fields_have_the_prediction_and_hang_together_as_the_belief_says(correla
     assert drawn.dtype == problem.risk_map.dtype
     assert float(drawn.min()) >= 0
     assert float(drawn.max()) <= 1
-    # Neighbouring cells are of one episode and hang together; E[λ] is within 4 standard errors in nearly all.
+    # Neighbouring cells are of one episode and hang together; E[λ] is within 4 standard
+    # errors in nearly all.
     off = (drawn.mean(1) - problem.distribution.mean()).abs() * 600**0.5 / drawn.std(1)
     assert float((off < 4).double().mean()) > 0.99
     ranks = drawn.argsort(1).argsort(1).double()
@@ -225,14 +272,17 @@ def test_fields_are_those_that_what_was_sensed_allows() -> None:
     assert (drawn[:, :, 4, 5] - value[:, None]).abs().max() < 0.05
     torch.manual_seed(0)
     before = drawing(Copula()).sample_fields(200, 5)
-    # A cell beside it is as much worse ground as the correlation has it; one far away is what it was.
+    # A cell beside it is as much worse ground as the correlation has it; one far away
+    # is what it was.
     torch.manual_seed(0)
     distribution = varied().distribution
     rank = torch.stack([distribution.cdf(own) for own in drawn.unbind(1)], 1)
     score = -0.6745 * math.exp(-1 / 18)
     spread = math.sqrt(1 - math.exp(-1 / 9))
     beside = torch.special.ndtri(rank[:, :, 4, 6].double().clamp(1e-6, 1 - 1e-6))
-    assert beside.mean(1).tolist() == pytest.approx([score] * BATCH, abs=4 * spread / 200**0.5 + 0.02)
+    assert beside.mean(1).tolist() == pytest.approx(
+        [score] * BATCH, abs=4 * spread / 200**0.5 + 0.02
+    )
     torch.testing.assert_close(drawn[..., 19], before[..., 19], atol=0.02, rtol=0)
 
 

@@ -33,7 +33,9 @@ def test_measures_by_name_are_those_of_the_mixture() -> None:
         ("single-class:0.2", mixture.most_likely().cvar(0.2)),
         ({"part": "cvar", "options": {"level": 0.3}}, mixture.cvar(0.3)),
     ):
-        assert torch.equal(risk.apply(registry.make("risk", text), mixture), expected), text
+        assert torch.equal(
+            risk.apply(registry.make("risk", text), mixture), expected
+        ), text
 
 
 @pytest.mark.parametrize("text", ["cvr", "cvar:x", "mean:0.5", ""])
@@ -59,7 +61,9 @@ def test_a_higher_level_is_more_cautious() -> None:
 
 def test_a_users_measure_is_applied_and_its_map_takes_the_mixtures_dtype() -> None:
     mixture = random_mixture()
-    single = TraversabilityMixture(mixture.weights.float(), mixture.means.float(), mixture.stds.float())
+    single = TraversabilityMixture(
+        mixture.weights.float(), mixture.means.float(), mixture.stds.float()
+    )
     worst = risk.apply(lambda given: given.cvar(0.99).double(), single)
     assert worst.dtype == torch.float32
     assert torch.equal(worst, single.cvar(0.99))
@@ -73,7 +77,10 @@ def test_a_users_measure_is_applied_and_its_map_takes_the_mixtures_dtype() -> No
         (lambda mixture: mixture.mean()[0], "got [1, 6]"),
         (lambda mixture: mixture.mean().mT, "got [2, 6, 1]"),
         (lambda mixture: None, "got NoneType"),
-        (lambda mixture: mixture.mean() > 0.3, "floating-point numbers, got torch.bool"),
+        (
+            lambda mixture: mixture.mean() > 0.3,
+            "floating-point numbers, got torch.bool",
+        ),
         (lambda mixture: mixture.mean() + 1, "in [0, 1], got values outside"),
         (lambda mixture: mixture.mean() - 1, "in [0, 1], got values outside"),
         (lambda mixture: mixture.mean() * torch.nan, "or not a number"),
@@ -95,9 +102,16 @@ def test_a_measure_changes_nothing_that_it_is_given(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "word"), [("chance:1.5", "bound"), ("expected-time:0", "least speed"), ("time-cvar:1", "level")]
+    ("text", "word"),
+    [
+        ("chance:1.5", "bound"),
+        ("expected-time:0", "least speed"),
+        ("time-cvar:1", "level"),
+    ],
 )
-def test_options_of_other_measures_out_of_range_are_refused(text: str, word: str) -> None:
+def test_options_of_other_measures_out_of_range_are_refused(
+    text: str, word: str
+) -> None:
     with pytest.raises(ConfigError, match=word):
         risk.apply(registry.make("risk", text), random_mixture())
 
@@ -108,12 +122,16 @@ def test_single_class_of_components_that_are_no_classes_is_refused_by_name() -> 
         risk.apply(registry.make("risk", "single-class"), mixture)
 
 
-def test_measures_are_those_of_any_distribution_and_single_class_refuses_by_name() -> None:
+def test_measures_are_those_of_any_distribution_and_single_class_refuses_by_name() -> (
+    None
+):
     law = quantiles()
     for text, expected in (
         ("mean", law.mean()), ("cvar:0.7", law.cvar(0.7)), ("var:0.7", law.var(0.7)), ("chance:0.2", law.chance(0.2)),
         ("expected-time:0.1", 1 / law.expected_time(0.1)), ("time-cvar:0.7", 1 / law.time_cvar(0.7, 0.05)),
     ):  # fmt: skip
         assert torch.equal(risk.apply(registry.make("risk", text), law), expected), text
-    with pytest.raises(ConfigError, match="single-class option, got QuantileDistribution"):
+    with pytest.raises(
+        ConfigError, match="single-class option, got QuantileDistribution"
+    ):
         risk.apply(registry.make("risk", "single-class"), law)

@@ -15,12 +15,16 @@ SHIPPED = [registry.make("robot", name) for name in registry.names("robot")]
 EACH = pytest.mark.parametrize("robot", SHIPPED, ids=lambda robot: type(robot).__name__)
 
 
-def run(robot: Robot, action: list[float], steps: int, traversability: float = 1.0) -> Tensor:
+def run(
+    robot: Robot, action: list[float], steps: int, traversability: float = 1.0
+) -> Tensor:
     """States of a robot that repeats an action, shape [steps + 1, S], in float64."""
     state = robot.initial_state(torch.tensor([[1.0, 2.0, 0.5]], dtype=torch.float64))
     states = [state[0]]
     for _ in range(steps):
-        state = robot(state, state.new_tensor([action]), state.new_tensor([traversability]))
+        state = robot(
+            state, state.new_tensor([action]), state.new_tensor([traversability])
+        )
         states.append(state[0])
     return torch.stack(states)
 
@@ -28,7 +32,11 @@ def run(robot: Robot, action: list[float], steps: int, traversability: float = 1
 def test_the_unicycle_is_the_papers_equation() -> None:
     state, action = torch.tensor([[1.0, 2.0, 0.5]]), torch.tensor([[0.8, -0.4]])
     moved = Unicycle()(state, action, torch.tensor([0.5]))
-    expected = [1 + 0.1 * 0.5 * 0.8 * 0.87758256, 2 + 0.1 * 0.5 * 0.8 * 0.47942554, 0.5 - 0.1 * 0.5 * 0.4]
+    expected = [
+        1 + 0.1 * 0.5 * 0.8 * 0.87758256,
+        2 + 0.1 * 0.5 * 0.8 * 0.47942554,
+        0.5 - 0.1 * 0.5 * 0.4,
+    ]
     assert moved[0].tolist() == pytest.approx(expected)
 
 
@@ -36,18 +44,25 @@ def test_the_unicycle_drives_the_circle_of_radius_speed_over_turn_rate() -> None
     states = run(Unicycle(dt_s=0.001), [0.8, 0.4], 7854, traversability=0.5)
     # A quarter of a turn: λ slows both motions and leaves the circle as it is.
     assert states[-1, 2].item() == pytest.approx(0.5 + math.pi / 2, abs=1e-3)
-    centre = torch.tensor([1 - 2 * math.sin(0.5), 2 + 2 * math.cos(0.5)], dtype=torch.float64)
+    centre = torch.tensor(
+        [1 - 2 * math.sin(0.5), 2 + 2 * math.cos(0.5)], dtype=torch.float64
+    )
     radius = torch.linalg.vector_norm(states[:, :2] - centre, dim=1)
     torch.testing.assert_close(radius, torch.full_like(radius, 2.0), atol=1e-3, rtol=0)
 
 
-def test_a_differential_drive_reaches_its_speed_in_speed_over_acceleration_seconds() -> None:
-    robot = DifferentialDrive(dt_s=0.1, acceleration_mps2=0.4, turn_acceleration_radps2=0.8)
+def test_a_differential_drive_reaches_its_speed_in_speed_over_acceleration_seconds() -> (
+    None
+):
+    robot = DifferentialDrive(
+        dt_s=0.1, acceleration_mps2=0.4, turn_acceleration_radps2=0.8
+    )
     states = run(robot, [1.0, -1.0], 40)
     speeds, rates = states[:, 3], states[:, 4]
     assert (speeds[24] < 1 - 1e-9, speeds[25].item()) == (True, pytest.approx(1.0))
     assert (rates[12] > -1 + 1e-9, rates[13].item()) == (True, pytest.approx(-1.0))
-    # Half the way of a constant speed is lost on starting: v·t − v²/2a, to half a step's.
+    # Half the way of a constant speed is lost on starting: v·t − v²/2a, to half a
+    # step's.
     straight = run(robot, [1.0, 0.0], 100)
     driven = torch.linalg.vector_norm(straight[-1, :2] - straight[0, :2]).item()
     assert driven == pytest.approx(10 - 1 / (2 * 0.4), abs=0.06)
@@ -71,11 +86,15 @@ def test_a_differential_drive_never_changes_its_velocities_faster_than_it_can() 
 def test_a_differential_drive_without_haste_is_the_unicycle() -> None:
     quick = DifferentialDrive(acceleration_mps2=1e9, turn_acceleration_radps2=1e9)
     for action in ([0.7, -0.3], [1.0, 1.0]):
-        torch.testing.assert_close(run(quick, action, 30, 0.6)[:, :3], run(Unicycle(), action, 30, 0.6))
+        torch.testing.assert_close(
+            run(quick, action, 30, 0.6)[:, :3], run(Unicycle(), action, 30, 0.6)
+        )
 
 
 def test_soft_ground_slows_a_differential_drive_but_not_its_wheels() -> None:
-    firm, soft = (run(DifferentialDrive(), [1.0, 0.5], 30, value) for value in (1.0, 0.25))
+    firm, soft = (
+        run(DifferentialDrive(), [1.0, 0.5], 30, value) for value in (1.0, 0.25)
+    )
     assert torch.equal(firm[:, 3:], soft[:, 3:])
     turned, hindered = (states[-1, 2] - states[0, 2] for states in (firm, soft))
     assert hindered.item() == pytest.approx(0.25 * turned.item())
@@ -88,14 +107,22 @@ def test_a_bicycle_drives_the_circle_of_radius_wheelbase_over_tangent(
     robot = Bicycle(dt_s=0.001, wheelbase_m=wheelbase)
     states = run(robot, [1.0, steering], 4000, traversability=0.5)
     radius = wheelbase / math.tan(steering)
-    centre = torch.tensor([1 - radius * math.sin(0.5), 2 + radius * math.cos(0.5)], dtype=torch.float64)
+    centre = torch.tensor(
+        [1 - radius * math.sin(0.5), 2 + radius * math.cos(0.5)], dtype=torch.float64
+    )
     away = torch.linalg.vector_norm(states[:, :2] - centre, dim=1)
-    torch.testing.assert_close(away, torch.full_like(away, abs(radius)), atol=2e-3, rtol=0)
-    assert (states[-1, 2] - states[0, 2]).item() == pytest.approx(2.0 / radius, rel=1e-6)
+    torch.testing.assert_close(
+        away, torch.full_like(away, abs(radius)), atol=2e-3, rtol=0
+    )
+    assert (states[-1, 2] - states[0, 2]).item() == pytest.approx(
+        2.0 / radius, rel=1e-6
+    )
 
 
 def test_a_bicycle_does_not_turn_while_it_stands() -> None:
-    assert torch.equal(run(Bicycle(), [0.0, 0.6], 1)[1], run(Bicycle(), [0.0, 0.6], 1)[0])
+    assert torch.equal(
+        run(Bicycle(), [0.0, 0.6], 1)[1], run(Bicycle(), [0.0, 0.6], 1)[0]
+    )
 
 
 @EACH
@@ -105,21 +132,31 @@ def test_ground_of_no_traversability_immobilises_a_robot(robot: Any) -> None:
 
 
 @EACH
-def test_a_robot_keeps_shape_and_dtype_for_any_leading_dimensions_and_changes_nothing(robot: Any) -> None:
+def test_a_robot_keeps_shape_and_dtype_for_any_leading_dimensions_and_changes_nothing(
+    robot: Any,
+) -> None:
     for dtype in (torch.float32, torch.float64):
         for leading in ((4,), (2, 3), (2, 3, 5)):
             pose = torch.rand(*leading, 3, dtype=dtype)
             state = robot.initial_state(pose.flatten(0, -2)).unflatten(0, leading)
             assert state.dtype == dtype
             assert torch.equal(state[..., :3], pose)
-            action, ground = torch.rand(*leading, 2, dtype=dtype), torch.rand(leading, dtype=dtype)
+            action, ground = (
+                torch.rand(*leading, 2, dtype=dtype),
+                torch.rand(leading, dtype=dtype),
+            )
             kept = [value.clone() for value in (state, action, ground)]
             moved = robot(state, action, ground)
             assert (moved.shape, moved.dtype) == (state.shape, dtype)
-            assert all(torch.equal(*pair) for pair in zip(kept, (state, action, ground), strict=True))
+            assert all(
+                torch.equal(*pair)
+                for pair in zip(kept, (state, action, ground), strict=True)
+            )
             # Each robot moves by itself.
             first = (0,) * len(leading)
-            alone = robot(state[first][None], action[first][None], ground[first][None])[0]
+            alone = robot(state[first][None], action[first][None], ground[first][None])[
+                0
+            ]
             torch.testing.assert_close(moved[first], alone)
 
 
@@ -185,7 +222,11 @@ def test_the_time_step_scales_the_motion(kind: Any, dt_s: float) -> None:
         (Unicycle, {"turn_rate_radps": (1.0, -1.0)}, "turn_rate_radps"),
         (DifferentialDrive, {"dt_s": -0.1}, "dt_s"),
         (DifferentialDrive, {"acceleration_mps2": 0.0}, "acceleration_mps2"),
-        (DifferentialDrive, {"turn_acceleration_radps2": -1.0}, "turn_acceleration_radps2"),
+        (
+            DifferentialDrive,
+            {"turn_acceleration_radps2": -1.0},
+            "turn_acceleration_radps2",
+        ),
         (Bicycle, {"dt_s": 0.0}, "dt_s"),
         (Bicycle, {"speed_mps": (1.0, 0.0)}, "speed_mps"),
         (Bicycle, {"steering_rad": 1.6}, "steering_rad"),
@@ -193,6 +234,8 @@ def test_the_time_step_scales_the_motion(kind: Any, dt_s: float) -> None:
         (Bicycle, {"wheelbase_m": 0.0}, "wheelbase_m"),
     ],
 )
-def test_a_robot_that_cannot_move_is_refused(kind: Any, settings: dict[str, Any], expected: str) -> None:
+def test_a_robot_that_cannot_move_is_refused(
+    kind: Any, settings: dict[str, Any], expected: str
+) -> None:
     with pytest.raises(ConfigError, match=expected):
         kind(**settings)

@@ -25,7 +25,11 @@ def test_pseudo_maps_are_drawn_as_often_as_maps() -> None:
 def test_the_interval_is_scipys() -> None:
     values = np.random.default_rng(2).random(25)
     exact = bootstrap(
-        (values,), np.mean, method="percentile", n_resamples=9_999, rng=np.random.default_rng(0)
+        (values,),
+        np.mean,
+        method="percentile",
+        n_resamples=9_999,
+        rng=np.random.default_rng(0),
     ).confidence_interval
     found = percentile_interval(bootstrap_counts(25) @ values / 25)
     assert found == pytest.approx((exact.low, exact.high), abs=0.01)

@@ -21,7 +21,9 @@ def test_difference_with_one_episode_a_map_is_that_of_bonett_and_price() -> None
     mean, low, high = success_interval(gain, 1)
     assert mean == pytest.approx(5 / 30)
     assert (low, high) == pytest.approx((won - lost - half, won - lost + half))
-    assert standard_deviation(gain, 1) == pytest.approx((won + lost - (won - lost) ** 2) ** 0.5)
+    assert standard_deviation(gain, 1) == pytest.approx(
+        (won + lost - (won - lost) ** 2) ** 0.5
+    )
 
 
 def test_difference_takes_episodes_a_map_into_account() -> None:
@@ -32,7 +34,9 @@ def test_difference_takes_episodes_a_map_into_account() -> None:
     c = (squares / 9 / 8 + 0.01) / (sizes / 3 / 8 + 0.01)
     shares = np.append(gain[0] / 3, [c, -c])
     half = t.ppf(0.975, 7) * shares.std() / 10**0.5
-    assert (low[0], high[0]) == pytest.approx((shares.mean() - half, shares.mean() + half))
+    assert (low[0], high[0]) == pytest.approx(
+        (shares.mean() - half, shares.mean() + half)
+    )
     wide = success_interval(gain, 3, confidence=0.99)
     assert np.all(wide[1] < low)
     assert np.all(wide[2] > high)
@@ -45,18 +49,27 @@ def test_a_difference_of_unequal_maps_is_a_ratio_of_sums() -> None:
     size, share = episodes / 3, gain / 3
     c = ((1 / 1 + 9 / 6) / 9 + 0.01) / (4 / 9 + 0.01)
     added = ((size**2).mean()) ** 0.5
-    size, share = np.append(size, [added, added]), np.append(share, [added * c, -added * c])
+    size, share = (
+        np.append(size, [added, added]),
+        np.append(share, [added * c, -added * c]),
+    )
     centre = share.sum() / size.sum()
     half = t.ppf(0.975, 2) * (((share - centre * size) ** 2).sum()) ** 0.5 / size.sum()
-    assert (mean, low, high) == pytest.approx((4 / 9, max(centre - half, -1), min(centre + half, 1)))
+    assert (mean, low, high) == pytest.approx(
+        (4 / 9, max(centre - half, -1), min(centre + half, 1))
+    )
 
 
 @pytest.mark.parametrize("sizes", [[20] * 5, [10, 10, 20, 20, 40]])
 def test_the_difference_of_few_large_groups_is_covered(sizes: list[int]) -> None:
-    """Rates 0.99 and 0.90 with a correlation of 0.3 within a group; pseudo-maps of ±1/m cover 72 %."""
+    """Rates 0.99 and 0.90 with a correlation of 0.3 within a group; pseudo-maps of ±1/m
+    cover 72 %.
+    """
     generator = np.random.default_rng(0)
     wins = [
-        generator.binomial(sizes, generator.beta(rate * 7 / 3, (1 - rate) * 7 / 3, (600, 5)))
+        generator.binomial(
+            sizes, generator.beta(rate * 7 / 3, (1 - rate) * 7 / 3, (600, 5))
+        )
         for rate in (0.99, 0.9)
     ]
     _, low, high = success_interval(wins[0] - wins[1], np.array(sizes))
@@ -98,39 +111,55 @@ def test_total_time_is_put_together_of_failures_and_of_time_without_them() -> No
     assert mean == 48
     assert low == pytest.approx(48 - (half**2 + (65 * 0.15) ** 2) ** 0.5)
     assert high == pytest.approx(48 + (half**2 + (65 * 0.3) ** 2) ** 0.5)
-    narrow = total_time_interval(times, 1.0 * failed, (0.05, 0.5), 65.0, 8, confidence=0.5)
+    narrow = total_time_interval(
+        times, 1.0 * failed, (0.05, 0.5), 65.0, 8, confidence=0.5
+    )
     assert low < narrow[1] < narrow[2] < high
 
 
 @pytest.mark.parametrize(("successes", "n"), [(0, 20), (18, 20), (20, 20), (7, 13)])
 def test_wilson_interval_is_scipys(successes: int, n: int) -> None:
     expected = binomtest(successes, n).proportion_ci(0.95, method="wilson")
-    assert wilson_interval(successes / n, n) == pytest.approx((expected.low, expected.high), abs=1e-12)
+    assert wilson_interval(successes / n, n) == pytest.approx(
+        (expected.low, expected.high), abs=1e-12
+    )
 
 
 def drawn(
-    generator: np.random.Generator, maps: int, each: int, correlation: float, rate: float
+    generator: np.random.Generator,
+    maps: int,
+    each: int,
+    correlation: float,
+    rate: float,
 ) -> np.ndarray:
-    """Successes, shape [maps, each], from the beta-binomial of a given intra-class correlation."""
+    """Successes, shape [maps, each], from the beta-binomial of a given intra-class
+    correlation.
+    """
     size = 1 / correlation - 1
     chance = generator.beta(rate * size, (1 - rate) * size, size=maps)
     return generator.random((maps, each)) < chance[:, None]
 
 
 def effect_of(success: np.ndarray) -> float:
-    return design_effect(success.ravel(), np.repeat(np.arange(len(success)), success.shape[1]))
+    return design_effect(
+        success.ravel(), np.repeat(np.arange(len(success)), success.shape[1])
+    )
 
 
 @pytest.mark.parametrize(("correlation", "each"), [(0.05, 5), (0.3, 5), (0.6, 3)])
 def test_design_effect_is_that_of_a_simulation(correlation: float, each: int) -> None:
     generator = np.random.default_rng(1)
-    found = [effect_of(drawn(generator, 300, each, correlation, 0.8)) for _ in range(60)]
+    found = [
+        effect_of(drawn(generator, 300, each, correlation, 0.8)) for _ in range(60)
+    ]
     expected = (1 + (each - 1) * correlation) * 0.16 / each  # variance of a map's rate
     assert np.mean(found) == pytest.approx(each * (expected + 0.01) / 0.17, rel=0.04)
 
 
 def test_many_maps_have_the_error_of_a_clustered_regression() -> None:
-    """Maps with 1, 2 and 9 episodes; statsmodels' variance by cluster is that of the ratio estimator."""
+    """Maps with 1, 2 and 9 episodes; statsmodels' variance by cluster is that of the
+    ratio estimator.
+    """
     generator = np.random.default_rng(2)
     size = np.tile([1, 2, 9], 100)
     success = drawn(generator, len(size), 9, 0.3, 0.7)[np.arange(9) < size[:, None]]
@@ -140,15 +169,20 @@ def test_many_maps_have_the_error_of_a_clustered_regression() -> None:
     fit = sm.OLS(success.astype(float), np.ones(len(success))).fit(
         cov_type="cluster", cov_kwds={"groups": maps, "use_correction": False}
     )
-    assert by_map(success.astype(float), maps).var() / len(size) == pytest.approx(fit.cov_params()[0, 0])
+    assert by_map(success.astype(float), maps).var() / len(size) == pytest.approx(
+        fit.cov_params()[0, 0]
+    )
     rate, unequal = success.mean(), (size**2).mean() / size.mean() ** 2
-    gain = (rate * (1 - rate) + 0.01) / (len(size) * fit.cov_params()[0, 0] + 0.01 * unequal)
+    gain = (rate * (1 - rate) + 0.01) / (
+        len(size) * fit.cov_params()[0, 0] + 0.01 * unequal
+    )
     student = (t.ppf(0.975, len(size) - 1) / norm.ppf(0.975)) ** 2
     assert design_effect(success, maps) == pytest.approx(size.mean() / gain * student)
 
 
 def test_design_effect_by_hand() -> None:
-    # Three maps of two episodes with the rates 1, 1/2, 1/2: p(1 − p) = 2/9, variance of maps 1/18.
+    # Three maps of two episodes with the rates 1, 1/2, 1/2: p(1 − p) = 2/9, variance of
+    # maps 1/18.
     success = np.array([1, 1, 0, 1, 1, 0], dtype=bool)
     gain = (2 / 9 + 0.01) / (1 / 18 + 0.01) * (norm.ppf(0.975) / t.ppf(0.975, 2)) ** 2
     assert gain < 1  # few maps do not tell that they are alike
@@ -160,10 +194,19 @@ def test_design_effect_by_hand() -> None:
 
 def test_design_effect_at_its_ends() -> None:
     both = np.array([True, False, True, True])
-    assert design_effect(both, np.arange(4)) == pytest.approx(1)  # each episode on a map of its own
-    assert design_effect(np.repeat(both, 3), np.repeat(np.arange(4), 3)) == pytest.approx(3)  # all alike
-    # What cannot be seen is taken to be as bad as it can be: one map, or nothing but successes.
+    assert design_effect(both, np.arange(4)) == pytest.approx(
+        1
+    )  # each episode on a map of its own
+    assert design_effect(
+        np.repeat(both, 3), np.repeat(np.arange(4), 3)
+    ) == pytest.approx(3)  # all alike
+    # What cannot be seen is taken to be as bad as it can be: one map, or nothing but
+    # successes.
     assert design_effect(both, np.zeros(4)) == 4
-    assert design_effect(np.ones(12, dtype=bool), np.repeat(np.arange(4), 3)) == pytest.approx(3)
+    assert design_effect(
+        np.ones(12, dtype=bool), np.repeat(np.arange(4), 3)
+    ) == pytest.approx(3)
     # 8, 1, 1, 1 and 1 episodes are worth 144/68 maps.
-    assert design_effect(np.ones(12, dtype=bool), [*[0] * 8, 1, 2, 3, 4]) == pytest.approx(12 / (144 / 68))
+    assert design_effect(
+        np.ones(12, dtype=bool), [*[0] * 8, 1, 2, 3, 4]
+    ) == pytest.approx(12 / (144 / 68))

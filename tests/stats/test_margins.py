@@ -21,11 +21,19 @@ def test_margins_are_tested_as_two_one_sided_t_tests(seed: int, margin: float) -
         float(ttest_1samp(values, bound, alternative=side).pvalue)
         for bound, side in ((-margin, "greater"), (margin, "less"))
     )
-    assert margin_p(interval, "equivalence", "", margin) == pytest.approx(max(above, below), rel=1e-4)
-    assert margin_p(interval, "non-inferiority", "higher", margin) == pytest.approx(above, rel=1e-4)
-    assert margin_p(interval, "non-inferiority", "lower", margin) == pytest.approx(below, rel=1e-4)
+    assert margin_p(interval, "equivalence", "", margin) == pytest.approx(
+        max(above, below), rel=1e-4
+    )
+    assert margin_p(interval, "non-inferiority", "higher", margin) == pytest.approx(
+        above, rel=1e-4
+    )
+    assert margin_p(interval, "non-inferiority", "lower", margin) == pytest.approx(
+        below, rel=1e-4
+    )
     superior = float(ttest_1samp(values, margin, alternative="greater").pvalue)
-    assert margin_p(interval, "superiority", "higher", margin) == pytest.approx(superior, rel=1e-4)
+    assert margin_p(interval, "superiority", "higher", margin) == pytest.approx(
+        superior, rel=1e-4
+    )
 
 
 def test_without_an_interval_nothing_is_supported() -> None:

@@ -22,7 +22,11 @@ def test_the_smallest_difference_is_shown_in_four_of_five_studies(alpha: float) 
 def test_maps_needed_are_those_that_show_the_difference() -> None:
     for difference in (0.02, 0.05, 0.2):
         maps = maps_needed(0.5, difference, 0.01)
-        assert smallest_difference(0.5, maps, 0.01) <= difference < smallest_difference(0.5, maps - 1, 0.01)
+        assert (
+            smallest_difference(0.5, maps, 0.01)
+            <= difference
+            < smallest_difference(0.5, maps - 1, 0.01)
+        )
 
 
 def test_more_maps_are_needed_for_more_power_and_less_chance() -> None:

@@ -25,7 +25,12 @@ def overlap(hits: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 SCORES = (
     Score(name="accuracy", parts=("hits", "true"), of=overlap, better="higher"),
-    Score(name="rmse", parts=("squares", "cells"), of=lambda a, b: np.sqrt(ratio(a, b)), better="lower"),
+    Score(
+        name="rmse",
+        parts=("squares", "cells"),
+        of=lambda a, b: np.sqrt(ratio(a, b)),
+        better="lower",
+    ),
     Score(name="loss", parts=("loss", "cells"), of=ratio, better="lower"),
     Score(name="coverage", parts=("inside", "cells"), of=ratio, target=0.9),
     Score(name="width", parts=("width", "cells"), of=ratio),
@@ -49,7 +54,9 @@ def sums_of(loss: Any, seed: int = 0) -> Sums:
 
 
 def compared(sums: dict[str, Sums], competing: str = "ab") -> pd.DataFrame:
-    return compare_pairs(SCORES, sums, list(competing), "cells").set_index(["measure", "one", "other"])
+    return compare_pairs(SCORES, sums, list(competing), "cells").set_index(
+        ["measure", "one", "other"]
+    )
 
 
 @pytest.mark.parametrize("maps", [6, 9])
@@ -58,7 +65,10 @@ def test_a_mean_is_tested_as_scipy_tests_it(maps: int) -> None:
     one, other = random.random(maps), random.random(maps) + 0.2
     found = compared({"a": sums_of(one), "b": sums_of(other, 1)}).loc["loss", "a", "b"]
     exact = permutation_test(
-        (one, other), lambda x, y: np.mean(x) - np.mean(y), permutation_type="samples", n_resamples=np.inf
+        (one, other),
+        lambda x, y: np.mean(x) - np.mean(y),
+        permutation_type="samples",
+        n_resamples=np.inf,
     )
     assert found["difference"] == pytest.approx(exact.statistic)
     assert found["p"] == found["p_holm"] == pytest.approx(exact.pvalue)
@@ -72,7 +82,9 @@ def test_what_is_no_mean_is_tested_by_exchanging_the_two_on_each_map() -> None:
     for score in SCORES:
         found = []
         for swap in product((False, True), repeat=5):
-            sides = [{name: own[name].copy() for name in score.parts} for own in (one, other)]
+            sides = [
+                {name: own[name].copy() for name in score.parts} for own in (one, other)
+            ]
             for name in score.parts:
                 sides[0][name][list(swap)], sides[1][name][list(swap)] = (
                     other[name][list(swap)],
@@ -83,33 +95,62 @@ def test_what_is_no_mean_is_tested_by_exchanging_the_two_on_each_map() -> None:
                 a, b = abs(a - 0.9), abs(b - 0.9)
             found.append(float(a - b))
         expected = np.mean(np.abs(found) >= abs(found[0]) - 1e-12)
-        assert rows.loc[score.name, "a", "b"]["difference"] == pytest.approx(found[0]), score.name
-        assert rows.loc[score.name, "a", "b"]["p"] == pytest.approx(expected), score.name
+        assert rows.loc[score.name, "a", "b"]["difference"] == pytest.approx(
+            found[0]
+        ), score.name
+        assert rows.loc[score.name, "a", "b"]["p"] == pytest.approx(expected), (
+            score.name
+        )
 
 
 @settings(deadline=None, max_examples=15)
 @given(st.integers(0, 1000), st.integers(3, 20))
-def test_nothing_depends_on_the_order_of_maps_or_contestants(seed: int, maps: int) -> None:
+def test_nothing_depends_on_the_order_of_maps_or_contestants(
+    seed: int, maps: int
+) -> None:
     random = np.random.default_rng(seed)
-    sums = {name: sums_of(random.random(maps), seed + place) for place, name in enumerate("abc")}
+    sums = {
+        name: sums_of(random.random(maps), seed + place)
+        for place, name in enumerate("abc")
+    }
     order = random.permutation(maps)
-    moved = {name: {part: values[order] for part, values in sums[name].items()} for name in "cab"}
-    twice = {name: {part: 2 * values for part, values in own.items()} for name, own in sums.items()}
+    moved = {
+        name: {part: values[order] for part, values in sums[name].items()}
+        for name in "cab"
+    }
+    twice = {
+        name: {part: 2 * values for part, values in own.items()}
+        for name, own in sums.items()
+    }
     expected, summary = compared(sums, "abc"), summarise(SCORES, sums)
-    best = against_best(SCORES, summary, expected.reset_index()).set_index("measure", append=True)
+    best = against_best(SCORES, summary, expected.reset_index()).set_index(
+        "measure", append=True
+    )
     for other in (moved, twice):
         rows, others = compared(other, "abc"), summarise(SCORES, other)
         pd.testing.assert_frame_equal(others.loc[list("abc")], summary, rtol=1e-9)
         for key, row in expected.iterrows():
             turned = key not in rows.index
             found = rows.loc[(key[0], key[2], key[1]) if turned else key]  # type: ignore[index]
-            ends = (-found["high"], -found["low"]) if turned else (found["low"], found["high"])
+            ends = (
+                (-found["high"], -found["low"])
+                if turned
+                else (found["low"], found["high"])
+            )
             sign = -1 if turned else 1
-            assert sign * found["difference"] == pytest.approx(row["difference"], abs=1e-12)
-            assert ends == pytest.approx((row["low"], row["high"]), abs=1e-12, nan_ok=True)
+            assert sign * found["difference"] == pytest.approx(
+                row["difference"], abs=1e-12
+            )
+            assert ends == pytest.approx(
+                (row["low"], row["high"]), abs=1e-12, nan_ok=True
+            )
             assert (found["p"], found["p_holm"]) == (row["p"], row["p_holm"])
-        again = against_best(SCORES, others, rows.reset_index()).set_index("measure", append=True)
-        pd.testing.assert_frame_equal(again.loc[best.index], best, rtol=1e-9, atol=1e-12)
+        again = against_best(SCORES, others, rows.reset_index()).set_index(
+            "measure", append=True
+        )
+        pd.testing.assert_frame_equal(
+            again.loc[best.index], best, rtol=1e-9, atol=1e-12
+        )
 
 
 def test_an_interval_is_that_of_samples_of_maps() -> None:
@@ -119,17 +160,24 @@ def test_an_interval_is_that_of_samples_of_maps() -> None:
     table = np.column_stack([sums["hits"], sums["true"]])
     drawn = bootstrap_counts(25) @ table[np.lexsort(table.T)]
     expected = np.quantile((drawn[:, :3] / drawn[:, 3:]).mean(1), [0.025, 0.975])
-    assert (found["accuracy_low"], found["accuracy_high"]) == pytest.approx(tuple(expected))
+    assert (found["accuracy_low"], found["accuracy_high"]) == pytest.approx(
+        tuple(expected)
+    )
     few = summarise(SCORES, {"a": sums_of(np.ones(7))}).loc["a"]
     assert np.isnan([few["loss_low"], few["coverage_high"]]).all()
-    pair = compared({"a": sums_of(np.ones(7)), "b": sums_of(np.zeros(7), 1)}).loc["loss", "a", "b"]
+    pair = compared({"a": sums_of(np.ones(7)), "b": sums_of(np.zeros(7), 1)}).loc[
+        "loss", "a", "b"
+    ]
     assert np.isnan([pair["low"], pair["high"]]).all()
     assert pair["p"] == 2 / 2**7
 
 
 def test_holm_is_over_the_pairs_that_compete_within_a_score() -> None:
     random = np.random.default_rng(4)
-    sums = {name: sums_of(random.random(9) + place, place) for place, name in enumerate("abc")}
+    sums = {
+        name: sums_of(random.random(9) + place, place)
+        for place, name in enumerate("abc")
+    }
     pairs = compared({**sums, "oracle": sums_of(np.zeros(9), 7)}, "abc").reset_index()
     assert len(pairs) == 6 * len(SCORES)
     privileged = pairs["other"] == "oracle"
@@ -142,7 +190,9 @@ def test_holm_is_over_the_pairs_that_compete_within_a_score() -> None:
 def test_maps_with_other_cells_and_scores_that_one_lacks_are_not_compared() -> None:
     one, other = sums_of(np.ones(9)), dict(sums_of(np.ones(9), 1))
     del other["hits"]
-    assert set(compared({"a": one, "b": other}).index.get_level_values(0)) == {*NAMES} - {"accuracy"}
+    assert set(compared({"a": one, "b": other}).index.get_level_values(0)) == {
+        *NAMES
+    } - {"accuracy"}
     other["loss"] = np.where(np.arange(9) == 2, np.nan, other["loss"])
     assert "loss" not in compared({"a": one, "b": other}).index
     assert compared({"a": one, "b": {**other, "cells": np.arange(9.0)}}).empty
@@ -151,11 +201,16 @@ def test_maps_with_other_cells_and_scores_that_one_lacks_are_not_compared() -> N
 def test_the_best_and_what_is_as_good_are_marked_where_something_is_worse() -> None:
     noise = np.random.default_rng(5).normal(0, 0.01, (3, 12))
     levels = {"bad": 0.5, "good": 0.1, "alike": 0.1}
-    sums = {name: dict(sums_of(level + noise[i], i)) for i, (name, level) in enumerate(levels.items())}
+    sums = {
+        name: dict(sums_of(level + noise[i], i))
+        for i, (name, level) in enumerate(levels.items())
+    }
     for name, own in sums.items():
         own["hits"] = own["true"] * (0.45 if name == "bad" else 0.9)
         own["inside"] = np.full(12, 85.0 if name == "alike" else 90.0)
-    pairs = compare_pairs(SCORES, {**sums, "oracle": sums_of(np.zeros(12), 9)}, list(sums), "cells")
+    pairs = compare_pairs(
+        SCORES, {**sums, "oracle": sums_of(np.zeros(12), 9)}, list(sums), "cells"
+    )
     found = against_best(SCORES, summarise(SCORES, sums), pairs)
     assert set(found["measure"]) == {*NAMES} - {"width"}
     by_loss, by_accuracy, by_coverage = (
@@ -170,7 +225,11 @@ def test_the_best_and_what_is_as_good_are_marked_where_something_is_worse() -> N
     assert bad["p_holm"] < 0.05
     assert set(by_coverage["best"]) == {"bad"}  # of equal ones the first by name
     assert by_coverage.loc["alike", "difference"] == pytest.approx(0.05)
-    assert by_coverage["marked"].to_dict() == {"bad": True, "good": True, "alike": False}
+    assert by_coverage["marked"].to_dict() == {
+        "bad": True,
+        "good": True,
+        "alike": False,
+    }
     alone = against_best(SCORES, summarise(SCORES, {"bad": sums["bad"]}), pairs)
     assert set(alone["best"]) == {"bad"}
     assert not alone["marked"].any()
@@ -180,6 +239,11 @@ def test_the_best_and_what_is_as_good_are_marked_where_something_is_worse() -> N
 def test_against_one_without_any_error_every_way_counts(maps: int) -> None:
     least = 2 / 2**maps if maps <= 13 else 1 / 10_000
     for seed in range(20):
-        one = {**sums_of(np.ones(maps)), "squares": np.random.default_rng(seed).random(maps)}
+        one = {
+            **sums_of(np.ones(maps)),
+            "squares": np.random.default_rng(seed).random(maps),
+        }
         other = {**one, "squares": np.zeros(maps)}
-        assert compared({"a": one, "b": other}).loc["rmse", "a", "b"]["p"] >= least * 0.99
+        assert (
+            compared({"a": one, "b": other}).loc["rmse", "a", "b"]["p"] >= least * 0.99
+        )

@@ -1,6 +1,14 @@
 import pytest
 
-from benchnav.stats.tables import Column, cell_of, labels_of, p_value, signed, signed_interval, table_of
+from benchnav.stats.tables import (
+    Column,
+    cell_of,
+    labels_of,
+    p_value,
+    signed,
+    signed_interval,
+    table_of,
+)
 
 
 def test_columns_write_their_cells_and_explain_themselves_once() -> None:
@@ -18,7 +26,9 @@ def test_columns_write_their_cells_and_explain_themselves_once() -> None:
     assert table.title == "t"
 
 
-@pytest.mark.parametrize(("p", "text"), [(1.0, "1"), (0.00011, "0.00011"), (0.0001, "≤ 0.0001")])
+@pytest.mark.parametrize(
+    ("p", "text"), [(1.0, "1"), (0.00011, "0.00011"), (0.0001, "≤ 0.0001")]
+)
 def test_the_minimum_of_drawn_flips_is_said_to_be_one(p: float, text: str) -> None:
     assert p_value(p) == text
 

@@ -17,7 +17,9 @@ def suite(study: str, part: str) -> Suite:
 
 
 def conditions(study: str, part: str) -> list[Condition]:
-    """Return the conditions of a part, with parts of files by their paths from the root."""
+    """Return the conditions of a part, with parts of files by their paths from the
+    root.
+    """
     import contextlib
 
     with contextlib.chdir(ROOT):

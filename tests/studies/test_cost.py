@@ -20,13 +20,19 @@ def test_arms_of_risk_on_the_cost_differ_in_what_they_are_called_for_alone() -> 
     found = conditions("cost", "levels")
     told = Counter()
     for each in found:
-        family, arm, held, level = itemgetter("planner", "arm", "held", "level")(arm_of(each.labels))
+        family, arm, held, level = itemgetter("planner", "arm", "held", "level")(
+            arm_of(each.labels)
+        )
         options = dict(each.planner.options)
         own = options["mppi"] if each.planner.part == "astar_mppi" else options
         assert (own["samples"], own["cost_to_go"]) == (1024, "expected-time")
         assert own.get("entrapment", False) is held
         if "cost" in arm:
-            assert (own["risk_on"], own.get("level", 0), own.get("fields", 64)) == ("cost", level, 64)
+            assert (own["risk_on"], own.get("level", 0), own.get("fields", 64)) == (
+                "cost",
+                level,
+                64,
+            )
             assert each.labels["risk"] == "expected-time"
         else:
             assert own.get("risk_on", "map") == "map"
@@ -50,11 +56,22 @@ def test_the_frontiers_have_a_line_an_arm_through_its_levels() -> None:
     assert list(panels) == titles
     for panel in panels.values():
         assert [line.get_label() for line in panel.lines] == sorted(ARMS)
-        marks = [found for found in panel.collections if isinstance(found, PathCollection)]
-        assert [list(own.get_sizes()) for own in marks] == len(ARMS) * [[9.0, 30.25, 49.0]]
-    for name, title in (("mppi cost 0.8", "MPPI"), ("mppi cost 0.8 held", "MPPI, entrapment")):
+        marks = [
+            found for found in panel.collections if isinstance(found, PathCollection)
+        ]
+        assert [list(own.get_sizes()) for own in marks] == len(ARMS) * [
+            [9.0, 30.25, 49.0]
+        ]
+    for name, title in (
+        ("mppi cost 0.8", "MPPI"),
+        ("mppi cost 0.8 held", "MPPI, entrapment"),
+    ):
         own = next(row for row in rows if row["planner"] == name)
-        line = next(line for line in panels[title].lines if line.get_label() == "CVaR of the cost")
+        line = next(
+            line
+            for line in panels[title].lines
+            if line.get_label() == "CVaR of the cost"
+        )
         # The last level, where the curve ends.
         assert (line.get_xdata()[-1], line.get_ydata()[-1]) == (
             own["success_time_mean_s"],
@@ -67,9 +84,14 @@ PARTS = {"cost-primary": "primary", "cost-frontier": "frontier50", "cost-own": "
 
 
 def table_of_arms(
-    name: str, arrived: dict[tuple[str, str], int], folder: Path, monkeypatch: pytest.MonkeyPatch
+    name: str,
+    arrived: dict[tuple[str, str], int],
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> dict[tuple[str, str], list[str]]:
-    """Return rows of a run where arms arrive on so many of 40 maps, in 30 s, and all others on 35, 2 s later."""
+    """Return rows of a run where arms arrive on so many of 40 maps, in 30 s, and all
+    others on 35, 2 s later.
+    """
 
     def conditions_in(name: str) -> list[Compared]:
         found = []
@@ -81,7 +103,9 @@ def table_of_arms(
                 "total_time_s": np.where(success, 30.0 + 2 * (arm not in arrived), 90.0), "time_budget_s": 90.0,
             })  # fmt: skip
             maps = tuple(map(str, range(40)))
-            found.append(Compared(labels=each.labels, value={}, maps=maps, episodes=episodes))
+            found.append(
+                Compared(labels=each.labels, value={}, maps=maps, episodes=episodes)
+            )
         return found
 
     summary = [
@@ -95,7 +119,9 @@ def table_of_arms(
     run.mkdir()
     pd.DataFrame(summary).to_csv(run / "summary.csv")
     monkeypatch.setattr(arms, "open_run", lambda run: run)
-    monkeypatch.setattr(arms, "read_conditions", lambda runs: conditions_in(runs[0].name))
+    monkeypatch.setattr(
+        arms, "read_conditions", lambda runs: conditions_in(runs[0].name)
+    )
     rows = [list(row) for row in arms.arms(run).rows]
     found = {(row[0], row[1]): row[2:] for row in rows}
     assert len(rows) == len(found) == len(summary)
@@ -109,8 +135,12 @@ def test_the_table_of_arms_sets_each_beside_cvar_of_time_with_its_planner(
     found = table_of_arms("cost-primary", base, tmp_path, monkeypatch)
     assert found["mppi map", "time-cvar:0.5"][:3] == ["50.0 (20–90)", "60.0", "1.5"]
     assert all(found[arm][3:] == ["", "", ""] for arm in base)
-    # All 5 maps that differ speak for an arm of A*+MPPI: 2 / 2⁵; after 8 smaller p of 15, Holm's factor is 7.
-    for planner, points, least, most in (("mppi", "+37.5", 0, 0.01), ("astar_mppi", "+12.5", 0.42, 0.46)):
+    # All 5 maps that differ speak for an arm of A*+MPPI: 2 / 2⁵; after 8 smaller p of
+    # 15, Holm's factor is 7.
+    for planner, points, least, most in (
+        ("mppi", "+37.5", 0, 0.01),
+        ("astar_mppi", "+12.5", 0.42, 0.46),
+    ):
         gain, p, later = found[f"{planner} cost 0.8", "expected-time"][3:]
         assert gain.startswith(points)
         assert least <= float(p) <= most

@@ -35,9 +35,15 @@ def test_the_figure_has_a_line_a_risk_setting_over_what_is_known() -> None:
     )
     figure = known(pd.DataFrame(rows))
     panel = figure.axes[0]
-    assert [label.get_text() for label in panel.get_xticklabels()] == [*KNOWN.values(), ALL_KNOWN]
+    assert [label.get_text() for label in panel.get_xticklabels()] == [
+        *KNOWN.values(),
+        ALL_KNOWN,
+    ]
     mean, cvar = panel.lines
     np.testing.assert_allclose(mean.get_ydata(), [50, 60, 70, 80, 100])
     np.testing.assert_allclose(cvar.get_ydata(), [60, 70, 80, 90, 100])
     np.testing.assert_allclose(panel.collections[0].get_segments()[1][:, 1], [56, 63])
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["mean", "CVaR₀.₈"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "mean",
+        "CVaR₀.₈",
+    ]

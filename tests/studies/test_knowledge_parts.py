@@ -31,12 +31,17 @@ def ground() -> tuple[Terrain, Tensor]:
 
 
 def elsewhere(**options: Any) -> Probe:
-    made: Probe = registry.make("ground", {"part": f"{PARTS}:Elsewhere", "options": options})
+    made: Probe = registry.make(
+        "ground", {"part": f"{PARTS}:Elsewhere", "options": options}
+    )
     return made
 
 
 def sense(
-    sensor: Probe, ground: tuple[Terrain, Tensor], keys: tuple[int, ...] = KEYS, step: int = 0
+    sensor: Probe,
+    ground: tuple[Terrain, Tensor],
+    keys: tuple[int, ...] = KEYS,
+    step: int = 0,
 ) -> Sensed:
     return sensor.sense(*ground, STATES[: len(keys)], Moment(keys, step))
 
@@ -44,7 +49,9 @@ def sense(
 def scores(sensed: Sensed, terrain: Terrain) -> Tensor:
     """Normal scores of what is sensed, a row an episode."""
     return (
-        terrain.truth.at(sensed.mask).to_normal(sensed.traversability[sensed.mask][None])[0].view(BATCH, -1)
+        terrain.truth.at(sensed.mask)
+        .to_normal(sensed.traversability[sensed.mask][None])[0]
+        .view(BATCH, -1)
     )
 
 
@@ -60,11 +67,15 @@ def test_elsewhere_tells_a_draw_of_the_same_law_that_has_nothing_to_do_with_the_
     assert float(told.std()) == pytest.approx(1, abs=0.15)
     # Neighbouring cells of one row are correlated by exp(−0.5² / 2ℓ²).
     for length_m, expected in ((1.0, 0.88), (0.0, 0.0)):
-        own = sense(elsewhere(radius_m=2.5, noise_std=0.001, correlation_m=length_m), ground)
+        own = sense(
+            elsewhere(radius_m=2.5, noise_std=0.001, correlation_m=length_m), ground
+        )
         drawn = torch.full(own.mask.shape, torch.nan, dtype=torch.float64)
         drawn[own.mask] = scores(own, ground[0]).flatten()
         pairs = torch.stack((drawn[:, :, 1:].flatten(), drawn[:, :, :-1].flatten()))
-        assert np.corrcoef(pairs[:, ~pairs.isnan().any(0)])[0, 1] == pytest.approx(expected, abs=0.06)
+        assert np.corrcoef(pairs[:, ~pairs.isnan().any(0)])[0, 1] == pytest.approx(
+            expected, abs=0.06
+        )
 
 
 def test_elsewhere_is_one_draw_an_episode_by_its_key_and_looks_at_no_field(
@@ -73,13 +84,17 @@ def test_elsewhere_is_one_draw_an_episode_by_its_key_and_looks_at_no_field(
     sensor, (terrain, field) = elsewhere(radius_m=2.0, noise_std=0.001), ground
     told = sense(sensor, ground).traversability
     later = sense(sensor, ground, step=7).traversability
-    torch.testing.assert_close(told, later, atol=0.01, rtol=0, equal_nan=True)  # but for the noise
+    torch.testing.assert_close(
+        told, later, atol=0.01, rtol=0, equal_nan=True
+    )  # but for the noise
     other = sense(sensor, (terrain, torch.rand_like(field)))
     assert torch.equal(other.traversability.nan_to_num(-1), told.nan_to_num(-1))
     # One episode alone meets what it met among all, another key another draw.
     own = torch.tensor([3])
     for key, same in ((3, True), (99, False)):
-        alone = sensor.sense(terrain.select(own), field[own], STATES[own], Moment((key,), 0)).traversability
+        alone = sensor.sense(
+            terrain.select(own), field[own], STATES[own], Moment((key,), 0)
+        ).traversability
         assert torch.equal(alone.nan_to_num(-1), told[own].nan_to_num(-1)) is same
 
 

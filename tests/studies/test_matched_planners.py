@@ -1,4 +1,6 @@
-"""Smooth MPPI and iCEM, which are compared with MPPI: they keep to the contract, and sample as their sources say."""
+"""Smooth MPPI and iCEM, which are compared with MPPI: they keep to the contract, and
+sample as their sources say.
+"""
 
 from dataclasses import replace
 
@@ -10,7 +12,13 @@ from benchnav.core import rng
 from benchnav.planning import MPPI, MPPIConfig, Planner, Problem, Step
 from benchnav.planning.free_space import PENALTY
 from benchnav.testing import check_planner
-from studies.matched.planners import ICEM, ICEMConfig, SmoothConfig, SmoothMPPI, coloured_noise
+from studies.matched.planners import (
+    ICEM,
+    ICEMConfig,
+    SmoothConfig,
+    SmoothMPPI,
+    coloured_noise,
+)
 from tests import factories
 
 
@@ -19,7 +27,11 @@ def open_ground() -> Problem:
 
 
 def first_step(problem: Problem) -> Step:
-    return Step(state=problem.start, traversability=torch.full((len(problem),), torch.nan), time_s=0.0)
+    return Step(
+        state=problem.start,
+        traversability=torch.full((len(problem),), torch.nan),
+        time_s=0.0,
+    )
 
 
 @pytest.mark.parametrize(
@@ -36,10 +48,16 @@ def test_they_keep_to_the_contract(planner: Planner) -> None:
 
 
 def test_samples_of_smooth_mppi_are_sums_of_changes() -> None:
-    problem, options = open_ground(), {"samples": 200, "horizon_s": 1.0, "noise_share": 0.02}
+    problem, options = (
+        open_ground(),
+        {"samples": 200, "horizon_s": 1.0, "noise_share": 0.02},
+    )
     plain, smooth = (
         planner.init(problem, rng.generator(0)).noise.at(3)
-        for planner in (MPPI(MPPIConfig(**options)), SmoothMPPI(SmoothConfig(**options)))
+        for planner in (
+            MPPI(MPPIConfig(**options)),
+            SmoothMPPI(SmoothConfig(**options)),
+        )
     )
     torch.testing.assert_close(smooth, plain.cumsum(0))
 
@@ -50,7 +68,9 @@ def test_changes_are_shares_of_an_actions_range() -> None:
     assert high[0] - low[0] != high[1] - low[1]
     costs = []
     for smoothness in (0.0, 3.0):
-        planner = SmoothMPPI(SmoothConfig(samples=50, horizon_s=1.0, smoothness=smoothness))
+        planner = SmoothMPPI(
+            SmoothConfig(samples=50, horizon_s=1.0, smoothness=smoothness)
+        )
         state = planner.init(problem, rng.generator(0))
         weigh = planner._weigh
         planner._weigh = lambda states, cost, *rest, weigh=weigh: (
@@ -58,10 +78,15 @@ def test_changes_are_shares_of_an_actions_range() -> None:
             weigh(states, cost, *rest),
         )[1]  # type: ignore[assignment]
         planner.plan_toward(first_step(problem), state, problem.goal_m)
-    actions = (state.mean[..., None] + state.noise.at(0)).clamp(low[:, None], high[:, None])
+    actions = (state.mean[..., None] + state.noise.at(0)).clamp(
+        low[:, None], high[:, None]
+    )
     shares = (actions - low[:, None]) / (high - low)[:, None]
     torch.testing.assert_close(
-        costs[1] - costs[0], 3 * (shares[:, 1:] - shares[:, :-1]).square().sum((1, 2)), rtol=1e-3, atol=1e-3
+        costs[1] - costs[0],
+        3 * (shares[:, 1:] - shares[:, :-1]).square().sum((1, 2)),
+        rtol=1e-3,
+        atol=1e-3,
     )
 
 
@@ -76,9 +101,19 @@ def test_the_spectrum_of_coloured_noise_falls_as_it_is_told(colour: float) -> No
 
 
 def test_icem_fits_its_distribution_to_its_elites_as_its_algorithm_says() -> None:
-    """Two iterations, written out: fewer samples in the second, which tries the elites and the mean again."""
+    """Two iterations, written out: fewer samples in the second, which tries the elites
+    and the mean again.
+    """
     problem = open_ground()
-    config = ICEMConfig(samples=40, horizon_s=0.5, iterations=2, elites=10, kept=0.2, decay=2.0, momentum=0.2)
+    config = ICEMConfig(
+        samples=40,
+        horizon_s=0.5,
+        iterations=2,
+        elites=10,
+        kept=0.2,
+        decay=2.0,
+        momentum=0.2,
+    )
     planner = ICEM(config)
     state = planner.init(problem, rng.generator(0))
     state = replace(state, step=3, mean=state.mean + 0.1, elites=state.elites + 0.2)
@@ -91,9 +126,15 @@ def test_icem_fits_its_distribution_to_its_elites_as_its_algorithm_says() -> Non
     for iteration, count in enumerate((40, 20)):
         noise = state.coloured.take(rng.stream_key(state.key, 3, iteration), count)
         sampled = (mean[..., None] + spread[..., None] * noise).clamp(low, high)
-        sequences = torch.cat((sampled, tried, *([mean[..., None]] if iteration else [])), 3)
-        order = planner._cost(problem, problem.start, sequences, problem.goal_m, None).argsort(1)[:, :10]
-        best = torch.stack([sequences[episode][..., order[episode]] for episode in range(len(problem))])
+        sequences = torch.cat(
+            (sampled, tried, *([mean[..., None]] if iteration else [])), 3
+        )
+        order = planner._cost(
+            problem, problem.start, sequences, problem.goal_m, None
+        ).argsort(1)[:, :10]
+        best = torch.stack(
+            [sequences[episode][..., order[episode]] for episode in range(len(problem))]
+        )
         mean, spread = 0.2 * mean + 0.8 * best.mean(3), 0.2 * spread + 0.8 * best.std(3)
         tried = best[..., :2]
     action, after, _ = planner.plan_toward(first_step(problem), state, problem.goal_m)

@@ -81,7 +81,14 @@ def figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def do(folder: Path, *words: str) -> int:
-    places = ["--out", str(folder.parent / "runs"), "--maps_in", str(folder.parent / "maps"), "--jobs", "1"]
+    places = [
+        "--out",
+        str(folder.parent / "runs"),
+        "--maps_in",
+        str(folder.parent / "maps"),
+        "--jobs",
+        "1",
+    ]
     return command.main([str(folder), *words, *places])
 
 
@@ -103,7 +110,9 @@ def test_a_report_writes_the_tables_and_figures_of_finished_runs_alone_and_twice
     assert "| planner | mean | cvar |" in first
     assert "old" not in first + second
     # A table in a fold is indented, between empty lines.
-    assert "    <!-- hypotheses tiny-primary -->\n\n    |  | hypothesis | maps |" in second
+    assert (
+        "    <!-- hypotheses tiny-primary -->\n\n    |  | hypothesis | maps |" in second
+    )
     assert second.endswith("\n\n    ")
     assert third == "\n\n<!-- settings tiny-later -->\nkept\n"
     assert fourth == "\n\n<!-- settings other-primary -->\nof another study\n"
@@ -169,7 +178,9 @@ def test_the_first_maps_of_a_part_alone_are_driven(tiny: Path) -> None:
 def test_what_a_script_returns_is_stored_by_its_kind(
     tiny: Path, figures: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def script(work: Work, folder: Path, maps: int = 5, word: str = "") -> dict[str, object]:
+    def script(
+        work: Work, folder: Path, maps: int = 5, word: str = ""
+    ) -> dict[str, object]:
         assert Path.cwd() == runs.ROOT
         rows = pd.DataFrame({"name": [word], "value": [maps / 3]})
         return {
@@ -180,7 +191,8 @@ def test_what_a_script_returns_is_stored_by_its_kind(
         }
 
     (tiny / "page.md").write_text(
-        PAGE + "<!-- table tiny-made -->\n<!-- end -->\n<!-- text tiny-made -->\n<!-- end -->\n"
+        PAGE
+        + "<!-- table tiny-made -->\n<!-- end -->\n<!-- text tiny-made -->\n<!-- end -->\n"
     )
     monkeypatch.setattr(Study, "function", lambda self, name: script)
     part = {"script": "module:function", "options": {"word": "x"}}
@@ -192,9 +204,14 @@ def test_what_a_script_returns_is_stored_by_its_kind(
     assert "| 1 | 2 |" not in (tiny / "page.md").read_text()
     assert do(tiny, "run", "made", "--maps", "2") == do(tiny, "report") == 0
     text = (tiny / "page.md").read_text()
-    assert "<!-- table tiny-made -->\n| a | b |\n|---|---|\n| 1 | 2 |\n<!-- end -->" in text
+    assert (
+        "<!-- table tiny-made -->\n| a | b |\n|---|---|\n| 1 | 2 |\n<!-- end -->"
+        in text
+    )
     assert "<!-- text tiny-made -->\n| c |\n<!-- end -->" in text
     made = tiny.parent / "runs" / "tiny-made"
-    assert pd.read_csv(made / "rows.csv").to_dict("records") == [{"name": "x", "value": pytest.approx(2 / 3)}]
+    assert pd.read_csv(made / "rows.csv").to_dict("records") == [
+        {"name": "x", "value": pytest.approx(2 / 3)}
+    ]
     assert "| x | 0.6667 |" in (made / "rows.md").read_text()
     assert (figures / "made.png").read_bytes()[:4] == b"\x89PNG"

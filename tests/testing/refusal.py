@@ -12,7 +12,9 @@ from benchnav.core.errors import ConfigError
 
 
 def refusal(check: Callable[..., None], part: Any) -> str:
-    """How a check refuses a part, which may leave the global generators elsewhere: a line for each breach."""
+    """How a check refuses a part, which may leave the global generators elsewhere: a
+    line for each breach.
+    """
     states = torch.random.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
     try:
         with pytest.raises(ConfigError) as caught:
@@ -22,6 +24,8 @@ def refusal(check: Callable[..., None], part: Any) -> str:
         np.random.set_state(states[1])  # noqa: NPY002
         random.setstate(states[2])
     first, *breaches = str(caught.value).split("\n")
-    assert all(line.startswith(f"({number}) ") for number, line in enumerate(breaches, start=1))
+    assert all(
+        line.startswith(f"({number}) ") for number, line in enumerate(breaches, start=1)
+    )
     assert first.endswith("which breaks it:" if breaches else ".")
     return str(caught.value)

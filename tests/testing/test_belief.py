@@ -42,7 +42,12 @@ class Good(Belief[Known]):
         nothing = torch.zeros(prior.shape, dtype=prior.dtype)
         return Known(prior, law, nothing, nothing + 1)
 
-    def update(self, state: Known, sensed: Sensed, prior: TraversabilityDistribution | None = None) -> Known:
+    def update(
+        self,
+        state: Known,
+        sensed: Sensed,
+        prior: TraversabilityDistribution | None = None,
+    ) -> Known:
         if prior is not None:
             state = replace(state, prior=prior)
         value = sensed.traversability.nan_to_num()
@@ -61,7 +66,9 @@ class Good(Belief[Known]):
         return other | (before.score != after.score) | (before.std != after.std)
 
     def sample_fields(self, state: Known, count: int, keys: Sequence[int]) -> Tensor:
-        drawn = draw_scores(replace(state.law, correlation_m=0.0), count, keys).to(state.std)
+        drawn = draw_scores(replace(state.law, correlation_m=0.0), count, keys).to(
+            state.std
+        )
         return fields_of(state.prior, state.score[:, None] + state.std[:, None] * drawn)
 
 
@@ -81,7 +88,9 @@ def doing(name: str, act: Callable[..., object]) -> Good:
 
 def giving(name: str, change: Callable[..., Any]) -> Good:
     """Good, but for what one of its methods gives."""
-    return having(**{name: lambda self, *given: change(getattr(Good, name)(self, *given), *given)})
+    return having(
+        **{name: lambda self, *given: change(getattr(Good, name)(self, *given), *given)}
+    )
 
 
 class OnSelf(Good):
@@ -89,9 +98,16 @@ class OnSelf(Good):
 
     count = 0
 
-    def update(self, state: Known, sensed: Sensed, prior: TraversabilityDistribution | None = None) -> Known:
+    def update(
+        self,
+        state: Known,
+        sensed: Sensed,
+        prior: TraversabilityDistribution | None = None,
+    ) -> Known:
         self.count += 1
-        return replace(super().update(state, sensed, prior), std=state.std * 0.99**self.count)
+        return replace(
+            super().update(state, sensed, prior), std=state.std * 0.99**self.count
+        )
 
 
 class LastBegun(Good):
@@ -121,10 +137,14 @@ def unkeyed(fields: Tensor, state: Known, count: int, keys: Sequence[int]) -> Te
 
 
 def in_turn(fields: Tensor, state: Known, count: int, keys: Sequence[int]) -> Tensor:
-    return Good().sample_fields(state, count, [key + place for place, key in enumerate(keys)])
+    return Good().sample_fields(
+        state, count, [key + place for place, key in enumerate(keys)]
+    )
 
 
-def of_the_prior(fields: Tensor, state: Known, count: int, keys: Sequence[int]) -> Tensor:
+def of_the_prior(
+    fields: Tensor, state: Known, count: int, keys: Sequence[int]
+) -> Tensor:
     return fields_of(state.prior, draw_scores(state.law, count, keys))
 
 
@@ -189,7 +209,9 @@ BAD: dict[str, tuple[Any, str]] = {
 
 
 @pytest.mark.parametrize(("belief", "expected"), BAD.values(), ids=BAD.keys())
-def test_a_breach_is_caught_and_named(belief: Any, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_breach_is_caught_and_named(
+    belief: Any, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("benchnav.testing.belief._FIELDS", FEW)
     assert expected in refusal(lambda one: check_belief(one, SMALL), belief)
 
@@ -204,7 +226,10 @@ def test_a_good_belief_passes_on_predictions_worth_trying() -> None:
             return super().init(prior, law)
 
         def update(
-            self, state: Known, sensed: Sensed, prior: TraversabilityDistribution | None = None
+            self,
+            state: Known,
+            sensed: Sensed,
+            prior: TraversabilityDistribution | None = None,
         ) -> Known:
             told.append(sensed)
             return super().update(state, sensed, prior)
@@ -232,7 +257,13 @@ def test_a_refusal_of_quantiles_has_to_name_them() -> None:
 
 @pytest.mark.parametrize(
     "belief",
-    [*registry.names("belief"), Static(correlated=False), Copula(), Copula("estimated"), Copula(0.0, 4)],
+    [
+        *registry.names("belief"),
+        Static(correlated=False),
+        Copula(),
+        Copula("estimated"),
+        Copula(0.0, 4),
+    ],
 )
 def test_every_belief_that_is_shipped_keeps_the_contract(belief: Any) -> None:
     check_belief(belief, SMALL)

@@ -43,7 +43,9 @@ class Good(TraversabilityModel):
         return torch.stack([self.predict(observation).weights] * 3)
 
 
-def changed(change: Callable[[TraversabilityMixture, Observation], TraversabilityMixture]) -> Good:
+def changed(
+    change: Callable[[TraversabilityMixture, Observation], TraversabilityMixture],
+) -> Good:
     """A model that is good but for one thing."""
 
     class Bad(Good):
@@ -65,7 +67,9 @@ def with_members(members: Callable[[Tensor], object]) -> Good:
 
 
 def with_soft_spots(owner: int) -> Good:
-    """The second class is split into a firm and a soft component, of which the latter is told to be another's."""
+    """The second class is split into a firm and a soft component, of which the latter
+    is told to be another's.
+    """
 
     class Split(Good):
         def predict(self, observation: Observation) -> TraversabilityMixture:
@@ -82,7 +86,9 @@ def with_soft_spots(owner: int) -> Good:
 
 
 def meddling(act: Callable[[Observation], object]) -> Good:
-    def change(mixture: TraversabilityMixture, observation: Observation) -> TraversabilityMixture:
+    def change(
+        mixture: TraversabilityMixture, observation: Observation
+    ) -> TraversabilityMixture:
         act(observation)
         return mixture
 
@@ -92,7 +98,9 @@ def meddling(act: Callable[[Observation], object]) -> Good:
 def poked(name: str, value: float) -> Good:
     """One number alone is wrong, in the last cell."""
 
-    def change(mixture: TraversabilityMixture, observation: Observation) -> TraversabilityMixture:
+    def change(
+        mixture: TraversabilityMixture, observation: Observation
+    ) -> TraversabilityMixture:
         values = getattr(mixture, name).clone()
         values[-1, -1, -1, -1] = value
         return replace(mixture, **{name: values})
@@ -130,7 +138,9 @@ class Misnamed(Good):
 
 def crop(mixture: TraversabilityMixture, _: Observation) -> TraversabilityMixture:
     return TraversabilityMixture(
-        mixture.weights[..., :-1, :], mixture.means[..., :-1, :], mixture.stds[..., :-1, :]
+        mixture.weights[..., :-1, :],
+        mixture.means[..., :-1, :],
+        mixture.stds[..., :-1, :],
     )
 
 
@@ -141,7 +151,9 @@ def transpose(mixture: TraversabilityMixture, _: Observation) -> TraversabilityM
 def whole(mixture: TraversabilityMixture, _: Observation) -> TraversabilityMixture:
     weights = torch.zeros_like(mixture.weights)
     weights[:, 0] = 1
-    return TraversabilityMixture(weights.long(), mixture.means.long(), mixture.stds.long())
+    return TraversabilityMixture(
+        weights.long(), mixture.means.long(), mixture.stds.long()
+    )
 
 
 def of_batch(mixture: TraversabilityMixture, _: Observation) -> TraversabilityMixture:
@@ -149,7 +161,9 @@ def of_batch(mixture: TraversabilityMixture, _: Observation) -> TraversabilityMi
 
 
 def elsewhere(mixture: TraversabilityMixture, _: Observation) -> TraversabilityMixture:
-    return TraversabilityMixture(mixture.weights.to("meta"), mixture.means, mixture.stds)
+    return TraversabilityMixture(
+        mixture.weights.to("meta"), mixture.means, mixture.stds
+    )
 
 
 BAD = {
@@ -246,7 +260,9 @@ def test_the_tolerance_is_of_sums_and_of_maps_alone() -> None:
         check_model(model)
 
 
-def test_a_good_model_keeps_the_contract_and_is_tried_on_maps_of_many_colours_and_slopes() -> None:
+def test_a_good_model_keeps_the_contract_and_is_tried_on_maps_of_many_colours_and_slopes() -> (
+    None
+):
     seen: list[Observation] = []
     check_model(meddling(seen.append))
     assert sorted({(len(one.rgb), *one.grid.shape) for one in seen}) == [
@@ -266,20 +282,28 @@ def family(name: str) -> bool:
     return is_family(registry.find("model", name).target)
 
 
-@pytest.mark.parametrize("name", [name for name in registry.names("model") if not family(name)])
+@pytest.mark.parametrize(
+    "name", [name for name in registry.names("model") if not family(name)]
+)
 def test_every_registered_model_keeps_the_contract(name: str) -> None:
     check_model(load_model(name))
     check_model(name, shapes=((9, 9),))
 
 
-def test_the_families_whose_checkpoints_are_tried_here_are_all_that_the_package_has() -> None:
-    own = {name for name in registry.names("model") if registry.find("model", name).shipped}
+def test_the_families_whose_checkpoints_are_tried_here_are_all_that_the_package_has() -> (
+    None
+):
+    own = {
+        name for name in registry.names("model") if registry.find("model", name).shipped
+    }
     assert {name for name in own if family(name)} == {"fused", "mdn", *ZOO}
 
 
 @pytest.mark.parametrize("name", ZOO)
 def test_models_of_the_zoo_are_found_by_name(name: str) -> None:
-    assert registry.find("model", name).target is ZOO[name][0]  # which tests/models/zoo/test_zoo.py tries
+    assert (
+        registry.find("model", name).target is ZOO[name][0]
+    )  # which tests/models/zoo/test_zoo.py tries
 
 
 @pytest.mark.parametrize("members", [1, 2])
@@ -289,23 +313,34 @@ def test_fused_models_keep_the_contract(checkpoint_path: Path, members: int) -> 
         part = checkpoint.part("classifier")
         generator = torch.Generator().manual_seed(index)
         tensors = {
-            name: value * torch.rand(value.shape, generator=generator) if value.ndim > 3 else value
+            name: value * torch.rand(value.shape, generator=generator)
+            if value.ndim > 3
+            else value
             for name, value in part.tensors.items()
         }
-        checkpoint = checkpoint.with_part(member_name(index, "classifier"), replace(part, tensors=tensors))
+        checkpoint = checkpoint.with_part(
+            member_name(index, "classifier"), replace(part, tensors=tensors)
+        )
     check_model(open_checkpoint(checkpoint))
 
 
 def test_a_mixture_density_model_keeps_the_contract() -> None:
     scales = scale(torch.full((3,), 90.0), torch.full((3,), 40.0), 9.0)
-    check_model(MixtureDensityModel(MDNConfig(encoder="mobilenet_v2")).build(scales).eval())
+    check_model(
+        MixtureDensityModel(MDNConfig(encoder="mobilenet_v2")).build(scales).eval()
+    )
 
 
 class Quantiles(TraversabilityModel):
-    """Quantiles from half of what the cell shows up to all of it, with an atom, and one thing changed."""
+    """Quantiles from half of what the cell shows up to all of it, with an atom, and one
+    thing changed.
+    """
 
     def __init__(
-        self, change: Callable[[QuantileDistribution], TraversabilityDistribution] = lambda found: found
+        self,
+        change: Callable[
+            [QuantileDistribution], TraversabilityDistribution
+        ] = lambda found: found,
     ) -> None:
         self.change = change
 
@@ -318,7 +353,11 @@ class Quantiles(TraversabilityModel):
 
 def test_a_model_of_quantiles_and_a_pool_of_models_keep_the_contract() -> None:
     check_model(Quantiles())
-    check_model(Quantiles(lambda found: pool([found, replace(found, values=found.values.square())])))
+    check_model(
+        Quantiles(
+            lambda found: pool([found, replace(found, values=found.values.square())])
+        )
+    )
 
 
 def overriding(
@@ -357,7 +396,9 @@ BAD_DISTRIBUTIONS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("change", "expected"), BAD_DISTRIBUTIONS.values(), ids=BAD_DISTRIBUTIONS.keys())
+@pytest.mark.parametrize(
+    ("change", "expected"), BAD_DISTRIBUTIONS.values(), ids=BAD_DISTRIBUTIONS.keys()
+)
 def test_a_distribution_that_is_none_is_named(
     change: Callable[[QuantileDistribution], TraversabilityDistribution], expected: str
 ) -> None:

@@ -14,7 +14,9 @@ METHODS = ("stage", "terminal", "path_cost")
 
 
 def changed(method: str, change: Callable[..., Any]) -> Objective:
-    """The goal distance, but for what one method gives: made of what it should be and of its arguments."""
+    """The goal distance, but for what one method gives: made of what it should be and
+    of its arguments.
+    """
     own = getattr(GoalDistance, method)
 
     def bad(self: Objective, *given: Tensor, **named: Tensor) -> Any:
@@ -28,7 +30,9 @@ class Forgetful(GoalDistance):
 
     asked = 0
 
-    def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
+    def stage(
+        self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor
+    ) -> Tensor:
         self.asked += 1
         return super().stage(state, action, traversability, target) + self.asked
 
@@ -64,13 +68,16 @@ def test_a_breach_is_caught_and_named(objective: Any, expected: str) -> None:
 
 @pytest.mark.parametrize("robot", registry.names("robot"))
 @pytest.mark.parametrize("name", registry.names("objective"))
-def test_every_registered_objective_keeps_the_contract_with_every_robot(name: str, robot: str) -> None:
+def test_every_registered_objective_keeps_the_contract_with_every_robot(
+    name: str, robot: str
+) -> None:
     check_objective(name, robot)
 
 
 def test_it_is_given_the_states_of_its_robot() -> None:
     seen: list[int] = []
     check_objective(
-        changed("stage", lambda cost, state, *_: seen.append(state.shape[-1]) or cost), DifferentialDrive()
+        changed("stage", lambda cost, state, *_: seen.append(state.shape[-1]) or cost),
+        DifferentialDrive(),
     )
     assert set(seen) == {5}

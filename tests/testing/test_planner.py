@@ -35,7 +35,9 @@ class Carried:
 
 
 class Good(Planner[Any]):
-    """Turns by what is predicted, by its noise and by what it did last; draws a line when asked to."""
+    """Turns by what is predicted, by its noise and by what it did last; draws a line
+    when asked to.
+    """
 
     steers = (("speed_mps", "turn_rate_radps"),)
 
@@ -48,7 +50,11 @@ class Good(Planner[Any]):
         turn = 0.5 * plan_state.last + 0.1 * plan_state.noise
         following = replace(plan_state, last=turn, count=plan_state.count + 1)
         path = step.state[:, None, :2].repeat(1, 3 if step.draw else 0, 1)
-        return torch.stack((speed, turn), dim=1), following, Plan.empty(len(turn), path=path)
+        return (
+            torch.stack((speed, turn), dim=1),
+            following,
+            Plan.empty(len(turn), path=path),
+        )
 
 
 def acting(act: Callable[[Step, Any], object]) -> Good:
@@ -73,11 +79,15 @@ def answering(change: Callable[[Tensor, Any, Plan, Step], Any]) -> Good:
 
 
 def action_of(change: Callable[[Tensor, Step], Tensor]) -> Good:
-    return answering(lambda action, following, plan, step: (change(action, step), following, plan))
+    return answering(
+        lambda action, following, plan, step: (change(action, step), following, plan)
+    )
 
 
 def plan_of(change: Callable[[Plan], Any]) -> Good:
-    return answering(lambda action, following, plan, step: (action, following, change(plan)))
+    return answering(
+        lambda action, following, plan, step: (action, following, change(plan))
+    )
 
 
 def preparing(act: Callable[[Problem, torch.Generator], object]) -> Good:
@@ -155,19 +165,28 @@ class LastSeen(Good):
 
     def plan(self, step: Step, plan_state: Any) -> Any:
         action, following, plan = super().plan(step, plan_state)
-        return torch.stack((action[:, 0], torch.full_like(action[:, 1], self.turn)), 1), following, plan
+        return (
+            torch.stack((action[:, 0], torch.full_like(action[:, 1], self.turn)), 1),
+            following,
+            plan,
+        )
 
 
 class Unseeded(Good):
     def init(self, problem: Problem, generator: torch.Generator) -> Any:
-        return super().init(problem, torch.Generator().manual_seed(torch.Generator().seed() % 2**60))
+        return super().init(
+            problem, torch.Generator().manual_seed(torch.Generator().seed() % 2**60)
+        )
 
 
 class NoiseOfBatch(Good):
     """Draws noise for each episode in turn, so that an episode's hangs on its place."""
 
     def init(self, problem: Problem, generator: torch.Generator) -> Any:
-        return replace(super().init(problem, generator), noise=torch.rand(len(problem), generator=generator))
+        return replace(
+            super().init(problem, generator),
+            noise=torch.rand(len(problem), generator=generator),
+        )
 
 
 class Draws(Good):
@@ -271,10 +290,21 @@ def test_a_good_planner_passes_on_maps_worth_trying() -> None:
 
     check_planner(Spy())
     tried = {(len(one), *one.grid.shape) for one in problems}
-    assert tried == {(batch, *shape) for batch in (4, 2, 1) for shape in ((24, 24), (20, 33))}
-    # The robot stands on ground predicted 0 in one of them, and a wall is closed in another.
-    assert (problems[0].risk_map.amin(dim=(1, 2)) == 0).tolist() == [False, False, True, True]
-    starts = [one.grid.lookup(one.grid.pad(one.risk_map, 0.0), *one.start.T[:2]) for one in problems[:1]]
+    assert tried == {
+        (batch, *shape) for batch in (4, 2, 1) for shape in ((24, 24), (20, 33))
+    }
+    # The robot stands on ground predicted 0 in one of them, and a wall is closed in
+    # another.
+    assert (problems[0].risk_map.amin(dim=(1, 2)) == 0).tolist() == [
+        False,
+        False,
+        True,
+        True,
+    ]
+    starts = [
+        one.grid.lookup(one.grid.pad(one.risk_map, 0.0), *one.start.T[:2])
+        for one in problems[:1]
+    ]
     assert starts[0][2] == 0
     shut = ~problems[0].free.any(dim=2)
     assert shut.any(dim=1).tolist() == [False, True, False, False]
@@ -287,17 +317,29 @@ def test_a_good_planner_passes_on_maps_worth_trying() -> None:
 
 def test_every_breach_is_named_once_with_the_robots_and_maps_it_was_found_on() -> None:
     bad = answering(
-        lambda a, following, plan, step: (a + 5, following, replace(plan, status=plan.status + 3))
+        lambda a, following, plan, step: (
+            a + 5,
+            following,
+            replace(plan, status=plan.status + 3),
+        )
     )
     with pytest.raises(ConfigError) as caught:
-        check_planner(bad, robots=["unicycle", DifferentialDrive()], shapes=((9, 16), (12, 14)))
+        check_planner(
+            bad, robots=["unicycle", DifferentialDrive()], shapes=((9, 16), (12, 14))
+        )
     message = str(caught.value)
-    assert message.count("within the robot's bounds") == message.count("`Plan.status` in 0–2") == 1
+    assert (
+        message.count("within the robot's bounds")
+        == message.count("`Plan.status` in 0–2")
+        == 1
+    )
     assert message.count("[wherever it was tried]\n(2) ") == 1
     assert message.endswith("[wherever it was tried]")
 
 
-def test_a_breach_that_is_not_everywhere_names_its_robots_and_maps_and_an_error_its_line() -> None:
+def test_a_breach_that_is_not_everywhere_names_its_robots_and_maps_and_an_error_its_line() -> (
+    None
+):
     class Small(Good):
         def init(self, problem: Problem, generator: torch.Generator) -> Any:
             if problem.grid.shape[0] < 12:
@@ -305,7 +347,11 @@ def test_a_breach_that_is_not_everywhere_names_its_robots_and_maps_and_an_error_
             return super().init(problem, generator)
 
     with pytest.raises(ConfigError) as caught:
-        check_planner(Small(), robots=["unicycle", DifferentialDrive()], shapes=((9, 16), (12, 14)))
+        check_planner(
+            Small(),
+            robots=["unicycle", DifferentialDrive()],
+            shapes=((9, 16), (12, 14)),
+        )
     line = Small.init.__code__.co_firstlineno + 2
     said = f"got ValueError: too small (test_planner.py, line {line})"
     assert f"{said} [unicycle on 9×16, DifferentialDrive on 9×16]" in str(caught.value)
@@ -330,7 +376,11 @@ def test_parts_are_taken_by_name_mapping_or_as_objects() -> None:
         check_planner("straigt")
     seen: list[Problem] = []
     spy = preparing(lambda problem, _: seen.append(problem))
-    check_planner(spy, robots=[{"part": "unicycle", "options": {"dt_s": 0.2}}], objective="travel_time")
+    check_planner(
+        spy,
+        robots=[{"part": "unicycle", "options": {"dt_s": 0.2}}],
+        objective="travel_time",
+    )
     assert {one.dt_s for one in seen} == {0.2}
     assert type(seen[0].objective).__name__ == "TravelTime"
     assert seen[0].objective.robot.dt_s == 0.2  # type: ignore[attr-defined]
@@ -354,7 +404,9 @@ def test_a_blind_planner_may_be_right_about_itself() -> None:
 @pytest.mark.parametrize("robot", registry.names("robot"))
 @pytest.mark.parametrize("planner", registry.names("planner"))
 def test_every_registered_planner_keeps_the_contract(planner: str, robot: str) -> None:
-    made = registry.make("planner", {"part": planner, "options": SMALL.get(planner, {})})
+    made = registry.make(
+        "planner", {"part": planner, "options": SMALL.get(planner, {})}
+    )
     try:
         check_steers(made, registry.make("robot", robot), planner)
     except ConfigError:
@@ -370,10 +422,28 @@ MEAN_FREE = Rules(free_space=FreeSpace(by="mean"))
 @pytest.mark.parametrize(
     ("part", "options", "objective", "by_mean", "by_risk"),
     [
-        ("mppi", COST, "goal_distance", {"fields", "distribution"}, {"fields", "risk_map"}),
-        ("mppi", COST | {"cost_to_go": "map"}, "travel_time", INPUTS, {"fields", "risk_map"}),
+        (
+            "mppi",
+            COST,
+            "goal_distance",
+            {"fields", "distribution"},
+            {"fields", "risk_map"},
+        ),
+        (
+            "mppi",
+            COST | {"cost_to_go": "map"},
+            "travel_time",
+            INPUTS,
+            {"fields", "risk_map"},
+        ),
         ("mppi", FEW | {"cost_to_go": "expected-time"}, "travel_time", MAPS, MAPS),
-        ("astar_mppi", {"mppi": COST}, "goal_distance", {"fields", "distribution"}, {"fields", "risk_map"}),
+        (
+            "astar_mppi",
+            {"mppi": COST},
+            "goal_distance",
+            {"fields", "distribution"},
+            {"fields", "risk_map"},
+        ),
         ("astar_mppi", {"mppi": COST}, "travel_time", INPUTS, {"fields", "risk_map"}),
         ("astar_dwa", {"explore": 0.5}, "travel_time", MAPS, MAPS),
         ("astar_dwa", {"explore": 0.5}, "goal_distance", MAPS, {"risk_map"}),
@@ -381,9 +451,16 @@ MEAN_FREE = Rules(free_space=FreeSpace(by="mean"))
     ],
 )
 def test_planners_say_what_they_use(
-    part: str, options: dict[str, Any], objective: str, by_mean: set[str], by_risk: set[str]
+    part: str,
+    options: dict[str, Any],
+    objective: str,
+    by_mean: set[str],
+    by_risk: set[str],
 ) -> None:
-    planner, robot = registry.make("planner", {"part": part, "options": options}), Unicycle()
+    planner, robot = (
+        registry.make("planner", {"part": part, "options": options}),
+        Unicycle(),
+    )
     cost = registry.make("objective", objective, robot=robot, goal_radius_m=1.0)
     task = Task(robot=robot, objective=cost, rules=MEAN_FREE)
     assert planner.uses(task) == by_mean
@@ -397,7 +474,9 @@ def test_what_select_keeps_has_to_be_those_that_were_asked_for(order: str) -> No
         def select(self, plan_state: Any, members: Tensor) -> Any:
             chosen = members if order == "kept" else members.sort().values
             return replace(
-                plan_state, problem=plan_state.problem.select(chosen), last=plan_state.last[chosen]
+                plan_state,
+                problem=plan_state.problem.select(chosen),
+                last=plan_state.last[chosen],
             )
 
     if order == "kept":

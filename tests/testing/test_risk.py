@@ -13,7 +13,9 @@ from benchnav.testing import check_risk
 from tests.testing.refusal import refusal
 
 
-def changed(change: Callable[[Tensor, TraversabilityMixture], Any]) -> Callable[[TraversabilityMixture], Any]:
+def changed(
+    change: Callable[[Tensor, TraversabilityMixture], Any],
+) -> Callable[[TraversabilityMixture], Any]:
     """The mean, but for what comes of it."""
     return lambda mixture: change(risk.Mean()(mixture), mixture)
 
@@ -62,13 +64,16 @@ def test_what_needs_a_mixture_says_so_by_name_or_fails_on_quantiles() -> None:
     needs = changed(lambda mean, given: mean * given.weights.sum(1))
     said = refusal(check_risk, needs)
     assert (
-        "got AttributeError: 'QuantileDistribution' object has no attribute 'weights' (test_risk.py" in said
+        "got AttributeError: 'QuantileDistribution' object has no attribute 'weights' (test_risk.py"
+        in said
     )
     assert said.endswith(" [quantiles]")
 
     def refusing(given: TraversabilityDistribution) -> Tensor:
         if not isinstance(given, TraversabilityMixture):
-            raise ConfigError(f"Expected a TraversabilityMixture, got a {type(given).__name__}.")
+            raise ConfigError(
+                f"Expected a TraversabilityMixture, got a {type(given).__name__}."
+            )
         return needs(given)
 
     check_risk(refusing)
@@ -79,8 +84,9 @@ def test_what_needs_a_mixture_says_so_by_name_or_fails_on_quantiles() -> None:
         raise ConfigError("Expected something else.")
 
     raised = nameless.__code__.co_firstlineno + 3
-    assert f"Expected something else. (test_risk.py, line {raised}) [quantiles]" in refusal(
-        check_risk, nameless
+    assert (
+        f"Expected something else. (test_risk.py, line {raised}) [quantiles]"
+        in refusal(check_risk, nameless)
     )
 
 
@@ -91,7 +97,12 @@ def test_every_registered_measure_keeps_the_contract(name: str) -> None:
 
 @pytest.mark.parametrize(
     "measure",
-    [risk.Mean(), risk.CVaR(0.5), {"part": "var", "options": {"level": 0.1}}, "cvar:0.99"],
+    [
+        risk.Mean(),
+        risk.CVaR(0.5),
+        {"part": "var", "options": {"level": 0.1}},
+        "cvar:0.99",
+    ],
 )
 def test_a_measure_is_taken_as_a_function_by_name_or_by_mapping(measure: Any) -> None:
     check_risk(measure)

@@ -16,11 +16,20 @@ from tests.testing.refusal import refusal
 
 
 def moving(change: Callable[[Tensor, Tensor, Tensor, Tensor], Any]) -> Unicycle:
-    """A unicycle, but for what F gives: made of what it should be, the state, the action and λ."""
+    """A unicycle, but for what F gives: made of what it should be, the state, the
+    action and λ.
+    """
 
     class Bad(Unicycle):
-        def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
-            return change(super().__call__(state, action, traversability), state, action, traversability)
+        def __call__(
+            self, state: Tensor, action: Tensor, traversability: Tensor
+        ) -> Tensor:
+            return change(
+                super().__call__(state, action, traversability),
+                state,
+                action,
+                traversability,
+            )
 
     return Bad()
 
@@ -40,7 +49,9 @@ def standing(change: Callable[[Tensor], Any]) -> Unicycle:
 def having(**attributes: Any) -> Unicycle:
     made = type("Bad", (Unicycle,), attributes)()
     for name, value in attributes.items():
-        object.__setattr__(made, name, value)  # also where it is a field of the frozen robot
+        object.__setattr__(
+            made, name, value
+        )  # also where it is a field of the frozen robot
     return made
 
 
@@ -51,7 +62,9 @@ class Forgetful(Unicycle):
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
         self.asked.append(1)
-        return super().__call__(state, action, traversability) * (1 - 1e-4 * len(self.asked))
+        return super().__call__(state, action, traversability) * (
+            1 - 1e-4 * len(self.asked)
+        )
 
 
 class Gathering(Unicycle):
@@ -61,8 +74,12 @@ class Gathering(Unicycle):
         return torch.cat((pose, torch.zeros_like(pose[..., :1])), dim=-1)
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
-        speed = 0.95 * state[..., 3:] + 0.08 * action[..., :1]  # up to 1.6 times what is commanded
-        moved = super().__call__(state[..., :3], torch.cat((speed, action[..., 1:]), dim=-1), traversability)
+        speed = (
+            0.95 * state[..., 3:] + 0.08 * action[..., :1]
+        )  # up to 1.6 times what is commanded
+        moved = super().__call__(
+            state[..., :3], torch.cat((speed, action[..., 1:]), dim=-1), traversability
+        )
         return torch.cat((moved, speed), dim=-1)
 
 

@@ -8,7 +8,16 @@ from torch import Tensor
 
 from benchnav import ConfigError, Terrain
 from benchnav.core import registry
-from benchnav.planning import Appearance, Contact, Full, Moment, Near, Probe, Sensed, Sensor
+from benchnav.planning import (
+    Appearance,
+    Contact,
+    Full,
+    Moment,
+    Near,
+    Probe,
+    Sensed,
+    Sensor,
+)
 from benchnav.testing import check_sensor
 from tests.testing.refusal import refusal
 
@@ -19,8 +28,12 @@ def telling(good: Sensor, change: Change) -> Sensor:
     """A good sensor, but for what it tells."""
 
     class Bad(Sensor):
-        def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
-            return change(good.sense(terrain, field, robot_state, moment), terrain, field, moment)  # type: ignore[no-any-return]
+        def sense(
+            self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
+        ) -> Sensed:
+            return change(
+                good.sense(terrain, field, robot_state, moment), terrain, field, moment
+            )  # type: ignore[no-any-return]
 
     return Bad()
 
@@ -29,7 +42,9 @@ def given(terrain: Callable[[Terrain], Terrain], good: Sensor | None = None) -> 
     """A good sensor on another terrain than the true one."""
 
     class Bad(Sensor):
-        def sense(self, truth: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
+        def sense(
+            self, truth: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
+        ) -> Sensed:
             return (good or Near()).sense(terrain(truth), field, robot_state, moment)
 
     return Bad()
@@ -39,7 +54,9 @@ def moved(moment: Callable[[Moment], Moment], good: Sensor | None = None) -> Sen
     """A good sensor with other noise."""
 
     class Bad(Sensor):
-        def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, given: Moment) -> Sensed:
+        def sense(
+            self, terrain: Terrain, field: Tensor, robot_state: Tensor, given: Moment
+        ) -> Sensed:
             return (good or Probe()).sense(terrain, field, robot_state, moment(given))
 
     return Bad()
@@ -58,7 +75,9 @@ def looking(change: Callable[[Appearance], Any]) -> Sensor:
     return telling(
         Near(),
         lambda sensed, *_: (
-            replace(sensed, appearance=change(sensed.appearance)) if sensed.appearance else sensed
+            replace(sensed, appearance=change(sensed.appearance))
+            if sensed.appearance
+            else sensed
         ),
     )
 
@@ -70,14 +89,19 @@ def seeing(**change: Callable[[Any], Any]) -> Sensor:
             look,
             observation=replace(
                 look.observation,
-                **{name: other(getattr(look.observation, name)) for name, other in change.items()},
+                **{
+                    name: other(getattr(look.observation, name))
+                    for name, other in change.items()
+                },
             ),
         )
     )
 
 
 def blurred(values: Tensor) -> Tensor:
-    return torch.nn.functional.avg_pool2d(values.float(), 3, 1, 1, count_include_pad=False)
+    return torch.nn.functional.avg_pool2d(
+        values.float(), 3, 1, 1, count_include_pad=False
+    )
 
 
 class Forgetful(Sensor):
@@ -85,19 +109,29 @@ class Forgetful(Sensor):
 
     asked = 0
 
-    def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
+    def sense(
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
+    ) -> Sensed:
         self.asked += 1
-        return Probe().sense(terrain, field, robot_state, Moment(moment.keys, self.asked))
+        return Probe().sense(
+            terrain, field, robot_state, Moment(moment.keys, self.asked)
+        )
 
 
 class Ray(Sensor):
-    """Sees a cell beside the robot where the one between, which it never reports, is low."""
+    """Sees a cell beside the robot where the one between, which it never reports, is
+    low.
+    """
 
-    def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
+    def sense(
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
+    ) -> Sensed:
         seen = torch.zeros_like(field, dtype=torch.bool)
         seen[:, 5, 5] = terrain.elevation_m[:, 5, 4] > -1.2
         doubt = torch.zeros_like(field)
-        return Sensed.looks(Appearance(seen=seen, observation=terrain.observe(), doubt=doubt))
+        return Sensed.looks(
+            Appearance(seen=seen, observation=terrain.observe(), doubt=doubt)
+        )
 
 
 class Seer(Full):
@@ -109,16 +143,15 @@ def drawn(values: Tensor, *seed: int) -> Tensor:
     return torch.rand(values.shape, generator=torch.Generator().manual_seed(sum(seed)))
 
 
-ELSEWHERE = (
-    "Expected the same whatever λ, its distribution and its class are where λ is not sensed, got another."
-)
-APPEARANCE = (
-    "Expected the same whatever colour, slope and layers are where nothing is sensed or seen, got another."
-)
+ELSEWHERE = "Expected the same whatever λ, its distribution and its class are where λ is not sensed, got another."
+APPEARANCE = "Expected the same whatever colour, slope and layers are where nothing is sensed or seen, got another."
 ELEVATION = "Expected the same whatever the elevation is where nothing is sensed or seen, got another."
 ALONE = "Expected for episodes alone and in another order what they got in the batch, got another."
 BAD: dict[str, tuple[Any, str]] = {
-    "senses nothing": (probing(lambda found, *_: torch.nan * found), "to sense or see some cell, got none"),
+    "senses nothing": (
+        probing(lambda found, *_: torch.nan * found),
+        "to sense or see some cell, got none",
+    ),
     **{
         f"knows {name} of the map": (
             telling(
@@ -132,20 +165,35 @@ BAD: dict[str, tuple[Any, str]] = {
         for name, of in {
             "mean λ": lambda terrain, field: field.mean((1, 2)),
             "greatest λ": lambda terrain, field: field.amax((1, 2)),
-            "mean of the truth": lambda terrain, field: terrain.truth.mean().mean((1, 2)),
-            "best of the truth": lambda terrain, field: terrain.truth.mean().amax((1, 2)),
-            "spread of the truth": lambda terrain, field: terrain.truth.stds.mean((1, 2, 3)),
+            "mean of the truth": lambda terrain, field: terrain.truth.mean().mean(
+                (1, 2)
+            ),
+            "best of the truth": lambda terrain, field: terrain.truth.mean().amax(
+                (1, 2)
+            ),
+            "spread of the truth": lambda terrain, field: terrain.truth.stds.mean(
+                (1, 2, 3)
+            ),
             "stored λ": lambda terrain, field: terrain.traversability.mean((1, 2)),
         }.items()
     },
     "no sensor": (3, "subclass of benchnav.planning.Sensor, got int"),
-    "raises": (probing(lambda found, *_: found[99]), "Expected an answer from `sense`, got IndexError"),
-    "says nothing": (telling(Probe(), lambda *_: None), "a Sensed from `sense`, got NoneType"),
+    "raises": (
+        probing(lambda found, *_: found[99]),
+        "Expected an answer from `sense`, got IndexError",
+    ),
+    "says nothing": (
+        telling(Probe(), lambda *_: None),
+        "a Sensed from `sense`, got NoneType",
+    ),
     "λ of a cell": (
         probing(lambda found, *_: found[:, 0]),
         "`Sensed.traversability` as torch.float32 of shape [4, 24, 24]",
     ),
-    "float64": (probing(lambda found, *_: found.double()), "`Sensed.traversability` as torch.float32"),
+    "float64": (
+        probing(lambda found, *_: found.double()),
+        "`Sensed.traversability` as torch.float32",
+    ),
     "λ above 1": (probing(lambda found, *_: found + 1), "Expected λ in [0, 1]"),
     "too sure": (
         telling(Probe(), lambda sensed, *_: replace(sensed, std=0 * sensed.std)),
@@ -156,7 +204,10 @@ BAD: dict[str, tuple[Any, str]] = {
         "`Sensed.std` of at least 0.001",
     ),
     "sees all, it says": (Seer(), "Expected `sees_all` of type bool, got 'yes'"),
-    "no appearance": (looking(lambda look: 3), "Expected `Sensed.appearance` as an Appearance"),
+    "no appearance": (
+        looking(lambda look: 3),
+        "Expected `Sensed.appearance` as an Appearance",
+    ),
     "seen in part": (
         looking(lambda look: replace(look, seen=look.seen.float())),
         "`Appearance.seen` as torch.bool",
@@ -169,27 +220,40 @@ BAD: dict[str, tuple[Any, str]] = {
         looking(lambda look: replace(look, doubt=-look.doubt)),
         "Expected `Appearance.doubt` ≥ 0",
     ),
-    "elevation unknown": (seeing(elevation_m=lambda height: height / 0), "Expected finite elevation where"),
+    "elevation unknown": (
+        seeing(elevation_m=lambda height: height / 0),
+        "Expected finite elevation where",
+    ),
     "a layer less": (
         seeing(layers=lambda layers: {}),
         "grid and layers in `Appearance.observation`, vegetation_m",
     ),
     "λ around": (
-        probing(lambda found, terrain, field, _: torch.where(found.isnan(), found, blurred(field))),
+        probing(
+            lambda found, terrain, field, _: torch.where(
+                found.isnan(), found, blurred(field)
+            )
+        ),
         ELSEWHERE,
     ),
     "λ farther on": (
         telling(
             Contact(),
             lambda sensed, terrain, field, _: replace(
-                sensed, traversability=(sensed.traversability + 0.1 * field.mean((1, 2), keepdim=True)) / 1.1
+                sensed,
+                traversability=(
+                    sensed.traversability + 0.1 * field.mean((1, 2), keepdim=True)
+                )
+                / 1.1,
             ),
         ),
         ELSEWHERE,
     ),
     "λ of the dataset": (
         probing(
-            lambda found, terrain, *_: 0.9 * found + 0.1 * terrain.traversability.amax((1, 2), keepdim=True)
+            lambda found, terrain, *_: (
+                0.9 * found + 0.1 * terrain.traversability.amax((1, 2), keepdim=True)
+            )
         ),
         ELSEWHERE,
     ),
@@ -203,7 +267,11 @@ BAD: dict[str, tuple[Any, str]] = {
         ELSEWHERE,
     ),
     "colour tells the class": (
-        given(lambda terrain: replace(terrain, rgb=terrain.rgb + terrain.class_id[:, None].to(torch.uint8))),
+        given(
+            lambda terrain: replace(
+                terrain, rgb=terrain.rgb + terrain.class_id[:, None].to(torch.uint8)
+            )
+        ),
         ELSEWHERE,
     ),
     "what all is like": (
@@ -215,7 +283,9 @@ BAD: dict[str, tuple[Any, str]] = {
         ELSEWHERE,
     ),
     "blurred colours": (
-        given(lambda terrain: replace(terrain, rgb=blurred(terrain.rgb).to(torch.uint8))),
+        given(
+            lambda terrain: replace(terrain, rgb=blurred(terrain.rgb).to(torch.uint8))
+        ),
         APPEARANCE,
     ),
     "colours around λ": (
@@ -229,7 +299,8 @@ BAD: dict[str, tuple[Any, str]] = {
     "layers around": (
         given(
             lambda terrain: replace(
-                terrain, layers={name: blurred(layer) for name, layer in terrain.layers.items()}
+                terrain,
+                layers={name: blurred(layer) for name, layer in terrain.layers.items()},
             )
         ),
         APPEARANCE,
@@ -240,29 +311,40 @@ BAD: dict[str, tuple[Any, str]] = {
             lambda sensed, terrain, *_: Sensed.looks(
                 replace(
                     sensed.appearance,
-                    doubt=sensed.appearance.doubt + terrain.slope_deg.amax((1, 2), keepdim=True),
+                    doubt=sensed.appearance.doubt
+                    + terrain.slope_deg.amax((1, 2), keepdim=True),
                 )
             ),
         ),
         APPEARANCE,
     ),
     "blurred elevation": (
-        given(lambda terrain: replace(terrain, elevation_m=blurred(terrain.elevation_m))),
+        given(
+            lambda terrain: replace(terrain, elevation_m=blurred(terrain.elevation_m))
+        ),
         ELEVATION,
     ),
     "a ray": (Ray(), ELEVATION),
     "the batch's mean": (
         given(
-            lambda terrain: replace(terrain, elevation_m=terrain.elevation_m - terrain.elevation_m.mean(0))
+            lambda terrain: replace(
+                terrain, elevation_m=terrain.elevation_m - terrain.elevation_m.mean(0)
+            )
         ),
         ALONE,
     ),
-    "noise of the batch": (probing(lambda found, *_: (found + 0.2 * drawn(found)).clamp(max=1)), ALONE),
+    "noise of the batch": (
+        probing(lambda found, *_: (found + 0.2 * drawn(found)).clamp(max=1)),
+        ALONE,
+    ),
     "keys of the first": (
         moved(lambda moment: Moment([moment.keys[0]] * len(moment.keys), moment.step)),
         ALONE,
     ),
-    "noise of the count": (Forgetful(), "Expected the same when asked again, got another."),
+    "noise of the count": (
+        Forgetful(),
+        "Expected the same when asked again, got another.",
+    ),
     "the same in each step": (
         moved(lambda moment: Moment(moment.keys, 0)),
         "Expected other noise in another step",
@@ -279,7 +361,10 @@ BAD: dict[str, tuple[Any, str]] = {
         probing(lambda found, *_: found + 0 * torch.rand(1)),
         "PyTorch's global generator",
     ),
-    "writes into λ": (probing(lambda found, _, field, __: (field.zero_(), found)[1]), "got another field"),
+    "writes into λ": (
+        probing(lambda found, _, field, __: (field.zero_(), found)[1]),
+        "got another field",
+    ),
     "writes into the terrain": (
         probing(lambda found, terrain, *_: (terrain.rgb.zero_(), found)[1]),
         "got another terrain.rgb",

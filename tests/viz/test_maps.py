@@ -27,35 +27,59 @@ from benchnav.viz.style import bytes_of
 SEEN = {
     "all": np.eye(3),
     "without red": np.array(
-        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+        [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ]
     ),
     "without green": np.array(
-        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+        [
+            [0.367322, 0.860646, -0.227968],
+            [0.280085, 0.672501, 0.047413],
+            [-0.011820, 0.042940, 0.968881],
+        ]
     ),
     "without blue": np.array(
-        [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
+        [
+            [1.255528, -0.076749, -0.178779],
+            [-0.078411, 0.930809, 0.147602],
+            [0.004733, 0.691367, 0.303900],
+        ]
     ),
 }
 
 
 def lab(colours: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """CIE L*a*b* of sRGB colours in [0, 1], as somebody sees them."""
-    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    linear = np.where(
+        colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4
+    )
+    to_xyz = np.array(
+        [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    )
     xyz = (linear @ seen.T).clip(0, 1) @ to_xyz.T / to_xyz.sum(axis=1)
-    x, y, z = np.moveaxis(np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116), -1, 0)
+    x, y, z = np.moveaxis(
+        np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116), -1, 0
+    )
     return np.stack((116 * y - 16, 500 * (x - y), 200 * (y - z)), axis=-1)
 
 
 @pytest.mark.parametrize("seen", SEEN)
-def test_what_immobilises_a_robot_has_a_colour_that_no_traversability_has(seen: str) -> None:
-    shades = field_colours(np.linspace(0, 1, 256)[None], np.zeros((1, 256), bool))[0] / 255
+def test_what_immobilises_a_robot_has_a_colour_that_no_traversability_has(
+    seen: str,
+) -> None:
+    shades = (
+        field_colours(np.linspace(0, 1, 256)[None], np.zeros((1, 256), bool))[0] / 255
+    )
     away = lab(shades, SEEN[seen]) - lab(np.array(to_rgb(IMMOBILISING)), SEEN[seen])
     # A difference of 2.3 can just be seen.
     assert np.linalg.norm(away, axis=1).min() > 30
 
 
-def test_cells_have_the_colour_of_their_own_traversability_or_that_of_what_holds() -> None:
+def test_cells_have_the_colour_of_their_own_traversability_or_that_of_what_holds() -> (
+    None
+):
     field = np.random.default_rng(0).random((5, 7))
     immobilising = field < 0.3
     colours = field_colours(field, immobilising)
@@ -66,12 +90,20 @@ def test_cells_have_the_colour_of_their_own_traversability_or_that_of_what_holds
 
 
 def test_each_outcome_has_a_mark() -> None:
-    marks = {outcome.name.lower(): end_mark(outcome.name.lower()) for outcome in Outcome}
+    marks = {
+        outcome.name.lower(): end_mark(outcome.name.lower()) for outcome in Outcome
+    }
     assert set(marks.values()) <= MARKS.keys()
     assert [name for name, mark in marks.items() if mark == "success"] == ["success"]
-    assert [name for name, mark in marks.items() if mark == "immobilised"] == ["immobilised"]
+    assert [name for name, mark in marks.items() if mark == "immobilised"] == [
+        "immobilised"
+    ]
     # What stood still until its time was up is out of time too.
-    assert [name for name, mark in marks.items() if mark == "out of time"] == ["timeout", "stuck", "stalled"]
+    assert [name for name, mark in marks.items() if mark == "out of time"] == [
+        "timeout",
+        "stuck",
+        "stalled",
+    ]
 
 
 def drawn_marks(**changes: Any) -> tuple[Axes, dict[str, Line2D]]:
@@ -82,7 +114,9 @@ def drawn_marks(**changes: Any) -> tuple[Axes, dict[str, Line2D]]:
     return panel, {str(line.get_label()): line for line in panel.lines}
 
 
-def test_an_end_is_marked_where_it_is_and_a_goal_that_was_reached_stays_in_sight() -> None:
+def test_an_end_is_marked_where_it_is_and_a_goal_that_was_reached_stays_in_sight() -> (
+    None
+):
     _, marks = drawn_marks(outcome="immobilised")
     np.testing.assert_allclose(np.ravel(marks["immobilised"].get_data()), (3.8, 3.2))
     assert "robot" not in marks
@@ -91,7 +125,9 @@ def test_an_end_is_marked_where_it_is_and_a_goal_that_was_reached_stays_in_sight
     position = tick.get_transform().transform(np.ravel(tick.get_data()))
     end = panel.transData.transform((3.8, 3.2))
     # At 72 dots an inch a pixel is a point; the goal lies along x.
-    np.testing.assert_allclose(position - end, (-0.9 * tick.get_markersize(), 0), atol=1e-9)
+    np.testing.assert_allclose(
+        position - end, (-0.9 * tick.get_markersize(), 0), atol=1e-9
+    )
 
 
 def test_a_robot_that_drives_is_shown_with_its_heading() -> None:
@@ -100,7 +136,9 @@ def test_a_robot_that_drives_is_shown_with_its_heading() -> None:
     assert not {"success", "immobilised"} & marks.keys()
 
 
-@pytest.mark.parametrize(("width_m", "length_m"), [(32.0, 10.0), (1.2, 0.5), (500.0, 100.0), (28.0, 5.0)])
+@pytest.mark.parametrize(
+    ("width_m", "length_m"), [(32.0, 10.0), (1.2, 0.5), (500.0, 100.0), (28.0, 5.0)]
+)
 def test_a_scale_bar_is_as_long_as_it_says(width_m: float, length_m: float) -> None:
     assert scale_length(width_m) == length_m
     panel = Figure().add_axes((0, 0, 1, 1))

@@ -28,7 +28,10 @@ from benchnav.viz.style import (
 
 
 def test_a_planner_has_one_colour_in_whatever_company() -> None:
-    alone, others = planner_colours(["mppi"]), planner_colours(["own", "cl_rrt", "mppi", "straight"])
+    alone, others = (
+        planner_colours(["mppi"]),
+        planner_colours(["own", "cl_rrt", "mppi", "straight"]),
+    )
     assert alone["mppi"] == others["mppi"]
     assert len(set(others.values())) == 4
     assert others["straight"] == BLIND
@@ -45,7 +48,9 @@ def test_a_planner_has_one_colour_in_whatever_company() -> None:
         ("mine", "mine"),
     ],
 )
-def test_a_planner_is_called_by_its_name_with_its_options(planner: str, name: str) -> None:
+def test_a_planner_is_called_by_its_name_with_its_options(
+    planner: str, name: str
+) -> None:
     assert planner_name(planner) == name
 
 
@@ -54,22 +59,33 @@ def test_conditions_have_their_planners_colours_where_these_tell_them_apart() ->
     own = planner_colours(planners)
     assert condition_colours(planners) == [own[planner] for planner in planners]
     assert condition_colours(["mppi"] * 3) == list(LINE_COLOURS[:3])
-    assert condition_colours(["mppi", "straight", "mppi"]) == [LINE_COLOURS[0], BLIND, LINE_COLOURS[1]]
+    assert condition_colours(["mppi", "straight", "mppi"]) == [
+        LINE_COLOURS[0],
+        BLIND,
+        LINE_COLOURS[1],
+    ]
 
 
 def test_lines_that_are_drawn_together_differ_in_style() -> None:
-    assert len({repr(line_style(place)) for place in range(len(LINE_STYLES))}) == len(LINE_STYLES)
+    assert len({repr(line_style(place)) for place in range(len(LINE_STYLES))}) == len(
+        LINE_STYLES
+    )
     assert line_style(0) == line_style(len(LINE_STYLES)) == "-"
 
 
 def test_the_robots_mark_turns_and_keeps_its_size() -> None:
     east, north = (robot_marker(heading) for heading in (0.0, np.pi / 2))
-    tips = [turned.get_transform().transform(turned.get_path().vertices[0]) for turned in (east, north)]
+    tips = [
+        turned.get_transform().transform(turned.get_path().vertices[0])
+        for turned in (east, north)
+    ]
     np.testing.assert_allclose(tips[0][::-1], tips[1], atol=1e-9)
 
 
 @pytest.mark.parametrize("trim", [False, True])
-def test_a_mark_stands_in_a_strip_over_a_figure_that_stays_as_it_is(tmp_path: Path, trim: bool) -> None:
+def test_a_mark_stands_in_a_strip_over_a_figure_that_stays_as_it_is(
+    tmp_path: Path, trim: bool
+) -> None:
     drawn = []
     for mark in ("", "Partial: 3 of 6 units"):
         with styled():
@@ -104,8 +120,12 @@ def test_a_figure_is_written_whole_as_png_and_pdf_at_its_width(tmp_path: Path) -
 REGIONS = arrays(bool, st.tuples(st.integers(1, 7), st.integers(1, 9)))
 
 
-def cells_beside(region: np.ndarray, edge: np.ndarray, resolution_m: float) -> list[bool]:
-    """Whether the cells on the two sides of an edge are of a region; off the map none is."""
+def cells_beside(
+    region: np.ndarray, edge: np.ndarray, resolution_m: float
+) -> list[bool]:
+    """Whether the cells on the two sides of an edge are of a region; off the map none
+    is.
+    """
     middle, along = edge.mean(axis=0) / resolution_m, (edge[1] - edge[0]) / resolution_m
     across = 0.5 * along[::-1]
     found = []
@@ -120,7 +140,9 @@ def test_an_outline_is_every_edge_between_what_is_in_a_region_and_what_is_not(
     region: np.ndarray, resolution_m: float
 ) -> None:
     edges = outline(region, resolution_m)
-    np.testing.assert_allclose(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1), resolution_m)
+    np.testing.assert_allclose(
+        np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1), resolution_m
+    )
     for edge in edges:
         assert sorted(cells_beside(region, edge, resolution_m)) == [False, True]
     # Each cell has four sides, and two cells of the region share what is between them.
@@ -129,7 +151,9 @@ def test_an_outline_is_every_edge_between_what_is_in_a_region_and_what_is_not(
 
 
 @given(region=REGIONS, resolution_m=st.sampled_from([0.25, 0.5, 1.0]))
-def test_hatching_lies_in_its_region_alone(region: np.ndarray, resolution_m: float) -> None:
+def test_hatching_lies_in_its_region_alone(
+    region: np.ndarray, resolution_m: float
+) -> None:
     lines = hatching(region, resolution_m)
     column, row = np.floor(lines.mean(axis=1) / resolution_m).astype(int).T
     assert region[row, column].all()
@@ -143,7 +167,9 @@ def test_hatching_goes_through_all_of_a_region_without_breaks() -> None:
         np.testing.assert_array_equal(np.diff(np.sort(column[row == line])), 4)
         assert (row == line).sum() == 3
     starts = {tuple(point) for point in lines[:, 0]}
-    assert all(tuple(end) in starts for end in lines[:, 1] if end[0] < 12 and end[1] < 9)
+    assert all(
+        tuple(end) in starts for end in lines[:, 1] if end[0] < 12 and end[1] < 9
+    )
 
 
 @pytest.mark.parametrize(
@@ -179,7 +205,9 @@ def test_a_layer_of_directions_ends_in_the_colour_that_it_begins_with() -> None:
         ("entropic:5", "entropic:5"), ("cautious", "cautious"), ("cvar:x", "cvar:x"), ("–", "–"),
     ],
 )  # fmt: skip
-def test_risk_settings_are_named_as_papers_do_and_own_ones_stay(label: str, name: str) -> None:
+def test_risk_settings_are_named_as_papers_do_and_own_ones_stay(
+    label: str, name: str
+) -> None:
     assert risk_name(label) == name
 
 

@@ -1,9 +1,12 @@
-"""The log of a robot's drives: positions, commanded and measured speed, and the λ that follows.
+"""The log of a robot's drives: positions, commanded and measured speed, and the λ that
+follows.
 
-A row is a moment of a drive. Columns: `time_s`; the position, `x_m` and `y_m` in the coordinate reference system of the
-elevation model or `longitude_deg` and `latitude_deg` (WGS 84); `commanded_m_s` and `measured_m_s`, speeds forward over
-ground; optionally `drive`, its name. λ is measured over commanded speed, where the robot was commanded to move. The
-ratio of a row may lie beyond [0, 1]: robots slide back and run downhill. It is clipped only when it is stored.
+A row is a moment of a drive. Columns: `time_s`; the position, `x_m` and `y_m` in the
+coordinate reference system of the elevation model or `longitude_deg` and `latitude_deg`
+(WGS 84); `commanded_m_s` and `measured_m_s`, speeds forward over ground; optionally
+`drive`, its name. λ is measured over commanded speed, where the robot was commanded to
+move. The ratio of a row may lie beyond [0, 1]: robots slide back and run downhill. It
+is clipped only when it is stored.
 Letters in shapes: N rows that are used.
 """
 
@@ -18,10 +21,18 @@ from numpy import ndarray
 
 from benchnav.core.errors import DatasetError, expect
 from benchnav.core.sources import digest_of_path
-from benchnav.datagen.files.robot_logs import ENDINGS, read_log, read_names, read_numbers, require_columns
+from benchnav.datagen.files.robot_logs import (
+    ENDINGS,
+    read_log,
+    read_names,
+    read_numbers,
+    require_columns,
+)
 
 LEAST_SPEED_M_S = 0.1
-MOST_SPEED_M_S = 15.0  # off-road robots are slower, unless they are logged in km/h or cm/s
+MOST_SPEED_M_S = (
+    15.0  # off-road robots are slower, unless they are logged in km/h or cm/s
+)
 TOP_RATIO = 1.5  # of a speed to the top command, which no robot exceeds (choice)
 _MOVES = ("commanded_m_s", "measured_m_s")
 _METRES_A_DEGREE = 111_320  # of latitude
@@ -36,9 +47,11 @@ REASONS = {
     "restarted": "have a time before an earlier row of their drive",
     "frozen": "have a position that stays the same while the robot moves",
     "jumped": f"have a position out of reach at {TOP_RATIO:g} times the top command",
-    "off_pace": "are of a drive whose positions and measured speed disagree by more than 15 %",
+    "off_pace": "are of a drive whose positions and measured speed disagree by more "
+    "than 15 %",
     "slow": "were commanded less than the least speed (standing, turning on the spot)",
-    "implausible": f"have a speed above {MOST_SPEED_M_S:g} m/s or above {TOP_RATIO:g} times the top command",
+    "implausible": f"have a speed above {MOST_SPEED_M_S:g} m/s or above {TOP_RATIO:g} "
+    "times the top command",
     "between_maps": "lie between the maps",
     "other_split": "lie on the ground of a split that their drive does not belong to",
 }
@@ -51,8 +64,9 @@ class Drives:
     Args:
         file: Table, CSV, TSV, one of these with .gz, or Parquet.
         least_speed: Least commanded speed of a row, forward or backward, m/s.
-        speed: Where speed over ground comes from: `positions`, or `measured` as logged, without comparison. If empty,
-            measured speed, which must agree with the positions.
+        speed: Where speed over ground comes from: `positions`, or `measured` as logged,
+            without comparison. If empty, measured speed, which must agree with the
+            positions.
     """
 
     file: str
@@ -63,9 +77,13 @@ class Drives:
         """Validate the settings."""
         expect(
             self.file.endswith(ENDINGS),
-            f"`drives` to end in one of {', '.join(ENDINGS)}, got {self.file!r}. Write such a table, with a header.",
+            f"`drives` to end in one of {', '.join(ENDINGS)}, got {self.file!r}. "
+            "Write such a table, with a header.",
         )
-        expect(0 < self.least_speed < np.inf, f"`least_speed` above 0 m/s, got {self.least_speed:g}.")
+        expect(
+            0 < self.least_speed < np.inf,
+            f"`least_speed` above 0 m/s, got {self.least_speed:g}.",
+        )
         expect(
             self.speed in ("", "positions", "measured"),
             f"`speed` to be 'positions' or 'measured', got {self.speed!r}.",
@@ -80,11 +98,14 @@ class DriveLog:
         settings: the file, and which rows of it are used.
         sha256: of the file.
         names: of its drives.
-        is_geographic: whether positions are longitude and latitude; else they are in the elevation model's CRS.
-        rows: a table of N rows: `x`, `y`, `time_s`, `commanded` and `speed` (m/s, signed), `drive` (index into
-            `names`) and, once speeds are compared with positions, `traversability` (speed over commanded).
+        is_geographic: whether positions are longitude and latitude; else they are in
+            the elevation model's CRS.
+        rows: a table of N rows: `x`, `y`, `time_s`, `commanded` and `speed` (m/s,
+            signed), `drive` (index into `names`) and, once speeds are compared with
+            positions, `traversability` (speed over commanded).
         left_out: rows that are not, by reason.
-        motion: what the comparison of positions with speeds gave, and the resolution of positions, 0 if it is fine.
+        motion: what the comparison of positions with speeds gave, and the resolution of
+            positions, 0 if it is fine.
     """
 
     settings: Drives
@@ -112,11 +133,22 @@ class DriveLog:
         """
         left_out = {**self.left_out, reason: int(which.sum())}
         if which.all():
-            several = [f"{count} {REASONS[name]}" for name, count in left_out.items() if count]
-            why = f": of {sum(left_out.values())}, {', '.join(several)}" if several else " below the header"
-            speeds = "commanded speed" if self.settings.speed == "positions" else "both speeds"
+            several = [
+                f"{count} {REASONS[name]}" for name, count in left_out.items() if count
+            ]
+            why = (
+                f": of {sum(left_out.values())}, {', '.join(several)}"
+                if several
+                else " below the header"
+            )
+            speeds = (
+                "commanded speed"
+                if self.settings.speed == "positions"
+                else "both speeds"
+            )
             raise DatasetError(
-                f"Expected rows of drives to learn from in {self.settings.file}, got none{why}. Log time, position and "
+                f"Expected rows of drives to learn from in {self.settings.file}, got "
+                f"none{why}. Log time, position and "
                 f"{speeds} on the move."
             )
         rows = self.rows[~which].reset_index(drop=True)
@@ -129,12 +161,16 @@ def read_drives(drives: Drives) -> DriveLog:
     With `speed` of `positions` the log needs no measured speed.
 
     Raises:
-        DatasetError: If the file is missing, cannot be read, lacks a column, contains what is no number, has speeds in
-            another unit, or no row is left.
+        DatasetError: If the file is missing, cannot be read, lacks a column, contains
+            what is no number, has speeds in another unit, or no row is left.
     """
     path = Path(drives.file)
     rows = read_log(path)
-    kind = "WGS 84" if set(PLACES["WGS 84"]) <= set(rows) and not set(PLACES["crs"]) <= set(rows) else "crs"
+    kind = (
+        "WGS 84"
+        if set(PLACES["WGS 84"]) <= set(rows) and not set(PLACES["crs"]) <= set(rows)
+        else "crs"
+    )
     moves = _MOVES[:1] if drives.speed == "positions" else _MOVES
     columns = ("time_s", *PLACES[kind], *moves)
     remedy = "Name positions x_m and y_m, or longitude_deg and latitude_deg for WGS 84."
@@ -151,14 +187,20 @@ def read_drives(drives: Drives) -> DriveLog:
     for name in columns:
         number = "Convert the column to numbers."
         if name == "time_s":
-            number = "Convert clock times to seconds, such as those since the start of the drive."
-        values[name] = read_numbers(rows, name, path, limits.get(name, (-np.inf, np.inf)), remedy, number)
+            number = (
+                "Convert clock times to seconds, such as those since the start "
+                "of the drive."
+            )
+        values[name] = read_numbers(
+            rows, name, path, limits.get(name, (-np.inf, np.inf)), remedy, number
+        )
     for name in moves:
         moving = np.abs(values[name])
         usual = pd.Series(moving[moving >= drives.least_speed]).median()
         if usual > MOST_SPEED_M_S:
             raise DatasetError(
-                f"Expected `{name}` in m/s in {path}, got a median of {usual:.4g} while moving, which looks like "
+                f"Expected `{name}` in m/s in {path}, got a median of {usual:.4g} "
+                "while moving, which looks like "
                 "another unit. Divide km/h by 3.6, cm/s by 100 and mm/s by 1000."
             )
     names, drive = np.array([path.name]), np.zeros(len(rows), dtype=np.int64)
@@ -166,7 +208,9 @@ def read_drives(drives: Drives) -> DriveLog:
         names, drive = np.unique(read_names(rows, "drive", path), return_inverse=True)
     x, y = (values[name] for name in PLACES[kind])
     unmeasured = np.full(len(rows), np.nan)
-    if drives.speed == "positions" and "measured_m_s" in rows:  # only for the comparison
+    if (
+        drives.speed == "positions" and "measured_m_s" in rows
+    ):  # only for the comparison
         unmeasured = read_numbers(rows, "measured_m_s", path, (-np.inf, np.inf))
     log = DriveLog(
         settings=drives,
@@ -189,11 +233,15 @@ def read_drives(drives: Drives) -> DriveLog:
 
 
 def _resolution_m(x: ndarray, y: ndarray, *, is_geographic: bool) -> float:
-    """Return the largest step that divides all positions, to three digits; 0 below some centimetres."""
+    """Return the largest step that divides all positions, to three digits; 0 below some
+    centimetres.
+    """
     most = 6 if is_geographic else 2
     for decimals in range(most):
         scaled = np.stack([x, y]) * 10.0**decimals
         scaled = scaled[:, np.isfinite(scaled).all(axis=0)]
         if scaled.size and (np.abs(scaled - np.rint(scaled)) < 1e-3).all():
-            return float(f"{10.0**-decimals * (_METRES_A_DEGREE if is_geographic else 1):.3g}")
+            return float(
+                f"{10.0**-decimals * (_METRES_A_DEGREE if is_geographic else 1):.3g}"
+            )
     return 0.0

@@ -1,8 +1,11 @@
-"""The comparison of a drive log's positions with its speeds, and the faults that it shows.
+"""The comparison of a drive log's positions with its speeds, and the faults that it
+shows.
 
-Measured speed makes λ, so it must be the speed over ground. Positions are its witness: over spans of two seconds they
-must move as far as the measured speed says. Their distance over that of the command is λ and no fault. Rows whose time
-or position cannot be right are left out by kind. A log with many of them is rejected, since the rest is suspect too.
+Measured speed makes λ, so it must be the speed over ground. Positions are its witness:
+over spans of two seconds they must move as far as the measured speed says. Their
+distance over that of the command is λ and no fault. Rows whose time or position cannot
+be right are left out by kind. A log with many of them is rejected, since the rest is
+suspect too.
 """
 
 import math
@@ -15,7 +18,13 @@ import pandas as pd
 from numpy import ndarray
 
 from benchnav.core.errors import DatasetError
-from benchnav.datagen.dem.drive_log import MOST_SPEED_M_S, OVER_SPEED, REASONS, TOP_RATIO, DriveLog
+from benchnav.datagen.dem.drive_log import (
+    MOST_SPEED_M_S,
+    OVER_SPEED,
+    REASONS,
+    TOP_RATIO,
+    DriveLog,
+)
 from benchnav.datagen.dem.drive_tracks import (
     MIN_SPANS,
     WINDOW_S,
@@ -28,18 +37,34 @@ from benchnav.datagen.dem.drive_tracks import (
     track_of,
     velocity_of,
 )
-from benchnav.datagen.dem.drive_units import is_coarse, median_ratio, no_unit, unit_of, unit_of_command
+from benchnav.datagen.dem.drive_units import (
+    is_coarse,
+    median_ratio,
+    no_unit,
+    unit_of,
+    unit_of_command,
+)
 
 # Thresholds that are someone's choice are marked (choice).
-PACE_LIMITS = (0.85, 1.15)  # of the distance of positions to that of the measured speed (choice)
+PACE_LIMITS = (
+    0.85,
+    1.15,
+)  # of the distance of positions to that of the measured speed (choice)
 _TOP_QUANTILE = 0.99  # of commands, since single ones may be wrong (choice)
 MAX_AGAINST = 0.05  # of the rows, with a measured speed of the other sign (choice)
 MAX_FAULTY = 0.1  # of the rows, with faults of one kind (choice)
-_STEADY = 0.02  # spread of measured over commanded speed that no terrain leaves (choice)
+_STEADY = (
+    0.02  # spread of measured over commanded speed that no terrain leaves (choice)
+)
 _MIN_WHEEL_SPANS = 10  # 20 s (choice)
-_WHEEL_PACE = 0.05  # that positions may differ from wheels that equal the command (choice)
-_VARIED_SLOPE_DEG = 10.0  # from the 5 % to the 95 % quantile along a track, so that λ varies too (choice)
-_STEEPEST = 1.0  # of a track; steeper cells of a surface model are trees and walls (choice)
+_WHEEL_PACE = (
+    0.05  # that positions may differ from wheels that equal the command (choice)
+)
+# from the 5 % to the 95 % quantile along a track, so that λ varies too (choice)
+_VARIED_SLOPE_DEG = 10.0
+_STEEPEST = (
+    1.0  # of a track; steeper cells of a surface model are trees and walls (choice)
+)
 
 _REMEDIES = {
     "restarted": "Sort the rows by time, or name each session in a column `drive`.",
@@ -50,14 +75,16 @@ _REMEDIES = {
 
 
 def compare_motion(log: DriveLog) -> DriveLog:
-    """Compare positions with speeds and return the log without faulty rows, with the ratio of each row.
+    """Compare positions with speeds and return the log without faulty rows, with the
+    ratio of each row.
 
     Args:
         log: with positions in metres.
 
     Raises:
-        DatasetError: If positions and measured speed disagree, measured speed has no sign, or more than a tenth of the
-            rows has a time, position or speed that cannot be right.
+        DatasetError: If positions and measured speed disagree, measured speed has no
+            sign, or more than a tenth of the rows has a time, position or speed that
+            cannot be right.
     """
     settings = log.settings
     is_compared = settings.speed == ""
@@ -67,12 +94,16 @@ def compare_motion(log: DriveLog) -> DriveLog:
         log = replace(log, rows=log.rows.assign(speed=comparable))
     log = log.without("doubled", log.rows.duplicated().to_numpy())
     log = _leave_out(log, {"restarted": find_restarted(log.rows)})
-    beyond = (log.rows[["commanded", "speed"]].abs() > MOST_SPEED_M_S).any(axis=1).to_numpy()
+    beyond = (
+        (log.rows[["commanded", "speed"]].abs() > MOST_SPEED_M_S).any(axis=1).to_numpy()
+    )
     log = _leave_out(log, {"implausible": beyond})
     is_slow = log.rows["commanded"].abs() < settings.least_speed
     if is_slow.all():
         return log.without("slow", is_slow.to_numpy())
-    standing = find_standing(track_of(log.rows), settings.least_speed, by_positions=by_positions)
+    standing = find_standing(
+        track_of(log.rows), settings.least_speed, by_positions=by_positions
+    )
     standing = standing.reindex(log.rows.index)
     _check_rest(log, standing["is_unknown"].to_numpy())
     log = _leave_out(log, {"frozen": standing["is_frozen"].to_numpy()})
@@ -81,21 +112,29 @@ def compare_motion(log: DriveLog) -> DriveLog:
     slow = np.abs(commanded) < settings.least_speed
     if slow.all():
         return log.without("slow", slow)
-    limit = TOP_RATIO * np.quantile(np.abs(commanded[~slow]), _TOP_QUANTILE, method="lower")
+    limit = TOP_RATIO * np.quantile(
+        np.abs(commanded[~slow]), _TOP_QUANTILE, method="lower"
+    )
     implausible = (np.abs(commanded) > limit) | (is_compared & (np.abs(speed) > limit))
     jumped = rows.index.isin(find_jumped(track_of(rows), limit))
     is_jumpy = jumped.mean() > MAX_FAULTY
     # Where most rows are at fault, it is by a unit, which spans of all of them show.
-    is_faulty = (jumped & (not is_jumpy)) | (implausible & (implausible.mean() <= MAX_FAULTY))
+    is_faulty = (jumped & (not is_jumpy)) | (
+        implausible & (implausible.mean() <= MAX_FAULTY)
+    )
     track = track_of(rows[~is_faulty])
     spans = spans_of(track, settings.least_speed)
-    motion = _sum_up(spans) | {"period_s": period_of(track), "standing": int(standing["is_unmeasured"].sum())}
+    motion = _sum_up(spans) | {
+        "period_s": period_of(track),
+        "standing": int(standing["is_unmeasured"].sum()),
+    }
     log = replace(log, motion={**log.motion, **motion})
     _check_pace(log, rows[~is_faulty], spans, is_jumpy=is_jumpy)
     masks, remedies = {"jumped": jumped}, _remedies_of_scale(log)
     if is_coarse(spans, _resolution_m(log)):
         remedies["jumped"] = (
-            f"Log positions with more decimals: they are multiples of {_resolution_m(log):.2g} m."
+            "Log positions with more decimals: they are multiples of "
+            f"{_resolution_m(log):.2g} m."
         )
     if is_compared:
         off_pace, remedies["off_pace"] = _off_pace(log, spans)
@@ -103,23 +142,37 @@ def compare_motion(log: DriveLog) -> DriveLog:
         masks["off_pace"] = off_pace
     masks |= {"slow": slow, "implausible": implausible}
     if settings.speed != "measured":
-        positions = speed_of_positions(track_of(rows[~(jumped | implausible)]), settings.least_speed)
+        positions = speed_of_positions(
+            track_of(rows[~(jumped | implausible)]), settings.least_speed
+        )
         positions = positions.reindex(rows.index).to_numpy()
         is_driven = ~(slow | jumped | implausible)
         is_signed = bool((is_driven & (speed * commanded < 0)).any())
-        reverses = is_driven & (positions * commanded < 0) & (np.abs(speed) > settings.least_speed)
-        log = replace(log, motion={**log.motion, "reverses": 0 if is_signed else int(reverses.sum())})
+        reverses = (
+            is_driven
+            & (positions * commanded < 0)
+            & (np.abs(speed) > settings.least_speed)
+        )
+        log = replace(
+            log,
+            motion={**log.motion, "reverses": 0 if is_signed else int(reverses.sum())},
+        )
     if by_positions:
         speed = positions
         masks["missing"] = np.isnan(speed)
     log = _leave_out(replace(log, rows=rows.assign(speed=speed)), masks, remedies)
-    return replace(log, rows=log.rows.assign(traversability=log.rows["speed"] / log.rows["commanded"]))
+    return replace(
+        log,
+        rows=log.rows.assign(traversability=log.rows["speed"] / log.rows["commanded"]),
+    )
 
 
 def compare_slopes(log: DriveLog, elevation_m: ndarray) -> DriveLog:
-    """Compare the ratio of speeds with slopes along the track, and take speeds of positions along the slope.
+    """Compare the ratio of speeds with slopes along the track, and take speeds of
+    positions along the slope.
 
-    Measured speed that follows the command up and down alike, or that equals it where positions do not, is of wheels.
+    Measured speed that follows the command up and down alike, or that equals it where
+    positions do not, is of wheels.
 
     Args:
         log: from `compare_motion`.
@@ -135,12 +188,19 @@ def compare_slopes(log: DriveLog, elevation_m: ndarray) -> DriveLog:
         return log
     climb = velocity_of(track, ["z"])["z"].reindex(log.rows.index).fillna(0.0)
     speed = log.rows["speed"]
-    along = np.sign(speed) * np.hypot(speed, np.minimum(climb.abs(), _STEEPEST * speed.abs()))
-    return replace(log, rows=log.rows.assign(speed=along, traversability=along / log.rows["commanded"]))
+    along = np.sign(speed) * np.hypot(
+        speed, np.minimum(climb.abs(), _STEEPEST * speed.abs())
+    )
+    return replace(
+        log,
+        rows=log.rows.assign(speed=along, traversability=along / log.rows["commanded"]),
+    )
 
 
 def _leave_out(
-    log: DriveLog, masks: Mapping[str, ndarray], remedies: Mapping[str, str] = MappingProxyType({})
+    log: DriveLog,
+    masks: Mapping[str, ndarray],
+    remedies: Mapping[str, str] = MappingProxyType({}),
 ) -> DriveLog:
     """Leave rows out, each by its first reason, and reject a log with too many of them.
 
@@ -155,7 +215,8 @@ def _leave_out(
         remedy = remedies.get(reason) or _REMEDIES.get(reason)
         if remedy and count > MAX_FAULTY * len(mask):
             raise DatasetError(
-                f"Expected up to {MAX_FAULTY:.0%} of the rows of {log.settings.file} to be faulty, got {count} of "
+                f"Expected up to {MAX_FAULTY:.0%} of the rows of {log.settings.file} "
+                f"to be faulty, got {count} of "
                 f"{len(mask)} that {REASONS[reason]}. {remedy}"
             )
         before = log.left_out.get(reason, 0)
@@ -166,39 +227,58 @@ def _leave_out(
 
 
 def _check_rest(log: DriveLog, unknown: ndarray) -> None:
-    """Reject a log with many rows at rest if nothing shows whether the robot or the receiver stopped."""
+    """Reject a log with many rows at rest if nothing shows whether the robot or the
+    receiver stopped.
+    """
     if unknown.mean() > MAX_FAULTY:
         raise DatasetError(
-            f"Expected positions that change to the end of the drives of {log.settings.file}, got {unknown.sum()} of "
-            f"{len(unknown)} rows under command whose position stays the same to the end. Log `measured_m_s` there, 0 "
-            "where the robot was immobilised, or leave the rows out where the receiver had no fix."
+            "Expected positions that change to the end of the drives of "
+            f"{log.settings.file}, got {unknown.sum()} of "
+            f"{len(unknown)} rows under command whose position stays the same to the "
+            "end. Log `measured_m_s` there, 0 "
+            "where the robot was immobilised, or leave the rows out where the "
+            "receiver had no fix."
         )
 
 
 def _remedies_of_scale(log: DriveLog) -> dict[str, str]:
-    """Return what to do about speeds above the top command where positions exceed the command, by reason."""
+    """Return what to do about speeds above the top command where positions exceed the
+    command, by reason.
+    """
     ratio = log.motion["commanded_pace"]
     if ratio is None or ratio <= OVER_SPEED:
         return {}
     remedy = (
-        f"Since positions move {ratio:g} times as far as `commanded_m_s` says, scale it by steady driving on flat, "
+        f"Since positions move {ratio:g} times as far as `commanded_m_s` says, scale "
+        "it by steady driving on flat, "
         "firm terrain."
     )
     return {"jumped": remedy, "implausible": remedy}
 
 
 def _sum_up(spans: pd.DataFrame) -> dict[str, float | None]:
-    """Return the ratios of positions to both speeds, to three digits; None where they are unknown."""
-    ratios = {"pace": median_ratio(spans, "measured"), "commanded_pace": median_ratio(spans, "commanded")}
-    return {name: float(f"{ratio:.3g}") if np.isfinite(ratio) else None for name, ratio in ratios.items()}
+    """Return the ratios of positions to both speeds, to three digits; None where they
+    are unknown.
+    """
+    ratios = {
+        "pace": median_ratio(spans, "measured"),
+        "commanded_pace": median_ratio(spans, "commanded"),
+    }
+    return {
+        name: float(f"{ratio:.3g}") if np.isfinite(ratio) else None
+        for name, ratio in ratios.items()
+    }
 
 
 def _resolution_m(log: DriveLog) -> float:
     return float(log.motion.get("resolution_m", 0.0))
 
 
-def _check_pace(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame, *, is_jumpy: bool) -> None:
-    """Reject a log whose positions and measured speed disagree, and name the unit that explains it.
+def _check_pace(
+    log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame, *, is_jumpy: bool
+) -> None:
+    """Reject a log whose positions and measured speed disagree, and name the unit that
+    explains it.
 
     Args:
         log: the log.
@@ -210,14 +290,20 @@ def _check_pace(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame, *, is_ju
     if spans.empty and speed == "":
         times = log.rows.groupby("drive")["time_s"]
         raise DatasetError(
-            f"Expected motion under one command in {path}, to compare positions with `measured_m_s`, got none in "
-            f"drives of up to {(times.max() - times.min()).max():.3g} s. Log `time_s` in seconds, or pass --speed "
+            f"Expected motion under one command in {path}, to compare positions with "
+            "`measured_m_s`, got none in "
+            f"drives of up to {(times.max() - times.min()).max():.3g} s. Log `time_s` "
+            "in seconds, or pass --speed "
             "measured."
         )
     if speed == "positions" and spans["measured"].isna().all():
         _check_command(log, rows, spans)
     ratio = median_ratio(spans, "measured")
-    if speed == "measured" or math.isnan(ratio) or PACE_LIMITS[0] <= ratio <= PACE_LIMITS[1]:
+    if (
+        speed == "measured"
+        or math.isnan(ratio)
+        or PACE_LIMITS[0] <= ratio <= PACE_LIMITS[1]
+    ):
         return
     unit, remedy, is_of_positions = _unit_of(log, rows, spans)
     if speed == "positions" and not is_of_positions:
@@ -229,28 +315,51 @@ def _check_pace(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame, *, is_ju
         return
     else:
         if _wheel_ratios(spans)[1]:
-            unit, remedy = "wheel odometry, since it equals `commanded_m_s`", "Log the speed over ground"
-        remedy += ", or pass --speed positions; pass --speed measured if measured_m_s is right and positions are not."
+            unit, remedy = (
+                "wheel odometry, since it equals `commanded_m_s`",
+                "Log the speed over ground",
+            )
+        remedy += (
+            ", or pass --speed positions; pass --speed measured if "
+            "measured_m_s "
+            "is right and positions are not."
+        )
     raise DatasetError(
-        f"Expected positions to move {PACE_LIMITS[0]:g} to {PACE_LIMITS[1]:g} times as far as `measured_m_s` says, got "
-        f"{ratio:.3g} times in {path}, which looks like {unit or no_unit(spans, _resolution_m(log))}. {remedy}"
+        f"Expected positions to move {PACE_LIMITS[0]:g} to {PACE_LIMITS[1]:g} times "
+        "as far as `measured_m_s` says, got "
+        f"{ratio:.3g} times in {path}, which looks like "
+        f"{unit or no_unit(spans, _resolution_m(log))}. {remedy}"
     )
 
 
-def _unit_of(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame) -> tuple[str, str, bool]:
+def _unit_of(
+    log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame
+) -> tuple[str, str, bool]:
     """Return the unit of rows of a log, see `unit_of`."""
     least_speed = log.settings.least_speed
-    return unit_of(rows, spans, least_speed, is_geographic=log.is_geographic, resolution_m=_resolution_m(log))
+    return unit_of(
+        rows,
+        spans,
+        least_speed,
+        is_geographic=log.is_geographic,
+        resolution_m=_resolution_m(log),
+    )
 
 
 def _check_command(log: DriveLog, rows: pd.DataFrame, spans: pd.DataFrame) -> None:
-    """Reject positions that move by a fraction of the command that no λ is, where nothing was measured."""
-    of_command = unit_of_command(rows, spans, log.settings.least_speed, is_geographic=log.is_geographic)
+    """Reject positions that move by a fraction of the command that no λ is, where
+    nothing was measured.
+    """
+    of_command = unit_of_command(
+        rows, spans, log.settings.least_speed, is_geographic=log.is_geographic
+    )
     if of_command is not None:
         ratio, unit, remedy = of_command
         raise DatasetError(
-            f"Expected positions in metres and times in seconds in {log.settings.file}, got positions that move "
-            f"{ratio:.3g} times as far as `commanded_m_s` says, which looks like {unit}. {remedy}."
+            "Expected positions in metres and times in seconds in "
+            f"{log.settings.file}, got positions that move "
+            f"{ratio:.3g} times as far as `commanded_m_s` says, which looks like "
+            f"{unit}. {remedy}."
         )
 
 
@@ -261,15 +370,23 @@ def _check_sign(log: DriveLog, is_driven: ndarray) -> None:
         log: the log.
         is_driven: rows that count, bool, shape [N].
     """
-    commanded, measured = (log.rows[name].to_numpy()[is_driven] for name in ("commanded", "speed"))
+    commanded, measured = (
+        log.rows[name].to_numpy()[is_driven] for name in ("commanded", "speed")
+    )
     ratio = measured / commanded
-    for direction, is_commanded in (("forward", commanded > 0), ("backward", commanded < 0)):
+    for direction, is_commanded in (
+        ("forward", commanded > 0),
+        ("backward", commanded < 0),
+    ):
         against = int((ratio[is_commanded] < 0).sum())
         if against > MAX_AGAINST * len(ratio) and np.median(ratio[is_commanded]) < 0:
             raise DatasetError(
-                f"Expected `measured_m_s` of the sign of `commanded_m_s` in {log.settings.file}, got the other one in "
-                f"{against} of {is_commanded.sum()} rows commanded {direction}. Log speed forward over ground, "
-                "negative backward, or pass --speed positions, or --speed measured to take the rows as they are."
+                "Expected `measured_m_s` of the sign of `commanded_m_s` in "
+                f"{log.settings.file}, got the other one in "
+                f"{against} of {is_commanded.sum()} rows commanded {direction}. Log "
+                "speed forward over ground, "
+                "negative backward, or pass --speed positions, or --speed measured to "
+                "take the rows as they are."
             )
 
 
@@ -286,20 +403,25 @@ def _off_pace(log: DriveLog, spans: pd.DataFrame) -> tuple[ndarray, str]:
         is_off[int(drive)] = is_known and not PACE_LIMITS[0] <= ratio <= PACE_LIMITS[1]
     off_spans = spans[is_off[spans["drive"].to_numpy(int)]]
     off_rows = log.rows[is_off[log.rows["drive"]]]
-    unit, remedy, _ = _unit_of(log, off_rows, off_spans) if len(off_rows) else ("", "", False)
+    unit, remedy, _ = (
+        _unit_of(log, off_rows, off_spans) if len(off_rows) else ("", "", False)
+    )
     names = np.array(log.names)[is_off]
     which = ", ".join(names[:5]) + ", …" * (len(names) > 5)
     ratio = median_ratio(off_spans, "measured")
     remedy = (
-        f"Positions move {ratio:.3g} times as far as `measured_m_s` says, which looks like "
-        f"{unit or no_unit(off_spans, _resolution_m(log))} in {which}. {remedy} there, leave those drives out, or pass "
+        f"Positions move {ratio:.3g} times as far as `measured_m_s` says, which looks "
+        "like "
+        f"{unit or no_unit(off_spans, _resolution_m(log))} in {which}. {remedy} "
+        "there, leave those drives out, or pass "
         "--speed positions."
     )
     return is_off[log.rows["drive"]], remedy
 
 
 def _wheel_ratios(spans: pd.DataFrame) -> tuple[bool, bool]:
-    """Return whether measured over commanded speed stays the same, and whether it stays 1.
+    """Return whether measured over commanded speed stays the same, and whether it stays
+    1.
 
     Returns:
         Both; false where spans are too few.
@@ -309,17 +431,24 @@ def _wheel_ratios(spans: pd.DataFrame) -> tuple[bool, bool]:
     chosen = steady if len(steady) >= _MIN_WHEEL_SPANS else spans
     if len(chosen) < _MIN_WHEEL_SPANS:
         return False, False
-    low, middle, high = (chosen["measured"] / chosen["commanded"]).quantile([0.16, 0.5, 0.84])
+    low, middle, high = (chosen["measured"] / chosen["commanded"]).quantile(
+        [0.16, 0.5, 0.84]
+    )
     stays = bool((high - low) / 2 < _STEADY * middle)
     return stays, stays and abs(middle - 1) < _STEADY
 
 
 def _check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
-    """Reject a measured speed that is that of wheels, in the whole log or in stretches of it.
+    """Reject a measured speed that is that of wheels, in the whole log or in stretches
+    of it.
 
-    Shorter spans follow curves that alternate, and noise only adds to the distance of positions.
+    Shorter spans follow curves that alternate, and noise only adds to the distance of
+    positions.
     """
-    spans, short = (spans_of(track, log.settings.least_speed, span_s) for span_s in (WINDOW_S, WINDOW_S / 2))
+    spans, short = (
+        spans_of(track, log.settings.least_speed, span_s)
+        for span_s in (WINDOW_S, WINDOW_S / 2)
+    )
     stays, equals = _wheel_ratios(spans)
     moving = spans[spans["is_moving"]]
     pace = max(median_ratio(spans, "measured"), median_ratio(short, "measured"))
@@ -327,27 +456,41 @@ def _check_wheels(log: DriveLog, track: pd.DataFrame) -> None:
     gentle, steep = moving["slope_deg"].quantile([0.05, 0.95])
     reasons = []
     if equals and pace < 1 - _WHEEL_PACE:
-        reasons.append(f"equals `commanded_m_s` where positions do not, which move {pace:.3g} times as far")
+        reasons.append(
+            f"equals `commanded_m_s` where positions do not, which move {pace:.3g} "
+            "times as far"
+        )
     elif off > MAX_FAULTY:
         reasons.append(
-            f"equals `commanded_m_s` where positions do not (over {1 - PACE_LIMITS[0]:.0%} less far in {off:.0%} "
+            "equals `commanded_m_s` where positions do not (over "
+            f"{1 - PACE_LIMITS[0]:.0%} less far in {off:.0%} "
             "of spans)"
         )
     if stays and steep - gentle >= _VARIED_SLOPE_DEG:
-        reasons.append(f"follows `commanded_m_s` to {_STEADY:.0%} on slopes of {gentle:.0f}° to {steep:.0f}°")
+        reasons.append(
+            f"follows `commanded_m_s` to {_STEADY:.0%} on slopes of {gentle:.0f}° to "
+            f"{steep:.0f}°"
+        )
     if reasons:
         raise DatasetError(
-            f"Expected `measured_m_s` over ground in {log.settings.file}, got one that {' and '.join(reasons)}, "
-            "as wheel odometry does. Log the speed over ground, or pass --speed positions; pass --speed measured if it "
+            f"Expected `measured_m_s` over ground in {log.settings.file}, got one "
+            f"that {' and '.join(reasons)}, "
+            "as wheel odometry does. Log the speed over ground, or pass --speed "
+            "positions; pass --speed measured if it "
             "is right."
         )
 
 
 def _off_stretches(moving: pd.DataFrame) -> float:
-    """Return the fraction of spans in stretches whose measured speed equals the command and is too high."""
+    """Return the fraction of spans in stretches whose measured speed equals the command
+    and is too high.
+    """
     number = moving.groupby("drive").cumcount() // _MIN_WHEEL_SPANS
     off = 0
     for _, stretch in moving.groupby([moving["drive"], number]):
-        if _wheel_ratios(stretch)[1] and median_ratio(stretch, "measured") < PACE_LIMITS[0]:
+        if (
+            _wheel_ratios(stretch)[1]
+            and median_ratio(stretch, "measured") < PACE_LIMITS[0]
+        ):
             off += len(stretch)
     return off / max(len(moving), 1)

@@ -1,8 +1,9 @@
-"""Tracks of a drive log: positions over time, their faults and the motion that they show.
+"""Tracks of a drive log: positions over time, their faults and the motion that they
+show.
 
-A *track* is the rows of a log, ordered by drive and time. A *segment* is a part of it without a gap. A *fix* is its
-rows of one position, since logs repeat a position until the receiver gives the next. Distances are horizontal, in
-metres.
+A *track* is the rows of a log, ordered by drive and time. A *segment* is a part of it
+without a gap. A *fix* is its rows of one position, since logs repeat a position until
+the receiver gives the next. Distances are horizontal, in metres.
 
 Letters in shapes: N rows.
 """
@@ -18,19 +19,29 @@ WINDOW_S = 2.0  # over which the noise of positions is small compared with the d
 MIN_SPANS = 5  # that a median needs (choice)
 _GAP_S = 1.0  # without a row, after which nothing is said of the motion between
 _FREEZE_FIXES = 3  # periods of positions that one may stay the same (choice)
-_STRAIGHT_COS = 0.9  # between neighbouring spans, so that a chord is at most 1 % shorter than its arc
-_MAX_BEND = math.radians(150)  # between neighbouring spans of an arc; more is a reversal (choice)
-_SLIDES_COS = -0.5  # between rows of one command; no robot turns by over 120° at once (choice)
-MAX_PERIOD_S = 0.8  # between fixes, in which no robot turns by over 120°, at 2.5 rad/s (choice)
+# between neighbouring spans, so that a chord is at most 1 % shorter than its arc
+_STRAIGHT_COS = 0.9
+_MAX_BEND = math.radians(
+    150
+)  # between neighbouring spans of an arc; more is a reversal (choice)
+_SLIDES_COS = (
+    -0.5
+)  # between rows of one command; no robot turns by over 120° at once (choice)
+MAX_PERIOD_S = (
+    0.8  # between fixes, in which no robot turns by over 120°, at 2.5 rad/s (choice)
+)
 _CLEAR_ERRORS = 5.0  # standard errors of a velocity whose direction counts (choice)
-_MAX_REST_WINDOWS = 2.0  # without such a velocity, after which a robot may have turned (choice)
+_MAX_REST_WINDOWS = (
+    2.0  # without such a velocity, after which a robot may have turned (choice)
+)
 _ROWS_AT_ONCE = 4096
 
 
 def find_restarted(rows: pd.DataFrame) -> ndarray:
     """Find rows whose time is before that of an earlier row of their drive.
 
-    Rows that are only out of order are no restart: by time they are a shorter track than in the order of the file.
+    Rows that are only out of order are no restart: by time they are a shorter track
+    than in the order of the file.
 
     Returns:
         bool, shape [N].
@@ -46,7 +57,11 @@ def find_restarted(rows: pd.DataFrame) -> ndarray:
 def _length_m(rows: pd.DataFrame) -> pd.Series:
     """Return the length of each drive, as its rows stand."""
     by_drive = rows.groupby("drive")
-    return np.hypot(by_drive["x"].diff(), by_drive["y"].diff()).groupby(rows["drive"]).sum()
+    return (
+        np.hypot(by_drive["x"].diff(), by_drive["y"].diff())
+        .groupby(rows["drive"])
+        .sum()
+    )
 
 
 def track_of(rows: pd.DataFrame) -> pd.DataFrame:
@@ -56,14 +71,19 @@ def track_of(rows: pd.DataFrame) -> pd.DataFrame:
         rows: of a log.
 
     Returns:
-        The rows with their index, and with `step_s` since the row before (0 after a gap), `segment` and `fix`.
+        The rows with their index, and with `step_s` since the row before (0 after a
+        gap), `segment` and `fix`.
     """
     track = rows.sort_values(["drive", "time_s"], kind="stable")
     step_s = track.groupby("drive")["time_s"].diff()
     usual_s = step_s.groupby(track["drive"]).transform("median")
-    starts = ~(step_s <= np.maximum(_GAP_S, 3 * usual_s))  # the first row of a drive too
+    starts = ~(
+        step_s <= np.maximum(_GAP_S, 3 * usual_s)
+    )  # the first row of a drive too
     changes = (track[["drive", "x", "y"]].diff() != 0).any(axis=1)
-    return track.assign(step_s=step_s.where(~starts, 0.0), segment=starts.cumsum(), fix=changes.cumsum())
+    return track.assign(
+        step_s=step_s.where(~starts, 0.0), segment=starts.cumsum(), fix=changes.cumsum()
+    )
 
 
 def _fixes(track: pd.DataFrame) -> pd.DataFrame:
@@ -73,34 +93,54 @@ def _fixes(track: pd.DataFrame) -> pd.DataFrame:
 
 
 def _period_s(fixes: pd.DataFrame) -> pd.Series:
-    """Return the usual time between fixes of the drive of each fix, 0 for a drive of one fix."""
+    """Return the usual time between fixes of the drive of each fix, 0 for a drive of
+    one fix.
+    """
     drive = fixes["drive"]
-    return fixes.groupby("drive")["time_s"].diff().groupby(drive).transform("median").fillna(0)
+    return (
+        fixes.groupby("drive")["time_s"]
+        .diff()
+        .groupby(drive)
+        .transform("median")
+        .fillna(0)
+    )
 
 
 def period_of(track: pd.DataFrame) -> float:
-    """Return the usual time between fixes of all drives, in seconds to three digits, 0 for single fixes."""
+    """Return the usual time between fixes of all drives, in seconds to three digits, 0
+    for single fixes.
+    """
     return float(f"{_period_s(_fixes(track)).median():.3g}")
 
 
 def _knots(track: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows at which a position is measured: the first of each fix and segment, and repeats of a long fix.
+    """Return the rows at which a position is measured: the first of each fix and
+    segment, and repeats of a long fix.
 
-    A position that stays the same for more than three fixes is that of a robot at rest, measured once a period.
+    A position that stays the same for more than three fixes is that of a robot at rest,
+    measured once a period.
     """
     fixes = _fixes(track)
     period_s = _period_s(fixes)[track["fix"]].to_numpy()
     since_s = track["time_s"] - fixes["time_s"][track["fix"]].to_numpy()
-    is_long = since_s.groupby(track["fix"]).transform("max") > np.maximum(_FREEZE_FIXES * period_s, _GAP_S)
-    repeat = np.floor(since_s / np.where(period_s > 0, period_s, 1e-9) + 1e-6).where(is_long, 0)
+    is_long = since_s.groupby(track["fix"]).transform("max") > np.maximum(
+        _FREEZE_FIXES * period_s, _GAP_S
+    )
+    repeat = np.floor(since_s / np.where(period_s > 0, period_s, 1e-9) + 1e-6).where(
+        is_long, 0
+    )
     return track[~track[["segment", "fix"]].assign(repeat=repeat).duplicated()]
 
 
-def find_standing(track: pd.DataFrame, least_speed: float, *, by_positions: bool) -> pd.DataFrame:
-    """Find rows of a position that stays the same for more than three fixes under a command.
+def find_standing(
+    track: pd.DataFrame, least_speed: float, *, by_positions: bool
+) -> pd.DataFrame:
+    """Find rows of a position that stays the same for more than three fixes under a
+    command.
 
-    The receiver is frozen if the robot moves on. Measured speed says so, and so does a next position that is far away.
-    A robot that stands still under its command is immobilised, which is no fault.
+    The receiver is frozen if the robot moves on. Measured speed says so, and so does a
+    next position that is far away. A robot that stands still under its command is
+    immobilised, which is no fault.
 
     Args:
         track: from `track_of`; `speed` is NaN where it was not measured.
@@ -108,8 +148,9 @@ def find_standing(track: pd.DataFrame, least_speed: float, *, by_positions: bool
         by_positions: whether the next position must be far away too.
 
     Returns:
-        Masks by the track's index, without the first row of each such fix: `is_frozen`; `is_unmeasured`, immobilised by
-        positions only; `is_unknown`, the part of them without a next position either.
+        Masks by the track's index, without the first row of each such fix: `is_frozen`;
+        `is_unmeasured`, immobilised by positions only; `is_unknown`, the part of them
+        without a next position either.
     """
     fixes = _fixes(track)
     by_drive, period_s = fixes.groupby("drive"), _period_s(fixes)
@@ -129,7 +170,11 @@ def find_standing(track: pd.DataFrame, least_speed: float, *, by_positions: bool
     if by_positions:
         is_frozen &= ~(next_m < moving_m)
     masks = pd.DataFrame(
-        {"is_frozen": is_frozen, "is_unmeasured": is_unmeasured & ~is_frozen, "is_unknown": is_unknown}
+        {
+            "is_frozen": is_frozen,
+            "is_unmeasured": is_unmeasured & ~is_frozen,
+            "is_unknown": is_unknown,
+        }
     )
     return masks.loc[track["fix"]].set_axis(track.index).where(repeats, False)
 
@@ -137,8 +182,9 @@ def find_standing(track: pd.DataFrame, least_speed: float, *, by_positions: bool
 def find_jumped(track: pd.DataFrame, limit_m_s: float) -> pd.Index:
     """Find rows whose position is out of reach of the others of their drive.
 
-    The longest stretch without a jump is right. From there, forward and backward, a position is right that is in reach
-    of the last right one. Over less than a second noise may exceed the reach, so that a second counts.
+    The longest stretch without a jump is right. From there, forward and backward, a
+    position is right that is in reach of the last right one. Over less than a second
+    noise may exceed the reach, so that a second counts.
 
     Args:
         track: from `track_of`.
@@ -157,18 +203,28 @@ def find_jumped(track: pd.DataFrame, limit_m_s: float) -> pd.Index:
         stretch = np.concatenate([[0], np.cumsum(breaks)])
         is_right = stretch == np.bincount(stretch, drive["rows"]).argmax()
         first, last = np.flatnonzero(is_right)[[0, -1]]
-        for anchor, others in ((last, range(last + 1, len(drive))), (first, range(first - 1, -1, -1))):
+        for anchor, others in (
+            (last, range(last + 1, len(drive))),
+            (first, range(first - 1, -1, -1)),
+        ):
             right = anchor
             for fix in others:
                 away_m = math.hypot(x[fix] - x[right], y[fix] - y[right])
                 if away_m <= limit_m_s * max(abs(time[fix] - time[right]), _GAP_S):
                     is_right[fix], right = True, fix
         jumped.append(drive.index[~is_right])
-    return track.index[track["fix"].isin(np.concatenate(jumped))] if jumped else track.index[:0]
+    return (
+        track.index[track["fix"].isin(np.concatenate(jumped))]
+        if jumped
+        else track.index[:0]
+    )
 
 
-def spans_of(track: pd.DataFrame, least_speed: float, span_s: float = WINDOW_S) -> pd.DataFrame:
-    """Sum up motion under command over spans of a time, or from fix to fix where those are more seldom.
+def spans_of(
+    track: pd.DataFrame, least_speed: float, span_s: float = WINDOW_S
+) -> pd.DataFrame:
+    """Sum up motion under command over spans of a time, or from fix to fix where those
+    are more seldom.
 
     Args:
         track: from `track_of`; with `z`, elevation in metres, too for slopes.
@@ -176,9 +232,10 @@ def spans_of(track: pd.DataFrame, least_speed: float, span_s: float = WINDOW_S) 
         span_s: of a span.
 
     Returns:
-        A table with a row for each span: `drive`, `duration_s`, `moved` (metres along the arc between positions),
-        `measured` and `commanded` (metres by speed), `is_moving`, `is_straight`, `is_steady` (one command), perhaps
-        `slope_deg` along the track.
+        A table with a row for each span: `drive`, `duration_s`, `moved` (metres along
+        the arc between positions), `measured` and `commanded` (metres by speed),
+        `is_moving`, `is_straight`, `is_steady` (one command), perhaps `slope_deg` along
+        the track.
     """
     knots = _knots(track)
     period_s = knots.groupby("segment")["time_s"].diff().median()
@@ -189,13 +246,21 @@ def spans_of(track: pd.DataFrame, least_speed: float, span_s: float = WINDOW_S) 
         window_s = longest_s / MIN_SPANS
     sums = {}
     for name, column in (("measured", "speed"), ("commanded", "commanded")):
-        sums[name] = (track[column] * track["step_s"]).groupby(track["segment"]).cumsum()
-    span = np.floor(knots["time_s"] / window_s).reindex(track.index).ffill()  # of the last position
+        sums[name] = (
+            (track[column] * track["step_s"]).groupby(track["segment"]).cumsum()
+        )
+    span = (
+        np.floor(knots["time_s"] / window_s).reindex(track.index).ffill()
+    )  # of the last position
     table = track.assign(span=span, command=track["commanded"], **sums)
     # A span reaches from its first measured position to that of the next one.
     firsts = table.loc[knots.index].groupby(["segment", "span"]).first()
     commands = table.groupby(["segment", "span"])["command"].agg(["min", "max"])
-    steps = firsts[[*sums, "x", "y", "time_s", *{"z"}.intersection(firsts)]].groupby("segment").diff(-1)
+    steps = (
+        firsts[[*sums, "x", "y", "time_s", *{"z"}.intersection(firsts)]]
+        .groupby("segment")
+        .diff(-1)
+    )
     chord = np.hypot(steps["x"], steps["y"])
     # On an arc the chords of two neighbours differ in direction by the angle of each.
     after = _angle_between(steps, steps.groupby("segment").shift(-1))
@@ -203,7 +268,9 @@ def spans_of(track: pd.DataFrame, least_speed: float, span_s: float = WINDOW_S) 
     bends = pd.concat([before, after], axis=1)
     bend = bends.where(bends.abs() < _MAX_BEND).mean(axis=1).fillna(0)
     moved = chord / np.sinc(bend / (2 * np.pi))
-    spans = pd.DataFrame({"drive": firsts["drive"], "duration_s": -steps["time_s"], "moved": moved})
+    spans = pd.DataFrame(
+        {"drive": firsts["drive"], "duration_s": -steps["time_s"], "moved": moved}
+    )
     spans = spans.assign(**{name: steps[name].abs() for name in sums})
     least_m = least_speed * spans["duration_s"]
     spans["is_moving"] = np.fmax(moved, spans["measured"]) >= least_m
@@ -215,35 +282,53 @@ def spans_of(track: pd.DataFrame, least_speed: float, span_s: float = WINDOW_S) 
 
 
 def _angle_between(vectors: pd.DataFrame, others: pd.DataFrame) -> pd.Series:
-    """Return the signed angle from vectors to others, in (-π, π], from their columns `x` and `y`."""
+    """Return the signed angle from vectors to others, in (-π, π], from their columns
+    `x` and `y`.
+    """
     cross = vectors["x"] * others["y"] - vectors["y"] * others["x"]
     dot = vectors["x"] * others["x"] + vectors["y"] * others["y"]
-    return np.arctan2(cross + 0.0, dot + 0.0)  # of a vector of 0 it is 0, which -0.0 would make π
+    return np.arctan2(
+        cross + 0.0, dot + 0.0
+    )  # of a vector of 0 it is 0, which -0.0 would make π
 
 
 def velocity_of(track: pd.DataFrame, columns: list[str]) -> pd.DataFrame:
-    """Fit a line through the fixes within a second of each row, or within 1.5 periods of fixes where they are seldom.
+    """Fit a line through the fixes within a second of each row, or within 1.5 periods
+    of fixes where they are seldom.
 
-    On fixes of equal steps it is the derivative of Savitzky and Golay (1964), "Smoothing and differentiation of data by
-    simplified least squares procedures".
+    On fixes of equal steps it is the derivative of Savitzky and Golay (1964),
+    "Smoothing and differentiation of data by simplified least squares procedures".
 
     Args:
         track: from `track_of`.
         columns: of coordinates, in metres.
 
     Returns:
-        A table by the track's index: derivatives in m/s, NaN where fixes do not reach over half of the time; `error`,
-        their standard error in m/s, from the scatter of these fixes and at least from that of the drive; `window_s`;
-        `reach_s`, half of the time that the fixes take, as if they were dense.
+        A table by the track's index: derivatives in m/s, NaN where fixes do not reach
+        over half of the time; `error`, their standard error in m/s, from the scatter of
+        these fixes and at least from that of the drive; `window_s`; `reach_s`, half of
+        the time that the fixes take, as if they were dense.
     """
-    fits = [pd.DataFrame(columns=[*columns, "error", "window_s", "reach_s"], dtype=float)]
+    fits = [
+        pd.DataFrame(columns=[*columns, "error", "window_s", "reach_s"], dtype=float)
+    ]
     marked = track.assign(is_knot=track.index.isin(_knots(track).index))
     for _, drive in marked.groupby("drive"):
-        fit = pd.concat([_fit(rows, rows[rows["is_knot"]], columns) for _, rows in drive.groupby("segment")])
-        freedom = ((fit["count"] - 2) * len(columns)).where((fit["count"] > 2) & fit["residual"].notna())
+        fit = pd.concat(
+            [
+                _fit(rows, rows[rows["is_knot"]], columns)
+                for _, rows in drive.groupby("segment")
+            ]
+        )
+        freedom = ((fit["count"] - 2) * len(columns)).where(
+            (fit["count"] > 2) & fit["residual"].notna()
+        )
         usual = fit["residual"].sum() / max(freedom.sum(), 1)
         variance = np.fmax(fit["residual"] / freedom, usual)
-        error, reach_s = np.sqrt(variance / fit["spread_s2"]), np.sqrt(3 * fit["spread_s2"] / fit["count"])
+        error, reach_s = (
+            np.sqrt(variance / fit["spread_s2"]),
+            np.sqrt(3 * fit["spread_s2"] / fit["count"]),
+        )
         fits.append(fit.assign(error=error, reach_s=reach_s)[fits[0].columns])
     return pd.concat(fits[1:] or fits).reindex(track.index)
 
@@ -252,8 +337,9 @@ def _fit(rows: pd.DataFrame, knots: pd.DataFrame, columns: list[str]) -> pd.Data
     """Fit lines through the knots around each row of a segment.
 
     Returns:
-        A table by the rows' index: slopes; `count` of knots; `residual`, the sum of squares in m² over the columns;
-        `spread_s2`, the sum of squares of times about their mean; `window_s`.
+        A table by the rows' index: slopes; `count` of knots; `residual`, the sum of
+        squares in m² over the columns; `spread_s2`, the sum of squares of times about
+        their mean; `window_s`.
     """
     time_s, values = knots["time_s"].to_numpy(), knots[columns].to_numpy()
     period_s = np.median(np.diff(time_s)) if len(time_s) > 1 else 0.0
@@ -267,11 +353,18 @@ def _fit(rows: pd.DataFrame, knots: pd.DataFrame, columns: list[str]) -> pd.Data
         index = low[:, None] + np.arange((high - low).max(initial=1))
         is_near = index < high[:, None]
         index = np.minimum(index, len(time_s) - 1)
-        reach_s = time_s[np.maximum(high - 1, 0)] - time_s[np.minimum(low, len(time_s) - 1)]
+        reach_s = (
+            time_s[np.maximum(high - 1, 0)] - time_s[np.minimum(low, len(time_s) - 1)]
+        )
         count = is_near.sum(axis=1, keepdims=True)
         offset_s = np.where(is_near, time_s[index], 0)
-        offset_s = np.where(is_near, offset_s - offset_s.sum(axis=1, keepdims=True) / count.clip(min=1), 0)
-        # The offsets sum to 0, so that a constant of the values does not count; less of it rounds less.
+        offset_s = np.where(
+            is_near,
+            offset_s - offset_s.sum(axis=1, keepdims=True) / count.clip(min=1),
+            0,
+        )
+        # The offsets sum to 0, so that a constant of the values does not count; less of
+        # it rounds less.
         near = values[index] - values[index[:, :1]]
         near = np.where(is_near[..., None], near, 0)
         spread_s2 = np.square(offset_s).sum(axis=1, keepdims=True)
@@ -282,52 +375,73 @@ def _fit(rows: pd.DataFrame, knots: pd.DataFrame, columns: list[str]) -> pd.Data
         misfit = near - middle - slopes[:, None, :] * offset_s[..., None]
         residual = np.square(np.where(is_near[..., None], misfit, 0)).sum(axis=(1, 2))
         fits.append(np.column_stack([slopes, count, residual, spread_s2]))
-    table = pd.DataFrame(np.concatenate(fits), rows.index, [*columns, "count", "residual", "spread_s2"])
+    table = pd.DataFrame(
+        np.concatenate(fits), rows.index, [*columns, "count", "residual", "spread_s2"]
+    )
     return table.assign(window_s=2 * half_s)
 
 
 def speed_of_positions(track: pd.DataFrame, least_speed: float) -> pd.Series:
     """Return the speed along the robot from its positions.
 
-    Positions have no heading, so that of the command counts: a robot moves as commanded. Where its track reverses
-    under one command, it slides back until the track reverses again. Only velocities of at least five standard errors
-    have a direction, since noise turns that of a robot at rest. After a rest of more than two windows of the fit, the
-    robot moves as commanded again. Where fixes are seldom, it may have turned between them, and no reversal counts.
+    Positions have no heading, so that of the command counts: a robot moves as
+    commanded. Where its track reverses under one command, it slides back until the
+    track reverses again. Only velocities of at least five standard errors have a
+    direction, since noise turns that of a robot at rest. After a rest of more than two
+    windows of the fit, the robot moves as commanded again. Where fixes are seldom, it
+    may have turned between them, and no reversal counts.
 
-    In a curve the fitted line is shorter than the arc, by the rate at which its direction turns.
+    In a curve the fitted line is shorter than the arc, by the rate at which its
+    direction turns.
 
     Args:
         track: from `track_of`.
         least_speed: m/s, of commands that count; slower ones may turn the robot round.
 
     Returns:
-        Speed in m/s, signed as the command, by the track's index; NaN where `velocity_of` is.
+        Speed in m/s, signed as the command, by the track's index; NaN where
+        `velocity_of` is.
     """
     sign, fit = np.sign(track["commanded"]), velocity_of(track, ["x", "y"])
     toward = fit[["x", "y"]].mul(sign, axis=0)
     speed = np.hypot(toward["x"], toward["y"])
     is_slow = track["commanded"].abs() < least_speed
     block = (is_slow | (track["segment"].diff() != 0)).cumsum()
-    is_clear = ~is_slow & (speed >= np.fmax(least_speed / 2, _CLEAR_ERRORS * fit["error"]))
+    is_clear = ~is_slow & (
+        speed >= np.fmax(least_speed / 2, _CLEAR_ERRORS * fit["error"])
+    )
     rest_s = track["time_s"][is_clear].diff()
-    starts = (block[is_clear].diff() != 0) | (rest_s > _MAX_REST_WINDOWS * fit["window_s"][is_clear])
+    starts = (block[is_clear].diff() != 0) | (
+        rest_s > _MAX_REST_WINDOWS * fit["window_s"][is_clear]
+    )
     stretch = starts.cumsum()
     unit = toward[is_clear].div(speed[is_clear], axis=0)
     turn = (unit * unit.groupby(stretch).shift(1)).sum(axis=1, min_count=2)
-    reverses = (turn < _SLIDES_COS) & (fit["window_s"][is_clear] <= max(WINDOW_S, 3 * MAX_PERIOD_S))
+    reverses = (turn < _SLIDES_COS) & (
+        fit["window_s"][is_clear] <= max(WINDOW_S, 3 * MAX_PERIOD_S)
+    )
     backward = (reverses.groupby(stretch).cumsum() % 2).astype(bool)
-    # A stretch may start by sliding, but robots are not logged sliding most of the time.
+    # A stretch may start by sliding, but robots are not logged sliding most of the
+    # time.
     mostly = backward.groupby(stretch).transform("mean") > 0.5
     is_back = backward != mostly
-    speed *= _arc_over_fit(track, fit["reach_s"], unit.mul(np.where(is_back, -1.0, 1.0), axis=0))
-    is_back = is_back.reindex(track.index).groupby(block).ffill().fillna(False).astype(bool)
+    speed *= _arc_over_fit(
+        track, fit["reach_s"], unit.mul(np.where(is_back, -1.0, 1.0), axis=0)
+    )
+    is_back = (
+        is_back.reindex(track.index).groupby(block).ffill().fillna(False).astype(bool)
+    )
     return speed * sign * np.where(is_back, -1.0, 1.0)
 
 
-def _arc_over_fit(track: pd.DataFrame, reach_s: pd.Series, heading: pd.DataFrame) -> pd.Series:
-    """Return the speed on an arc over that of a line fitted to it, 1 where the heading is unknown.
+def _arc_over_fit(
+    track: pd.DataFrame, reach_s: pd.Series, heading: pd.DataFrame
+) -> pd.Series:
+    """Return the speed on an arc over that of a line fitted to it, 1 where the heading
+    is unknown.
 
-    On an arc of rate ω, fixes within ±T give a line of 3 (sin a - a cos a) / a³ of the speed, a = ω T.
+    On an arc of rate ω, fixes within ±T give a line of 3 (sin a - a cos a) / a³ of the
+    speed, a = ω T.
 
     Args:
         track: from `track_of`.
@@ -341,5 +455,7 @@ def _arc_over_fit(track: pd.DataFrame, reach_s: pd.Series, heading: pd.DataFrame
     rate = velocity_of(track.assign(turned=turned), ["turned"])["turned"].abs()
     a = (rate * reach_s).clip(upper=np.pi / 2)  # a half circle; more is no arc
     wide = a.clip(lower=0.01)
-    factor = (wide**3 / (3 * (np.sin(wide) - wide * np.cos(wide)))).where(a == wide, 1 + a**2 / 10)
+    factor = (wide**3 / (3 * (np.sin(wide) - wide * np.cos(wide)))).where(
+        a == wide, 1 + a**2 / 10
+    )
     return factor[heading.index].reindex(track.index).fillna(1)

@@ -12,19 +12,34 @@ _COMMAND_LIMITS = (
     _PLAUSIBLE[0],
     5.0,
 )  # of positions to the command, beyond which a time is in another unit (choice)
-_FASTEST = 0.95  # quantile of the spans of a log, some of which may show an immobilised robot (choice)
+# quantile of the spans of a log, some of which may show an immobilised robot (choice)
+_FASTEST = 0.95
 _SLIPS = 0.9  # of measured to commanded speed, which is not that of wheels (choice)
 _COARSE = 0.25  # of a span's distance (choice)
 
 # The ratio of positions to measured speed that each unit gives.
-_SPEEDS = {"knots": 0.5144, "km/h": 1 / 3.6, "mph": 1 / 2.237, "ft/s": 1 / 3.281, "cm/s": 0.01}
-_TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "minutes": 60.0, "hours": 3600.0}
+_SPEEDS = {
+    "knots": 0.5144,
+    "km/h": 1 / 3.6,
+    "mph": 1 / 2.237,
+    "ft/s": 1 / 3.281,
+    "cm/s": 0.01,
+}
+_TIMES = {
+    "milliseconds": 1e-3,
+    "microseconds": 1e-6,
+    "nanoseconds": 1e-9,
+    "minutes": 60.0,
+    "hours": 3600.0,
+}
 _LENGTHS = {"feet": 3.281, "centimetres": 100.0, "millimetres": 1000.0}
 _METRES = "Bring speeds to m/s, times to s and positions to m"
 
 
 def median_ratio(spans: pd.DataFrame, of: str) -> float:
-    """Return the median of the distance of positions over that by a speed, in straight spans where they suffice."""
+    """Return the median of the distance of positions over that by a speed, in straight
+    spans where they suffice.
+    """
     spans = spans[spans["is_moving"] & spans[of].notna()]
     straight = spans[spans["is_straight"]]
     chosen = straight if len(straight) >= MIN_SPANS else spans
@@ -46,19 +61,32 @@ def _n_straight(spans: pd.DataFrame) -> int:
 
 
 def _is_winding(spans: pd.DataFrame) -> bool:
-    """Return whether positions move less far than measured because the track winds between them."""
-    return _n_straight(spans) < min(MIN_SPANS, len(spans)) and median_ratio(spans, "measured") < 1
+    """Return whether positions move less far than measured because the track winds
+    between them.
+    """
+    return (
+        _n_straight(spans) < min(MIN_SPANS, len(spans))
+        and median_ratio(spans, "measured") < 1
+    )
 
 
 def is_coarse(spans: pd.DataFrame, resolution_m: float) -> bool:
-    """Return whether positions have too few decimals to say how far the robot moved in a span."""
+    """Return whether positions have too few decimals to say how far the robot moved in
+    a span.
+    """
     return bool(resolution_m > _COARSE * spans["commanded"].median())
 
 
 def unit_of(
-    rows: pd.DataFrame, spans: pd.DataFrame, least_speed: float, *, is_geographic: bool, resolution_m: float
+    rows: pd.DataFrame,
+    spans: pd.DataFrame,
+    least_speed: float,
+    *,
+    is_geographic: bool,
+    resolution_m: float,
 ) -> tuple[str, str, bool]:
-    """Name the unit that the ratio of positions to measured speed looks like, and the remedy.
+    """Name the unit that the ratio of positions to measured speed looks like, and the
+    remedy.
 
     Args:
         rows: of a log.
@@ -68,14 +96,20 @@ def unit_of(
         resolution_m: of positions.
 
     Returns:
-        The unit, empty if none fits; the remedy without a full stop; whether it is a unit of times or positions.
+        The unit, empty if none fits; the remedy without a full stop; whether it is a
+        unit of times or positions.
     """
-    ratio, by_command = (median_ratio(spans, name) for name in ("measured", "commanded"))
+    ratio, by_command = (
+        median_ratio(spans, name) for name in ("measured", "commanded")
+    )
     # Times and positions are off against the command too, a measured speed is not.
     is_plausible = _PLAUSIBLE[0] <= by_command <= _PLAUSIBLE[1]
     for name, value in _TIMES.items():
         # Spans of 2 s are others in another unit, and their arcs too.
-        if abs(median_ratio(_in_seconds(rows, value, least_speed), "measured") - 1) <= _UNIT_TOLERANCE:
+        if (
+            abs(median_ratio(_in_seconds(rows, value, least_speed), "measured") - 1)
+            <= _UNIT_TOLERANCE
+        ):
             return name, f"Multiply `time_s` by {value:.4g}", True
     if not is_plausible:
         for name, value in {} if is_geographic else _LENGTHS.items():
@@ -85,8 +119,13 @@ def unit_of(
         return "", "Log positions with more decimals", False
     if _is_winding(spans):
         return "", f"{_METRES}, log positions more often", False
-    for name, value in sorted(_SPEEDS.items(), key=lambda item: abs(ratio / item[1] - 1)):
-        if abs(ratio / value - 1) <= _UNIT_TOLERANCE and _n_straight(spans) >= MIN_SPANS:
+    for name, value in sorted(
+        _SPEEDS.items(), key=lambda item: abs(ratio / item[1] - 1)
+    ):
+        if (
+            abs(ratio / value - 1) <= _UNIT_TOLERANCE
+            and _n_straight(spans) >= MIN_SPANS
+        ):
             also = f" (`commanded_m_s` too, if it is in {name})"
             return name, f"Multiply `measured_m_s` by {value:.4g}{also}", False
     return "", _METRES, False
@@ -100,7 +139,8 @@ def _in_seconds(rows: pd.DataFrame, value: float, least_speed: float) -> pd.Data
 def unit_of_command(
     rows: pd.DataFrame, spans: pd.DataFrame, least_speed: float, *, is_geographic: bool
 ) -> tuple[float, str, str] | None:
-    """Name the unit that the ratio of positions to the command looks like, where measured speed does not agree.
+    """Name the unit that the ratio of positions to the command looks like, where
+    measured speed does not agree.
 
     The ratio is λ, so that only one that no drive has is of a unit.
 
@@ -111,11 +151,14 @@ def unit_of_command(
         is_geographic: whether positions are angles, which have no other unit.
 
     Returns:
-        The ratio, the units that give it, and the remedy; None where the ratio may be λ.
+        The ratio, the units that give it, and the remedy; None where the ratio may be
+        λ.
     """
     ratios = spans["moved"] / spans["commanded"]
     ratio, fastest = float(ratios.median()), float(ratios.quantile(_FASTEST))
-    if (spans["measured"] / spans["commanded"]).median() < _SLIPS:  # so that the robot did move at that speed
+    if (
+        spans["measured"] / spans["commanded"]
+    ).median() < _SLIPS:  # so that the robot did move at that speed
         fastest = ratio
     is_slow, is_fast = fastest < _COMMAND_LIMITS[0], ratio > _COMMAND_LIMITS[1]
     if math.isnan(ratio) or not (is_slow or ratio > _PLAUSIBLE[1]):
@@ -136,7 +179,12 @@ def unit_of_command(
         return None
     if not units:
         remedies = [
-            "log `time_s` in seconds and positions in metres, or `measured_m_s` where the robot was immobilised"
+            "log `time_s` in seconds and positions in metres, or `measured_m_s` where "
+            "the robot was immobilised"
         ]
     remedy = " or ".join(remedies)
-    return ratio, " or ".join(units) or "no unit that is known", remedy[0].upper() + remedy[1:]
+    return (
+        ratio,
+        " or ".join(units) or "no unit that is known",
+        remedy[0].upper() + remedy[1:],
+    )

@@ -1,8 +1,8 @@
 """How the ground is cut into maps, described and checked before anything is read.
 
-The maps start at the south-west corner of the elevation model, around the drives, or where the user sets their origin.
-Pairs of metres here are northward and eastward, shape [2], from the south-west corner of the elevation model, unless
-they are called (x, y).
+The maps start at the south-west corner of the elevation model, around the drives, or
+where the user sets their origin. Pairs of metres here are northward and eastward, shape
+[2], from the south-west corner of the elevation model, unless they are called (x, y).
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -16,13 +16,24 @@ from benchnav.core.copula import LONGEST_CORRELATION
 from benchnav.core.errors import BenchnavError, ConfigError, DatasetError, expect
 from benchnav.core.grid import Grid
 from benchnav.datagen.dem.raster import GroundOptions, Raster, load_rasterio
-from benchnav.datagen.dem.tiling import SLACK, Shape, Tiling, cut, cut_around, fewest_cells
+from benchnav.datagen.dem.tiling import (
+    SLACK,
+    Shape,
+    Tiling,
+    cut,
+    cut_around,
+    fewest_cells,
+)
 from benchnav.datagen.layers.spec import overrides_of
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Fields
 
-MAX_RATIO = 3.0  # of a raster's cell to a map's, from which on maps show interpolation rather than ground
-MAX_RELIEF_M = 2048.0  # of a map; float32 holds the schema's steps of 2^-13 m up to here
+# of a raster's cell to a map's, from which on maps show interpolation rather than
+# ground
+MAX_RATIO = 3.0
+MAX_RELIEF_M = (
+    2048.0  # of a map; float32 holds the schema's steps of 2^-13 m up to here
+)
 _KERNEL_CELLS = 2.0  # that cubic convolution reaches to either side
 _MIN_SIDE = 8  # cells of a map that a correction may come down to
 
@@ -32,14 +43,21 @@ class GroundError(ConfigError):
 
     Args:
         problem: What does not fit, in a sentence, with the option that allows it.
-        changes: Recipe settings by key that mend it; empty where only `stride_m` or nothing does.
+        changes: Recipe settings by key that mend it; empty where only `stride_m` or
+            nothing does.
         stride_m: From one map to the next, where that has to change too.
     """
 
-    def __init__(self, problem: str, changes: Mapping[str, Any], stride_m: float | None) -> None:
+    def __init__(
+        self, problem: str, changes: Mapping[str, Any], stride_m: float | None
+    ) -> None:
         """Keep the parts, from which a command can be put together."""
         self.problem, self.changes, self.stride_m = problem, changes, stride_m
-        words = self.settings if stride_m is None else [*self.settings, f"stride_m={stride_m:.10g}"]
+        words = (
+            self.settings
+            if stride_m is None
+            else [*self.settings, f"stride_m={stride_m:.10g}"]
+        )
         super().__init__(self.advise(" ".join(words)) if words else problem)
 
     @property
@@ -77,8 +95,10 @@ class Extent:
         bounds: Of the elevation model in `crs`.
         cell_m: Size of its cells there.
         shares: Of the maps, by split.
-        origin_m: (x, y) of the south-west corner of the first map in `crs`; None for the default.
-        places_m: Where drives went, around which the ground is cut, shape [N, 2]; None for all of it.
+        origin_m: (x, y) of the south-west corner of the first map in `crs`; None for
+            the default.
+        places_m: Where drives went, around which the ground is cut, shape [N, 2]; None
+            for all of it.
     """
 
     raster: Raster
@@ -108,21 +128,25 @@ class Extent:
             stride: Cells from one map to the next, northward and eastward.
 
         Raises:
-            ConfigError: If the origin lies off the elevation model, or too far north-east on it.
+            ConfigError: If the origin lies off the elevation model, or too far
+                north-east on it.
             DatasetError: If the ground is too small.
         """
         step = grid.resolution_m
         start_m, end_m = np.zeros(2), self.size_m
         if self.places_m is not None:
             map_m, apart_m = np.multiply(grid.shape, step), np.multiply(stride, step)
-            start_m, end_m = cut_around(self.places_m, self.size_m, self.cell_m, map_m, apart_m)
+            start_m, end_m = cut_around(
+                self.places_m, self.size_m, self.cell_m, map_m, apart_m
+            )
             end_m = start_m + end_m
         if self.origin_m is not None:
             start_m = np.array(self.origin_m[::-1]) - self.corner_m
             west, south, east, north = (f"{value:.10g}" for value in self.bounds)
             expect(
                 ((start_m >= -SLACK * step) & (start_m < self.size_m)).all(),
-                f"`origin` on `dem`, x {west} to {east} and y {south} to {north} in {_name_of(self.crs)}, "
+                f"`origin` on `dem`, x {west} to {east} and y {south} to {north} in "
+                f"{_name_of(self.crs)}, "
                 f"got {list(self.origin_m)}.",
             )
             self._check_room(start_m, end_m, grid, stride)
@@ -132,18 +156,27 @@ class Extent:
         if np.less(cells, grid.shape).any():
             wide, high = grid.extent_m
             raise DatasetError(
-                f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {self.raster.name} of "
-                f"{self.size_m[1]:g} m × {self.size_m[0]:g} m. Take a larger raster or a recipe of smaller maps."
+                f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, "
+                f"got {self.raster.name} of "
+                f"{self.size_m[1]:g} m × {self.size_m[0]:g} m. Take a larger raster "
+                "or a recipe of smaller maps."
             )
         tiling = cut(cells, grid.shape, stride, self.shares)
-        # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
+        # What would be left over keeps the maps off the raster's edges, where
+        # interpolation lacks neighbours.
         reach_m *= self.origin_m is None
         return Laid(
-            tiling, start_m + np.clip((size_m - np.multiply(step, tiling.cells)) / 2, 0, reach_m), how
+            tiling,
+            start_m
+            + np.clip((size_m - np.multiply(step, tiling.cells)) / 2, 0, reach_m),
+            how,
         )
 
-    def _check_room(self, start_m: ndarray, end_m: ndarray, grid: Grid, stride: Shape) -> None:
-        """Reject an origin too far north-east for a map of each split, where another one leaves room for them.
+    def _check_room(
+        self, start_m: ndarray, end_m: ndarray, grid: Grid, stride: Shape
+    ) -> None:
+        """Reject an origin too far north-east for a map of each split, where another
+        one leaves room for them.
 
         Args:
             start_m: The origin.
@@ -173,17 +206,28 @@ class Extent:
                 if (corner_m >= -SLACK * step).all() and fits(corner_m):
                     wide, high = grid.extent_m
                     maps = "a map" if n_splits == 1 else f"maps of {n_splits} splits"
-                    end = "of `dem`" if self.places_m is None else "of the ground around the drives"
+                    end = (
+                        "of `dem`"
+                        if self.places_m is None
+                        else "of the ground around the drives"
+                    )
                     raise ConfigError(
-                        f"Expected `origin` from which {maps} of {wide:g} m × {high:g} m fit up to the "
-                        f"north-east corner {end}, got {list(self.origin_m or ())}. The largest that fits: "
+                        f"Expected `origin` from which {maps} of {wide:g} m × "
+                        f"{high:g} m fit up to the "
+                        f"north-east corner {end}, got {list(self.origin_m or ())}. "
+                        "The largest that fits: "
                         f"--origin '{_origin(self.corner_m + corner_m)}'"
                     )
 
     def _resample(self, step: float, start_m: ndarray) -> tuple[str, float]:
-        """Return how elevation is resampled on cells of a width, and how far that reaches."""
+        """Return how elevation is resampled on cells of a width, and how far that
+        reaches.
+        """
         offset = start_m / self.cell_m
-        is_same = np.allclose(self.cell_m, step, rtol=1e-9) and self.bounds == self.raster.file.bounds
+        is_same = (
+            np.allclose(self.cell_m, step, rtol=1e-9)
+            and self.bounds == self.raster.file.bounds
+        )
         if is_same and np.abs(offset - np.rint(offset)).max() < SLACK:
             return "nearest", 0.0
         if max(self.cell_m) <= step / 2 * (1 + 1e-9):
@@ -200,24 +244,34 @@ class Extent:
         """
         grid, tiling, file = recipe.grid, laid.tiling, self.raster.file
         n_bytes = tiling.maps * sum(
-            np.dtype(field.dtype).itemsize * int(np.prod(field.entry_shape(*grid.shape)))
+            np.dtype(field.dtype).itemsize
+            * int(np.prod(field.entry_shape(*grid.shape)))
             for field in fields.values()
         )
         high, wide = (f"{value:.4g}" for value in self.cell_m)
-        taken = {"nearest": "taken as they are", "average": "averaged", "cubic": "interpolated"}[laid.how]
+        taken = {
+            "nearest": "taken as they are",
+            "average": "averaged",
+            "cubic": "interpolated",
+        }[laid.how]
         gigabytes = f"{n_bytes / 1e9:,.2f}" if n_bytes >= 1e7 else "under 0.01"
         maps = f"{tiling.maps:,} map{'s' * (tiling.maps > 1)}"
         place = "set by `origin`" if self.origin_m else "set it by `origin`"
         return (
-            f"{self.raster.name}: {file.height} × {file.width} cells of {wide} m × {high} m on the ground, elevations "
-            f"in {self.unit}, {taken}. {maps} of {grid.height} × {grid.width} cells of "
-            f"{grid.resolution_m:g} m, one every {tiling.stride[1] * grid.resolution_m:g} m from the south-west corner "
-            f"{_origin(self.corner_m + laid.offset_m)} on ({place}), in {_name_of(self.crs)}; {gigabytes} GB before "
+            f"{self.raster.name}: {file.height} × {file.width} cells of {wide} m × "
+            f"{high} m on the ground, elevations "
+            f"in {self.unit}, {taken}. {maps} of {grid.height} × {grid.width} cells "
+            "of "
+            f"{grid.resolution_m:g} m, one every "
+            f"{tiling.stride[1] * grid.resolution_m:g} m from the south-west corner "
+            f"{_origin(self.corner_m + laid.offset_m)} on ({place}), in "
+            f"{_name_of(self.crs)}; {gigabytes} GB before "
             "compression."
         )
 
     def frame(self, laid: Laid, step: float) -> dict[str, Any]:
-        """Return where the cells of all maps and one around them lie, as `Raster.laid` takes it.
+        """Return where the cells of all maps and one around them lie, as `Raster.laid`
+        takes it.
 
         Args:
             laid: The maps.
@@ -226,18 +280,32 @@ class Extent:
         south_m, west_m = (self.corner_m + laid.offset_m).tolist()
         height, width = laid.tiling.cells
         north_m = south_m + (height + 1) * step
-        transform = load_rasterio().transform.from_origin(west_m - step, north_m, step, step)
-        return {"crs": self.crs, "transform": transform, "height": height + 2, "width": width + 2}
+        transform = load_rasterio().transform.from_origin(
+            west_m - step, north_m, step, step
+        )
+        return {
+            "crs": self.crs,
+            "transform": transform,
+            "height": height + 2,
+            "width": width + 2,
+        }
 
     def _has_maps(self, laid: Laid, step: float) -> bool:
-        """Return whether each split has a map whose elevation is whole; it reads until there is one."""
-        layer, without_map = self.raster.laid(self.frame(laid, step), [1], laid.how), set(self.shares)
+        """Return whether each split has a map whose elevation is whole; it reads until
+        there is one.
+        """
+        layer, without_map = (
+            self.raster.laid(self.frame(laid, step), [1], laid.how),
+            set(self.shares),
+        )
         (north, east), (height, width) = laid.tiling.stride, laid.tiling.shape
         with layer.warped:
             for run in laid.tiling.runs(1):
                 if run.split in without_map:
                     south, west = run.row * north, run.columns[0] * east
-                    heights_m = layer.read(range(south, south + height), range(west, west + width))
+                    heights_m = layer.read(
+                        range(south, south + height), range(west, west + width)
+                    )
                     if np.ptp(heights_m[:, 1:-1, 1:-1]) <= MAX_RELIEF_M:  # NaN is not
                         without_map.remove(run.split)
                 if not without_map:
@@ -247,7 +315,8 @@ class Extent:
     def suggest_origin(
         self, raster: Raster, laid: Laid, step: float, announce: Callable[[str], object]
     ) -> None:
-        """Announce an origin where another raster begins on the ground but off the corners of the maps.
+        """Announce an origin where another raster begins on the ground but off the
+        corners of the maps.
 
         Args:
             raster: Not the elevation model.
@@ -257,14 +326,19 @@ class Extent:
         """
         with raster.warped(self.crs) as warped:
             bounds = warped.bounds
-        if self.origin_m is not None or self.places_m is not None or bounds != raster.file.bounds:
+        if (
+            self.origin_m is not None
+            or self.places_m is not None
+            or bounds != raster.file.bounds
+        ):
             return
         start_m = np.array([bounds.bottom, bounds.left]) - self.corner_m
         is_on = ((start_m >= 0) & (start_m < self.size_m)).all()
         maps = (start_m - laid.offset_m) / np.multiply(laid.tiling.stride, step)
         if is_on and np.abs(maps - np.rint(maps)).max() > SLACK:
             announce(
-                f"`{raster.argument}` begins within a map. To begin the maps where it does, pass "
+                f"`{raster.argument}` begins within a map. To begin the maps where it "
+                "does, pass "
                 f"--origin '{_origin((bounds.bottom, bounds.left))}'"
             )
 
@@ -274,7 +348,8 @@ class Extent:
         Args:
             laid: The maps.
             recipe: Of the maps.
-            options: Most maps, and whether the elevation model may be much coarser than they are.
+            options: Most maps, and whether the elevation model may be much coarser than
+                they are.
 
         Raises:
             GroundError: If it does, with settings that do not.
@@ -286,34 +361,50 @@ class Extent:
         if not is_coarse and count <= max_maps:
             return
         problem = (
-            f"Expected cells of `dem` less than {MAX_RATIO:g} times as wide as the maps' {step:g} m, got "
-            f"{max(self.cell_m):.4g} m in {name}, which {count:,} maps would show as smooth ground. Pass --coarse to "
+            f"Expected cells of `dem` less than {MAX_RATIO:g} times as wide as the "
+            f"maps' {step:g} m, got "
+            f"{max(self.cell_m):.4g} m in {name}, which {count:,} maps would show as "
+            "smooth ground. Pass --coarse to "
             "allow it."
             if is_coarse
-            else f"Expected at most {max_maps:,} maps, got {count:,} on {name}. Pass --max-maps {count} to allow them."
+            else f"Expected at most {max_maps:,} maps, got {count:,} on {name}. Pass "
+            f"--max-maps {count} to allow them."
         )
-        raise GroundError(problem, *next(self._corrections(laid, recipe, max_maps, is_coarse), ({}, None)))
+        raise GroundError(
+            problem,
+            *next(self._corrections(laid, recipe, max_maps, is_coarse), ({}, None)),
+        )
 
     def _corrections(
         self, laid: Laid, recipe: Recipe, max_maps: int, is_coarse: bool
     ) -> Iterator[tuple[dict[str, Any], float | None]]:
-        """Yield recipe settings and a stride that fit, those nearest to the user's first."""
+        """Yield recipe settings and a stride that fit, those nearest to the user's
+        first.
+        """
         cell_m = float(max(self.cell_m))
         for divisor in (1, 2, 4) if is_coarse else (1,):
             for step in (cell_m, cell_m / 2) if is_coarse else (recipe.resolution_m,):
-                changes = _scaled(recipe, float(f"{step:.3g}"), divisor) if is_coarse else {}
+                changes = (
+                    _scaled(recipe, float(f"{step:.3g}"), divisor) if is_coarse else {}
+                )
                 try:
                     changed = replace(recipe, **changes)
-                    stride = tuple(max(1, cells // divisor) for cells in laid.tiling.stride)
+                    stride = tuple(
+                        max(1, cells // divisor) for cells in laid.tiling.stride
+                    )
                     fit, times = self.lay(changed.grid, stride), 1  # type: ignore[arg-type]
                     while fit.tiling.maps > max_maps:
                         times += max(1, int(np.sqrt(fit.tiling.maps / max_maps)) - 1)
-                        fit = self.lay(changed.grid, (stride[0] * times, stride[1] * times))
+                        fit = self.lay(
+                            changed.grid, (stride[0] * times, stride[1] * times)
+                        )
                     if not self._has_maps(fit, changed.resolution_m):
                         continue
                 except BenchnavError:
                     continue
-                is_default = times == 1 and np.equal(laid.tiling.stride, recipe.grid.shape).all()
+                is_default = (
+                    times == 1 and np.equal(laid.tiling.stride, recipe.grid.shape).all()
+                )
                 yield (
                     _plain(changes, recipe),
                     None if is_default else stride[1] * times * changed.resolution_m,
@@ -321,7 +412,8 @@ class Extent:
 
 
 def _scaled(recipe: Recipe, step: float, divisor: int) -> dict[str, Any]:
-    """Return fields of a recipe for another resolution, with start, goal and classes on the same part of a map.
+    """Return fields of a recipe for another resolution, with start, goal and classes on
+    the same part of a map.
 
     Args:
         recipe: Of the maps.
@@ -331,7 +423,10 @@ def _scaled(recipe: Recipe, step: float, divisor: int) -> dict[str, Any]:
     times = step / recipe.resolution_m / divisor
     changes: dict[str, Any] = {"resolution_m": step}
     if divisor > 1:
-        changes |= {name: max(_MIN_SIDE, getattr(recipe, name) // divisor) for name in ("height", "width")}
+        changes |= {
+            name: max(_MIN_SIDE, getattr(recipe, name) // divisor)
+            for name in ("height", "width")
+        }
 
     def scaled(value: float) -> float:
         return float(f"{value * times:.6g}")
@@ -343,7 +438,9 @@ def _scaled(recipe: Recipe, step: float, divisor: int) -> dict[str, Any]:
     for name in ("start_m", "goal_m"):
         if (position := getattr(recipe, name)) is not None:
             changes[name] = tuple(scaled(value) for value in position)
-    changes["class_periods_m"] = tuple(max(step, scaled(value)) for value in recipe.class_periods_m)
+    changes["class_periods_m"] = tuple(
+        max(step, scaled(value)) for value in recipe.class_periods_m
+    )
     changes["layers"] = tuple(spec.scaled(times, step) for spec in recipe.layers)
     extent_m = step * min(recipe.height // divisor, recipe.width // divisor)
     if recipe.correlation_m > LONGEST_CORRELATION * extent_m:
@@ -353,7 +450,10 @@ def _scaled(recipe: Recipe, step: float, divisor: int) -> dict[str, Any]:
 
 def _plain(changes: Mapping[str, Any], recipe: Recipe) -> dict[str, Any]:
     """Return changed fields of a recipe as its file has them."""
-    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in changes.items()}
+    plain = {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in changes.items()
+    }
     plain |= overrides_of(recipe.layers, plain.pop("layers", recipe.layers))
     if places := plain.pop("places", None):
         plain |= {f"places.{name}": value for name, value in vars(places).items()}
@@ -364,7 +464,13 @@ def _name_of(crs: Any) -> str:
     """Return the code of a CRS, or its name where it has none."""
     text, about = crs.to_string(), crs.to_dict(projjson=True)
     name = about.get("source_crs", about).get("name", "unknown")
-    return text if len(text) < 60 else "a CRS without a name" if name == "unknown" else str(name)
+    return (
+        text
+        if len(text) < 60
+        else "a CRS without a name"
+        if name == "unknown"
+        else str(name)
+    )
 
 
 def _whole_cells(size_m: ndarray, step: float) -> list[int]:
@@ -380,4 +486,8 @@ def _origin(corner_m: Iterable[float]) -> str:
 
 def _text(value: Any) -> str:
     """Return a number, or a list of numbers, as YAML."""
-    return f"[{','.join(map(_text, value))}]" if isinstance(value, list) else f"{value:.10g}"
+    return (
+        f"[{','.join(map(_text, value))}]"
+        if isinstance(value, list)
+        else f"{value:.10g}"
+    )

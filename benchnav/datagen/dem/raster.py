@@ -1,7 +1,9 @@
-"""Rasters by any name that GDAL opens, laid on the cells of the maps by GDAL's warper and read by windows.
+"""Rasters by any name that GDAL opens, laid on the cells of the maps by GDAL's warper
+and read by windows.
 
-rasterio is an extra of this package, imported when a raster is opened. A raster's rows run southward; what
-is read here runs northward, with y. Letters in shapes: K bands, H×W cells.
+rasterio is an extra of this package, imported when a raster is opened. A raster's rows
+run southward; what is read here runs northward, with y. Letters in shapes: K bands, H×W
+cells.
 """
 
 import json
@@ -18,7 +20,9 @@ from benchnav.core.touched import note_file
 from benchnav.datagen.dem.layer import LayerRaster, read_layer
 
 MAX_MAPS = 20_000  # of an import, unless more are allowed
-_MOST_STRETCH = 0.02  # of a projection against the ground; within a UTM zone it is at most 0.001
+_MOST_STRETCH = (
+    0.02  # of a projection against the ground; within a UTM zone it is at most 0.001
+)
 _PROBE_M = 10.0  # to either side of a place where the scale of a projection is measured
 _TOLERANCE = 0.01  # of a raster's cell that a place may be off by in another CRS
 
@@ -28,10 +32,14 @@ class GroundOptions:
     """How an elevation model is read and cut into maps.
 
     Args:
-        dem_unit: Unit of elevations: m, ft, us-ft, or metres in a unit; if empty, what the raster declares.
-        origin: Where the first map's south-west corner lies, [X,Y] in the coordinate reference system of the maps.
-        max_maps: Most maps; ground of more stops the import, with a command that makes fewer.
-        coarse: Allow an elevation model whose cells are three times as wide as the maps', or wider.
+        dem_unit: Unit of elevations: m, ft, us-ft, or metres in a unit; if empty, what
+            the raster declares.
+        origin: Where the first map's south-west corner lies, [X,Y] in the coordinate
+            reference system of the maps.
+        max_maps: Most maps; ground of more stops the import, with a command that makes
+            fewer.
+        coarse: Allow an elevation model whose cells are three times as wide as the
+            maps', or wider.
     """
 
     dem_unit: str = ""
@@ -52,7 +60,8 @@ class Cut:
         shares: of the maps, by split.
         scenario: which of the recipe's scenarios lights the maps.
         stride_m: from one map to the next; None for maps side by side.
-        solvable: keep only maps whose goal can be reached, and store the grid reference time.
+        solvable: keep only maps whose goal can be reached, and store the grid reference
+            time.
         ground: how the elevation model is read and cut.
     """
 
@@ -65,18 +74,24 @@ class Cut:
 
 @dataclass(frozen=True, kw_only=True)
 class Rasters:
-    """What there is of the ground beside its elevation. Where a raster does not cover it, maps are left out.
+    """What there is of the ground beside its elevation. Where a raster does not cover
+    it, maps are left out.
 
     A layer alone has to cover all maps; where it has no value, it is NaN.
 
     Args:
         classes: Raster of terrain classes; laid out at random when not given.
-        class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
-        random_classes: Allow a photo or measured traversability without classes: these are laid out at random.
-        unlabelled: Allow a photo and measured traversability without classes: no cell has one.
+        class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}',
+            null for no label; else indices.
+        random_classes: Allow a photo or measured traversability without classes: these
+            are laid out at random.
+        unlabelled: Allow a photo and measured traversability without classes: no cell
+            has one.
         photo: Raster of red, green and blue; painted by the class when not given.
-        traversability: Raster of measured traversability in [0, 1]; drawn by the class table when not given.
-        layer: A layer as NAME=RASTER or NAME=RASTER:UNIT, such as vegetation_m=canopy.tif; several as a list.
+        traversability: Raster of measured traversability in [0, 1]; drawn by the class
+            table when not given.
+        layer: A layer as NAME=RASTER or NAME=RASTER:UNIT, such as
+            vegetation_m=canopy.tif; several as a list.
     """
 
     classes: str = ""
@@ -93,17 +108,27 @@ class Rasters:
             self.classes or self.class_ids is None,
             "`classes` with `class_ids`, got none. Pass the raster they belong to.",
         )
-        expect(not (self.classes and self.random_classes), "either `classes` or `random_classes`, got both.")
         expect(
-            not self.unlabelled or (self.photo and not self.classes and not self.random_classes),
-            "`unlabelled` with `photo` and without classes, got otherwise: a cell without a class has the photo's "
+            not (self.classes and self.random_classes),
+            "either `classes` or `random_classes`, got both.",
+        )
+        expect(
+            not self.unlabelled
+            or (self.photo and not self.classes and not self.random_classes),
+            "`unlabelled` with `photo` and without classes, got otherwise: a cell "
+            "without a class has the photo's "
             "colour alone. Pass --photo RASTER, or --classes RASTER in place of it.",
         )
         for name in ("photo", "traversability"):
             expect(
-                not getattr(self, name) or self.classes or self.random_classes or self.unlabelled,
-                f"`classes` with `{name}`, got none: what is real would be joined to classes laid out at random. "
-                "Pass --classes RASTER, --unlabelled for models that need none, or --random-classes if that is what "
+                not getattr(self, name)
+                or self.classes
+                or self.random_classes
+                or self.unlabelled,
+                f"`classes` with `{name}`, got none: what is real would be joined to "
+                "classes laid out at random. "
+                "Pass --classes RASTER, --unlabelled for models that need none, or "
+                "--random-classes if that is what "
                 "you want.",
             )
         names = [layer.name for layer in self.layers]
@@ -117,7 +142,9 @@ class Rasters:
 
 
 class Raster(NamedTuple):
-    """An open raster: what the user calls it, its name, rasterio's reader, and metres per unit of its values."""
+    """An open raster: what the user calls it, its name, rasterio's reader, and metres
+    per unit of its values.
+    """
 
     argument: str
     name: str
@@ -130,7 +157,9 @@ class Raster(NamedTuple):
 
     @property
     def mask_kinds(self) -> set[str]:
-        """How it tells cells without a value, in GDAL's words; `all_valid` alone where it does not."""
+        """How it tells cells without a value, in GDAL's words; `all_valid` alone where
+        it does not.
+        """
         return {flag.name for flags in self.file.mask_flag_enums for flag in flags}
 
     @property
@@ -139,24 +168,29 @@ class Raster(NamedTuple):
         return self.mask_kinds != {"all_valid"}
 
     def place(self) -> tuple[Any, Any, tuple[float, float]]:
-        """Where it lies: a CRS in metres, its bounds there, and the size of its cells northward and eastward.
+        """Where it lies: a CRS in metres, its bounds there, and the size of its cells
+        northward and eastward.
 
-        The CRS is its own where a metre of that is one on the ground, all over the raster. Else it is that of
-        its UTM zone, and off the Earth a transverse Mercator projection of the raster's middle.
+        The CRS is its own where a metre of that is one on the ground, all over the
+        raster. Else it is that of its UTM zone, and off the Earth a transverse Mercator
+        projection of the raster's middle.
 
         Raises:
             DatasetError: there is none, as of ground that is too large.
         """
         own, bounds = horizontal(self.file.crs), self.file.bounds
         x, y = np.meshgrid(
-            np.linspace(bounds.left, bounds.right, 3), np.linspace(bounds.bottom, bounds.top, 3)
+            np.linspace(bounds.left, bounds.right, 3),
+            np.linspace(bounds.bottom, bounds.top, 3),
         )
         middle = x[1, 1], y[1, 1]
         local = local_crs(own, *middle)
         if local is None:
             raise DatasetError(
-                f"Expected `{self.argument}` in a CRS of the Earth or another body, got {own.to_string()[:80]} in "
-                f"{self.name}. If you know it, declare it: rio edit-info --crs EPSG:CODE {self.name}"
+                f"Expected `{self.argument}` in a CRS of the Earth or another body, "
+                f"got {own.to_string()[:80]} in "
+                f"{self.name}. If you know it, declare it: rio edit-info --crs "
+                f"EPSG:CODE {self.name}"
             )
         for crs in (own, _utm_of(own, *middle), local):
             if crs is not None and crs.is_projected and crs.linear_units_factor[1] == 1:
@@ -166,38 +200,55 @@ class Raster(NamedTuple):
                         return crs, warped.bounds, (warped.res[1], warped.res[0])
         wide, high = bounds.right - bounds.left, bounds.top - bounds.bottom
         raise DatasetError(
-            f"Expected `{self.argument}` of ground small enough for a map whose metres are metres on the ground, got "
+            f"Expected `{self.argument}` of ground small enough for a map whose "
+            "metres are metres on the ground, got "
             f"{self.name} of {wide:g} × {high:g} units of {own.to_string()[:80]}. "
-            f"Cut out a part: rio clip {self.name} part.tif --bounds 'WEST SOUTH EAST NORTH'"
+            f"Cut out a part: rio clip {self.name} part.tif --bounds 'WEST SOUTH EAST "
+            "NORTH'"
         )
 
     def warped(self, crs: Any, **settings: Any) -> Any:
-        """The raster in another CRS; where it has no values, that shows, if need be by one more band."""
-        if self.mask_kinds == {"all_valid"} and np.dtype(self.file.dtypes[0]).kind == "f":
+        """The raster in another CRS; where it has no values, that shows, if need be by
+        one more band.
+        """
+        if (
+            self.mask_kinds == {"all_valid"}
+            and np.dtype(self.file.dtypes[0]).kind == "f"
+        ):
             settings |= {"src_nodata": np.nan, "nodata": np.nan}
         elif not self.mask_kinds & {"nodata", "alpha"}:
             settings |= {"add_alpha": True}
         with _naming(self.argument, self.name):
             return load_rasterio().vrt.WarpedVRT(
-                self.file, src_crs=horizontal(self.file.crs), crs=crs, tolerance=_TOLERANCE, **settings
+                self.file,
+                src_crs=horizontal(self.file.crs),
+                crs=crs,
+                tolerance=_TOLERANCE,
+                **settings,
             )
 
     def laid(self, frame: Mapping[str, Any], bands: list[int], how: str) -> "Layer":
         """Lays bands of it on cells, resampled in one of GDAL's ways.
 
         Args:
-            frame: the cells of all maps and one around them: `crs`, `transform`, `height` and `width`.
+            frame: the cells of all maps and one around them: `crs`, `transform`,
+                `height` and `width`.
             bands: which bands.
             how: name of one of `rasterio.enums.Resampling`.
         """
         resampling = load_rasterio().enums.Resampling[how]
-        # Of whole numbers the means need not be whole; with transparency GDAL wants a photo's own type.
+        # Of whole numbers the means need not be whole; with transparency GDAL wants a
+        # photo's own type.
         dtype = "float64" if len(bands) == 1 else self.file.dtypes[0]
-        return Layer(self, bands, self.warped(**frame, resampling=resampling, dtype=dtype))
+        return Layer(
+            self, bands, self.warped(**frame, resampling=resampling, dtype=dtype)
+        )
 
 
 class Layer(NamedTuple):
-    """The first bands of a raster as resampled to the cells of all maps and one around them."""
+    """The first bands of a raster as resampled to the cells of all maps and one around
+    them.
+    """
 
     raster: Raster
     bands: list[int]
@@ -211,7 +262,8 @@ class Layer(NamedTuple):
             columns: counted eastward.
 
         Returns:
-            Values, NaN where there are none, float64, shape [K, len(rows) + 2, len(columns) + 2].
+            Values, NaN where there are none, float64, shape [K, len(rows) + 2,
+            len(columns) + 2].
         """
         file, warped = self.raster.file, self.warped
         top = warped.height - 2 - rows.stop
@@ -223,7 +275,9 @@ class Layer(NamedTuple):
             else:
                 mask = warped.dataset_mask(window=window)
         values[:, (mask == 0) | ~np.isfinite(values).all(axis=0)] = np.nan
-        scales, offsets = np.array([file.scales, file.offsets])[:, : len(values), None, None]
+        scales, offsets = np.array([file.scales, file.offsets])[
+            :, : len(values), None, None
+        ]
         return (values * scales + offsets)[:, ::-1] * self.raster.metres
 
 
@@ -237,7 +291,8 @@ def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Ra
         kinds: dtypes of its first bands; none for one band of any.
 
     Raises:
-        DatasetError: it cannot be read, holds other bands, or does not say where it lies.
+        DatasetError: it cannot be read, holds other bands, or does not say where it
+            lies.
     """
     # Rasterio warns of a missing place, which is an error below.
     with warnings.catch_warnings(action="ignore"), _naming(argument, name):
@@ -246,13 +301,16 @@ def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Ra
     with file:
         if file.crs is None:
             raise DatasetError(
-                f"Expected `{argument}` with a coordinate reference system (CRS), got {name} without one. "
+                f"Expected `{argument}` with a coordinate reference system (CRS), got "
+                f"{name} without one. "
                 f"If you know it, declare it: rio edit-info --crs EPSG:CODE {name}"
             )
         if file.transform.is_identity:
             raise DatasetError(
-                f"Expected `{argument}` with a geotransform, which says where it lies and how large its cells "
-                f"are, got {name} without one. If you know it: rio edit-info --transform "
+                f"Expected `{argument}` with a geotransform, which says where it lies "
+                "and how large its cells "
+                f"are, got {name} without one. If you know it: rio edit-info "
+                "--transform "
                 f"'[CELL, 0, WEST, 0, -CELL, NORTH]' {name}"
             )
         if not kinds and file.count != 1:
@@ -262,13 +320,16 @@ def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Ra
             )
         if not kinds and file.dtypes[0].startswith("complex"):
             raise DatasetError(
-                f"Expected real numbers in `{argument}`, got {file.dtypes[0]} in {name}. If the imaginary parts mean "
+                f"Expected real numbers in `{argument}`, got {file.dtypes[0]} in "
+                f"{name}. If the imaginary parts mean "
                 f"nothing, leave them out: rio convert --dtype float64 {name} real.tif"
             )
         if file.dtypes[: len(kinds)] != kinds:
             raise DatasetError(
-                f"Expected `{argument}` with first bands {', '.join(kinds)}, got {', '.join(file.dtypes)} in {name}. "
-                "Convert it: gdal_translate -expand rgb for a palette, rio convert --dtype uint8 --scale-ratio RATIO "
+                f"Expected `{argument}` with first bands {', '.join(kinds)}, got "
+                f"{', '.join(file.dtypes)} in {name}. "
+                "Convert it: gdal_translate -expand rgb for a palette, rio convert "
+                "--dtype uint8 --scale-ratio RATIO "
                 "for deeper numbers."
             )
         yield Raster(argument, name, file)
@@ -284,7 +345,8 @@ def _utm_of(crs: Any, x: float, y: float) -> Any:
 
 
 def local_crs(crs: Any, x: float, y: float) -> Any:
-    """A transverse Mercator projection of the same body and datum, true to scale at a place; None where it has none.
+    """A transverse Mercator projection of the same body and datum, true to scale at a
+    place; None where it has none.
 
     Args:
         crs: of the place, on any ellipsoid.
@@ -296,7 +358,9 @@ def local_crs(crs: Any, x: float, y: float) -> Any:
         base = inner
     if base["type"] not in ("GeographicCRS", "GeodeticCRS"):
         return None
-    longitude, latitude = transformed(crs, type(crs).from_user_input(json.dumps(base)), [x], [y])[:, 0]
+    longitude, latitude = transformed(
+        crs, type(crs).from_user_input(json.dumps(base)), [x], [y]
+    )[:, 0]
     if not np.isfinite(longitude + latitude):
         return None
     parameters = [
@@ -317,14 +381,19 @@ def local_crs(crs: Any, x: float, y: float) -> Any:
         "type": "ProjectedCRS",
         "name": f"Transverse Mercator at {latitude:.6f}, {longitude:.6f}",
         "base_crs": base,
-        "conversion": {"name": "local", "method": {"name": "Transverse Mercator"}, "parameters": parameters},
+        "conversion": {
+            "name": "local",
+            "method": {"name": "Transverse Mercator"},
+            "parameters": parameters,
+        },
         "coordinate_system": {"subtype": "Cartesian", "axis": axes},
     }
     return type(crs).from_user_input(json.dumps(local))
 
 
 def stretch(crs: Any, x: float, y: float) -> float:
-    """How far a metre of a projection in metres is from one on the ground at a place, in the worst direction.
+    """How far a metre of a projection in metres is from one on the ground at a place,
+    in the worst direction.
 
     Returns:
         |scale − 1|; infinite where the place is not on the ground.
@@ -341,7 +410,9 @@ def stretch(crs: Any, x: float, y: float) -> float:
 
 
 def transformed(crs: Any, to: Any, x: Any, y: Any) -> np.ndarray:
-    """Moves N places from one CRS to another, shape [2, N]; not finite where no way leads, as from another planet."""
+    """Moves N places from one CRS to another, shape [2, N]; not finite where no way
+    leads, as from another planet.
+    """
     try:
         return np.array(load_rasterio().warp.transform(crs, to, list(x), list(y)))
     except Exception:  # rasterio gives PROJ's failures no public class
@@ -351,7 +422,11 @@ def transformed(crs: Any, to: Any, x: Any, y: Any) -> np.ndarray:
 def horizontal(crs: Any) -> Any:
     """The part of a CRS that says where on the map, where another says how high."""
     whole = crs.to_dict(projjson=True)
-    return type(crs).from_user_input(json.dumps(whole["components"][0])) if "components" in whole else crs
+    return (
+        type(crs).from_user_input(json.dumps(whole["components"][0]))
+        if "components" in whole
+        else crs
+    )
 
 
 @contextmanager
@@ -362,7 +437,8 @@ def _naming(argument: str, name: str) -> Iterator[None]:
     except load_rasterio().errors.RasterioError as error:
         reason = " ".join(str(error.__cause__ or error).split())
         raise DatasetError(
-            f"Expected `{argument}` as a raster that GDAL can read, got {name}: {reason}"
+            f"Expected `{argument}` as a raster that GDAL can read, got {name}: "
+            f"{reason}"
         ) from error
 
 
@@ -377,6 +453,7 @@ def load_rasterio() -> Any:
         import rasterio.warp
     except ImportError as error:
         raise ConfigError(
-            f"Expected rasterio, which reads rasters, got: {error}. Install it: pip install 'benchnav[geo]'"
+            f"Expected rasterio, which reads rasters, got: {error}. Install it: pip "
+            "install 'benchnav[geo]'"
         ) from error
     return rasterio

@@ -1,9 +1,10 @@
 """How ground is cut into maps, and which of them belong to which split.
 
-Maps are cut from the ground's south-west corner on, a stride apart, and are numbered row by row, northward,
-each row eastward. Splits take strips across the longer side of the ground, one each, in the order given.
-Between two strips lies ground of at least a map's width that no map shows, so that maps of different splits
-neither overlap nor touch.
+Maps are cut from the ground's south-west corner on, a stride apart, and are numbered
+row by row, northward, each row eastward. Splits take strips across the longer side of
+the ground, one each, in the order given. Between two strips lies ground of at least a
+map's width that no map shows, so that maps of different splits neither overlap nor
+touch.
 """
 
 import math
@@ -36,7 +37,8 @@ class Tiling(NamedTuple):
         shape: cells of a map, (H, W).
         stride: cells from one map to the next, northward and eastward.
         tiles: rows and columns of maps.
-        strips: by split the rows of maps that it takes, or the columns where there are as many or more.
+        strips: by split the rows of maps that it takes, or the columns where there are
+            as many or more.
     """
 
     shape: Shape
@@ -68,8 +70,9 @@ class Tiling(NamedTuple):
         Returns:
             For each the least number of a map of its group, int64, shape of `numbers`.
         """
-        # A map is drawn on every second place of a lattice as a block that reaches to the last map that it overlaps.
-        # So blocks share a place just where maps overlap, and never touch where they do not.
+        # A map is drawn on every second place of a lattice as a block that reaches to
+        # the last map that it overlaps. So blocks share a place just where maps
+        # overlap, and never touch where they do not.
         reach = 2 * np.ceil(np.divide(self.shape, self.stride)).astype(int) - 2
         own = np.asarray(numbers, dtype=np.int64)
         corners = tuple(2 * place for place in np.divmod(own, self.tiles[1]))
@@ -83,7 +86,8 @@ class Tiling(NamedTuple):
         return own[firsts][inverse]
 
     def split_of(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Which split's maps show cells: index into `strips`, −1 where none do, int64, shape of `row`.
+        """Which split's maps show cells: index into `strips`, −1 where none do, int64,
+        shape of `row`.
 
         Args:
             row: of the cells, counted northward.
@@ -98,7 +102,9 @@ class Tiling(NamedTuple):
                 (strip.stop - 1) * self.stride[side] + self.shape[side],
             )
             split[(along >= first) & (along < last)] = place
-        for cell, count, stride, size in zip((row, column), self.cells, self.stride, self.shape, strict=True):
+        for cell, count, stride, size in zip(
+            (row, column), self.cells, self.stride, self.shape, strict=True
+        ):
             split[(cell < 0) | (cell >= count) | (cell % stride >= size)] = -1
         return split
 
@@ -112,12 +118,16 @@ class Tiling(NamedTuple):
         rows, columns = self.tiles
         for row in range(rows):
             for split, strip in self.strips.items():
-                own = strip if rows <= columns else range(columns if row in strip else 0)
+                own = (
+                    strip if rows <= columns else range(columns if row in strip else 0)
+                )
                 for first in range(own.start, own.stop, most):
                     yield Run(split, row, range(first, min(first + most, own.stop)))
 
 
-def cut(cells: Sequence[int], shape: Shape, stride: Shape, shares: Mapping[str, float]) -> Tiling:
+def cut(
+    cells: Sequence[int], shape: Shape, stride: Shape, shares: Mapping[str, float]
+) -> Tiling:
     """Cuts ground into maps and splits.
 
     Args:
@@ -135,13 +145,16 @@ def cut(cells: Sequence[int], shape: Shape, stride: Shape, shares: Mapping[str, 
     usable = lines - gap * (len(shares) - 1)
     if usable < len(shares):
         raise DatasetError(
-            f"Expected ground for {len(shares)} splits with a map's width between them, got {lines} maps along its "
+            f"Expected ground for {len(shares)} splits with a map's width between "
+            f"them, got {lines} maps along its "
             "longer side. Take fewer splits, smaller maps or larger ground."
         )
     ends = [0]
     for place, total in enumerate(accumulate(shares.values()), start=1):
         # Every split gets a strip, however small its share.
-        ends.append(min(max(round(total * usable), ends[-1] + 1), usable - len(shares) + place))
+        ends.append(
+            min(max(round(total * usable), ends[-1] + 1), usable - len(shares) + place)
+        )
     strips = {
         split: range(ends[place] + place * gap, ends[place + 1] + place * gap)
         for place, split in enumerate(shares)
@@ -150,7 +163,8 @@ def cut(cells: Sequence[int], shape: Shape, stride: Shape, shares: Mapping[str, 
 
 
 def fewest_cells(shape: Shape, stride: Shape, splits: int) -> list[Shape]:
-    """Return the cells of the smallest grounds for some splits, northward and eastward, each way that strips can lie.
+    """Return the cells of the smallest grounds for some splits, northward and eastward,
+    each way that strips can lie.
 
     Args:
         shape: cells of a map, (H, W).
@@ -171,12 +185,18 @@ def _gap(shape: Shape, stride: Shape, side: int) -> int:
 
 
 def cut_around(
-    places_m: np.ndarray, whole_m: np.ndarray, cell_m: np.ndarray, shape_m: np.ndarray, stride_m: np.ndarray
+    places_m: np.ndarray,
+    whole_m: np.ndarray,
+    cell_m: np.ndarray,
+    shape_m: np.ndarray,
+    stride_m: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cuts ground of whole maps around places, from an edge between cells of the raster on, where there is room.
+    """Cuts ground of whole maps around places, from an edge between cells of the raster
+    on, where there is room.
 
     Args:
-        places_m: northward and eastward from the raster's south-west corner, shape [N, 2].
+        places_m: northward and eastward from the raster's south-west corner, shape [N,
+            2].
         whole_m: size of the raster; as what follows northward and eastward, shape [2].
         cell_m: size of its cells.
         shape_m: size of a map.
@@ -194,7 +214,8 @@ def cut_around(
 
 
 def read_shares(text: str) -> dict[str, float]:
-    """Reads splits and their shares of the maps, such as `train:0.7,valid:0.1,test/site:0.2`.
+    """Reads splits and their shares of the maps, such as
+    `train:0.7,valid:0.1,test/site:0.2`.
 
     Raises:
         ConfigError: it is not of that form, or the shares do not sum to 1.
@@ -208,10 +229,14 @@ def read_shares(text: str) -> dict[str, float]:
             value = math.nan
         expect(
             name and name not in shares and 0 < value <= 1,
-            "`splits` such as train:0.7,valid:0.1,test/site:0.2, each name once and each share above 0, "
+            "`splits` such as train:0.7,valid:0.1,test/site:0.2, each name once and "
+            "each share above 0, "
             f"got {part.strip()!r} in {text!r}.",
         )
         shares[name] = value
     total = sum(shares.values())
-    expect(abs(total - 1) < 1e-6, f"the shares of `splits` to sum to 1, got {total:g} in {text!r}.")
+    expect(
+        abs(total - 1) < 1e-6,
+        f"the shares of `splits` to sum to 1, got {total:g} in {text!r}.",
+    )
     return shares

@@ -10,7 +10,15 @@ UNITS_M = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}  # by the names of PROJ
 _SPELLINGS = {
     "m": ("m", "metre", "meter", "metres", "meters"),
     "ft": ("ft", "foot", "feet", "international foot", "international feet"),
-    "us-ft": ("us-ft", "ftus", "us survey foot", "us survey feet", "us_survey_foot", "foot_us", "us foot"),
+    "us-ft": (
+        "us-ft",
+        "ftus",
+        "us survey foot",
+        "us survey feet",
+        "us_survey_foot",
+        "foot_us",
+        "us foot",
+    ),
     "0.1": ("dm", "decimetre", "decimeter", "decimetres", "decimeters"),
     "0.01": ("cm", "centimetre", "centimeter", "centimetres", "centimeters"),
     "0.001": ("mm", "millimetre", "millimeter", "millimetres", "millimeters"),
@@ -25,7 +33,8 @@ def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
 
     Args:
         dem: Elevation model, one band.
-        unit: A name of `UNITS_M`, or metres in a unit as text; if empty, what the raster declares.
+        unit: A name of `UNITS_M`, or metres in a unit as text; if empty, what the
+            raster declares.
 
     Raises:
         ConfigError: If the unit is neither.
@@ -39,7 +48,8 @@ def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
             metres = np.nan
         expect(
             0 < metres < np.inf,
-            f"`dem_unit` among {', '.join(UNITS_M)}, or as metres in a unit, such as 0.01, got {unit!r}.",
+            f"`dem_unit` among {', '.join(UNITS_M)}, or as metres in a unit, such as "
+            f"0.01, got {unit!r}.",
         )
         instead = f", where the raster declares {declared!r}" if declared else ""
         return dem._replace(metres=metres), f"{unit} as set by `dem_unit`{instead}"
@@ -47,15 +57,22 @@ def in_unit(dem: Raster, unit: str) -> tuple[Raster, str]:
     if name == "m":
         return dem, "metres as the raster declares"
     if declared:
-        option = f"--dem-unit {name}" if name else "--dem-unit with the metres in one, such as 0.01"
+        option = (
+            f"--dem-unit {name}"
+            if name
+            else "--dem-unit with the metres in one, such as 0.01"
+        )
         raise DatasetError(
-            f"Expected elevations of `dem` in metres, got {declared!r} in {dem.name}. To convert them, pass {option}; "
+            f"Expected elevations of `dem` in metres, got {declared!r} in {dem.name}. "
+            f"To convert them, pass {option}; "
             "if they are metres all the same, pass --dem-unit m."
         )
     if crs.is_projected and crs.linear_units_factor[1] != 1:
         raise DatasetError(
-            f"Expected a unit of the elevations of `dem`, since {dem.name} is in {crs.linear_units_factor[0]} and "
-            "declares none, got none declared. Pass --dem-unit us-ft, --dem-unit ft or --dem-unit m, whichever it is."
+            f"Expected a unit of the elevations of `dem`, since {dem.name} is in "
+            f"{crs.linear_units_factor[0]} and "
+            "declares none, got none declared. Pass --dem-unit us-ft, --dem-unit ft "
+            "or --dem-unit m, whichever it is."
         )
     return dem, "metres (the raster declares no unit: if others, set `dem_unit`)"
 
@@ -72,11 +89,16 @@ def check_metres(raster: Raster) -> None:
         return
     factor = f"{UNITS_M.get(name) or float(name):.10g}" if name else "METRES"
     unmasked = "" if raster.declares_missing else "--not-masked "
-    convert = f"rio calc {unmasked}-t float32 '(* {factor} (read 1))' {raster.name} metres.tif"
+    convert = (
+        f"rio calc {unmasked}-t float32 '(* {factor} (read 1))' {raster.name} "
+        "metres.tif"
+    )
     relabel = f"rio edit-info --bidx 1 --units m {raster.name}"
     raise DatasetError(
-        f"Expected `{raster.argument}` in metres, got {declared!r} in {raster.name}. If they are metres all the same, "
-        f"declare it: {relabel}. Else convert them{'' if name else ', METRES being those in one'}: {convert}"
+        f"Expected `{raster.argument}` in metres, got {declared!r} in {raster.name}. "
+        "If they are metres all the same, "
+        f"declare it: {relabel}. Else convert "
+        f"them{'' if name else ', METRES being those in one'}: {convert}"
     )
 
 

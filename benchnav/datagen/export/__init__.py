@@ -1,1 +1,3 @@
-"""Datasets in forms that are read without this package: Parquet with Croissant metadata."""
+"""Datasets in forms that are read without this package: Parquet with Croissant
+metadata.
+"""

@@ -19,10 +19,20 @@ import yaml
 from benchnav.core.errors import ConfigError, check_label, choose, expect
 from benchnav.core.sources import digest_of_path
 from benchnav.core.store import building, take_place
-from benchnav.datagen.export.parquet import FOLDER, MAP, columns_of, split_names, write_split
+from benchnav.datagen.export.parquet import (
+    FOLDER,
+    MAP,
+    columns_of,
+    split_names,
+    write_split,
+)
 from benchnav.datagen.files.hdf5 import held
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict, shipped_recipes
+from benchnav.datagen.recipe.recipe import (
+    load_recipe,
+    recipe_from_dict,
+    shipped_recipes,
+)
 
 METADATA = "croissant.json"
 CARD = "README.md"
@@ -42,8 +52,10 @@ Node = dict[str, Any]  # of JSON-LD
 
 # The context that readers of version 1.0 look for, whether or not a term is used.
 _OWN_TERMS = (
-    "citeAs column extract field fileProperty fileObject fileSet format includes isLiveDataset jsonPath key md5 "
-    "parentField path recordSet references regex repeated replace samplingRate separator source subField transform "
+    "citeAs column extract field fileProperty fileObject fileSet format includes "
+    "isLiveDataset jsonPath key md5 "
+    "parentField path recordSet references regex repeated replace samplingRate "
+    "separator source subField transform "
     "equivalentProperty"
 )
 _CONTEXT: Node = {
@@ -79,7 +91,10 @@ class Publication:
 
     def __post_init__(self) -> None:
         """Checks what programs read."""
-        from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
+        from packaging.licenses import (
+            InvalidLicenseExpression,
+            canonicalize_license_expression,
+        )
 
         for name in ("license", "creator"):
             check_label(f"`{name}`", getattr(self, name))
@@ -88,16 +103,24 @@ class Publication:
         except InvalidLicenseExpression:
             listed = ""
         near = f" Did you mean {listed!r}?" if listed not in ("", self.license) else ""
-        is_listed = listed == self.license and re.fullmatch(r"(?!LicenseRef-)[A-Za-z0-9.+-]+", listed)
+        is_listed = listed == self.license and re.fullmatch(
+            r"(?!LicenseRef-)[A-Za-z0-9.+-]+", listed
+        )
         expect(
             self.is_url or is_listed,
-            f"`license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got {self.license!r}.{near}",
+            "`license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got "
+            f"{self.license!r}.{near}",
         )
-        expect(_URL.fullmatch(self.url) or not self.url, f"`url` to begin with https://, got {self.url!r}.")
+        expect(
+            _URL.fullmatch(self.url) or not self.url,
+            f"`url` to begin with https://, got {self.url!r}.",
+        )
         try:
             datetime.date.fromisoformat(self.date or "2024-05-21")
         except ValueError as error:
-            raise ConfigError(f"Expected `date` as YYYY-MM-DD, got {self.date!r}.") from error
+            raise ConfigError(
+                f"Expected `date` as YYYY-MM-DD, got {self.date!r}."
+            ) from error
 
     @property
     def is_url(self) -> bool:
@@ -107,7 +130,11 @@ class Publication:
     @property
     def license_url(self) -> str:
         """Where the licence is to be read."""
-        return self.license if self.is_url else f"https://spdx.org/licenses/{self.license}.html"
+        return (
+            self.license
+            if self.is_url
+            else f"https://spdx.org/licenses/{self.license}.html"
+        )
 
 
 def export(
@@ -119,7 +146,8 @@ def export(
     maps_a_file: int = 0,
     overwrite: bool = False,
 ) -> Iterator[tuple[int, int]]:
-    """Exports a dataset, yielding (maps done, maps in all) as it goes; to be iterated to the end.
+    """Exports a dataset, yielding (maps done, maps in all) as it goes; to be iterated
+    to the end.
 
     Args:
         dataset: what to export.
@@ -127,7 +155,8 @@ def export(
         publication: licence, creator, place and date; without a date that of today.
         splits: which splits, in the dataset's order; None for all.
         fields: which of its fields, in their order; None for all.
-        maps_a_file: most maps of a file; 0 for as many as make a file of a few hundred MB at most.
+        maps_a_file: most maps of a file; 0 for as many as make a file of a few hundred
+            MB at most.
         overwrite: replace an exported dataset that is there.
 
     Raises:
@@ -143,11 +172,15 @@ def export(
         (folder / FOLDER).mkdir()
         yield done, total
         for split, name in names.items():
-            for maps in write_split(folder / FOLDER, name, dataset, split, columns, maps_a_file):
+            for maps in write_split(
+                folder / FOLDER, name, dataset, split, columns, maps_a_file
+            ):
                 done += maps
                 yield done, total
         about = metadata(dataset, names, columns, publication, folder)
-        (folder / METADATA).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n")
+        (folder / METADATA).write_text(
+            json.dumps(about, indent=1, ensure_ascii=False) + "\n"
+        )
         (folder / CARD).write_text(card(dataset, names, publication))
         take_place(folder, out)
 
@@ -157,17 +190,28 @@ def _foreign(out: Path) -> str:
 
 
 def is_ours(dataset: TerrainDataset, splits: Iterable[str]) -> bool:
-    """Whether all maps of some splits were made by shipped recipes as they are, but for their seed and splits."""
-    used = {part.get("recipe") for split in splits for part in dataset.splits[split]["parts"]}
+    """Whether all maps of some splits were made by shipped recipes as they are, but for
+    their seed and splits.
+    """
+    used = {
+        part.get("recipe")
+        for split in splits
+        for part in dataset.splits[split]["parts"]
+    }
     if None in used:  # some were imported
         return False
     for number in used:
-        recipe = recipe_from_dict(dataset.manifest["recipes"][number], f"in {dataset.path}")
+        recipe = recipe_from_dict(
+            dataset.manifest["recipes"][number], f"in {dataset.path}"
+        )
         shipped_id = recipe.id.removesuffix(f"-seed{recipe.seed}")
         if shipped_id not in shipped_recipes():
             return False
         shipped = load_recipe(shipped_id)
-        if replace(recipe, id=shipped.id, seed=shipped.seed, splits=shipped.splits) != shipped:
+        if (
+            replace(recipe, id=shipped.id, seed=shipped.seed, splits=shipped.splits)
+            != shipped
+        ):
             return False
     return True
 
@@ -177,17 +221,32 @@ def describe(dataset: TerrainDataset, splits: Collection[str]) -> str:
     grid, maps = dataset.grid, sum(dataset.map_count(split) for split in splits)
     generator = dataset.manifest["generator"]
     parts = [part for split in splits for part in dataset.splits[split]["parts"]]
-    recipes = [dataset.manifest["recipes"][part["recipe"]] for part in parts if "recipe" in part]
-    origins = sorted({f"recipe {recipe['id']}, seed {recipe['seed']}" for recipe in recipes})
-    origins += sorted({f"file {part['source']['file']}" for part in parts if "source" in part})
+    recipes = [
+        dataset.manifest["recipes"][part["recipe"]]
+        for part in parts
+        if "recipe" in part
+    ]
+    origins = sorted(
+        {f"recipe {recipe['id']}, seed {recipe['seed']}" for recipe in recipes}
+    )
+    origins += sorted(
+        {f"file {part['source']['file']}" for part in parts if "source" in part}
+    )
     units = {name: dataset.fields[name].unit for name in dataset.layer_names}
-    layers = [name if unit == "1" else f"{name} [{unit}]" for name, unit in units.items()]
-    with_layers = f"; layers {', '.join(layers)}, NaN where nothing is known" if layers else ""
+    layers = [
+        name if unit == "1" else f"{name} [{unit}]" for name, unit in units.items()
+    ]
+    with_layers = (
+        f"; layers {', '.join(layers)}, NaN where nothing is known" if layers else ""
+    )
     return (
-        f"{maps} maps of off-road terrain, {grid.height} × {grid.width} cells of {grid.resolution_m:g} m: colour "
-        "image, terrain class, elevation, slope, and traversability in [0, 1], of which higher is better; with start, "
+        f"{maps} maps of off-road terrain, {grid.height} × {grid.width} cells of "
+        f"{grid.resolution_m:g} m: colour "
+        "image, terrain class, elevation, slope, and traversability in [0, 1], of "
+        "which higher is better; with start, "
         f"goal and reference time{with_layers}. "
-        f"Written by {generator['package']} {generator['version']} from {'; '.join(origins)}."
+        f"Written by {generator['package']} {generator['version']} from "
+        f"{'; '.join(origins)}."
     )
 
 
@@ -207,7 +266,9 @@ def metadata(
         publication: licence, creator, place and date.
         folder: where the files are.
     """
-    content = hashlib.sha256(",".join(dataset.splits[split]["digest"] for split in names).encode())
+    content = hashlib.sha256(
+        ",".join(dataset.splits[split]["digest"] for split in names).encode()
+    )
     found = re.search(r"-v(\d+)", dataset.id)
     return {
         "@context": _CONTEXT,
@@ -218,11 +279,14 @@ def metadata(
         "license": publication.license_url,
         "creator": {"@type": "sc:Organization", "name": publication.creator},
         "url": publication.url or f"urn:sha256:{content.hexdigest()}",
-        "datePublished": publication.date or datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "datePublished": publication.date
+        or datetime.datetime.now(datetime.UTC).date().isoformat(),
         **({"version": f"{found[1]}.0.0"} if found else {}),
         "keywords": ["robotics", "off-road navigation", "traversability", "terrain"],
         **({"citeAs": PAPER} if is_ours(dataset, names) else {}),
-        "distribution": [item for name in names.values() for item in _distribution(name, folder)],
+        "distribution": [
+            item for name in names.values() for item in _distribution(name, folder)
+        ],
         "recordSet": [
             _classes(dataset),
             *(_maps(dataset, split, name, fields) for split, name in names.items()),
@@ -232,7 +296,12 @@ def metadata(
 
 def _node(kind: str, node_id: str, **about: Any) -> Node:
     """A node of Croissant's own, named by the last part of its id."""
-    return {"@type": f"cr:{kind}", "@id": node_id, "name": node_id.rpartition("/")[2], **about}
+    return {
+        "@type": f"cr:{kind}",
+        "@id": node_id,
+        "name": node_id.rpartition("/")[2],
+        **about,
+    }
 
 
 def _distribution(name: str, folder: Path) -> Iterator[Node]:
@@ -247,10 +316,17 @@ def _distribution(name: str, folder: Path) -> Iterator[Node]:
             encodingFormat="application/x-parquet",
             sha256=digest_of_path(path),
         )
-    yield _node("FileSet", f"{name}-files", encodingFormat="application/x-parquet", includes=pattern)
+    yield _node(
+        "FileSet",
+        f"{name}-files",
+        encodingFormat="application/x-parquet",
+        includes=pattern,
+    )
 
 
-def _maps(dataset: TerrainDataset, split: str, name: str, fields: Sequence[str]) -> Node:
+def _maps(
+    dataset: TerrainDataset, split: str, name: str, fields: Sequence[str]
+) -> Node:
     """The rows of a split, and what its columns are."""
     columns = []
     for of, field in columns_of(dataset, fields).items():
@@ -265,7 +341,9 @@ def _maps(dataset: TerrainDataset, split: str, name: str, fields: Sequence[str])
         }
         columns.append(_node("Field", f"{name}/{of}", **about))
     entry = dataset.splits[split]
-    description = f"Split {split}: {entry['maps']} maps of scenario {entry['scenario']}."
+    description = (
+        f"Split {split}: {entry['maps']} maps of scenario {entry['scenario']}."
+    )
     key = {"@id": f"{name}/{MAP}"}
     return _node("RecordSet", name, description=description, key=key, field=columns)
 
@@ -281,20 +359,35 @@ def _classes(dataset: TerrainDataset) -> Node:
         for layer in filter(None, layers):
             row |= layer.class_columns(item.name)
         rows.append({f"classes/{key}": value for key, value in row.items()})
-    kinds = {key: "sc:Text" if isinstance(value, str) else "sc:Float" for key, value in rows[0].items()}
+    kinds = {
+        key: "sc:Text" if isinstance(value, str) else "sc:Float"
+        for key, value in rows[0].items()
+    }
     kinds["classes/id"] = "sc:Integer"
     fields = [_node("Field", key, dataType=kind) for key, kind in kinds.items()]
     meaning = (
-        "Terrain classes. At a slope of ψ degrees traversability is normal with mean 1 − (scale·10⁻³·ψ^exponent + "
-        "offset), clipped to [0, 1], and standard deviation noise; with probability soft_weight it is normal with "
+        "Terrain classes. At a slope of ψ degrees traversability is normal with mean "
+        "1 − (scale·10⁻³·ψ^exponent + "
+        "offset), clipped to [0, 1], and standard deviation noise; with probability "
+        "soft_weight it is normal with "
         "soft_mean and soft_std instead. It is clipped to [0, 1]."
     )
     identity = {"@id": "classes/id"}
-    return _node("RecordSet", "classes", description=meaning, key=identity, field=fields, data=rows)
+    return _node(
+        "RecordSet",
+        "classes",
+        description=meaning,
+        key=identity,
+        field=fields,
+        data=rows,
+    )
 
 
-def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publication) -> str:
-    """Writes the card of the exported dataset: Markdown, with what hubs read at its head.
+def card(
+    dataset: TerrainDataset, names: Mapping[str, str], publication: Publication
+) -> str:
+    """Writes the card of the exported dataset: Markdown, with what hubs read at its
+    head.
 
     Args:
         dataset: what was exported.
@@ -303,7 +396,10 @@ def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publica
     """
     ours = is_ours(dataset, names)
     title = f"BenchNav {dataset.id}" if ours else dataset.id
-    files = [{"split": name, "path": f"{FOLDER}/{name}-*-of-*.parquet"} for name in names.values()]
+    files = [
+        {"split": name, "path": f"{FOLDER}/{name}-*-of-*.parquet"}
+        for name in names.values()
+    ]
     head = {
         "pretty_name": title,
         "license": "other" if publication.is_url else publication.license.lower(),
@@ -312,7 +408,8 @@ def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publica
         "configs": [{"config_name": "default", "data_files": files}],
     }
     rows = [
-        f"| `{name}` | `{split}` | {dataset.map_count(split)} | `{dataset.splits[split]['digest']}` |"
+        f"| `{name}` | `{split}` | {dataset.map_count(split)} | "
+        f"`{dataset.splits[split]['digest']}` |"
         for split, name in names.items()
     ]
     return "\n".join(
@@ -320,9 +417,12 @@ def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publica
             f"---\n{yaml.safe_dump(head, sort_keys=False, allow_unicode=True)}---\n",
             f"# {title}\n",
             f"{describe(dataset, names)}\n",
-            f"A row is a map; arrays are nested lists. `{METADATA}` describes the columns and holds the SHA-256 of",
-            "each file. The metadata of each Parquet file holds the recipes that make the maps again.\n",
-            "| split here | split of the dataset | maps | digest of the dataset's maps |\n|---|---|---|---|",
+            f"A row is a map; arrays are nested lists. `{METADATA}` describes the "
+            "columns and holds the SHA-256 of",
+            "each file. The metadata of each Parquet file holds the recipes that make "
+            "the maps again.\n",
+            "| split here | split of the dataset | maps | digest of the dataset's "
+            "maps |\n|---|---|---|---|",
             *rows,
             f"\nLicence: [{publication.license}]({publication.license_url}).\n",
             *([f"```bibtex\n{PAPER}\n```\n"] if ours else []),

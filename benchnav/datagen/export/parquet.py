@@ -1,7 +1,9 @@
-"""Maps as rows of Parquet files: a column a field, arrays as nested lists of fixed size.
+"""Maps as rows of Parquet files: a column a field, arrays as nested lists of fixed
+size.
 
-Any reader of Parquet takes them. The values are those of the dataset, bit for bit; NaN stays NaN and nothing is
-null. The first column, `map`, is the number of the map in its split. Letters in shapes: B maps.
+Any reader of Parquet takes them. The values are those of the dataset, bit for bit; NaN
+stays NaN and nothing is null. The first column, `map`, is the number of the map in its
+split. Letters in shapes: B maps.
 """
 
 import json
@@ -25,7 +27,8 @@ _CELLS_A_ROW_GROUP = 2**20
 
 
 def split_names(splits: Iterable[str]) -> dict[str, str]:
-    """Gives splits names that readers allow, of letters, digits and `_`: `test/std` is `test_std`.
+    """Gives splits names that readers allow, of letters, digits and `_`: `test/std` is
+    `test_std`.
 
     Raises:
         DatasetError: two of them would have one name.
@@ -35,20 +38,28 @@ def split_names(splits: Iterable[str]) -> dict[str, str]:
         alike = [other for other in names if names[other] == name]
         if len(alike) > 1:
             raise DatasetError(
-                f"Expected splits that differ in letters and digits, got {' and '.join(alike)}, both {name!r} "
+                "Expected splits that differ in letters and digits, got "
+                f"{' and '.join(alike)}, both {name!r} "
                 f"in Parquet. Export them apart, with `splits` [{split}]."
             )
     return names
 
 
-def columns_of(dataset: TerrainDataset, fields: Iterable[str]) -> dict[str, schema.Field]:
+def columns_of(
+    dataset: TerrainDataset, fields: Iterable[str]
+) -> dict[str, schema.Field]:
     """The columns of a split: the number of the map, and some of the dataset's fields."""
-    columns = {MAP: schema.Field("<i8", (), "1", 0, np.inf, "number of the map in its split")}
+    columns = {
+        MAP: schema.Field("<i8", (), "1", 0, np.inf, "number of the map in its split")
+    }
     return columns | {name: dataset.fields[name] for name in fields}
 
 
-def table_schema(dataset: TerrainDataset, split: str, fields: Sequence[str]) -> pa.Schema:
-    """The columns of a split, with shape, unit and meaning of each, and the dataset's recipes, as metadata.
+def table_schema(
+    dataset: TerrainDataset, split: str, fields: Sequence[str]
+) -> pa.Schema:
+    """The columns of a split, with shape, unit and meaning of each, and the dataset's
+    recipes, as metadata.
 
     Args:
         dataset: where the split is.
@@ -69,16 +80,28 @@ def table_schema(dataset: TerrainDataset, split: str, fields: Sequence[str]) -> 
     }
     columns = []
     for name, field in columns_of(dataset, fields).items():
-        kind, shape = pa.from_numpy_dtype(np.dtype(field.dtype)), field.entry_shape(*dataset.grid.shape)
+        kind, shape = (
+            pa.from_numpy_dtype(np.dtype(field.dtype)),
+            field.entry_shape(*dataset.grid.shape),
+        )
         for size in reversed(shape):
             kind = pa.list_(pa.field("element", kind, False), size)
-        words = {"shape": json.dumps(list(shape)), "unit": field.unit, "meaning": field.meaning}
+        words = {
+            "shape": json.dumps(list(shape)),
+            "unit": field.unit,
+            "meaning": field.meaning,
+        }
         columns.append(pa.field(name, kind, False, words))
     return pa.schema(columns, {"benchnav": json.dumps(about)})
 
 
 def write_split(
-    folder: Path, name: str, dataset: TerrainDataset, split: str, fields: Sequence[str], maps_a_file: int
+    folder: Path,
+    name: str,
+    dataset: TerrainDataset,
+    split: str,
+    fields: Sequence[str],
+    maps_a_file: int,
 ) -> Iterator[int]:
     """Writes a split as one file or several, some maps at a time.
 
@@ -95,7 +118,10 @@ def write_split(
     """
     most = maps_a_file or dataset.grid.maps_in(CELLS_A_FILE)
     step = dataset.grid.maps_in(_CELLS_A_ROW_GROUP)
-    every, columns = range(dataset.map_count(split)), table_schema(dataset, split, fields)
+    every, columns = (
+        range(dataset.map_count(split)),
+        table_schema(dataset, split, fields),
+    )
     files = -(-len(every) // most)
     for number in range(files):
         own = every[number * most :][:most]
@@ -104,7 +130,9 @@ def write_split(
             for place in range(0, len(own), step):
                 rows = own[place : place + step]
                 maps = {MAP: np.array(rows), **dataset.read(split, rows, fields)}
-                arrays = [_nested_array(maps[column.name], column.type) for column in columns]
+                arrays = [
+                    _nested_array(maps[column.name], column.type) for column in columns
+                ]
                 writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=columns))
                 yield len(rows)
 

@@ -1,4 +1,6 @@
-"""Checks a whole dataset: schema, per-chunk checksums, entry digests, ranges, split digests."""
+"""Checks a whole dataset: schema, per-chunk checksums, entry digests, ranges, split
+digests.
+"""
 
 from collections.abc import Collection, Iterator
 from contextlib import suppress
@@ -53,7 +55,9 @@ def summarise(faults: list[Fault]) -> Iterator[str]:
         maps = f"map {first.map}" if first.map >= 0 else ""
         if others:
             maps = f"maps {first.map}–{first.map + len(others)}"
-        problem = f"field {first.field!r} {first.problem}" if first.field else first.problem
+        problem = (
+            f"field {first.field!r} {first.problem}" if first.field else first.problem
+        )
         where = f" ({first.file})" if first.file else ""
         yield ": ".join(word for word in (first.split, maps, problem) if word) + where
 
@@ -65,19 +69,28 @@ def find_faults(path: str | Path) -> list[Fault]:
         path: the file or folder.
 
     Returns:
-        The faults, every damaged map and field among them; empty when the file is sound.
+        The faults, every damaged map and field among them; empty when the file is
+        sound.
 
     Raises:
         DatasetError: the file or its manifest cannot be read at all.
     """
     dataset = TerrainDataset(path)
-    return [Fault(split, *about) for split in dataset.splits for about in _split_faults(dataset, split)]
+    return [
+        Fault(split, *about)
+        for split in dataset.splits
+        for about in _split_faults(dataset, split)
+    ]
 
 
-def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, str, str, str]]:
+def _split_faults(
+    dataset: TerrainDataset, split: str
+) -> Iterator[tuple[int, str, str, str]]:
     """The faults of a split: map, field, problem and file of each."""
     fields = list(dataset.fields)
-    stored = np.ma.masked_all((dataset.map_count(split), len(fields), schema.DIGEST_BYTES), np.uint8)
+    stored = np.ma.masked_all(
+        (dataset.map_count(split), len(fields), schema.DIGEST_BYTES), np.uint8
+    )
     computed = stored.copy()
     files: list[str] = []  # of each map
     for piece in dataset.pieces[split]:
@@ -94,7 +107,12 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, st
                     array = dataset.stored_array(file, split, name, piece.maps)
                 except (*READ_ERRORS, TypeError, AttributeError) as error:
                     is_other = type(error) is ValueError
-                    yield -1, name, str(error).removeprefix("it ") if is_other else _MISSING, own
+                    yield (
+                        -1,
+                        name,
+                        str(error).removeprefix("it ") if is_other else _MISSING,
+                        own,
+                    )
                     continue
                 for place, values in _read_some(array):
                     first = piece.first + place
@@ -107,7 +125,9 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, st
                         continue
                     for index in _out_of_range(dataset, split, name, values):
                         yield first + index, name, "is out of range", own
-                    digests = schema.entry_digests({name: values}, {name: dataset.fields[name]})
+                    digests = schema.entry_digests(
+                        {name: values}, {name: dataset.fields[name]}
+                    )
                     computed[maps, fields.index(name)] = digests[:, 0]
             for name in _damaged_scales(file, split, (*fields, schema.ENTRY_DIGESTS)):
                 yield -1, name, "is damaged", own
@@ -115,7 +135,8 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, st
     unlike = (computed != stored).filled(False).any(axis=2)
     digest = schema.split_digest(computed.data, *dataset.grid.shape, dataset.fields)
     if is_readable and digest == dataset.splits[split]["digest"]:
-        # The maps are what the manifest says, so it is the digests beside them that differ.
+        # The maps are what the manifest says, so it is the digests beside them that
+        # differ.
         for index in np.flatnonzero(unlike.any(axis=1)).tolist():
             yield index, schema.ENTRY_DIGESTS, "does not match the map", files[index]
         return
@@ -125,7 +146,9 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, st
         yield -1, "", "the maps do not match the digest in the manifest", ""
 
 
-def _damaged_scales(file: h5py.File, split: str, known: Collection[str]) -> Iterator[str]:
+def _damaged_scales(
+    file: h5py.File, split: str, known: Collection[str]
+) -> Iterator[str]:
     """Name what else lies in a split, such as dimension scales, and cannot be read."""
     others: list[str] = []
     with suppress(*READ_ERRORS):
@@ -138,7 +161,9 @@ def _damaged_scales(file: h5py.File, split: str, known: Collection[str]) -> Iter
 
 
 def _read_some(array: h5py.Dataset) -> Iterator[tuple[int, np.ndarray | None]]:
-    """Reads some maps at a time, from the first given on; each one, or None, of those that cannot be read together."""
+    """Reads some maps at a time, from the first given on; each one, or None, of those
+    that cannot be read together.
+    """
     step = max(1, CHUNK_CELLS * len(array) // max(1, array.size))
     for start in range(0, len(array), step):
         try:
@@ -151,14 +176,17 @@ def _read_some(array: h5py.Dataset) -> Iterator[tuple[int, np.ndarray | None]]:
                 yield index, values
 
 
-def _out_of_range(dataset: TerrainDataset, split: str, name: str, values: np.ndarray) -> list[int]:
+def _out_of_range(
+    dataset: TerrainDataset, split: str, name: str, values: np.ndarray
+) -> list[int]:
     """Which maps have a value that may not be."""
     field = dataset.fields[name]
     most = len(dataset.recipe.classes) - 1 if name == "class_id" else field.most
     allowed = (values >= field.least) & (values <= most)
     if name == "class_id" and schema.has_unlabelled(dataset.splits[split]):
         allowed |= values == schema.UNLABELLED
-    # Not asked for; not observed; of one row; what a field that is not ours means by it, it may mean.
+    # Not asked for; not observed; of one row; what a field that is not ours means by
+    # it, it may mean.
     gaps = ("reference_time_s", "traversability", "drive_std")
     if name in gaps or name not in (*schema.KNOWN, *schema.TRUTH):
         allowed |= np.isnan(values)

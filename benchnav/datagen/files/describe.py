@@ -14,7 +14,8 @@ from benchnav.datagen.recipe.classes import ClassTable
 
 _DIGESTS = {
     "digest": "content digests",
-    "recorded_digest": "digests that models record (content, class table, λ_stuck, resolution, kind of truth)",
+    "recorded_digest": "digests that models record (content, class table, λ_stuck, "
+    "resolution, kind of truth)",
 }
 
 
@@ -22,8 +23,16 @@ def describe(dataset: TerrainDataset) -> schema.Json:
     """Gathers what `show` shows, ready for JSON."""
     manifest, recipe = dataset.manifest, dataset.recipe
     about, stored = plain(recipe) | {"classes": recipe.class_rows}, recipe.to_dict()
-    made_by = ("environments", "stuck_threshold", "synthesis", "places", "correlation_m")
-    of_vegetation = {name: stored[name] for name in ("vegetation_period_m",) if name in stored}
+    made_by = (
+        "environments",
+        "stuck_threshold",
+        "synthesis",
+        "places",
+        "correlation_m",
+    )
+    of_vegetation = {
+        name: stored[name] for name in ("vegetation_period_m",) if name in stored
+    }
     return {
         "path": str(dataset.path),
         "bytes": sum(path.stat().st_size for path in dataset.files),
@@ -35,7 +44,9 @@ def describe(dataset: TerrainDataset) -> schema.Json:
         **{name: about[name] for name in made_by},
         **of_vegetation,
         "classes": about["classes"],
-        "drawn_layers": [_describe_layer(spec, recipe.classes) for spec in recipe.layers],
+        "drawn_layers": [
+            _describe_layer(spec, recipe.classes) for spec in recipe.layers
+        ],
         "splits": {
             name: {
                 **entry,
@@ -67,17 +78,22 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
     grid, generator = described["grid"], described["generator"]
     files = f" in {described['files']} files" if described["files"] > 1 else ""
     yield (
-        f"{described['path']}: {described['id']}, format {described['format_version']}, "
-        f"{described['bytes'] / 1e6:.1f} MB{files}, written by {generator['package']} {generator['version']}"
+        f"{described['path']}: {described['id']}, format "
+        f"{described['format_version']}, "
+        f"{described['bytes'] / 1e6:.1f} MB{files}, written by {generator['package']} "
+        f"{generator['version']}"
     )
     yield (
-        f"maps of {grid['height']} × {grid['width']} cells of {grid['resolution_m']:g} m, "
-        f"{described['environments']} environments, λ_stuck {described['stuck_threshold']:g}"
+        f"maps of {grid['height']} × {grid['width']} cells of "
+        f"{grid['resolution_m']:g} m, "
+        f"{described['environments']} environments, λ_stuck "
+        f"{described['stuck_threshold']:g}"
     )
     making, places = f"synthesis {described['synthesis']}", described["places"]
     if places:
         making += (
-            f", start and goal drawn for each map, at least {places['least_distance_m']:g} m apart and "
+            ", start and goal drawn for each map, at least "
+            f"{places['least_distance_m']:g} m apart and "
             f"{places['margin_m']:g} m from the edges"
         )
     making += "".join(f", {layer['words']}" for layer in described["drawn_layers"])
@@ -107,7 +123,8 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
             title="layers",
             headings=("layer", "unit", "meaning", "drawn by"),
             rows=tuple(
-                (name, fields[name].unit, fields[name].meaning, code.get(name, "")) for name in layers
+                (name, fields[name].unit, fields[name].meaning, code.get(name, ""))
+                for name in layers
             ),
         )
     extra = [name for name in fields if name not in (*schema.FIELDS, *layers)]
@@ -116,14 +133,21 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
     for key, title in _DIGESTS.items():
         yield title
         wide = widest(described["splits"])
-        yield from (f"  {name:{wide}} {entry[key]}" for name, entry in described["splits"].items())
+        yield from (
+            f"  {name:{wide}} {entry[key]}"
+            for name, entry in described["splits"].items()
+        )
     columns = {layer["name"]: layer["classes"] for layer in described["drawn_layers"]}
     headings = ["id", "class", "colour", "a", "b", "o", "σ", "soft spots", *columns]
     rows = []
     for number, item in enumerate(described["classes"]):
         colour = f"#{bytes(item['colour']).hex()}"
         numbers = [f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise")]
-        soft = "{weight:.0%} N({mean:g}, {std:g})".format(**item["soft"]) if item["soft"] else ""
+        soft = (
+            "{weight:.0%} N({mean:g}, {std:g})".format(**item["soft"])
+            if item["soft"]
+            else ""
+        )
         drawn = (words[item["name"]] for words in columns.values())
         rows.append((str(number), item["name"], colour, *numbers, soft, *drawn))
     # What no class has is left out.
@@ -137,13 +161,20 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
 
 
 def _describe_layer(spec: LayerSpec, classes: ClassTable) -> schema.Json:
-    """Describe a layer of a recipe; what it is on each class only where its code is here."""
+    """Describe a layer of a recipe; what it is on each class only where its code is
+    here.
+    """
     layer = spec.available
     return {
         "name": spec.name,
         "words": spec.words,
-        "source": f"{spec.source}, digest {spec.digest[:12]}" if spec.source else "benchnav",
-        "classes": {item.name: layer.describe_class(item.name) if layer else "" for item in classes},
+        "source": f"{spec.source}, digest {spec.digest[:12]}"
+        if spec.source
+        else "benchnav",
+        "classes": {
+            item.name: layer.describe_class(item.name) if layer else ""
+            for item in classes
+        },
     }
 
 
@@ -155,16 +186,23 @@ def _origin(described: schema.Json, part: schema.Json) -> str:
 
 
 def widest(names: Iterable[str]) -> int:
-    """Characters of the longest of some names, at least 12, so that what follows them stands in one column."""
+    """Characters of the longest of some names, at least 12, so that what follows them
+    stands in one column.
+    """
     return max([12, *map(len, names)])
 
 
 def written(path: Path) -> TerrainDataset:
-    """Gives a new dataset and prints where it is, its size, its splits and their digests."""
+    """Gives a new dataset and prints where it is, its size, its splits and their
+    digests.
+    """
     from rich.filesize import decimal
 
     dataset = TerrainDataset(path)
-    size, files = decimal(sum(file.stat().st_size for file in dataset.files)), len(dataset.files)
+    size, files = (
+        decimal(sum(file.stat().st_size for file in dataset.files)),
+        len(dataset.files),
+    )
     print(f"wrote {path} ({size}{f' in {files} files' if files > 1 else ''})")
     wide = widest(dataset.splits)
     for name, split in dataset.splits.items():

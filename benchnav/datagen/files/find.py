@@ -15,7 +15,8 @@ def dataset_folders() -> list[Path]:
 
 
 def find_dataset(source: str | Path) -> Path:
-    """Finds a dataset by path, by id in `dataset_folders`, or on a hub by `owner/name@revision`.
+    """Finds a dataset by path, by id in `dataset_folders`, or on a hub by
+    `owner/name@revision`.
 
     Raises:
         DatasetError: none of them is there.
@@ -27,10 +28,14 @@ def find_dataset(source: str | Path) -> Path:
             if is_dataset(folder / name):
                 return folder / name
     if hub.is_address(source):
-        return _in_snapshot(hub.download(str(source), "dataset", DatasetError), str(source))
+        return _in_snapshot(
+            hub.download(str(source), "dataset", DatasetError), str(source)
+        )
     raise DatasetError(
-        f"Expected the path or id of a dataset, got {str(source)!r}, which is neither a file nor in "
-        f"{' or '.join(map(str, dataset_folders()))}. Make one with `benchnav-datagen create`."
+        f"Expected the path or id of a dataset, got {str(source)!r}, which is neither "
+        "a file nor in "
+        f"{' or '.join(map(str, dataset_folders()))}. Make one with `benchnav-datagen "
+        "create`."
     )
 
 
@@ -41,7 +46,8 @@ def _in_snapshot(folder: Path, source: str) -> Path:
     files = sorted(folder.glob("*.h5"))
     if len(files) != 1:
         raise DatasetError(
-            f"Expected {source} to hold {FOLDER_MANIFEST} and its shards, or one file .h5, got {len(files)} files .h5. "
+            f"Expected {source} to hold {FOLDER_MANIFEST} and its shards, or one file "
+            f".h5, got {len(files)} files .h5. "
             "Name another repository or revision."
         )
     return files[0]

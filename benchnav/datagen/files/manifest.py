@@ -1,4 +1,6 @@
-"""Opens the files of datasets, and reads the manifest of one file or of a folder of shards."""
+"""Opens the files of datasets, and reads the manifest of one file or of a folder of
+shards.
+"""
 
 import errno
 import json
@@ -28,7 +30,8 @@ def open_file(path: Path) -> h5py.File:
     """Opens a file for reading.
 
     Raises:
-        DatasetError: it is not there, is locked, is no HDF5 file, or its structure is damaged.
+        DatasetError: it is not there, is locked, is no HDF5 file, or its structure is
+            damaged.
     """
     try:
         note_file(path)
@@ -42,9 +45,15 @@ def open_file(path: Path) -> h5py.File:
         if "unable to lock file" in str(error):
             free = "Close what writes to it."
             if error.errno not in _TAKEN:
-                free = "If its file system cannot lock, set HDF5_USE_FILE_LOCKING=FALSE."
-            raise DatasetError(f"{path} is locked: {os.strerror(error.errno or 0)}. {free}") from error
-        raise DatasetError(f"{path} is no readable HDF5 file: {error}. Make it again.") from error
+                free = (
+                    "If its file system cannot lock, set HDF5_USE_FILE_LOCKING=FALSE."
+                )
+            raise DatasetError(
+                f"{path} is locked: {os.strerror(error.errno or 0)}. {free}"
+            ) from error
+        raise DatasetError(
+            f"{path} is no readable HDF5 file: {error}. Make it again."
+        ) from error
 
 
 def read_manifest(path: Path) -> schema.Json:
@@ -57,19 +66,27 @@ def read_manifest(path: Path) -> schema.Json:
         text = _manifest_text(path)
         manifest = json.loads(text)
         kind, version = manifest["format"], manifest["format_version"]
-        if kind == schema.FORMAT and tuple(map(int, version.split("."))) <= schema.FORMAT_VERSION:
+        if (
+            kind == schema.FORMAT
+            and tuple(map(int, version.split("."))) <= schema.FORMAT_VERSION
+        ):
             manifest = unseal(text)
             schema.check(manifest)
             return manifest
     except (*READ_ERRORS, TypeError, AttributeError, IndexError) as error:
         raise DatasetError(
-            f"The manifest of {path} is damaged: {str(error)[:200]}. Make the dataset again."
+            f"The manifest of {path} is damaged: {str(error)[:200]}. Make the dataset "
+            "again."
         ) from error
     if kind != schema.FORMAT:
-        raise DatasetError(f"Expected format {schema.FORMAT!r} in {path}, got {kind!r}.")
+        raise DatasetError(
+            f"Expected format {schema.FORMAT!r} in {path}, got {kind!r}."
+        )
     raise DatasetError(
-        f"Expected format version at most {'.'.join(map(str, schema.FORMAT_VERSION))} in {path}, "
-        f"got {version}. Read it with a newer benchnav: pip install --upgrade benchnav."
+        f"Expected format version at most {'.'.join(map(str, schema.FORMAT_VERSION))} "
+        f"in {path}, "
+        f"got {version}. Read it with a newer benchnav: pip install --upgrade "
+        "benchnav."
     )
 
 
@@ -77,11 +94,16 @@ def _manifest_text(path: Path) -> str | bytes:
     if path.is_dir():
         if not is_dataset(path):
             raise DatasetError(
-                f"Expected a folder with a finished dataset, got {path} without {FOLDER_MANIFEST}. "
-                "Finish it by the command that began it, or by `benchnav-datagen merge` of its shares."
+                f"Expected a folder with a finished dataset, got {path} without "
+                f"{FOLDER_MANIFEST}. "
+                "Finish it by the command that began it, or by `benchnav-datagen "
+                "merge` of its shares."
             )
         return (path / FOLDER_MANIFEST).read_text()
     with open_file(path) as file:
         if schema.MANIFEST not in file:
-            raise DatasetError(f"Expected a {schema.FORMAT} file with a manifest, got {path} without one.")
+            raise DatasetError(
+                f"Expected a {schema.FORMAT} file with a manifest, got {path} without "
+                "one."
+            )
         return file[schema.MANIFEST][()]

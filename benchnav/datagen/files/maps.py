@@ -15,8 +15,8 @@ from benchnav.datagen.files.reader import TerrainDataset
 class TerrainMaps(Dataset[dict[str, Tensor]]):
     """The maps of a split, each a dict of tensors by field.
 
-    Safe under DataLoader workers, forked or spawned: each process opens files for itself, at the first map of
-    each. Only the fields asked for are read.
+    Safe under DataLoader workers, forked or spawned: each process opens files for
+    itself, at the first map of each. Only the fields asked for are read.
 
     Args:
         path: dataset file or folder, or the id of one at hand.
@@ -25,7 +25,8 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         in_memory: read all maps at once, here; worth it for what is read many times.
 
     Raises:
-        DatasetError: no such file, split or field; when a map is read: its data are damaged.
+        DatasetError: no such file, split or field; when a map is read: its data are
+            damaged.
     """
 
     def __init__(
@@ -39,7 +40,9 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         self.dataset = TerrainDataset(find_dataset(path).resolve(), keep_open=True)
         self.split, self.fields = split, self.dataset.check_fields(tuple(fields))
         if not fields:
-            raise DatasetError(f"Expected `fields` among {list(self.dataset.field_names)}, got none.")
+            raise DatasetError(
+                f"Expected `fields` among {list(self.dataset.field_names)}, got none."
+            )
         self._maps = self.dataset.map_count(split)
         self._memory: dict[str, Tensor] | None = None
         if in_memory:
@@ -60,10 +63,15 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         """
         if not -len(self) <= index < len(self):
             raise IndexError(f"Expected a map index in 0–{len(self) - 1}, got {index}.")
-        return {name: values[0] for name, values in self.read([int(index) % len(self)]).items()}
+        return {
+            name: values[0]
+            for name, values in self.read([int(index) % len(self)]).items()
+        }
 
     def read(self, indices: Sequence[int]) -> dict[str, Tensor]:
-        """Reads maps by their indices ≥ 0, in any order; tensors by field, each of shape [B, *entry shape]."""
+        """Reads maps by their indices ≥ 0, in any order; tensors by field, each of
+        shape [B, *entry shape].
+        """
         if self._memory is None:
             read = self.dataset.read(self.split, indices, self.fields)
             return {name: torch.from_numpy(values) for name, values in read.items()}

@@ -1,7 +1,8 @@
-"""Reading datasets of formats 1.0 to 1.4: a file (HDF5), or a folder of such files with one manifest.
+"""Reading datasets of formats 1.0 to 1.4: a file (HDF5), or a folder of such files with
+one manifest.
 
-All that reads maps goes through `TerrainDataset.read`, which may be passed to other processes. PyTorch is imported
-where Terrain is asked for. Letters in shapes: B maps.
+All that reads maps goes through `TerrainDataset.read`, which may be passed to other
+processes. PyTorch is imported where Terrain is asked for. Letters in shapes: B maps.
 """
 
 import hashlib
@@ -31,7 +32,9 @@ if TYPE_CHECKING:
 CHUNK_CELLS = 2**17
 _MOST_OPEN = 128  # files that a process keeps open; far fewer than systems allow
 
-Opened = tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]  # a file, and its arrays by split and name
+Opened = tuple[
+    h5py.File, dict[tuple[str, str], h5py.Dataset]
+]  # a file, and its arrays by split and name
 
 _SHOWN_SPLITS = 8
 
@@ -52,7 +55,9 @@ class Piece(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _read_recipe(text: str, origin: str) -> Recipe:
-    """The recipe in a manifest, checked; kept, since to check it takes longer than to read a map."""
+    """The recipe in a manifest, checked; kept, since to check it takes longer than to
+    read a map.
+    """
     return recipe_from_dict(json.loads(text), origin)
 
 
@@ -61,18 +66,22 @@ class TerrainDataset:
 
     Args:
         path: the file, or the folder.
-        keep_open: keep files open from call to call, for many reads of few maps. Each process opens them for itself,
-            forked or spawned. Otherwise they are open during a call alone, and may be changed in between.
+        keep_open: keep files open from call to call, for many reads of few maps. Each
+            process opens them for itself, forked or spawned. Otherwise they are open
+            during a call alone, and may be changed in between.
 
     Raises:
-        DatasetError: there is no such file, or it is damaged, foreign, or of a newer format.
+        DatasetError: there is no such file, or it is damaged, foreign, or of a newer
+            format.
     """
 
     def __init__(self, path: str | Path, keep_open: bool = False) -> None:
         """Reads and checks the manifest."""
         self.path, self.keep_open = Path(path), keep_open
         self.manifest: schema.Json = read_manifest(self.path)
-        self._opened: dict[tuple[int, Path], Opened] = {}  # by process, since one's files are not for another
+        self._opened: dict[
+            tuple[int, Path], Opened
+        ] = {}  # by process, since one's files are not for another
 
     def __getstate__(self) -> schema.Json:
         """Leaves out the open files, so that it may be sent to other processes."""
@@ -82,10 +91,13 @@ class TerrainDataset:
         """Return id, path, cells and the maps of each split, in up to six lines."""
         height, width = self.grid.shape
         splits = [f"{name} {about['maps']}" for name, about in self.splits.items()]
-        shown = ", ".join(splits[:_SHOWN_SPLITS]) + (", …" if len(splits) > _SHOWN_SPLITS else "")
+        shown = ", ".join(splits[:_SHOWN_SPLITS]) + (
+            ", …" if len(splits) > _SHOWN_SPLITS else ""
+        )
         return (
             f"TerrainDataset {self.id} in {self.path}\n"
-            f"  {height} × {width} cells of {self.grid.resolution_m:g} m, fields {', '.join(self.field_names)}\n"
+            f"  {height} × {width} cells of {self.grid.resolution_m:g} m, fields "
+            f"{', '.join(self.field_names)}\n"
             f"  maps: {shown}"
         )
 
@@ -101,7 +113,9 @@ class TerrainDataset:
 
     @cached_property
     def recipe(self) -> Recipe:
-        """The recipe that the file was made by; of the first part where it was made from several."""
+        """The recipe that the file was made by; of the first part where it was made
+        from several.
+        """
         return _read_recipe(json.dumps(self.manifest["recipes"][0]), f"in {self.path}")
 
     @property
@@ -111,9 +125,13 @@ class TerrainDataset:
 
     @cached_property
     def fields(self) -> dict[str, schema.Field]:
-        """What every map has, by name: those of `schema.FIELDS`, and others that this dataset lists."""
+        """What every map has, by name: those of `schema.FIELDS`, and others that this
+        dataset lists.
+        """
         drawn = {spec.name: spec.stored_field for spec in self.recipe.layers}
-        return schema.read_field_table(self.manifest["fields"], shipped_fields() | drawn)
+        return schema.read_field_table(
+            self.manifest["fields"], shipped_fields() | drawn
+        )
 
     @property
     def field_names(self) -> tuple[str, ...]:
@@ -122,7 +140,9 @@ class TerrainDataset:
 
     @property
     def layer_names(self) -> tuple[str, ...]:
-        """Names of the layers among `fields`: what a model may see of the ground beside colour and shape."""
+        """Names of the layers among `fields`: what a model may see of the ground beside
+        colour and shape.
+        """
         return schema.layer_names(self.fields)
 
     @property
@@ -134,8 +154,9 @@ class TerrainDataset:
         """Return whether the distribution of λ in each cell of a split is known.
 
         Returns:
-            "generated" where a recipe made all its maps, λ by its class table; "unknown" where some were imported:
-            the class table says nothing of real ground, whether or not λ was measured there.
+            "generated" where a recipe made all its maps, λ by its class table;
+            "unknown" where some were imported: the class table says nothing of real
+            ground, whether or not λ was measured there.
 
         Raises:
             DatasetError: there is no such split.
@@ -150,29 +171,37 @@ class TerrainDataset:
 
     @property
     def truth(self) -> Literal["generated", "unknown"]:
-        """Knowledge of the distribution of λ in each cell, over all splits; see `truth_of`."""
+        """Knowledge of the distribution of λ in each cell, over all splits; see
+        `truth_of`.
+        """
         known = all(self.truth_of(name) == "generated" for name in self.splits)
         return "generated" if known else "unknown"
 
     def has_photo(self, split: str) -> bool:
-        """Return whether the colours of some maps of a split are those of a photo, which is lit from one direction.
+        """Return whether the colours of some maps of a split are those of a photo,
+        which is lit from one direction.
 
         Raises:
             DatasetError: If there is no such split.
         """
         self.map_count(split)
-        return any(part.get("source", {}).get("photo") for part in self.splits[split]["parts"])
+        return any(
+            part.get("source", {}).get("photo") for part in self.splits[split]["parts"]
+        )
 
     def about_digest(self, split: str) -> str:
         """SHA-256 of what numbers on a split rest on beside its maps.
 
-        These are class table, layers of the recipe, λ_stuck, resolution and kind of truth.
+        These are class table, layers of the recipe, λ_stuck, resolution and kind of
+        truth.
 
         Raises:
             DatasetError: there is no such split.
         """
         recipe = self.recipe
-        drawn = [spec.meaning_of_maps for spec in recipe.layers if not spec.is_vegetation]
+        drawn = [
+            spec.meaning_of_maps for spec in recipe.layers if not spec.is_vegetation
+        ]
         about = {
             **({"layers": drawn} if drawn else {}),
             "classes": recipe.class_rows,
@@ -184,21 +213,29 @@ class TerrainDataset:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def split_digest(self, split: str) -> str:
-        """SHA-256 of a split's maps and of what they mean, which models and results record: `about_digest` too.
+        """SHA-256 of a split's maps and of what they mean, which models and results
+        record: `about_digest` too.
 
         Raises:
             DatasetError: there is no such split.
         """
         about = self.about_digest(split)
-        return hashlib.sha256(f"{self.splits[split]['digest']} {about}".encode()).hexdigest()
+        return hashlib.sha256(
+            f"{self.splits[split]['digest']} {about}".encode()
+        ).hexdigest()
 
     @property
     def digest(self) -> str:
-        """One digest for the dataset, as `split:split_digest` joined in the manifest's order."""
+        """One digest for the dataset, as `split:split_digest` joined in the manifest's
+        order.
+        """
         return ",".join(f"{name}:{self.split_digest(name)}" for name in self.splits)
 
     def read(
-        self, split: str, indices: Sequence[int] | None = None, fields: Collection[str] | None = None
+        self,
+        split: str,
+        indices: Sequence[int] | None = None,
+        fields: Collection[str] | None = None,
     ) -> Maps:
         """Reads stored arrays.
 
@@ -217,10 +254,14 @@ class TerrainDataset:
         names = self.field_names if fields is None else self.check_fields(fields)
         chosen = range(size) if indices is None else np.asarray(indices).tolist()
         if not all(type(i) is int and 0 <= i < size for i in chosen):
-            raise DatasetError(f"Expected map indices in 0–{size - 1} of split {split!r}, got {chosen}.")
+            raise DatasetError(
+                f"Expected map indices in 0–{size - 1} of split {split!r}, got "
+                f"{chosen}."
+            )
 
         pieces, firsts = self.pieces[split], self._firsts[split]
-        # In the order of the files, each of which is asked once for maps that follow one another in it.
+        # In the order of the files, each of which is asked once for maps that follow
+        # one another in it.
         places = sorted(range(len(chosen)), key=chosen.__getitem__)
 
         def run_of(item: tuple[int, int]) -> tuple[int, int]:
@@ -228,7 +269,8 @@ class TerrainDataset:
             return bisect_right(firsts, chosen[place]) - 1, chosen[place] - rank
 
         read = {
-            name: np.empty((len(chosen), *self._stored[name][1]), self._stored[name][0]) for name in names
+            name: np.empty((len(chosen), *self._stored[name][1]), self._stored[name][0])
+            for name in names
         }
         for (piece, _), items in groupby(enumerate(places), run_of):
             own = [place for _, place in items]
@@ -240,8 +282,11 @@ class TerrainDataset:
                 read[name][own] = values
         return read
 
-    def entry_digests(self, split: str, indices: Sequence[int] | None = None) -> np.ndarray:
-        """Reads the stored SHA-256 of every entry, as `schema.entry_digests` gives them.
+    def entry_digests(
+        self, split: str, indices: Sequence[int] | None = None
+    ) -> np.ndarray:
+        """Reads the stored SHA-256 of every entry, as `schema.entry_digests` gives
+        them.
 
         Raises:
             DatasetError: no such split, or a stored chunk is damaged.
@@ -249,7 +294,10 @@ class TerrainDataset:
         return self.read(split, indices, (schema.ENTRY_DIGESTS,))[schema.ENTRY_DIGESTS]
 
     def chunks(
-        self, split: str, fields: Collection[str] | None = None, cells: int = CHUNK_CELLS
+        self,
+        split: str,
+        fields: Collection[str] | None = None,
+        cells: int = CHUNK_CELLS,
     ) -> Iterator[tuple[range, Maps]]:
         """Reads a split from its first map to its last, some maps at a time.
 
@@ -277,9 +325,13 @@ class TerrainDataset:
         Raises:
             DatasetError: maps have no such field.
         """
-        unknown = [name for name in names if name not in (*self.fields, schema.ENTRY_DIGESTS)]
+        unknown = [
+            name for name in names if name not in (*self.fields, schema.ENTRY_DIGESTS)
+        ]
         if unknown:
-            raise DatasetError(f"Expected `fields` among {list(self.fields)}, got {unknown}.")
+            raise DatasetError(
+                f"Expected `fields` among {list(self.fields)}, got {unknown}."
+            )
         return names
 
     @cached_property
@@ -296,7 +348,10 @@ class TerrainDataset:
 
     @cached_property
     def _firsts(self) -> dict[str, list[int]]:
-        return {split: [piece.first for piece in pieces] for split, pieces in self.pieces.items()}
+        return {
+            split: [piece.first for piece in pieces]
+            for split, pieces in self.pieces.items()
+        }
 
     @cached_property
     def _stored(self) -> dict[str, tuple[str, tuple[int, ...]]]:
@@ -307,7 +362,9 @@ class TerrainDataset:
         """The files that hold maps."""
         return {piece.path for pieces in self.pieces.values() for piece in pieces}
 
-    def _read_run(self, split: str, piece: Piece, run: range, names: Collection[str]) -> Maps:
+    def _read_run(
+        self, split: str, piece: Piece, run: range, names: Collection[str]
+    ) -> Maps:
         """Reads maps that follow one another in a file, as `read` does."""
         file, arrays = self._open(piece.path)
         read, most = Maps(), len(self.recipe.classes) - 1
@@ -315,11 +372,17 @@ class TerrainDataset:
         try:
             for name in names:
                 if (split, name) not in arrays:
-                    arrays[split, name] = self.stored_array(file, split, name, piece.maps)
+                    arrays[split, name] = self.stored_array(
+                        file, split, name, piece.maps
+                    )
                 read[name] = values = _values(arrays[split, name], which)
-                # The greatest is looked at first, since that is quicker than to compare each.
+                # The greatest is looked at first, since that is quicker than to compare
+                # each.
                 is_beyond = name == "class_id" and values.max(initial=0) > most
-                if is_beyond and ((values > most) & (values != schema.UNLABELLED)).any():
+                if (
+                    is_beyond
+                    and ((values > most) & (values != schema.UNLABELLED)).any()
+                ):
                     raise ValueError(f"it has classes beyond {most}")
         except READ_ERRORS as error:
             raise damage(piece.path, split, name, error) from error
@@ -335,21 +398,31 @@ class TerrainDataset:
         place = os.getpid(), path
         if place not in self._opened:
             if len(self._opened) == _MOST_OPEN:
-                # Let go, which closes it: h5py's own `close` looks through all that is open, of any file.
+                # Let go, which closes it: h5py's own `close` looks through all that is
+                # open, of any file.
                 del self._opened[next(iter(self._opened))]
             self._opened[place] = open_file(path), {}
         return self._opened[place]
 
-    def stored_array(self, file: h5py.File, split: str, name: str, maps: int) -> h5py.Dataset:
-        """An array of so many maps in a file; refuses, by a ValueError, one that is not what the manifest says."""
+    def stored_array(
+        self, file: h5py.File, split: str, name: str, maps: int
+    ) -> h5py.Dataset:
+        """An array of so many maps in a file; refuses, by a ValueError, one that is not
+        what the manifest says.
+        """
         array = file[f"{split}/{name}"]
         kind, entry = self._stored[name]
         if (array.dtype.str, array.shape) != (kind, (maps, *entry)):
-            raise ValueError(f"it is {array.dtype.str} {list(array.shape)}, not {kind} {[maps, *entry]}")
+            raise ValueError(
+                f"it is {array.dtype.str} {list(array.shape)}, not {kind} "
+                f"{[maps, *entry]}"
+            )
         return array
 
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> "Terrain":
-        """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
+        """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on
+        what is stored.
+        """
         from benchnav.datagen.files.stored_terrain import terrain_of
 
         names = (*schema.MAP_FIELDS, *self.layer_names, *self.truth_names)
@@ -363,7 +436,8 @@ class TerrainDataset:
         """
         if split not in self.splits:
             raise DatasetError(
-                f"Expected a split of {self.path}, one of {sorted(self.splits)}, got {split!r}."
+                f"Expected a split of {self.path}, one of {sorted(self.splits)}, got "
+                f"{split!r}."
             )
         return self.splits[split]["maps"]
 
@@ -371,14 +445,19 @@ class TerrainDataset:
 def damage(path: Path, split: str, field: str, error: Exception) -> DatasetError:
     """Says that a field cannot be read, and what to do."""
     return DatasetError(
-        f"Field {field!r} of split {split!r} in {path} is damaged: {error}. Run `benchnav-datagen validate` "
+        f"Field {field!r} of split {split!r} in {path} is damaged: {error}. Run "
+        "`benchnav-datagen validate` "
         "on the dataset, which says how to make it anew."
     )
 
 
 def _values(array: h5py.Dataset, which: slice) -> np.ndarray:
-    """Some maps of an array; one at a time where they cannot be read together, which may be for want of memory."""
+    """Some maps of an array; one at a time where they cannot be read together, which
+    may be for want of memory.
+    """
     try:
         return array[which]
     except OSError:
-        return np.concatenate([array[index : index + 1] for index in range(which.start, which.stop)])
+        return np.concatenate(
+            [array[index : index + 1] for index in range(which.start, which.stop)]
+        )

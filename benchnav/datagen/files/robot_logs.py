@@ -1,6 +1,7 @@
 """Tables that a robot logged, a row each time: CSV or TSV, packed or not, or Parquet.
 
-Text is read as text, so that a class may be called NA and a bad number is found in its row.
+Text is read as text, so that a class may be called NA and a bad number is found in its
+row.
 """
 
 import warnings
@@ -17,11 +18,15 @@ from benchnav.core.settings import hint
 from benchnav.core.touched import note_file
 
 ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
-_SEPARATE = "Separate columns by commas, in a .tsv by tabs, and write decimals with a point."
+_SEPARATE = (
+    "Separate columns by commas, in a .tsv by tabs, and write decimals with a point."
+)
 _MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
 
 
-def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path, remedy: str = "") -> None:
+def require_columns(
+    rows: pd.DataFrame, columns: Collection[str], path: Path, remedy: str = ""
+) -> None:
     """Require columns of a log.
 
     Args:
@@ -42,7 +47,8 @@ def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path, re
         elif any(_is_number(name) for name in names):
             near = " Begin the file with a line of column names."
         raise DatasetError(
-            f"Expected columns {', '.join(columns)} in {path}, got no {' and no '.join(missing)}. "
+            f"Expected columns {', '.join(columns)} in {path}, got no "
+            f"{' and no '.join(missing)}. "
             f"It has {', '.join(names) or 'none'}.{near}"
         )
 
@@ -75,23 +81,35 @@ def read_log(path: Path) -> pd.DataFrame:
                 index_col=False,
             )
         rows = rows.rename(columns=str.strip)
-    except (OSError, EOFError, ValueError, zlib.error, pd.errors.ParserWarning) as error:
+    except (
+        OSError,
+        EOFError,
+        ValueError,
+        zlib.error,
+        pd.errors.ParserWarning,
+    ) as error:
         why = [*str(error).strip().splitlines(), type(error).__name__]
         is_text = isinstance(error, pd.errors.ParserWarning | pd.errors.ParserError)
-        remedy = f". {_SEPARATE} Remove lines above the column names." if is_text else ""
+        remedy = (
+            f". {_SEPARATE} Remove lines above the column names." if is_text else ""
+        )
         if isinstance(error, UnicodeDecodeError):
             remedy = ". Save it as UTF-8."
         elif isinstance(error, pd.errors.EmptyDataError):
             remedy = ". Write a line of column names and a row for each time."
         raise DatasetError(
-            f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got one that cannot be read: "
+            f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got "
+            "one that cannot be read: "
             f"{why[0].removesuffix('.')}{remedy}"
         ) from error
     for name in rows.columns:
-        first, dot, number = str(name).rpartition(".")  # pandas numbers the second of two columns of one name
+        first, dot, number = str(name).rpartition(
+            "."
+        )  # pandas numbers the second of two columns of one name
         if dot and number.isdigit() and first in rows.columns and not _is_number(first):
             raise DatasetError(
-                f"Expected one column `{first}` in {path}, got several. Rename or remove the others."
+                f"Expected one column `{first}` in {path}, got several. Rename or "
+                "remove the others."
             )
     return rows
 
@@ -125,20 +143,26 @@ def read_numbers(
     is_within = (values >= minimum) & (values <= maximum)
     for expected, is_good, everywhere in (
         ("to be numbers", is_number, number),
-        (f"within [{minimum:g}, {maximum:g}]", ~is_number | is_within, remedy or "Convert the column."),
+        (
+            f"within [{minimum:g}, {maximum:g}]",
+            ~is_number | is_within,
+            remedy or "Convert the column.",
+        ),
     ):
         bad = np.flatnonzero(is_given & ~is_good)
         if len(bad):
             is_everywhere = len(bad) == is_given.sum()
             raise DatasetError(
-                f"Expected `{name}` {expected} in {path}, got {column.iloc[bad[0]]!s} in row {bad[0] + 1} below the "
+                f"Expected `{name}` {expected} in {path}, got {column.iloc[bad[0]]!s} "
+                f"in row {bad[0] + 1} below the "
                 f"header. {everywhere if is_everywhere else 'Mend that row, or leave the value out.'}"
             )
     return values
 
 
 def read_names(rows: pd.DataFrame, name: str, path: Path) -> np.ndarray:
-    """Return the names of a column, such as those of classes or drives, as text, shape [N].
+    """Return the names of a column, such as those of classes or drives, as text, shape
+    [N].
 
     Raises:
         DatasetError: If a row has none.
@@ -147,7 +171,8 @@ def read_names(rows: pd.DataFrame, name: str, path: Path) -> np.ndarray:
     absent = text.index[text == ""]
     if len(absent):
         raise DatasetError(
-            f"Expected a `{name}` in every row of {path}, got none in row {absent[0] + 1} below the header. "
+            f"Expected a `{name}` in every row of {path}, got none in row "
+            f"{absent[0] + 1} below the header. "
             "Fill it in, or leave the row out."
         )
     return text.to_numpy(str)

@@ -1,1 +1,3 @@
-"""Layers of recipes: maps that are drawn, change colours and change λ; one file a shipped layer."""
+"""Layers of recipes: maps that are drawn, change colours and change λ; one file a
+shipped layer.
+"""

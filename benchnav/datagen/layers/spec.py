@@ -1,7 +1,9 @@
-"""What a recipe records of a layer, from which it is built again: part, options, stored field, digest of its code.
+"""What a recipe records of a layer, from which it is built again: part, options, stored
+field, digest of its code.
 
-A dataset with a layer of a user's is read without the layer's code; only generating maps, and what the colours of
-look-alike classes tell of λ where the layer changes it, need the code.
+A dataset with a layer of a user's is read without the layer's code; only generating
+maps, and what the colours of look-alike classes tell of λ where the layer changes it,
+need the code.
 """
 
 import sys
@@ -29,7 +31,8 @@ class LayerSpec:
     """A layer of a recipe, as its dataset records it.
 
     Args:
-        part: shipped name, entry point, `package.module:Name` or `path/to/file.py:Name`.
+        part: shipped name, entry point, `package.module:Name` or
+            `path/to/file.py:Name`.
         options: all its settings, as plain data.
         name: of the stored field.
         unit: of the stored field.
@@ -63,7 +66,9 @@ class LayerSpec:
         check_layer_name(f"`name` of layer {self.part}", self.name)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the object, whose class another process may have to load from a file."""
+        """Leave out the object, whose class another process may have to load from a
+        file.
+        """
         return {name: value for name, value in vars(self).items() if name != "layer"}
 
     @property
@@ -81,7 +86,12 @@ class LayerSpec:
     @property
     def meaning_of_maps(self) -> dict[str, Any]:
         """What the maps depend on, wherever the code lies."""
-        return {"name": self.name, "options": self.options, "digest": self.digest, "files": self.files}
+        return {
+            "name": self.name,
+            "options": self.options,
+            "digest": self.digest,
+            "files": self.files,
+        }
 
     @property
     def is_built(self) -> bool:
@@ -93,27 +103,35 @@ class LayerSpec:
         """The layer itself.
 
         Raises:
-            ConfigError: If its code is not found, is other code than was recorded, or rejects its options.
+            ConfigError: If its code is not found, is other code than was recorded, or
+                rejects its options.
         """
         if self.is_vegetation:
             return read(Vegetation, self.options, of("layer 'vegetation'"))
-        part = registry.Part(part=self.part, label=self.name, options=self.options, kind=KIND)
+        part = registry.Part(
+            part=self.part, label=self.name, options=self.options, kind=KIND
+        )
         try:
             layer, digest = part.create(), part.found.digest
             files = registry.option_files(part) if self.source else {}
         except BenchnavError as error:
             raise ConfigError(
-                f"The code of layer {self.name!r} is needed to generate maps or to tell what colours show: {error}"
+                f"The code of layer {self.name!r} is needed to generate maps or to "
+                f"tell what colours show: {error}"
             ) from error
         expect(
             digest == self.digest,
-            f"the code of layer {self.name!r} that the dataset records, of digest {self.digest[:12] or 'none'}, got "
-            f"{self.part} of digest {digest[:12] or 'none'}. Restore that code, or make a new dataset.",
+            f"the code of layer {self.name!r} that the dataset records, of digest "
+            f"{self.digest[:12] or 'none'}, got "
+            f"{self.part} of digest {digest[:12] or 'none'}. Restore that code, or "
+            "make a new dataset.",
         )
         expect(
             files == self.files,
-            f"the files that options of layer {self.name!r} name as the dataset records them, got others: "
-            f"{', '.join(sorted(dict(files.items() ^ self.files.items())))}. Restore them, or make a new dataset.",
+            f"the files that options of layer {self.name!r} name as the dataset "
+            "records them, got others: "
+            f"{', '.join(sorted(dict(files.items() ^ self.files.items())))}. Restore "
+            "them, or make a new dataset.",
         )
         return layer
 
@@ -126,7 +144,8 @@ class LayerSpec:
         found = None if self.is_vegetation else registry.find(KIND, self.part)
         expect(
             found is None or found.everywhere,
-            f"one process with layer {self.name!r}, whose class is registered in this process only, got more. Pass "
+            f"one process with layer {self.name!r}, whose class is registered in this "
+            "process only, got more. Pass "
             "`jobs` 1, or put the class in a file.",
         )
 
@@ -138,7 +157,9 @@ class LayerSpec:
         return None
 
     def scaled(self, factor: float, resolution_m: float) -> Self:
-        """Return it for maps whose lengths are multiplied by a factor; see `Layer.scaled`."""
+        """Return it for maps whose lengths are multiplied by a factor; see
+        `Layer.scaled`.
+        """
         settings = plain(self.layer.scaled(factor, resolution_m).settings())
         return self if settings == self.options else replace(self, options=settings)
 
@@ -147,7 +168,8 @@ def read_layer(given: Any) -> LayerSpec:
     """Read a layer as a recipe has it.
 
     Args:
-        given: `NAME`, `{part: NAME, options: {…}}`, a `LayerSpec` as plain data, or a `Layer`.
+        given: `NAME`, `{part: NAME, options: {…}}`, a `LayerSpec` as plain data, or a
+            `Layer`.
 
     Raises:
         ConfigError: If it is none of these, or there is no such layer or option.
@@ -156,7 +178,10 @@ def read_layer(given: Any) -> LayerSpec:
         return given
     if isinstance(given, Layer):
         options = plain(given.settings())
-        return _record(registry.Part(part=_part_of(given), label="", options=options, kind=KIND), given)
+        return _record(
+            registry.Part(part=_part_of(given), label="", options=options, kind=KIND),
+            given,
+        )
     if isinstance(given, Mapping) and "name" in given:
         return read(LayerSpec, given, of("a layer"))
     expect(
@@ -177,18 +202,26 @@ def read_layers(given: Any) -> tuple[LayerSpec, ...]:
     specs = tuple(map(read_layer, given))
     names = [spec.name for spec in specs]
     for name in names:
-        expect(names.count(name) == 1, f"layers of different names, got {name!r} twice.")
+        expect(
+            names.count(name) == 1, f"layers of different names, got {name!r} twice."
+        )
     return specs
 
 
-def overrides_of(before: Sequence[LayerSpec], after: Sequence[LayerSpec]) -> dict[str, Any]:
+def overrides_of(
+    before: Sequence[LayerSpec], after: Sequence[LayerSpec]
+) -> dict[str, Any]:
     """Return the changed options of a recipe's layers by the keys of overrides."""
     changed: dict[str, Any] = {}
     number = 0
     for old, new in zip(before, after, strict=True):
         key = "vegetation_" if old.is_vegetation else f"layers.{number}.options."
         number += not old.is_vegetation
-        changed |= {key + name: value for name, value in new.options.items() if value != old.options[name]}
+        changed |= {
+            key + name: value
+            for name, value in new.options.items()
+            if value != old.options[name]
+        }
     return changed
 
 
@@ -205,7 +238,9 @@ def _shipped_fields(path: tuple[str, ...]) -> dict[str, Field]:
 
 
 def _shipped_classes() -> dict[str, type[Layer]]:
-    return {name: registry.find(KIND, name).target for name in registry.shipped_names(KIND)}
+    return {
+        name: registry.find(KIND, name).target for name in registry.shipped_names(KIND)
+    }
 
 
 def _part_of(layer: Layer) -> str:
@@ -214,7 +249,9 @@ def _part_of(layer: Layer) -> str:
     if isinstance(layer, Vegetation):
         return "vegetation"
     if kind.__module__.startswith(_OWN_PACKAGE):
-        return next(name for name, target in _shipped_classes().items() if target is kind)
+        return next(
+            name for name, target in _shipped_classes().items() if target is kind
+        )
     is_file = kind.__module__.startswith("benchnav_file_")
     place = sys.modules[kind.__module__].__file__ if is_file else kind.__module__
     return f"{place}:{kind.__qualname__}"

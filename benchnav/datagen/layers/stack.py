@@ -20,13 +20,19 @@ Parameters = tuple[
 ]  # weights, means, standard deviations, each of shape [B, K, H, W]
 
 
-def check_layer(layer: Layer, grid: Grid, classes: ClassTable, colours: Mapping[str, ndarray]) -> None:
+def check_layer(
+    layer: Layer, grid: Grid, classes: ClassTable, colours: Mapping[str, ndarray]
+) -> None:
     """Check that a layer fits a recipe; see `Layer.check`."""
     _call(layer, "check", layer.check, grid, classes, colours)
 
 
 def draw_layers(
-    layers: Iterable[Layer], seed: int, names: tuple[str, int], indices: ndarray, maps: DrawnMaps
+    layers: Iterable[Layer],
+    seed: int,
+    names: tuple[str, int],
+    indices: ndarray,
+    maps: DrawnMaps,
 ) -> dict[str, ndarray]:
     """Draw the values of layers.
 
@@ -41,7 +47,8 @@ def draw_layers(
         By layer, values as stored but in float64, shape [B, H, W].
 
     Raises:
-        ConfigError: If a layer raises, or returns another shape or a value that is not allowed.
+        ConfigError: If a layer raises, or returns another shape or a value that is not
+            allowed.
     """
     split, attempt = names
     values = {}
@@ -56,9 +63,13 @@ def draw_layers(
 
 
 def colour_layers(
-    layers: Iterable[Layer], rgb: ndarray, values: Mapping[str, ndarray], maps: DrawnMaps
+    layers: Iterable[Layer],
+    rgb: ndarray,
+    values: Mapping[str, ndarray],
+    maps: DrawnMaps,
 ) -> ndarray:
-    """Return the colours in full light that the terrain has with all layers, 0–255, shape [B, 3, H, W].
+    """Return the colours in full light that the terrain has with all layers, 0–255,
+    shape [B, 3, H, W].
 
     Args:
         layers: in their order.
@@ -67,7 +78,8 @@ def colour_layers(
         maps: what lies below.
 
     Raises:
-        ConfigError: If a layer raises, or returns another shape or a value beyond 0–255.
+        ConfigError: If a layer raises, or returns another shape or a value beyond
+            0–255.
     """
     for layer in layers:
         shown = _call(layer, "look", layer.look, rgb, values[layer.name], maps)
@@ -76,7 +88,10 @@ def colour_layers(
 
 
 def affect_layers(
-    layers: Sequence[Layer], truth: Parameters, values: Mapping[str, ndarray], maps: DrawnMaps
+    layers: Sequence[Layer],
+    truth: Parameters,
+    values: Mapping[str, ndarray],
+    maps: DrawnMaps,
 ) -> Parameters:
     """Return the true distribution of λ with all layers.
 
@@ -89,8 +104,8 @@ def affect_layers(
         maps: what lies below.
 
     Raises:
-        ConfigError: If a layer raises, or returns another shape, a mean beyond [0, 1] or a standard deviation beyond
-            (0, 1].
+        ConfigError: If a layer raises, or returns another shape, a mean beyond [0, 1]
+            or a standard deviation beyond (0, 1].
     """
     layers = [layer for layer in layers if layer.affects()]
     if not layers:
@@ -100,20 +115,34 @@ def affect_layers(
         cells = (weights[:, component] > 0) & ~np.isnan(means[:, component])
         for layer in layers:
             mean, std = means[:, component], stds[:, component]
-            result = _call(layer, "affect", layer.affect, mean, std, values[layer.name], maps)
+            result = _call(
+                layer, "affect", layer.affect, mean, std, values[layer.name], maps
+            )
             is_pair = isinstance(result, tuple) and len(result) == 2
-            expect(is_pair, f"mean and std of `affect` of layer {layer.name!r}, got {type(result).__name__}.")
-            new_mean = _checked(layer, "means of `affect`", result[0], mean.shape, (0, 1), cells)
-            new_std = _checked(layer, "stds of `affect`", result[1], std.shape, (1e-6, 1), cells)
+            expect(
+                is_pair,
+                f"mean and std of `affect` of layer {layer.name!r}, got "
+                f"{type(result).__name__}.",
+            )
+            new_mean = _checked(
+                layer, "means of `affect`", result[0], mean.shape, (0, 1), cells
+            )
+            new_std = _checked(
+                layer, "stds of `affect`", result[1], std.shape, (1e-6, 1), cells
+            )
             means[:, component] = np.where(cells, new_mean, mean)
             stds[:, component] = np.where(cells, new_std, std)
     return weights, means, stds
 
 
 def weigh_layers(
-    layers: Iterable[Layer], weights: ndarray, values: Mapping[str, ndarray], maps: DrawnMaps
+    layers: Iterable[Layer],
+    weights: ndarray,
+    values: Mapping[str, ndarray],
+    maps: DrawnMaps,
 ) -> ndarray:
-    """Return the probability of each class by what a picture shows with all layers, shape [B, C, H, W].
+    """Return the probability of each class by what a picture shows with all layers,
+    shape [B, C, H, W].
 
     Args:
         layers: in their order.
@@ -122,19 +151,31 @@ def weigh_layers(
         maps: what lies below.
 
     Raises:
-        ConfigError: If a layer raises, or returns another shape or a weight that is negative or not finite.
+        ConfigError: If a layer raises, or returns another shape or a weight that is
+            negative or not finite.
     """
     hiding = [layer for layer in layers if layer.hides()]
     for layer in hiding:
-        changed = _call(layer, "class_weights", layer.class_weights, weights, values[layer.name], maps)
-        weights = _checked(layer, "weights of `class_weights`", changed, weights.shape, (0, np.inf))
+        changed = _call(
+            layer,
+            "class_weights",
+            layer.class_weights,
+            weights,
+            values[layer.name],
+            maps,
+        )
+        weights = _checked(
+            layer, "weights of `class_weights`", changed, weights.shape, (0, np.inf)
+        )
     if not hiding:
         return weights
     total = sum(weights[:, number] for number in range(weights.shape[1]))
     return weights / np.maximum(total, np.finfo(np.float64).tiny)[:, None]
 
 
-def _call(layer: Layer, method: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def _call(
+    layer: Layer, method: str, function: Callable[..., Any], *arguments: Any
+) -> Any:
     """Call a method of a layer; whatever it raises ends in one line."""
     try:
         return function(*arguments)
@@ -168,19 +209,24 @@ def _checked(
         array = np.asarray(result, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ConfigError(
-            f"Expected {what} of layer {layer.name!r} as an array of numbers, got {type(result).__name__}."
+            f"Expected {what} of layer {layer.name!r} as an array of numbers, got "
+            f"{type(result).__name__}."
         ) from error
     expect(
         array.shape == shape,
-        f"{what} of layer {layer.name!r} of shape {list(shape)}, got {list(array.shape)}.",
+        f"{what} of layer {layer.name!r} of shape {list(shape)}, got "
+        f"{list(array.shape)}.",
     )
     low, high = limits
     wrong = ~((array >= low) & (array <= high) & np.isfinite(array))
     if cells is not None:
         wrong &= cells
     if wrong.any():
-        allowed = "finite" if np.isinf(low) and np.isinf(high) else f"in [{low:g}, {high:g}]"
+        allowed = (
+            "finite" if np.isinf(low) and np.isinf(high) else f"in [{low:g}, {high:g}]"
+        )
         raise ConfigError(
-            f"Expected {what} of layer {layer.name!r} {allowed}, got {array[wrong][0]:g} in {wrong.sum()} cells."
+            f"Expected {what} of layer {layer.name!r} {allowed}, got "
+            f"{array[wrong][0]:g} in {wrong.sum()} cells."
         )
     return array

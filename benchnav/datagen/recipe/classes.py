@@ -1,7 +1,8 @@
-"""Terrain classes: their looks, and what their latent traversability (LT) functions are made of.
+"""Terrain classes: their looks, and what their latent traversability (LT) functions are
+made of.
 
-Beyond the paper, a class may have soft spots, a second mode of λ that neither colour nor slope shows, and
-classes may share a colour.
+Beyond the paper, a class may have soft spots, a second mode of λ that neither colour
+nor slope shows, and classes may share a colour.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,8 @@ from benchnav.core.errors import check_label, expect
 
 @dataclass(frozen=True, kw_only=True)
 class SoftSpots:
-    """Ground of a class that is soft for no reason one could see: buried loose sand, a wet patch.
+    """Ground of a class that is soft for no reason one could see: buried loose sand, a
+    wet patch.
 
     Args:
         weight: share of the class's ground, in (0, 1).
@@ -62,7 +64,10 @@ class TerrainClass:
         check_colour(f"class {self.name!r}", self.colour)
         numbers = self.scale, self.exponent, self.offset, self.noise
         expect(
-            np.isfinite(numbers).all() and self.scale >= 0 and self.exponent > 0 and self.noise > 0,
+            np.isfinite(numbers).all()
+            and self.scale >= 0
+            and self.exponent > 0
+            and self.noise > 0,
             f"`scale` ≥ 0, `exponent` > 0 and `noise` > 0 of class {self.name!r}, "
             f"got {self.scale}, {self.exponent} and {self.noise}.",
         )
@@ -72,8 +77,13 @@ ClassTable = tuple[TerrainClass, ...]
 
 
 def look_alike_classes(classes: ClassTable) -> list[tuple[int, ...]]:
-    """Classes that share a colour, by class: of each class those that look like it, itself among them."""
-    return [tuple(i for i, c in enumerate(classes) if c.colour == own.colour) for own in classes]
+    """Classes that share a colour, by class: of each class those that look like it,
+    itself among them.
+    """
+    return [
+        tuple(i for i, c in enumerate(classes) if c.colour == own.colour)
+        for own in classes
+    ]
 
 
 def check_colour(of: str, colour: tuple[int, int, int]) -> None:
@@ -82,4 +92,7 @@ def check_colour(of: str, colour: tuple[int, int, int]) -> None:
     Raises:
         ConfigError: If it is not, with `of` in its message.
     """
-    expect(all(0 <= value <= 255 for value in colour), f"`colour` of {of} in 0–255, got {colour}.")
+    expect(
+        all(0 <= value <= 255 for value in colour),
+        f"`colour` of {of} in 0–255, got {colour}.",
+    )

@@ -1,10 +1,11 @@
 """Latent traversability (LT) functions: how a class's traversability falls with slope.
 
-f_c(ψ) = clip(1 − (a_c·10⁻³·ψ^b_c + o_c), 0, 1), ψ in degrees; observed λ = clip(f_c(ψ) + ε_c, 0, 1)
-with ε_c zero-mean Gaussian of standard deviation σ_c. Source: paper III-A.
+f_c(ψ) = clip(1 − (a_c·10⁻³·ψ^b_c + o_c), 0, 1), ψ in degrees; observed λ = clip(f_c(ψ)
++ ε_c, 0, 1) with ε_c zero-mean Gaussian of standard deviation σ_c. Source: paper III-A.
 
-Beyond the paper, a class may have soft spots, a second mode of λ that neither colour nor slope shows, and
-classes may share a colour. Letters in shapes: B maps, H×W cells, K components.
+Beyond the paper, a class may have soft spots, a second mode of λ that neither colour
+nor slope shows, and classes may share a colour. Letters in shapes: B maps, H×W cells, K
+components.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,18 +44,24 @@ def truth(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> Paramet
         classes: the class table.
 
     Returns:
-        Weights, means and standard deviations, each of shape [B, K, H, W]: K = 1, or 2 where the table has
-        soft spots; a class without them has them at weight 0. Where the class is not known, means are NaN.
+        Weights, means and standard deviations, each of shape [B, K, H, W]: K = 1, or 2
+        where the table has soft spots; a class without them has them at weight 0. Where
+        the class is not known, means are NaN.
     """
     labelled = class_id != UNLABELLED
     class_id = np.where(labelled, class_id, 0)
     mean, std = latent_mean(class_id, slope_deg, classes), latent_std(class_id, classes)
     components: list[tuple[ndarray, ...]] = [(np.ones(mean.shape), mean, std)]
     if any(c.soft for c in classes):
-        spots = [(c.soft.weight, c.soft.mean, c.soft.std) if c.soft else (0.0, 0.0, 1.0) for c in classes]
+        spots = [
+            (c.soft.weight, c.soft.mean, c.soft.std) if c.soft else (0.0, 0.0, 1.0)
+            for c in classes
+        ]
         soft = tuple(np.take(np.transpose(spots), class_id, axis=1))
         components = [(1 - soft[0], mean, std), soft]
-    weights, means, stds = (np.stack(values, axis=1) for values in zip(*components, strict=True))
+    weights, means, stds = (
+        np.stack(values, axis=1) for values in zip(*components, strict=True)
+    )
     return weights, np.where(labelled[:, None], means, np.nan), stds
 
 
@@ -62,22 +69,29 @@ def stored_truth(maps: Maps, classes: ClassTable) -> Parameters:
     """Return the true distribution of λ of stored maps, as `truth` does.
 
     Args:
-        maps: `class_id`, `slope_deg` and, where layers change λ, the fields of `schema.TRUTH`.
+        maps: `class_id`, `slope_deg` and, where layers change λ, the fields of
+            `schema.TRUTH`.
         classes: the class table.
     """
-    weights, means, stds = truth(maps["class_id"], maps["slope_deg"].astype(np.float64), classes)
+    weights, means, stds = truth(
+        maps["class_id"], maps["slope_deg"].astype(np.float64), classes
+    )
     if all(name in maps for name in TRUTH):
         means, stds = (maps[name].astype(np.float64) for name in TRUTH)
     return weights, means, stds
 
 
 def look_alikes(
-    maps: DrawnMaps, layers: Sequence[Layer] = (), values: Mapping[str, ndarray] | None = None
+    maps: DrawnMaps,
+    layers: Sequence[Layer] = (),
+    values: Mapping[str, ndarray] | None = None,
 ) -> Parameters:
-    """What the colours tell of λ at best: the mixture over all classes that look like a cell's own.
+    """What the colours tell of λ at best: the mixture over all classes that look like a
+    cell's own.
 
-    Classes of one colour are shown together, and which of them takes which ground is drawn again in each map, so that
-    each weighs the same. Layers may change these weights, and λ of each class; their values are taken as known.
+    Classes of one colour are shown together, and which of them takes which ground is
+    drawn again in each map, so that each weighs the same. Layers may change these
+    weights, and λ of each class; their values are taken as known.
 
     Args:
         maps: classes and slopes.
@@ -85,28 +99,37 @@ def look_alikes(
         values: by layer, shape [B, H, W].
 
     Returns:
-        As `truth`, with the components of each class in turn, a second one where it has soft spots.
+        As `truth`, with the components of each class in turn, a second one where it has
+        soft spots.
     """
     values, labelled = values or {}, maps.class_id != UNLABELLED
     alike = look_alike_classes(maps.classes)
     shares = np.zeros((len(alike), len(alike)))  # of each class, by the cell's own
     for number, members in enumerate(alike):
         shares[list(members), number] = 1 / len(members)
-    colour_weights = np.moveaxis(np.take(shares, np.where(labelled, maps.class_id, 0), axis=1), 0, 1)
+    colour_weights = np.moveaxis(
+        np.take(shares, np.where(labelled, maps.class_id, 0), axis=1), 0, 1
+    )
     class_weights = weigh_layers(layers, colour_weights, values, maps)
     class_weights = np.where(labelled[:, None], class_weights, colour_weights)
     pieces = []
     for number, item in enumerate(maps.classes):
         below = replace(maps, class_id=np.where(labelled, number, UNLABELLED))
-        own = affect_layers(layers, truth(below.class_id, maps.slope_deg, maps.classes), values, below)
+        own = affect_layers(
+            layers, truth(below.class_id, maps.slope_deg, maps.classes), values, below
+        )
         weights, means, stds = (array[:, : 2 if item.soft else 1] for array in own)
         pieces.append((weights * class_weights[:, number, None], means, stds))
-    weights, means, stds = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
+    weights, means, stds = (
+        np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True)
+    )
     return weights, means, stds
 
 
 def expected_of(parameters: Parameters) -> ndarray:
-    """E[λ] of the clipped mixture, shape [B, H, W], from parameters of shape [B, K, H, W]."""
+    """E[λ] of the clipped mixture, shape [B, H, W], from parameters of shape [B, K, H,
+    W].
+    """
     weights, means, stds = parameters
     return (weights * expected_traversability(means, stds)).sum(1)
 
@@ -114,18 +137,22 @@ def expected_of(parameters: Parameters) -> ndarray:
 def expected_traversability(mean: ndarray, std: ndarray) -> ndarray:
     """E[λ] of the clipped Gaussian N(mean, std), shape of `mean`.
 
-    The integral of 1 − Φ from 0 to 1; `TraversabilityMixture.mean` says the same for mixtures of tensors.
+    The integral of 1 − Φ from 0 to 1; `TraversabilityMixture.mean` says the same for
+    mixtures of tensors.
     """
     below = (np.array([[1.0], [0.0]]) - mean.ravel()) / std.ravel()
-    integral = below * _probability(below) + np.exp(-0.5 * below * below) / np.sqrt(2 * np.pi)
+    integral = below * _probability(below) + np.exp(-0.5 * below * below) / np.sqrt(
+        2 * np.pi
+    )
     return 1 - std * (integral[0] - integral[1]).reshape(mean.shape)
 
 
 def quantile_of(parameters: Parameters, normal: ndarray) -> ndarray:
-    """λ of the rank that a standard normal number has: clip(F⁻¹(Φ(z)), 0, 1), F the mixture's CDF.
+    """λ of the rank that a standard normal number has: clip(F⁻¹(Φ(z)), 0, 1), F the
+    mixture's CDF.
 
-    In closed form where one component has all the weight, else by bisection to within 2⁻²⁵;
-    `TraversabilityMixture.from_normal` says the same of tensors.
+    In closed form where one component has all the weight, else by bisection to within
+    2⁻²⁵; `TraversabilityMixture.from_normal` says the same of tensors.
 
     Args:
         parameters: weights, means and standard deviations, each of shape [B, K, H, W].
@@ -136,7 +163,9 @@ def quantile_of(parameters: Parameters, normal: ndarray) -> ndarray:
     """
     weights, means, stds = parameters
     heaviest = weights.argmax(axis=1)[:, None]
-    mean, std = (np.take_along_axis(values, heaviest, axis=1)[:, 0] for values in (means, stds))
+    mean, std = (
+        np.take_along_axis(values, heaviest, axis=1)[:, 0] for values in (means, stds)
+    )
     value = np.clip(mean + std * normal, 0, 1)
     mixed = weights.max(axis=1) < 1
     if mixed.any():
@@ -156,11 +185,15 @@ def _bisected_quantile(parameters: tuple[ndarray, ...], rank: ndarray) -> ndarra
     for _ in range(_BISECTIONS):
         width /= 2
         low = np.where(below(low + width) < rank, low + width, low)
-    return np.where(below(0.0) >= rank, 0.0, np.where(below(1.0) <= rank, 1.0, low + width / 2))
+    return np.where(
+        below(0.0) >= rank, 0.0, np.where(below(1.0) <= rank, 1.0, low + width / 2)
+    )
 
 
 def _probability(z: ndarray) -> ndarray:
     """Φ(z)."""
-    from scipy.special import ndtr  # imported here: a dataset is listed and shown without
+    from scipy.special import (
+        ndtr,
+    )  # imported here: a dataset is listed and shown without
 
     return ndtr(z)

@@ -1,7 +1,9 @@
-"""What colours classes show, and that tints leave look-alikes as the class table has them.
+"""What colours classes show, and that tints leave look-alikes as the class table has
+them.
 
-`Terrain.look_alikes`, what colour can tell at best, goes by the class table. So a tint may neither make classes
-alike nor tell those apart that are. Letters in shapes: C classes.
+`Terrain.look_alikes`, what colour can tell at best, goes by the class table. So a tint
+may neither make classes alike nor tell those apart that are. Letters in shapes: C
+classes.
 """
 
 from collections.abc import Mapping
@@ -16,7 +18,9 @@ from benchnav.datagen.recipe.scenario import Scenario
 
 
 def shown_colours(classes: ClassTable, scenario: Scenario) -> ndarray:
-    """Return the colours of classes in full light, tinted: RGB, 0–255, float64, shape [C, 3]."""
+    """Return the colours of classes in full light, tinted: RGB, 0–255, float64, shape
+    [C, 3].
+    """
     ground = np.array([item.colour for item in classes], dtype=np.float64)
     for tint in scenario.tints:
         changed = [not tint.classes or item.name in tint.classes for item in classes]
@@ -39,8 +43,10 @@ def check_tints(classes: ClassTable, scenarios: Mapping[str, Scenario]) -> None:
         for one, other in np.argwhere(_alike(shown) != _alike(table)).tolist():
             is_alike = (shown[one] == shown[other]).all()
             raise ConfigError(
-                f"Expected `tints` of scenario {name!r} that leave look-alikes as they are in the class table, got "
-                f"{names[one]!r} and {names[other]!r} in {'one colour' if is_alike else 'two colours'}. "
+                f"Expected `tints` of scenario {name!r} that leave look-alikes as "
+                "they are in the class table, got "
+                f"{names[one]!r} and {names[other]!r} in "
+                f"{'one colour' if is_alike else 'two colours'}. "
                 f"{'Lower a `share`' if is_alike else 'Tint both'}."
             )
 

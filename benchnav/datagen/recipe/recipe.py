@@ -1,6 +1,7 @@
 """Recipes: everything that fixes a dataset, as data.
 
-A recipe is a YAML file. Shipped ones are named by id (`paper-v1`); a user's own is named by path.
+A recipe is a YAML file. Shipped ones are named by id (`paper-v1`); a user's own is
+named by path.
 """
 
 import re
@@ -25,15 +26,29 @@ from benchnav.datagen.layers.spec import LayerSpec, read_layers
 from benchnav.datagen.layers.stack import check_layer
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes
-from benchnav.datagen.recipe.environments import AlikeClasses, deal_classes, deal_units, never_shown
+from benchnav.datagen.recipe.environments import (
+    AlikeClasses,
+    deal_classes,
+    deal_units,
+    never_shown,
+)
 from benchnav.datagen.recipe.looks import check_tints, shown_colours
 from benchnav.datagen.recipe.places import PlacesRule, check_places
-from benchnav.datagen.recipe.scenario import DEFAULTS, PRESETS, RECIPES, Scenario, load_presets, resolve
+from benchnav.datagen.recipe.scenario import (
+    DEFAULTS,
+    PRESETS,
+    RECIPES,
+    Scenario,
+    load_presets,
+    resolve,
+)
 from benchnav.datagen.schema import FIELDS, UNLABELLED, Fields, truth_fields
 
 _MOST_CRATERED = 0.4  # share of a map; discs laid at random one by one jam at 0.55
 _LEAST_GAP = 0.3  # between classes of one colour, in E[λ] on flat ground
-REFERENCE_M = 32.0  # side of the square that relief and crater counts of synthesis 2 are for
+REFERENCE_M = (
+    32.0  # side of the square that relief and crater counts of synthesis 2 are for
+)
 
 
 # More than a machine makes; a shard's name counts maps in eight digits.
@@ -48,7 +63,8 @@ class Split:
     Args:
         scenario: name of one of the recipe's scenarios.
         maps: number of maps; map i shows environment i mod the number of environments.
-        solvable: keep only maps whose goal can be reached, and store the grid reference time.
+        solvable: keep only maps whose goal can be reached, and store the grid reference
+            time.
     """
 
     scenario: str
@@ -57,7 +73,10 @@ class Split:
 
     def __post_init__(self) -> None:
         """Refuses empty splits."""
-        expect(self.maps >= 1, f"`maps` ≥ 1 in every split, got {self.maps}. Leave the split out instead.")
+        expect(
+            self.maps >= 1,
+            f"`maps` ≥ 1 in every split, got {self.maps}. Leave the split out instead.",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,24 +85,30 @@ class Recipe:
 
     Args:
         id: name and version of the dataset, for example `paper-v1`.
-        seed: root seed; another seed makes a sibling with other maps and the same class table.
+        seed: root seed; another seed makes a sibling with other maps and the same class
+            table.
         height: rows of a map.
         width: columns of a map.
         resolution_m: cell width.
         start_m: (x, y) where navigation starts; None where `places` says.
         goal_m: (x, y) where it ends; None where `places` says.
-        places: how start and goal are drawn a map, in place of `start_m` and `goal_m`; synthesis 2 only.
+        places: how start and goal are drawn a map, in place of `start_m` and `goal_m`;
+            synthesis 2 only.
         stuck_threshold: λ_stuck; a cell is truly free when E[λ] exceeds it.
-        synthesis: how maps are made: 1 as by version 0.1, bit for bit, or 2, which knows soft spots, classes
-            that look alike, drawn places and correlated λ, and makes the same ground at any size.
-        correlation_m: ℓ of stored λ: at distance d the noise of two cells has the correlation exp(−d²/2ℓ²);
-            at 0, as in synthesis 1, each cell's is its own.
-        layers: what else is drawn, in this order; objects of `Layer` become their specs. Synthesis 2 only.
-        closed_corners: whether a diagonal step between two cells that are not free is no way, for solvable maps and
-            reference times. False in the shipped recipes and in files of versions before 1.2; in a recipe of synthesis
-            2 with an id of its own true, unless it says otherwise. Synthesis 2 only.
+        synthesis: how maps are made: 1 as by version 0.1, bit for bit, or 2, which
+            knows soft spots, classes that look alike, drawn places and correlated λ,
+            and makes the same ground at any size.
+        correlation_m: ℓ of stored λ: at distance d the noise of two cells has the
+            correlation exp(−d²/2ℓ²); at 0, as in synthesis 1, each cell's is its own.
+        layers: what else is drawn, in this order; objects of `Layer` become their
+            specs. Synthesis 2 only.
+        closed_corners: whether a diagonal step between two cells that are not free is
+            no way, for solvable maps and reference times. False in the shipped recipes
+            and in files of versions before 1.2; in a recipe of synthesis 2 with an id
+            of its own true, unless it says otherwise. Synthesis 2 only.
         environments: number of environments; each shows its own choice of classes.
-        occupancy: share of the cells that each class of an environment covers, summing to 1.
+        occupancy: share of the cells that each class of an environment covers, summing
+            to 1.
         class_periods_m: lattice spacings of the class noise, one an octave.
         classes: the class table.
         scenarios: scenarios by name.
@@ -117,7 +142,10 @@ class Recipe:
         object.__setattr__(self, "layers", read_layers(self.layers))
         expect(self.synthesis in (1, 2), f"`synthesis` 1 or 2, got {self.synthesis}.")
         expect(0 <= self.seed < 2**63, f"`seed` in 0–2^63 − 1, got {self.seed}.")
-        expect(0 <= self.stuck_threshold < 1, f"`stuck_threshold` in [0, 1), got {self.stuck_threshold}.")
+        expect(
+            0 <= self.stuck_threshold < 1,
+            f"`stuck_threshold` in [0, 1), got {self.stuck_threshold}.",
+        )
         check_name("id", self.id)
         _check_ends(self)
         _check_scenarios(self)
@@ -137,7 +165,8 @@ class Recipe:
             for name, value in asked.items():
                 expect(
                     not value,
-                    f"`synthesis: 2` with `{name}`, got 1, which makes maps as version 0.1 did. "
+                    f"`synthesis: 2` with `{name}`, got 1, which makes maps as "
+                    "version 0.1 did. "
                     "Set `synthesis: 2` in the recipe.",
                 )
             return
@@ -145,7 +174,8 @@ class Recipe:
         most_m = LONGEST_CORRELATION * min(self.grid.extent_m)
         expect(
             0 <= self.correlation_m <= most_m,
-            f"`correlation_m` in 0–{most_m:g} m, a quarter of the map's shorter side, got {self.correlation_m:g}.",
+            f"`correlation_m` in 0–{most_m:g} m, a quarter of the map's shorter side, "
+            f"got {self.correlation_m:g}.",
         )
 
     @property
@@ -157,7 +187,11 @@ class Recipe:
     def fields(self) -> Fields:
         """What a dataset of the recipe's maps has of each."""
         components = 2 if any(item.soft for item in self.classes) else 1
-        truth = truth_fields(components) if any(spec.affects for spec in self.layers) else {}
+        truth = (
+            truth_fields(components)
+            if any(spec.affects for spec in self.layers)
+            else {}
+        )
         return FIELDS | {spec.name: spec.stored_field for spec in self.layers} | truth
 
     @property
@@ -168,30 +202,42 @@ class Recipe:
     @property
     def _vegetation(self) -> vegetation.Vegetation | None:
         grown = [spec.layer for spec in self.layers if spec.is_vegetation]
-        return grown[0] if grown and isinstance(grown[0], vegetation.Vegetation) else None
+        return (
+            grown[0] if grown and isinstance(grown[0], vegetation.Vegetation) else None
+        )
 
     def cells_of(self, positions_m: ndarray) -> tuple[ndarray, ndarray]:
-        """Rows and columns of the cells that positions [B, 2] lie in, read in single precision as stored."""
+        """Rows and columns of the cells that positions [B, 2] lie in, read in single
+        precision as stored.
+        """
         column, row = (
-            np.floor(positions_m.astype(np.float32) / np.float32(self.resolution_m)).astype(np.int64).T
+            np.floor(positions_m.astype(np.float32) / np.float32(self.resolution_m))
+            .astype(np.int64)
+            .T
         )
         return row.clip(0, self.height - 1), column.clip(0, self.width - 1)
 
     @cached_property
     def units(self) -> tuple[AlikeClasses, ...]:
-        """Classes that are shown together in synthesis 2: those of one colour, in the table's order."""
+        """Classes that are shown together in synthesis 2: those of one colour, in the
+        table's order.
+        """
         return tuple(dict.fromkeys(look_alike_classes(self.classes)))
 
     @cached_property
     def environment_classes(self) -> ndarray:
-        """The classes that each environment shows: indices, distinct in a row, shape [E, len(occupancy)]."""
+        """The classes that each environment shows: indices, distinct in a row, shape
+        [E, len(occupancy)].
+        """
         shown = len(self.occupancy)
         if self.synthesis == 1:
             return deal_classes(len(self.classes), shown, self.environments)
         return deal_units(self.units, shown, self.environments)
 
     def craters(self, scenario: Scenario) -> tuple[int, int]:
-        """Fewest and most craters of a map; in synthesis 2 a scenario's counts are for 32 m × 32 m."""
+        """Fewest and most craters of a map; in synthesis 2 a scenario's counts are for
+        32 m × 32 m.
+        """
         extent_x, extent_y = self.grid.extent_m
         share = 1.0 if self.synthesis == 1 else extent_x * extent_y / REFERENCE_M**2
         low, high = (round(share * count) for count in scenario.crater_count)
@@ -224,12 +270,14 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
 
     Args:
         source: id or path.
-        overrides: changes `key.key=value`, the value in YAML, such as `splits.train.maps=50`; an item of a list goes
-            by its `name`, as in `classes.dune_sand.soft.weight=0.2`. What differs needs a name of its own, so
-            `id=NAME` has to be among them.
+        overrides: changes `key.key=value`, the value in YAML, such as
+            `splits.train.maps=50`; an item of a list goes by its `name`, as in
+            `classes.dune_sand.soft.weight=0.2`. What differs needs a name of its own,
+            so `id=NAME` has to be among them.
 
     Raises:
-        ConfigError: there is no such recipe, or it is not one; or other maps would bear its id.
+        ConfigError: there is no such recipe, or it is not one; or other maps would bear
+            its id.
     """
     path = RECIPES / f"{source}.yaml"
     if not path.exists():
@@ -237,20 +285,29 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
     shipped = shipped_recipes()
     expect(
         path.is_file(),
-        f"a shipped recipe ({', '.join(shipped)}) or the path of a YAML file, got {str(source)!r}.",
+        f"a shipped recipe ({', '.join(shipped)}) or the path of a YAML file, got "
+        f"{str(source)!r}.",
     )
     data = read_yaml(path)
     own = _with_class_table(data)
     for text in overrides:
         name, equals, value = text.partition("=")
-        expect(equals and all(name.split(".")), f"an override such as splits.train.maps=50, got {text!r}.")
+        expect(
+            equals and all(name.split(".")),
+            f"an override such as splits.train.maps=50, got {text!r}.",
+        )
         own = changed(own, name.split("."), load_yaml(value))
-    if isinstance(own, dict) and own.get("synthesis") == 2 and own.get("id") not in shipped:
+    if (
+        isinstance(own, dict)
+        and own.get("synthesis") == 2
+        and own.get("id") not in shipped
+    ):
         own = {"closed_corners": True, **own}
     recipe = recipe_from_dict(own, str(source))
     expect(
         not overrides or recipe.id != data.get("id"),
-        f"`id=NAME` among the overrides, since {recipe.id!r} names the maps of the recipe as it is.",
+        f"`id=NAME` among the overrides, since {recipe.id!r} names the maps of the "
+        "recipe as it is.",
     )
     as_shipped = path == RECIPES / f"{recipe.id}.yaml" and not overrides
     expect(
@@ -287,19 +344,29 @@ def recipe_from_dict(data: Any, origin: str) -> Recipe:
         origin: where it came from, for messages.
 
     Raises:
-        ConfigError: a key is unknown or missing, or a value is of the wrong type or out of range.
+        ConfigError: a key is unknown or missing, or a value is of the wrong type or out
+            of range.
     """
-    expect(isinstance(data, dict), f"a mapping in recipe {origin}, got {type(data).__name__}.")
+    expect(
+        isinstance(data, dict),
+        f"a mapping in recipe {origin}, got {type(data).__name__}.",
+    )
     data = _with_class_table(data)
     _, presets = load_presets(data.get("synthesis"))
     scenarios = data.get("scenarios", {name: {"preset": name} for name in DEFAULTS})
     if isinstance(scenarios, dict):
-        scenarios = {name: resolve(entry, presets, name) for name, entry in scenarios.items()}
+        scenarios = {
+            name: resolve(entry, presets, name) for name, entry in scenarios.items()
+        }
     try:
         growth, data = vegetation.read_keys(data)
         layers = read_layers(data.get("layers", []))
         data["layers"] = read_layers((*([growth] if growth else []), *layers))
-        return read(Recipe, data | {"scenarios": scenarios}, lambda key: f"`{key}`" if key else "a recipe")
+        return read(
+            Recipe,
+            data | {"scenarios": scenarios},
+            lambda key: f"`{key}`" if key else "a recipe",
+        )
     except ConfigError as error:
         raise ConfigError(f"Recipe {origin}: {error}") from error
 
@@ -317,10 +384,15 @@ def check_name(kind: str, name: str) -> None:
 
 
 def _check_ends(recipe: Recipe) -> None:
-    given = [name for name in ("start_m", "goal_m", "places") if getattr(recipe, name) is not None]
+    given = [
+        name
+        for name in ("start_m", "goal_m", "places")
+        if getattr(recipe, name) is not None
+    ]
     expect(
         given in (["start_m", "goal_m"], ["places"]),
-        f"either `start_m` and `goal_m`, or `places`, got {' and '.join(given) or 'neither'}.",
+        "either `start_m` and `goal_m`, or `places`, got "
+        f"{' and '.join(given) or 'neither'}.",
     )
     if recipe.places is not None:
         return check_places(recipe.places, recipe.grid)
@@ -332,7 +404,11 @@ def _check_ends(recipe: Recipe) -> None:
             f"`{name}` on the map of {extent_x:g} m × {extent_y:g} m, got ({x}, {y}).",
         )
     start, goal = np.transpose(recipe.cells_of(ends)).tolist()
-    expect(start != goal, f"`goal_m` in another cell than `start_m`, got both in that of {recipe.goal_m}.")
+    expect(
+        start != goal,
+        "`goal_m` in another cell than `start_m`, got both in that of "
+        f"{recipe.goal_m}.",
+    )
 
 
 def _check_scenarios(recipe: Recipe) -> None:
@@ -344,42 +420,57 @@ def _check_scenarios(recipe: Recipe) -> None:
         _, most = recipe.craters(scenario)
         expect(
             most == 0 or 2 * scenario.crater_radius_m[1] <= min(extent_x, extent_y),
-            f"`crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × {extent_y:g} m, "
+            f"`crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × "
+            f"{extent_y:g} m, "
             f"got {scenario.crater_radius_m}.",
         )
         covered = most * scenario.mean_crater_area_m2 / (extent_x * extent_y)
         expect(
             covered <= _MOST_CRATERED,
-            f"the craters of scenario {name!r} to cover at most {_MOST_CRATERED:.0%} of a map, "
-            f"so that they fit side by side, got {covered:.0%}. Lower `crater_count` or `crater_radius_m`.",
+            f"the craters of scenario {name!r} to cover at most {_MOST_CRATERED:.0%} "
+            "of a map, "
+            f"so that they fit side by side, got {covered:.0%}. Lower `crater_count` "
+            "or `crater_radius_m`.",
         )
 
 
 def _check_environments(recipe: Recipe) -> None:
     shares, classes, periods = recipe.occupancy, recipe.classes, recipe.class_periods_m
-    expect(1 <= len(classes) <= UNLABELLED, f"1–{UNLABELLED} classes in `classes`, got {len(classes)}.")
+    expect(
+        1 <= len(classes) <= UNLABELLED,
+        f"1–{UNLABELLED} classes in `classes`, got {len(classes)}.",
+    )
     expect(
         np.isclose(sum(shares), 1, atol=1e-6) and min(shares) > 0,
         f"`occupancy` as shares > 0 summing to 1, got {list(shares)}.",
     )
     expect(
         len(shares) <= len(classes),
-        f"at most {len(classes)} shares in `occupancy`, one a class, got {len(shares)}.",
+        f"at most {len(classes)} shares in `occupancy`, one a class, got "
+        f"{len(shares)}.",
     )
     most = np.iinfo(FIELDS["environment"].dtype).max
-    expect(1 <= recipe.environments <= most, f"`environments` in 1–{most}, got {recipe.environments}.")
+    expect(
+        1 <= recipe.environments <= most,
+        f"`environments` in 1–{most}, got {recipe.environments}.",
+    )
     expect(
         periods and all(recipe.resolution_m <= period < np.inf for period in periods),
-        f"`class_periods_m` of at least a cell, {recipe.resolution_m} m, got {list(periods)}.",
+        f"`class_periods_m` of at least a cell, {recipe.resolution_m} m, got "
+        f"{list(periods)}.",
     )
 
 
 def _check_splits(recipe: Recipe) -> None:
     expect(recipe.splits, "at least one split in `splits`, got none.")
-    maps, cells = sum(split.maps for split in recipe.splits.values()), recipe.height * recipe.width
+    maps, cells = (
+        sum(split.maps for split in recipe.splits.values()),
+        recipe.height * recipe.width,
+    )
     expect(
         maps <= MAX_MAPS and maps * cells <= MAX_CELLS,
-        f"at most {MAX_MAPS:,} maps of {MAX_CELLS:,} cells together, got {maps:,} of {cells:,}. Ask for fewer `maps`.",
+        f"at most {MAX_MAPS:,} maps of {MAX_CELLS:,} cells together, got {maps:,} of "
+        f"{cells:,}. Ask for fewer `maps`.",
     )
     for name, split in recipe.splits.items():
         for part in name.split("/"):
@@ -390,7 +481,8 @@ def _check_splits(recipe: Recipe) -> None:
         )
         expect(
             split.scenario in recipe.scenarios,
-            f"`scenario` of split {name!r} to be one of {sorted(recipe.scenarios)}, got {split.scenario!r}.",
+            f"`scenario` of split {name!r} to be one of {sorted(recipe.scenarios)}, "
+            f"got {split.scenario!r}.",
         )
 
 
@@ -399,24 +491,31 @@ def _check_look_alikes(recipe: Recipe) -> None:
     flat = np.zeros((len(names), 1, 1))
     order = np.arange(len(names)).reshape(flat.shape)
     means = latent.expected_of(latent.truth(order, flat, recipe.classes)).ravel()
-    for first, second in (pair for group in recipe.units for pair in combinations(group, 2)):
+    for first, second in (
+        pair for group in recipe.units for pair in combinations(group, 2)
+    ):
         expect(
             abs(means[first] - means[second]) >= _LEAST_GAP,
-            f"classes of one colour to differ by at least {_LEAST_GAP:g} in E[λ] on flat ground, "
-            f"got {means[first]:.3f} for {names[first]!r} and {means[second]:.3f} for {names[second]!r}. "
+            f"classes of one colour to differ by at least {_LEAST_GAP:g} in E[λ] on "
+            "flat ground, "
+            f"got {means[first]:.3f} for {names[first]!r} and {means[second]:.3f} for "
+            f"{names[second]!r}. "
             "Change an `offset` or a `colour`.",
         )
     for unit in never_shown(recipe.units, shown):
         raise ConfigError(
-            f"Expected classes that can be shown {shown} at a time, one for each share in `occupancy`, those of one "
+            f"Expected classes that can be shown {shown} at a time, one for each "
+            "share in `occupancy`, those of one "
             "colour together; got no choice of others that goes with "
-            f"{', '.join(names[member] for member in unit)}. Change `occupancy` or a `colour`."
+            f"{', '.join(names[member] for member in unit)}. Change `occupancy` or a "
+            "`colour`."
         )
 
 
 def _check_layers(recipe: Recipe) -> None:
     colours = {
-        name: np.rint(shown_colours(recipe.classes, scenario)) for name, scenario in recipe.scenarios.items()
+        name: np.rint(shown_colours(recipe.classes, scenario))
+        for name, scenario in recipe.scenarios.items()
     }
     for spec in recipe.layers:
         # Others are of a dataset, whose recipe was checked when it was made.

@@ -1,7 +1,9 @@
-"""Scenarios, the geometry, light and tints of a family of maps, and the shipped ones that recipes build on.
+"""Scenarios, the geometry, light and tints of a family of maps, and the shipped ones
+that recipes build on.
 
-`presets.yaml` holds the shipped class table and scenarios, which a recipe may name or replace. A
-scenario's `severity` s moves every number of it from `std` (s = 0) to the preset (s = 1), and beyond.
+`presets.yaml` holds the shipped class table and scenarios, which a recipe may name or
+replace. A scenario's `severity` s moves every number of it from `std` (s = 0) to the
+preset (s = 1), and beyond.
 """
 
 import re
@@ -25,7 +27,9 @@ SeriesOfShifts = dict[str, list[tuple[float, str]]]
 # Those of a recipe that names none.
 DEFAULTS = ("std", "hg", "hs")
 
-_NAMED = re.compile(r"(?P<scenario>.*[^/])(-(?P<hundredths>\d{3})|@(?P<severity>\d+(\.\d+)?))")
+_NAMED = re.compile(
+    r"(?P<scenario>.*[^/])(-(?P<hundredths>\d{3})|@(?P<severity>\d+(\.\d+)?))"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,13 +54,15 @@ class Tint:
         )
         expect(
             0 < self.share < 1,
-            f"`share` of a tint in (0, 1), got {self.share:g}. At severity 1 a preset has its own share.",
+            f"`share` of a tint in (0, 1), got {self.share:g}. At severity 1 a preset "
+            "has its own share.",
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """Geometry, light and tints of a family of maps; each range is drawn from uniformly, a value a map.
+    """Geometry, light and tints of a family of maps; each range is drawn from
+    uniformly, a value a map.
 
     Args:
         relief_m: highest minus lowest elevation of the fractal ground.
@@ -66,7 +72,8 @@ class Scenario:
         crater_depth_ratio: depth below the rim over diameter.
         light_height: z of the unit vector toward the light; 1 is overhead.
         ambient: share of ambient light.
-        tints: what changes the colours of classes, one after another. Vegetation keeps its own.
+        tints: what changes the colours of classes, one after another. Vegetation keeps
+            its own.
     """
 
     relief_m: Range = (1.4, 1.7)
@@ -94,7 +101,8 @@ class Scenario:
             low, high = value if isinstance(value, tuple) else (value, value)
             expect(
                 least <= low <= high <= most,
-                f"scenario `{name}` finite, ordered and within [{least:g}, {most:g}], got {value}.",
+                f"scenario `{name}` finite, ordered and within [{least:g}, {most:g}], "
+                f"got {value}.",
             )
 
     @property
@@ -113,16 +121,26 @@ def blend(base: Scenario, full: Scenario, severity: float) -> Scenario:
     """
 
     def between(low: Any, high: Any) -> Any:
-        return tuple(map(between, low, high)) if isinstance(low, tuple) else low + severity * (high - low)
+        return (
+            tuple(map(between, low, high))
+            if isinstance(low, tuple)
+            else low + severity * (high - low)
+        )
 
     numbers = [item.name for item in fields(Scenario) if item.name != "tints"]
-    moved = {name: between(getattr(base, name), getattr(full, name)) for name in numbers}
-    tints = tuple(replace(tint, share=severity * tint.share) for tint in full.tints if severity)
+    moved = {
+        name: between(getattr(base, name), getattr(full, name)) for name in numbers
+    }
+    tints = tuple(
+        replace(tint, share=severity * tint.share) for tint in full.tints if severity
+    )
     return Scenario(**moved, tints=tints)
 
 
 def load_presets(synthesis: Any) -> tuple[list[Any], dict[str, Any]]:
-    """Reads the shipped class table and the scenarios shipped for a synthesis, as plain data."""
+    """Reads the shipped class table and the scenarios shipped for a synthesis, as plain
+    data.
+    """
     data = yaml.safe_load(PRESETS.read_text())
     return data["classes"], data["scenarios-2" if synthesis == 2 else "scenarios"]
 
@@ -131,8 +149,8 @@ def resolve(entry: Any, presets: Mapping[str, Any], name: str) -> Any:
     """Gives a scenario's numbers in full.
 
     Args:
-        entry: plain data of a scenario; where it names a `preset`, that one's numbers at its `severity`,
-            with what else the entry says in their place.
+        entry: plain data of a scenario; where it names a `preset`, that one's numbers
+            at its `severity`, with what else the entry says in their place.
         presets: the presets' plain data by name, `std` among them.
         name: the scenario's name, for messages.
 
@@ -144,31 +162,38 @@ def resolve(entry: Any, presets: Mapping[str, Any], name: str) -> Any:
     preset, severity = entry["preset"], entry.get("severity", 1.0)
     expect(
         isinstance(preset, str) and preset in presets,
-        f"`preset` of scenario {name!r} to be one of {sorted(presets)}, got {preset!r}.",
+        f"`preset` of scenario {name!r} to be one of {sorted(presets)}, got "
+        f"{preset!r}.",
     )
     expect(
         isinstance(severity, int | float) and np.isfinite(severity),
         f"`severity` of scenario {name!r} to be a finite number, got {severity!r}.",
     )
-    base, full = (read(Scenario, presets[key], of(f"preset {key!r}")) for key in ("std", preset))
-    changes = {key: value for key, value in entry.items() if key not in ("preset", "severity")}
+    base, full = (
+        read(Scenario, presets[key], of(f"preset {key!r}")) for key in ("std", preset)
+    )
+    changes = {
+        key: value for key, value in entry.items() if key not in ("preset", "severity")
+    }
     return {**plain(blend(base, full, severity)), **changes}
 
 
 def find_series(splits: Iterable[str]) -> SeriesOfShifts:
     """Finds the series of shifts among splits by their names.
 
-    A split is one of a series where its name ends in the severity: in hundredths after a dash (`test/hg-050`), or as
-    a number after an @ (`test/hg@0.5`). What stands before is the scenario; the split `std` of the same folder is
-    severity 0 of each, and a split of the scenario's own name (`test/hg`) severity 1. Every other split stands by
-    itself.
+    A split is one of a series where its name ends in the severity: in hundredths after
+    a dash (`test/hg-050`), or as a number after an @ (`test/hg@0.5`). What stands
+    before is the scenario; the split `std` of the same folder is severity 0 of each,
+    and a split of the scenario's own name (`test/hg`) severity 1. Every other split
+    stands by itself.
 
     Args:
         splits: names of splits.
 
     Returns:
-        By scenario, its pairs as (severity, split), ascending, with `std` at severity 0 and the scenario itself at 1
-        where they are there; scenarios with fewer than two pairs are left out.
+        By scenario, its pairs as (severity, split), ascending, with `std` at severity 0
+        and the scenario itself at 1 where they are there; scenarios with fewer than two
+        pairs are left out.
     """
     splits = list(splits)
     all_series: SeriesOfShifts = {}

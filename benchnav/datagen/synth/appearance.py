@@ -1,6 +1,8 @@
-"""What terrain looks like: where each class lies, by bands of noise, and its colour shaded by the light.
+"""What terrain looks like: where each class lies, by bands of noise, and its colour
+shaded by the light.
 
-Shading is Lambert's law with ambient light, as in paper III-A. Batched NumPy in float64, the same on every machine.
+Shading is Lambert's law with ambient light, as in paper III-A. Batched NumPy in
+float64, the same on every machine.
 Letters in shapes: B maps, H×W cells, M classes that a map shows.
 """
 
@@ -16,7 +18,8 @@ def class_bands(noise: ndarray, occupancy: ndarray) -> ndarray:
         occupancy: share of each band, summing to 1, shape [M].
 
     Returns:
-        Band index in [0, M), int64, shape [B, H, W]; each share is met to within one cell.
+        Band index in [0, M), int64, shape [B, H, W]; each share is met to within one
+        cell.
     """
     flat = noise.reshape(len(noise), -1)
     edges = np.round(np.cumsum(occupancy)[:-1] * flat.shape[1]).astype(int)
@@ -35,10 +38,14 @@ def light_direction(azimuth_rad: ndarray, height: ndarray) -> ndarray:
         (x, y, z), shape [B, 3].
     """
     across = np.sqrt(1 - height**2)
-    return np.stack([across * np.cos(azimuth_rad), across * np.sin(azimuth_rad), height], axis=-1)
+    return np.stack(
+        [across * np.cos(azimuth_rad), across * np.sin(azimuth_rad), height], axis=-1
+    )
 
 
-def shade(along_x: ndarray, along_y: ndarray, light: ndarray, ambient: float) -> ndarray:
+def shade(
+    along_x: ndarray, along_y: ndarray, light: ndarray, ambient: float
+) -> ndarray:
     """Brightness of the ground: ambient + (1 − ambient)·max(0, n·l).
 
     Args:
@@ -51,7 +58,9 @@ def shade(along_x: ndarray, along_y: ndarray, light: ndarray, ambient: float) ->
         Brightness in [0, 1], shape [B, H, W].
     """
     x, y, z = (light[:, k, None, None] for k in range(3))
-    cosine = (z - x * along_x - y * along_y) / np.sqrt(1 + along_x * along_x + along_y * along_y)
+    cosine = (z - x * along_x - y * along_y) / np.sqrt(
+        1 + along_x * along_x + along_y * along_y
+    )
     return np.maximum(cosine, 0) * (1 - ambient) + ambient
 
 

@@ -1,6 +1,7 @@
 """From a recipe to maps: each map is a pure function of (recipe, split, index).
 
-Elevation is quantised first; slope, shading and λ are derived from what is stored. Batched NumPy in
+Elevation is quantised first; slope, shading and λ are derived from what is stored.
+Batched NumPy in
 float64. Letters in shapes: B maps, H×W cells.
 """
 
@@ -25,7 +26,9 @@ from benchnav.datagen.schema import TRUTH, Maps, join_maps, quantise
 from benchnav.datagen.synth import appearance, elevation
 
 MOST_ATTEMPTS = 200
-_PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache; of large maps fewer
+# maps at a time, so that what is worked on stays in the processor's cache; of large
+# maps fewer
+_PIECE = 16
 _PIECE_CELLS = 2**20
 
 
@@ -41,13 +44,22 @@ def generate(recipe: Recipe, split: str, indices: ndarray) -> Maps:
         The fields of `recipe.fields`, each of shape [B, *entry shape].
 
     Raises:
-        ConfigError: a split asks for solvable maps and the recipe yields none for some index.
+        ConfigError: a split asks for solvable maps and the recipe yields none for some
+            index.
     """
     indices = np.asarray(indices, dtype=np.int64)
     size = min(_PIECE, recipe.grid.maps_in(_PIECE_CELLS))
     starts = range(0, max(len(indices), 1), size)
-    maps = join_maps([_generate_piece(recipe, split, indices[start : start + size]) for start in starts])
-    return {name: maps[name].astype(field.dtype, copy=False) for name, field in recipe.fields.items()}
+    maps = join_maps(
+        [
+            _generate_piece(recipe, split, indices[start : start + size])
+            for start in starts
+        ]
+    )
+    return {
+        name: maps[name].astype(field.dtype, copy=False)
+        for name, field in recipe.fields.items()
+    }
 
 
 def _generate_piece(recipe: Recipe, split: str, indices: ndarray) -> Maps:
@@ -64,13 +76,16 @@ def _generate_piece(recipe: Recipe, split: str, indices: ndarray) -> Maps:
         if len(pending) == 0:
             return maps
     raise ConfigError(
-        f"Expected split {split!r} to have maps whose goal can be reached; {MOST_ATTEMPTS} draws gave none "
-        f"for map {int(indices[pending[0]])}. Ease its scenario or lower `stuck_threshold`."
+        f"Expected split {split!r} to have maps whose goal can be reached; "
+        f"{MOST_ATTEMPTS} draws gave none "
+        f"for map {int(indices[pending[0]])}. Ease its scenario or lower "
+        "`stuck_threshold`."
     )
 
 
 def reference_time_s(recipe: Recipe, maps: Maps) -> ndarray:
-    """Grid reference time: least time from start to goal over truly free cells at a commanded 1 m/s.
+    """Grid reference time: least time from start to goal over truly free cells at a
+    commanded 1 m/s.
 
     A reference, not a bound: the grid has eight headings, and noise is at its mean.
 
@@ -79,7 +94,9 @@ def reference_time_s(recipe: Recipe, maps: Maps) -> ndarray:
     """
     expected = latent.expected_of(latent.stored_truth(maps, recipe.classes))
     free = expected > recipe.stuck_threshold
-    costs = gridgraph.travel_time_costs(expected, free, recipe.resolution_m, recipe.closed_corners)
+    costs = gridgraph.travel_time_costs(
+        expected, free, recipe.resolution_m, recipe.closed_corners
+    )
     every = np.arange(len(expected))
     goals = np.zeros(expected.shape, dtype=bool)
     goals[(every, *recipe.cells_of(maps["goal_m"]))] = True
@@ -87,21 +104,29 @@ def reference_time_s(recipe: Recipe, maps: Maps) -> ndarray:
     return cost[(every, *recipe.cells_of(maps["start_m"]))]
 
 
-def class_map(recipe: Recipe, split: str, indices: ndarray, attempt: int = 0) -> ndarray:
-    """Lays out the classes of each map's environment; maps show the environments in turns.
+def class_map(
+    recipe: Recipe, split: str, indices: ndarray, attempt: int = 0
+) -> ndarray:
+    """Lays out the classes of each map's environment; maps show the environments in
+    turns.
 
     Returns:
         Class indices, shape [B, H, W].
     """
     periods = [period / recipe.resolution_m for period in recipe.class_periods_m]
-    noise = fractal_perlin(recipe.seed, (split, "class", attempt), indices, recipe.grid.shape, periods)
-    # Which class takes which band differs from map to map, so no two classes are neighbours always.
+    noise = fractal_perlin(
+        recipe.seed, (split, "class", attempt), indices, recipe.grid.shape, periods
+    )
+    # Which class takes which band differs from map to map, so no two classes are
+    # neighbours always.
     order_key = rng.stream_key(recipe.seed, split, "class order", attempt)
     order = rng.permutation(order_key, indices, len(recipe.occupancy))
     table = recipe.environment_classes[indices % recipe.environments]
     shown = np.take_along_axis(table, order, axis=1)
     bands = appearance.class_bands(noise, np.asarray(recipe.occupancy))
-    return np.take_along_axis(shown, bands.reshape(len(indices), -1), axis=1).reshape(bands.shape)
+    return np.take_along_axis(shown, bands.reshape(len(indices), -1), axis=1).reshape(
+        bands.shape
+    )
 
 
 def complete(
@@ -113,21 +138,24 @@ def complete(
     attempt: int = 0,
     layers: Sequence[LayerSpec] = (),
 ) -> Maps:
-    """Derives all else from classes and elevation: slope, layers, colour under a random light, λ.
+    """Derives all else from classes and elevation: slope, layers, colour under a random
+    light, λ.
 
     Args:
         recipe: class table, seed, start and goal.
-        split: name of the maps' split, for their scenario's light and their random streams.
+        split: name of the maps' split, for their scenario's light and their random
+            streams.
         indices: which maps of the split, shape [B].
         class_id: shape [B, H, W].
-        framed_m: elevation, with one cell of the ground beyond, NaN where that is not known, shape
-            [B, H + 2, W + 2]; it is quantised first, and everything follows what is stored.
+        framed_m: elevation, with one cell of the ground beyond, NaN where that is not
+            known, shape [B, H + 2, W + 2]; it is quantised first, and everything
+            follows what is stored.
         attempt: how many draws of these maps were rejected before.
         layers: those that are drawn.
 
     Returns:
-        The fields of `schema.FIELDS` but `reference_time_s`, those of the layers, and those of `schema.TRUTH` if a
-        layer changes λ.
+        The fields of `schema.FIELDS` but `reference_time_s`, those of the layers, and
+        those of `schema.TRUTH` if a layer changes λ.
     """
     key = partial(rng.stream_key, recipe.seed, split)
     scenario = recipe.scenarios[recipe.splits[split].scenario]
@@ -135,14 +163,18 @@ def complete(
     gradient = elevation.horn_gradient(ground, recipe.resolution_m)
     slope = quantise(elevation.inclination_deg(*gradient), 10)
     azimuth, lift = rng.uniform(key("light", attempt), indices, (2,)).T
-    light = appearance.light_direction(2 * np.pi * azimuth, _within(scenario.light_height, lift))
+    light = appearance.light_direction(
+        2 * np.pi * azimuth, _within(scenario.light_height, lift)
+    )
     noise_key, shape = key("traversability", attempt), recipe.grid.shape
     if recipe.synthesis == 1:
         noise = rng.normal(noise_key, indices, shape)
     else:
         cells = recipe.correlation_m / recipe.resolution_m
         noise = copula.correlated_normal(noise_key, indices, shape, cells)
-    below = DrawnMaps(class_id, ground[:, 1:-1, 1:-1], slope, recipe.grid, recipe.classes)
+    below = DrawnMaps(
+        class_id, ground[:, 1:-1, 1:-1], slope, recipe.grid, recipe.classes
+    )
     stack = [spec.layer for spec in layers]
     values = draw_layers(stack, recipe.seed, (split, attempt), indices, below)
     realised, stored_truth = _realise(stack, values, below, noise)
@@ -151,7 +183,9 @@ def complete(
         ends = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)
         start_m, goal_m = np.tile(ends[:, None], (1, len(indices), 1))
     else:
-        start_m, goal_m = draw_places(recipe.places, recipe.grid, key("places", attempt), indices)
+        start_m, goal_m = draw_places(
+            recipe.places, recipe.grid, key("places", attempt), indices
+        )
     return {
         "rgb": appearance.paint(_colour(stack, values, below, scenario), brightness),
         "class_id": class_id,
@@ -166,14 +200,27 @@ def complete(
     }
 
 
-def _realise(layers: Sequence[Layer], values: Maps, below: DrawnMaps, noise: ndarray) -> tuple[ndarray, Maps]:
-    """Return λ [B, H, W] by standard normal numbers, and the fields of `schema.TRUTH` if a layer changes λ."""
-    truth = affect_layers(layers, latent.truth(below.class_id, below.slope_deg, below.classes), values, below)
+def _realise(
+    layers: Sequence[Layer], values: Maps, below: DrawnMaps, noise: ndarray
+) -> tuple[ndarray, Maps]:
+    """Return λ [B, H, W] by standard normal numbers, and the fields of `schema.TRUTH`
+    if a layer changes λ.
+    """
+    truth = affect_layers(
+        layers,
+        latent.truth(below.class_id, below.slope_deg, below.classes),
+        values,
+        below,
+    )
     is_affected = any(layer.affects() for layer in layers)
-    return latent.quantile_of(truth, noise), dict(zip(TRUTH, truth[1:], strict=True)) if is_affected else {}
+    return latent.quantile_of(truth, noise), dict(
+        zip(TRUTH, truth[1:], strict=True)
+    ) if is_affected else {}
 
 
-def _colour(layers: Sequence[Layer], values: Maps, below: DrawnMaps, scenario: Scenario) -> ndarray:
+def _colour(
+    layers: Sequence[Layer], values: Maps, below: DrawnMaps, scenario: Scenario
+) -> ndarray:
     """Return the colours of maps in full light, with their layers, shape [B, 3, H, W]."""
     by_class = shown_colours(below.classes, scenario)
     colours = np.moveaxis(np.take(by_class.T, below.class_id, axis=1), 0, 1)
@@ -188,20 +235,35 @@ def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
     if recipe.synthesis == 1:
         ground = elevation.fractal(*surface)
     else:
-        ground = elevation.open_fractal(*surface, max(3, round(REFERENCE_M / recipe.resolution_m)))
+        ground = elevation.open_fractal(
+            *surface, max(3, round(REFERENCE_M / recipe.resolution_m))
+        )
     relief, crowding = rng.uniform(key("relief", attempt), indices, (2,)).T
     ground *= _within(scenario.relief_m, relief)[:, None, None]
     low, high = recipe.craters(scenario)
     if high > 0:
         count = low + np.floor((high - low + 1) * crowding)
         craters = elevation.place_craters(
-            key("craters", attempt), indices, grid.extent_m, count, scenario.crater_radius_m, high
+            key("craters", attempt),
+            indices,
+            grid.extent_m,
+            count,
+            scenario.crater_radius_m,
+            high,
         )
         ground += elevation.crater_elevation(
             *craters, grid.shape, grid.resolution_m, scenario.crater_depth_ratio
         )
     class_id = class_map(recipe, split, indices, attempt)
-    return complete(recipe, split, indices, class_id, elevation.framed(ground), attempt, recipe.layers)
+    return complete(
+        recipe,
+        split,
+        indices,
+        class_id,
+        elevation.framed(ground),
+        attempt,
+        recipe.layers,
+    )
 
 
 def _within(limits: tuple[float, float], share: ndarray) -> ndarray:

@@ -1,4 +1,6 @@
-"""Metrics that a suite names besides those that every run has: how they are read, and how `run.json` holds them."""
+"""Metrics that a suite names besides those that every run has: how they are read, and
+how `run.json` holds them.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -18,7 +20,17 @@ from benchnav.metrics.shipped import QUANTITIES, SHIPPED
 from benchnav.planning.robots import Robot
 
 # Columns of a row of episodes that are no metrics.
-_BOOKKEEPING = ("condition", *LABELS, *DRAW, "group", "outcome", "compiled", "error", "code", "time_budget_s")
+_BOOKKEEPING = (
+    "condition",
+    *LABELS,
+    *DRAW,
+    "group",
+    "outcome",
+    "compiled",
+    "error",
+    "code",
+    "time_budget_s",
+)
 # What of a metric's description results and hypotheses rest on.
 _FIXED = ("name", "column", "unit", "scale", "of_arrivals")
 
@@ -44,7 +56,12 @@ class NamedMetric:
     def about(self) -> dict[str, Any]:
         """The entry of `metrics` in `run.json`."""
         marked = {"unreproducible": True} if self.is_object else {}
-        return {**self.spec, "label": self.part.label, "quantity": asdict(self.quantity), **marked}
+        return {
+            **self.spec,
+            "label": self.part.label,
+            "quantity": asdict(self.quantity),
+            **marked,
+        }
 
     @property
     def is_object(self) -> bool:
@@ -52,7 +69,9 @@ class NamedMetric:
         return registry.is_object("metric", self.part.part)
 
 
-def read_metrics(given: Sequence[PartSpec], robots: Iterable[Robot]) -> tuple[NamedMetric, ...]:
+def read_metrics(
+    given: Sequence[PartSpec], robots: Iterable[Robot]
+) -> tuple[NamedMetric, ...]:
     """Reads the metrics of a suite, and tries each on an episode of each robot.
 
     Args:
@@ -60,34 +79,45 @@ def read_metrics(given: Sequence[PartSpec], robots: Iterable[Robot]) -> tuple[Na
         robots: of the suite.
 
     Raises:
-        ConfigError: If there is no such metric, it breaks its contract, or two have one name or column.
+        ConfigError: If there is no such metric, it breaks its contract, or two have one
+            name or column.
     """
     parts = [part for spec in given for part in read_parts("metric", spec)]
-    episodes = [episode for robot in robots for episode in sample_episodes(robot)] if parts else []
+    episodes = (
+        [episode for robot in robots for episode in sample_episodes(robot)]
+        if parts
+        else []
+    )
     named: list[NamedMetric] = []
     for part in parts:
         metric: Metric = part.object
         if type(metric) in map(type, SHIPPED):
             raise ConfigError(
-                f"Expected `metrics` besides those that every run has, got {part.part!r}. Leave it out."
+                "Expected `metrics` besides those that every run has, got "
+                f"{part.part!r}. Leave it out."
             )
         if faults := attribute_faults(metric):
-            raise ConfigError(f"metric {part.part!r} breaks its contract. {' '.join(faults)}")
+            raise ConfigError(
+                f"metric {part.part!r} breaks its contract. {' '.join(faults)}"
+            )
         try:
             for episode in episodes:
                 measure(metric, episode)
         except MetricError as error:
-            raise ConfigError(f"{error} It was tried on {episode} before the run.") from error
+            raise ConfigError(
+                f"{error} It was tried on {episode} before the run."
+            ) from error
         named = add_metric(named, NamedMetric(part=part, quantity=metric.quantity))
     return tuple(named)
 
 
 def add_metric(known: Sequence[NamedMetric], new: NamedMetric) -> list[NamedMetric]:
-    """Adds a metric to those of a run; one that is there already keeps its place and takes the new description.
+    """Adds a metric to those of a run; one that is there already keeps its place and
+    takes the new description.
 
     Raises:
-        ConfigError: If another metric, or a column of every run, has its name or column, or it has another name,
-            column or unit than before.
+        ConfigError: If another metric, or a column of every run, has its name or
+            column, or it has another name, column or unit than before.
     """
     quantity = new.quantity
     owned = [(other.name, other.column) for other in QUANTITIES.values()]
@@ -101,8 +131,10 @@ def add_metric(known: Sequence[NamedMetric], new: NamedMetric) -> list[NamedMetr
     for name, column in owned:
         if name == quantity.name or column == quantity.column:
             raise ConfigError(
-                f"Expected metrics with names and columns of their own, got {new.part.part!r} named {quantity.name!r} "
-                f"with column {quantity.column!r}, and {name or 'bookkeeping'!r} with {column!r}. Give one another "
+                "Expected metrics with names and columns of their own, got "
+                f"{new.part.part!r} named {quantity.name!r} "
+                f"with column {quantity.column!r}, and {name or 'bookkeeping'!r} with "
+                f"{column!r}. Give one another "
                 "`name` and `column`, or another `out` to the run."
             )
     return [*known, new]
@@ -116,7 +148,12 @@ def metrics_of_run(about: Mapping[str, Any]) -> tuple[NamedMetric, ...]:
     """
     return tuple(
         NamedMetric(
-            part=Part(part=entry["part"], label=entry["label"], options=entry["options"], kind="metric"),
+            part=Part(
+                part=entry["part"],
+                label=entry["label"],
+                options=entry["options"],
+                kind="metric",
+            ),
             quantity=Quantity(**entry["quantity"]),
         )
         for entry in about.get("metrics", ())

@@ -1,4 +1,6 @@
-"""Parts and sweeps of a suite: where it gives several values for one, it means each of them."""
+"""Parts and sweeps of a suite: where it gives several values for one, it means each of
+them.
+"""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -23,25 +25,33 @@ _Chosen = dict[tuple[str, ...], Any]  # values by where they stand
 def part_of(kind: str, about: Mapping[str, Any], label: str) -> Part:
     """Return the part that `part` and `options` describe."""
     part_class = ModelPart if kind == "model" else Part
-    return part_class(kind=kind, part=about["part"], label=label, options=about["options"])
+    return part_class(
+        kind=kind, part=about["part"], label=label, options=about["options"]
+    )
 
 
 def read_parts(kind: str, given: Any) -> list[Part]:
-    """Read what a suite lists as one part: several parts where options are given lists of values.
+    """Read what a suite lists as one part: several parts where options are given lists
+    of values.
 
     Args:
         kind: one of `registry.KINDS`.
         given: in any form that `registry.read_part` reads.
 
     Raises:
-        ConfigError: If there is no such part or option, or the part rejects its options.
+        ConfigError: If there is no such part or option, or the part rejects its
+            options.
     """
     part = registry.read_part(kind, given)
     if kind == "model":
         model = ModelPart(**vars(part))
         if folder := model.folder:
             is_named = part.label not in (part.part, part.part.rpartition(":")[2])
-            label = part.part.rpartition("/")[2] if hub.is_address(part.part) else folder.name
+            label = (
+                part.part.rpartition("/")[2]
+                if hub.is_address(part.part)
+                else folder.name
+            )
             return [model if is_named else replace(model, label=label)]
         if is_family(model.found.target):
             raise no_model(model)
@@ -58,10 +68,13 @@ def read_parts(kind: str, given: Any) -> list[Part]:
 
 
 def each_part(kind: str, part: Part) -> list[Part]:
-    """Gives a part for each combination of values where an option is given a list of them.
+    """Gives a part for each combination of values where an option is given a list of
+    them.
 
-    A list that the option itself takes, such as a pair of bounds, is one value. Each part is labelled by its
-    values: `cvar:0.9` for the first option, which stands behind a colon, `astar_dwa lookahead_m=4` for others.
+    A list that the option itself takes, such as a pair of bounds, is one value. Each
+    part is labelled by its
+    values: `cvar:0.9` for the first option, which stands behind a colon, `astar_dwa
+        lookahead_m=4` for others.
 
     Args:
         kind: of the part, as in `registry.KINDS`.
@@ -86,7 +99,9 @@ def each_part(kind: str, part: Part) -> list[Part]:
 
 
 def each_mapping(given: Any) -> list[Any]:
-    """Gives a mapping for each combination of values where one is a list, at any depth; anything else as it is."""
+    """Gives a mapping for each combination of values where one is a list, at any depth;
+    anything else as it is.
+    """
     if not isinstance(given, Mapping):
         return [given]
     return [_with(given, chosen) for chosen in _choices(given)]
@@ -113,7 +128,8 @@ def check_count(counts: Iterable[int]) -> None:
     if math.prod(counts) > MAX_CONDITIONS:
         product_of = " × ".join(map(str, counts))
         raise ConfigError(
-            f"Expected at most {MAX_CONDITIONS:,} settings, got a product of {product_of} values. List fewer."
+            f"Expected at most {MAX_CONDITIONS:,} settings, got a product of "
+            f"{product_of} values. List fewer."
         )
 
 
@@ -125,11 +141,15 @@ def _taken(kind: str, source: str, name: str, option: Any, value: Any) -> bool:
     return True
 
 
-def _lists(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], list[Any]]]:
+def _lists(
+    value: Any, path: tuple[str, ...]
+) -> Iterator[tuple[tuple[str, ...], list[Any]]]:
     """Lists in a value, at any depth, each with where it stands."""
     if isinstance(value, list | tuple):
         if not value:
-            raise ConfigError(f"Expected one or more values of `{'.'.join(path)}`, got none.")
+            raise ConfigError(
+                f"Expected one or more values of `{'.'.join(path)}`, got none."
+            )
         yield path, list(value)
     elif isinstance(value, Mapping):
         for name, inner in value.items():

@@ -34,25 +34,33 @@ class Driven:
     tracks: Sequence[np.ndarray]
 
     def chosen(self, most: int) -> list[int]:
-        """Indices of at most so many episodes in the order of the rows, as many successes as failures if possible."""
+        """Indices of at most so many episodes in the order of the rows, as many
+        successes as failures if possible.
+        """
         turn = self.rows.groupby("success", sort=False).cumcount().to_numpy()
         return sorted(np.argsort(turn, kind="stable")[:most].tolist())
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunData:
-    """What figures of a run are drawn from; what lies in the run's folder is read when it is first asked for.
+    """What figures of a run are drawn from; what lies in the run's folder is read when
+    it is first asked for.
 
     Args:
-        about: all of `run.json`; of a run that is not finished with the conditions that have rows.
-        summary: a row a condition, from `summary.summarise`, joined with `best.against_best`.
+        about: all of `run.json`; of a run that is not finished with the conditions that
+            have rows.
+        summary: a row a condition, from `summary.summarise`, joined with
+            `best.against_best`.
         episodes: the rows behind the summary.
-        tests: a row a hypothesis, from `hypotheses.test_hypotheses`; empty where the suite held none.
+        tests: a row a hypothesis, from `hypotheses.test_hypotheses`; empty where the
+            suite held none.
         regret: from `regret.split_regret`; empty where the run has no chain.
         failures: a row a failed episode.
         sheets: failures on their maps.
-        folder: of the run; None where it was not saved, so that no steps or recordings are known.
-        record_driven: records driven episodes again, as `run.recordings.record_driven` does of the folder.
+        folder: of the run; None where it was not saved, so that no steps or recordings
+            are known.
+        record_driven: records driven episodes again, as `run.recordings.record_driven`
+            does of the folder.
     """
 
     about: Mapping[str, Any]
@@ -61,7 +69,9 @@ class RunData:
     tests: pd.DataFrame = field(default_factory=pd.DataFrame)
     regret: pd.DataFrame = field(default_factory=pd.DataFrame)
     failures: pd.DataFrame = field(default_factory=pd.DataFrame)
-    sheets: Sheets = field(default_factory=lambda: Sheets(shown=(), predicted={}, left_out=""))
+    sheets: Sheets = field(
+        default_factory=lambda: Sheets(shown=(), predicted={}, left_out="")
+    )
     folder: Path | None = None
     record_driven: RecordDriven | None = None
 
@@ -72,20 +82,26 @@ class RunData:
 
     @cached_property
     def driven(self) -> Driven | None:
-        """Whole driven paths on the map that the run kept; None where it kept none, or no steps."""
+        """Whole driven paths on the map that the run kept; None where it kept none, or
+        no steps.
+        """
         return read_driven(self.folder, self.episodes) if self.folder else None
 
     @cached_property
     def on_one_map(self) -> list[Recording]:
-        """Recordings of at most `MAX_PANELS` conditions on the map on which outcomes differ most.
+        """Recordings of at most `MAX_PANELS` conditions on the map on which outcomes
+        differ most.
 
-        Each is that of the folder, which has plans too, or is made again of the steps that were kept. None where one
-        cannot be made.
+        Each is that of the folder, which has plans too, or is made again of the steps
+        that were kept. None where one cannot be made.
         """
         if self.driven is None:
             return []
         chosen = self.driven.rows.iloc[self.driven.chosen(MAX_PANELS)]
-        stored = {tuple(str(own.about[name]) for name in _EPISODE): own for own in self.recordings}
+        stored = {
+            tuple(str(own.about[name]) for name in _EPISODE): own
+            for own in self.recordings
+        }
         recordings = []
         for index, row in chosen.iterrows():
             recording = stored.get(tuple(str(row[name]) for name in _EPISODE))
@@ -101,7 +117,8 @@ class RunData:
 
 
 def read_driven(folder: Path, episodes: pd.DataFrame) -> Driven | None:
-    """Read whole driven paths on the map that a run kept; None where it kept none, or no steps.
+    """Read whole driven paths on the map that a run kept; None where it kept none, or
+    no steps.
 
     Args:
         folder: a finished run.
@@ -111,36 +128,55 @@ def read_driven(folder: Path, episodes: pd.DataFrame) -> Driven | None:
     if not path.exists() or not (folder / STEPS).is_dir():
         return None
     ground = Ground.load(path)
-    rows = episodes[(episodes[list(ground.about)] == pd.Series(ground.about)).all(axis=1)]
+    rows = episodes[
+        (episodes[list(ground.about)] == pd.Series(ground.about)).all(axis=1)
+    ]
     place = {name: ground.about[name] for name in ("seed", "realisation", "map")}
-    steps = read_steps(folder, condition=list(rows["condition"]), **place).groupby("condition")
+    steps = read_steps(folder, condition=list(rows["condition"]), **place).groupby(
+        "condition"
+    )
     rows = rows[rows["condition"].isin(steps.groups)]
-    tracks = [steps.get_group(condition)[["x_m", "y_m"]].to_numpy() for condition in rows["condition"]]
+    tracks = [
+        steps.get_group(condition)[["x_m", "y_m"]].to_numpy()
+        for condition in rows["condition"]
+    ]
     return Driven(ground=ground, rows=rows, tracks=tracks) if tracks else None
 
 
-def choose_recordings(recordings: Sequence[Recording], conditions: Sequence[str]) -> list[Recording]:
-    """Choose one recording a condition, all of one map where there are such, at most `MAX_PANELS`.
+def choose_recordings(
+    recordings: Sequence[Recording], conditions: Sequence[str]
+) -> list[Recording]:
+    """Choose one recording a condition, all of one map where there are such, at most
+    `MAX_PANELS`.
 
-    Of the maps that the first condition was recorded on it is the first on which outcomes differ, if there is one;
-    else the first on which an episode failed.
+    Of the maps that the first condition was recorded on it is the first on which
+    outcomes differ, if there is one; else the first on which an episode failed.
 
     Args:
         recordings: all there are.
         conditions: ids in order.
     """
     table = pd.DataFrame(
-        [recording.about for recording in recordings], columns=["condition", "outcome", *_SAME_MAP]
+        [recording.about for recording in recordings],
+        columns=["condition", "outcome", *_SAME_MAP],
     )
     table = table.astype({"condition": pd.CategoricalDtype(conditions), "map": int})
-    table = table.dropna(subset="condition").sort_values(["condition", "map"], kind="stable")
+    table = table.dropna(subset="condition").sort_values(
+        ["condition", "map"], kind="stable"
+    )
     if table.empty:
         return []
     maps = table.groupby(_SAME_MAP)
     table["differing"] = maps["outcome"].transform("nunique") > 1
-    table["failed"] = maps["outcome"].transform(lambda outcomes: set(outcomes) != {"success"})
+    table["failed"] = maps["outcome"].transform(
+        lambda outcomes: set(outcomes) != {"success"}
+    )
     firsts = table[table["condition"] == table["condition"].iloc[0]]
-    shown = firsts.sort_values(["differing", "failed"], ascending=False, kind="stable").iloc[0]
+    shown = firsts.sort_values(
+        ["differing", "failed"], ascending=False, kind="stable"
+    ).iloc[0]
     table["other"] = (table[_SAME_MAP] != shown[_SAME_MAP]).any(axis=1)
-    chosen = table.sort_values(["condition", "other"], kind="stable").drop_duplicates("condition")
+    chosen = table.sort_values(["condition", "other"], kind="stable").drop_duplicates(
+        "condition"
+    )
     return [recordings[index] for index in chosen.index[:MAX_PANELS]]

@@ -13,22 +13,35 @@ from benchnav.viz.figure import Figure
 from benchnav.viz.panels import draw_interval, jitter
 from benchnav.viz.style import BLUE, ORANGE, legend_outside
 
-_QUANTITIES = {"total_time_s": "T_total [s], a failure counts as T", "traversability": "λ̄, mean observed λ"}
+_QUANTITIES = {
+    "total_time_s": "T_total [s], a failure counts as T",
+    "traversability": "λ̄, mean observed λ",
+}
 _ENDS = {"success": (BLUE, "o"), "failure": (ORANGE, "x")}  # colour and marker of a dot
 _SPREAD = 0.32  # of a row's height, to either side
 
 
 class Distributions(Figure):
-    """A dot an episode with median and quartiles: T_total left, mean observed λ right, a line a block."""
+    """A dot an episode with median and quartiles: T_total left, mean observed λ right,
+    a line a block.
+    """
 
     name = "distributions"
-    text = "Each dot is an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean observed λ."
+    text = (
+        "Each dot is an episode. Left: T_total, a failure counted as T. Right: "
+        "λ̄, "
+        "the mean observed λ."
+    )
 
     def draw(self, data: RunData) -> Drawing:
         """Draw the episodes of each condition at its height."""
-        figure, panels = lay_out(data.summary, list(_QUANTITIES.values()), legend_in=0.15)
+        figure, panels = lay_out(
+            data.summary, list(_QUANTITIES.values()), legend_in=0.15
+        )
         for place, (panel, rows) in enumerate(panels):
-            _draw_dots(panel, rows, data.episodes, list(_QUANTITIES)[place % len(_QUANTITIES)])
+            _draw_dots(
+                panel, rows, data.episodes, list(_QUANTITIES)[place % len(_QUANTITIES)]
+            )
         panels[0][0].set_xlim(left=0)
         panels[1][0].set_xlim(0, 1)
         handles = [
@@ -36,13 +49,19 @@ class Distributions(Figure):
             for label, (colour, marker) in _ENDS.items()
         ]
         words = "median and quartiles of all"
-        handles.append(Line2D([], [], color="black", marker="|", ms=6, lw=1.2, label=words))
+        handles.append(
+            Line2D([], [], color="black", marker="|", ms=6, lw=1.2, label=words)
+        )
         legend_outside(figure, handles)
         return figure
 
 
-def _draw_dots(panel: Axes, rows: pd.DataFrame, episodes: pd.DataFrame, name: str) -> None:
-    """Draw a quantity of the episodes of several conditions, each condition at its height; all dots at once."""
+def _draw_dots(
+    panel: Axes, rows: pd.DataFrame, episodes: pd.DataFrame, name: str
+) -> None:
+    """Draw a quantity of the episodes of several conditions, each condition at its
+    height; all dots at once.
+    """
     dots = rows[["condition", "height"]].merge(episodes, on="condition")
     turn = dots.groupby("condition").cumcount()
     dots["up"] = dots["height"] + jitter(len(dots), _SPREAD)[turn]
@@ -50,7 +69,12 @@ def _draw_dots(panel: Axes, rows: pd.DataFrame, episodes: pd.DataFrame, name: st
     for (colour, marker), is_success in zip(_ENDS.values(), (True, False), strict=True):
         own = dots[dots["success"] == is_success]
         size, line = (5, 0.5) if marker == "x" else (3, 0)
-        looks: dict[str, Any] = {"color": colour, "marker": marker, "s": size, "lw": line}
+        looks: dict[str, Any] = {
+            "color": colour,
+            "marker": marker,
+            "s": size,
+            "lw": line,
+        }
         panel.scatter(own[name], own["up"], alpha=0.45, rasterized=True, **looks)
     for height, values in dots.groupby("height")[name]:
         low, middle, high = values.quantile([0.25, 0.5, 0.75])

@@ -6,10 +6,21 @@ from matplotlib.figure import Figure as Drawing
 
 from benchnav.eval.figures.data import RunData
 from benchnav.eval.recording import Ground
-from benchnav.eval.words import NAMING, chosen_in_words, contender_names, outcome_in_words
+from benchnav.eval.words import (
+    NAMING,
+    chosen_in_words,
+    contender_names,
+    outcome_in_words,
+)
 from benchnav.viz import maps
 from benchnav.viz.figure import Figure
-from benchnav.viz.style import LINE_COLOURS, ONE_COLUMN_IN, TWO_COLUMNS_IN, condition_colours, line_style
+from benchnav.viz.style import (
+    LINE_COLOURS,
+    ONE_COLUMN_IN,
+    TWO_COLUMNS_IN,
+    condition_colours,
+    line_style,
+)
 
 _MAX_PATHS = 8
 _DARKEST = 0.35  # grey of λ = 0
@@ -30,10 +41,16 @@ class DrivenPaths(Figure):
         assert data.driven is not None
         about, rows = data.driven.ground.about, data.driven.rows
         differing = rows["success"].nunique() > 1
-        why = "On this map outcomes differ most." if differing else "Outcomes differ on no map."
+        why = (
+            "On this map outcomes differ most."
+            if differing
+            else "Outcomes differ on no map."
+        )
         return (
-            f"Driven paths on {about['scenario']}, map {about['map']}, seed {about['seed']}, realisation "
-            f"{about['realisation']}. {why}{chosen_in_words(min(len(rows), _MAX_PATHS), len(rows))}"
+            f"Driven paths on {about['scenario']}, map {about['map']}, seed "
+            f"{about['seed']}, realisation "
+            f"{about['realisation']}. "
+            f"{why}{chosen_in_words(min(len(rows), _MAX_PATHS), len(rows))}"
         )
 
     def draw(self, data: RunData) -> Drawing:
@@ -41,33 +58,58 @@ class DrivenPaths(Figure):
         driven = data.driven
         assert driven is not None
         ground, places = driven.ground, driven.chosen(_MAX_PATHS)
-        rows, tracks = driven.rows.iloc[places], [driven.tracks[place] for place in places]
+        rows, tracks = (
+            driven.rows.iloc[places],
+            [driven.tracks[place] for place in places],
+        )
         high, wide = ground.grid.shape
         is_wide = wide >= 2 * high
         width = TWO_COLUMNS_IN if is_wide else ONE_COLUMN_IN
         # The legend stands at the side of a map, and below a wide one.
-        tall = min(width * high / wide, 7.0) + (0.15 * (len(rows) + 4) + 0.4 if is_wide else 0.4)
+        tall = min(width * high / wide, 7.0) + (
+            0.15 * (len(rows) + 4) + 0.4 if is_wide else 0.4
+        )
         figure = Drawing(figsize=(TWO_COLUMNS_IN, tall), layout="compressed")
         panel = figure.subplots()
         maps.show_map(panel, _backdrop(ground), ground.grid.extent_m)
-        names = contender_names(rows[[name for name in NAMING if name in rows]].to_dict("records"))
+        names = contender_names(
+            rows[[name for name in NAMING if name in rows]].to_dict("records")
+        )
         colours = condition_colours(list(rows["planner"]), LINE_COLOURS)
-        for place, (row, track) in enumerate(zip(rows.to_dict("records"), tracks, strict=True)):
+        for place, (row, track) in enumerate(
+            zip(rows.to_dict("records"), tracks, strict=True)
+        ):
             # Later ones are thinner, so that paths that coincide are all seen.
             thickness = 0.9 + 2.2 * (1 - place / max(len(rows), 2))
-            label = f"{names[place]}: {outcome_in_words(row['outcome'])}, {row['end_time_s']:.0f} s"
-            maps.draw_path(panel, track, thickness, colours[place], ls=line_style(place), label=label)
+            label = (
+                f"{names[place]}: {outcome_in_words(row['outcome'])}, "
+                f"{row['end_time_s']:.0f} s"
+            )
+            maps.draw_path(
+                panel,
+                track,
+                thickness,
+                colours[place],
+                ls=line_style(place),
+                label=label,
+            )
         maps.mark(panel, "start", tracks[0][0])
         maps.mark(panel, "goal", ground.goal_m)
         maps.name_immobilising(panel, ground.immobilising)
-        title = "terrain, faded" if ground.field is None else "λ field of the episode; lighter is higher"
+        title = (
+            "terrain, faded"
+            if ground.field is None
+            else "λ field of the episode; lighter is higher"
+        )
         panel.set(xlabel="x [m]", ylabel="y [m]", title=title)
         maps.frame_map(panel)
         failed = np.flatnonzero(~rows["success"].to_numpy(bool))
         outcomes = [rows["outcome"].iloc[place] for place in failed]
         handles, _ = panel.get_legend_handles_labels()
         for name in dict.fromkeys(map(maps.end_mark, outcomes)):
-            handles.append(maps.mark_handle(name, label=f"{name}, in the colour of its path"))
+            handles.append(
+                maps.mark_handle(name, label=f"{name}, in the colour of its path")
+            )
         panel.legend(
             handles=handles,
             loc="upper left",
@@ -76,7 +118,10 @@ class DrivenPaths(Figure):
             ncols=2 if is_wide else 1,
         )
         maps.mark_ends(
-            panel, [tracks[place] for place in failed], outcomes, [colours[place] for place in failed]
+            panel,
+            [tracks[place] for place in failed],
+            outcomes,
+            [colours[place] for place in failed],
         )
         return figure
 

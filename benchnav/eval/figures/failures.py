@@ -36,8 +36,10 @@ class Failures(Figure):
         """Return which failures are shown."""
         title, _ = data.sheets.shown[self.place]
         return (
-            f"Failures of the settings with the highest and the lowest success rate, {title}: predicted λ̂ (colour), "
-            "driven path and its end. λ̂ is that of the cell of the end, observed λ the mean of the last 2 s."
+            "Failures of the settings with the highest and the lowest success rate, "
+            f"{title}: predicted λ̂ (colour), "
+            "driven path and its end. λ̂ is that of the cell of the end, observed λ "
+            "the mean of the last 2 s."
         )
 
     def draw(self, data: RunData) -> Drawing:
@@ -53,15 +55,20 @@ class Failures(Figure):
             panel.set_visible(False)
         for row_of_panels, line in zip(panels, lines, strict=True):
             rows = line.failures.to_dict("records")
-            for panel, recording, row in zip(row_of_panels, line.recordings, rows, strict=False):
+            for panel, recording, row in zip(
+                row_of_panels, line.recordings, rows, strict=False
+            ):
                 _draw_failure(panel, recording)
                 predicted = recording.predicted_at_end
-                words = ["outside the map" if np.isnan(predicted) else f"λ̂ = {predicted:.2f}"]
+                words = [
+                    "outside the map" if np.isnan(predicted) else f"λ̂ = {predicted:.2f}"
+                ]
                 if not np.isnan(row["last_traversability"]):
                     words.append(f"observed λ = {row['last_traversability']:.2f}")
                 ended = f"{outcome_in_words(row['outcome'])}, {row['end_time_s']:.0f} s"
                 panel.set_title(
-                    f"{row['scenario']}, map {row['map']}: {ended}\n{', '.join(words)}", fontsize="small"
+                    f"{row['scenario']}, map {row['map']}: {ended}\n{', '.join(words)}",
+                    fontsize="small",
                 )
             count = f"({len(line.failures)} of {line.among} failures)"
             row_of_panels[0].set_ylabel(f"{line.name}\n{count}", fontsize="small")
@@ -77,6 +84,12 @@ def _draw_failure(panel: Axes, recording: Recording) -> None:
     maps.show_map(panel, recording.predicted, extent_m, alpha=_LIGHT, **maps.LAMBDA)
     maps.overlay(panel, recording.immobilising, extent_m, maps.IMMOBILISING, 0.75)
     maps.name_immobilising(panel, recording.immobilising)
-    maps.draw_drive(panel, drive_at(recording, len(recording.traversability)), 1.1, 0.9, label="driven")
+    maps.draw_drive(
+        panel,
+        drive_at(recording, len(recording.traversability)),
+        1.1,
+        0.9,
+        label="driven",
+    )
     panel.spines[:].set_visible(False)
     panel.set(xticks=[], yticks=[])

@@ -26,8 +26,10 @@ class Forest(Figure):
 
     name = "forest"
     text = (
-        "Paired differences of the hypotheses that were fixed before the run. Filled points are supported "
-        "(p < 0.05 after Holm's correction). Lines are 90 % (thick) and 95 % (thin) intervals of one difference."
+        "Paired differences of the hypotheses that were fixed before the run. Filled "
+        "points are supported "
+        "(p < 0.05 after Holm's correction). Lines are 90 % (thick) and 95 % (thin) "
+        "intervals of one difference."
     )
 
     def needs(self, data: RunData) -> bool:
@@ -35,7 +37,9 @@ class Forest(Figure):
         return not data.tests.empty
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a row a hypothesis, a panel a metric; the band is where a margin wants the difference to lie."""
+        """Draw a row a hypothesis, a panel a metric; the band is where a margin wants
+        the difference to lie.
+        """
         known = quantities(further_quantities(data.about))
         numbered = data.tests.assign(number=range(1, len(data.tests) + 1))
         panels = {
@@ -44,8 +48,12 @@ class Forest(Figure):
             if (data.tests["metric"] == name).any()
         }
         heights = [_METRIC_IN + _TEST_IN * len(rows) for rows in panels.values()]
-        figure = Drawing(figsize=(TWO_COLUMNS_IN, sum(heights) + 0.3), layout="constrained")
-        axes = figure.subplots(len(panels), squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
+        figure = Drawing(
+            figsize=(TWO_COLUMNS_IN, sum(heights) + 0.3), layout="constrained"
+        )
+        axes = figure.subplots(
+            len(panels), squeeze=False, gridspec_kw={"height_ratios": heights}
+        )[:, 0]
         for panel, (name, rows) in zip(axes, panels.items(), strict=True):
             _draw_tests(panel, rows, known[name])
         point: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 0}
@@ -57,7 +65,8 @@ class Forest(Figure):
             "95 % interval": {"lw": 0.9},
         }
         handles: list[Artist] = [
-            Line2D([], [], color=BLUE, label=label, **look) for label, look in looks.items()
+            Line2D([], [], color=BLUE, label=label, **look)
+            for label, look in looks.items()
         ]
         if (data.tests["margin"] > 0).any():
             handles.append(Patch(color=_MARGIN, label="allowed by the margin"))
@@ -77,11 +86,17 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:
             inner = -row["margin"] if row["kind"] == "superiority" else row["margin"]
             low = -reach if row["direction"] == "lower" else -inner
             high = reach if row["direction"] == "higher" else inner
-            panel.fill_between([low, high], height - 0.36, height + 0.36, color=_MARGIN, lw=0, zorder=0)
+            panel.fill_between(
+                [low, high], height - 0.36, height + 0.36, color=_MARGIN, lw=0, zorder=0
+            )
         for suffix, width in (("", 0.9), ("_90", 2.6)):
-            draw_interval(panel, row[f"low{suffix}"], row[f"high{suffix}"], height, BLUE, width)
+            draw_interval(
+                panel, row[f"low{suffix}"], row[f"high{suffix}"], height, BLUE, width
+            )
         face = BLUE if row["supported"] else "white"
-        panel.plot(row["difference"], height, "o", color=BLUE, ms=4.5, mfc=face, zorder=3)
+        panel.plot(
+            row["difference"], height, "o", color=BLUE, ms=4.5, mfc=face, zorder=3
+        )
         side = panel.get_yaxis_transform()
         panel.text(1.01, height, p_in_words(row["p_holm"]), transform=side, va="center")
         one, other = map(reading_names, row["names"])
@@ -93,7 +108,16 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:
     panel.set(xlabel=f"Δ {quantity.words}{unit}", axisbelow=True)
     # Which way is better, at the end of the axis where it lies.
     place, side_name, words = (
-        (1, "right", "better →") if quantity.better == "higher" else (0, "left", "← better")
+        (1, "right", "better →")
+        if quantity.better == "higher"
+        else (0, "left", "← better")
     )
     if quantity.better != "neither":
-        panel.annotate(words, (place, 1), xycoords="axes fraction", va="bottom", ha=side_name, color="0.35")
+        panel.annotate(
+            words,
+            (place, 1),
+            xycoords="axes fraction",
+            va="bottom",
+            ha=side_name,
+            color="0.35",
+        )

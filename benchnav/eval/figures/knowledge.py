@@ -24,7 +24,8 @@ _MOMENTS = 4
 
 
 class KnowledgeMaps(Figure):
-    """E[λ] of the belief of a robot at four moments, and its spread, one for each of at most four conditions.
+    """E[λ] of the belief of a robot at four moments, and its spread, one for each of at
+    most four conditions.
 
     Attributes:
         place: of the recording among those that are shown.
@@ -44,8 +45,10 @@ class KnowledgeMaps(Figure):
         about = shown[self.place].about
         name = contender_names([own.about for own in shown])[self.place]
         return (
-            f"What a robot knew of {about['scenario']}, map {about['map']}, during its episode ({name}): E[λ] of its "
-            "belief above, and below its spread, half of the range from the 16 % to the 84 % quantile of λ."
+            f"What a robot knew of {about['scenario']}, map {about['map']}, during "
+            f"its episode ({name}): E[λ] of its "
+            "belief above, and below its spread, half of the range from the 16 % to "
+            "the 84 % quantile of λ."
         )
 
     def draw(self, data: RunData) -> Drawing:
@@ -73,8 +76,12 @@ def draw_knowledge(recording: Recording) -> Drawing:
             if known is not None and known.sensed.any():
                 edge = outline(known.sensed, recording.resolution_m)
                 maps.draw_lines(panel, edge, "white", 0.5)
-                maps.name_terrain(panel, "edge of where λ was sensed", fc="0.6", ec="white")
-            maps.draw_drive(panel, moment.drive_at(recording, step), 1.2, 0.8, label="driven")
+                maps.name_terrain(
+                    panel, "edge of where λ was sensed", fc="0.6", ec="white"
+                )
+            maps.draw_drive(
+                panel, moment.drive_at(recording, step), 1.2, 0.8, label="driven"
+            )
             maps.frame_map(panel)
         row[0].set_ylabel("y [m]")
         maps.draw_bar(figure, label, row, (colours, most), aspect=20)

@@ -23,7 +23,10 @@ from benchnav.viz.style import TWO_COLUMNS_IN, legend_outside
 METRICS = dict(
     zip(
         AHEAD_COLUMNS,
-        ("RMSE of E[λ] ahead\n(lower is better)", "log score ahead\n(higher is better)"),
+        (
+            "RMSE of E[λ] ahead\n(lower is better)",
+            "log score ahead\n(higher is better)",
+        ),
         strict=True,
     )
 )
@@ -34,34 +37,54 @@ _EPISODE = ["condition", "seed", "realisation", "map"]
 
 
 class Learning(Figure):
-    """RMSE and log score of what is believed ahead of robots, over the seconds of experience."""
+    """RMSE and log score of what is believed ahead of robots, over the seconds of
+    experience.
+    """
 
     name = "learning"
     text = (
-        f"What robots know of the terrain ahead of them, within {AHEAD_M:g} m and {AHEAD_DEG:g}° to either side, "
-        "where they have not sensed λ: RMSE of E[λ] and mean log score of the belief, over the time since they set "
-        f"out. Means over the maps on which a robot still drives, one for every {_BIN_S:g} s, with 95 % intervals "
+        f"What robots know of the terrain ahead of them, within {AHEAD_M:g} m and "
+        f"{AHEAD_DEG:g}° to either side, "
+        "where they have not sensed λ: RMSE of E[λ] and mean log score of the belief, "
+        "over the time since they set "
+        "out. Means over the maps on which a robot still drives, one for every "
+        f"{_BIN_S:g} s, with 95 % intervals "
         f"(bootstrap over maps). Times with fewer than {LEAST_MAPS} maps are left out."
     )
 
     curves = pd.DataFrame()
 
     def variants(self, data: RunData) -> Sequence[Self]:
-        """Return one figure where robots learnt, steps were kept, and there are enough maps."""
-        curves = read_learning(data.folder, data.episodes) if data.folder else self.curves
+        """Return one figure where robots learnt, steps were kept, and there are enough
+        maps.
+        """
+        curves = (
+            read_learning(data.folder, data.episodes) if data.folder else self.curves
+        )
         return [self.variant(curves=curves)] if len(curves) else []
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a line a condition, with its band; where these are many, a panel a model, planner and risk setting."""
-        rows = data.summary[data.summary["condition"].isin(self.curves["condition"])].reset_index(drop=True)
+        """Draw a line a condition, with its band; where these are many, a panel a
+        model, planner and risk setting.
+        """
+        rows = data.summary[
+            data.summary["condition"].isin(self.curves["condition"])
+        ].reset_index(drop=True)
         differing = [
-            name for name in dict.fromkeys((*BLOCK, *NAMING)) if name in rows and rows[name].nunique() > 1
+            name
+            for name in dict.fromkeys((*BLOCK, *NAMING))
+            if name in rows and rows[name].nunique() > 1
         ]
         titled, groups = divide_lines(rows, [(*BLOCK, *more) for more in _WAYS])
         named = [name for name in differing if name not in titled]
-        labels = ([reading_name(name, row[name]) for name in named] for row in rows.to_dict("records"))
+        labels = (
+            [reading_name(name, row[name]) for name in named]
+            for row in rows.to_dict("records")
+        )
         names = [joined(own) or "mean over maps" for own in labels]
-        letters = int((TWO_COLUMNS_IN / min(len(groups), MAX_ACROSS) - 0.4) / _LETTER_IN)
+        letters = int(
+            (TWO_COLUMNS_IN / min(len(groups), MAX_ACROSS) - 0.4) / _LETTER_IN
+        )
         points = [
             self.curves[self.curves["condition"] == rows["condition"][index]].assign(
                 panel=textwrap.fill(title, letters), line=names[index]
@@ -80,17 +103,19 @@ class Learning(Figure):
 
 
 def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
-    """Read how well λ was known ahead of the robots of a run, over the time since they set out.
+    """Read how well λ was known ahead of the robots of a run, over the time since they
+    set out.
 
     Args:
         folder: a finished run.
         episodes: its rows.
 
     Returns:
-        A row a condition and bin of time that at least `LEAST_MAPS` maps, or groups of maps, tell of: `condition`,
-        `time_s`, the middle of the bin, `maps`, how many these are, and of each of `METRICS` its mean over them, with
-        its 95 % interval in the columns that end in `_low` and `_high`. No row where no robot learnt, or no steps were
-        kept.
+        A row a condition and bin of time that at least `LEAST_MAPS` maps, or groups of
+        maps, tell of: `condition`, `time_s`, the middle of the bin, `maps`, how many
+        these are, and of each of `METRICS` its mean over them, with its 95 % interval
+        in the columns that end in `_low` and `_high`. No row where no robot learnt, or
+        no steps were kept.
     """
     names = list(METRICS)
     columns = [
@@ -116,7 +141,9 @@ def read_learning(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         if len(own) < LEAST_MAPS:
             continue
         values = own.to_numpy(np.float64)
-        low, high = np.quantile(bootstrap_counts(len(own)) @ values / len(own), [0.025, 0.975], axis=0)
+        low, high = np.quantile(
+            bootstrap_counts(len(own)) @ values / len(own), [0.025, 0.975], axis=0
+        )
         numbers = np.stack((values.mean(axis=0), low, high), axis=1).ravel()
         rows.append((condition, (place + 0.5) * _BIN_S, len(own), *numbers))
     return pd.DataFrame(rows, columns=columns)

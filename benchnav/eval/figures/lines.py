@@ -1,4 +1,6 @@
-"""Lines of curves, which are divided into panels until none holds more lines than a reader can distinguish."""
+"""Lines of curves, which are divided into panels until none holds more lines than a
+reader can distinguish.
+"""
 
 from collections.abc import Sequence
 
@@ -15,7 +17,8 @@ _BLIND_TO = ("model", "sensor", "ground", "belief", "who", "planner", "risk")
 def divide_lines(
     labels: pd.DataFrame, ways: Sequence[Sequence[str]]
 ) -> tuple[list[str], list[tuple[str, list[int]]]]:
-    """Divide lines into panels by their labels, the first way if its panels hold few enough, else the next.
+    """Divide lines into panels by their labels, the first way if its panels hold few
+    enough, else the next.
 
     A blind planner stands in all panels of its place that have other lines.
 
@@ -34,9 +37,14 @@ def divide_lines(
         blind = numbered.loc[is_blind, [*places, "line"]].merge(panels, "left", places)
         blind = blind.fillna(NOT_USED)
         shown = pd.concat([numbered.loc[~is_blind, [*columns, "line"]], blind])
-        groups = shown.groupby(list(columns), sort=False)["line"].agg(list).reset_index()
+        groups = (
+            shown.groupby(list(columns), sort=False)["line"].agg(list).reset_index()
+        )
         if groups["line"].map(len).max() <= _MAX_LINES:
             break
     titled = [name for name in columns if groups[name].nunique() > 1]
     rows = groups.to_dict("records")
-    return titled, [(joined(reading_name(name, row[name]) for name in titled), row["line"]) for row in rows]
+    return titled, [
+        (joined(reading_name(name, row[name]) for name in titled), row["line"])
+        for row in rows
+    ]

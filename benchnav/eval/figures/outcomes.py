@@ -11,8 +11,8 @@ from benchnav.eval.words import outcome_in_words
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import AMBER, BLUE, GREEN, ORANGE, PINK, SKY, legend_outside
 
-# From what the terrain did to what the code did: the colour of each failure, and its hatching in white, so that
-# outcomes of one lightness differ in grey. Success is light.
+# From what the terrain did to what the code did: the colour of each failure, and its
+# hatching in white, so that outcomes of one lightness differ in grey. Success is light.
 LOOKS = {
     "immobilised": (ORANGE, ""),
     "stuck": (AMBER, "/////"),
@@ -29,7 +29,9 @@ SUCCESS_COLOUR = "#E4E4E4"
 
 
 class Outcomes(Figure):
-    """Fractions of outcomes in one order for all conditions: failures first, then success."""
+    """Fractions of outcomes in one order for all conditions: failures first, then
+    success.
+    """
 
     name = "outcomes"
     text = "Outcomes of the episodes."
@@ -38,16 +40,38 @@ class Outcomes(Figure):
         """Draw a bar a condition."""
         ended = [name for name in LOOKS if data.summary[f"{name}_count"].sum()]
         label = "fraction of episodes [%]"
-        figure, panels = lay_out(data.summary, [label], legend_in=0.15 + 0.15 * (len(ended) // 3))
+        figure, panels = lay_out(
+            data.summary, [label], legend_in=0.15 + 0.15 * (len(ended) // 3)
+        )
         for panel, rows in panels:
             left = np.zeros(len(rows))
             for name in ended:
                 fraction = 100 * rows[f"{name}_count"] / rows["n_episodes"]
                 colour, hatch = LOOKS[name]
-                look: dict[str, Any] = {"fc": colour, "hatch": hatch, "ec": "white", "lw": 0}
-                panel.barh(rows["height"], fraction, 0.78, left, label=outcome_in_words(name), **look)
+                look: dict[str, Any] = {
+                    "fc": colour,
+                    "hatch": hatch,
+                    "ec": "white",
+                    "lw": 0,
+                }
+                panel.barh(
+                    rows["height"],
+                    fraction,
+                    0.78,
+                    left,
+                    label=outcome_in_words(name),
+                    **look,
+                )
                 left = left + fraction
-            panel.barh(rows["height"], 100 - left, 0.78, left, color=SUCCESS_COLOUR, lw=0, label="success")
+            panel.barh(
+                rows["height"],
+                100 - left,
+                0.78,
+                left,
+                color=SUCCESS_COLOUR,
+                lw=0,
+                label="success",
+            )
         panel.set_xlim(0, 100)
         legend_outside(figure, columns=6)
         return figure

@@ -1,4 +1,6 @@
-"""Sweeps of a run: conditions that are equal in all but one number, which takes three values or more, as curves."""
+"""Sweeps of a run: conditions that are equal in all but one number, which takes three
+values or more, as curves.
+"""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -19,7 +21,14 @@ from benchnav.eval.words import joined
 from benchnav.planning.free_space import Rules
 from benchnav.viz.figure import Figure
 from benchnav.viz.panels import Curves, line_looks
-from benchnav.viz.style import BLIND, LINE_COLOURS, condition_colours, legend_outside, planner_name, risk_name
+from benchnav.viz.style import (
+    BLIND,
+    LINE_COLOURS,
+    condition_colours,
+    legend_outside,
+    planner_name,
+    risk_name,
+)
 
 SEVERITY = "severity"
 MIN_VALUES = 3
@@ -33,9 +42,23 @@ _MEASURES = {
 }
 _SAME = ("data", "scenario", "world", "robot", "objective")
 
-# What panels are named by, in order; who plans and the risk setting only where lines are many.
-_LABELS = ("scenario", "data", "world", "model", *KNOWLEDGE, "who", "risk", "robot", "objective")
-_WAYS = [[name for name in _LABELS if name not in left_out] for left_out in (("who", "risk"), ("risk",), ())]
+# What panels are named by, in order; who plans and the risk setting only where lines
+# are many.
+_LABELS = (
+    "scenario",
+    "data",
+    "world",
+    "model",
+    *KNOWLEDGE,
+    "who",
+    "risk",
+    "robot",
+    "objective",
+)
+_WAYS = [
+    [name for name in _LABELS if name not in left_out]
+    for left_out in (("who", "risk"), ("risk",), ())
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,8 +85,8 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
         conditions: by id, with `value`, as `run.json` holds them.
 
     Returns:
-        Lines in the order of the run, by the name of their number with dots, such as `risk.options.level`;
-        `severity` is that of scenarios.
+        Lines in the order of the run, by the name of their number with dots, such as
+        `risk.options.level`; `severity` is that of scenarios.
     """
     values = {
         name: _with_defaults(about["value"])
@@ -76,12 +99,19 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
     for scenario, pairs in find_series(dict.fromkeys(known.get("split", ()))).items():
         severities = {split: severity for severity, split in pairs}
         own = known[known["split"].isin(list(severities))]
-        tables.append((SEVERITY, own.assign(severity=own["split"].map(severities), split=scenario)))
+        tables.append(
+            (
+                SEVERITY,
+                own.assign(severity=own["split"].map(severities), split=scenario),
+            )
+        )
     sweeps: dict[str, list[Line]] = {}
     for number, table in tables:
         table = table[table[number].map(_is_number)]
         rest = table.drop(columns=number)
-        for _, alike in table.groupby(rest.astype(str).apply(tuple, axis=1), sort=False):
+        for _, alike in table.groupby(
+            rest.astype(str).apply(tuple, axis=1), sort=False
+        ):
             if alike[number].nunique() >= MIN_VALUES:
                 ordered = alike[number].astype(float).sort_values(kind="stable")
                 line = Line(
@@ -94,7 +124,9 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
 
 
 def _with_defaults(value: Mapping[str, Any]) -> dict[str, Any]:
-    """A condition's value with rules and options of shipped planners that stand in it only where they differ."""
+    """A condition's value with rules and options of shipped planners that stand in it
+    only where they differ.
+    """
     planner = value["planner"]
     later = {}
     if planner["part"] in registry.names("planner"):
@@ -117,7 +149,8 @@ def sweep_name(number: str) -> str:
 
 
 class Over(Figure):
-    """Success and T_total over a number in which conditions that are equal in all else differ.
+    """Success and T_total over a number in which conditions that are equal in all else
+    differ.
 
     Attributes:
         number: a name from `find_sweeps`.
@@ -132,7 +165,10 @@ class Over(Figure):
         """Return a figure a sweep."""
         sweeps = find_sweeps(data.about["conditions"])
         counts = Counter(map(sweep_name, sweeps))
-        short = {n: sweep_name(n) if counts[sweep_name(n)] == 1 else n.replace(".", "-") for n in sweeps}
+        short = {
+            n: sweep_name(n) if counts[sweep_name(n)] == 1 else n.replace(".", "-")
+            for n in sweeps
+        }
         return [
             self.variant(number=number, lines=lines, name=f"over-{short[number]}")
             for number, lines in sweeps.items()
@@ -140,20 +176,28 @@ class Over(Figure):
 
     def caption(self, data: RunData) -> str:
         """Return which number it is."""
-        return f"Success and T_total over {self.name.removeprefix('over-')}, with 95 % intervals."
+        return (
+            f"Success and T_total over {self.name.removeprefix('over-')}, with 95 "
+            "% intervals."
+        )
 
     def draw(self, data: RunData) -> Drawing:
         """Draw success above with Wilson's band, T_total below with the bootstrap's.
 
-        A panel a scenario, world, model and what else there is of that kind; where lines are many, a panel a planner
-        too. Over a number of a risk setting, the other settings of the same planner are horizontal lines.
+        A panel a scenario, world, model and what else there is of that kind; where
+        lines are many, a panel a planner too. Over a number of a risk setting, the
+        other settings of the same planner are horizontal lines.
         """
         rows = data.summary.set_index("condition", drop=False)
         labels = _label_lines(self.number, self.lines, rows)
         planners = labels.drop_duplicates("name").set_index("name")["planner"]
-        looks = line_looks(planners.index, condition_colours(planners.tolist(), LINE_COLOURS))
+        looks = line_looks(
+            planners.index, condition_colours(planners.tolist(), LINE_COLOURS)
+        )
         _, groups = divide_lines(labels, _WAYS)
-        groups = [(title or labels["scenario"][shown[0]], shown) for title, shown in groups]
+        groups = [
+            (title or labels["scenario"][shown[0]], shown) for title, shown in groups
+        ]
         measured = pd.DataFrame(
             {
                 name + end: scale * rows[column]
@@ -163,7 +207,9 @@ class Over(Figure):
         )
         points = [
             measured.loc[list(self.lines[index].conditions)].assign(
-                panel=title, line=labels["name"][index], x=_places(self.number, self.lines[index].values)
+                panel=title,
+                line=labels["name"][index],
+                x=_places(self.number, self.lines[index].values),
             )
             for title, shown in groups
             for index in shown
@@ -171,18 +217,38 @@ class Over(Figure):
         across = min(len(groups), MAX_ACROSS)
         measures = {name: name for name in _MEASURES}
         label = _NAMES.get(self.number, sweep_name(self.number))
-        curves = Curves(table=pd.concat(points), measures=measures, looks=looks, x_label=label, across=across)
+        curves = Curves(
+            table=pd.concat(points),
+            measures=measures,
+            looks=looks,
+            x_label=label,
+            across=across,
+        )
         figure, panels = curves.draw()
         ticks = sorted({value for line in self.lines for value in line.values})
         for panel in panels.values():
-            panel.set_xticks(_places(self.number, ticks), [f"{value:g}" for value in ticks])
+            panel.set_xticks(
+                _places(self.number, ticks), [f"{value:g}" for value in ticks]
+            )
         if self.number.startswith("risk."):
-            others = rows.drop([condition for line in self.lines for condition in line.conditions])
+            others = rows.drop(
+                [condition for line in self.lines for condition in line.conditions]
+            )
             for title, shown in groups:
-                colours = {index: looks[labels["name"][index]]["color"] for index in shown}
-                firsts = {index: rows.loc[self.lines[index].conditions[0]] for index in shown}
+                colours = {
+                    index: looks[labels["name"][index]]["color"] for index in shown
+                }
+                firsts = {
+                    index: rows.loc[self.lines[index].conditions[0]] for index in shown
+                }
                 for measure in _MEASURES:
-                    _draw_references(panels[title, measure], others, measured[measure], firsts, colours)
+                    _draw_references(
+                        panels[title, measure],
+                        others,
+                        measured[measure],
+                        firsts,
+                        colours,
+                    )
         legend_outside(figure)
         return figure
 
@@ -194,9 +260,15 @@ def _draw_references(
     firsts: Mapping[int, pd.Series],
     colours: Mapping[int, Any],
 ) -> None:
-    """Draw settings without the number as horizontal lines: those of a line's planner, and blind ones."""
-    settings = [risk_name(row["risk"]) if row["model"] != NOT_USED else planner_name(row["planner"])
-                for row in others.to_dict("records")]  # fmt: skip
+    """Draw settings without the number as horizontal lines: those of a line's planner,
+    and blind ones.
+    """
+    settings = [
+        risk_name(row["risk"])
+        if row["model"] != NOT_USED
+        else planner_name(row["planner"])
+        for row in others.to_dict("records")
+    ]
     order = list(dict.fromkeys(settings))
     for index, first in firsts.items():
         for name, (condition, row) in zip(settings, others.iterrows(), strict=True):
@@ -206,16 +278,28 @@ def _draw_references(
                 colour = BLIND if is_blind else colours[index]
                 # A pattern of dashes for each setting, with more and more dots between.
                 dashes = (0, (6, 2, *(1, 1.5) * order.index(name)))
-                panel.axhline(values[condition], color=colour, ls=dashes, lw=1, zorder=1, label=name)
+                panel.axhline(
+                    values[condition],
+                    color=colour,
+                    ls=dashes,
+                    lw=1,
+                    zorder=1,
+                    label=name,
+                )
 
 
-def _label_lines(number: str, lines: Sequence[Line], rows: pd.DataFrame) -> pd.DataFrame:
-    """What names lines and their panels: a row a line, with the `planner` and the `name` of the line beside `_LABELS`.
+def _label_lines(
+    number: str, lines: Sequence[Line], rows: pd.DataFrame
+) -> pd.DataFrame:
+    """What names lines and their panels: a row a line, with the `planner` and the
+    `name` of the line beside `_LABELS`.
 
     Of the part that is swept it is the name alone, since its label holds the number.
     """
     labelled = rows.loc[[line.conditions[0] for line in lines]].reset_index(drop=True)
-    labelled["scenario"] = [str(line.rest["split"]).removeprefix("test/") for line in lines]
+    labelled["scenario"] = [
+        str(line.rest["split"]).removeprefix("test/") for line in lines
+    ]
     labelled["who"] = labelled["planner"]
     if number.startswith(("world.", "rules.")):
         labelled["world"] = labelled["world"].str.partition(" ")[0]
@@ -231,13 +315,19 @@ def _label_lines(number: str, lines: Sequence[Line], rows: pd.DataFrame) -> pd.D
         rests = [lines[place].rest for place in alike.index]
         for place, rest in zip(alike.index, rests, strict=True):
             # What labels do not say is said where that is needed.
-            differing = [key for key in rest if len({repr(other.get(key)) for other in rests}) > 1]
+            differing = [
+                key
+                for key in rest
+                if len({repr(other.get(key)) for other in rests}) > 1
+            ]
             more = (f"{sweep_name(key)} {rest[key]}" for key in differing)
             names[place] = joined([alike["who"][place], alike["risk"][place], *more])
     return labelled.assign(name=pd.Series(names))
 
 
 def _places(number: str, values: Sequence[float]) -> np.ndarray:
-    """Where values stand: levels by the logarithm of the tail's share, since they crowd toward 1."""
+    """Where values stand: levels by the logarithm of the tail's share, since they crowd
+    toward 1.
+    """
     numbers = np.asarray(values)
     return -np.log(1 - numbers) if number == _LEVEL and numbers.max() < 1 else numbers

@@ -1,4 +1,6 @@
-"""The waterfall of regret: what each step of a chain of conditions takes from success, and adds to time."""
+"""The waterfall of regret: what each step of a chain of conditions takes from success,
+and adds to time.
+"""
 
 from itertools import pairwise
 from typing import Any
@@ -17,14 +19,25 @@ from benchnav.eval.words import joined
 from benchnav.stats.tables import signed, signed_interval
 from benchnav.viz.figure import Figure
 from benchnav.viz.panels import GRID, draw_interval
-from benchnav.viz.style import BLUE, ORANGE, TEXT, TWO_COLUMNS_IN, legend_outside, planner_name, risk_name
+from benchnav.viz.style import (
+    BLUE,
+    ORANGE,
+    TEXT,
+    TWO_COLUMNS_IN,
+    legend_outside,
+    planner_name,
+    risk_name,
+)
 
 MAX_CHAINS = 6
 _ROW_IN = 0.24
 _ENDS = "0.75"
 _BOUND = "0.25"
 # Of each measure its axis, its factor, and whether more is worse.
-_MEASURES = {"success": ("success [%]", 100.0, False), "time": ("T_total [s]", 1.0, True)}
+_MEASURES = {
+    "success": ("success [%]", 100.0, False),
+    "time": ("T_total [s]", 1.0, True),
+}
 
 
 class Regret(Figure):
@@ -39,21 +52,33 @@ class Regret(Figure):
     def caption(self, data: RunData) -> str:
         """Return what a step means, and how many chains are shown."""
         chains = data.regret["chain"].nunique()
-        shown = f" The first {MAX_CHAINS} of {chains} chains are shown." if chains > MAX_CHAINS else ""
+        shown = (
+            f" The first {MAX_CHAINS} of {chains} chains are shown."
+            if chains > MAX_CHAINS
+            else ""
+        )
         return (
-            "Regret against the near-optimal reference, a drive on λ itself and no bound: step by step from a planner "
-            "to it, on the episodes that all have in common, paired differences with 95 % intervals. A step may be "
+            "Regret against the near-optimal reference, a drive on λ itself and no "
+            "bound: step by step from a planner "
+            "to it, on the episodes that all have in common, paired differences with "
+            "95 % intervals. A step may be "
             "negative, and in another order steps would be others, so that none is "
             f"a share of the causes.{shown}"
         )
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw each chain from its planner, on top, to the reference: success left, T_total right."""
-        chains = [rows for _, rows in data.regret.groupby("chain", sort=True)][:MAX_CHAINS]
+        """Draw each chain from its planner, on top, to the reference: success left,
+        T_total right.
+        """
+        chains = [rows for _, rows in data.regret.groupby("chain", sort=True)][
+            :MAX_CHAINS
+        ]
         steps = 2 + max(len(rows) for rows in chains)
         height = len(chains) * (_ROW_IN * steps + 0.55) + 0.3
         figure = Drawing(figsize=(TWO_COLUMNS_IN, height), layout="constrained")
-        axes = figure.subplots(len(chains), len(_MEASURES), squeeze=False, sharey="row", sharex="col")
+        axes = figure.subplots(
+            len(chains), len(_MEASURES), squeeze=False, sharey="row", sharex="col"
+        )
         differing = [name for name in BLOCK if data.regret[name].nunique() > 1]
         for line, rows in zip(axes, chains, strict=True):
             for panel, measure in zip(line, _MEASURES, strict=True):
@@ -62,7 +87,9 @@ class Regret(Figure):
             line[0].set_yticks(range(len(names)), names)
             line[0].set_ylim(len(rows) + 1.6, -0.6)
             about = rows.iloc[0]
-            title = joined([risk_name(about["risk"]), *(about[name] for name in differing)])
+            title = joined(
+                [risk_name(about["risk"]), *(about[name] for name in differing)]
+            )
             line[0].set_title(f"{title}, {about['n_maps']} maps", loc="left")
         for panel, (label, *_) in zip(axes[-1], _MEASURES.values(), strict=True):
             panel.set_xlabel(label)
@@ -74,43 +101,77 @@ class Regret(Figure):
         ]
         if data.regret["time_bound"].notna().any():
             handles.append(
-                Line2D([], [], color=_BOUND, ls="--", lw=1.1, label="lower bound: no planner is better")
+                Line2D(
+                    [],
+                    [],
+                    color=_BOUND,
+                    ls="--",
+                    lw=1.1,
+                    label="lower bound: no planner is better",
+                )
             )
         legend_outside(figure, handles, len(handles))
         return figure
 
 
 def _row_names(rows: pd.DataFrame) -> list[str]:
-    """Name the first condition of a chain, what changes in each step, and the last condition."""
+    """Name the first condition of a chain, what changes in each step, and the last
+    condition.
+    """
     ends = [("one", rows.iloc[0]), *(("other", row) for _, row in rows.iterrows())]
-    named = [(planner_name(row[f"{end}_planner"]), row[f"{end}_model"]) for end, row in ends]
+    named = [
+        (planner_name(row[f"{end}_planner"]), row[f"{end}_model"]) for end, row in ends
+    ]
     steps = [
-        "\n".join(f"{first} → {then}" for first, then in zip(*pair, strict=True) if first != then)
+        "\n".join(
+            f"{first} → {then}"
+            for first, then in zip(*pair, strict=True)
+            if first != then
+        )
         for pair in pairwise(named)
     ]
     return [", ".join(named[0]), *steps, ", ".join(named[-1])]
 
 
 def _draw_chain(panel: Axes, rows: pd.DataFrame, measure: str) -> None:
-    """Bars of the first and the last mean, and between them each difference from where the one before ended."""
+    """Bars of the first and the last mean, and between them each difference from where
+    the one before ended.
+    """
     _, factor, more_is_worse = _MEASURES[measure]
-    means = factor * np.array([*rows[f"{measure}_one"], rows[f"{measure}_other"].iloc[-1]])
+    means = factor * np.array(
+        [*rows[f"{measure}_one"], rows[f"{measure}_other"].iloc[-1]]
+    )
     looks: dict[str, Any] = {"height": 0.7, "lw": 0}
     beside = panel.get_yaxis_transform()
     for place, value in ((0, means[0]), (len(rows) + 1, means[-1])):
         panel.barh(place, value, color=_ENDS, **looks)
-        panel.text(1.02, place, f"{value:.1f}", transform=beside, va="center", size=TEXT)
+        panel.text(
+            1.02, place, f"{value:.1f}", transform=beside, va="center", size=TEXT
+        )
     for place, row in enumerate(rows.to_dict("records"), start=1):
-        difference, low, high = (factor * row[f"{measure}_{end}"] for end in ("difference", "low", "high"))
+        difference, low, high = (
+            factor * row[f"{measure}_{end}"] for end in ("difference", "low", "high")
+        )
         start, end = means[place - 1], means[place]
         better = difference > 0 if more_is_worse else difference < 0
-        panel.barh(place, end - start, left=start, color=ORANGE if better else BLUE, **looks)
-        from_x, to_x = np.clip([start - high, start - low], 0, None if more_is_worse else factor)
+        panel.barh(
+            place, end - start, left=start, color=ORANGE if better else BLUE, **looks
+        )
+        from_x, to_x = np.clip(
+            [start - high, start - low], 0, None if more_is_worse else factor
+        )
         draw_interval(panel, from_x, to_x, place, "black", 0.9)
         words = signed(-difference)
         if low == low:  # of few maps there is no interval
             words += f" ({signed_interval(-high, -low)})"
-        panel.text(1.02, place, words.replace("-", "−"), transform=beside, va="center", size=TEXT)
+        panel.text(
+            1.02,
+            place,
+            words.replace("-", "−"),
+            transform=beside,
+            va="center",
+            size=TEXT,
+        )
     for place, value in enumerate(means):
         panel.plot([value, value], [place - 0.35, place + 1.35], color="0.5", lw=0.5)
     bound = factor * rows[f"{measure}_bound"].iloc[0]

@@ -1,6 +1,7 @@
 """Panels with a row a setting and a panel a block of the run.
 
-Any number of planners, models and risk settings fits, since their names stand on the left.
+Any number of planners, models and risk settings fits, since their names stand on the
+left.
 """
 
 from collections.abc import Sequence
@@ -27,17 +28,20 @@ def lay_out(
 
     Args:
         summary: from `summary.summarise`.
-        measures: what is drawn of each block, a panel each and side by side; the panels then list each block as
-            often.
+        measures: what is drawn of each block, a panel each and side by side; the panels
+            then list each block as often.
         legend_in: height kept for a legend.
 
     Returns:
-        The figure; of each block its panel, and its rows of the summary with the `height` that each is drawn at.
+        The figure; of each block its panel, and its rows of the summary with the
+        `height` that each is drawn at.
     """
     settings = with_names(summary[_SETTING].drop_duplicates())
     # Planners are a little apart.
     planner = settings["planner"].factorize()[0]
-    settings = settings.assign(gap=_GAP_ROWS * planner).sort_values("gap", kind="stable")
+    settings = settings.assign(gap=_GAP_ROWS * planner).sort_values(
+        "gap", kind="stable"
+    )
     settings["height"] = np.arange(len(settings)) + settings.pop("gap")
     lowest, columns = settings["height"].max(), len(measures)
     known = blocks(summary.merge(settings, on=_SETTING, how="left"))
@@ -46,7 +50,9 @@ def lay_out(
     tall = _ROW_IN * (lowest + 1.4) + 0.5
     titles = [title for title, _ in every]
     shared = "all" if columns == 1 else "col"
-    figure, places = panel_grid(titles, across, tall, 0.2 + legend_in, sharex=shared, sharey=True)
+    figure, places = panel_grid(
+        titles, across, tall, 0.2 + legend_in, sharex=shared, sharey=True
+    )
     panels = []
     for place, ((panel,), (_, rows)) in enumerate(zip(places, every, strict=True)):
         panels.append((panel, rows))
@@ -56,7 +62,11 @@ def lay_out(
         if place >= len(every) - across:
             panel.set_xlabel(measures[place % columns])
         for height in sorted(set(settings["height"]) - set(rows["height"])):
-            looks: dict[str, Any] = {"transform": panel.get_yaxis_transform(), "ha": "center", "va": "center"}
+            looks: dict[str, Any] = {
+                "transform": panel.get_yaxis_transform(),
+                "ha": "center",
+                "va": "center",
+            }
             panel.text(0.5, height, "not run", color="0.5", size=6, **looks)
     first, _ = panels[0]
     first.set_yticks(settings["height"].tolist(), settings["name"].tolist())

@@ -1,4 +1,6 @@
-"""The figures that every run has, in the order of the report: what it was to show first, then how and where."""
+"""The figures that every run has, in the order of the report: what it was to show
+first, then how and where.
+"""
 
 from collections.abc import Sequence
 
@@ -27,10 +29,13 @@ def figures_of(data: RunData, more: Sequence[Figure] = ()) -> list[Figure]:
 
     Args:
         data: of the run.
-        more: figures after the shipped ones; one that is of a shipped class is drawn once.
+        more: figures after the shipped ones; one that is of a shipped class is drawn
+            once.
 
     Returns:
         Those whose needs are met.
     """
-    figures = [cls() for cls in SHIPPED] + [figure for figure in more if type(figure) not in SHIPPED]
+    figures = [cls() for cls in SHIPPED] + [
+        figure for figure in more if type(figure) not in SHIPPED
+    ]
     return applicable(figures, data)

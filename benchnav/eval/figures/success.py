@@ -20,39 +20,65 @@ _POINT: dict[str, Any] = {"marker": "o", "ms": 4, "ls": "none", "color": "0.2"}
 
 
 class Success(Figure):
-    """The success rate of every condition with its 95 % interval, a panel a block of the run."""
+    """The success rate of every condition with its 95 % interval, a panel a block of
+    the run.
+    """
 
     name = "success"
     text = (
-        "Success rates with 95 % intervals. Filled points are not significantly worse than the best of their "
-        "panel; all are open where nothing is significantly worse. Grey planners are blind: the dashed line and "
+        "Success rates with 95 % intervals. Filled points are not significantly worse "
+        "than the best of their "
+        "panel; all are open where nothing is significantly worse. Grey planners are "
+        "blind: the dashed line and "
         "the band carry their rate and its interval through the panel."
     )
 
     def draw(self, data: RunData) -> Drawing:
-        """Draw a point a condition; a blind planner is a line through its panel, the baseline of all others."""
-        is_blind = data.summary["model"] == NOT_USED  # the clairvoyant has a model, and no risk
+        """Draw a point a condition; a blind planner is a line through its panel, the
+        baseline of all others.
+        """
+        is_blind = (
+            data.summary["model"] == NOT_USED
+        )  # the clairvoyant has a model, and no risk
         is_marked = (
-            data.summary.get("best_marked", pd.Series(False, data.summary.index)).fillna(False).astype(bool)
+            data.summary.get("best_marked", pd.Series(False, data.summary.index))
+            .fillna(False)
+            .astype(bool)
         )
         handles: list[Any] = []
         if is_marked.any():
-            handles.append(Line2D([], [], **_POINT, label="not significantly worse than the best"))
+            handles.append(
+                Line2D([], [], **_POINT, label="not significantly worse than the best")
+            )
             if not is_marked.all():
                 handles.append(
-                    Line2D([], [], **_POINT, mfc="white", label="significantly worse, or a baseline")
+                    Line2D(
+                        [],
+                        [],
+                        **_POINT,
+                        mfc="white",
+                        label="significantly worse, or a baseline",
+                    )
                 )
         if is_blind.any():
-            handles.append(Line2D([], [], color=BLIND, lw=0.8, ls="--", label="blind planner"))
-            handles.append(Patch(color=BLIND, alpha=_BAND, lw=0, label="its 95 % interval"))
-        figure, panels = lay_out(data.summary, ["success [%]"], legend_in=0.15 * len(handles))
+            handles.append(
+                Line2D([], [], color=BLIND, lw=0.8, ls="--", label="blind planner")
+            )
+            handles.append(
+                Patch(color=BLIND, alpha=_BAND, lw=0, label="its 95 % interval")
+            )
+        figure, panels = lay_out(
+            data.summary, ["success [%]"], legend_in=0.15 * len(handles)
+        )
         colours = planner_colours(list(data.summary["planner"]))
         for panel, rows in panels:
             for row in rows.to_dict("records"):
                 blind = row["model"] == NOT_USED
                 colour = BLIND if blind else colours[row["planner"]]
                 face = colour if row.get("best_marked") else "white"
-                rate, low, high = (100 * row[f"success_{name}"] for name in ("rate", "low", "high"))
+                rate, low, high = (
+                    100 * row[f"success_{name}"] for name in ("rate", "low", "high")
+                )
                 draw_interval(panel, low, high, row["height"], colour)
                 panel.plot(rate, row["height"], "o", color=colour, ms=4, mfc=face)
                 if blind:

@@ -1,4 +1,6 @@
-"""Episodes side by side: terrain, the λ̂ that was planned on, and the λ field (after the paper's Fig. 2)."""
+"""Episodes side by side: terrain, the λ̂ that was planned on, and the λ field (after
+the paper's Fig. 2).
+"""
 
 import textwrap
 from collections.abc import Sequence
@@ -14,7 +16,12 @@ from benchnav.eval.recording import Recording
 from benchnav.eval.words import chosen_in_words, episode_names
 from benchnav.viz import maps
 from benchnav.viz.figure import Figure
-from benchnav.viz.style import ONE_COLUMN_IN, TWO_COLUMNS_IN, legend_outside, stack_panels
+from benchnav.viz.style import (
+    ONE_COLUMN_IN,
+    TWO_COLUMNS_IN,
+    legend_outside,
+    stack_panels,
+)
 
 _PANELS_A_LINE = 4
 _LETTER_IN = 0.048
@@ -27,7 +34,9 @@ class Trajectories(Figure):
     trim = True
 
     def _shown(self, data: RunData) -> Sequence[Recording]:
-        return data.on_one_map or choose_recordings(data.recordings, list(data.summary["condition"]))
+        return data.on_one_map or choose_recordings(
+            data.recordings, list(data.summary["condition"])
+        )
 
     def needs(self, data: RunData) -> bool:
         """Return whether there are recordings, or steps that can be recorded again."""
@@ -38,8 +47,15 @@ class Trajectories(Figure):
         shown = self._shown(data)
         pairs = {(own.about["scenario"], own.about["map"]) for own in shown}
         where = " on {}, map {}".format(*pairs.pop()) if len(pairs) == 1 else ""
-        what = "Plans and driven paths" if any(own.own_plans for own in shown) else "Driven paths"
-        caption = f"{what}{where}, over the terrain and over the λ̂ that the planner was given."
+        what = (
+            "Plans and driven paths"
+            if any(own.own_plans for own in shown)
+            else "Driven paths"
+        )
+        caption = (
+            f"{what}{where}, over the terrain and over the λ̂ that the planner "
+            "was given."
+        )
         if any(own.field is not None for own in shown):
             caption += " Below: the whole driven path over the λ field."
         if data.on_one_map and data.driven:
@@ -49,7 +65,8 @@ class Trajectories(Figure):
     def draw(self, data: RunData) -> Drawing:
         """Draw the terrain above with what was planned, and the map planned on below.
 
-        Where λ did not change during an episode, a third row shows it, with the whole driven path.
+        Where λ did not change during an episode, a third row shows it, with the whole
+        driven path.
         """
         return draw_trajectories(self._shown(data))
 
@@ -61,9 +78,13 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
     layers = 2 if all(recording.field is None for recording in recordings) else 3
     width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
     panel_in = (width - 0.9) / across - 0.1
-    tallest = max(recording.grid.height / recording.grid.width for recording in recordings)
+    tallest = max(
+        recording.grid.height / recording.grid.width for recording in recordings
+    )
     tall = panel_in * min(max(tallest, 0.3), 2.0) + 0.35
-    figure = Drawing(figsize=(width, (layers * tall + 0.2) * lines + 0.8), layout="compressed")
+    figure = Drawing(
+        figsize=(width, (layers * tall + 0.2) * lines + 0.8), layout="compressed"
+    )
     stacks = stack_panels(figure, len(recordings), across, layers)
     for place, (recording, heading, stack) in enumerate(
         zip(recordings, _headings(recordings), stacks, strict=True)
@@ -76,11 +97,14 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
             stack.pop().remove()
         for panel in stack:
             maps.frame_map(panel)
-            panel.tick_params(labelleft=place % across == 0, labelbottom=panel is stack[-1])
+            panel.tick_params(
+                labelleft=place % across == 0, labelbottom=panel is stack[-1]
+            )
             panel.set_ylabel("y [m]" if place % across == 0 else "")
             # Broken where it is wider than the panel.
             title = (
-                textwrap.fill(line, int(panel_in / _LETTER_IN)) for line in panel.get_title().splitlines()
+                textwrap.fill(line, int(panel_in / _LETTER_IN))
+                for line in panel.get_title().splitlines()
             )
             panel.set_title("\n".join(title), fontsize="small")
         stack[-1].set_xlabel("x [m]")
@@ -93,7 +117,9 @@ def draw_trajectories(recordings: Sequence[Recording]) -> Drawing:
 def _headings(recordings: Sequence[Recording]) -> list[str]:
     """Name each recording by what differs, and say when it is shown and how it ended."""
     names = episode_names([own.about for own in recordings])
-    places = [f", {own.about['scenario']}, map {own.about['map']}" for own in recordings]
+    places = [
+        f", {own.about['scenario']}, map {own.about['map']}" for own in recordings
+    ]
     headings = []
     for own, name, place in zip(recordings, names, places, strict=True):
         shown = f"{own.outcome} after {own.end_s:g} s"
@@ -109,7 +135,9 @@ def _draw_terrain(panel: Axes, recording: Recording, title: str) -> None:
     maps.show_map(panel, np.moveaxis(recording.rgb, 0, -1), recording.grid.extent_m)
     if recording.field is not None and recording.soft.any():
         for lines in (outline, maps.hatching):
-            maps.draw_lines(panel, lines(recording.soft, recording.resolution_m), maps.SOFT, 0.4)
+            maps.draw_lines(
+                panel, lines(recording.soft, recording.resolution_m), maps.SOFT, 0.4
+            )
         look = {"fc": "0.45", "ec": maps.SOFT, "hatch": "////"}
         maps.name_terrain(panel, "soft terrain, which no image shows", **look)
     moment.draw_plan(panel, recording, recording.now)
@@ -120,7 +148,9 @@ def _draw_terrain(panel: Axes, recording: Recording, title: str) -> None:
 
 
 def _draw_predicted(panel: Axes, recording: Recording) -> None:
-    """Draw the λ̂ that the planner had by that moment, and the path in black, since the map has the colours of λ."""
+    """Draw the λ̂ that the planner had by that moment, and the path in black, since the
+    map has the colours of λ.
+    """
     moment.show_known(panel, recording, recording.now)
     moment.draw_plan(panel, recording, recording.now)
     words = "driven; above in the colour of the observed λ"

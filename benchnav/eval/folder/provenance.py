@@ -1,8 +1,10 @@
-"""Where rows come from: the code and the maps that made them, and what `run.json` says of machine and commands.
+"""Where rows come from: the code and the maps that made them, and what `run.json` says
+of machine and commands.
 
-A unit of work is known by a key: the digest of its condition, seed, realisation, maps and code. Code is all of this
-package that a unit of the condition imports (see `package_modules`), the parts' own code and files, versions of what
-is installed, and the arithmetic of the processor.
+A unit of work is known by a key: the digest of its condition, seed, realisation, maps
+and code. Code is all of this package that a unit of the condition imports (see
+`package_modules`), the parts' own code and files, versions of what is installed, and
+the arithmetic of the processor.
 """
 
 import json
@@ -45,7 +47,8 @@ _MOST_NAMED = 3
 
 Code = dict[str, dict[str, Any]]
 METRICS = "metrics"  # the group of code that rows with further metrics have
-TOUCHED = "touched"  # beside the groups of code: what parts touched, which is known only when they have run
+# beside the groups of code: what parts touched, which is known only when they have run
+TOUCHED = "touched"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +56,10 @@ class Origin:
     """What makes the rows of a unit, beside its condition, seed and realisation.
 
     Args:
-        code: `environment` (versions, processor, device, time limit of planners), `modules` of this package with their
-            digests, `parts`, the digests of code and files that are not of it, and, if rows have further metrics,
-            `metrics`, see `describe_metrics`.
+        code: `environment` (versions, processor, device, time limit of planners),
+            `modules` of this package with their digests, `parts`, the digests of code
+            and files that are not of it, and, if rows have further metrics, `metrics`,
+            see `describe_metrics`.
         maps: digest of what the split's maps mean, and that of each map.
     """
 
@@ -64,9 +68,16 @@ class Origin:
 
     def key(self, unit: Unit) -> str:
         """The key of a unit that is made so, 16 hexadecimal digits."""
-        return text_digest([unit.condition.id, unit.seed, unit.realisation, unit.maps, self.maps, self.code])[
-            :16
-        ]
+        return text_digest(
+            [
+                unit.condition.id,
+                unit.seed,
+                unit.realisation,
+                unit.maps,
+                self.maps,
+                self.code,
+            ]
+        )[:16]
 
 
 def code_digest(code: Code) -> str:
@@ -93,7 +104,9 @@ class Origins:
             "planner_limit_s": planner_limit_s,
         }
         self._codes: dict[str, Code] = {}
-        self._maps: dict[tuple[Any, ...], tuple[str, ...]] = {}  # a digest of what they mean, and one of each
+        self._maps: dict[
+            tuple[Any, ...], tuple[str, ...]
+        ] = {}  # a digest of what they mean, and one of each
 
     def of(self, unit: Unit) -> Origin:
         """The origin of a unit that is made now."""
@@ -101,7 +114,11 @@ class Origins:
         known_by = f"{condition.id} {unit.metrics}"
         if known_by not in self._codes:
             metrics = {METRICS: describe_metrics(unit.metrics)} if unit.metrics else {}
-            self._codes[known_by] = {"environment": self._environment, **describe_parts(condition), **metrics}
+            self._codes[known_by] = {
+                "environment": self._environment,
+                **describe_parts(condition),
+                **metrics,
+            }
         place = condition.data, condition.split, unit.maps
         if place not in self._maps:
             dataset = condition.dataset
@@ -111,7 +128,9 @@ class Origins:
 
 
 def describe_parts(condition: Condition) -> Code:
-    """The `modules` of this package that a condition's units import, and the digests of its other `parts`."""
+    """The `modules` of this package that a condition's units import, and the digests of
+    its other `parts`.
+    """
     modules, parts = [_UNIT], {}
     for kind, part in condition.parts.items():
         name, found = f"{kind} {part.part}", part.found
@@ -121,7 +140,9 @@ def describe_parts(condition: Condition) -> Code:
         if found.shipped:
             modules.append(found.target.__module__)
         else:
-            parts[f"class of {name}" if folder else name] = text_digest([found.origin, found.digest])
+            parts[f"class of {name}" if folder else name] = text_digest(
+                [found.origin, found.digest]
+            )
         files = registry.option_files(part)
         parts |= {f"{text} of {name}": digest for text, digest in files.items()}
     if statistics := condition.statistics:
@@ -134,7 +155,11 @@ def describe_metrics(metrics: Iterable[Part]) -> dict[str, Any]:
     described = {}
     for part in metrics:
         found = part.found
-        known = package_modules([found.target.__module__]) if found.shipped else [found.origin, found.digest]
+        known = (
+            package_modules([found.target.__module__])
+            if found.shipped
+            else [found.origin, found.digest]
+        )
         files = registry.option_files(part)
         described[part.object.column] = {
             "part": part.part,
@@ -151,21 +176,31 @@ def lacks_metrics(code: Mapping[str, Any], wanted: Code) -> list[str]:
         code: that made the rows.
         wanted: of rows that have them.
     """
-    return [column for column in wanted.get(METRICS, {}) if column not in code.get(METRICS, {})]
+    return [
+        column
+        for column in wanted.get(METRICS, {})
+        if column not in code.get(METRICS, {})
+    ]
 
 
 def touches(condition: Condition, metrics: Iterable[Part] = ()) -> Touches:
-    """Return what the user's own parts of a unit have touched in this process; see `benchnav.core.touched`."""
+    """Return what the user's own parts of a unit have touched in this process; see
+    `benchnav.core.touched`.
+    """
     known = [part.found for part in (*metrics, *condition.parts.values())]
     return touches_of(found.target for found in known if not found.shipped)
 
 
 def describe_datasets(conditions: Conditions) -> dict[str, Any]:
-    """The maps used: by dataset its id and, by split, a digest of each map and one of what they mean."""
+    """The maps used: by dataset its id and, by split, a digest of each map and one of
+    what they mean.
+    """
     described: dict[str, Any] = {}
     for condition, extent in conditions.values():
         dataset, split = condition.dataset, condition.split
-        about = described.setdefault(condition.data, {"id": dataset.id, "maps": {}, "about": {}})
+        about = described.setdefault(
+            condition.data, {"id": dataset.id, "maps": {}, "about": {}}
+        )
         if extent.maps > len(about["maps"].get(split, ())):
             about["maps"][split] = map_digests(dataset, split, range(extent.maps))
             about["about"][split] = dataset.about_digest(split)
@@ -174,11 +209,15 @@ def describe_datasets(conditions: Conditions) -> dict[str, Any]:
 
 def map_digests(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> list[str]:
     """Digests of some maps of a split, 16 hexadecimal digits each."""
-    return [digest_of([entry.tobytes()])[:16] for entry in dataset.entry_digests(split, maps)]
+    return [
+        digest_of([entry.tobytes()])[:16]
+        for entry in dataset.entry_digests(split, maps)
+    ]
 
 
 def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Names what two codes both have and what is not the same, with the values where they are short.
+    """Names what two codes both have and what is not the same, with the values where
+    they are short.
 
     Args:
         earlier: as `Origin.code`, perhaps with what parts touched as `TOUCHED`.
@@ -193,18 +232,28 @@ def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
         for group in ("modules", "environment", "parts", METRICS)
     }
     modules = differing["modules"]
-    more = f" and {len(modules) - _MOST_NAMED} more of its modules" if len(modules) > _MOST_NAMED else ""
+    more = (
+        f" and {len(modules) - _MOST_NAMED} more of its modules"
+        if len(modules) > _MOST_NAMED
+        else ""
+    )
     return [
         *([f"{', '.join(modules[:_MOST_NAMED])}{more}"] if modules else []),
-        *(f"{n} ({earlier['environment'][n]} to {now['environment'][n]})" for n in differing["environment"]),
+        *(
+            f"{n} ({earlier['environment'][n]} to {now['environment'][n]})"
+            for n in differing["environment"]
+        ),
         *differing["parts"],
         *(f"metric {column}" for column in differing[METRICS]),
         *unlike(earlier.get(TOUCHED, {}), now.get(TOUCHED, {})),
     ]
 
 
-def dataset_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Names what of the maps of two runs is not the same; what only one has is no difference.
+def dataset_differences(
+    earlier: Mapping[str, Any], now: Mapping[str, Any]
+) -> list[str]:
+    """Names what of the maps of two runs is not the same; what only one has is no
+    difference.
 
     Args:
         earlier: from `describe_datasets`.
@@ -217,7 +266,10 @@ def dataset_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> l
             pairs = zip(digests, other["maps"].get(split, digests), strict=False)
             if any(before != after for before, after in pairs):
                 changed.append(f"maps of {data} {split}")
-            if other["about"].get(split, about["about"][split]) != about["about"][split]:
+            if (
+                other["about"].get(split, about["about"][split])
+                != about["about"][split]
+            ):
                 changed.append(f"{MEANING} of {data} {split}")
     return changed
 
@@ -227,11 +279,14 @@ def describe_machine() -> dict[str, Any]:
     return {"processor": _processor(), "cores": os.cpu_count(), "host": platform.node()}
 
 
-def extend_history(earlier: Iterable[Mapping[str, Any]], suite: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """What was asked of a run: command, suite, date, machine, version and git commit of this package, an entry each.
+def extend_history(
+    earlier: Iterable[Mapping[str, Any]], suite: Mapping[str, Any]
+) -> list[Mapping[str, Any]]:
+    """What was asked of a run: command, suite, date, machine, version and git commit of
+    this package, an entry each.
 
-    The commit ends in `+` where files differ from it, and is empty where the package is in no repository. A command
-    that is given again at the same place adds no entry.
+    The commit ends in `+` where files differ from it, and is empty where the package is
+    in no repository. A command that is given again at the same place adds no entry.
 
     Args:
         earlier: entries that are there.
@@ -244,14 +299,23 @@ def extend_history(earlier: Iterable[Mapping[str, Any]], suite: Mapping[str, Any
         "benchnav": benchnav.__version__,
         "commit": _commit(),
     }
-    now = {"date": datetime.now(UTC).isoformat(timespec="seconds"), **json.loads(json.dumps(asked))}
+    now = {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        **json.loads(json.dumps(asked)),
+    }
     again = any({**entry, "date": now["date"]} == now for entry in earlier)
     return [*earlier, *([] if again else [now])]
 
 
 def join(*lists: Iterable[Any]) -> list[Any]:
     """All entries of lists of plain data, each once, in order."""
-    return list({json.dumps(item, sort_keys=True): item for entries in lists for item in entries}.values())
+    return list(
+        {
+            json.dumps(item, sort_keys=True): item
+            for entries in lists
+            for item in entries
+        }.values()
+    )
 
 
 def command_lines(about: Mapping[str, Any]) -> list[str]:
@@ -272,10 +336,16 @@ def _processor() -> str:
 def _commit() -> str:
     def git(*words: str) -> str:
         command = ["git", "-C", str(PACKAGE), *words]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+        return subprocess.run(
+            command, capture_output=True, text=True, check=True, timeout=10
+        ).stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", "__init__.py")  # else the repository is another project's
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", ".") else "")
+        git(
+            "ls-files", "--error-unmatch", "__init__.py"
+        )  # else the repository is another project's
+        return git("rev-parse", "HEAD") + (
+            "+" if git("status", "--porcelain", "--", ".") else ""
+        )
     except (OSError, subprocess.SubprocessError):
         return ""

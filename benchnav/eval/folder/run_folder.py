@@ -1,10 +1,11 @@
 """Run folders, format version 6: what lies where, and how it is read.
 
-A run folder holds `run.json` (conditions, and where everything came from), `units/` (what is finished: one Parquet file
-a unit, by condition and key, with rows and, in its metadata, what else is known of it), `steps/`, `playback/`, and,
-when all is done, `episodes.parquet`, `errors.txt` where a planner, model, sensor or belief failed, and the report.
-Every file is written under another name first. `run.json` is sealed, and holds the digests of the run's tables, so that
-an edit of either is found.
+A run folder holds `run.json` (conditions, and where everything came from), `units/`
+(what is finished: one Parquet file a unit, by condition and key, with rows and, in its
+metadata, what else is known of it), `steps/`, `playback/`, and, when all is done,
+`episodes.parquet`, `errors.txt` where a planner, model, sensor or belief failed, and
+the report. Every file is written under another name first. `run.json` is sealed, and
+holds the digests of the run's tables, so that an edit of either is found.
 """
 
 import json
@@ -26,8 +27,21 @@ from benchnav.core.store import Shard, replacing, seal, unseal, write_text
 from benchnav.eval.experiment.condition import NOT_USED, Condition, condition_from
 from benchnav.eval.experiment.suite import RECORDS
 from benchnav.eval.experiment.unit import DRAW, Extent, Unit, steps_path
-from benchnav.eval.folder.provenance import METRICS, TOUCHED, Origin, code_digest, touches
-from benchnav.eval.folder.sealed import CONTENT, DamageError, damage_of, metadata, read_sealed, with_metadata
+from benchnav.eval.folder.provenance import (
+    METRICS,
+    TOUCHED,
+    Origin,
+    code_digest,
+    touches,
+)
+from benchnav.eval.folder.sealed import (
+    CONTENT,
+    DamageError,
+    damage_of,
+    metadata,
+    read_sealed,
+    with_metadata,
+)
 
 FORMAT, FORMAT_VERSION = "benchnav-run", 6
 RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
@@ -59,15 +73,21 @@ def open_run(folder: Path) -> Run:
     """
     if not (folder / RUN).is_file():
         raise ConfigError(
-            f"Expected a run folder with {RUN}, got {folder}. Make one with `benchnav-eval run`."
+            f"Expected a run folder with {RUN}, got {folder}. Make one with "
+            "`benchnav-eval run`."
         )
-    with damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
+    with damaged(
+        folder / RUN, "Take it from a copy, or run the suite again into another folder."
+    ):
         text = (folder / RUN).read_text()
         version = _format_version(json.loads(text))
         if version == FORMAT_VERSION:
             about = unseal(text)
             conditions = {
-                i: (condition_from(entry), Extent(draws=tuple(tuple(draw) for draw in entry["draws"])))
+                i: (
+                    condition_from(entry),
+                    Extent(draws=tuple(tuple(draw) for draw in entry["draws"])),
+                )
                 for i, entry in about["conditions"].items()
             }
             shard = Shard(**about["shard"]) if "shard" in about else None
@@ -76,7 +96,8 @@ def open_run(folder: Path) -> Run:
     if version < FORMAT_VERSION:
         remedy = "Run its suite again, or read it with benchnav 1.3"
     raise ConfigError(
-        f"Expected a run folder of format version {FORMAT_VERSION}, got {folder} of version {version}. {remedy}."
+        f"Expected a run folder of format version {FORMAT_VERSION}, got {folder} of "
+        f"version {version}. {remedy}."
     )
 
 
@@ -98,7 +119,8 @@ def write_run(folder: Path, about: Mapping[str, Any]) -> None:
 
 
 def caveats(about: Mapping[str, Any]) -> list[str]:
-    """What readers of a run's tables should know: its warnings, and the combinations that it left out.
+    """What readers of a run's tables should know: its warnings, and the combinations
+    that it left out.
 
     Args:
         about: of its `run.json` at least `warnings` and `dropped`.
@@ -116,7 +138,9 @@ def dropped_labels(entry: Mapping[str, str]) -> dict[str, str]:
 def _in_words(entry: Mapping[str, str]) -> str:
     """Return a combination that was left out, and why, in words."""
     labels = dropped_labels(entry).items()
-    words = ", ".join(f"{column} {label}" for column, label in labels if label != NOT_USED)
+    words = ", ".join(
+        f"{column} {label}" for column, label in labels if label != NOT_USED
+    )
     return f"{words}: {entry['reason']}"
 
 
@@ -124,18 +148,22 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
     """Reads a table of episodes of a finished run, which is checked against `run.json`.
 
     Raises:
-        ConfigError: the run is not finished, the folder holds a shard of it, or the table is not the run's.
+        ConfigError: the run is not finished, the folder holds a shard of it, or the
+            table is not the run's.
     """
     path, run = folder / name, open_run(folder)
     if not path.exists():
         if run.shard is not None:
             raise ConfigError(
-                f"Expected a whole run, got {folder}, which is shard {run.shard} of a run and has no tables. Merge all "
+                f"Expected a whole run, got {folder}, which is shard {run.shard} of a "
+                "run and has no tables. Merge all "
                 "shards with `benchnav-eval merge OUT PART …`."
             )
         raise ConfigError(
-            f"Expected a finished run, got {folder} without {name}. Give its `benchnav-eval run` command again to "
-            "finish it; `benchnav-eval report --partial` and `replay` read what is there."
+            f"Expected a finished run, got {folder} without {name}. Give its "
+            "`benchnav-eval run` command again to "
+            "finish it; `benchnav-eval report --partial` and `replay` read what is "
+            "there."
         )
     with damaged(path, "Remove it and give the run's command again."):
         if run.about.get("tables", {}).get(name) != digest_of_path(path):
@@ -145,14 +173,22 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
 
 @contextmanager
 def damaged(path: Path, remedy: str) -> Iterator[None]:
-    """Says in one line that a file is not what it has to be, whatever reading it raised."""
+    """Says in one line that a file is not what it has to be, whatever reading it
+    raised.
+    """
     try:
         yield
     except PermissionError:
         raise
-    except Exception as error:  # of a table what its library raises, of a rule what refuses a suite
-        said = error if isinstance(error, DamageError | ConfigError) else one_line(error)
-        raise out_of_memory(error) or ConfigError(f"{path} is damaged: {said}. {remedy}") from error
+    except (
+        Exception
+    ) as error:  # of a table what its library raises, of a rule what refuses a suite
+        said = (
+            error if isinstance(error, DamageError | ConfigError) else one_line(error)
+        )
+        raise out_of_memory(error) or ConfigError(
+            f"{path} is damaged: {said}. {remedy}"
+        ) from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,10 +197,11 @@ class Finished:
 
     Args:
         path: its file.
-        about: the metadata of the file: `unit` (what was run), `key`, `code`, `digests` of the maps, `record`, `made`
-            (a token of this one making of it, which copies keep), `traceback`, `errors`, `touched` by the user's own
-            parts, and the digests `content` of its rows, `steps` of its steps and `recordings` of its recordings by
-            their path.
+        about: the metadata of the file: `unit` (what was run), `key`, `code`, `digests`
+            of the maps, `record`, `made` (a token of this one making of it, which
+            copies keep), `traceback`, `errors`, `touched` by the user's own parts, and
+            the digests `content` of its rows, `steps` of its steps and `recordings` of
+            its recordings by their path.
     """
 
     path: Path
@@ -181,16 +218,23 @@ class Finished:
         return set(self.about["code"].get(METRICS, ()))
 
     def has(self, unit: Unit) -> bool:
-        """Whether it was recorded as a unit is now to be, and what was recorded is still of its making."""
+        """Whether it was recorded as a unit is now to be, and what was recorded is
+        still of its making.
+        """
         if RECORDS.index(self.about["record"]) < RECORDS.index(unit.record):
             return False
         steps = self.folder / unit.steps_path
-        return self.about["record"] == "none" or metadata(steps).get("key") == self.about["key"]
+        return (
+            self.about["record"] == "none"
+            or metadata(steps).get("key") == self.about["key"]
+        )
 
     def damage(self) -> list[str]:
-        """Return what of the unit is not as it was written, a line each that begins with the file.
+        """Return what of the unit is not as it was written, a line each that begins
+        with the file.
 
-        Steps and recordings count if they are of this making of the unit; a file that is missing is no damage.
+        Steps and recordings count if they are of this making of the unit; a file that
+        is missing is no damage.
         """
         lines = damage_of(self.path, str(self.path.relative_to(self.folder)))
         steps = steps_path(self.about["unit"][0], self.path.name.rpartition("-")[0])
@@ -200,7 +244,9 @@ class Finished:
         if self.about.get("steps") and (self.folder / steps).exists():
             of_others = [f"{steps}: it holds the steps of another run"]
             is_own = about.get(CONTENT) == self.about["steps"]
-            lines += damage_of(self.folder / steps, str(steps)) or ([] if is_own else of_others)
+            lines += damage_of(self.folder / steps, str(steps)) or (
+                [] if is_own else of_others
+            )
         for name, digest in self.about.get("recordings", {}).items():
             if digest_of_path(self.folder / name) not in ("", digest):
                 lines.append(f"{name}: it was changed after benchnav wrote it")
@@ -215,7 +261,9 @@ def find_units(folder: Path, unit: Unit) -> list[Finished]:
         reverse=True,
     )
     found = [Finished(path=path, about=metadata(path)) for path in files]
-    return [finished for finished in found if finished.about.get("unit") == _identity(unit)]
+    return [
+        finished for finished in found if finished.about.get("unit") == _identity(unit)
+    ]
 
 
 def unit_path(unit: Unit, key: str) -> Path:
@@ -228,7 +276,12 @@ def _identity(unit: Unit) -> list[Any]:
 
 
 def write_unit(
-    folder: Path, unit: Unit, origin: Origin, rows: pd.DataFrame, errors: Sequence[str], traceback: str
+    folder: Path,
+    unit: Unit,
+    origin: Origin,
+    rows: pd.DataFrame,
+    errors: Sequence[str],
+    traceback: str,
 ) -> None:
     """Writes a finished unit.
 
@@ -254,10 +307,14 @@ def write_unit(
         TOUCHED: touches(unit.condition, unit.metrics),
         "steps": metadata(folder / unit.steps_path).get(CONTENT, ""),
         "recordings": {
-            path.as_posix(): digest for path in recordings if (digest := digest_of_path(folder / path))
+            path.as_posix(): digest
+            for path in recordings
+            if (digest := digest_of_path(folder / path))
         },
     }
-    table = pa.Table.from_pandas(rows.assign(code=code_digest(origin.code)), preserve_index=False)
+    table = pa.Table.from_pandas(
+        rows.assign(code=code_digest(origin.code)), preserve_index=False
+    )
     with replacing(folder / unit_path(unit, key)) as partial:
         pq.write_table(with_metadata(table, about), partial)
 
@@ -270,8 +327,11 @@ def clear_unit(folder: Path, unit: Unit) -> None:
             (folder / unit.recording_path(member, suffix)).unlink(missing_ok=True)
 
 
-def finish_run(folder: Path, finished: Sequence[tuple[Unit, Finished]], reused: str = "") -> None:
-    """Writes `episodes.parquet` of all units, its digest and codes into `run.json`, and `errors.txt`.
+def finish_run(
+    folder: Path, finished: Sequence[tuple[Unit, Finished]], reused: str = ""
+) -> None:
+    """Writes `episodes.parquet` of all units, its digest and codes into `run.json`, and
+    `errors.txt`.
 
     Args:
         folder: the run folder.
@@ -280,15 +340,25 @@ def finish_run(folder: Path, finished: Sequence[tuple[Unit, Finished]], reused: 
     """
     about = open_run(folder).about
     write_errors(folder, finished)
-    rows = pd.concat([labelled_rows(unit, one) for unit, one in finished], ignore_index=True)
-    table = pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata(None)
+    rows = pd.concat(
+        [labelled_rows(unit, one) for unit, one in finished], ignore_index=True
+    )
+    table = pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata(
+        None
+    )
     with replacing(folder / EPISODES) as partial:
         pq.write_table(table, partial)
     codes: dict[str, Any] = {}
     for _, one in finished:
-        code = codes.setdefault(code_digest(one.about["code"]), {**one.about["code"], TOUCHED: {}})
+        code = codes.setdefault(
+            code_digest(one.about["code"]), {**one.about["code"], TOUCHED: {}}
+        )
         code[TOUCHED] |= one.about.get(TOUCHED, {})
-    known = {"codes": codes, "reused": reused, "tables": {EPISODES: digest_of_path(folder / EPISODES)}}
+    known = {
+        "codes": codes,
+        "reused": reused,
+        "tables": {EPISODES: digest_of_path(folder / EPISODES)},
+    }
     if {name: about.get(name) for name in known} != known:
         write_run(folder, {**about, **known})
 
@@ -308,28 +378,38 @@ def unit_rows(finished: Finished) -> pd.DataFrame:
     Raises:
         ConfigError: If its file is damaged.
     """
-    with damaged(finished.path, "Give the run's command again, which runs the unit again."):
+    with damaged(
+        finished.path, "Give the run's command again, which runs the unit again."
+    ):
         return read_sealed(finished.path).to_pandas()
 
 
 def labelled_rows(unit: Unit, finished: Finished) -> pd.DataFrame:
-    """Reads the rows of a finished unit, under the labels that its condition has now; see `unit_rows`."""
+    """Reads the rows of a finished unit, under the labels that its condition has now;
+    see `unit_rows`.
+    """
     return unit_rows(finished).assign(**unit.condition.labels)
 
 
-def differences(first: pd.DataFrame, second: pd.DataFrame) -> tuple[pd.DataFrame, pd.Index]:
-    """What differs between two tables of episodes, bit for bit, in columns of results that both have.
+def differences(
+    first: pd.DataFrame, second: pd.DataFrame
+) -> tuple[pd.DataFrame, pd.Index]:
+    """What differs between two tables of episodes, bit for bit, in columns of results
+    that both have.
 
     Args:
         first: rows of episodes, in any order.
         second: as well.
 
     Returns:
-        The cells that differ, in the order of the first: `first`, `second`, by `KEYS` and the column's name. And the
-        keys of episodes that one of the tables lacks.
+        The cells that differ, in the order of the first: `first`, `second`, by `KEYS`
+        and the column's name. And the keys of episodes that one of the tables lacks.
     """
     common = _results(first) & _results(second)
-    one, other = (rows.set_index(KEYS)[sorted(common, key=list(first).index)] for rows in (first, second))
+    one, other = (
+        rows.set_index(KEYS)[sorted(common, key=list(first).index)]
+        for rows in (first, second)
+    )
     both = one.index.intersection(other.index, sort=False)
     cells = one.loc[both].compare(other.loc[both], result_names=("first", "second"))
     lacking = one.index.symmetric_difference(other.index, sort=False)
@@ -345,7 +425,9 @@ def differing_columns(first: pd.DataFrame, second: pd.DataFrame) -> list[str]:
 def _results(rows: pd.DataFrame) -> set[str]:
     """Columns of results: no wall times, and not the digest of the code."""
     others = (*KEYS, "code", "learning_ms")
-    return {name for name in rows if name not in others and not name.startswith("planning_")}
+    return {
+        name for name in rows if name not in others and not name.startswith("planning_")
+    }
 
 
 def _trace(unit: Unit, finished: Finished, folder: Path) -> str:
@@ -355,6 +437,7 @@ def _trace(unit: Unit, finished: Finished, folder: Path) -> str:
     maps = f"maps {unit.maps[0]}–{unit.maps[-1]}"
     place = finished.path.relative_to(folder)
     heading = (
-        f"{unit.condition.description}, seed {unit.seed}, realisation {unit.realisation}, {maps} ({place})"
+        f"{unit.condition.description}, seed {unit.seed}, realisation "
+        f"{unit.realisation}, {maps} ({place})"
     )
     return "\n".join([heading, *about["errors"], about["traceback"]])

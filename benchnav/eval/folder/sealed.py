@@ -1,6 +1,8 @@
-"""Parquet files of a run that hold digests of what they hold, so that a changed bit is found.
+"""Parquet files of a run that hold digests of what they hold, so that a changed bit is
+found.
 
-The metadata of a file is JSON text sealed as `run.json` is (`benchnav.core.store.seal`). It holds, beside what the file
+The metadata of a file is JSON text sealed as `run.json` is
+(`benchnav.core.store.seal`). It holds, beside what the file
 says of itself, `content`: the digest of the table.
 """
 
@@ -28,8 +30,9 @@ class DamageError(ValueError):
 def content_digest(table: pa.Table) -> str:
     """Return the SHA-256 of a table's columns: names, types and values.
 
-    The order of columns does not count, and neither do columns in which every value is missing, since files of steps
-    get such columns when a run is extended by another robot.
+    The order of columns does not count, and neither do columns in which every value is
+    missing, since files of steps get such columns when a run is extended by another
+    robot.
 
     Args:
         table: any table of numbers, Booleans and text.
@@ -50,13 +53,17 @@ def content_digest(table: pa.Table) -> str:
 
 
 def with_metadata(table: pa.Table, about: Mapping[str, Any]) -> pa.Table:
-    """Return a table whose metadata says what it is, with the digest of its content; see `metadata`."""
+    """Return a table whose metadata says what it is, with the digest of its content;
+    see `metadata`.
+    """
     text = seal({**about, CONTENT: content_digest(table)})
     return table.replace_schema_metadata({METADATA: text.encode()})
 
 
 def metadata(path: Path) -> dict[str, Any]:
-    """Return what a file says of itself; empty if it is missing, damaged, or not a file of a run."""
+    """Return what a file says of itself; empty if it is missing, damaged, or not a file
+    of a run.
+    """
     try:
         return _unsealed((pq.read_schema(path).metadata or {}).get(METADATA, b"{}"))
     except Exception:  # what a flipped bit makes Arrow raise is not of one kind
@@ -80,7 +87,8 @@ def read_sealed(path: Path) -> pa.Table:
         The table, without metadata, on which no digest depends.
 
     Raises:
-        DamageError: If it cannot be read, or holds something else than was written to it.
+        DamageError: If it cannot be read, or holds something else than was written to
+            it.
     """
     try:
         table = pq.read_table(path, partitioning=None)
@@ -100,7 +108,9 @@ def read_sealed(path: Path) -> pa.Table:
 
 
 def damage_of(path: Path, name: str) -> list[str]:
-    """Return a line that begins with the name of a file and says what is wrong with it; none where it is as written."""
+    """Return a line that begins with the name of a file and says what is wrong with it;
+    none where it is as written.
+    """
     try:
         read_sealed(path)
     except DamageError as error:

@@ -2,7 +2,8 @@
 
 The files are `steps/condition=ID/SEED-REALISATION-BLOCK.parquet`.
 
-Any reader of partitioned Parquet takes them: `pandas.read_parquet(run / "steps", filters=[("condition", "==", id)])`.
+Any reader of partitioned Parquet takes them: `pandas.read_parquet(run / "steps",
+filters=[("condition", "==", id)])`.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -27,9 +28,15 @@ STEPS = "steps"
 LAST_COLUMN = "traversability"
 # RMSE of E[λ] and mean log score of what is believed of the ground ahead of a robot.
 AHEAD_COLUMNS = ("ahead_rmse", "ahead_log_score")
-AHEAD_M, AHEAD_DEG = 5.0, 45.0  # how far, and how far to either side, ground is ahead of a robot
+AHEAD_M, AHEAD_DEG = (
+    5.0,
+    45.0,
+)  # how far, and how far to either side, ground is ahead of a robot
 _ORDER = ["condition", *DRAW, "step"]
-_REMEDY = "Remove the steps, which the report can do without, or run it again with another `--out`."
+_REMEDY = (
+    "Remove the steps, which the report can do without, or run it again with "
+    "another `--out`."
+)
 
 
 def write_steps(folder: Path, unit: Unit, key: str, table: pa.Table) -> None:
@@ -61,13 +68,18 @@ def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
     paths = [path for unit in finished if (path := folder / unit.steps_path).exists()]
     with damaged(folder / STEPS, _REMEDY):
         held = {path: pq.read_schema(path).names for path in paths}
-        every = dict.fromkeys(name for names in held.values() for name in names if name != LAST_COLUMN)
+        every = dict.fromkeys(
+            name for names in held.values() for name in names if name != LAST_COLUMN
+        )
         for path, names in held.items():
             if names == [*every, LAST_COLUMN]:
                 continue
             table = read_sealed(path)
             none = pa.array(np.full(len(table), np.nan, np.float32))
-            full = {name: table[name] if name in names else none for name in [*every, LAST_COLUMN]}
+            full = {
+                name: table[name] if name in names else none
+                for name in [*every, LAST_COLUMN]
+            }
             _write(path, pa.table(full), metadata(path))
 
 
@@ -76,7 +88,9 @@ def has_steps(folder: Path) -> bool:
     return any((folder / STEPS).glob("*/*.parquet"))
 
 
-def step_files(folder: Path, conditions: Collection[str] | None = None) -> Iterator[pd.DataFrame]:
+def step_files(
+    folder: Path, conditions: Collection[str] | None = None
+) -> Iterator[pd.DataFrame]:
     """Yield the steps of a run, a file at a time, whose digest is of all that it holds.
 
     Args:
@@ -84,7 +98,8 @@ def step_files(folder: Path, conditions: Collection[str] | None = None) -> Itera
         conditions: ids of those that are read; None for all.
 
     Yields:
-        Columns as of `step_table`, and `condition`. Files of a run that is not finished may differ in their columns.
+        Columns as of `step_table`, and `condition`. Files of a run that is not finished
+        may differ in their columns.
 
     Raises:
         ConfigError: a file is damaged.
@@ -102,12 +117,13 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
 
     Args:
         folder: a run folder.
-        **filters: which; `condition` by its id or by its labels (`planner="mppi"`, `risk="mean"`, …), and `seed`,
-            `realisation`, `map`, `step`. A list takes any of several.
+        **filters: which; `condition` by its id or by its labels (`planner="mppi"`,
+            `risk="mean"`, …), and `seed`, `realisation`, `map`, `step`. A list takes
+            any of several.
 
     Returns:
-        A row a state, in the order of condition, seed, realisation, map and step; columns as of `step_table`,
-        and `condition`.
+        A row a state, in the order of condition, seed, realisation, map and step;
+        columns as of `step_table`, and `condition`.
 
     Raises:
         ConfigError: the run has no steps, or nothing by that filter's name.
@@ -115,15 +131,24 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
     run = open_run(folder)
     if not has_steps(folder):
         raise ConfigError(
-            f"Expected a run with steps, got {folder} without any. Make them with `--record steps`."
+            f"Expected a run with steps, got {folder} without any. Make them with "
+            "`--record steps`."
         )
     conditions = set(run.conditions)
     chosen = {}
     for name, value in filters.items():
         check_known("filters", name, (*LABELS, *_ORDER))
-        values = list(value) if isinstance(value, list | tuple | set | range | np.ndarray) else [value]
+        values = (
+            list(value)
+            if isinstance(value, list | tuple | set | range | np.ndarray)
+            else [value]
+        )
         if name in LABELS:
-            conditions &= {i for i, (known, _) in run.conditions.items() if known.labels[name] in values}
+            conditions &= {
+                i
+                for i, (known, _) in run.conditions.items()
+                if known.labels[name] in values
+            }
         elif name == "condition":
             conditions &= set(values)
         else:

@@ -6,7 +6,14 @@ from benchnav.core.errors import BenchnavError
 from benchnav.core.sources import digest_of_path
 from benchnav.eval.experiment.unit import units
 from benchnav.eval.folder.checksums import SUMS, read_checksums
-from benchnav.eval.folder.run_folder import EPISODES, RUN, Finished, find_units, open_run, read_table
+from benchnav.eval.folder.run_folder import (
+    EPISODES,
+    RUN,
+    Finished,
+    find_units,
+    open_run,
+    read_table,
+)
 from benchnav.eval.folder.sealed import damage_of, metadata
 from benchnav.eval.folder.steps import STEPS
 
@@ -18,7 +25,8 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
         folder: a run folder, finished or not; nothing is written.
 
     Returns:
-        Lines on what is damaged, each beginning with the file, and lines on what is not damaged but should be known.
+        Lines on what is damaged, each beginning with the file, and lines on what is not
+        damaged but should be known.
 
     Raises:
         ConfigError: If the folder has no `run.json`.
@@ -54,12 +62,17 @@ def verify_run(folder: Path) -> tuple[list[str], list[str]]:
         elif digest_of_path(folder / name) != digest:
             damage.append(f"{name}: it was changed after benchnav wrote it")
     every = units(run.conditions)
-    own = [unit for unit in every if run.shard is None or unit.shard(run.shard.of) == run.shard]
+    own = [
+        unit
+        for unit in every
+        if run.shard is None or unit.shard(run.shard.of) == run.shard
+    ]
     missing = sum(not find_units(folder, unit) for unit in own)
     if missing:
         notes.append(f"{missing} of {len(own)} units are not finished")
     if removed:
         notes.append(
-            f"{len(removed)} of {len(checksums)} files in {SUMS} are missing, the first {removed[0]}"
+            f"{len(removed)} of {len(checksums)} files in {SUMS} are missing, the "
+            f"first {removed[0]}"
         )
     return list(dict.fromkeys(damage)), notes

@@ -1,4 +1,6 @@
-"""What a run says of the hypotheses that were fixed before it: sentences, and their table."""
+"""What a run says of the hypotheses that were fixed before it: sentences, and their
+table.
+"""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -24,10 +26,16 @@ _TESTS = {
     "superiority": "one-sided test at the margin (superiority)",
     "equivalence": "two one-sided tests (TOST) at the margin (equivalence)",
 }
-_OF_MARGINS = {"equivalence": "equivalent", "non-inferiority": "not inferior", "superiority": "superior"}
+_OF_MARGINS = {
+    "equivalence": "equivalent",
+    "non-inferiority": "not inferior",
+    "superiority": "superior",
+}
 
 
-def hypothesis_findings(tests: pd.DataFrame, about: Mapping[str, Any], unit: str) -> dict[str, list[str]]:
+def hypothesis_findings(
+    tests: pd.DataFrame, about: Mapping[str, Any], unit: str
+) -> dict[str, list[str]]:
     """Says of each hypothesis how its test came out.
 
     Args:
@@ -40,14 +48,20 @@ def hypothesis_findings(tests: pd.DataFrame, about: Mapping[str, Any], unit: str
     """
     known = quantities(further_quantities(about))
     said = [
-        f"{number}. {_capital(_claim(row, known))}: {_verdict(row)} ({_numbers(row, unit)})."
+        f"{number}. {_capital(_claim(row, known))}: {_verdict(row)} "
+        f"({_numbers(row, unit)})."
         for number, row in enumerate(tests.to_dict("records"), start=1)
     ]
-    title = f"Hypotheses, fixed before the first unit was run (digest {about['hypotheses']['digest']})"
+    title = (
+        "Hypotheses, fixed before the first unit was run (digest "
+        f"{about['hypotheses']['digest']})"
+    )
     return {title: [*said, *_extended(about)]}
 
 
-def hypothesis_table(tests: pd.DataFrame, unit: str, known: Mapping[str, Quantity] = QUANTITIES) -> Table:
+def hypothesis_table(
+    tests: pd.DataFrame, unit: str, known: Mapping[str, Quantity] = QUANTITIES
+) -> Table:
     """Formats the tests, a row a hypothesis; bold where it is supported.
 
     Args:
@@ -55,13 +69,20 @@ def hypothesis_table(tests: pd.DataFrame, unit: str, known: Mapping[str, Quantit
         unit: of the statistics, from `words.unit_of_statistics`.
         known: what conditions are compared by, by name.
     """
-    used = "; ".join(words for kind, words in _TESTS.items() if (tests["kind"] == kind).any())
+    used = "; ".join(
+        words for kind, words in _TESTS.items() if (tests["kind"] == kind).any()
+    )
     family = "1 hypothesis" if len(tests) == 1 else f"{len(tests)} hypotheses"
     notes = [
-        f"Tests: {used.format(unit=unit)}; p is corrected over {family} (Holm). Supported: p < {ALPHA}.",
-        "Intervals are of one difference and not corrected, so that an interval and p can disagree.",
+        f"Tests: {used.format(unit=unit)}; p is corrected over {family} (Holm). "
+        f"Supported: p < {ALPHA}.",
+        "Intervals are of one difference and not corrected, so that an interval and p "
+        "can disagree.",
     ]
-    rows = [{**row, "number": number} for number, row in enumerate(tests.to_dict("records"), start=1)]
+    rows = [
+        {**row, "number": number}
+        for number, row in enumerate(tests.to_dict("records"), start=1)
+    ]
     columns = [
         Column("", lambda row: str(row["number"])),
         Column("hypothesis", lambda row: _claim(row, known)),
@@ -75,11 +96,18 @@ def hypothesis_table(tests: pd.DataFrame, unit: str, known: Mapping[str, Quantit
         Column(
             "interval",
             _interval,
-            "95 % for a difference; 90 % for a margin, where the end beyond the margin decides the test before the "
+            "95 % for a difference; 90 % for a margin, where the end beyond the "
+            "margin decides the test before the "
             f"correction. Under {LEAST_MAPS} {unit}s success alone has an interval.",
         ),
-        Column("p", lambda row: NOT_USED if np.isnan(row["p_holm"]) else p_value(row["p_holm"])),
-        Column("result", lambda row: Bold(_verdict(row)) if row["supported"] else _verdict(row)),
+        Column(
+            "p",
+            lambda row: NOT_USED if np.isnan(row["p_holm"]) else p_value(row["p_holm"]),
+        ),
+        Column(
+            "result",
+            lambda row: Bold(_verdict(row)) if row["supported"] else _verdict(row),
+        ),
     ]
     table = table_of(
         rows,
@@ -93,18 +121,23 @@ def hypothesis_table(tests: pd.DataFrame, unit: str, known: Mapping[str, Quantit
         explained.append(
             (
                 "T_total",
-                "the interval allows for rare failures that no episode showed, and p does not. So p can be small where "
+                "the interval allows for rare failures that no episode showed, and p "
+                "does not. So p can be small where "
                 "the interval holds 0.",
             )
         )
     for quantity in known.values():
         if quantity.of_arrivals and (tests["metric"] == quantity.name).any():
-            explained.append((quantity.words, "over the episodes in which both arrived."))
+            explained.append(
+                (quantity.words, "over the episodes in which both arrived.")
+            )
     return replace(table, explained=(*table.explained, *explained))
 
 
 def _claim(row: Mapping[Any, Any], known: Mapping[str, Quantity]) -> str:
-    """The hypothesis with the names that tables and figures have for the two conditions."""
+    """The hypothesis with the names that tables and figures have for the two
+    conditions.
+    """
     test = Hypothesis(**{name.name: row[name.name] for name in fields(Hypothesis)})
     one, other = map(reading_names, row["names"])
     return test.claim(one, other, known[test.metric])
@@ -118,7 +151,9 @@ def _verdict(row: Mapping[Any, Any]) -> str:
         return _OF_MARGINS[kind] if row["supported"] else f"{kind} not shown"
     if row["supported"]:
         return f"significantly {direction or 'different'}"
-    return f"not significantly {direction}" if direction else "no significant difference"
+    return (
+        f"not significantly {direction}" if direction else "no significant difference"
+    )
 
 
 def _numbers(row: Mapping[Any, Any], unit: str) -> str:
@@ -139,8 +174,10 @@ def _extended(about: Mapping[str, Any]) -> list[str]:
     if now == planned:
         return []
     return [
-        f"The run was extended after the hypotheses were fixed (episodes a condition: {count_range(planned.values())} "
-        f"then, {count_range(now.values())} now). The p-values hold only if that was planned."
+        "The run was extended after the hypotheses were fixed (episodes a condition: "
+        f"{count_range(planned.values())} "
+        f"then, {count_range(now.values())} now). The p-values hold only if that was "
+        "planned."
     ]
 
 
@@ -148,7 +185,9 @@ def _interval(row: Mapping[Any, Any]) -> str:
     # The interval whose end decides a test at 5 %, before a correction.
     suffix, words = ("_90", "90 %") if row["kind"] in _OF_MARGINS else ("", "95 %")
     low, high = row[f"low{suffix}"], row[f"high{suffix}"]
-    return NOT_USED if np.isnan(low) else f"{_signed(low)} to {_signed(high)} ({words})"
+    return (
+        NOT_USED if np.isnan(low) else (f"{_signed(low)} to {_signed(high)} ({words})")
+    )
 
 
 def _with_unit(row: Mapping[Any, Any]) -> str:

@@ -1,4 +1,6 @@
-"""The report of a run: what it says, its table, where its rows come from, and its figures."""
+"""The report of a run: what it says, its table, where its rows come from, and its
+figures.
+"""
 
 import base64
 import json
@@ -29,7 +31,12 @@ from benchnav.eval.folder.run_folder import ERRORS, caveats
 from benchnav.eval.recording import MAP
 from benchnav.eval.report.findings import findings
 from benchnav.eval.report.hypotheses import hypothesis_findings, hypothesis_table
-from benchnav.eval.report.result_tables import LATENCIES, learning_table, paper_table, result_table
+from benchnav.eval.report.result_tables import (
+    LATENCIES,
+    learning_table,
+    paper_table,
+    result_table,
+)
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
 from benchnav.eval.stats.regret import best_possible, split_regret
@@ -75,11 +82,15 @@ class Report(RunData):
     def hypotheses(self) -> Table:
         """The table of `tests`."""
         known = quantities(further_quantities(self.about))
-        return self.marked(hypothesis_table(self.tests, unit_of_statistics(self.summary), known))
+        return self.marked(
+            hypothesis_table(self.tests, unit_of_statistics(self.summary), known)
+        )
 
     def marked(self, table: Table) -> Table:
         """A table that says so where the run is not finished."""
-        return replace(table, notes=(*([_capital(self.mark)] if self.mark else []), *table.notes))
+        return replace(
+            table, notes=(*([_capital(self.mark)] if self.mark else []), *table.notes)
+        )
 
     def says(self, text: str) -> str:
         """A text that begins with the mark of a run that is not finished."""
@@ -87,17 +98,23 @@ class Report(RunData):
 
     def csv(self, table: pd.DataFrame, digits: int = 6) -> str:
         """A table as CSV; of a run that is not finished it has a column `partial`."""
-        marked = table.assign(partial=self.mark.removeprefix("partial: ")) if self.mark else table
+        marked = (
+            table.assign(partial=self.mark.removeprefix("partial: "))
+            if self.mark
+            else table
+        )
         return marked.to_csv(index=False, float_format=f"%.{digits}g")
 
 
-def read_report(folder: Path, record_driven: RecordDriven | None = None, partial: bool = False) -> Report:
+def read_report(
+    folder: Path, record_driven: RecordDriven | None = None, partial: bool = False
+) -> Report:
     """Makes the report of a run, and writes nothing.
 
     Args:
         folder: a finished run.
-        record_driven: records driven episodes again, as `run.recordings.record_driven` does of the folder; without it
-            no failure is shown on a map.
+        record_driven: records driven episodes again, as `run.recordings.record_driven`
+            does of the folder; without it no failure is shown on a map.
         partial: also of a run that is not finished, of what is there.
 
     Raises:
@@ -105,34 +122,54 @@ def read_report(folder: Path, record_driven: RecordDriven | None = None, partial
     """
     results = read_results(folder, partial)
     about, episodes = results.run.about, results.episodes
-    worlds = {condition: entry["value"]["world"] for condition, entry in about["conditions"].items()}
+    worlds = {
+        condition: entry["value"]["world"]
+        for condition, entry in about["conditions"].items()
+    }
     further = further_quantities(about)
     summary = summarise(episodes, worlds, further)
     tests = (
-        test_hypotheses(about["hypotheses"], episodes, worlds, not results.is_partial, quantities(further))
+        test_hypotheses(
+            about["hypotheses"],
+            episodes,
+            worlds,
+            not results.is_partial,
+            quantities(further),
+        )
         if "hypotheses" in about
         else pd.DataFrame()
     )
     best = against_best(episodes, summary, privileged_models(about["conditions"]))
     summary = summary.merge(best, on="condition", how="left", validate="1:1")
     # How long a step of one robot takes, where the run measured it.
-    known = [about["conditions"][condition].get("latency", {}) for condition in summary["condition"]]
-    summary = summary.join(pd.DataFrame(known, columns=LATENCIES, dtype=float).add_prefix("latency_"))
+    known = [
+        about["conditions"][condition].get("latency", {})
+        for condition in summary["condition"]
+    ]
+    summary = summary.join(
+        pd.DataFrame(known, columns=LATENCIES, dtype=float).add_prefix("latency_")
+    )
     failures = failures_table(folder, episodes)
     sheets = collect_sheets(summary, failures, record_driven)
     said = findings(summary, failures, sheets.predicted)
     if not tests.empty:
         # Beside hypotheses that were fixed before the run all else is exploratory.
-        explored = {f"Exploratory: {title}": sentences for title, sentences in said.items()}
+        explored = {
+            f"Exploratory: {title}": sentences for title, sentences in said.items()
+        }
         said = hypothesis_findings(tests, about, unit_of_statistics(summary)) | explored
     if results.mark:
-        said = {f"{_capital(results.mark)}. {title}": sentences for title, sentences in said.items()}
+        said = {
+            f"{_capital(results.mark)}. {title}": sentences
+            for title, sentences in said.items()
+        }
     warnings = [*results.notes(), *caveats(about)]
     about = {**about, "conditions": results.conditions}
     if count := summary[[f"{name}_count" for name in ERROR_OUTCOMES]].to_numpy().sum():
         episodes_in_words = "1 episode" if count == 1 else f"{count} episodes"
         warnings.append(
-            f"warning: a planner, model, sensor or belief failed in {episodes_in_words}; see {folder / ERRORS}"
+            "warning: a planner, model, sensor or belief failed in "
+            f"{episodes_in_words}; see {folder / ERRORS}"
         )
     if sheets.left_out:
         warnings.append(f"note: {sheets.left_out}")
@@ -167,30 +204,47 @@ def write_report(
     partial: bool = False,
     figures: Sequence[Figure] = (),
 ) -> Report:
-    """Writes `report.html`, `summary.{csv,md,tex}`, `failures.csv` and `figures/` of a run.
+    """Writes `report.html`, `summary.{csv,md,tex}`, `failures.csv` and `figures/` of a
+    run.
 
     Args:
         folder: a finished run.
-        record_driven: records driven episodes again, as `run.recordings.record_driven` does of the folder; without it
-            no failure is shown on a map.
-        out: where to. If not given, the run folder, and its folder `PARTIAL` for a run that is not finished.
+        record_driven: records driven episodes again, as `run.recordings.record_driven`
+            does of the folder; without it no failure is shown on a map.
+        out: where to. If not given, the run folder, and its folder `PARTIAL` for a run
+            that is not finished.
         partial: also of a run that is not finished, of what is there.
-        figures: of the user, drawn after the shipped ones and those that the suite names. One that raises is left out,
-            and a line of `Report.faults` says why.
+        figures: of the user, drawn after the shipped ones and those that the suite
+            names. One that raises is left out, and a line of `Report.faults` says why.
 
     Returns:
         The report as it was written.
     """
     report = read_report(folder, record_driven, partial)
     out = out or (folder / PARTIAL if report.mark else folder)
-    tables = {"summary": report.summary, "hypotheses": report.tests, "regret": report.regret}
-    texts = {f"{name}.csv": report.csv(table) for name, table in tables.items() if not table.empty}
+    tables = {
+        "summary": report.summary,
+        "hypotheses": report.tests,
+        "regret": report.regret,
+    }
+    texts = {
+        f"{name}.csv": report.csv(table)
+        for name, table in tables.items()
+        if not table.empty
+    }
     texts["failures.csv"] = report.csv(report.failures, digits=4)
-    comments = "".join(f"% {line}\n" for line in (*report.header, *report.table.notes, *report.warnings))
-    texts["summary.tex"] = comments + paper_table(report.summary, report.name, report.says(""))
+    comments = "".join(
+        f"% {line}\n"
+        for line in (*report.header, *report.table.notes, *report.warnings)
+    )
+    texts["summary.tex"] = comments + paper_table(
+        report.summary, report.name, report.says("")
+    )
     if not report.tests.empty:
         caption = report.says("Tests of the hypotheses that were fixed before the run.")
-        texts["hypotheses.tex"] = to_latex([report.hypotheses], caption, f"{report.name}-hypotheses")
+        texts["hypotheses.tex"] = to_latex(
+            [report.hypotheses], caption, f"{report.name}-hypotheses"
+        )
     for name, text in texts.items():
         write_text(out / name, text)
     captions, faults = _draw_figures(report, figures, out / "figures")
@@ -198,18 +252,28 @@ def write_report(
     pages = "summary.md", PAGE
     for name in pages:
         write_text(out / name, render(name, report, captions))
-    drawn = [path.with_suffix(suffix) for path in captions for suffix in (".png", ".pdf")]
+    drawn = [
+        path.with_suffix(suffix) for path in captions for suffix in (".png", ".pdf")
+    ]
     note_checksums(out, [*drawn, *(out / name for name in (*texts, *pages))])
     return report
 
 
 def print_report(report: Report) -> None:
-    """Prints what a run says and its table, as wide as the terminal, or unbroken where none is."""
-    print("\n".join([*([_capital(report.mark)] if report.mark else []), *report.header]))
+    """Prints what a run says and its table, as wide as the terminal, or unbroken where
+    none is.
+    """
+    print(
+        "\n".join([*([_capital(report.mark)] if report.mark else []), *report.header])
+    )
     print_table(report.table)
     if report.learning:
         print_table(report.learning)
-    said = [line for title, lines in report.findings.items() for line in (f"{title}:", *lines)]
+    said = [
+        line
+        for title, lines in report.findings.items()
+        for line in (f"{title}:", *lines)
+    ]
     print("\n".join([*report.warnings, *said]))
 
 
@@ -223,13 +287,18 @@ def _draw_figures(
     """Write the figures of a run, those of the user last.
 
     Returns:
-        By the path of its PNG what each shows; and a line for each figure of the user that could not be drawn.
+        By the path of its PNG what each shows; and a line for each figure of the user
+        that could not be drawn.
     """
     captions: dict[Path, str] = {}
     _save_figures(report, figures_of(report), folder, captions)
     faults = []
     for given in (*report.about.get("suite", {}).get("figures", ()), *figures):
-        name = given["part"] if isinstance(given, Mapping) else getattr(given, "name", given)
+        name = (
+            given["part"]
+            if isinstance(given, Mapping)
+            else getattr(given, "name", given)
+        )
         try:
             figure = registry.take("figure", given)
             if type(figure) not in SHIPPED:
@@ -239,12 +308,15 @@ def _draw_figures(
     return captions, tuple(faults)
 
 
-def _save_figures(report: Report, figures: Iterable[Figure], folder: Path, captions: dict[Path, str]) -> None:
+def _save_figures(
+    report: Report, figures: Iterable[Figure], folder: Path, captions: dict[Path, str]
+) -> None:
     for figure in figures:
         path = folder / f"{figure.name}.png"
         if path in captions or path.parent != folder or not figure.name:
             raise ConfigError(
-                f"Expected the name of a figure that no other has, got {figure.name!r}. Rename it."
+                "Expected the name of a figure that no other has, got "
+                f"{figure.name!r}. Rename it."
             )
         caption = report.says(figure.caption(report))
         save_twice(figure(report), path, trim=figure.trim, mark=_capital(report.mark))
@@ -253,13 +325,22 @@ def _save_figures(report: Report, figures: Iterable[Figure], folder: Path, capti
 
 def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
     conditions = [about["conditions"][condition] for condition in summary["condition"]]
-    worlds = {condition["labels"]["world"]: _world(condition["value"]) for condition in conditions}
+    worlds = {
+        condition["labels"]["world"]: _world(condition["value"])
+        for condition in conditions
+    }
     lines = [f"World {label}: {text}." for label, text in worlds.items()]
-    seeds = dict.fromkeys(seed for condition in conditions for seed in condition["seeds"])
-    data, models = (joined(summary[name].unique()) or NOT_USED for name in ("data", "model"))
+    seeds = dict.fromkeys(
+        seed for condition in conditions for seed in condition["seeds"]
+    )
+    data, models = (
+        joined(summary[name].unique()) or NOT_USED for name in ("data", "model")
+    )
     lines.append(f"Data: {data}. Models: {models}. Seeds: {joined(map(str, seeds))}.")
     if summary["revisions_mean"].notna().any():
-        known = (f"{kind} {joined(summary[kind].unique()) or NOT_USED}" for kind in KNOWLEDGE)
+        known = (
+            f"{kind} {joined(summary[kind].unique()) or NOT_USED}" for kind in KNOWLEDGE
+        )
         lines.append(f"What robots know by: {'; '.join(known)}.")
     if len(summary[["n_episodes", "n_maps", "n_groups"]].drop_duplicates()) == 1:
         maps = maps_in_words(summary["n_maps"][0], summary["n_groups"][0])
@@ -274,7 +355,11 @@ def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
 
 def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> list[str]:
     """The share of draws of frozen λ that were rejected."""
-    frozen = [name for name, about in conditions.items() if about["value"]["world"]["noise"] == "frozen"]
+    frozen = [
+        name
+        for name, about in conditions.items()
+        if about["value"]["world"]["noise"] == "frozen"
+    ]
     episodes = episodes[episodes["condition"].isin(frozen)]
     if not episodes["rejected_draws"].any():
         return []
@@ -282,14 +367,19 @@ def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> li
     again = episodes.groupby(MAP)["rejected_draws"].max()
     share = again.sum() / (again + 1).sum()
     return [
-        f"{100 * share:.1f} % of the draws of λ had no feasible path from start to goal and were rejected."
+        f"{100 * share:.1f} % of the draws of λ had no feasible path from start to "
+        "goal and were rejected."
     ]
 
 
 def _bracket(
-    episodes: pd.DataFrame, conditions: Mapping[str, Any], worlds: Mapping[str, Mapping[str, Any]]
+    episodes: pd.DataFrame,
+    conditions: Mapping[str, Any],
+    worlds: Mapping[str, Mapping[str, Any]],
 ) -> list[str]:
-    """Both ends between which the least time lies, of each condition whose planner is given λ."""
+    """Both ends between which the least time lies, of each condition whose planner is
+    given λ.
+    """
     found = []
     for name, rows in episodes.groupby("condition", sort=False):
         rows = rows.assign(time_budget_s=time_budgets(rows, worlds[str(name)]))
@@ -299,8 +389,10 @@ def _bracket(
         reached, time_s = rows["success"].mean(), rows["total_time_s"].mean()
         labels = conditions[str(name)]["labels"]
         found.append(
-            f"The best that any planner can do ({labels['scenario']}, {labels['world']}) lies between a lower bound "
-            f"and what {planner_name(labels['planner'])} drives: T_total {best['time_bound']:.1f} to {time_s:.1f} s, "
+            f"The best that any planner can do ({labels['scenario']}, "
+            f"{labels['world']}) lies between a lower bound "
+            f"and what {planner_name(labels['planner'])} drives: T_total "
+            f"{best['time_bound']:.1f} to {time_s:.1f} s, "
             f"success {100 * reached:.1f} to {100 * best['success_bound']:.1f} %."
         )
     return found
@@ -314,9 +406,14 @@ def _world(value: Mapping[str, Any]) -> str:
         words[0] += " (Matérn-3/2)" if world.get("kernel") == "matern32" else ""
     if "immobile" in world:
         held = world["immobile"]
-        words.append(f"λ below {held['below']:g} for {held['for_s']:g} s immobilises the robot")
+        words.append(
+            f"λ below {held['below']:g} for {held['for_s']:g} s immobilises the robot"
+        )
     if "time_budget_ratio" in world:
-        words.append(f"time budget T = {world['time_budget_ratio']:g} × the reference time at the top speed")
+        words.append(
+            f"time budget T = {world['time_budget_ratio']:g} × the reference time at "
+            "the top speed"
+        )
     else:
         words.append(f"time budget T = {world['time_budget_s']:g} s")
     by = "mean λ" if free["by"] == "mean" else "λ̂"
@@ -324,7 +421,8 @@ def _world(value: Mapping[str, Any]) -> str:
 
 
 def render(file: str, report: Report, figures: Mapping[Path, str]) -> str:
-    """Fills the template of a file; in HTML all text is escaped, and the page needs no other file and no network.
+    """Fills the template of a file; in HTML all text is escaped, and the page needs no
+    other file and no network.
 
     Args:
         file: `report.html` or `summary.md`.
@@ -332,10 +430,18 @@ def render(file: str, report: Report, figures: Mapping[Path, str]) -> str:
         figures: by the path of its PNG what each shows.
     """
     environment = Environment(
-        loader=PackageLoader("benchnav.eval.report", "templates"), autoescape=select_autoescape(),
-        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters |= {"markdown": markdown, "table": to_markdown, "inline": _inline, "pixels": _pixels}
+        loader=PackageLoader("benchnav.eval.report", "templates"),
+        autoescape=select_autoescape(),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "markdown": markdown,
+        "table": to_markdown,
+        "inline": _inline,
+        "pixels": _pixels,
+    }
     return environment.get_template(file).render(
         report=report,
         figures=figures,
@@ -351,18 +457,35 @@ def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
     Args:
         about: all of `run.json`.
     """
-    machine, codes, last = about["machine"], about["codes"].values(), about["history"][-1]
-    lines = [("commit of benchnav", last["commit"]), ("version of benchnav", last["benchnav"])]
-    for environment in {json.dumps(code["environment"]): code["environment"] for code in codes}.values():
+    machine, codes, last = (
+        about["machine"],
+        about["codes"].values(),
+        about["history"][-1],
+    )
+    lines = [
+        ("commit of benchnav", last["commit"]),
+        ("version of benchnav", last["benchnav"]),
+    ]
+    for environment in {
+        json.dumps(code["environment"]): code["environment"] for code in codes
+    }.values():
         lines += [(name, str(value)) for name, value in environment.items()]
     lines.append(("machine", f"{machine['processor']}, {machine['cores']} cores"))
     for data, known in about["datasets"].items():
-        maps = ", ".join(f"{split} {len(digests)}" for split, digests in known["maps"].items())
+        maps = ", ".join(
+            f"{split} {len(digests)}" for split, digests in known["maps"].items()
+        )
         lines.append((f"dataset {data}", f"{known['id']}; maps: {maps}"))
     lines += dict.fromkeys(part for code in codes for part in code["parts"].items())
     metrics = [entry for code in codes for entry in code.get(METRICS, {}).items()]
-    lines += dict.fromkeys((f"metric {column}", own["digest"]) for column, own in metrics)
-    seeds = dict.fromkeys(seed for condition in about["conditions"].values() for seed in condition["seeds"])
+    lines += dict.fromkeys(
+        (f"metric {column}", own["digest"]) for column, own in metrics
+    )
+    seeds = dict.fromkeys(
+        seed
+        for condition in about["conditions"].values()
+        for seed in condition["seeds"]
+    )
     lines.append(("seeds", ", ".join(map(str, seeds))))
     return [(name, value) for name, value in lines if value]
 

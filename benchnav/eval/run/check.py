@@ -1,7 +1,9 @@
-"""Before a run: its conditions are built and tried, so that what cannot be run is rejected before anything is run.
+"""Before a run: its conditions are built and tried, so that what cannot be run is
+rejected before anything is run.
 
-Nothing is predicted and nothing is planned. A suite is a product, and some of its combinations make no sense: a planner
-that cannot steer a robot, `single-class` with a model that knows no classes. They are left out, each with its reason.
+Nothing is predicted and nothing is planned. A suite is a product, and some of its
+combinations make no sense: a planner that cannot steer a robot, `single-class` with a
+    model that knows no classes. They are left out, each with its reason.
 """
 
 import json
@@ -21,7 +23,12 @@ from benchnav.core.store import text_digest
 from benchnav.core.terrain import Grid, Observation
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import shipped_recipes, shipped_sizes
-from benchnav.eval.experiment.condition import KNOWLEDGE, Condition, conditions_of, scenarios_of
+from benchnav.eval.experiment.condition import (
+    KNOWLEDGE,
+    Condition,
+    conditions_of,
+    scenarios_of,
+)
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.metrics import NamedMetric, quantities, read_metrics
 from benchnav.eval.experiment.suite import Suite, check_size
@@ -38,7 +45,9 @@ from benchnav.planning.sensing.belief import Fields, Law, Static
 from benchnav.planning.world.realisation import check_known, draw_frozen
 
 Say = Callable[[str], None]
-LeftOut = dict[str, str]  # the labels that do not go together, by column, and the `reason`
+LeftOut = dict[
+    str, str
+]  # the labels that do not go together, by column, and the `reason`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,17 +82,26 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         elsewhere: whether parts are created in other processes.
 
     Raises:
-        ConfigError: If a part, scenario or map is missing, no combination can be run, or a hypothesis names one that
-            cannot.
+        ConfigError: If a part, scenario or map is missing, no combination can be run,
+            or a hypothesis names one that cannot.
         DatasetError: If there is no such dataset.
     """
     conditions = conditions_of(suite)
     if not conditions:
         raise ConfigError(
-            f"Expected a suite with at least one condition, got none; data has {scenarios_of(suite.data)}."
+            "Expected a suite with at least one condition, got none; data has "
+            f"{scenarios_of(suite.data)}."
         )
-    maps = {condition.id: check_split(condition, suite.maps) for condition in conditions}
-    check_size(len(conditions), len(suite.all_seeds), suite.realisations, max(maps.values()), BLOCK_MAPS)
+    maps = {
+        condition.id: check_split(condition, suite.maps) for condition in conditions
+    }
+    check_size(
+        len(conditions),
+        len(suite.all_seeds),
+        suite.realisations,
+        max(maps.values()),
+        BLOCK_MAPS,
+    )
     left_out = find_left_out(conditions)
     kept = [condition for condition in conditions if condition.id not in left_out]
     if not kept:
@@ -91,22 +109,31 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
     for figure in suite.figures:
         for part in read_parts("figure", figure):
             _ = part.object  # which may reject its options
-    metrics = read_metrics(suite.metrics, {one.robot.label: one.task.robot for one in kept}.values())
+    metrics = read_metrics(
+        suite.metrics, {one.robot.label: one.task.robot for one in kept}.values()
+    )
     known = quantities(metric.quantity for metric in metrics)
     if elsewhere:
         check_everywhere(kept, metrics)
     every = {
-        one.id: (one, Extent(draws=tuple((*draw, maps[one.id]) for draw in suite.draws)))
+        one.id: (
+            one,
+            Extent(draws=tuple((*draw, maps[one.id]) for draw in suite.draws)),
+        )
         for one in conditions
     }
     hypotheses = _fix_hypotheses(suite, every, left_out, known)
     warnings = build_each(kept, suite.maps)
     lone = [part for condition in kept for part in condition.unreproducible]
     lone += [f"metric {metric.quantity.name}" for metric in metrics if metric.is_object]
-    warnings += [f"not reproducible: {part} is an object of one process" for part in lone]
+    warnings += [
+        f"not reproducible: {part} is an object of one process" for part in lone
+    ]
     return Checked(
         conditions={condition.id: every[condition.id] for condition in kept},
-        dropped=tuple({json.dumps(entry): entry for entry in left_out.values()}.values()),
+        dropped=tuple(
+            {json.dumps(entry): entry for entry in left_out.values()}.values()
+        ),
         warnings=tuple(dict.fromkeys(warnings)),
         hypotheses=hypotheses,
         metrics=metrics,
@@ -114,22 +141,29 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
 
 
 def _fix_hypotheses(
-    suite: Suite, conditions: Conditions, left_out: Mapping[str, LeftOut], known: Mapping[str, Quantity]
+    suite: Suite,
+    conditions: Conditions,
+    left_out: Mapping[str, LeftOut],
+    known: Mapping[str, Quantity],
 ) -> dict[str, Any]:
     """Fix the hypotheses of a suite on the conditions that are run.
 
     Raises:
-        ConfigError: If a hypothesis compares a condition that is run with one that is left out, or is invalid.
+        ConfigError: If a hypothesis compares a condition that is run with one that is
+            left out, or is invalid.
     """
     try:
         tests = fix_hypotheses(suite.hypotheses, conditions, known).get("tests", ())
     except ConfigError:  # perhaps of a combination that is left out
         tests = ()
     for test in tests:
-        lost = [left_out[test[side]] for side in ("one", "other") if test[side] in left_out]
+        lost = [
+            left_out[test[side]] for side in ("one", "other") if test[side] in left_out
+        ]
         if len(lost) == 1:
             raise ConfigError(
-                f"Expected hypotheses on conditions that can be run, got {test['claim']!r}, which names one that "
+                "Expected hypotheses on conditions that can be run, got "
+                f"{test['claim']!r}, which names one that "
                 f"cannot: {lost[0]['reason']}"
             )
     kept = {i: entry for i, entry in conditions.items() if i not in left_out}
@@ -137,7 +171,8 @@ def _fix_hypotheses(
 
 
 def check_split(condition: Condition, maps: int) -> int:
-    """Return how many maps of a condition's split are run; reject a missing scenario, and more maps than there are.
+    """Return how many maps of a condition's split are run; reject a missing scenario,
+    and more maps than there are.
 
     Args:
         condition: its data and scenario.
@@ -146,13 +181,15 @@ def check_split(condition: Condition, maps: int) -> int:
     dataset, known = condition.dataset, scenarios_of(condition.data)
     if condition.scenario not in known:
         raise ConfigError(
-            f"Expected `scenarios` among {known} of {dataset.path}, got {condition.scenario!r}."
+            f"Expected `scenarios` among {known} of {dataset.path}, got "
+            f"{condition.scenario!r}."
             f"{hint(condition.scenario, known)}{_remedy(dataset, condition.split, 1)}"
         )
     count = dataset.map_count(condition.split)
     if maps > count:
         raise ConfigError(
-            f"Expected `maps` at most {count}, the maps of {condition.split} in {dataset.path}, got {maps}. "
+            f"Expected `maps` at most {count}, the maps of {condition.split} in "
+            f"{dataset.path}, got {maps}. "
             f"0 takes all.{_remedy(dataset, condition.split, maps)}"
         )
     return maps or count
@@ -160,12 +197,20 @@ def check_split(condition: Condition, maps: int) -> int:
 
 def _remedy(dataset: TerrainDataset, split: str, maps: int) -> str:
     """Return how to make the maps that a file lacks, if its shipped recipe has them."""
-    if dataset.id not in shipped_recipes() or shipped_sizes(dataset.id).get(split, 0) < maps:
+    if (
+        dataset.id not in shipped_recipes()
+        or shipped_sizes(dataset.id).get(split, 0) < maps
+    ):
         return ""
-    return f" All maps of {dataset.id} are made with `benchnav-datagen create {dataset.id}`."
+    return (
+        f" All maps of {dataset.id} are made with `benchnav-datagen create "
+        f"{dataset.id}`."
+    )
 
 
-def check_everywhere(conditions: Iterable[Condition], metrics: Iterable[NamedMetric] = ()) -> None:
+def check_everywhere(
+    conditions: Iterable[Condition], metrics: Iterable[NamedMetric] = ()
+) -> None:
     """Reject parts that other processes would not find.
 
     Raises:
@@ -175,17 +220,21 @@ def check_everywhere(conditions: Iterable[Condition], metrics: Iterable[NamedMet
     for part in (*parts, *(metric.part for metric in metrics)):
         if not part.found.everywhere:
             raise ConfigError(
-                f"Expected a {part.kind} that other processes can load (for `jobs` > 1, `scheduler` or "
-                f"`planner_limit_s`), got {part.part!r}, which only this process has. Write its class into a file, "
+                f"Expected a {part.kind} that other processes can load (for `jobs` > "
+                "1, `scheduler` or "
+                f"`planner_limit_s`), got {part.part!r}, which only this process has. "
+                "Write its class into a file, "
                 "and import it from there or name it as path/to/file.py:Name."
             )
 
 
-# --- each condition on one map ------------------------------------------------------------------------
+# --- each condition on one map
+# ------------------------------------------------------------------------
 
 
 def build_each(conditions: Sequence[Condition], maps: int) -> list[str]:
-    """Build conditions on the first map of their splits, without a prediction or a plan.
+    """Build conditions on the first map of their splits, without a prediction or a
+    plan.
 
     Args:
         conditions: what is built; what several share is built once.
@@ -198,11 +247,15 @@ def build_each(conditions: Sequence[Condition], maps: int) -> list[str]:
         BenchnavError: If a condition cannot be run.
     """
     warnings: list[str] = []
-    for condition in _distinct(conditions, "data", "scenario", "world", "rules", "robot"):
+    for condition in _distinct(
+        conditions, "data", "scenario", "world", "rules", "robot"
+    ):
         warnings += _check_world(condition, condition.dataset, maps)
     for condition in _distinct(conditions, "data", "scenario", "model", *KNOWLEDGE):
         _ = condition.statistics  # which may be missing
-    for condition in _distinct([one for one in conditions if not one.blind], "data", "model"):
+    for condition in _distinct(
+        [one for one in conditions if not one.blind], "data", "model"
+    ):
         warnings += _check_model(condition)
     for condition in conditions:
         warnings += _doubts(condition, condition.dataset)
@@ -214,7 +267,9 @@ def _distinct(conditions: Sequence[Condition], *names: str) -> list[Condition]:
     first: dict[str, Condition] = {}
     for condition in conditions:
         value = {**condition.value, "scenario": condition.scenario}
-        first.setdefault(text_digest({name: value.get(name) for name in names}), condition)
+        first.setdefault(
+            text_digest({name: value.get(name) for name in names}), condition
+        )
     return list(first.values())
 
 
@@ -229,7 +284,9 @@ def _check_model(condition: Condition) -> list[str]:
 
 
 def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> list[str]:
-    """Draw λ of the first map, and warn of goals that top speed does not reach within T."""
+    """Draw λ of the first map, and warn of goals that top speed does not reach within
+    T.
+    """
     task, world, split = condition.task, condition.world, condition.split
     chosen = range(maps or dataset.map_count(split))
     read = dataset.read(split, chosen, ["start_m", "goal_m", "reference_time_s"])
@@ -239,17 +296,26 @@ def _check_world(condition: Condition, dataset: TerrainDataset, maps: int) -> li
     # Only imported maps have cells of which λ is missing.
     is_imported = any("source" in part for part in dataset.splits[split]["parts"])
     for start in chosen[::BLOCK_MAPS] if is_imported else chosen[:1]:
-        block = read_maps(dataset, split, chosen[start : start + BLOCK_MAPS] if is_imported else [0])
+        block = read_maps(
+            dataset, split, chosen[start : start + BLOCK_MAPS] if is_imported else [0]
+        )
         check_known(block.terrain, world)
         if world.noise == "frozen" and start == 0:
-            first = block.terrain.select(torch.tensor([0])), block.places.select(torch.tensor([0]))
+            first = (
+                block.terrain.select(torch.tensor([0])),
+                block.places.select(torch.tensor([0])),
+            )
             draw_frozen(first[0], world, first[1], key=0, maps=[0])
-    distance_m = np.linalg.norm(read["goal_m"] - read["start_m"], axis=1) - task.rules.goal_radius_m
+    distance_m = (
+        np.linalg.norm(read["goal_m"] - read["start_m"], axis=1)
+        - task.rules.goal_radius_m
+    )
     late = distance_m / top_speed > budget.numpy()
     if not late.any():
         return []
     return [
-        f"in {late.sum()} of {len(late)} maps of {condition.split} a robot of {top_speed:g} m/s cannot reach the goal "
+        f"in {late.sum()} of {len(late)} maps of {condition.split} a robot of "
+        f"{top_speed:g} m/s cannot reach the goal "
         "within the time budget T"
     ]
 
@@ -259,18 +325,21 @@ def _doubts(condition: Condition, dataset: TerrainDataset) -> Iterator[str]:
     threshold = dataset.recipe.stuck_threshold
     if condition.rules.free_space.above != threshold:
         yield (
-            f"maps of {dataset.id} have a feasible path over ground above {threshold:g}, but free ground is above "
+            f"maps of {dataset.id} have a feasible path over ground above "
+            f"{threshold:g}, but free ground is above "
             f"{condition.rules.free_space.above:g} in this run"
         )
     split = dataset.recipe.splits.get(condition.split)
     if split is not None and not split.solvable:
         yield (
-            f"maps of {dataset.id} {condition.split} may have no feasible path to the goal (no `solvable: true`), "
+            f"maps of {dataset.id} {condition.split} may have no feasible path to the "
+            "goal (no `solvable: true`), "
             "so that a planner may fail on them for that alone"
         )
 
 
-# --- combinations that cannot be run ------------------------------------------------------------------
+# --- combinations that cannot be run
+# ------------------------------------------------------------------
 
 
 def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
@@ -283,11 +352,14 @@ def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
         Why each of them is not run, by its id, in the order of the conditions.
 
     Raises:
-        ConfigError: If a shipped planner rejects its settings in each combination that the suite has of it.
+        ConfigError: If a shipped planner rejects its settings in each combination that
+            the suite has of it.
     """
     reasons: dict[tuple[Any, ...], str] = {}
     left_out: dict[str, LeftOut] = {}
-    refusals: dict[str, str] = {}  # by planner; empty if it can be prepared for some condition
+    refusals: dict[
+        str, str
+    ] = {}  # by planner; empty if it can be prepared for some condition
     for condition in conditions:
         for columns, rule in _RULES.items():
             labels = {column: condition.labels[column] for column in columns}
@@ -308,17 +380,24 @@ def find_left_out(conditions: Iterable[Condition]) -> dict[str, LeftOut]:
 
 def _unsteered(condition: Condition) -> str:
     try:
-        check_steers(condition.planner.object, condition.task.robot, condition.planner.label)
+        check_steers(
+            condition.planner.object, condition.task.robot, condition.planner.label
+        )
     except ConfigError as error:
         return str(error)
     return ""
 
 
 def _plans_once(condition: Condition) -> str:
-    if condition.blind or not condition.planner.object.plans_once or not condition.learns:
+    if (
+        condition.blind
+        or not condition.planner.object.plans_once
+        or not condition.learns
+    ):
         return ""
     return (
-        f"Expected belief 'static' and sensor 'full' for planner {condition.planner.label!r}, which plans once, got "
+        "Expected belief 'static' and sensor 'full' for planner "
+        f"{condition.planner.label!r}, which plans once, got "
         f"{condition.belief.label!r} and {condition.sensor.label!r}."
     )
 
@@ -328,7 +407,8 @@ def _given_truth(condition: Condition) -> str:
     if not is_given or condition.model.part == "clairvoyant":
         return ""
     return (
-        f"Expected model 'clairvoyant' for planner {condition.planner.label!r}, which is given λ itself, got "
+        f"Expected model 'clairvoyant' for planner {condition.planner.label!r}, which "
+        "is given λ itself, got "
         f"{condition.model.label!r}."
     )
 
@@ -337,8 +417,10 @@ def _resampled(condition: Condition) -> str:
     if condition.model.part != "clairvoyant" or condition.world.noise != "resampled":
         return ""
     return (
-        f"Expected a world with λ that stays for the model 'clairvoyant', got {condition.world_label!r}, which "
-        "resamples λ at each step. Take the world stakes, or `world.noise` frozen or stored."
+        "Expected a world with λ that stays for the model 'clairvoyant', got "
+        f"{condition.world_label!r}, which "
+        "resamples λ at each step. Take the world stakes, or `world.noise` frozen or "
+        "stored."
     )
 
 
@@ -346,8 +428,10 @@ def _learns_no_class(condition: Condition) -> str:
     if not _is_single_class(condition) or not condition.belief.object.learns:
         return ""
     return (
-        "Expected a belief that does not learn for the risk setting 'single-class', got "
-        f"{condition.belief.label!r}: what is learnt of λ is of no class. Take the belief static."
+        "Expected a belief that does not learn for the risk setting 'single-class', "
+        "got "
+        f"{condition.belief.label!r}: what is learnt of λ is of no class. Take the "
+        "belief static."
     )
 
 
@@ -358,7 +442,8 @@ def _without_classes(condition: Condition) -> str:
     if model.class_names or isinstance(model, PrivilegedModel):
         return ""
     return (
-        f"Expected a model that predicts classes for the risk setting 'single-class', got {condition.model.label!r}, "
+        "Expected a model that predicts classes for the risk setting 'single-class', "
+        f"got {condition.model.label!r}, "
         "which has no `class_names`."
     )
 
@@ -368,26 +453,37 @@ def _is_single_class(condition: Condition) -> bool:
 
 
 def _unprepared(condition: Condition) -> str:
-    """Return why a shipped planner rejects what only its preparation can tell, such as its bounds."""
+    """Return why a shipped planner rejects what only its preparation can tell, such as
+    its bounds.
+    """
     planner: Part = condition.planner
     if not planner.found.shipped:
         return ""
     ground = torch.full((1, 4, 4), 0.9)
     grid = Grid(4, 4, condition.dataset.grid.resolution_m)
-    seen = Observation(torch.zeros(1, 3, 4, 4, dtype=torch.uint8), 0 * ground, 0 * ground, grid)
+    seen = Observation(
+        torch.zeros(1, 3, 4, 4, dtype=torch.uint8), 0 * ground, 0 * ground, grid
+    )
     ones = torch.ones_like(ground).unsqueeze(1)
     mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
-    start, goal = (torch.full((1, 2), cells * grid.resolution_m) for cells in (0.5, 3.5))
+    start, goal = (
+        torch.full((1, 2), cells * grid.resolution_m) for cells in (0.5, 3.5)
+    )
 
     def prepare() -> None:
-        fields = Fields(Static(), Static().init(mixture, Law(grid=grid, correlation_m=0.0)), (0,))
+        fields = Fields(
+            Static(), Static().init(mixture, Law(grid=grid, correlation_m=0.0)), (0,)
+        )
         prediction = Prediction(seen, mixture, ground, fields=fields)
-        problem = pose_problem(condition.task, prediction, start, goal, 1.0, condition.world.immobile)
+        problem = pose_problem(
+            condition.task, prediction, start, goal, 1.0, condition.world.immobile
+        )
         planner.object.init(problem, torch.Generator())
 
     labels = condition.labels
     what = (
-        f"Planner {labels['planner']!r} for robot {labels['robot']!r} and objective {labels['objective']!r}"
+        f"Planner {labels['planner']!r} for robot {labels['robot']!r} and "
+        f"objective {labels['objective']!r}"
     )
     try:
         call(what, prepare, {})

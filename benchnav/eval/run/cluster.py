@@ -1,8 +1,8 @@
 """Units on the workers of a Dask cluster.
 
-Workers write nothing that lasts: the files that a unit makes come back as bytes, and the command that asked for
-them writes them. So workers share no disk with it, and a unit that was begun twice, since a worker died, is
-there once.
+Workers write nothing that lasts: the files that a unit makes come back as bytes, and
+the command that asked for them writes them. So workers share no disk with it, and a
+unit that was begun twice, since a worker died, is there once.
 """
 
 import multiprocessing
@@ -25,7 +25,8 @@ from benchnav.eval.run.unit import Settings, run_unit
 def run_on_worker(
     here: Path, unit: Unit, origin: Origin, settings: Settings
 ) -> tuple[Unit, dict[str, bytes]]:
-    """Runs a unit on a worker of a cluster; gives what it wrote, by its place in a run folder.
+    """Runs a unit on a worker of a cluster; gives what it wrote, by its place in a run
+    folder.
 
     Args:
         here: where names of files begin, if the worker's machine has that place.
@@ -34,7 +35,8 @@ def run_on_worker(
         settings: how it is run.
 
     Raises:
-        ConfigError: the worker is not fit for the run, or its code or maps are others; the message names it.
+        ConfigError: the worker is not fit for the run, or its code or maps are others;
+            the message names it.
     """
     from distributed import get_worker
 
@@ -49,7 +51,9 @@ def run_on_worker(
         except BenchnavError as error:
             raise type(error)(f"Worker {worker.address}: {error}") from error
         files = (path for path in Path(scratch).rglob("*") if path.is_file())
-        return unit, {path.relative_to(scratch).as_posix(): path.read_bytes() for path in files}
+        return unit, {
+            path.relative_to(scratch).as_posix(): path.read_bytes() for path in files
+        }
 
 
 def check_worker(worker: Any, settings: Settings) -> None:
@@ -65,23 +69,29 @@ def check_worker(worker: Any, settings: Settings) -> None:
     threads = worker.state.nthreads
     if threads != 1:
         raise ConfigError(
-            f"Expected workers of one thread, got {worker.address} with {threads}. Start them with "
+            f"Expected workers of one thread, got {worker.address} with {threads}. "
+            "Start them with "
             "`dask worker ADDRESS --nworkers N --nthreads 1`."
         )
     if settings.planner_limit_s and multiprocessing.current_process().daemon:
         raise ConfigError(
-            f"Expected workers that may start processes, which `planner_limit_s` needs, got {worker.address}. Start "
-            "them with `dask worker … --no-nanny`, or with DASK_DISTRIBUTED__WORKER__DAEMON=False."
+            "Expected workers that may start processes, which `planner_limit_s` "
+            f"needs, got {worker.address}. Start "
+            "them with `dask worker … --no-nanny`, or with "
+            "DASK_DISTRIBUTED__WORKER__DAEMON=False."
         )
     if settings.device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(
-            f"Expected workers with a GPU for `device` cuda, got {worker.address} without. Pass --device cpu, or "
+            f"Expected workers with a GPU for `device` cuda, got {worker.address} "
+            "without. Pass --device cpu, or "
             "start workers on machines that have one."
         )
 
 
 def store_files(folder: Path, unit: Unit, files: Mapping[str, bytes]) -> None:
-    """Writes what a unit made into a run folder, its rows last, since they say that it is finished."""
+    """Writes what a unit made into a run folder, its rows last, since they say that it
+    is finished.
+    """
     clear_unit(folder, unit)
     for name in sorted(files, key=lambda name: name.startswith("units/")):
         with replacing(folder / name) as partial:

@@ -1,4 +1,6 @@
-"""Whether rows come out the same when they are made again: in fresh processes, in another order of units and maps."""
+"""Whether rows come out the same when they are made again: in fresh processes, in
+another order of units and maps.
+"""
 
 import random
 from collections.abc import Callable, Sequence
@@ -33,11 +35,13 @@ _GENERATORS: dict[str, Callable[[], bytes]] = {
 def check_determinism(
     suite: Suite, say: Say, planner_limit_s: float = 0.0, device: str = "cpu"
 ) -> tuple[int, list[str]]:
-    """Run the first unit of each condition in two processes and compare the rows bit for bit, but for planning times.
+    """Run the first unit of each condition in two processes and compare the rows bit
+    for bit, but for planning times.
 
-    The second process runs all units in the reverse order, and the maps of each, and does so twice: its second rows
-    count, so that state which parts keep has had time to grow. If rows differ, a third process does what the first did,
-    which distinguishes state that is kept from what comes from outside.
+    The second process runs all units in the reverse order, and the maps of each, and
+    does so twice: its second rows count, so that state which parts keep has had time to
+    grow. If rows differ, a third process does what the first did, which distinguishes
+    state that is kept from what comes from outside.
 
     Args:
         suite: what is to be evaluated.
@@ -46,48 +50,75 @@ def check_determinism(
         device: "cpu", "cuda" or "auto".
 
     Returns:
-        The number of conditions, and for each that differs a line with what differs and why.
+        The number of conditions, and for each that differs a line with what differs and
+        why.
 
     Raises:
         BenchnavError: If the suite cannot be run.
     """
-    settings = Settings(planner_limit_s=planner_limit_s, device=find_device(device).type)
+    settings = Settings(
+        planner_limit_s=planner_limit_s, device=find_device(device).type
+    )
     checked = check_suite(suite, elsewhere=True)
     metrics = [metric.part for metric in checked.metrics]
-    chosen = [units({name: known}, metrics=metrics)[0] for name, known in checked.conditions.items()]
-    say(f"checking that {len(chosen)} conditions repeat, each by its unit of {len(chosen[0].maps)} maps")
+    chosen = [
+        units({name: known}, metrics=metrics)[0]
+        for name, known in checked.conditions.items()
+    ]
+    say(
+        f"checking that {len(chosen)} conditions repeat, each by its unit of "
+        f"{len(chosen[0].maps)} maps"
+    )
     first = _run_fresh(chosen, settings)
     backwards = [replace(unit, maps=unit.maps[::-1]) for unit in chosen[::-1]]
     second = _run_fresh([*backwards, *backwards], settings)[len(chosen) :][::-1]
-    columns = [_differing(one, other) for (one, _), (other, _) in zip(first, second, strict=True)]
+    columns = [
+        _differing(one, other)
+        for (one, _), (other, _) in zip(first, second, strict=True)
+    ]
     third = _run_fresh(chosen, settings) if any(columns) else first
     lines = [
         f"{unit.condition.description}: {', '.join(names)} differ; {_cause(*made)}"
-        for unit, names, *made in zip(chosen, columns, first, second, third, strict=True)
+        for unit, names, *made in zip(
+            chosen, columns, first, second, third, strict=True
+        )
         if names
     ]
     return len(chosen), lines
 
 
 def _cause(one: _Made, other: _Made, again: _Made) -> str:
-    """Say why rows of a unit differ between one process and another; `again` did what the first did."""
+    """Say why rows of a unit differ between one process and another; `again` did what
+    the first did.
+    """
     generators = sorted({*one[1], *other[1], *again[1]})
     if generators:
         return f"a part draws from the global generator of {' and '.join(generators)}"
     if _differing(one[0], again[0]):
-        return "a part depends on something outside, such as a clock, entropy or the order of threads"
-    return "a part keeps state between episodes or units, so that rows depend on what ran before"
+        return (
+            "a part depends on something outside, such as a clock, entropy or the "
+            "order of threads"
+        )
+    return (
+        "a part keeps state between episodes or units, so that rows depend on "
+        "what "
+        "ran before"
+    )
 
 
 def _differing(one: pd.DataFrame, other: pd.DataFrame) -> list[str]:
     cells, missing = differences(one, other)
-    return list(dict.fromkeys(cells.index.get_level_values(-1))) + (["episodes"] if len(missing) else [])
+    return list(dict.fromkeys(cells.index.get_level_values(-1))) + (
+        ["episodes"] if len(missing) else []
+    )
 
 
 def _run_fresh(chosen: Sequence[Unit], settings: Settings) -> list[_Made]:
     """Run units one after the other in one fresh process."""
     with ProcessPoolExecutor(1) as executor:
-        return executor.submit(partial(_run_units, Path.cwd(), chosen, settings)).result()
+        return executor.submit(
+            partial(_run_units, Path.cwd(), chosen, settings)
+        ).result()
 
 
 def _run_units(here: Path, chosen: Sequence[Unit], settings: Settings) -> list[_Made]:
@@ -101,4 +132,6 @@ def _run_unit(unit: Unit, settings: Settings) -> _Made:
     with TemporaryDirectory() as folder:
         run_unit(replace(unit, record="none"), Path(folder), origin, settings)
         rows = unit_rows(find_units(Path(folder), unit)[0])
-    return rows, tuple(name for name, state in _GENERATORS.items() if state() != before[name])
+    return rows, tuple(
+        name for name, state in _GENERATORS.items() if state() != before[name]
+    )

@@ -1,7 +1,8 @@
 """A planner in a process of its own, so that one that hangs can be stopped.
 
-The simulation stays where it is: only the planner's calls cross, each with a time limit. The child makes
-the planner's, robot's and objective's parts by name first, so that what they are made of can be sent.
+The simulation stays where it is: only the planner's calls cross, each with a time
+limit. The child makes the planner's, robot's and objective's parts by name first, so
+that what they are made of can be sent.
 """
 
 import multiprocessing
@@ -28,7 +29,9 @@ _CLOSE_S = 5.0
 
 
 class PlannerProcessError(BenchnavError):
-    """A planner did not answer in time, or its process ended, or it raised: its last line, its traceback as a note."""
+    """A planner did not answer in time, or its process ended, or it raised: its last
+    line, its traceback as a note.
+    """
 
 
 class IsolatedPlanner(Planner[int]):
@@ -36,7 +39,8 @@ class IsolatedPlanner(Planner[int]):
 
     Args:
         condition: whose planner.
-        limit_s: time limit of each call; `init` and the first `plan` have two minutes more, to compile.
+        limit_s: time limit of each call; `init` and the first `plan` have two minutes
+            more, to compile.
     """
 
     compiled: bool | None = None
@@ -46,7 +50,9 @@ class IsolatedPlanner(Planner[int]):
         self.limit_s = limit_s
         context = multiprocessing.get_context("spawn")
         self._here, there = context.Pipe()
-        self._child = context.Process(target=_serve, args=(there, condition), daemon=True)
+        self._child = context.Process(
+            target=_serve, args=(there, condition), daemon=True
+        )
         self._child.start()
         there.close()
         try:
@@ -65,7 +71,9 @@ class IsolatedPlanner(Planner[int]):
         self._here.close()
 
     def init(self, problem: Problem, generator: torch.Generator) -> int:
-        """See `Planner`. The plan state stays in the child; here it is the number of calls."""
+        """See `Planner`. The plan state stays in the child; here it is the number of
+        calls.
+        """
         seed, state = generator.initial_seed(), generator.get_state()
         self._ask(self.limit_s + _START_S, "init", problem, seed, state)
         return 0
@@ -78,7 +86,9 @@ class IsolatedPlanner(Planner[int]):
         return action, plan_state + 1, plan
 
     def revise(self, plan_state: int, problem: Problem) -> int:
-        """See `Planner`. A planner that has to begin anew does so in the child, which may take as long as `init`."""
+        """See `Planner`. A planner that has to begin anew does so in the child, which
+        may take as long as `init`.
+        """
         self._ask(self.limit_s + _START_S, "revise", problem)
         return plan_state
 
@@ -87,12 +97,15 @@ class IsolatedPlanner(Planner[int]):
             self._here.send_bytes(pickle.dumps((call, *arguments)))
             if not self._here.poll(limit_s):
                 self._child.kill()
-                raise PlannerProcessError(f"The planner gave no answer to `{call}` within {limit_s:g} s.")
+                raise PlannerProcessError(
+                    f"The planner gave no answer to `{call}` within {limit_s:g} s."
+                )
             kind, value = pickle.loads(self._here.recv_bytes())
         except (EOFError, BrokenPipeError, ConnectionResetError) as error:
             self._child.join(1)
             raise PlannerProcessError(
-                f"The planner's process ended in `{call}` with status {self._child.exitcode}."
+                f"The planner's process ended in `{call}` with status "
+                f"{self._child.exitcode}."
             ) from error
         if kind == "lost":
             raise gpu_failed(value)
@@ -120,7 +133,8 @@ def _serve(connection: Connection, condition: Condition) -> None:
             if call == "touched":
                 answer = snapshot()
             elif call == "start":
-                # The classes of what a problem holds have to be there before one is read.
+                # The classes of what a problem holds have to be there before one is
+                # read.
                 _ = condition.task, condition.belief.object
                 planner, answer = condition.planner.create(), None
             elif call == "init":
@@ -129,7 +143,10 @@ def _serve(connection: Connection, condition: Condition) -> None:
                 generator.set_state(state)
                 plan_state, answer = planner.init(problem, generator), None
             elif call == "revise":
-                plan_state, answer = boundary.revise(planner, plan_state, arguments[0], generator), None
+                plan_state, answer = (
+                    boundary.revise(planner, plan_state, arguments[0], generator),
+                    None,
+                )
             else:
                 action, plan_state, plan = planner.plan(arguments[0], plan_state)
                 answer = action, plan, planner.compiled

@@ -1,8 +1,9 @@
-"""What robots of a unit learn while they drive, and the problem that their planner is given of it.
+"""What robots of a unit learn while they drive, and the problem that their planner is
+given of it.
 
-`benchnav.planning.sensing.knowledge` says what they know. Here their planner is told where λ̂ has changed for it, and
-what they know is measured against the ground ahead of them. Letters in shapes: B episodes, S state dimensions, H×W
-cells.
+`benchnav.planning.sensing.knowledge` says what they know. Here their planner is told
+where λ̂ has changed for it, and what they know is measured against the ground ahead of
+them. Letters in shapes: B episodes, S state dimensions, H×W cells.
 """
 
 import math
@@ -35,7 +36,8 @@ class Learning:
         learner: how that is done.
         start: what they know when they set out.
         truth: of B episodes, for sensors and privileged models alone.
-        field_at: gives λ of every cell at a step, [B, H, W]; None where it stays what `truth` says.
+        field_at: gives λ of every cell at a step, [B, H, W]; None where it stays what
+            `truth` says.
     """
 
     learner: Learner
@@ -55,8 +57,9 @@ class Knowing:
         revisions: how often each episode's map was changed, int64, shape [B].
         seen_cells: how many cells each robot saw by its last update, int64, shape [B].
         sensed_cells: of how many cells each sensed λ by then, int64, shape [B].
-        ahead: by step, RMSE of E[λ] and mean log score of the belief over the cells ahead of each robot of which λ was
-            not sensed, shape [B, 2]; NaN where there are none.
+        ahead: by step, RMSE of E[λ] and mean log score of the belief over the cells
+            ahead of each robot of which λ was not sensed, shape [B, 2]; NaN where there
+            are none.
         known: what is known, of the episodes that are left.
         members: which these are, int64.
     """
@@ -66,7 +69,9 @@ class Knowing:
         self._how, self._problem, self._truth = how, problem, how.truth
         self.known = how.start
         self._every = steps_in(problem.task.rules.replan_every_s, problem.dt_s)
-        self._at_goal = cells_at_goal(problem.grid, problem.goal_m, problem.goal_radius_m)
+        self._at_goal = cells_at_goal(
+            problem.grid, problem.goal_m, problem.goal_radius_m
+        )
         self.members = torch.arange(len(problem), device=problem.start.device)
         self.revisions = torch.zeros_like(self.members)
         self.seen_cells = self.known.seen.flatten(1).sum(1)
@@ -74,9 +79,14 @@ class Knowing:
         self.ahead: dict[int, Tensor] = {}
 
     def keep(self, left: Tensor) -> None:
-        """Forgets all episodes but some, by their places among those that are left, int64."""
+        """Forgets all episodes but some, by their places among those that are left,
+        int64.
+        """
         self.known = self._how.learner.select(self.known, left)
-        self._problem, self._truth = self._problem.select(left), self._truth.select(left)
+        self._problem, self._truth = (
+            self._problem.select(left),
+            self._truth.select(left),
+        )
         self._at_goal, self.members = self._at_goal[left], self.members[left]
 
     def is_due(self, step: int) -> bool:
@@ -92,19 +102,24 @@ class Knowing:
             running: which of these episodes go on, bool, shape [B].
 
         Returns:
-            The problem as it now is, which starts where the robots are; None where the planner need not be told.
+            The problem as it now is, which starts where the robots are; None where the
+            planner need not be told.
 
         Raises:
-            KnowledgeError: a sensor, the belief, the model or the risk measure raised, or gave what is none.
+            KnowledgeError: a sensor, the belief, the model or the risk measure raised,
+                or gave what is none.
         """
         how = self._how
         due = self.is_due(step)
-        # To draw λ of all cells takes long, and between updates only a belief that learns is told any.
+        # To draw λ of all cells takes long, and between updates only a belief that
+        # learns is told any.
         if how.field_at is not None and (due or how.learner.belief.learns):
             self._truth = replace(self._truth, field=how.field_at(step)[self.members])
         # Who has ended senses nothing more, whenever it leaves the batch.
         looks = running if due else torch.zeros_like(running)
-        self.known = how.learner.sense(self.known, self._truth, robot_state, step, looks, running)
+        self.known = how.learner.sense(
+            self.known, self._truth, robot_state, step, looks, running
+        )
         if not due:
             return None
         on = self.members[running]
@@ -115,10 +130,14 @@ class Knowing:
         return self._told(robot_state, running) if bool(changed.any()) else None
 
     def _told(self, robot_state: Tensor, running: Tensor) -> Problem | None:
-        """The problem with the maps of the episodes that go on and in which enough has changed."""
+        """The problem with the maps of the episodes that go on and in which enough has
+        changed.
+        """
         known, before = self.known, self._problem
         free = known.free | self._at_goal
-        moved = ((known.risk_map - before.risk_map).abs() > _LEAST_CHANGE) | (free != before.free)
+        moved = ((known.risk_map - before.risk_map).abs() > _LEAST_CHANGE) | (
+            free != before.free
+        )
         told = moved.flatten(1).any(1) & running
         if not bool(told.any()):
             return None
@@ -131,14 +150,19 @@ class Knowing:
                 state = fields.state
                 believed = call(
                     Outcome.BELIEF_ERROR,
-                    lambda: belief.put(state, places, belief.select(known.believed, places)),
+                    lambda: belief.put(
+                        state, places, belief.select(known.believed, places)
+                    ),
                 )
             fields = replace(fields, state=believed)
         self._problem = replace(
             before,
-            # Of other episodes the planner is told nothing, so that none depends on those beside it.
+            # Of other episodes the planner is told nothing, so that none depends on
+            # those beside it.
             observation=put_if_alike(before.observation, places, known.observation),
-            distribution=put_if_alike(before.distribution, places, self._how.learner.distribution(known)),
+            distribution=put_if_alike(
+                before.distribution, places, self._how.learner.distribution(known)
+            ),
             risk_map=torch.where(which, known.risk_map, before.risk_map),
             free=torch.where(which, free, before.free),
             start=robot_state,
@@ -147,33 +171,52 @@ class Knowing:
         return self._problem
 
     def look_ahead(self, step: int, robot_state: Tensor, running: Tensor) -> None:
-        """Measures what is believed of the ground ahead of the robots; arguments as of `learn`."""
+        """Measures what is believed of the ground ahead of the robots; arguments as of
+        `learn`.
+        """
         grid, known = self._problem.grid, self.known
-        row, column = (torch.arange(size, device=robot_state.device) for size in grid.shape)
+        row, column = (
+            torch.arange(size, device=robot_state.device) for size in grid.shape
+        )
         x, y = grid.centre_of(row[:, None], column[None, :])
-        away_x, away_y = x - robot_state[:, 0, None, None], y - robot_state[:, 1, None, None]
+        away_x, away_y = (
+            x - robot_state[:, 0, None, None],
+            y - robot_state[:, 1, None, None],
+        )
         turn = torch.atan2(away_y, away_x) - robot_state[:, 2, None, None]
         turn = torch.atan2(turn.sin(), turn.cos())
-        near = (torch.hypot(away_x, away_y) <= AHEAD_M) & (turn.abs() <= math.radians(AHEAD_DEG))
+        near = (torch.hypot(away_x, away_y) <= AHEAD_M) & (
+            turn.abs() <= math.radians(AHEAD_DEG)
+        )
         cells = near & ~known.ever_sensed & running[:, None, None]
-        found = torch.full((len(self.revisions), 2), torch.nan, device=robot_state.device)
+        found = torch.full(
+            (len(self.revisions), 2), torch.nan, device=robot_state.device
+        )
         if bool(cells.any()):
             value = self._truth.field[cells]
             error = self._how.learner.at(known, cells).mean()[0] - value
-            score = self._how.learner.distribution(known).at(cells).log_prob(value[None])[0]
+            score = (
+                self._how.learner.distribution(known).at(cells).log_prob(value[None])[0]
+            )
             member = cells.nonzero()[:, 0]
             count = torch.bincount(member, minlength=len(cells))
-            sums = torch.stack((error.square().double(), score.double().clamp(min=_LEAST_LOG_SCORE)), 1)
-            means = torch.zeros(len(cells), 2, dtype=torch.float64, device=sums.device).index_add_(
-                0, member, sums
+            sums = torch.stack(
+                (error.square().double(), score.double().clamp(min=_LEAST_LOG_SCORE)), 1
             )
+            means = torch.zeros(
+                len(cells), 2, dtype=torch.float64, device=sums.device
+            ).index_add_(0, member, sums)
             means = means / count[:, None]
-            found[self.members] = torch.stack((means[:, 0].sqrt(), means[:, 1]), 1).float()
+            found[self.members] = torch.stack(
+                (means[:, 0].sqrt(), means[:, 1]), 1
+            ).float()
         self.ahead[step] = found
 
     def maps_of(self, step: int, wanted: Iterable[int]) -> dict[int, KnownMap]:
         """What is known in some episodes, by their numbers, of those that are left."""
-        places = {int(member): place for place, member in enumerate(self.members.tolist())}
+        places = {
+            int(member): place for place, member in enumerate(self.members.tolist())
+        }
         learner, known = self._how.learner, self.known
         maps = {}
         for member in wanted:
@@ -198,6 +241,8 @@ class Knowing:
                 spread=whole(believed.spread()),
                 seen=own(known.seen),
                 sensed=own(known.ever_sensed),
-                outline=reach_outline(own(known.reached), self._problem.grid.resolution_m),
+                outline=reach_outline(
+                    own(known.reached), self._problem.grid.resolution_m
+                ),
             )
         return maps

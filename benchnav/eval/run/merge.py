@@ -1,6 +1,8 @@
-"""Merging the shards of a run into one run folder, which then is as any: reported, resumed, extended.
+"""Merging the shards of a run into one run folder, which then is as any: reported,
+resumed, extended.
 
-Units are files that are known by what made them, so that merging is copying them together and checking.
+Units are files that are known by what made them, so that merging is copying them
+together and checking.
 """
 
 import shutil
@@ -38,7 +40,8 @@ from benchnav.eval.run.recordings import keep_ground
 
 
 def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int]]:
-    """Makes one run folder of shards, yielding (units copied, units in all); to be iterated to the end.
+    """Makes one run folder of shards, yielding (units copied, units in all); to be
+    iterated to the end.
 
     The folder takes its name when it is whole.
 
@@ -47,12 +50,14 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         folder: where the run is to be; nothing, or an empty folder.
 
     Raises:
-        ConfigError: a part is no shard, the parts are not of one run, or units are missing; nothing is written.
+        ConfigError: a part is no shard, the parts are not of one run, or units are
+            missing; nothing is written.
     """
     with sole_writer(folder, str(folder)):
         if is_taken(folder):
             raise ConfigError(
-                f"Expected `out` to be a new folder, got {folder}, which exists. Write `benchnav-eval merge OUT PART "
+                f"Expected `out` to be a new folder, got {folder}, which exists. "
+                "Write `benchnav-eval merge OUT PART "
                 "…` with the new folder first."
             )
         runs = [_open_shard(part) for part in parts]
@@ -62,17 +67,23 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         _check_whole([unit for unit, finished in makings if finished is None], runs)
         found = [(unit, finished) for unit, finished in makings if finished is not None]
         for (_, earlier), (_, now) in pairwise(found):
-            if changed := provenance.code_differences(earlier.about["code"], now.about["code"]):
+            if changed := provenance.code_differences(
+                earlier.about["code"], now.about["code"]
+            ):
                 raise ConfigError(
-                    f"Expected shards made by one code, got {earlier.path} and {now.path}, which differ in "
-                    f"{'; '.join(changed)}. Give the commands of the shards again with one code."
+                    f"Expected shards made by one code, got {earlier.path} and "
+                    f"{now.path}, which differ in "
+                    f"{'; '.join(changed)}. Give the commands of the shards again "
+                    "with one code."
                 )
         touched: dict[str, str] = {}
         for _, one in found:
             if changed := unlike(touched, one.about.get(TOUCHED, {})):
                 raise ConfigError(
-                    f"Expected shards whose parts read the same, got {one.path}, which differs from units before it in "
-                    f"{'; '.join(changed)}. Give the commands of the shards again with the same files, packages and "
+                    f"Expected shards whose parts read the same, got {one.path}, "
+                    "which differs from units before it in "
+                    f"{'; '.join(changed)}. Give the commands of the shards again "
+                    "with the same files, packages and "
                     "variables."
                 )
             touched |= one.about.get(TOUCHED, {})
@@ -86,11 +97,17 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
             _copy(finished.path, path)
             copied.append((unit, replace(finished, path=path)))
             yield len(copied), len(every)
-        for source in [run.folder / kind for run in runs for kind in ("steps", "playback")]:
+        for source in [
+            run.folder / kind for run in runs for kind in ("steps", "playback")
+        ]:
             if source.exists():
                 hidden = shutil.ignore_patterns(".*")
                 shutil.copytree(
-                    source, partial / source.name, ignore=hidden, copy_function=_copy, dirs_exist_ok=True
+                    source,
+                    partial / source.name,
+                    ignore=hidden,
+                    copy_function=_copy,
+                    dirs_exist_ok=True,
                 )
         align_steps(partial, every)
         finish_run(partial, copied)
@@ -108,7 +125,8 @@ def _open_shard(part: Path) -> Run:
     run = open_run(part)
     if run.shard is None:
         raise ConfigError(
-            f"Expected folders of shards, made with `benchnav-eval run … --shard I/N`, got {part}, which is a whole "
+            "Expected folders of shards, made with `benchnav-eval run … --shard "
+            f"I/N`, got {part}, which is a whole "
             "run."
         )
     return run
@@ -118,16 +136,23 @@ def _check_alike(runs: Sequence[Run]) -> None:
     """Refuses shards of different runs, with all that differs."""
     if not runs:
         raise ConfigError("Expected one or more `parts`, folders of shards, got none.")
-    reasons = [f"{run.folder}: {'; '.join(unlike)}" for run in runs[1:] if (unlike := _unlike(runs[0], run))]
+    reasons = [
+        f"{run.folder}: {'; '.join(unlike)}"
+        for run in runs[1:]
+        if (unlike := _unlike(runs[0], run))
+    ]
     if reasons:
         raise ConfigError(
-            f"Expected shards of one run, got differences to {runs[0].folder}: {'. '.join(reasons)}. Give the same "
+            f"Expected shards of one run, got differences to {runs[0].folder}: "
+            f"{'. '.join(reasons)}. Give the same "
             "command, with the same code and data, for each shard."
         )
 
 
 def _unlike(first: Run, other: Run) -> list[str]:
-    """Names what is not the same in two runs: the number of shards, conditions, how often they are run, and maps."""
+    """Names what is not the same in two runs: the number of shards, conditions, how
+    often they are run, and maps.
+    """
     lines = []
     if _shard(other).of != _shard(first).of:
         lines.append(f"number of shards ({_shard(first).of} to {_shard(other).of})")
@@ -139,35 +164,56 @@ def _unlike(first: Run, other: Run) -> list[str]:
         ]
         if names:
             more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-            lines.append(f"conditions that {lacking.folder} lacks ({', '.join(names[:3])}{more})")
-    both = [(run, other.conditions[i]) for i, run in first.conditions.items() if i in other.conditions]
+            lines.append(
+                f"conditions that {lacking.folder} lacks ({', '.join(names[:3])}{more})"
+            )
+    both = [
+        (run, other.conditions[i])
+        for i, run in first.conditions.items()
+        if i in other.conditions
+    ]
     if any(one.labels != another.labels for (one, _), (another, _) in both):
         lines.append("labels of conditions")
     if any(set(one.draws) != set(another.draws) for (_, one), (_, another) in both):
         lines.append("seeds, realisations or maps")
-    lines += provenance.dataset_differences(first.about["datasets"], other.about["datasets"])
-    lines += [name for name in ("hypotheses", "metrics") if other.about.get(name) != first.about.get(name)]
+    lines += provenance.dataset_differences(
+        first.about["datasets"], other.about["datasets"]
+    )
+    lines += [
+        name
+        for name in ("hypotheses", "metrics")
+        if other.about.get(name) != first.about.get(name)
+    ]
     return lines
 
 
 def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
-    """A finished unit of some runs, the newest of each; refuses one that came out differently in two."""
+    """A finished unit of some runs, the newest of each; refuses one that came out
+    differently in two.
+    """
     columns = {one.quantity.column for one in metrics_of_run(runs[0].about)}
     found = [
         makings[0]
         for run in runs
-        if (makings := [one for one in find_units(run.folder, unit) if columns <= one.metrics])
+        if (
+            makings := [
+                one for one in find_units(run.folder, unit) if columns <= one.metrics
+            ]
+        )
     ]
     for making in found:
         if damage := making.damage():
             raise ConfigError(
-                f"{making.folder} is damaged: {damage[0]}. Give the shard's command again, which runs the unit again."
+                f"{making.folder} is damaged: {damage[0]}. Give the shard's command "
+                "again, which runs the unit again."
             )
     for other in found[1:]:
         if len(differences(unit_rows(found[0]), unit_rows(other))[0]):
             raise ConfigError(
-                f"Expected the same rows of a unit in all shards, got {unit.name} ({unit.condition.description}), "
-                f"which differs between {found[0].path} and {other.path}. Leave one of them out."
+                f"Expected the same rows of a unit in all shards, got {unit.name} "
+                f"({unit.condition.description}), "
+                f"which differs between {found[0].path} and {other.path}. Leave one "
+                "of them out."
             )
     return found[0] if found else None
 
@@ -182,26 +228,44 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run]) -> None:
     named = []
     for index, count in sorted(counts.items()):
         begun = f" in {folders[index]}" if index in folders else ""
-        named.append(f"{count} {'unit' if count == 1 else 'units'} of shard {index}/{of}{begun}")
+        named.append(
+            f"{count} {'unit' if count == 1 else 'units'} of shard {index}/{of}{begun}"
+        )
     raise ConfigError(
-        f"Expected all units of the run, got none for: {', '.join(named)}. Finish the run's command with each of these "
+        f"Expected all units of the run, got none for: {', '.join(named)}. Finish the "
+        "run's command with each of these "
         "as `--shard`, then give this command again with all parts."
     )
 
 
 def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
-    """`run.json` of the whole: that of the first shard, with what was measured, said and commanded of all."""
+    """`run.json` of the whole: that of the first shard, with what was measured, said
+    and commanded of all.
+    """
     about = {name: value for name, value in runs[0].about.items() if name != "shard"}
-    entries = {i: [run.about["conditions"][i] for run in reversed(runs)] for i in runs[0].conditions}
+    entries = {
+        i: [run.about["conditions"][i] for run in reversed(runs)]
+        for i in runs[0].conditions
+    }
     # They are alike but for latencies, which only those shards have that measured them.
-    about["conditions"] = {i: {k: v for entry in own for k, v in entry.items()} for i, own in entries.items()}
+    about["conditions"] = {
+        i: {k: v for entry in own for k, v in entry.items()}
+        for i, own in entries.items()
+    }
     for name in ("warnings", "dropped", "history"):
         about[name] = provenance.join(*(run.about[name] for run in runs))
     about["history"] = provenance.extend_history(about["history"], about["suite"])
     machines = provenance.join([run.about["machine"] for run in runs])
     if len(machines) > 1:
-        names = ", ".join(dict.fromkeys(f"{one['processor']} with {one['cores']} cores" for one in machines))
-        line = f"the shards ran on {len(machines)} machines ({names}), so that planning times do not compare planners"
+        names = ", ".join(
+            dict.fromkeys(
+                f"{one['processor']} with {one['cores']} cores" for one in machines
+            )
+        )
+        line = (
+            f"the shards ran on {len(machines)} machines ({names}), so that "
+            "planning times do not compare planners"
+        )
         about["warnings"] = provenance.join(about["warnings"], [line])
     return about
 

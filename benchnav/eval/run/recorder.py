@@ -39,15 +39,26 @@ class Recorder:
     """
 
     def __init__(
-        self, unit: Unit, problem: Problem, simulation: Simulation, terrain: Terrain, members: Iterable[int]
+        self,
+        unit: Unit,
+        problem: Problem,
+        simulation: Simulation,
+        terrain: Terrain,
+        members: Iterable[int],
     ) -> None:
         """Begins with nothing."""
-        self.unit, self.problem, self.simulation, self.terrain = unit, problem, simulation, terrain
+        self.unit, self.problem, self.simulation, self.terrain = (
+            unit,
+            problem,
+            simulation,
+            terrain,
+        )
         self._plans: dict[int, list[DrawnPlan]] = {member: [] for member in members}
         self._known: dict[int, list[KnownMap]] = {member: [] for member in self._plans}
 
     def watch(self, step: int, plan: Plan, planned: list[int]) -> None:
-        """Keeps a step's plan; those that no figure will show are thinned, since there may be many.
+        """Keeps a step's plan; those that no figure will show are thinned, since there
+        may be many.
 
         Args:
             step: its number.
@@ -63,7 +74,11 @@ class Recorder:
     @property
     def observer(self) -> Observer:
         """What `run_episodes` calls with plans and with what is known."""
-        return Observer(plan=self.watch, every=drawing_interval(self.problem.dt_s), knowledge=self.learn)
+        return Observer(
+            plan=self.watch,
+            every=drawing_interval(self.problem.dt_s),
+            knowledge=self.learn,
+        )
 
     def learn(self, step: int, knowing: Knowing) -> None:
         """Keeps what is known from a step on.
@@ -96,10 +111,12 @@ class Recorder:
         actions: np.ndarray,
         traversability: np.ndarray,
     ) -> Recording:
-        """Records an episode that was driven elsewhere, with what was planned here for it.
+        """Records an episode that was driven elsewhere, with what was planned here for
+        it.
 
         Args:
-            member: which of the unit's episodes; letters in the shapes of what follows are those of `Recording`.
+            member: which of the unit's episodes; letters in the shapes of what follows
+                are those of `Recording`.
             outcome: how it ended.
             states: shape [N + 1, S].
             actions: shape [N, A].
@@ -111,7 +128,11 @@ class Recorder:
             return values[member].cpu().numpy()
 
         truth, free = self.terrain.truth, problem.task.rules.free_space
-        numbers = {"seed": unit.seed, "realisation": unit.realisation, "map": unit.maps[member]}
+        numbers = {
+            "seed": unit.seed,
+            "realisation": unit.realisation,
+            "map": unit.maps[member],
+        }
         return Recording(
             about={
                 "condition": unit.condition.id,
@@ -125,7 +146,11 @@ class Recorder:
             immobilising=own(simulation.immobilising),
             goal_m=own(problem.goal_m),
             elevation_m=own(self.terrain.elevation_m),
-            true_mean=truth.select(torch.tensor([member])).mean()[0].float().cpu().numpy(),
+            true_mean=truth.select(torch.tensor([member]))
+            .mean()[0]
+            .float()
+            .cpu()
+            .numpy(),
             soft=(truth.weights[member, 1:] > 0).any(dim=0).cpu().numpy(),
             predicted=own(problem.risk_map),
             free=own(problem.free),
@@ -140,5 +165,9 @@ class Recorder:
             plans=self._plans.get(member, ()),
             layers={name: own(layer) for name, layer in self.terrain.layers.items()},
             # An ended episode may stay in a batch that goes on.
-            known=tuple(known for known in self._known.get(member, ()) if known.step <= len(actions)),
+            known=tuple(
+                known
+                for known in self._known.get(member, ())
+                if known.step <= len(actions)
+            ),
         )

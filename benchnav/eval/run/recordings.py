@@ -1,4 +1,6 @@
-"""What is made again of a finished run: recordings of episodes, the ground of failures, and that of driven paths."""
+"""What is made again of a finished run: recordings of episodes, the ground of failures,
+and that of driven paths.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +15,15 @@ from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.checksums import note_checksums
 from benchnav.eval.folder.results import code_of
-from benchnav.eval.folder.run_folder import EPISODES, KEYS, Run, find_units, open_run, read_table, unit_rows
+from benchnav.eval.folder.run_folder import (
+    EPISODES,
+    KEYS,
+    Run,
+    find_units,
+    open_run,
+    read_table,
+    unit_rows,
+)
 from benchnav.eval.folder.steps import LAST_COLUMN, has_steps, read_steps
 from benchnav.eval.recording import GROUND, MAP, Ground, Recording
 from benchnav.eval.run.recorder import Recorder
@@ -31,17 +41,22 @@ from benchnav.metrics.motion import path_length_m
 from benchnav.planning.world.simulation import Simulation
 
 
-def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = None) -> Recording:
-    """Gives the recording of an episode, running its unit again where it was not recorded.
+def find_recording(
+    folder: Path, unit: Unit, member: int, out: Path | None = None
+) -> Recording:
+    """Gives the recording of an episode, running its unit again where it was not
+    recorded.
 
     Args:
         folder: a run in which that unit is finished.
         unit: the episode's.
         member: which of the unit's episodes.
-        out: folder that the recording of an episode that is run again is written to; the run's when not given.
+        out: folder that the recording of an episode that is run again is written to;
+            the run's when not given.
 
     Raises:
-        ConfigError: the run has no row of the episode, or the device that it was computed on is not there.
+        ConfigError: the run has no row of the episode, or the device that it was
+            computed on is not there.
         BenchnavError: the unit did not repeat what the run holds.
     """
     out = out or folder
@@ -58,17 +73,23 @@ def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = Non
     recording = recorder.recording(episodes, member)
     if not _repeats(row, recording):
         raise BenchnavError(
-            f"The repeated episode differs from the stored one: {folder} was made with other versions or on "
+            f"The repeated episode differs from the stored one: {folder} was made "
+            "with other versions or on "
             "another machine type. Run the suite again here to replay it."
         )
     recording.save(out / unit.recording_path(member))
     return recording
 
 
-def _recorder(unit: Unit, settings: Settings, members: Sequence[int]) -> tuple[Recorder, Built]:
+def _recorder(
+    unit: Unit, settings: Settings, members: Sequence[int]
+) -> tuple[Recorder, Built]:
     """Makes the problem and the simulation of a unit again."""
     origin, device = settings.origins().of(unit), torch.device(settings.device)
-    built, terrain = build(unit, origin, device), read_block(unit, origin, device).terrain
+    built, terrain = (
+        build(unit, origin, device),
+        read_block(unit, origin, device).terrain,
+    )
     return Recorder(unit, built.problem, built.simulation, terrain, members), built
 
 
@@ -77,7 +98,9 @@ def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
     if (folder / EPISODES).exists():
         rows = read_table(folder, EPISODES)
     else:
-        rows = pd.concat([pd.DataFrame(columns=KEYS), *map(unit_rows, find_units(folder, unit)[:1])])
+        rows = pd.concat(
+            [pd.DataFrame(columns=KEYS), *map(unit_rows, find_units(folder, unit)[:1])]
+        )
     known = {
         "condition": unit.condition.id,
         "seed": unit.seed,
@@ -87,7 +110,8 @@ def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
     own = (rows[list(known)] == pd.Series(known)).all(axis=1)
     if not own.any():
         raise ConfigError(
-            f"Expected an episode that is finished, got one that {folder} does not have yet. Give its `benchnav-eval "
+            f"Expected an episode that is finished, got one that {folder} does not "
+            "have yet. Give its `benchnav-eval "
             "run` command again to finish it, or name another condition."
         )
     return rows[own].to_dict("records")[0]
@@ -106,7 +130,8 @@ def _repeats(row: Mapping[str, Any], recording: Recording) -> bool:
 
 
 def record_driven(folder: Path, rows: pd.DataFrame) -> list[Recording]:
-    """Records episodes again from the steps that were kept: their ground is read and predicted, nothing is planned.
+    """Records episodes again from the steps that were kept: their ground is read and
+    predicted, nothing is planned.
 
     Args:
         folder: a finished run that kept steps.
@@ -134,25 +159,39 @@ def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
     origin, made = Settings().origins().of(unit), code_of(run, first["code"])
     digests = run.about["datasets"][condition.data]["maps"][condition.split]
     if origin.maps[1:] != tuple(digests[i] for i in maps):
-        raise BenchnavError(f"Expected {condition.data} with the maps of {run.folder}, got other maps.")
+        raise BenchnavError(
+            f"Expected {condition.data} with the maps of {run.folder}, got other maps."
+        )
     for part, digest in origin.code["parts"].items():
         if made["parts"].get(part) != digest:
-            raise BenchnavError(f"Expected {part} as it was when {run.folder} was run, got a changed one.")
+            raise BenchnavError(
+                f"Expected {part} as it was when {run.folder} was run, got a changed "
+                "one."
+            )
     with one_thread():
         recorder, _ = _recorder(unit, Settings(), ())
-    kept = read_steps(run.folder, condition=condition.id, seed=seed, realisation=realisation, map=maps)
+    kept = read_steps(
+        run.folder, condition=condition.id, seed=seed, realisation=realisation, map=maps
+    )
     driven = kept.groupby("map")
     commands = list(recorder.problem.robot.action_names)
-    for member, (map_index, outcome) in enumerate(zip(maps, rows["outcome"], strict=True)):
+    for member, (map_index, outcome) in enumerate(
+        zip(maps, rows["outcome"], strict=True)
+    ):
         steps = driven.get_group(map_index)
         states = steps[["x_m", "y_m", "heading_rad"]].to_numpy()
         yield recorder.driven(
-            member, outcome, states, steps[commands].to_numpy()[:-1], steps[LAST_COLUMN].to_numpy()[:-1]
+            member,
+            outcome,
+            states,
+            steps[commands].to_numpy()[:-1],
+            steps[LAST_COLUMN].to_numpy()[:-1],
         )
 
 
 def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
-    """Chooses the map and the draw of λ on which about as many conditions succeed as fail.
+    """Chooses the map and the draw of λ on which about as many conditions succeed as
+    fail.
 
     Of several such the one that most conditions were run on, then the first.
 
@@ -164,13 +203,18 @@ def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
     """
     groups = episodes.groupby(MAP, sort=False)["success"]
     counted = groups.agg(conditions="size", successes="sum").reset_index()
-    counted["differing"] = np.minimum(counted["successes"], counted["conditions"] - counted["successes"])
-    best = counted.sort_values(["differing", "conditions"], ascending=False, kind="stable")
+    counted["differing"] = np.minimum(
+        counted["successes"], counted["conditions"] - counted["successes"]
+    )
+    best = counted.sort_values(
+        ["differing", "conditions"], ascending=False, kind="stable"
+    )
     return best[MAP].head(1).to_dict("records")[0]
 
 
 def keep_ground(folder: Path) -> None:
-    """Writes the map on which the outcomes of a run differ most, with the λ field; not where no steps were kept.
+    """Writes the map on which the outcomes of a run differ most, with the λ field; not
+    where no steps were kept.
 
     Args:
         folder: a run whose rows are all there.
@@ -184,7 +228,12 @@ def keep_ground(folder: Path) -> None:
     block = read_maps(condition.dataset, condition.split, [about["map"]])
     noise = noise_key(about["seed"], condition.split, about["realisation"])
     simulation = Simulation(
-        block.terrain, condition.task, condition.world, block.places, noise, [about["map"]]
+        block.terrain,
+        condition.task,
+        condition.world,
+        block.places,
+        noise,
+        [about["map"]],
     )
     Ground(
         about=about,

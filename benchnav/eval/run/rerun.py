@@ -1,6 +1,7 @@
 """Repeating a run from its provenance, and telling whether every row came out the same.
 
-What is repeated are the conditions of `run.json`, each as often as it was run, whatever commands they came by.
+What is repeated are the conditions of `run.json`, each as often as it was run, whatever
+commands they came by.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,7 +31,13 @@ from benchnav.eval.folder.run_folder import (
     read_table,
 )
 from benchnav.eval.run.begin import Work, check_resumable
-from benchnav.eval.run.check import Say, build_each, check_everywhere, check_split, find_left_out
+from benchnav.eval.run.check import (
+    Say,
+    build_each,
+    check_everywhere,
+    check_split,
+    find_left_out,
+)
 from benchnav.eval.run.runner import run_work
 from benchnav.eval.run.unit import Settings
 
@@ -44,7 +51,8 @@ def rerun(
     overwrite: bool = False,
     say: Say = lambda line: None,
 ) -> Iterator[Progress]:
-    """Runs all of a finished run again, yielding its progress in units; to be iterated to the end.
+    """Runs all of a finished run again, yielding its progress in units; to be iterated
+    to the end.
 
     Args:
         run_folder: what is repeated.
@@ -59,14 +67,22 @@ def rerun(
     run = _open(run_folder)
     check_resumable(run)
     if folder.resolve() == run_folder.resolve():
-        raise ConfigError(f"Expected `out` to be another folder than the run that is repeated, got {folder}.")
+        raise ConfigError(
+            "Expected `out` to be another folder than the run that is repeated, got "
+            f"{folder}."
+        )
     if not overwrite and (folder / RUN).exists():
         _check_repeats(run, folder)
-    settings = Settings(planner_limit_s=run.about["planner_limit_s"], device=device_of_run(run.about).type)
+    settings = Settings(
+        planner_limit_s=run.about["planner_limit_s"],
+        device=device_of_run(run.about).type,
+    )
     _check_there(run)
     metrics = metrics_of_run(run.about)
     if jobs != 1 or settings.planner_limit_s:
-        check_everywhere((condition for condition, _ in run.conditions.values()), metrics)
+        check_everywhere(
+            (condition for condition, _ in run.conditions.values()), metrics
+        )
     work = Work(
         suite=run.about["suite"],
         conditions=run.conditions,
@@ -89,7 +105,8 @@ def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:
         folder: what came out.
 
     Returns:
-        Whether every row came out the same, in all columns of either table, and all that is to be told.
+        Whether every row came out the same, in all columns of either table, and all
+        that is to be told.
 
     Raises:
         ConfigError: one of them is not finished.
@@ -101,7 +118,10 @@ def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:
     same = not (len(cells) or len(lacking) or columns)
     lines = [f"all {len(first)} rows came out the same"] if same else []
     if len(cells) or len(lacking):
-        conditions = {i: one for i, (one, _) in (*again.conditions.items(), *run.conditions.items())}
+        conditions = {
+            i: one
+            for i, (one, _) in (*again.conditions.items(), *run.conditions.items())
+        }
         lines += _verdict(conditions, len(first), cells, lacking)
     lines += [f"column {name} is in only one of the two tables" for name in columns]
     return same, [*lines, _environment(run.about, again.about)]
@@ -114,24 +134,33 @@ def _open(folder: Path) -> Run:
 
 
 def _check_repeats(run: Run, folder: Path) -> None:
-    """Refuses a run that is no rerun: one of other conditions, or with units that were copied from the run itself."""
+    """Refuses a run that is no rerun: one of other conditions, or with units that were
+    copied from the run itself.
+    """
     if set(open_run(folder).conditions) != set(run.conditions):
         raise ConfigError(
-            f"Expected `out` to be new or an earlier rerun of {run.folder}, got {folder} with other conditions. Choose "
+            f"Expected `out` to be new or an earlier rerun of {run.folder}, got "
+            f"{folder} with other conditions. Choose "
             "another `out`."
         )
     every = units(run.conditions)
     copied = len(_makings(run.folder, every) & _makings(folder, every))
     if copied:
         raise ConfigError(
-            f"Expected `out` to be new or an earlier rerun of {run.folder}, got {folder}, where {copied} of "
-            f"{len(every)} units are copies of that run's units. Choose another `out`, or pass --overwrite."
+            f"Expected `out` to be new or an earlier rerun of {run.folder}, got "
+            f"{folder}, where {copied} of "
+            f"{len(every)} units are copies of that run's units. Choose another "
+            "`out`, or pass --overwrite."
         )
 
 
 def _makings(folder: Path, every: Sequence[Unit]) -> set[str]:
     """Tokens of all makings of units, which copies of them share."""
-    return {finished.about["made"] for unit in every for finished in find_units(folder, unit)}
+    return {
+        finished.about["made"]
+        for unit in every
+        for finished in find_units(folder, unit)
+    }
 
 
 def _check_there(run: Run) -> None:
@@ -148,7 +177,10 @@ def _check_there(run: Run) -> None:
         except BenchnavError as error:
             lacking[str(error)] = None
     if lacking:
-        raise ConfigError(f"Expected all that {run.folder} was made with, got a lack: {' '.join(lacking)}")
+        raise ConfigError(
+            f"Expected all that {run.folder} was made with, got a lack: "
+            f"{' '.join(lacking)}"
+        )
     conditions = [condition for condition, _ in run.conditions.values()]
     for one in find_left_out(conditions).values():
         raise ConfigError(one["reason"])
@@ -156,25 +188,53 @@ def _check_there(run: Run) -> None:
 
 
 def _verdict(
-    conditions: Mapping[str, Condition], rows: int, cells: pd.DataFrame, lacking: pd.Index
+    conditions: Mapping[str, Condition],
+    rows: int,
+    cells: pd.DataFrame,
+    lacking: pd.Index,
 ) -> list[str]:
-    """Which rows came out differently, the first of them with all that differs, and the greatest differences."""
-    changes = [f"{name} {_text(a)} → {_text(b)}" for (*_, name), a, b in cells.itertuples()]
-    told = pd.Series(changes, index=cells.index, dtype=str).groupby(level=KEYS, sort=False).agg(", ".join)
-    differing = pd.concat([told, pd.Series("in only one of the two tables", index=lacking)])
+    """Which rows came out differently, the first of them with all that differs, and the
+    greatest differences.
+    """
+    changes = [
+        f"{name} {_text(a)} → {_text(b)}" for (*_, name), a, b in cells.itertuples()
+    ]
+    told = (
+        pd.Series(changes, index=cells.index, dtype=str)
+        .groupby(level=KEYS, sort=False)
+        .agg(", ".join)
+    )
+    differing = pd.concat(
+        [told, pd.Series("in only one of the two tables", index=lacking)]
+    )
     counts = differing.groupby(level="condition", sort=False).size()
     lines = [
-        f"{len(differing)} of {rows} rows came out differently, in {len(counts)} of {len(conditions)} conditions:"
+        f"{len(differing)} of {rows} rows came out differently, in {len(counts)} of "
+        f"{len(conditions)} conditions:"
     ]
-    lines += [f"  {conditions[condition].description}: {count} rows" for condition, count in counts.items()]
+    lines += [
+        f"  {conditions[condition].description}: {count} rows"
+        for condition, count in counts.items()
+    ]
     lines.append("the first of them:")
     for (condition, *place), line in differing.head(_SHOWN).items():
-        where = ", ".join(f"{name} {value}" for name, value in zip(KEYS[1:], place, strict=True))
+        where = ", ".join(
+            f"{name} {value}" for name, value in zip(KEYS[1:], place, strict=True)
+        )
         lines.append(f"  {conditions[condition].description}, {where}: {line}")
     numbers = cells[cells.map(lambda value: isinstance(value, float)).all(axis=1)]
-    gaps = (numbers["first"] - numbers["second"]).abs().groupby(level=-1, sort=False).max().dropna()
+    gaps = (
+        (numbers["first"] - numbers["second"])
+        .abs()
+        .groupby(level=-1, sort=False)
+        .max()
+        .dropna()
+    )
     if len(gaps):
-        lines.append(f"greatest differences: {', '.join(f'{name} {gap:.3g}' for name, gap in gaps.items())}")
+        lines.append(
+            "greatest differences: "
+            f"{', '.join(f'{name} {gap:.3g}' for name, gap in gaps.items())}"
+        )
     return lines
 
 
@@ -188,7 +248,8 @@ def _environment(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     changed = [line for pair in codes for line in provenance.code_differences(*pair)]
     changed += provenance.dataset_differences(before["datasets"], now["datasets"])
     machines = [
-        f"{about['machine']['processor']}, {about['machine']['cores']} cores" for about in (before, now)
+        f"{about['machine']['processor']}, {about['machine']['cores']} cores"
+        for about in (before, now)
     ]
     if machines[0] != machines[1]:
         changed.append(f"machine ({machines[0]} to {machines[1]})")

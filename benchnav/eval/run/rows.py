@@ -25,10 +25,12 @@ class Draws:
     """What is known of the maps of a batch and of the λ that was drawn on them.
 
     Args:
-        reference_time_s: grid reference times at 1 m/s, shape [B]; NaN where there is none.
-        rejected_draws: draws of λ of each episode in which no feasible path joins start and goal, B of them.
-        lower_bound_s: time to the goal that no trajectory undercuts, infinite where none arrives, B of them; empty if
-            it was not computed.
+        reference_time_s: grid reference times at 1 m/s, shape [B]; NaN where there is
+            none.
+        rejected_draws: draws of λ of each episode in which no feasible path joins start
+            and goal, B of them.
+        lower_bound_s: time to the goal that no trajectory undercuts, infinite where
+            none arrives, B of them; empty if it was not computed.
     """
 
     reference_time_s: np.ndarray
@@ -36,7 +38,9 @@ class Draws:
     lower_bound_s: Sequence[float] = ()
 
 
-def finished_episodes(problem: Problem, episodes: Episodes, draws: Draws) -> list[Episode]:
+def finished_episodes(
+    problem: Problem, episodes: Episodes, draws: Draws
+) -> list[Episode]:
     """Return each episode of a batch as metrics are given it.
 
     Args:
@@ -44,7 +48,9 @@ def finished_episodes(problem: Problem, episodes: Episodes, draws: Draws) -> lis
         episodes: what happened.
         draws: on which maps and λ.
     """
-    above = torch.tensor(problem.task.rules.free_space.above, dtype=episodes.traversability.dtype)
+    above = torch.tensor(
+        problem.task.rules.free_space.above, dtype=episodes.traversability.dtype
+    )
     planning_s = episodes.planning_s / episodes.planned
     finished = []
     for b in range(len(episodes.steps)):
@@ -70,14 +76,19 @@ def finished_episodes(problem: Problem, episodes: Episodes, draws: Draws) -> lis
                 preparing_s=episodes.begin_s / len(episodes.steps),
                 learnt=_learnt(episodes, b),
                 rejected_draws=draws.rejected_draws[b],
-                lower_bound_s=draws.lower_bound_s[b] if len(draws.lower_bound_s) else np.nan,
+                lower_bound_s=draws.lower_bound_s[b]
+                if len(draws.lower_bound_s)
+                else np.nan,
             )
         )
     return finished
 
 
-def unbegun_episodes(task: Task, places: Places, time_budget_s: Tensor, outcome: Outcome) -> list[Episode]:
-    """Return episodes that could not begin, as when their model failed: they have no step.
+def unbegun_episodes(
+    task: Task, places: Places, time_budget_s: Tensor, outcome: Outcome
+) -> list[Episode]:
+    """Return episodes that could not begin, as when their model failed: they have no
+    step.
 
     Args:
         task: of all episodes.
@@ -106,7 +117,9 @@ def unbegun_episodes(task: Task, places: Places, time_budget_s: Tensor, outcome:
             planning_s=nothing,
             preparing_s=np.nan,
         )
-        for start, goal_m, budget_s in zip(starts, places.goal_m, time_budget_s, strict=True)
+        for start, goal_m, budget_s in zip(
+            starts, places.goal_m, time_budget_s, strict=True
+        )
     ]
 
 
@@ -116,7 +129,11 @@ def _own(values: Tensor) -> np.ndarray:
 
 
 def _learnt(episodes: Episodes, member: int) -> Learnt | None:
-    if episodes.ahead is None or episodes.seen_cells is None or episodes.sensed_cells is None:
+    if (
+        episodes.ahead is None
+        or episodes.seen_cells is None
+        or episodes.sensed_cells is None
+    ):
         return None
     planned = int(episodes.planned.sum())
     return Learnt(
@@ -129,20 +146,26 @@ def _learnt(episodes: Episodes, member: int) -> Learnt | None:
 
 
 def episode_rows(
-    unit: Unit, groups: np.ndarray, finished: Sequence[Episode], errors: Sequence[str], compiled: bool
+    unit: Unit,
+    groups: np.ndarray,
+    finished: Sequence[Episode],
+    errors: Sequence[str],
+    compiled: bool,
 ) -> pd.DataFrame:
     """Tabulates episodes, a row each.
 
     Args:
-        unit: what was run, with the metrics that its rows have besides those of all runs.
+        unit: what was run, with the metrics that its rows have besides those of all
+            runs.
         groups: which maps go together, shape [B].
         finished: its episodes, B of them.
         errors: what went wrong in each, one line; empty if nothing did.
         compiled: the planner ran compiled.
 
     Returns:
-        The condition's id and labels, `seed`, `realisation`, `map`, `group`, `outcome`; the columns of
-        `benchnav.metrics.SHIPPED`; `compiled`, `error`; and the columns of the unit's own metrics.
+        The condition's id and labels, `seed`, `realisation`, `map`, `group`, `outcome`;
+        the columns of `benchnav.metrics.SHIPPED`; `compiled`, `error`; and the columns
+        of the unit's own metrics.
 
     Raises:
         MetricError: If a metric fails, or returns an infinite number or none.
@@ -156,7 +179,10 @@ def episode_rows(
         try:
             row |= {metric.column: measure(metric, episode) for metric in further}
         except MetricError as fault:
-            place = f"{unit.condition.description}, seed {unit.seed}, realisation {unit.realisation}, map {map_index}"
+            place = (
+                f"{unit.condition.description}, seed {unit.seed}, realisation "
+                f"{unit.realisation}, map {map_index}"
+            )
             raise MetricError(f"{fault} It was given an episode of {place}.") from fault
         rows.append(row)
     return _named(unit, groups).join(pd.DataFrame(rows))
@@ -165,7 +191,12 @@ def episode_rows(
 def _named(unit: Unit, groups: np.ndarray) -> pd.DataFrame:
     """What episodes are known by, a row each."""
     condition = unit.condition
-    draw = {"seed": unit.seed, "realisation": unit.realisation, "map": unit.maps, "group": groups}
+    draw = {
+        "seed": unit.seed,
+        "realisation": unit.realisation,
+        "map": unit.maps,
+        "group": groups,
+    }
     return pd.DataFrame({"condition": condition.id, **condition.labels, **draw})
 
 
@@ -178,9 +209,10 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
         episodes: what happened.
 
     Returns:
-        `seed`, `realisation`, `map`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`, each action by its
-        name, where robots learn `AHEAD_COLUMNS` (NaN but where what is known was updated), and `traversability` as
-        met; actions and `traversability` are NaN at the last state.
+        `seed`, `realisation`, `map`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`,
+        each action by its name, where robots learn `AHEAD_COLUMNS` (NaN but where what
+        is known was updated), and `traversability` as met; actions and `traversability`
+        are NaN at the last state.
     """
     every, steps = np.arange(episodes.states.shape[1]), episodes.steps.numpy()[:, None]
     inside = every <= steps

@@ -1,7 +1,8 @@
-"""Running a unit of work: its maps, its problem and simulation, its episodes, and the files that hold them.
+"""Running a unit of work: its maps, its problem and simulation, its episodes, and the
+files that hold them.
 
-Only the unit's own block of maps is read and predicted. A prediction serves all planners and risk settings
-of its block that a process runs one after another.
+Only the unit's own block of maps is read and predicted. A prediction serves all
+planners and risk settings of its block that a process runs one after another.
 """
 
 import traceback
@@ -32,13 +33,25 @@ from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.knowledge import Learning
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rollout import Episodes, Observer, run_episodes
-from benchnav.eval.run.rows import Draws, episode_rows, finished_episodes, step_table, unbegun_episodes
+from benchnav.eval.run.rows import (
+    Draws,
+    episode_rows,
+    finished_episodes,
+    step_table,
+    unbegun_episodes,
+)
 from benchnav.models.base import predict
 from benchnav.models.predictor import Clairvoyant, loaded, nugget_of
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Prediction, Problem, heading_to, pose_problem
 from benchnav.planning.sensing.belief import Fields, Law
-from benchnav.planning.sensing.knowledge import KnowledgeError, Learner, Truth, call, sensor_keys
+from benchnav.planning.sensing.knowledge import (
+    KnowledgeError,
+    Learner,
+    Truth,
+    call,
+    sensor_keys,
+)
 from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.lower_bound import BOUNDED_ROBOTS, Motion, lower_bound_s
 from benchnav.planning.world.outcome import Outcome
@@ -60,7 +73,9 @@ class Settings:
 
     @classmethod
     def on(cls, device: str, planner_limit_s: float = 0.0) -> "Settings":
-        """Choose the settings on a device: "cpu", "cuda", or "auto" for CUDA if there is a GPU."""
+        """Choose the settings on a device: "cpu", "cuda", or "auto" for CUDA if there
+        is a GPU.
+        """
         return cls(planner_limit_s=planner_limit_s, device=find_device(device).type)
 
     def origins(self) -> Origins:
@@ -69,7 +84,8 @@ class Settings:
 
 
 def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> None:
-    """Runs one unit on one thread and writes its file, and before it its recordings and steps.
+    """Runs one unit on one thread and writes its file, and before it its recordings and
+    steps.
 
     Args:
         unit: what is run.
@@ -89,9 +105,13 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
             built = build(unit, origin, device)
         except KnowledgeError as error:
             task, places = unit.condition.task, block.places
-            budgets = unit.condition.world.budget_s(places.reference_time_s, task.robot.top_speed_mps)
+            budgets = unit.condition.world.budget_s(
+                places.reference_time_s, task.robot.top_speed_mps
+            )
             unbegun = unbegun_episodes(task, places, budgets, error.outcome)
-            rows = episode_rows(unit, block.groups, unbegun, [str(error)] * len(unbegun), compiled=False)
+            rows = episode_rows(
+                unit, block.groups, unbegun, [str(error)] * len(unbegun), compiled=False
+            )
             write_unit(folder, unit, origin, rows, [str(error)], traceback.format_exc())
             return
         problem, simulation = built.problem, built.simulation
@@ -119,14 +139,17 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
 
 
 def _check_origin(unit: Unit, origin: Origin, settings: Settings) -> None:
-    """Refuses to make rows of other code or maps than those that the run was begun with."""
+    """Refuses to make rows of other code or maps than those that the run was begun
+    with.
+    """
     now = settings.origins().of(unit)
     changed = code_differences(origin.code, now.code)
     if now.maps != origin.maps:
         changed.append(f"maps of {unit.condition.data} {unit.condition.split}")
     if changed or now != origin:
         raise ConfigError(
-            f"Expected the code and the maps that the run was begun with, got changes: {'; '.join(changed)}. "
+            "Expected the code and the maps that the run was begun with, got "
+            f"changes: {'; '.join(changed)}. "
             "Give the run's command again; finished units are kept."
         )
 
@@ -138,7 +161,8 @@ class Block:
     Args:
         terrain: the true maps.
         places: starts, goals and grid reference times.
-        groups: which maps go together, as overlapping ones do: those of one number; int64, shape [B].
+        groups: which maps go together, as overlapping ones do: those of one number;
+            int64, shape [B].
     """
 
     terrain: Terrain
@@ -147,25 +171,33 @@ class Block:
 
     def to(self, device: torch.device) -> "Block":
         """The same on a device."""
-        return replace(self, terrain=self.terrain.to(device), places=self.places.to(device))
+        return replace(
+            self, terrain=self.terrain.to(device), places=self.places.to(device)
+        )
 
 
 def read_maps(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> Block:
-    """Reads some maps of a split, with starts, goals, reference times and groups; else each map is one."""
+    """Reads some maps of a split, with starts, goals, reference times and groups; else
+    each map is one.
+    """
     places = dataset.read(split, maps, ["start_m", "goal_m", "reference_time_s"])
     groups: Any = maps
     if "group" in dataset.field_names:
         groups = dataset.read(split, maps, ["group"])["group"]
     return Block(
         terrain=dataset.terrain(split, maps),
-        places=Places(**{name: torch.from_numpy(values) for name, values in places.items()}),
+        places=Places(
+            **{name: torch.from_numpy(values) for name, values in places.items()}
+        ),
         groups=np.asarray(groups, dtype=np.int64).reshape(-1),
     )
 
 
 def read_block(unit: Unit, origin: Origin, device: torch.device = CPU) -> Block:
     """Reads a unit's maps and places onto a device; they are kept for other settings."""
-    return _block(unit.condition.data, unit.condition.split, unit.maps, origin.maps, device)
+    return _block(
+        unit.condition.data, unit.condition.split, unit.maps, origin.maps, device
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +216,8 @@ class Built:
 
 
 def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
-    """Makes the problem and the simulation of a unit, and what its robots know when they set out.
+    """Makes the problem and the simulation of a unit, and what its robots know when
+    they set out.
 
     Args:
         unit: what is to be run.
@@ -199,22 +232,35 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
     condition = unit.condition
     block, task = read_block(unit, origin, device), condition.task
     noise = noise_key(unit.seed, condition.split, unit.realisation)
-    simulation = Simulation(block.terrain, task, condition.world, block.places, noise, unit.maps)
+    simulation = Simulation(
+        block.terrain, task, condition.world, block.places, noise, unit.maps
+    )
     try:
         learner = _learner(condition, block)
         redrawn = simulation.field is None
-        field = simulation.field_at(0) if condition.learns else block.terrain.traversability
-        truth = Truth(terrain=block.terrain, field=field, keys=sensor_keys(noise, unit.maps))
+        field = (
+            simulation.field_at(0) if condition.learns else block.terrain.traversability
+        )
+        truth = Truth(
+            terrain=block.terrain, field=field, keys=sensor_keys(noise, unit.maps)
+        )
         predicted = None
         if learner.sensor.sees_all:
             predicted = call(
-                Outcome.MODEL_ERROR, lambda: _predict(condition.model.key, block, simulation.field)
+                Outcome.MODEL_ERROR,
+                lambda: _predict(condition.model.key, block, simulation.field),
             )
-        start = task.robot.initial_state(heading_to(block.places.start_m, block.places.goal_m))
+        start = task.robot.initial_state(
+            heading_to(block.places.start_m, block.places.goal_m)
+        )
         known = learner.begin(truth, start, predicted)
         fields = Fields(learner.belief, known.believed, tuple(unit.maps))
         prediction = Prediction(
-            known.observation, learner.distribution(known), known.risk_map, known.free, fields
+            known.observation,
+            learner.distribution(known),
+            known.risk_map,
+            known.free,
+            fields,
         )
         problem = pose_problem(
             task,
@@ -229,7 +275,10 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
     if not condition.learns:
         return Built(problem=problem, simulation=simulation, learning=None)
     learning = Learning(
-        learner=learner, start=known, truth=truth, field_at=simulation.field_at if redrawn else None
+        learner=learner,
+        start=known,
+        truth=truth,
+        field_at=simulation.field_at if redrawn else None,
     )
     return Built(problem=problem, simulation=simulation, learning=learning)
 
@@ -242,10 +291,13 @@ def _learner(condition: Condition, block: Block) -> Learner:
     model = call(Outcome.MODEL_ERROR, lambda: condition.model.object)
     law = Law(
         grid=block.terrain.grid,
-        correlation_m=dataset.recipe.correlation_m if world.noise == "stored" else world.correlation_m,
+        correlation_m=dataset.recipe.correlation_m
+        if world.noise == "stored"
+        else world.correlation_m,
         nugget=nugget_of(model),
         statistics=condition.statistics,
-        class_names=model.class_names or tuple(item.name for item in dataset.recipe.classes),
+        class_names=model.class_names
+        or tuple(item.name for item in dataset.recipe.classes),
     )
 
     return Learner(
@@ -259,8 +311,12 @@ def _learner(condition: Condition, block: Block) -> Learner:
     )
 
 
-def _predict(model_key: str, block: Block, field: Tensor | None) -> TraversabilityDistribution:
-    """The prediction of a block, kept for other settings; of the clairvoyant's λ, of one unit alone."""
+def _predict(
+    model_key: str, block: Block, field: Tensor | None
+) -> TraversabilityDistribution:
+    """The prediction of a block, kept for other settings; of the clairvoyant's λ, of
+    one unit alone.
+    """
     model = loaded(model_key)
     if not isinstance(model, Clairvoyant):
         return _prediction(model_key, block)
@@ -269,7 +325,9 @@ def _predict(model_key: str, block: Block, field: Tensor | None) -> Traversabili
 
 
 def noise_key(seed: int, split: str, realisation: int) -> int:
-    """Key of the simulation's noise: the same for every condition (common random numbers)."""
+    """Key of the simulation's noise: the same for every condition (common random
+    numbers).
+    """
     return rng.stream_key(seed, "simulation", *_draw(split, realisation))
 
 
@@ -277,8 +335,11 @@ def _draw(split: str, realisation: int) -> tuple[str | int, ...]:
     return (split, realisation) if realisation else (split,)
 
 
-def simulate(unit: Unit, built: Built, settings: Settings, **options: Any) -> tuple[Episodes, bool]:
-    """Runs a unit's episodes; gives what happened, and whether the planner ran compiled.
+def simulate(
+    unit: Unit, built: Built, settings: Settings, **options: Any
+) -> tuple[Episodes, bool]:
+    """Runs a unit's episodes; gives what happened, and whether the planner ran
+    compiled.
 
     Args:
         unit: what is run.
@@ -291,37 +352,59 @@ def simulate(unit: Unit, built: Built, settings: Settings, **options: Any) -> tu
     with ExitStack() as stack:
         try:
             if settings.planner_limit_s:
-                planner = stack.enter_context(closing(IsolatedPlanner(condition, settings.planner_limit_s)))
+                planner = stack.enter_context(
+                    closing(IsolatedPlanner(condition, settings.planner_limit_s))
+                )
             else:
                 planner = condition.planner.create()
         except (Exception, SystemExit) as error:
             planner = _Unmade(error)
         # Keyed by seed and split, never by the batch.
-        key = rng.stream_key(unit.seed, "planner", *_draw(condition.split, unit.realisation))
+        key = rng.stream_key(
+            unit.seed, "planner", *_draw(condition.split, unit.realisation)
+        )
         generator = rng.generator(key)
         episodes = run_episodes(
-            planner, built.problem, built.simulation, generator, learning=built.learning, **options
+            planner,
+            built.problem,
+            built.simulation,
+            generator,
+            learning=built.learning,
+            **options,
         )
     return episodes, bool(planner.compiled)
 
 
 def _lower_bounds_s(unit: Unit, built: Built) -> list[float] | None:
-    """Lower bounds of the time to the goal where the planner is given λ, of robots and worlds that have one."""
+    """Lower bounds of the time to the goal where the planner is given λ, of robots and
+    worlds that have one.
+    """
     problem, field, condition = built.problem, built.simulation.field, unit.condition
-    if field is None or type(problem.robot) not in BOUNDED_ROBOTS or condition.model.part != "clairvoyant":
+    if (
+        field is None
+        or type(problem.robot) not in BOUNDED_ROBOTS
+        or condition.model.part != "clairvoyant"
+    ):
         return None
     if not condition.planner.object.given_truth:
         return None
     motion = Motion(
-        robot=problem.robot, goal_radius_m=problem.goal_radius_m, immobile=condition.world.immobile
+        robot=problem.robot,
+        goal_radius_m=problem.goal_radius_m,
+        immobile=condition.world.immobile,
     )
     ends = problem.start[:, :2].cpu().numpy(), problem.goal_m.cpu().numpy()
     each = zip(field.cpu().numpy(), *ends, strict=True)
-    return [lower_bound_s(values, problem.grid, motion, start_m, goal_m) for values, start_m, goal_m in each]
+    return [
+        lower_bound_s(values, problem.grid, motion, start_m, goal_m)
+        for values, start_m, goal_m in each
+    ]
 
 
 class _Unmade(Planner[None]):
-    """Stands for a planner that could not be made: it fails in each unit as one that raises."""
+    """Stands for a planner that could not be made: it fails in each unit as one that
+    raises.
+    """
 
     def __init__(self, error: BaseException) -> None:
         self.error = error
@@ -335,7 +418,9 @@ class _Unmade(Planner[None]):
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One thread for PyTorch, whose results do not then depend on the machine; what was is put back."""
+    """One thread for PyTorch, whose results do not then depend on the machine; what was
+    is put back.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -344,12 +429,17 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-# What is kept of maps and models is kept for what they are now: other digests are read and loaded anew.
+# What is kept of maps and models is kept for what they are now: other digests are read
+# and loaded anew.
 
 
 @lru_cache(maxsize=2)
 def _block(
-    data: str, split: str, maps: tuple[int, ...], digests: tuple[str, ...], device: torch.device
+    data: str,
+    split: str,
+    maps: tuple[int, ...],
+    digests: tuple[str, ...],
+    device: torch.device,
 ) -> Block:
     return read_maps(TerrainDataset(find_dataset(data)), split, maps).to(device)
 

@@ -1,7 +1,7 @@
 """Tests of the hypotheses that a suite fixed, map by map.
 
-A difference is tested by flipping signs, the others by a margin (`benchnav.stats.margins`). Holm's correction is over
-the whole list.
+A difference is tested by flipping signs, the others by a margin
+(`benchnav.stats.margins`). Holm's correction is over the whole list.
 """
 
 from collections.abc import Mapping
@@ -34,21 +34,31 @@ def test_hypotheses(
         about: from `fix_hypotheses`.
         episodes: all rows of the run.
         worlds: by condition what λ did.
-        is_whole: the run is finished. Of a part of it differences and intervals are computed on common episodes, and
+        is_whole: the run is finished. Of a part of it differences and intervals are
+            computed on common episodes, and
             `p`, `p_holm` are NaN: a test is made once.
         quantities: what conditions are compared by, by name.
 
     Returns:
-        A row a hypothesis, of which `difference` is of `one` less `other`: all fields of `Hypothesis` and `claim`;
-        `unit` of all that follows; `n_maps`, of which a group counts as one, and `n_episodes` of each condition;
-        `mean_one`, `mean_other`, `difference`, and the ends of its 95 % and 90 % intervals, `low`, `high`, `low_90`,
-        `high_90`; `p`, after Holm's correction `p_holm`; and `supported`, true where `p_holm` is under 0.05. Under
-        `stats.bootstrap.LEAST_MAPS` maps a difference of anything but success has no interval.
+        A row a hypothesis, of which `difference` is of `one` less `other`: all fields
+        of `Hypothesis` and `claim`; `unit` of all that follows; `n_maps`, of which a
+        group counts as one, and `n_episodes` of each condition; `mean_one`,
+        `mean_other`, `difference`, and the ends of its 95 % and 90 % intervals, `low`,
+        `high`, `low_90`, `high_90`; `p`, after Holm's correction `p_holm`; and
+        `supported`, true where `p_holm` is under 0.05. Under
+        `stats.bootstrap.LEAST_MAPS` maps a difference of anything but success has no
+        interval.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
     made = []
     for plain in about["tests"]:
-        test = Hypothesis(**{name: value for name, value in plain.items() if name not in ("names", "claim")})
+        test = Hypothesis(
+            **{
+                name: value
+                for name, value in plain.items()
+                if name not in ("names", "claim")
+            }
+        )
         one, other = (
             own.assign(time_budget_s=time_budgets(own, worlds[condition]))
             for condition in (test.one, test.other)
@@ -74,8 +84,11 @@ def test_hypotheses(
     return table.assign(supported=table["p_holm"] < ALPHA)
 
 
-def comparable(one: pd.DataFrame, other: pd.DataFrame, quantity: Quantity) -> pd.DataFrame:
-    """Return the episodes in which two conditions can be compared by a quantity, side by side.
+def comparable(
+    one: pd.DataFrame, other: pd.DataFrame, quantity: Quantity
+) -> pd.DataFrame:
+    """Return the episodes in which two conditions can be compared by a quantity, side
+    by side.
 
     Args:
         one: rows of a condition, with T of each as `time_budget_s`.
@@ -83,8 +96,8 @@ def comparable(one: pd.DataFrame, other: pd.DataFrame, quantity: Quantity) -> pd
         quantity: what is compared.
 
     Returns:
-        The episodes of which both have a value and, for a quantity `of_arrivals`, in which both reached the goal; see
-        `side_by_side`.
+        The episodes of which both have a value and, for a quantity `of_arrivals`, in
+        which both reached the goal; see `side_by_side`.
     """
     column = quantity.column
     measures = dict.fromkeys(["success", "total_time_s", "time_budget_s", column])
@@ -95,7 +108,8 @@ def comparable(one: pd.DataFrame, other: pd.DataFrame, quantity: Quantity) -> pd
 
 
 def means_and_difference(quantity: Quantity, rows: pd.DataFrame) -> dict[str, float]:
-    """Return `mean_one`, `mean_other` and `difference` with the 95 % interval `low`, `high`, in the quantity's unit.
+    """Return `mean_one`, `mean_other` and `difference` with the 95 % interval `low`,
+    `high`, in the quantity's unit.
 
     Args:
         quantity: what is compared.
@@ -112,18 +126,25 @@ def means_and_difference(quantity: Quantity, rows: pd.DataFrame) -> dict[str, fl
 
 
 def _interval(rows: pd.DataFrame, quantity: Quantity, confidence: float) -> Interval:
-    """Return the difference in the quantity's unit, with its interval; NaN if there are too few maps."""
+    """Return the difference in the quantity's unit, with its interval; NaN if there are
+    too few maps.
+    """
     found = interval_of(rows, quantity.column, confidence)
     difference, low, high = (quantity.scale * value for value in found)
     return difference, low, high
 
 
-def p_of(test: Hypothesis, rows: pd.DataFrame, quantities: Mapping[str, Quantity] = QUANTITIES) -> float:
+def p_of(
+    test: Hypothesis,
+    rows: pd.DataFrame,
+    quantities: Mapping[str, Quantity] = QUANTITIES,
+) -> float:
     """Return p of a hypothesis before any correction; 1 if there are too few maps.
 
     Args:
         test: what is claimed.
-        rows: episodes of the two conditions side by side, the other's columns ending in `_other`.
+        rows: episodes of the two conditions side by side, the other's columns ending in
+            `_other`.
         quantities: what conditions are compared by, by name.
     """
     quantity = quantities[test.metric]

@@ -1,11 +1,12 @@
 """Regret, split along a chain of conditions that ends at the near-optimal reference.
 
-From a planner with a model's prediction to the optimal planner with the same prediction, with that of ideal eyes
-(`ideal`), with the true distribution (`oracle`), and to the near-optimal reference, which is given λ itself. What that
-drives is feasible, so regret against it is at most that against the least time; the lower bound of the time, which no
-trajectory undercuts, is given with it. Each step is a paired difference of its
-own. They add up to the whole by construction, which does not make them causes: a step may be negative, and another
-order of steps would give others.
+From a planner with a model's prediction to the optimal planner with the same
+prediction, with that of ideal eyes (`ideal`), with the true distribution (`oracle`),
+and to the near-optimal reference, which is given λ itself. What that drives is
+feasible, so regret against it is at most that against the least time; the lower bound
+of the time, which no trajectory undercuts, is given with it. Each step is a paired
+difference of its own. They add up to the whole by construction, which does not make
+them causes: a step may be negative, and another order of steps would give others.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,8 +37,8 @@ def find_chains(conditions: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
         conditions: by id what `run.json` knows of them.
 
     Returns:
-        Of each chain its conditions, by id: a planner with a model, the optimal planner with it, with `ideal` and with
-        `oracle`, and the reference.
+        Of each chain its conditions, by id: a planner with a model, the optimal planner
+        with it, with `ideal` and with `oracle`, and the reference.
     """
     values = {condition: about["value"] for condition, about in conditions.items()}
 
@@ -59,14 +60,22 @@ def find_chains(conditions: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
             continue
         references = [
             other
-            for other in like(value, ("planner", "model", "risk"), planner=REFERENCE, model="clairvoyant")
+            for other in like(
+                value,
+                ("planner", "model", "risk"),
+                planner=REFERENCE,
+                model="clairvoyant",
+            )
             if values[other]["planner"]["options"].get("levels")
             != 0  # where entry is loss it is no reference
         ]
         for optimal in like(value, ("planner",), planner=OPTIMAL):
             told = [like(values[optimal], ("model",), model=one) for one in _MODELS]
             if all(told):
-                chains += [[condition, optimal, *(found[0] for found in told), last] for last in references]
+                chains += [
+                    [condition, optimal, *(found[0] for found in told), last]
+                    for last in references
+                ]
     return chains
 
 
@@ -75,7 +84,8 @@ def split_regret(
     episodes: pd.DataFrame,
     worlds: Mapping[str, Mapping[str, Any]],
 ) -> pd.DataFrame:
-    """Paired differences along each chain, on the episodes that all five of its conditions have in common.
+    """Paired differences along each chain, on the episodes that all five of its
+    conditions have in common.
 
     Args:
         conditions: by id what `run.json` knows of them.
@@ -83,19 +93,23 @@ def split_regret(
         worlds: by condition what λ did.
 
     Returns:
-        A row a step of a chain: `chain`, its number; labels of what it begins with; `against`, the end that regret is
-        against; ids, planners and models of the
-        two conditions, `one`, `one_planner`, `one_model` and `other…`; `n_maps`, of which a group counts as one, and
-        `n_episodes`; of `success` and of `time`, T_total in seconds, a failure counted as T: the means `_one` and
-        `_other`, and the `_difference` of one less other with its 95 % interval `_low`, `_high`; and `_bound`, the best
-        mean that the lower bounds of the time allow, NaN where the reference's rows have none.
+        A row a step of a chain: `chain`, its number; labels of what it begins with;
+        `against`, the end that regret is against; ids, planners and models of the
+        two conditions, `one`, `one_planner`, `one_model` and `other…`; `n_maps`, of
+        which a group counts as one, and `n_episodes`; of `success` and of `time`,
+        T_total in seconds, a failure counted as T: the means `_one` and `_other`, and
+        the `_difference` of one less other with its 95 % interval `_low`, `_high`; and
+        `_bound`, the best mean that the lower bounds of the time allow, NaN where the
+        reference's rows have none.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
     made: list[dict[str, Any]] = []
     for number, chain in enumerate(find_chains(conditions), start=1):
         common = on_common_draws({condition: rows[condition] for condition in chain})
         own = {
-            condition: found.assign(time_budget_s=time_budgets(found, worlds[condition]))
+            condition: found.assign(
+                time_budget_s=time_budgets(found, worlds[condition])
+            )
             for condition, found in common.items()
         }
         if own[chain[0]].empty:
@@ -104,7 +118,9 @@ def split_regret(
         about = {name: labels[name] for name in (*BLOCK, "planner", "model", "risk")}
         bounds = best_possible(own[chain[-1]])
         for one, other in pairwise(chain):
-            both = side_by_side(own[one], own[other], ["success", "total_time_s", "time_budget_s"])
+            both = side_by_side(
+                own[one], own[other], ["success", "total_time_s", "time_budget_s"]
+            )
             made.append(
                 {
                     "chain": number,
@@ -125,7 +141,8 @@ def split_regret(
 
 
 def best_possible(rows: pd.DataFrame) -> dict[str, float]:
-    """The best means that the lower bounds of the time allow: `success_bound`, and `time_bound` in seconds of T_total.
+    """The best means that the lower bounds of the time allow: `success_bound`, and
+    `time_bound` in seconds of T_total.
 
     Args:
         rows: episodes, with `time_budget_s`; NaN where some have no `lower_bound_s`.

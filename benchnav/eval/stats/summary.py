@@ -1,8 +1,10 @@
-"""Summaries of conditions: success with its interval, and means with how many episodes each is made of.
+"""Summaries of conditions: success with its interval, and means with how many episodes
+each is made of.
 
-The map is the unit, or the group of maps where a dataset has groups. Episodes on one map, under other seeds or
-realisations, have much in common, so that a hundred of them on twenty maps tell less than a hundred maps would. The
-design effect says how much less.
+The map is the unit, or the group of maps where a dataset has groups. Episodes on one
+map, under other seeds or realisations, have much in common, so that a hundred of them
+on twenty maps tell less than a hundred maps would. The design effect says how much
+less.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,10 +20,20 @@ from benchnav.metrics import shipped
 from benchnav.metrics.base import Metric
 from benchnav.planning.world.outcome import FAILURES
 from benchnav.stats.by_map import by_map
-from benchnav.stats.intervals import design_effect, mean_interval, total_time_interval, wilson_interval
+from benchnav.stats.intervals import (
+    design_effect,
+    mean_interval,
+    total_time_interval,
+    wilson_interval,
+)
 
-# Metrics with mean and standard deviation, those with a median, and those of what robots learnt, with a mean.
-_SPREAD: tuple[Metric, ...] = (shipped.TRAVERSABILITY, shipped.TIME_RATIO, shipped.SCORE)
+# Metrics with mean and standard deviation, those with a median, and those of what
+# robots learnt, with a mean.
+_SPREAD: tuple[Metric, ...] = (
+    shipped.TRAVERSABILITY,
+    shipped.TIME_RATIO,
+    shipped.SCORE,
+)
 _SPREAD += (shipped.PATH_LENGTH, shipped.STUCK_SHARE, shipped.ROUGHNESS)
 _MEDIANS: tuple[Metric, ...] = shipped.PLANNING
 _LEARNT: tuple[Metric, ...] = (
@@ -34,7 +46,8 @@ _LEARNT: tuple[Metric, ...] = (
 
 
 def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
-    """T of each episode in seconds: what a failure counts as, and what a success might have cost.
+    """T of each episode in seconds: what a failure counts as, and what a success might
+    have cost.
 
     Args:
         episodes: rows of one condition.
@@ -42,42 +55,66 @@ def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
     """
     if "time_budget_ratio" in world:
         # The time over its ratio is the reference time at the robot's top speed.
-        granted = world["time_budget_ratio"] * episodes["total_time_s"] / episodes["time_ratio"]
+        granted = (
+            world["time_budget_ratio"]
+            * episodes["total_time_s"]
+            / episodes["time_ratio"]
+        )
     else:
         granted = world["time_budget_s"]
     return episodes["total_time_s"].where(~episodes["success"], granted)
 
 
 def success_mean(episodes: pd.DataFrame) -> tuple[float, float, float]:
-    """Success rate of one condition with its 95 % interval, Wilson's on the episodes over `design_effect`."""
+    """Success rate of one condition with its 95 % interval, Wilson's on the episodes
+    over `design_effect`.
+    """
     success = episodes["success"].to_numpy(dtype=bool)
     effect = design_effect(success, episodes["group"].to_numpy())
-    return float(success.mean()), *wilson_interval(float(success.mean()), len(success) / effect)
+    return float(success.mean()), *wilson_interval(
+        float(success.mean()), len(success) / effect
+    )
 
 
-def total_time_mean(episodes: pd.DataFrame, world: Mapping[str, Any]) -> tuple[float, float, float]:
-    """Mean of T_total of one condition with its 95 % interval, which lies within 0 and T.
+def total_time_mean(
+    episodes: pd.DataFrame, world: Mapping[str, Any]
+) -> tuple[float, float, float]:
+    """Mean of T_total of one condition with its 95 % interval, which lies within 0 and
+    T.
 
     Args:
         episodes: rows of one condition.
         world: of the condition, as `run.json` holds it.
 
     Returns:
-        Mean and ends in seconds; the ends are NaN where there are fewer than `stats.bootstrap.LEAST_MAPS` maps.
+        Mean and ends in seconds; the ends are NaN where there are fewer than
+        `stats.bootstrap.LEAST_MAPS` maps.
     """
-    success, maps = episodes["success"].to_numpy(dtype=bool), episodes["group"].to_numpy()
+    success, maps = (
+        episodes["success"].to_numpy(dtype=bool),
+        episodes["group"].to_numpy(),
+    )
     taken, budgets = episodes["total_time_s"].to_numpy(), time_budgets(episodes, world)
     arrival = taken[success].mean() if success.any() else 0.0  # no arrival takes less
     _, low, high = success_mean(episodes)
     mean, low_s, high_s = total_time_interval(
-        by_map(taken, maps), by_map(1.0 - success, maps), (1 - high, 1 - low),
-        budgets.mean() - arrival, len(np.unique(maps[success])),
-    )  # fmt: skip
-    return float(mean), float(np.maximum(low_s, 0.0)), float(np.minimum(high_s, budgets.max()))
+        by_map(taken, maps),
+        by_map(1.0 - success, maps),
+        (1 - high, 1 - low),
+        budgets.mean() - arrival,
+        len(np.unique(maps[success])),
+    )
+    return (
+        float(mean),
+        float(np.maximum(low_s, 0.0)),
+        float(np.minimum(high_s, budgets.max())),
+    )
 
 
 def summarise(
-    episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]], further: Sequence[Quantity] = ()
+    episodes: pd.DataFrame,
+    worlds: Mapping[str, Mapping[str, Any]],
+    further: Sequence[Quantity] = (),
 ) -> pd.DataFrame:
     """Summarises each condition, in the order in which conditions first appear.
 
@@ -87,20 +124,26 @@ def summarise(
         further: quantities that the episodes have besides those of every run.
 
     Returns:
-        A row a condition: `condition` and its labels; `n_episodes`, `n_maps`, and `n_groups`, which is the number of
-        maps where the dataset has no groups; `success_rate` with Wilson's interval `success_low`, `success_high` on the
-        number of episodes over `design_effect`. Of each quantity
-        `NAME_mean`, `NAME_std` and `NAME_n`, the number of episodes that have it: total time, a failure
-        counted as T; time of the successes alone; observed λ; time over the reference time; score; path length;
-        share of stuck steps; roughness. `total_time_low_s`, `total_time_high_s`, the 95 % interval of its mean,
-        from `total_time_interval`. `planning_ms_median`, and so for `planning_ms_p95` and `planning_start_ms`;
-        `NAME_mean` of what robots learnt, NaN where they learn nothing; `compiled_share`; and `OUTCOME_count` of
-        each failure. Of each further quantity mean, standard deviation and number of episodes that have it, as above,
+        A row a condition: `condition` and its labels; `n_episodes`, `n_maps`, and
+        `n_groups`, which is the number of maps where the dataset has no groups;
+        `success_rate` with Wilson's interval `success_low`, `success_high` on the
+        number of episodes over `design_effect`. Of each quantity `NAME_mean`,
+        `NAME_std` and `NAME_n`, the number of episodes that have it: total time, a
+        failure counted as T; time of the successes alone; observed λ; time over the
+        reference time; score; path length; share of stuck steps; roughness.
+        `total_time_low_s`, `total_time_high_s`, the 95 % interval of its mean, from
+        `total_time_interval`. `planning_ms_median`, and so for `planning_ms_p95` and
+        `planning_start_ms`; `NAME_mean` of what robots learnt, NaN where they learn
+        nothing; `compiled_share`; and `OUTCOME_count` of each failure. Of each further
+        quantity mean, standard deviation and number of episodes that have it, as above,
         and `NAME_low`, `NAME_high`, Student's 95 % interval of the mean by map.
     """
     groups = episodes.groupby("condition", sort=False)
     return pd.DataFrame(
-        [_summarise_condition(group, worlds[str(condition)], further) for condition, group in groups]
+        [
+            _summarise_condition(group, worlds[str(condition)], further)
+            for condition, group in groups
+        ]
     )
 
 
@@ -110,9 +153,20 @@ def _summarise_condition(
     success = group["success"].to_numpy(dtype=bool)
     effect = design_effect(success, group["group"].to_numpy())
     rate, low, high = success_mean(group)
-    row: dict[str, object] = {name: group[name].iloc[0] for name in ("condition", *LABELS)}
-    row |= {"n_episodes": len(group), "n_maps": group["map"].nunique(), "n_groups": group["group"].nunique()}
-    row |= {"success_rate": rate, "success_low": low, "success_high": high, "design_effect": effect}
+    row: dict[str, object] = {
+        name: group[name].iloc[0] for name in ("condition", *LABELS)
+    }
+    row |= {
+        "n_episodes": len(group),
+        "n_maps": group["map"].nunique(),
+        "n_groups": group["group"].nunique(),
+    }
+    row |= {
+        "success_rate": rate,
+        "success_low": low,
+        "success_high": high,
+        "design_effect": effect,
+    }
     total_time = shipped.TOTAL_TIME.quantity
     taken = group[total_time.column]
     row |= _spread(total_time, taken)
@@ -144,10 +198,18 @@ def _spread(quantity: Quantity, values: pd.Series) -> dict[str, object]:
 
 
 def _mean_with_interval(quantity: Quantity, group: pd.DataFrame) -> dict[str, object]:
-    """As `_spread`, with Student's 95 % interval of the mean by map; of a part of a run the column may be missing."""
-    values = group[quantity.column] if quantity.column in group else pd.Series(np.nan, index=group.index)
+    """As `_spread`, with Student's 95 % interval of the mean by map; of a part of a run
+    the column may be missing.
+    """
+    values = (
+        group[quantity.column]
+        if quantity.column in group
+        else pd.Series(np.nan, index=group.index)
+    )
     known = values.notna()
-    by_unit = by_map(values[known].to_numpy(dtype=float), group.loc[known, "group"].to_numpy())
+    by_unit = by_map(
+        values[known].to_numpy(dtype=float), group.loc[known, "group"].to_numpy()
+    )
     _, low, high = mean_interval(by_unit)
     return {
         **_spread(quantity, values),

@@ -1,11 +1,13 @@
-"""The terrain classifier: from colour, and perhaps other layers, to class probabilities that can be trusted.
+"""The terrain classifier: from colour, and perhaps other layers, to class probabilities
+that can be trusted.
 
-Any architecture and encoder of segmentation-models-pytorch fits; the default is the U-Net with a
-ResNet-18 encoder of paper III-B, joined by the image at full resolution. Cells whose class is not known count neither
-in losses nor in measures.
+Any architecture and encoder of segmentation-models-pytorch fits; the default is the
+U-Net with a ResNet-18 encoder of paper III-B, joined by the image at full resolution.
+Cells whose class is not known count neither in losses nor in measures.
 
-Sources: Ronneberger et al. (2015), "U-Net"; He et al. (2016), "Deep residual learning". Letters in shapes: B maps,
-H×W cells, C classes, N channels of the images that the network is given.
+Sources: Ronneberger et al. (2015), "U-Net"; He et al. (2016), "Deep residual learning".
+Letters in shapes: B maps, H×W cells, C classes, N channels of the images that the
+    network is given.
 """
 
 import inspect
@@ -24,7 +26,11 @@ from benchnav.core.settings import hint, one_line
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import CLASSIFIER, Checkpoint, member_names
 from benchnav.models.config import DEEPEST, ClassifierConfig
-from benchnav.models.nets.calibration import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.nets.calibration import (
+    fit_pool_temperature,
+    fit_temperature,
+    sample_logits,
+)
 from benchnav.models.nets.inputs import Maps
 from benchnav.models.nets.trainable import Loss, TrainableNetwork
 
@@ -34,9 +40,11 @@ _LEAST_DOUBT = 1e-6
 
 
 class MeanIoU(MulticlassJaccardIndex):
-    """Intersection over union in the mean over the classes that occur in truth; not a number where none does.
+    """Intersection over union in the mean over the classes that occur in truth; not a
+    number where none does.
 
-    torchmetrics' own mean counts a class that no cell has as 0 as soon as one cell is taken for it.
+    torchmetrics' own mean counts a class that no cell has as 0 as soon as one cell is
+    taken for it.
     """
 
     def compute(self) -> Tensor:
@@ -69,10 +77,15 @@ class TerrainClassifier(TrainableNetwork):
     def configure_losses(self) -> Loss:
         """Cross-entropy, a proper score, unless more is asked for.
 
-        A soft Dice loss may be added, which weighs rare classes as much as frequent ones. Source: Milletari et al.
-        (2016), "V-Net". The focal loss weighs cells that are classified well less than others.
+        A soft Dice loss may be added, which weighs rare classes as much as frequent
+        ones. Source: Milletari et al. (2016), "V-Net". The focal loss weighs cells that
+            are classified well less than others.
         """
-        smoothing, dice, focal = self.config.label_smoothing, self.config.dice, self.config.focal
+        smoothing, dice, focal = (
+            self.config.label_smoothing,
+            self.config.dice,
+            self.config.focal,
+        )
         overlap = smp.losses.DiceLoss("multiclass", ignore_index=UNLABELLED)
 
         def loss(logits: Tensor, class_id: Tensor) -> Tensor:
@@ -95,7 +108,9 @@ class TerrainClassifier(TrainableNetwork):
         """Accuracy and mean intersection over union, of the cells whose class is known."""
         count = len(self.map_classes)
         return {
-            "accuracy": MulticlassAccuracy(count, average="micro", ignore_index=UNLABELLED),
+            "accuracy": MulticlassAccuracy(
+                count, average="micro", ignore_index=UNLABELLED
+            ),
             "miou": MeanIoU(count, average="none", ignore_index=UNLABELLED),
         }
 
@@ -118,25 +133,36 @@ class TerrainClassifier(TrainableNetwork):
 
     def calibrate(self, maps: Any, device: torch.device) -> None:
         """Fits the temperature."""
-        self.temperature = fit_temperature(*sample_logits(self, maps, self.seed, device))
+        self.temperature = fit_temperature(
+            *sample_logits(self, maps, self.seed, device)
+        )
 
     @classmethod
-    def fit_pool(cls, members: Sequence[Self], maps: Any, seed: int, device: torch.device) -> float:
+    def fit_pool(
+        cls, members: Sequence[Self], maps: Any, seed: int, device: torch.device
+    ) -> float:
         """Fits the temperature of the average of several classifiers' probabilities."""
         return fit_pool_temperature(members, maps, seed, device)
 
     @classmethod
-    def from_tensors(cls, config: Mapping[str, Any], map_classes: tuple[str, ...], tensors: Maps) -> Self:
-        """As `TrainableNetwork.from_tensors`; in checkpoints before format 2.3 colours had a scale of their own."""
+    def from_tensors(
+        cls, config: Mapping[str, Any], map_classes: tuple[str, ...], tensors: Maps
+    ) -> Self:
+        """As `TrainableNetwork.from_tensors`; in checkpoints before format 2.3 colours
+        had a scale of their own.
+        """
         renamed = {
-            name.replace("colour_", "stack."): value.flatten() if name.startswith("colour_") else value
+            name.replace("colour_", "stack."): value.flatten()
+            if name.startswith("colour_")
+            else value
             for name, value in tensors.items()
         }
         return super().from_tensors(config, map_classes, renamed)
 
 
 def focal_weights(logits: Tensor, class_id: Tensor, focal: float) -> Tensor:
-    """Weights of cells in the focal loss: (1 − p)^γ, where p is the probability of a cell's class.
+    """Weights of cells in the focal loss: (1 − p)^γ, where p is the probability of a
+    cell's class.
 
     Source: Lin et al. (2017), "Focal loss for dense object detection".
 
@@ -160,12 +186,19 @@ def classifiers_of(checkpoint: Checkpoint) -> list[TerrainClassifier]:
     Raises:
         CheckpointError: there is none.
     """
-    parts, names = map(checkpoint.part, member_names(checkpoint, CLASSIFIER)), checkpoint.class_names
-    return [TerrainClassifier.from_tensors(part.config, names, part.tensors) for part in parts]
+    parts, names = (
+        map(checkpoint.part, member_names(checkpoint, CLASSIFIER)),
+        checkpoint.class_names,
+    )
+    return [
+        TerrainClassifier.from_tensors(part.config, names, part.tensors)
+        for part in parts
+    ]
 
 
 class WithFullResolution(nn.Module):
-    """A network whose features are joined by those of the image at full resolution before classes are told.
+    """A network whose features are joined by those of the image at full resolution
+    before classes are told.
 
     Args:
         network: from images [B, N, H, W] to features [B, 32, H, W].
@@ -179,7 +212,8 @@ class WithFullResolution(nn.Module):
         self.network = network
         self.detail = _convolution(channels, _DETAIL_CHANNELS)
         self.head = nn.Sequential(
-            _convolution(2 * _DETAIL_CHANNELS, _DETAIL_CHANNELS), nn.Conv2d(_DETAIL_CHANNELS, class_count, 1)
+            _convolution(2 * _DETAIL_CHANNELS, _DETAIL_CHANNELS),
+            nn.Conv2d(_DETAIL_CHANNELS, class_count, 1),
         )
 
     def forward(self, image: Tensor) -> Tensor:
@@ -187,8 +221,12 @@ class WithFullResolution(nn.Module):
         return self.head(torch.cat([self.network(image), self.detail(image)], dim=1))
 
 
-@torch.inference_mode(False)  # idle stages are found by gradients, which a caller may have switched off
-def build_network(config: ClassifierConfig, channels: int, class_count: int) -> nn.Module:
+@torch.inference_mode(
+    False
+)  # idle stages are found by gradients, which a caller may have switched off
+def build_network(
+    config: ClassifierConfig, channels: int, class_count: int
+) -> nn.Module:
     """Builds the network with fresh weights, drawn from PyTorch's global generator.
 
     Args:
@@ -197,21 +235,29 @@ def build_network(config: ClassifierConfig, channels: int, class_count: int) -> 
         class_count: C.
 
     Returns:
-        From images [B, N, H, W], whose sides are multiples of 2^encoder_depth, to logits [B, C, H, W].
+        From images [B, N, H, W], whose sides are multiples of 2^encoder_depth, to
+        logits [B, C, H, W].
 
     Raises:
-        ConfigError: there is no such architecture or encoder, or they do not take these settings.
+        ConfigError: there is no such architecture or encoder, or they do not take these
+            settings.
     """
     _check_names(config)
-    known = inspect.signature(smp.MODEL_ARCHITECTURES_MAPPING[config.architecture]).parameters
+    known = inspect.signature(
+        smp.MODEL_ARCHITECTURES_MAPPING[config.architecture]
+    ).parameters
     own = known["decoder_channels"].default if "decoder_channels" in known else None
     expect(
         isinstance(own, tuple) or not config.decoder_channels,
-        f"no `decoder_channels` for architecture {config.architecture}, which has no such setting, "
+        f"no `decoder_channels` for architecture {config.architecture}, which has no "
+        "such setting, "
         f"got {list(config.decoder_channels)}. Leave them out.",
     )
-    # What is not asked for is left to the architecture; at a lesser depth it would have too many channels.
-    size: dict[str, Any] = {"decoder_channels": config.decoder_channels} if config.decoder_channels else {}
+    # What is not asked for is left to the architecture; at a lesser depth it would have
+    # too many channels.
+    size: dict[str, Any] = (
+        {"decoder_channels": config.decoder_channels} if config.decoder_channels else {}
+    )
     if config.encoder_depth < DEEPEST:
         size["encoder_depth"] = config.encoder_depth
         if isinstance(own, tuple):
@@ -233,13 +279,17 @@ def build_network(config: ClassifierConfig, channels: int, class_count: int) -> 
             if not config.pretrained:
                 raise
             raise out_of_memory(error) or ConfigError(
-                f"Expected to download ImageNet weights of {config.encoder} for `pretrained`, got: {one_line(error)} "
-                "Try again where there is a connection, or leave --classifier.pretrained or --mdn.pretrained out."
+                f"Expected to download ImageNet weights of {config.encoder} for "
+                f"`pretrained`, got: {one_line(error)} "
+                "Try again where there is a connection, or leave "
+                "--classifier.pretrained or --mdn.pretrained out."
             ) from error
         except (ValueError, TypeError) as error:
             raise ConfigError(
-                f"Expected settings that {config.architecture} of {config.encoder} takes, got `encoder_depth` "
-                f"{config.encoder_depth} and `decoder_channels` {list(config.decoder_channels)}: {error} "
+                f"Expected settings that {config.architecture} of {config.encoder} "
+                "takes, got `encoder_depth` "
+                f"{config.encoder_depth} and `decoder_channels` "
+                f"{list(config.decoder_channels)}: {error} "
                 "Change them, or leave them out."
             ) from error
         if config.full_resolution:
@@ -252,21 +302,27 @@ def _check_names(config: ClassifierConfig) -> None:
     if config.architecture not in architectures:
         near = hint(config.architecture.lower().replace("+", "plus"), architectures)
         raise ConfigError(
-            f"Expected `architecture` among {', '.join(architectures)}, got {config.architecture!r}.{near}"
+            f"Expected `architecture` among {', '.join(architectures)}, got "
+            f"{config.architecture!r}.{near}"
         )
     known, own = list(smp.encoders.get_encoder_names()), encoder.startswith("tu-")
-    # Of a name such as tu-resnet18.a1_in1k what follows the dot names weights. One with a colon, of a hub or a folder,
-    # is none: who opens a checkpoint would ask there for it.
-    if encoder not in known and not (own and timm.is_model(encoder[3:].partition(".")[0])):
+    # Of a name such as tu-resnet18.a1_in1k what follows the dot names weights. One with
+    # a colon, of a hub or a folder, is none: who opens a checkpoint would ask there for
+    # it.
+    if encoder not in known and not (
+        own and timm.is_model(encoder[3:].partition(".")[0])
+    ):
         known += [f"tu-{name}" for name in timm.list_models()] if own else []
         raise ConfigError(
-            "Expected `encoder` to be one of segmentation-models-pytorch, such as resnet18, or of timm, such as "
+            "Expected `encoder` to be one of segmentation-models-pytorch, such as "
+            "resnet18, or of timm, such as "
             f"tu-resnet18, got {encoder!r}.{hint(encoder, known)}"
         )
 
 
 def _drop_unused_stages(network: Any, channels: int) -> None:
-    """Takes out what a lesser depth leaves idle in a network's encoder: it would be stored all the same.
+    """Takes out what a lesser depth leaves idle in a network's encoder: it would be
+    stored all the same.
 
     Idle is what has weights of which none is given a gradient.
 
@@ -286,4 +342,8 @@ def _drop_unused_stages(network: Any, channels: int) -> None:
 
 
 def _convolution(channels: int, out: int) -> nn.Module:
-    return nn.Sequential(nn.Conv2d(channels, out, 3, padding=1, bias=False), nn.BatchNorm2d(out), nn.ReLU())
+    return nn.Sequential(
+        nn.Conv2d(channels, out, 3, padding=1, bias=False),
+        nn.BatchNorm2d(out),
+        nn.ReLU(),
+    )

@@ -1,8 +1,9 @@
 """What a trainable model is: named hooks that a subclass fills in.
 
-`benchnav-train fit` trains any `TrainableModel`, a user's own as well as ours. It learns one field of the maps, λ as it
-was observed, from layers of the same maps. A subclass says which layers (`inputs` among its settings), makes its
-network, its loss and its distribution, and leaves the rest as it is:
+`benchnav-train fit` trains any `TrainableModel`, a user's own as well as ours. It
+learns one field of the maps, λ as it was observed, from layers of the same maps. A
+subclass says which layers (`inputs` among its settings), makes its network, its loss
+and its distribution, and leaves the rest as it is:
 
     class Mine(TrainableModel):
         def __init__(self, config: MyConfig = MyConfig()) -> None:
@@ -51,7 +52,8 @@ Loss = Callable[[Any, Tensor], Tensor]
 
 
 class TrainableNetwork(lightning.LightningModule):
-    """A network that learns one field of the maps from others: the base of trainable models, and of the classifier.
+    """A network that learns one field of the maps from others: the base of trainable
+    models, and of the classifier.
 
     Args:
         config: what it is and how it is trained.
@@ -61,7 +63,9 @@ class TrainableNetwork(lightning.LightningModule):
     """Field of the maps that is learned."""
 
     stops_early: ClassVar[bool] = True
-    """Whether training ends after `patience` epochs without a gain, and keeps the best; if not, it keeps the last."""
+    """Whether training ends after `patience` epochs without a gain, and keeps the best;
+    if not, it keeps the last.
+    """
 
     no_graph: ClassVar[str] = ""
     """Why no ONNX graph can be made of it; empty where one can."""
@@ -75,17 +79,22 @@ class TrainableNetwork(lightning.LightningModule):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Layers that the network is given: `rgb`, `elevation_m`, `slope_deg`, and others that the maps have."""
+        """Layers that the network is given: `rgb`, `elevation_m`, `slope_deg`, and
+        others that the maps have.
+        """
         return tuple(self.config.inputs)
 
     @property
     def stride(self) -> int:
-        """Maps are padded to multiples of so many cells for the network, and its outputs cropped."""
+        """Maps are padded to multiples of so many cells for the network, and its
+        outputs cropped.
+        """
         return 1
 
     @abstractmethod
     def configure_network(self, channels: int) -> nn.Module:
-        """Makes the network with fresh weights, drawn from PyTorch's global generator, which has been seeded.
+        """Makes the network with fresh weights, drawn from PyTorch's global generator,
+        which has been seeded.
 
         Args:
             channels: N, of the images that it is given, [B, N, H, W].
@@ -93,17 +102,23 @@ class TrainableNetwork(lightning.LightningModule):
 
     @abstractmethod
     def configure_losses(self) -> Loss:
-        """Gives the loss of a batch, from outputs of `forward` and the field that is learned, [B, H, W], to a number.
+        """Gives the loss of a batch, from outputs of `forward` and the field that is
+        learned, [B, H, W], to a number.
 
-        The field is NaN, or 255 of classes, where it is not known; those cells are to be left out.
+        The field is NaN, or 255 of classes, where it is not known; those cells are to
+        be left out.
         """
 
     def configure_metrics(self) -> dict[str, Metric]:
-        """Gives what is measured on the validation maps beside the loss, by name; `update_metrics` updates it."""
+        """Gives what is measured on the validation maps beside the loss, by name;
+        `update_metrics` updates it.
+        """
         return {}
 
     def update_metrics(self, outputs: Any, target: Tensor) -> None:
-        """Updates `self.metrics` by a batch of validation maps, [B, H, W] of the field that is learned."""
+        """Updates `self.metrics` by a batch of validation maps, [B, H, W] of the field
+        that is learned.
+        """
 
     def build(
         self,
@@ -111,7 +126,8 @@ class TrainableNetwork(lightning.LightningModule):
         map_classes: tuple[str, ...] = (),
         seed: int = 0,
     ) -> Self:
-        """Makes the network with fresh weights; leaves PyTorch's global generator as it was.
+        """Makes the network with fresh weights; leaves PyTorch's global generator as it
+        was.
 
         Args:
             scale: of the training maps, by layer of `inputs`.
@@ -123,7 +139,10 @@ class TrainableNetwork(lightning.LightningModule):
             torch.default_generator.manual_seed(seed)
             self.make_modules(scale)
         # A loss that is no number is to be seen, not left out.
-        measured: dict[str, Any] = {"loss": MeanMetric(nan_strategy=math.nan), **self.configure_metrics()}
+        measured: dict[str, Any] = {
+            "loss": MeanMetric(nan_strategy=math.nan),
+            **self.configure_metrics(),
+        }
         self.metrics = MetricCollection(measured, prefix="valid_", compute_groups=False)
         self.loss = self.configure_losses()
         return self
@@ -134,20 +153,26 @@ class TrainableNetwork(lightning.LightningModule):
         self.network = self.configure_network(self.stack.channels)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state without the loss, which may be a closure; `__setstate__` configures it again."""
+        """The state without the loss, which may be a closure; `__setstate__` configures
+        it again.
+        """
         state = super().__getstate__()
         if "loss" in state:
             state["loss"] = None
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restores a pickled or copied network, whose loss refers to it and not to the original."""
+        """Restores a pickled or copied network, whose loss refers to it and not to the
+        original.
+        """
         super().__setstate__(state)
         if "loss" in state:
             self.loss = self.configure_losses()
 
     @classmethod
-    def from_tensors(cls, config: Mapping[str, Any], map_classes: tuple[str, ...], tensors: Maps) -> Self:
+    def from_tensors(
+        cls, config: Mapping[str, Any], map_classes: tuple[str, ...], tensors: Maps
+    ) -> Self:
         """Rebuilds a trained network, downloading nothing.
 
         Args:
@@ -166,17 +191,22 @@ class TrainableNetwork(lightning.LightningModule):
         kind = config_class(cls)
         if "pretrained" in settings:
             settings["pretrained"] = False
-        network = cls(read(kind, settings, of(kind.__name__))).build(map_classes=map_classes)
+        network = cls(read(kind, settings, of(kind.__name__))).build(
+            map_classes=map_classes
+        )
         network.load_state_dict(tensors)
         network.temperature = float(temperature)
         return network.eval()
 
     def settings(self) -> dict[str, Any]:
-        """Plain data that it is rebuilt from, beside its tensors: the configuration and the temperature."""
+        """Plain data that it is rebuilt from, beside its tensors: the configuration and
+        the temperature.
+        """
         return {**plain_config(self.config), "temperature": self.temperature}
 
     def forward(self, maps: Maps) -> Any:
-        """Computes the outputs of the network for maps of any size, which are padded and the outputs cropped.
+        """Computes the outputs of the network for maps of any size, which are padded
+        and the outputs cropped.
 
         Args:
             maps: B maps by field, `inputs` among them.
@@ -189,10 +219,14 @@ class TrainableNetwork(lightning.LightningModule):
         if self.stride > 1:
             padding = (0, -width % self.stride, 0, -height % self.stride)
             image = nn.functional.pad(image, padding, mode="replicate")
-        return self.network(image.contiguous(memory_format=torch.channels_last))[..., :height, :width]
+        return self.network(image.contiguous(memory_format=torch.channels_last))[
+            ..., :height, :width
+        ]
 
     def assess(self, maps: Maps) -> tuple[Tensor, int]:
-        """Computes the loss of a batch, and of how many cells it is the mean; in evaluation updates `metrics`."""
+        """Computes the loss of a batch, and of how many cells it is the mean; in
+        evaluation updates `metrics`.
+        """
         outputs, target = self(maps), maps[self.target]
         if target.is_floating_point():
             known = target.isfinite()
@@ -207,20 +241,25 @@ class TrainableNetwork(lightning.LightningModule):
         return loss, int(known.sum())
 
     def calibrate(self, maps: Any, device: torch.device) -> None:
-        """Is called with the validation maps when the training has ended; the network is in evaluation.
+        """Is called with the validation maps when the training has ended; the network
+        is in evaluation.
 
         Args:
-            maps: a `models.training.data.MapDataset` with `inputs` and the field that is learned.
+            maps: a `models.training.data.MapDataset` with `inputs` and the field that
+                is learned.
             device: where to compute.
         """
 
     @classmethod
-    def fit_pool(cls, members: Sequence[Self], maps: Any, seed: int, device: torch.device) -> float:
+    def fit_pool(
+        cls, members: Sequence[Self], maps: Any, seed: int, device: torch.device
+    ) -> float:
         """Fits the temperature of the average of several members.
 
         Args:
             members: trained and calibrated.
-            maps: a `models.training.data.MapDataset` with their inputs and the field that is learned.
+            maps: a `models.training.data.MapDataset` with their inputs and the field
+                that is learned.
             seed: root seed of the cells to fit to.
             device: where to compute.
         """
@@ -229,44 +268,69 @@ class TrainableNetwork(lightning.LightningModule):
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW under the schedule of `configure_schedule`."""
         rate = self.config.learning_rate
-        # Under mixed precision the fused kind unscales gradients by itself, and Lightning would not clip them.
+        # Under mixed precision the fused kind unscales gradients by itself, and
+        # Lightning would not clip them.
         fused = not self.trainer.gradient_clip_val
         optimizer = torch.optim.AdamW(
             self.parameters(), rate, weight_decay=self.config.weight_decay, fused=fused
         )
         steps = max(int(self.trainer.estimated_stepping_batches), 2)
         schedule = self.configure_schedule(optimizer, steps)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": schedule, "interval": "step"},
+        }
 
     def configure_schedule(self, optimizer: torch.optim.Optimizer, steps: int) -> Any:
-        """Gives the schedule of the learning rate over all steps of a training: one cycle (Smith and Topin, 2018)."""
+        """Gives the schedule of the learning rate over all steps of a training: one
+        cycle (Smith and Topin, 2018).
+        """
         return torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, self.config.learning_rate, total_steps=steps, pct_start=WARM_UP_SHARE
+            optimizer,
+            self.config.learning_rate,
+            total_steps=steps,
+            pct_start=WARM_UP_SHARE,
         )
 
     def on_train_epoch_start(self) -> None:
-        """Seeds what an epoch draws, such as dropout: by seed and epoch, so that a resumed training draws the same."""
-        place = np.array([self.current_epoch * self.trainer.world_size + self.global_rank])
+        """Seeds what an epoch draws, such as dropout: by seed and epoch, so that a
+        resumed training draws the same.
+        """
+        place = np.array(
+            [self.current_epoch * self.trainer.world_size + self.global_rank]
+        )
         drawn = rng.uniform(rng.stream_key(self.seed, "models", "epoch"), place, (1,))
         torch.manual_seed(int(drawn.item() * 2**53))
 
     def training_step(self, batch: Maps, batch_index: int) -> Tensor:
         """Computes the loss of a batch."""
         loss, cells = self.assess(batch)
-        self.log("train_loss", loss, on_step=False, on_epoch=True, sync_dist=True, batch_size=cells)
+        self.log(
+            "train_loss",
+            loss,
+            on_step=False,
+            on_epoch=True,
+            sync_dist=True,
+            batch_size=cells,
+        )
         return loss
 
     def validation_step(self, batch: Maps, batch_index: int) -> None:
         """Measures a batch."""
         self.tally(batch)
-        named = {"valid_loss": self.metrics["loss"], **dict(self.metrics.items())}  # tables begin with it
+        named = {
+            "valid_loss": self.metrics["loss"],
+            **dict(self.metrics.items()),
+        }  # tables begin with it
         self.log_dict(named, on_epoch=True, batch_size=len(batch[self.target]))
 
     def measure(self, maps: Any) -> dict[str, float]:
-        """Measures maps as training does, by name, such as `valid_loss`; the network is in evaluation.
+        """Measures maps as training does, by name, such as `valid_loss`; the network is
+        in evaluation.
 
         Args:
-            maps: a `models.training.data.MapDataset` with `inputs` and the field that is learned.
+            maps: a `models.training.data.MapDataset` with `inputs` and the field that
+                is learned.
         """
         self.metrics.to(self.device).reset()
         with torch.inference_mode():
@@ -283,16 +347,20 @@ class TrainableNetwork(lightning.LightningModule):
 class TrainableModel(TrainableNetwork, ModelFamily):
     """A model that `benchnav-train fit` trains, and that is kept in checkpoints.
 
-    Calibration: the temperature T widens or narrows every distribution on the scale of normal scores, to
-    F⁻¹(Φ(T·Φ⁻¹(u))). It is fitted to the validation maps by maximum likelihood and leaves every median as it is.
+    Calibration: the temperature T widens or narrows every distribution on the scale of
+    normal scores, to F⁻¹(Φ(T·Φ⁻¹(u))). It is fitted to the validation maps by maximum
+    likelihood and leaves every median as it is.
     """
 
     @abstractmethod
     def to_distribution(self, outputs: Any) -> TraversabilityDistribution:
-        """Gives the distribution of λ in each cell, [B, H, W], from outputs of `forward`, float32."""
+        """Gives the distribution of λ in each cell, [B, H, W], from outputs of
+        `forward`, float32.
+        """
 
     def predict(self, observation: Observation) -> TraversabilityDistribution:
-        """Predicts on the observation's device, to which the network is moved, some maps at a time.
+        """Predicts on the observation's device, to which the network is moved, some
+        maps at a time.
 
         Args:
             observation: B maps of any size, with the layers of `inputs`.
@@ -309,7 +377,9 @@ class TrainableModel(TrainableNetwork, ModelFamily):
         size = max(1, CHUNK_CELLS // (first.shape[-2] * first.shape[-1]))
         with torch.inference_mode():
             chunks = [
-                self._some({name: layer[at : at + size] for name, layer in maps.items()})
+                self._some(
+                    {name: layer[at : at + size] for name, layer in maps.items()}
+                )
                 for at in range(0, len(first), size)
             ]
         return map_tensors(chunks[0], lambda *values: torch.cat(values), *chunks[1:])
@@ -317,7 +387,9 @@ class TrainableModel(TrainableNetwork, ModelFamily):
     def _some(self, maps: Maps) -> TraversabilityDistribution:
         return self.to_distribution(in_single_precision(self(maps)))
 
-    def sharpen(self, distribution: TraversabilityDistribution) -> TraversabilityDistribution:
+    def sharpen(
+        self, distribution: TraversabilityDistribution
+    ) -> TraversabilityDistribution:
         """Applies the temperature."""
         return widened(distribution, self.temperature)
 
@@ -326,7 +398,9 @@ class TrainableModel(TrainableNetwork, ModelFamily):
         return {"rmse": MeanSquaredError(squared=False)}
 
     def update_metrics(self, outputs: Any, target: Tensor) -> None:
-        """Updates every metric by E[λ] and λ of the cells where it was observed, each of shape [N]."""
+        """Updates every metric by E[λ] and λ of the cells where it was observed, each
+        of shape [N].
+        """
         seen = target.isfinite()
         mean = self.to_distribution(outputs).mean()[seen]
         for name, metric in self.metrics.items(keep_base=True):
@@ -335,14 +409,20 @@ class TrainableModel(TrainableNetwork, ModelFamily):
 
     def calibrate(self, maps: Any, device: torch.device) -> None:
         """Fits the temperature."""
-        self.temperature = fit_width(*sample_scores(self.predict_raw, maps, self.inputs, self.seed, device))
+        self.temperature = fit_width(
+            *sample_scores(self.predict_raw, maps, self.inputs, self.seed, device)
+        )
 
     @classmethod
-    def fit_pool(cls, members: Sequence[Self], maps: Any, seed: int, device: torch.device) -> float:
+    def fit_pool(
+        cls, members: Sequence[Self], maps: Any, seed: int, device: torch.device
+    ) -> float:
         """Fits the temperature of the average of several members' distributions."""
 
         def predict(layers: dict[str, Tensor]) -> TraversabilityDistribution:
-            return pool([member.sharpen(member.predict_raw(layers)) for member in members])
+            return pool(
+                [member.sharpen(member.predict_raw(layers)) for member in members]
+            )
 
         return fit_width(*sample_scores(predict, maps, members[0].inputs, seed, device))
 
@@ -355,7 +435,8 @@ class TrainableModel(TrainableNetwork, ModelFamily):
         """
         name = checkpoint.model
         members = [
-            cls.from_part(checkpoint.part(part), checkpoint) for part in member_names(checkpoint, name)
+            cls.from_part(checkpoint.part(part), checkpoint)
+            for part in member_names(checkpoint, name)
         ]
         if len(members) == 1:
             return members[0]
@@ -368,17 +449,20 @@ class TrainableModel(TrainableNetwork, ModelFamily):
 
 
 class Ensemble(TraversabilityModel):
-    """Several models as one: the average of their distribution functions, calibrated as a whole.
+    """Several models as one: the average of their distribution functions, calibrated as
+    a whole.
 
-    Source: Lakshminarayanan et al. (2017), "Simple and scalable predictive uncertainty estimation using deep
-    ensembles".
+    Source: Lakshminarayanan et al. (2017), "Simple and scalable predictive uncertainty
+    estimation using deep ensembles".
 
     Args:
         members: the models.
         temperature: of the average; see `TrainableModel`.
     """
 
-    def __init__(self, members: Sequence[TrainableModel], temperature: float = 1.0) -> None:
+    def __init__(
+        self, members: Sequence[TrainableModel], temperature: float = 1.0
+    ) -> None:
         """Keeps them."""
         self.members, self.temperature = tuple(members), temperature
 
@@ -388,8 +472,11 @@ class Ensemble(TraversabilityModel):
         return widened(averaged, self.temperature)
 
 
-def widened(distribution: TraversabilityDistribution, temperature: float) -> TraversabilityDistribution:
-    """Multiplies the normal scores of distributions by a temperature, over 1 to make them wider.
+def widened(
+    distribution: TraversabilityDistribution, temperature: float
+) -> TraversabilityDistribution:
+    """Multiplies the normal scores of distributions by a temperature, over 1 to make
+    them wider.
 
     Args:
         distribution: of shape [B, H, W].
@@ -397,7 +484,9 @@ def widened(distribution: TraversabilityDistribution, temperature: float) -> Tra
     """
     if temperature == 1:
         return distribution
-    zeros = torch.zeros(distribution.shape, dtype=distribution.dtype, device=distribution.device)
+    zeros = torch.zeros(
+        distribution.shape, dtype=distribution.dtype, device=distribution.device
+    )
     return conditioned(distribution, zeros, zeros + temperature)
 
 

@@ -1,6 +1,8 @@
-"""What can be said without a model: the class of the nearest colour, and one distribution of λ for all cells.
+"""What can be said without a model: the class of the nearest colour, and one
+distribution of λ for all cells.
 
-A model that is worse than these is worse than none. Letters in shapes: B maps, H×W cells, C classes.
+A model that is worse than these is worse than none. Letters in shapes: B maps, H×W
+cells, C classes.
 """
 
 import numpy as np
@@ -14,7 +16,8 @@ _BINS = 2**12
 
 
 def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
-    """Takes for each cell the class whose colour in full light is nearest, by Euclidean distance.
+    """Takes for each cell the class whose colour in full light is nearest, by Euclidean
+    distance.
 
     Args:
         rgb: 0–255, shape [B, 3, H, W].
@@ -43,7 +46,8 @@ def nearest_colour_accuracy(dataset: TerrainDataset, split: str) -> float:
 def climatology_crps(dataset: TerrainDataset, split: str) -> float:
     """CRPS of one distribution of λ for all cells: that of the split's own observed λ.
 
-    It is ∫ F·(1 − F), with F the share of cells up to a value, read off a histogram: off by 1e-4 at most. Not a number
+    It is ∫ F·(1 − F), with F the share of cells up to a value, read off a histogram:
+    off by 1e-4 at most. Not a number
     where no λ was observed. Source: Gneiting and Raftery (2007), 4.2.
     """
     counts = np.zeros(_BINS)

@@ -1,4 +1,6 @@
-"""The files of an evaluation and of a comparison, and what is checked before any work is done."""
+"""The files of an evaluation and of a comparison, and what is checked before any work
+is done.
+"""
 
 import tempfile
 from collections.abc import Collection
@@ -23,7 +25,8 @@ def open_maps(
     files: Collection[str],
     what: str,
 ) -> "TerrainDataset":
-    """Open the dataset that models are measured on, after a check of the other arguments.
+    """Open the dataset that models are measured on, after a check of the other
+    arguments.
 
     Args:
         data: its path or id.
@@ -45,7 +48,9 @@ def open_maps(
 
     check_seed(seed)
     if out:
-        refuse_taken(Path(out), overwrite, partial(_foreign, files={*files, FIGURES}, what=what))
+        refuse_taken(
+            Path(out), overwrite, partial(_foreign, files={*files, FIGURES}, what=what)
+        )
         check_writable(Path(out, FIGURES))
     dataset = TerrainDataset(find_dataset(data))
     expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
@@ -53,7 +58,9 @@ def open_maps(
 
 
 def _foreign(folder: Path, files: set[str], what: str) -> str:
-    """Return why what is at a path is none of these; empty if it is one. For `refuse_taken`."""
+    """Return why what is at a path is none of these; empty if it is one. For
+    `refuse_taken`.
+    """
     own = folder.is_dir() and {item.name for item in folder.iterdir()} <= files
     return "" if own else f"is something else than {what}"
 

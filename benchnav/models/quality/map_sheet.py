@@ -1,7 +1,8 @@
-"""Map sheets: truth, prediction, error and uncertainty of a few maps side by side, a row a map.
+"""Map sheets: truth, prediction, error and uncertainty of a few maps side by side, a
+row a map.
 
-A quantity has one scale in all sheets of an evaluation, so that splits compare. Letters in shapes: B
-maps, H×W cells.
+A quantity has one scale in all sheets of an evaluation, so that splits compare. Letters
+in shapes: B maps, H×W cells.
 """
 
 from collections.abc import Sequence
@@ -21,7 +22,8 @@ from benchnav.models.quality.scores import mutual_information, predictive_entrop
 from benchnav.viz.maps import LAMBDA, TRAVERSABILITY_COLOURS, lacking_handle
 from benchnav.viz.sheet import SheetColumn, class_patches, class_scale, sheet_of_maps
 
-# Of each layer its title, what stands under its colour bar, and its colours; classes and images have no bar.
+# Of each layer its title, what stands under its colour bar, and its colours; classes
+# and images have no bar.
 _LAYERS: dict[str, tuple[str, str, str]] = {
     "rgb": ("Image", "", ""),
     "class_true": ("True class", "", ""),
@@ -45,8 +47,8 @@ class MapSheet(NamedTuple):
         split: where the maps are from.
         indices: which maps.
         extent_m: size of a map along x and y.
-        layers: by the keys of `_LAYERS`, those that the model has, each of shape [B, H, W]; `rgb` is of
-            shape [B, H, W, 3].
+        layers: by the keys of `_LAYERS`, those that the model has, each of shape [B, H,
+            W]; `rgb` is of shape [B, H, W, 3].
     """
 
     split: str
@@ -56,7 +58,10 @@ class MapSheet(NamedTuple):
 
 
 def read_sheet(
-    model: TraversabilityModel, dataset: TerrainDataset, split: str, indices: Sequence[int]
+    model: TraversabilityModel,
+    dataset: TerrainDataset,
+    split: str,
+    indices: Sequence[int],
 ) -> MapSheet:
     """Predicts some maps of a split.
 
@@ -73,7 +78,11 @@ def read_sheet(
     with torch.inference_mode():
         predicted = predict(model, terrain)
         known = dataset.truth_of(split) == "generated"
-        true = Oracle().predict_terrain(terrain).mean() if known else terrain.traversability
+        true = (
+            Oracle().predict_terrain(terrain).mean()
+            if known
+            else terrain.traversability
+        )
         layers = {"rgb": terrain.rgb.movedim(1, -1)}
         if model.class_names:
             classes = predicted.class_probabilities(len(model.class_names))
@@ -92,7 +101,9 @@ def read_sheet(
     return MapSheet(split, tuple(indices), terrain.grid.extent_m, arrays)
 
 
-def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -> dict[str, dict[str, Any]]:
+def shared_scales(
+    sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]
+) -> dict[str, dict[str, Any]]:
     """Finds how each layer is drawn in all sheets: keywords of `imshow`, by layer.
 
     Scales that are not of a fixed range hold 99.5 % of the cells.
@@ -102,23 +113,41 @@ def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -
         classes: of the dataset.
     """
     kinds = class_scale(class_colours(classes))
-    scales: dict[str, dict[str, Any]] = {"rgb": {}, "class_true": kinds, "class_found": kinds}
+    scales: dict[str, dict[str, Any]] = {
+        "rgb": {},
+        "class_true": kinds,
+        "class_found": kinds,
+    }
     for name, (_, unit, palette) in _LAYERS.items():
-        values = [sheet.layers[name].ravel() for sheet in sheets if name in sheet.layers and unit]
+        values = [
+            sheet.layers[name].ravel()
+            for sheet in sheets
+            if name in sheet.layers and unit
+        ]
         if unit == "λ":
             scales[name] = LAMBDA
         elif values:
             shown = np.abs(np.concatenate(values))
             shown = shown[np.isfinite(shown)]
-            most = _round_up(float(np.quantile(shown, _SHOWN_SHARE)) if len(shown) else 0.0)
-            scales[name] = {"cmap": palette, "vmin": -most if name.startswith("error") else 0, "vmax": most}
+            most = _round_up(
+                float(np.quantile(shown, _SHOWN_SHARE)) if len(shown) else 0.0
+            )
+            scales[name] = {
+                "cmap": palette,
+                "vmin": -most if name.startswith("error") else 0,
+                "vmax": most,
+            }
     return scales
 
 
 def map_sheet_figure(
-    sheet: MapSheet, scales: dict[str, dict[str, Any]], classes: Sequence[TerrainClass], title: str
+    sheet: MapSheet,
+    scales: dict[str, dict[str, Any]],
+    classes: Sequence[TerrainClass],
+    title: str,
 ) -> Figure:
-    """Draws a sheet, a row a map and a column a layer; the panel of a layer has the label `LAYER ROW`.
+    """Draws a sheet, a row a map and a column a layer; the panel of a layer has the
+    label `LAYER ROW`.
 
     Args:
         sheet: the maps.
@@ -134,7 +163,9 @@ def map_sheet_figure(
             SheetColumn(
                 name=name,
                 title=title_of,
-                layers=np.ma.masked_equal(layers, UNLABELLED) if name == "class_true" else layers,
+                layers=np.ma.masked_equal(layers, UNLABELLED)
+                if name == "class_true"
+                else layers,
                 shades=scales[name],
                 unit=unit or None,
                 # λ ends at 0 and 1.
@@ -142,15 +173,22 @@ def map_sheet_figure(
                 most=2 if is_error else 4,
             )
         )
-    kinds = [sheet.layers[name] for name in ("class_true", "class_found") if name in sheet.layers]
+    kinds = [
+        sheet.layers[name]
+        for name in ("class_true", "class_found")
+        if name in sheet.layers
+    ]
     shown = np.setdiff1d(kinds, UNLABELLED).astype(int)
     patches = class_patches(
-        [classes[number].name.replace("_", " ") for number in shown], class_colours(classes)[shown]
+        [classes[number].name.replace("_", " ") for number in shown],
+        class_colours(classes)[shown],
     )
     if patches and any(bool(np.isnan(layer).any()) for layer in sheet.layers.values()):
         patches.append(lacking_handle())
     rows = [f"map {index}" for index in sheet.indices]
-    return sheet_of_maps(columns, rows, sheet.extent_m, f"{title}, split {sheet.split}", patches)
+    return sheet_of_maps(
+        columns, rows, sheet.extent_m, f"{title}, split {sheet.split}", patches
+    )
 
 
 def _round_up(value: float) -> float:

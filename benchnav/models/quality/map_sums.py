@@ -1,4 +1,5 @@
-"""Quality by map: sums from which every score follows (`scores_of_maps`), of one map or of any number of them.
+"""Quality by map: sums from which every score follows (`scores_of_maps`), of one map or
+of any number of them.
 
 Letters in shapes: B maps of a chunk, M maps of a split, C classes, N cells.
 """
@@ -56,7 +57,8 @@ class MapTally:
     Args:
         classes: number of classes C, 0 of a model without any.
         truth: whether the maps' true distribution of λ is known.
-        quantiles: add up what quantiles of every cell are needed for, which take most of the time.
+        quantiles: add up what quantiles of every cell are needed for, which take most
+            of the time.
     """
 
     def __init__(self, classes: int, truth: bool, quantiles: bool = True) -> None:
@@ -71,28 +73,49 @@ class MapTally:
         """Adds `count` maps by their observed cells, None where there are none."""
         sums = {name: torch.zeros(count, dtype=torch.float64) for name in self.names}
         if cells is not None:
-            scores: dict[str, Tensor] = {**cells.scores, "cells": torch.ones_like(cells.observed)}
+            scores: dict[str, Tensor] = {
+                **cells.scores,
+                "cells": torch.ones_like(cells.observed),
+            }
             scores["inside"] = (cells.transformed - 0.5).abs() <= LEVEL / 2
-            scores |= {f"under_{round(100 * level)}": cells.transformed < 1 - level for level in TAIL_LEVELS}
+            scores |= {
+                f"under_{round(100 * level)}": cells.transformed < 1 - level
+                for level in TAIL_LEVELS
+            }
             if self.quantiles:
                 loss, width = lower_fifth_and_width(cells.predicted, cells.observed)
-                scores |= {"pinball": loss, "width": width, "areas": self._rank(cells, width[0], count)}
-            sums |= {name: _by_map(values, cells.maps, count) for name, values in scores.items()}
+                scores |= {
+                    "pinball": loss,
+                    "width": width,
+                    "areas": self._rank(cells, width[0], count),
+                }
+            sums |= {
+                name: _by_map(values, cells.maps, count)
+                for name, values in scores.items()
+            }
             self.pit += pit_counts(cells.transformed).numpy()
             if self.truth:
                 sums["labelled"] = _by_map(cells.labelled, cells.maps, count)
-                sums["expected_squares"] = _by_map(cells.expected_squares, cells.maps[cells.labelled], count)
+                sums["expected_squares"] = _by_map(
+                    cells.expected_squares, cells.maps[cells.labelled], count
+                )
         for name, values in sums.items():
             self._keep(name, values)
 
     def add_classes(self, probabilities: Tensor, class_id: Tensor) -> None:
         """Adds class probabilities [B, C, H, W] of maps with true classes [B, H, W]."""
         maps, labelled = len(class_id), class_id != UNLABELLED
-        where = (self.classes * torch.arange(maps, device=class_id.device))[:, None, None].expand_as(class_id)
-        found, true, where = (layer[labelled] for layer in (probabilities.argmax(1), class_id, where))
+        where = (self.classes * torch.arange(maps, device=class_id.device))[
+            :, None, None
+        ].expand_as(class_id)
+        found, true, where = (
+            layer[labelled] for layer in (probabilities.argmax(1), class_id, where)
+        )
         for name, cells in (
-            ("true", where + true), ("found", where + found), ("hits", (where + true)[found == true]),
-        ):  # fmt: skip
+            ("true", where + true),
+            ("found", where + found),
+            ("hits", (where + true)[found == true]),
+        ):
             counts = torch.bincount(cells, minlength=maps * self.classes)
             self._keep(name, counts.view(maps, self.classes))
 
@@ -101,7 +124,9 @@ class MapTally:
         return {name: np.concatenate(parts) for name, parts in self.parts.items()}
 
     def curves(self) -> np.ndarray:
-        """Share of cells that is left out; mean error of the rest, ranked by width, and by error; shape [3, STEPS]."""
+        """Share of cells that is left out; mean error of the rest, ranked by width, and
+        by error; shape [3, STEPS].
+        """
         cells = sum(float(part.sum()) for part in self.parts["cells"])
         return np.vstack([np.arange(STEPS) / STEPS, self.ranked / cells])
 
@@ -109,8 +134,13 @@ class MapTally:
         self.parts.setdefault(name, []).append(values.double().cpu().numpy())
 
     def _rank(self, cells: CellScores, width: Tensor, count: int) -> Tensor:
-        """The AUSE of each cell's own map, [N], while the curves are added to those of all maps."""
-        areas, error = torch.zeros_like(width), (cells.expected - cells.observed)[0].abs()
+        """The AUSE of each cell's own map, [N], while the curves are added to those of
+        all maps.
+        """
+        areas, error = (
+            torch.zeros_like(width),
+            (cells.expected - cells.observed)[0].abs(),
+        )
         for place in range(count):
             here = cells.maps == place
             size = int(here.sum())
@@ -137,7 +167,8 @@ _OF_QUANTILES = ("pinball", "width", "areas")
 
 
 def by_group(sums: Sums, groups: np.ndarray) -> dict[str, np.ndarray]:
-    """Adds maps of one group up, as of overlapping ones, which are one unit; those without any cell are left out.
+    """Adds maps of one group up, as of overlapping ones, which are one unit; those
+    without any cell are left out.
 
     Args:
         sums: of shape [M], of classes [M, C].
@@ -147,7 +178,10 @@ def by_group(sums: Sums, groups: np.ndarray) -> dict[str, np.ndarray]:
         Sums of the units, in the order of their numbers.
     """
     numbers, member = np.unique(groups, return_inverse=True)
-    together = {name: np.zeros((len(numbers), *values.shape[1:])) for name, values in sums.items()}
+    together = {
+        name: np.zeros((len(numbers), *values.shape[1:]))
+        for name, values in sums.items()
+    }
     for name, values in sums.items():
         np.add.at(together[name], member, values)
     return {name: values[together["cells"] > 0] for name, values in together.items()}

@@ -1,8 +1,9 @@
-"""How good a model's predictions are, a split at a time: of classes, and of traversability.
+"""How good a model's predictions are, a split at a time: of classes, and of
+traversability.
 
-One pass over the maps with sums and counts alone, so that memory does not grow with them. The scores
-themselves stand in `scores`. Letters in shapes: B maps, H×W cells, C classes, N
-cells of all maps.
+One pass over the maps with sums and counts alone, so that memory does not grow with
+them. The scores themselves stand in `scores`. Letters in shapes: B maps, H×W cells, C
+classes, N cells of all maps.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -49,19 +50,21 @@ class ClassQuality:
     Args:
         accuracy: share of cells whose most likely class is right.
         miou: intersection over union, averaged over the classes that occur in truth.
-        miou_predicted: the same over those that are predicted somewhere too, of which each that does not occur
-            counts as 0.
+        miou_predicted: the same over those that are predicted somewhere too, of which
+            each that does not occur counts as 0.
         ece: expected calibration error of the most likely class, 15 bins.
-        brier: Brier score, the squared distance of the probabilities to the class that is there, 0–2.
+        brier: Brier score, the squared distance of the probabilities to the class that
+            is there, 0–2.
         entropy: mean predictive entropy, in nats.
-        mutual_information: mean mutual information of class and member, in nats; not a number for a
-            model without several members.
-        entropy_auroc: how often the entropy is higher in a wrongly than in a rightly classified cell;
-            not a number where all or none are wrong.
+        mutual_information: mean mutual information of class and member, in nats; not a
+            number for a model without several members.
+        entropy_auroc: how often the entropy is higher in a wrongly than in a rightly
+            classified cell; not a number where all or none are wrong.
         mutual_information_auroc: the same of mutual information.
         confusion: cells by true class (row) and most likely class (column), [C][C].
-        reliability: the curve that the ECE sums up: in 15 equal bins of the probability of the most likely class how
-            many `cells` there are, their mean `confidence`, and the `accuracy`, both 0 in an empty bin.
+        reliability: the curve that the ECE sums up: in 15 equal bins of the probability
+            of the most likely class how many `cells` there are, their mean
+            `confidence`, and the `accuracy`, both 0 in an empty bin.
         slope_cells: cells by true class and whole degree of slope, [C][90].
         look_alikes: with classes that look alike merged; None where no two do.
     """
@@ -83,14 +86,15 @@ class ClassQuality:
 
 @dataclass(frozen=True, kw_only=True)
 class TraversabilityQuality:
-    """Quality of predicted distributions of traversability; lower is better but for the last three.
+    """Quality of predicted distributions of traversability; lower is better but for the
+    last three.
 
     Args:
         rmse_observed: root mean square of E[λ] − λ as realised.
-        rmse_expected: root mean square of E[λ] − E[λ] in truth, of labelled cells; not a number where there is none
-            or the truth is not known.
-        nll: negative log likelihood of λ as realised, density inside (0, 1) and mass at 0 and 1; not a number for
-            distributions without a density.
+        rmse_expected: root mean square of E[λ] − E[λ] in truth, of labelled cells; not
+            a number where there is none or the truth is not known.
+        nll: negative log likelihood of λ as realised, density inside (0, 1) and mass at
+            0 and 1; not a number for distributions without a density.
         crps: continuous ranked probability score of λ as realised.
         coverage: share of λ in the central 90 % of its prediction; ideally 0.9.
         tail_rate: share of λ under the VaR at level 0.9; ideally 0.1.
@@ -113,7 +117,8 @@ class Quality:
     Args:
         maps: how many maps were predicted.
         traversability: of the distributions.
-        classes: of the class probabilities; empty for a model that predicts no classes, and on maps without any.
+        classes: of the class probabilities; empty for a model that predicts no classes,
+            and on maps without any.
         by_map: what a comparison needs, where it was asked for.
     """
 
@@ -149,10 +154,13 @@ def known_splits(dataset: TerrainDataset, splits: Iterable[str] = ()) -> list[st
     Raises:
         DatasetError: there is no such split, or no test split.
     """
-    chosen = list(dict.fromkeys(splits)) or [name for name in dataset.splits if name.startswith("test/")]
+    chosen = list(dict.fromkeys(splits)) or [
+        name for name in dataset.splits if name.startswith("test/")
+    ]
     if not chosen:
         raise DatasetError(
-            f"Expected a test split in {dataset.path}, got {sorted(dataset.splits)}. Name one in `splits`."
+            f"Expected a test split in {dataset.path}, got {sorted(dataset.splits)}. "
+            "Name one in `splits`."
         )
     for split in chosen:
         dataset.map_count(split)  # refuses an unknown one
@@ -194,7 +202,8 @@ def measure_split(
     device: torch.device = CPU,
     by_map: bool = False,
 ) -> Quality:
-    """Measures a model on one split; by its λ alone where it knows other classes than the maps.
+    """Measures a model on one split; by its λ alone where it knows other classes than
+    the maps.
 
     Args:
         model: any model.
@@ -227,7 +236,8 @@ def measure(
         model: any model.
         chunks: the maps, at least one, a few at a time.
         generator: of the draws within atoms, on the CPU.
-        alike: of each class those that look like it, itself among them; empty where none do.
+        alike: of each class those that look like it, itself among them; empty where
+            none do.
         truth: whether the maps' true distribution of λ is known.
         by_map: keep what a comparison needs, which takes quantiles of every cell.
         classes: measure the model's classes, where it tells any.
@@ -238,7 +248,10 @@ def measure(
     for terrain in chunks:
         predicted, members = _predict(model, terrain)
         kept.add(
-            _score_cells(predicted, terrain, generator, isinstance(model, PrivilegedModel)), len(terrain)
+            _score_cells(
+                predicted, terrain, generator, isinstance(model, PrivilegedModel)
+            ),
+            len(terrain),
         )
         maps += len(terrain)
         if tally.count:
@@ -253,15 +266,21 @@ def measure(
     return Quality(
         maps=maps,
         traversability=TraversabilityQuality(
-            **values, tail_rate=SCORES["tail_rate_90"].value(sums), pit=tuple(kept.pit.tolist())
+            **values,
+            tail_rate=SCORES["tail_rate_90"].value(sums),
+            pit=tuple(kept.pit.tolist()),
         ),
         classes=(tally.quality(),) if tally.confusion.any() else (),
         by_map=kept if by_map else None,
     )
 
 
-def _predict(model: TraversabilityModel, terrain: Terrain) -> tuple[TraversabilityDistribution, Tensor]:
-    """The prediction, and the class probabilities of M members, shape [M, B, C, H, W], M = 0 where there are none."""
+def _predict(
+    model: TraversabilityModel, terrain: Terrain
+) -> tuple[TraversabilityDistribution, Tensor]:
+    """The prediction, and the class probabilities of M members, shape [M, B, C, H, W],
+    M = 0 where there are none.
+    """
     observation = terrain.observe()
     with exact_convolutions():
         members = model.member_probabilities(observation)
@@ -271,11 +290,13 @@ def _predict(model: TraversabilityModel, terrain: Terrain) -> tuple[Traversabili
 
 
 class _ClassTally:
-    """Counts of a model's class probabilities over maps, in the cells whose class is known.
+    """Counts of a model's class probabilities over maps, in the cells whose class is
+    known.
 
     Args:
         count: number of classes C, 0 of a model without any.
-        alike: of each class those that look like it, itself among them; empty where none do.
+        alike: of each class those that look like it, itself among them; empty where
+            none do.
     """
 
     def __init__(self, count: int, alike: Sequence[tuple[int, ...]]) -> None:
@@ -285,15 +306,25 @@ class _ClassTally:
         self.reliability, self.look_alikes = ReliabilityCurve(), LookAlikeTally(alike)
         self.entropy, self.information = ErrorRanking(), ErrorRanking()
 
-    def add(self, probabilities: Tensor, members: Tensor, class_id: Tensor, slope_deg: Tensor) -> None:
-        """Adds maps: probabilities [B, C, H, W], of members [M, B, C, H, W], true classes and slopes [B, H, W]."""
+    def add(
+        self,
+        probabilities: Tensor,
+        members: Tensor,
+        class_id: Tensor,
+        slope_deg: Tensor,
+    ) -> None:
+        """Adds maps: probabilities [B, C, H, W], of members [M, B, C, H, W], true
+        classes and slopes [B, H, W].
+        """
         labelled = class_id != UNLABELLED
         if not bool(labelled.any()):
             return
         if not bool(labelled.all()):
             probabilities = _in_a_row(probabilities[None], labelled)[0]
             members = _in_a_row(members, labelled) if len(members) > 1 else members
-            class_id, slope_deg = (layer[labelled][None, None] for layer in (class_id, slope_deg))
+            class_id, slope_deg = (
+                layer[labelled][None, None] for layer in (class_id, slope_deg)
+            )
         found = probabilities.argmax(1)
         wrong = found != class_id
         self.confusion += multiclass_confusion_matrix(found, class_id, self.count).cpu()
@@ -303,7 +334,9 @@ class _ClassTally:
         if len(members) > 1:
             self.information.update(mutual_information(members), wrong)
         degree = slope_deg.floor().long().clamp(0, 89)
-        counted = torch.bincount((90 * class_id + degree).flatten(), minlength=self.slope_cells.numel())
+        counted = torch.bincount(
+            (90 * class_id + degree).flatten(), minlength=self.slope_cells.numel()
+        )
         self.slope_cells += counted.view_as(self.slope_cells).cpu()
         if self.look_alikes.groups:
             self.look_alikes.add(probabilities, class_id)
@@ -341,18 +374,25 @@ def _in_a_row(layers: Tensor, which: Tensor) -> Tensor:
 
 
 def _score_cells(
-    predicted: TraversabilityDistribution, terrain: Terrain, generator: torch.Generator, privileged: bool
+    predicted: TraversabilityDistribution,
+    terrain: Terrain,
+    generator: torch.Generator,
+    privileged: bool,
 ) -> CellScores | None:
     """What is said of each cell whose λ was observed, None where there are none.
 
-    Of a privileged model, which says nothing where no class is known, cells without a class are left out as well.
+    Of a privileged model, which says nothing where no class is known, cells without a
+    class are left out as well.
     """
     labelled = terrain.class_id != UNLABELLED
     known = ~terrain.traversability.isnan()
     known = known & labelled if privileged else known
     if not bool(known.any()):
         return None
-    predicted, observed = predicted.at(known), terrain.traversability[known].unsqueeze(0)
+    predicted, observed = (
+        predicted.at(known),
+        terrain.traversability[known].unsqueeze(0),
+    )
     expected, transformed = predicted.mean(), pit(predicted, observed, generator)
     labelled = labelled[known]
     return CellScores(
@@ -367,5 +407,7 @@ def _score_cells(
             "crps": predicted.crps(observed).double(),
         },
         labelled=labelled,
-        expected_squares=(expected - terrain.truth.at(known).mean())[0, labelled].double().square(),
+        expected_squares=(expected - terrain.truth.at(known).mean())[0, labelled]
+        .double()
+        .square(),
     )

@@ -1,4 +1,6 @@
-"""Models measured on splits of a dataset, and what a reader of their numbers has to know, in lines of text."""
+"""Models measured on splits of a dataset, and what a reader of their numbers has to
+know, in lines of text.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -34,7 +36,9 @@ class Measurement:
     device: torch.device
     qualities: dict[tuple[str, str], Quality] = field(default_factory=dict)
 
-    def measure(self, pairs: Sequence[tuple[str, Candidate]], what: str, by_map: bool) -> None:
+    def measure(
+        self, pairs: Sequence[tuple[str, Candidate]], what: str, by_map: bool
+    ) -> None:
         """Measure models on splits, with a line of progress.
 
         Args:
@@ -46,7 +50,14 @@ class Measurement:
         def steps() -> Iterator[tuple[int, int]]:
             yield 0, len(pairs)
             for count, (split, one) in enumerate(pairs, 1):
-                quality = measure_split(one.model, self.dataset, split, self.seed, self.device, by_map=by_map)
+                quality = measure_split(
+                    one.model,
+                    self.dataset,
+                    split,
+                    self.seed,
+                    self.device,
+                    by_map=by_map,
+                )
                 self.qualities[split, one.label] = quality
                 yield count, len(pairs)
 
@@ -54,12 +65,20 @@ class Measurement:
 
     def of(self, one: Candidate) -> dict[str, Quality]:
         """Return the qualities of a model by split."""
-        return {split: quality for (split, label), quality in self.qualities.items() if label == one.label}
+        return {
+            split: quality
+            for (split, label), quality in self.qualities.items()
+            if label == one.label
+        }
 
     @cached_property
     def nearest_colour_accuracy(self) -> dict[str, float]:
-        """Fraction of the cells whose class the nearest colour tells, by split on which classes were measured."""
-        classified = {split for (split, _), quality in self.qualities.items() if quality.classes}
+        """Fraction of the cells whose class the nearest colour tells, by split on which
+        classes were measured.
+        """
+        classified = {
+            split for (split, _), quality in self.qualities.items() if quality.classes
+        }
         return {
             split: baselines.nearest_colour_accuracy(self.dataset, split)
             for split in self.splits
@@ -69,29 +88,49 @@ class Measurement:
     @cached_property
     def climatology_crps(self) -> dict[str, float]:
         """CRPS of one distribution of λ for all cells, by split."""
-        return {split: baselines.climatology_crps(self.dataset, split) for split in self.splits}
+        return {
+            split: baselines.climatology_crps(self.dataset, split)
+            for split in self.splits
+        }
 
     @property
     def unknown(self) -> list[str]:
         """Splits of which the truth is unknown."""
-        return [split for split in self.splits if self.dataset.truth_of(split) == "unknown"]
+        return [
+            split for split in self.splits if self.dataset.truth_of(split) == "unknown"
+        ]
 
     @property
     def notes_of_data(self) -> list[str]:
         """What a reader has to know of the maps."""
         lines = []
         if by_colour := self.nearest_colour_accuracy:
-            listed = ", ".join(f"{split} {share:.4f}" for split, share in by_colour.items())
-            lines.append(f"baseline without a model, class of the nearest colour: accuracy {listed}")
-        listed = ", ".join(f"{split} {score:.4f}" for split, score in self.climatology_crps.items())
-        lines.append(f"baseline without a model, one distribution of λ for all cells: CRPS {listed}")
+            listed = ", ".join(
+                f"{split} {share:.4f}" for split, share in by_colour.items()
+            )
+            lines.append(
+                "baseline without a model, class of the nearest colour: accuracy "
+                f"{listed}"
+            )
+        listed = ", ".join(
+            f"{split} {score:.4f}" for split, score in self.climatology_crps.items()
+        )
+        lines.append(
+            "baseline without a model, one distribution of λ for all cells: CRPS "
+            f"{listed}"
+        )
         if self.unknown:
-            parts = [part for split in self.unknown for part in self.dataset.splits[split]["parts"]]
+            parts = [
+                part
+                for split in self.unknown
+                for part in self.dataset.splits[split]["parts"]
+            ]
             observed = "λ that the class table drew at least in part, not measured λ"
             if all(part.get("source", {}).get("traversability") for part in parts):
                 observed = "measured λ"
             lines.append(
-                f"the true distribution of λ is unknown on {', '.join(self.unknown)}: RMSE E[λ] is a dash, and RMSE λ, "
+                f"the true distribution of λ is unknown on {', '.join(self.unknown)}: "
+                "RMSE E[λ] is a dash, and RMSE λ, "
                 f"NLL, CRPS, “in 90 %” and “< VaR” are against {observed}"
             )
         return lines
@@ -107,29 +146,41 @@ class Measurement:
         ]
         if less_accurate:
             splits = ", ".join(less_accurate)
-            warnings.append(f"the model's accuracy is below that of the nearest colour on {splits}")
-        worse = [split for split, own in qualities.items() if own.traversability.crps > climatology[split]]
+            warnings.append(
+                f"the model's accuracy is below that of the nearest colour on {splits}"
+            )
+        worse = [
+            split
+            for split, own in qualities.items()
+            if own.traversability.crps > climatology[split]
+        ]
         if worse:
             splits = ", ".join(worse)
             warnings.append(
-                f"the model's CRPS is worse than that of one distribution for all cells on {splits}"
+                "the model's CRPS is worse than that of one distribution for all "
+                f"cells on {splits}"
             )
         seen = [
             f"{split} (its {one.trained_on[digest]})"
             for split in qualities
             # Checkpoints of earlier versions hold the digest of the arrays alone.
-            for digest in (self.dataset.split_digest(split), self.dataset.splits[split]["digest"])
+            for digest in (
+                self.dataset.split_digest(split),
+                self.dataset.splits[split]["digest"],
+            )
             if digest in one.trained_on
         ]
         if seen:
             warnings.append(
-                f"the model was trained, or selected and calibrated, on the maps of {', '.join(seen)}: these numbers "
+                "the model was trained, or selected and calibrated, on the maps of "
+                f"{', '.join(seen)}: these numbers "
                 "do not hold for unseen maps"
             )
         unknown = [split for split in self.unknown if split in qualities]
         if unknown and one.needs_truth:
             warnings.append(
-                f"on {', '.join(unknown)} this model gives the class table of the recipe, not the truth of the ground"
+                f"on {', '.join(unknown)} this model gives the class table of the "
+                "recipe, not the truth of the ground"
             )
         return [f"warning: {line}" for line in warnings]
 

@@ -1,4 +1,6 @@
-"""The files that measures of models are written to: texts, figures, and a page that shows and explains them."""
+"""The files that measures of models are written to: texts, figures, and a page that
+shows and explains them.
+"""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +25,8 @@ class Page:
 
     Args:
         title: of the page.
-        tables: the first stands under the title, before the notes; the others have headings of their own.
+        tables: the first stands under the title, before the notes; the others have
+            headings of their own.
         notes: lines.
     """
 
@@ -47,9 +50,15 @@ class Page:
 
 
 def write_folder(
-    folder: Path, texts: Mapping[str, str], name: str, page: Page, figures: Sequence[Figure], data: Any
+    folder: Path,
+    texts: Mapping[str, str],
+    name: str,
+    page: Page,
+    figures: Sequence[Figure],
+    data: Any,
 ) -> None:
-    """Write all files of a measurement, in place of figures that are there, and say where they are.
+    """Write all files of a measurement, in place of figures that are there, and say
+    where they are.
 
     Args:
         folder: where to.
@@ -70,7 +79,10 @@ def write_folder(
             yield count, len(figures)
 
     show_progress(saved(), "figures")
-    shown = [(f"{FIGURES}/{figure.name}.png", figure.title, figure.caption(data)) for figure in figures]
+    shown = [
+        (f"{FIGURES}/{figure.name}.png", figure.title, figure.caption(data))
+        for figure in figures
+    ]
     write_text(folder / name, page.to_markdown(shown))
     print(f"wrote {', '.join(texts)}, {name} and {len(figures)} figures in {folder}")
     print(f"columns and figures are explained in {folder / name}")

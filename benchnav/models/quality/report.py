@@ -1,4 +1,6 @@
-"""A model's quality in numbers and words: a table for each kind of file, and what columns and figures mean."""
+"""A model's quality in numbers and words: a table for each kind of file, and what
+columns and figures mean.
+"""
 
 import math
 from collections.abc import Mapping
@@ -16,7 +18,9 @@ from benchnav.models.quality.output import json_text
 from benchnav.stats.tables import Column, cell_of, table_of
 
 
-def quality_table(title: str, qualities: Mapping[str, Quality], whole: bool = False) -> Table:
+def quality_table(
+    title: str, qualities: Mapping[str, Quality], whole: bool = False
+) -> Table:
     """Formats the numbers, a row a split; a number that there is not has a dash.
 
     Args:
@@ -24,18 +28,31 @@ def quality_table(title: str, qualities: Mapping[str, Quality], whole: bool = Fa
         qualities: by split.
         whole: with the numbers that a terminal is too narrow for.
     """
-    table = pd.DataFrame([numbers(quality) for quality in qualities.values()], index=list(qualities))
+    table = pd.DataFrame(
+        [numbers(quality) for quality in qualities.values()], index=list(qualities)
+    )
     # Those that some split has, and those that the truth or the prediction may lack.
-    kept = table.columns[np.isfinite(table).any() | table.columns.isin(["rmse_expected", "nll"])]
-    names = [name for name in COLUMNS if name in kept and (whole or name not in FILES_ONLY)]
+    kept = table.columns[
+        np.isfinite(table).any() | table.columns.isin(["rmse_expected", "nll"])
+    ]
+    names = [
+        name for name in COLUMNS if name in kept and (whole or name not in FILES_ONLY)
+    ]
     rows = [
         {"split": split, "maps": qualities[split].maps, **row}
         for split, row in table[names].to_dict("index").items()
     ]
     columns = [
-        Column("split\n", cell_of("split"), "split of the dataset; maps: the number of its maps."),
+        Column(
+            "split\n",
+            cell_of("split"),
+            "split of the dataset; maps: the number of its maps.",
+        ),
         Column("maps\n", cell_of("maps")),
-        *(Column(COLUMNS[name][0], cell_of(name, _number), COLUMNS[name][1]) for name in names),
+        *(
+            Column(COLUMNS[name][0], cell_of(name, _number), COLUMNS[name][1])
+            for name in names
+        ),
     ]
     return table_of(rows, columns, title=title, numbers=True)
 
@@ -51,27 +68,44 @@ def quality_json(about: Mapping[str, Any], qualities: Mapping[str, Quality]) -> 
         about: what is said of model and data.
         qualities: by split.
     """
-    return json_text(about, {
-        split: {"maps": quality.maps, **_everything(quality)} for split, quality in qualities.items()
-    })  # fmt: skip
+    return json_text(
+        about,
+        {
+            split: {"maps": quality.maps, **_everything(quality)}
+            for split, quality in qualities.items()
+        },
+    )
 
 
 def quality_csv(qualities: Mapping[str, Quality]) -> str:
-    """Writes the numbers as CSV, a row a split, with scenario and severity where it is of a series.
+    """Writes the numbers as CSV, a row a split, with scenario and severity where it is
+    of a series.
 
     `std` stands at severity 0 with no scenario, as it begins every series.
     """
     rows: dict[str, dict[str, Any]] = {
-        split: {"split": split, "scenario": "", "maps": quality.maps, **numbers(quality)}
+        split: {
+            "split": split,
+            "scenario": "",
+            "maps": quality.maps,
+            **numbers(quality),
+        }
         for split, quality in qualities.items()
     }
     for scenario, series in find_series(qualities).items():
         for severity, split in series:
-            rows[split] |= {"scenario": scenario if severity else "", "severity": severity}
-    table = pd.DataFrame(rows.values(), columns=["split", "scenario", "severity", "maps", *COLUMNS])
+            rows[split] |= {
+                "scenario": scenario if severity else "",
+                "severity": severity,
+            }
+    table = pd.DataFrame(
+        rows.values(), columns=["split", "scenario", "severity", "maps", *COLUMNS]
+    )
     if table[LOOK_ALIKES[0]].isna().all():
         table = table.drop(columns=list(LOOK_ALIKES))
-    return table.replace((math.inf, -math.inf), math.nan).to_csv(index=False, float_format="%.6g")
+    return table.replace((math.inf, -math.inf), math.nan).to_csv(
+        index=False, float_format="%.6g"
+    )
 
 
 def numbers(quality: Quality) -> dict[str, float]:

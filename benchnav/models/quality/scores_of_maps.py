@@ -1,4 +1,5 @@
-"""Scores of models that follow from sums over maps (`map_sums`): how they are computed, and which way is better.
+"""Scores of models that follow from sums over maps (`map_sums`): how they are computed,
+and which way is better.
 
 Headings and meanings are those of `columns`, which the tables of one model have too.
 """
@@ -14,26 +15,32 @@ from benchnav.stats.scores import Score
 _COMPARED = {
     "pinball": (
         "pinball\nfifth",
-        "pinball loss of the lower fifth: u·(λ − Q(u)) where λ is at least the quantile Q(u), else (1 − u)·(Q(u) − λ), "
-        "averaged over the levels u = 0.01, 0.02, …, 0.20. It scores the bad end of the prediction; lower is better.",
+        "pinball loss of the lower fifth: u·(λ − Q(u)) where λ is at least the "
+        "quantile Q(u), else (1 − u)·(Q(u) − λ), "
+        "averaged over the levels u = 0.01, 0.02, …, 0.20. It scores the bad end of "
+        "the prediction; lower is better.",
     ),
     "width": (
         "width\n90 %",
-        "sharpness: mean width Q(0.95) − Q(0.05) of the central 90 % interval; narrower is better where “in 90 %” is "
+        "sharpness: mean width Q(0.95) − Q(0.05) of the central 90 % interval; "
+        "narrower is better where “in 90 %” is "
         "right.",
     ),
     "tail_error": (
         "tail\nerror",
-        "tail calibration: mean gap between the share of observed λ below VaR₀.₈, VaR₀.₉ and VaR₀.₉₅, and 0.2, 0.1 and "
+        "tail calibration: mean gap between the share of observed λ below VaR₀.₈, "
+        "VaR₀.₉ and VaR₀.₉₅, and 0.2, 0.1 and "
         "0.05; 0 is perfect.",
     ),
     "ause": (
         "AUSE\n",
-        "area under the sparsification error curve: cells are removed by uncertainty, and by error; the area between "
-        "the two curves of the mean error |λ − E[λ]| of the rest is averaged over maps. 0 is perfect; noise of the "
+        "area under the sparsification error curve: cells are removed by uncertainty, "
+        "and by error; the area between "
+        "the two curves of the mean error |λ − E[λ]| of the rest is averaged over "
+        "maps. 0 is perfect; noise of the "
         "ground keeps any model above it.",
     ),
-}  # fmt: skip
+}
 _UNDER = {level: f"under_{round(100 * level)}" for level in TAIL_LEVELS}
 
 
@@ -47,7 +54,9 @@ def _root(squares: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 
 def _miou(hits: np.ndarray, true: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Return the intersection over union, averaged over the classes that occur in truth."""
+    """Return the intersection over union, averaged over the classes that occur in
+    truth.
+    """
     union = true + found - hits
     overlap: np.ndarray = np.where(true > 0, hits / np.where(union > 0, union, 1), 0.0)
     mean: np.ndarray = overlap.sum(-1) / (true > 0).sum(-1)
@@ -55,15 +64,28 @@ def _miou(hits: np.ndarray, true: np.ndarray, found: np.ndarray) -> np.ndarray:
 
 
 def _tail_error(cells: np.ndarray, *under: np.ndarray) -> np.ndarray:
-    """Return by how far the fractions of λ under the VaR at each level are from 1 − level, on average."""
-    gaps = [abs(_ratio(part, cells) - (1 - level)) for part, level in zip(under, TAIL_LEVELS, strict=True)]
+    """Return by how far the fractions of λ under the VaR at each level are from 1 −
+    level, on average.
+    """
+    gaps = [
+        abs(_ratio(part, cells) - (1 - level))
+        for part, level in zip(under, TAIL_LEVELS, strict=True)
+    ]
     return np.mean(gaps, axis=0)
 
 
-def _score(name: str, *parts: str, of: Any = _ratio, better: Any = "lower", target: Any = None) -> Score:
+def _score(
+    name: str, *parts: str, of: Any = _ratio, better: Any = "lower", target: Any = None
+) -> Score:
     heading, meaning = (COLUMNS | _COMPARED).get(name, ("", ""))
     return Score(
-        name=name, parts=parts, of=of, better=better, target=target, heading=heading, meaning=meaning
+        name=name,
+        parts=parts,
+        of=of,
+        better=better,
+        target=target,
+        heading=heading,
+        meaning=meaning,
     )
 
 
@@ -83,6 +105,7 @@ COMPARED = (
 )
 # Fractions of λ under the VaR at each level, which `tail_error` sums up.
 TAIL_RATES = tuple(
-    _score(f"tail_rate_{round(100 * level)}", part, "cells", better="") for level, part in _UNDER.items()
+    _score(f"tail_rate_{round(100 * level)}", part, "cells", better="")
+    for level, part in _UNDER.items()
 )
 SCORES = {score.name: score for score in (*COMPARED, *TAIL_RATES)}

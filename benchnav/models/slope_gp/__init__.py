@@ -1,1 +1,3 @@
-"""Traversability over slope, class by class: Gaussian processes and soft spots, and the cells they learn from."""
+"""Traversability over slope, class by class: Gaussian processes and soft spots, and the
+cells they learn from.
+"""

@@ -1,18 +1,21 @@
-"""Finding a second mode of a class's traversability, one that slope does not explain: soft spots.
+"""Finding a second mode of a class's traversability, one that slope does not explain:
+soft spots.
 
-A cell of the class is, with probability 1 − p, from a normal distribution about the class's function of
-slope f(ψ) with standard deviation σ, and else from N(m, s²), the same at any slope; what is observed is
-clipped to [0, 1]. The parameters are found by expectation maximisation over counts of cells by slope and
-by λ, in which a cell's share in each mode, and what lies beyond the clip, are the unknowns. Here f is
-any function of small bends; the GP is fitted afterwards to the cells of the main mode.
+A cell of the class is, with probability 1 − p, from a normal distribution about the
+class's function of slope f(ψ) with standard deviation σ, and else from N(m, s²), the
+same at any slope; what is observed is clipped to [0, 1]. The parameters are found by
+expectation maximisation over counts of cells by slope and by λ, in which a cell's share
+in each mode, and what lies beyond the clip, are the unknowns. Here f is any function of
+small bends; the GP is fitted afterwards to the cells of the main mode.
 
-A second mode is kept where there are 100 cells or more, it holds over 1 % of them, BIC very strongly
-prefers it, and every cell is told better by 0.002 nats on average. The last keeps away modes that only
-mend how the main one is drawn, which BIC would keep once there are cells enough. Sources: Dempster, Laird
-and Rubin (1977), "Maximum likelihood from incomplete data via the EM algorithm"; Tobin (1958),
-"Estimation of relationships for limited dependent variables"; Schwarz (1978), "Estimating the dimension
-of a model"; Kass and Raftery (1995), "Bayes factors". Letters in shapes: S starts, B bins of slope, V
-bins of λ, C classes.
+A second mode is kept where there are 100 cells or more, it holds over 1 % of them, BIC
+very strongly prefers it, and every cell is told better by 0.002 nats on average. The
+last keeps away modes that only mend how the main one is drawn, which BIC would keep
+once there are cells enough. Sources: Dempster, Laird and Rubin (1977), "Maximum
+likelihood from incomplete data via the EM algorithm"; Tobin (1958), "Estimation of
+relationships for limited dependent variables"; Schwarz (1978), "Estimating the
+dimension of a model"; Kass and Raftery (1995), "Bayes factors". Letters in shapes: S
+starts, B bins of slope, V bins of λ, C classes.
 """
 
 import math
@@ -39,7 +42,9 @@ _SETTLED = 1e-8  # nats a cell and step
 
 
 class _Modes(NamedTuple):
-    """Parameters of S fits: f of shape [S, B], all others of shape [S, 1]; weight 0 for a single mode."""
+    """Parameters of S fits: f of shape [S, B], all others of shape [S, 1]; weight 0 for
+    a single mode.
+    """
 
     main: Tensor
     main_std: Tensor
@@ -55,8 +60,10 @@ def find_soft_modes(sums: SlopeSums) -> tuple[SoftModes | None, dict[str, Tensor
         sums: of the observed cells of C classes.
 
     Returns:
-        The second modes, None where no class has one; and the sums that the censored likelihood takes, over the
-        cells of the main modes: as `SlopeSums.bins`, and what that gives for a class without a second mode.
+        The second modes, None where no class has one; and the sums that the censored
+        likelihood takes, over the
+        cells of the main modes: as `SlopeSums.bins`, and what that gives for a class
+            without a second mode.
     """
     classes, bins = len(sums.cells), sums.bins(censored=True)
     weight, mean, std = torch.zeros(classes), torch.zeros(classes), torch.ones(classes)
@@ -72,37 +79,55 @@ def find_soft_modes(sums: SlopeSums) -> tuple[SoftModes | None, dict[str, Tensor
     inside = kept[..., 1:-1]
     bins["zeros"][has_two], bins["ones"][has_two] = kept[..., 0], kept[..., -1]
     bins["inside"][has_two] = inside.sum(-1)
-    bins["total"][has_two], bins["squares"][has_two] = inside @ _INSIDE, inside @ _INSIDE**2
+    bins["total"][has_two], bins["squares"][has_two] = (
+        inside @ _INSIDE,
+        inside @ _INSIDE**2,
+    )
     return SoftModes(weight, mean, std), bins
 
 
 def _find_in_class(counts: Tensor) -> _Modes | None:
-    """The two modes of a class, up to its steepest bin with cells; None where it has one mode."""
+    """The two modes of a class, up to its steepest bin with cells; None where it has
+    one mode.
+    """
     total = int(counts.sum())
     if total < LEAST_CELLS:
         return None
     size = int(counts.sum(1).nonzero().max()) + 1
     cells = counts[:size].double()
-    # One mode, level at the mean of all cells, then with a small second one at several places.
+    # One mode, level at the mean of all cells, then with a small second one at several
+    # places.
     level, every = levels(), cells.sum(0)
     mean = (every * level).sum() / every.sum()
-    spread = ((every * (level - mean) ** 2).sum() / every.sum()).sqrt().clamp(min=_FIRST_STD)
+    spread = (
+        ((every * (level - mean) ** 2).sum() / every.sum()).sqrt().clamp(min=_FIRST_STD)
+    )
     none = torch.zeros(1, 1, dtype=torch.float64)
-    flat = _Modes(mean.expand(1, size), spread.view(1, 1), none, none, none + _FIRST_STD)
+    flat = _Modes(
+        mean.expand(1, size), spread.view(1, 1), none, none, none + _FIRST_STD
+    )
     single, single_fit = _maximise(cells, flat, _MOST_STEPS)
     places = torch.tensor(_STARTS, dtype=torch.float64).unsqueeze(1)
     small = single._replace(
-        weight=torch.full_like(places, _FIRST_WEIGHT), mean=places, std=torch.full_like(places, _FIRST_STD)
+        weight=torch.full_like(places, _FIRST_WEIGHT),
+        mean=places,
+        std=torch.full_like(places, _FIRST_STD),
     )
     starts, fits = _maximise(cells, small, _FIRST_STEPS)
     best = _Modes(*(values[fits.argmax()].unsqueeze(0) for values in starts))
     double, double_fit = _maximise(cells, best, _MOST_STEPS)
     least = max(LEAST_GAIN * total, (_FREE_PARAMETERS * math.log(total) + _STRONG) / 2)
-    return double if double.weight > LEAST_WEIGHT and double_fit - single_fit > least else None
+    return (
+        double
+        if double.weight > LEAST_WEIGHT and double_fit - single_fit > least
+        else None
+    )
 
 
 def _maximise(cells: Tensor, modes: _Modes, most_steps: int) -> tuple[_Modes, Tensor]:
-    """Climbs from S starts at once; gives the last parameters and their log likelihoods [S]."""
+    """Climbs from S starts at once; gives the last parameters and their log likelihoods
+    [S].
+    """
     before = torch.tensor(-math.inf, dtype=torch.float64)
     for _ in range(most_steps):
         log_prob, share = _soft_share(modes)
@@ -114,23 +139,36 @@ def _maximise(cells: Tensor, modes: _Modes, most_steps: int) -> tuple[_Modes, Te
 
 
 def _soft_share(modes: _Modes) -> tuple[Tensor, Tensor]:
-    """Log probability of a bin of λ, and the second mode's share in it, each of shape [S, B, V]."""
-    main = _log_prob(modes.main, modes.main_std) + torch.log1p(-modes.weight).unsqueeze(-1)
+    """Log probability of a bin of λ, and the second mode's share in it, each of shape
+    [S, B, V].
+    """
+    main = _log_prob(modes.main, modes.main_std) + torch.log1p(-modes.weight).unsqueeze(
+        -1
+    )
     soft = _log_prob(modes.mean, modes.std) + modes.weight.log().unsqueeze(-1)
     odds = (soft - main).clamp(-_MOST_ODDS, _MOST_ODDS)
     return main + torch.nn.functional.softplus(odds), odds.sigmoid()
 
 
 def _log_prob(mean: Tensor, std: Tensor) -> Tensor:
-    """Of the bins of λ under clipped normal distributions: shape [S, B, V] from means [S, B] and deviations [S, 1]."""
+    """Of the bins of λ under clipped normal distributions: shape [S, B, V] from means
+    [S, B] and deviations [S, 1].
+    """
     z = (_INSIDE - mean.unsqueeze(-1)) / std.unsqueeze(-1)
-    inside = -0.5 * z**2 - (std * math.sqrt(2 * math.pi) * INSIDE_BINS).log().unsqueeze(-1)
-    at_0, at_1 = torch.special.log_ndtr(-mean / std), torch.special.log_ndtr((mean - 1) / std)
+    inside = -0.5 * z**2 - (std * math.sqrt(2 * math.pi) * INSIDE_BINS).log().unsqueeze(
+        -1
+    )
+    at_0, at_1 = (
+        torch.special.log_ndtr(-mean / std),
+        torch.special.log_ndtr((mean - 1) / std),
+    )
     return torch.cat([at_0.unsqueeze(-1), inside, at_1.unsqueeze(-1)], -1)
 
 
 def _improve(cells: Tensor, modes: _Modes, share: Tensor) -> _Modes:
-    """The parameters of greatest expected likelihood, given the shares of the second mode [S, B, V]."""
+    """The parameters of greatest expected likelihood, given the shares of the second
+    mode [S, B, V].
+    """
     soft = cells * share
     count, total, squares = _moments(cells - soft, modes.main, modes.main_std)
     main = _smooth(count, total, modes.main_std)
@@ -150,7 +188,8 @@ def _deviation(variance: Tensor) -> Tensor:
 
 
 def _moments(cells: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Cells, and the sums of their λ and λ² before clipping as far as a normal distribution tells it.
+    """Cells, and the sums of their λ and λ² before clipping as far as a normal
+    distribution tells it.
 
     Args:
         cells: shape [S, B, V].
@@ -162,20 +201,32 @@ def _moments(cells: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor, 
     """
     inside = cells[..., 1:-1]
     total, squares = inside @ _INSIDE, inside @ _INSIDE**2
-    for clipped, edge, sign in ((cells[..., 0], -mean / std, -1), (cells[..., -1], (mean - 1) / std, 1)):
-        # Of a normal variable beyond the edge (Tobin): h = φ/Φ, mean m ± s·h, variance s²(1 − e·h − h²).
-        hazard = torch.exp(-0.5 * edge**2 - torch.special.log_ndtr(edge)) / math.sqrt(2 * math.pi)
+    for clipped, edge, sign in (
+        (cells[..., 0], -mean / std, -1),
+        (cells[..., -1], (mean - 1) / std, 1),
+    ):
+        # Of a normal variable beyond the edge (Tobin): h = φ/Φ, mean m ± s·h, variance
+        # s²(1 − e·h − h²).
+        hazard = torch.exp(-0.5 * edge**2 - torch.special.log_ndtr(edge)) / math.sqrt(
+            2 * math.pi
+        )
         beyond = mean + sign * std * hazard
         total = total + clipped * beyond
-        squares = squares + clipped * (beyond**2 + std**2 * (1 - edge * hazard - hazard**2).clamp(min=0))
+        squares = squares + clipped * (
+            beyond**2 + std**2 * (1 - edge * hazard - hazard**2).clamp(min=0)
+        )
     return cells.sum(-1), total, squares
 
 
 def _smooth(count: Tensor, total: Tensor, std: Tensor) -> Tensor:
-    """f of least squares, its bends held small, from counts and sums of λ by bins of slope, [S, B]."""
+    """f of least squares, its bends held small, from counts and sums of λ by bins of
+    slope, [S, B].
+    """
     bends = torch.eye(count.shape[1], dtype=torch.float64).diff(n=2, dim=0) / _BEND_STD
     variance = std**2
     # A little of the level of all cells settles what the data leave open.
     level = (total.sum(1) / count.sum(1)).unsqueeze(1)
     precision = torch.diag_embed(count / variance + 1e-3) + bends.T @ bends
-    return torch.linalg.solve(precision, (total / variance + 1e-3 * level).unsqueeze(-1)).squeeze(-1)
+    return torch.linalg.solve(
+        precision, (total / variance + 1e-3 * level).unsqueeze(-1)
+    ).squeeze(-1)

@@ -1,4 +1,6 @@
-"""Halves of `valid` for conformal recalibration: maps for stopping and temperature, and maps for scores."""
+"""Halves of `valid` for conformal recalibration: maps for stopping and temperature, and
+maps for scores.
+"""
 
 import numpy as np
 import torch
@@ -15,7 +17,9 @@ _LEAST_MAPS = 4
 
 
 def stopping_every(conformal: bool) -> int:
-    """The n of which stopping and temperature see every n-th map of `valid`, from the first on."""
+    """The n of which stopping and temperature see every n-th map of `valid`, from the
+    first on.
+    """
     return 2 if conformal else 1
 
 
@@ -33,15 +37,18 @@ def check_valid(dataset: TerrainDataset) -> None:
     count = dataset.map_count(VALID)
     expect(
         count >= _LEAST_MAPS,
-        f"at least {_LEAST_MAPS} maps in split {VALID} of {dataset.path} for `conformal`, which takes every second "
-        f"one, got {count}. Its least level is 1 / (n + 1) for n maps: give {VALID} more maps.",
+        f"at least {_LEAST_MAPS} maps in split {VALID} of {dataset.path} for "
+        "`conformal`, which takes every second "
+        f"one, got {count}. Its least level is 1 / (n + 1) for n maps: give {VALID} "
+        "more maps.",
     )
 
 
 def conformal_table(
     model: TraversabilityModel, dataset: TerrainDataset, seed: int, device: torch.device
 ) -> ConformalTable:
-    """Predicts every second map of `valid` and finds the levels that a model's quantiles are to be read at.
+    """Predicts every second map of `valid` and finds the levels that a model's
+    quantiles are to be read at.
 
     Args:
         model: trained, and calibrated, on other maps.
@@ -49,18 +56,28 @@ def conformal_table(
         seed: root seed of the scores of atoms.
         device: where to compute.
     """
-    scores = [_scores(model, dataset, index, seed, device) for index in scored_maps(dataset.map_count(VALID))]
+    scores = [
+        _scores(model, dataset, index, seed, device)
+        for index in scored_maps(dataset.map_count(VALID))
+    ]
     return fit_table(scores)
 
 
 def _scores(
-    model: TraversabilityModel, dataset: TerrainDataset, index: int, seed: int, device: torch.device
+    model: TraversabilityModel,
+    dataset: TerrainDataset,
+    index: int,
+    seed: int,
+    device: torch.device,
 ) -> ndarray:
     """PIT values of the observed cells of a map, float64."""
     terrain = dataset.terrain(VALID, [index]).to(device)
     observed = terrain.traversability
     with torch.no_grad():
-        lower, upper = (share.double() for share in predict(model, terrain).cdf_limits(observed.nan_to_num()))
+        lower, upper = (
+            share.double()
+            for share in predict(model, terrain).cdf_limits(observed.nan_to_num())
+        )
     key = rng.stream_key(seed, "models", "conformal")
     drawn = rng.uniform(key, np.array([index]), tuple(observed.shape[1:]))
     inside = torch.lerp(lower, upper, torch.from_numpy(drawn).to(lower))

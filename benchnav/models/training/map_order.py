@@ -1,7 +1,8 @@
 """The order in which an epoch of training takes the maps, and what is done to each.
 
-To take maps from thousands of shards in any order would open a file for nearly every map. So the shards are put in a
-random order and cut into windows, and the maps of a window are shuffled: a window's files are opened once. Letters in
+To take maps from thousands of shards in any order would open a file for nearly every
+map. So the shards are put in a random order and cut into windows, and the maps of a
+window are shuffled: a window's files are opened once. Letters in
 shapes: B maps in all, b maps in a batch.
 """
 
@@ -16,14 +17,15 @@ from torch.utils.data import Sampler
 
 from benchnav.core import rng
 
-WINDOW_SHARDS = 100  # fewer than the files that a reader keeps open, so that hardly any is opened twice
+# fewer than the files that a reader keeps open, so that hardly any is opened twice
+WINDOW_SHARDS = 100
 
 
 def map_order(shards: Sequence[int], seed: int, epoch: int) -> np.ndarray:
     """Draws the order of an epoch, a pure function of its arguments.
 
-    Windows have nearly the same number of shards, 100 at most. So many shards as fit into one window are shuffled as
-    one file with all their maps would be.
+    Windows have nearly the same number of shards, 100 at most. So many shards as fit
+    into one window are shuffled as one file with all their maps would be.
 
     Args:
         shards: how many maps each holds, in order.
@@ -34,10 +36,14 @@ def map_order(shards: Sequence[int], seed: int, epoch: int) -> np.ndarray:
         Indices of the maps, int64, shape [B].
     """
     which = np.array([epoch])
-    turn = rng.permutation(rng.stream_key(seed, "models", "shard order"), which, len(shards))[0]
+    turn = rng.permutation(
+        rng.stream_key(seed, "models", "shard order"), which, len(shards)
+    )[0]
     windows = -(-len(shards) // WINDOW_SHARDS)
     window = turn * windows // len(shards)
-    drawn = rng.uniform(rng.stream_key(seed, "models", "map order"), which, (sum(shards),))[0]
+    drawn = rng.uniform(
+        rng.stream_key(seed, "models", "map order"), which, (sum(shards),)
+    )[0]
     return np.lexsort((drawn, np.repeat(window, shards)))
 
 
@@ -48,8 +54,10 @@ class MapKey(NamedTuple):
         maps: indices of the maps, int64, shape [b].
         symmetry: that each is turned by, int64, shape [b].
         factors: of `apply_jitter`, shape [b, 3].
-        origin: first row and column of the square that is cut from each, int64, shape [b, 2].
-        look: uniform numbers that decide what of each is seen, see `RandomMasks`, float64, shape [b, 8].
+        origin: first row and column of the square that is cut from each, int64, shape
+            [b, 2].
+        look: uniform numbers that decide what of each is seen, see `RandomMasks`,
+            float64, shape [b, 8].
     """
 
     maps: Tensor
@@ -59,7 +67,9 @@ class MapKey(NamedTuple):
     look: Tensor
 
 
-def crop_origins(shape: tuple[int, int], crop: int, seed: int, epoch: int, count: int) -> np.ndarray:
+def crop_origins(
+    shape: tuple[int, int], crop: int, seed: int, epoch: int, count: int
+) -> np.ndarray:
     """Draws where squares are cut from maps, by (seed, epoch, place).
 
     Args:
@@ -74,7 +84,9 @@ def crop_origins(shape: tuple[int, int], crop: int, seed: int, epoch: int, count
     """
     if not crop:
         return np.zeros((count, 2), dtype=np.int64)
-    drawn = rng.uniform(rng.stream_key(seed, "models", "map crop"), np.array([epoch]), (count, 2))[0]
+    drawn = rng.uniform(
+        rng.stream_key(seed, "models", "map crop"), np.array([epoch]), (count, 2)
+    )[0]
     return (drawn * (np.array(shape) - crop + 1)).astype(np.int64)
 
 
@@ -89,17 +101,22 @@ def draw_looks(seed: int, epoch: int, count: int) -> np.ndarray:
     Returns:
         Uniform in (0, 1), float64, shape [count, 8].
     """
-    return rng.uniform(rng.stream_key(seed, "models", "map look"), np.array([epoch]), (count, 8))[0]
+    return rng.uniform(
+        rng.stream_key(seed, "models", "map look"), np.array([epoch]), (count, 8)
+    )[0]
 
 
 def squares_a_map(shape: tuple[int, int], crop: int) -> int:
-    """Squares that a training map gives an epoch: as many as it has room for; 1 of whole maps."""
+    """Squares that a training map gives an epoch: as many as it has room for; 1 of
+    whole maps.
+    """
     return (shape[0] // crop) * (shape[1] // crop) if crop else 1
 
 
 @dataclass(eq=False)
 class MapSampler(Sampler[MapKey]):
-    """Cuts the maps into batches of nearly equal size, in an order keyed by (seed, epoch).
+    """Cuts the maps into batches of nearly equal size, in an order keyed by (seed,
+    epoch).
 
     Args:
         maps: how many there are.
@@ -108,11 +125,13 @@ class MapSampler(Sampler[MapKey]):
         symmetries: which symmetries to draw from; (0,) leaves maps as they are.
         jitter: largest relative change of brightness, contrast and saturation.
         shuffle: whether order, symmetries and squares change each epoch.
-        share: (i, n): of every batch take the i-th of n interleaved parts, for one of n processes.
+        share: (i, n): of every batch take the i-th of n interleaved parts, for one of n
+            processes.
         crop: cells of a side of the squares that are cut from maps; 0 takes whole maps.
         shape: (H, W) of the maps that squares are cut from.
         epoch: that the next iteration gives.
-        shards: how many maps each file of the dataset holds, in order; none where one holds them all.
+        shards: how many maps each file of the dataset holds, in order; none where one
+            holds them all.
     """
 
     maps: int
@@ -148,14 +167,23 @@ class MapSampler(Sampler[MapKey]):
             squares = count // self.maps
             shards = tuple(squares * maps for maps in self.shards or (self.maps,))
             order = map_order(shards, self.seed, self.epoch) // squares
-        drawn = rng.uniform(rng.stream_key(self.seed, "models", "map symmetry"), epoch, (count,))[0]
-        symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
-        drawn = rng.uniform(rng.stream_key(self.seed, "models", "map jitter"), epoch, (count, 3))[0]
+        drawn = rng.uniform(
+            rng.stream_key(self.seed, "models", "map symmetry"), epoch, (count,)
+        )[0]
+        symmetry = np.array(self.symmetries)[
+            (drawn * len(self.symmetries)).astype(np.int64)
+        ]
+        drawn = rng.uniform(
+            rng.stream_key(self.seed, "models", "map jitter"), epoch, (count, 3)
+        )[0]
         factors = 1 + self.jitter * (2 * drawn - 1)
         origins = crop_origins(self.shape, self.crop, self.seed, number, count)
         looks = draw_looks(self.seed, number, count)
         first, step = self.share
-        pieces = (np.array_split(v, len(self)) for v in (order, symmetry, factors, origins, looks))
+        pieces = (
+            np.array_split(v, len(self))
+            for v in (order, symmetry, factors, origins, looks)
+        )
         for batch in zip(*pieces, strict=True):
             start = min(first, len(batch[0]) - 1)  # no process is left without a map
             yield MapKey(*(torch.from_numpy(values[start::step]) for values in batch))

@@ -1,1 +1,3 @@
-"""The field's ways to predict uncertainty, as trainable models: a file each, on one network."""
+"""The field's ways to predict uncertainty, as trainable models: a file each, on one
+network.
+"""

@@ -1,11 +1,14 @@
-"""Deep evidential regression: a normal-inverse-gamma distribution over mean and variance of each cell.
+"""Deep evidential regression: a normal-inverse-gamma distribution over mean and
+variance of each cell.
 
-λ is then Student-t with 2α degrees of freedom about γ, of scale² β (1 + ν) / (ν α). It is predicted as Gaussians of one
-mean whose precisions are weighed by the gamma distribution, and clipped to [0, 1]: within 10⁻⁴ of the t's CDF. The
-loss is the authors', which does not censor. Its epistemic share, β / (ν (α − 1)), is not identified by the likelihood:
-a reference row of the field with a known weakness.
-Sources: Amini et al. (2020), "Deep evidential regression"; Meinert et al. (2023), "The unreasonable effectiveness of
-deep evidential regression". Letters in shapes: B maps, H×W cells, K nodes.
+λ is then Student-t with 2α degrees of freedom about γ, of scale² β (1 + ν) / (ν α). It
+is predicted as Gaussians of one mean whose precisions are weighed by the gamma
+distribution, and clipped to [0, 1]: within 10⁻⁴ of the t's CDF. The loss is the
+authors', which does not censor. Its epistemic share, β / (ν (α − 1)), is not identified
+by the likelihood: a reference row of the field with a known weakness.
+Sources: Amini et al. (2020), "Deep evidential regression"; Meinert et al. (2023), "The
+unreasonable effectiveness of deep evidential regression". Letters in shapes: B maps,
+H×W cells, K nodes.
 """
 
 import math
@@ -21,9 +24,13 @@ from benchnav.models.config import JoinedConfig
 from benchnav.models.nets.joined import JoinedModel
 from benchnav.models.nets.trainable import Loss
 
-Evidence = tuple[Tensor, Tensor, Tensor, Tensor]  # γ, ν > 0, α > 1 and β > 0, each of shape [B, 1, H, W]
+Evidence = tuple[
+    Tensor, Tensor, Tensor, Tensor
+]  # γ, ν > 0, α > 1 and β > 0, each of shape [B, 1, H, W]
 
-_NODES = torch.linspace(-7, 3.5, 20, dtype=torch.float64)  # of log precision, in its standard deviations
+_NODES = torch.linspace(
+    -7, 3.5, 20, dtype=torch.float64
+)  # of log precision, in its standard deviations
 _LEAST = 1e-3  # of ν and α − 1
 _LEAST_BETA = 1e-5
 _FIRST = (0.5, 0.5413, 0.5413, -2.25)  # γ = 0.5, ν = 1, α = 2, β = 0.1
@@ -34,7 +41,8 @@ class EvidentialConfig(JoinedConfig):
     """What the network is and how it is trained.
 
     Args:
-        regulariser: weight of |λ − γ| (2ν + α), which takes evidence away where the mean is wrong.
+        regulariser: weight of |λ − γ| (2ν + α), which takes evidence away where the
+            mean is wrong.
     """
 
     regulariser: float = 0.01
@@ -42,7 +50,10 @@ class EvidentialConfig(JoinedConfig):
     def __post_init__(self) -> None:
         """Refuses numbers that cannot train."""
         super().__post_init__()
-        expect(0 <= self.regulariser < math.inf, f"`regulariser` ≥ 0, got {self.regulariser!r}.")
+        expect(
+            0 <= self.regulariser < math.inf,
+            f"`regulariser` ≥ 0, got {self.regulariser!r}.",
+        )
 
 
 class EvidentialModel(JoinedModel):
@@ -79,10 +90,11 @@ class EvidentialModel(JoinedModel):
     def to_distribution(self, outputs: Evidence) -> TraversabilityMixture:
         """The Student-t, clipped, as a mixture of K Gaussians."""
         mean, nu, alpha, beta = (value.double() for value in outputs)
-        # log precision has mean ψ(α) and variance ψ′(α); τ ~ Gamma(α, 1), of density τ^α exp(−τ) over log τ.
-        log_tau = torch.digamma(alpha) + torch.polygamma(1, alpha).sqrt() * _NODES.to(mean.device).view(
-            -1, 1, 1
-        )
+        # log precision has mean ψ(α) and variance ψ′(α); τ ~ Gamma(α, 1), of density
+        # τ^α exp(−τ) over log τ.
+        log_tau = torch.digamma(alpha) + torch.polygamma(1, alpha).sqrt() * _NODES.to(
+            mean.device
+        ).view(-1, 1, 1)
         weights = (alpha * log_tau - log_tau.exp()).softmax(1)
         stds = (beta * (1 + nu) / nu / log_tau.exp()).sqrt()
         dtype, means = outputs[0].dtype, outputs[0].expand_as(stds).contiguous()
@@ -90,7 +102,8 @@ class EvidentialModel(JoinedModel):
 
 
 def evidential_loss(evidence: Evidence, observed: Tensor, regulariser: float) -> Tensor:
-    """Negative log density of the Student-t, and `regulariser` times |λ − γ| (2ν + α); equations 8 and 9.
+    """Negative log density of the Student-t, and `regulariser` times |λ − γ| (2ν + α);
+    equations 8 and 9.
 
     Args:
         evidence: γ, ν, α and β.

@@ -1,11 +1,14 @@
 """Quantile regression: the quantiles of λ at many levels at once, by the pinball loss.
 
-Q is a median and slopes ≥ 0 over normal scores between the levels, so that quantiles cannot cross, and is clipped to
-[0, 1]; equal slopes are a Gaussian, with which training begins. An observed 0 or 1 is learned as −0.1 or 1.1: quantiles
-of an atom then lie clearly beyond the range and are clipped to it, which is exact, since clipping is monotone. No loss
-tells the ends of a distribution: of what is beyond the outermost levels half is put on 0 and on 1, so that no
-observation is impossible.
-Sources: Koenker and Bassett (1978), "Regression quantiles"; Powell (1986), "Censored regression quantiles". Letters in
+Q is a median and slopes ≥ 0 over normal scores between the levels, so that quantiles
+cannot cross, and is clipped to [0, 1]; equal slopes are a Gaussian, with which training
+begins. An observed 0 or 1 is learned as −0.1 or 1.1: quantiles of an atom then lie
+clearly beyond the range and are clipped to it, which is exact, since clipping is
+monotone. No loss
+tells the ends of a distribution: of what is beyond the outermost levels half is put on
+0 and on 1, so that no observation is impossible.
+Sources: Koenker and Bassett (1978), "Regression quantiles"; Powell (1986), "Censored
+    regression quantiles". Letters in
 shapes: B maps, H×W cells, Q inner levels.
 """
 
@@ -26,7 +29,12 @@ INNER = LEVELS[1:-1]
 _ALL = (0.0, INNER[0] / 2, *INNER, (1 + INNER[-1]) / 2, 1.0)
 _MEDIAN = INNER.index(0.5)
 _BEYOND = 0.1
-_STEPS = torch.special.ndtri(torch.tensor(INNER, dtype=torch.float64)).diff().float().view(-1, 1, 1)
+_STEPS = (
+    torch.special.ndtri(torch.tensor(INNER, dtype=torch.float64))
+    .diff()
+    .float()
+    .view(-1, 1, 1)
+)
 _FIRST_STD = 0.2
 
 
@@ -53,7 +61,9 @@ class QuantileModel(JoinedModel):
 
     def to_outputs(self, numbers: Tensor) -> Tensor:
         """Quantiles before clipping, ascending, shape [B, Q, H, W]."""
-        rise = (nn.functional.softplus(numbers[:, 1:]) * _STEPS.to(numbers.device)).cumsum(1)
+        rise = (
+            nn.functional.softplus(numbers[:, 1:]) * _STEPS.to(numbers.device)
+        ).cumsum(1)
         rise = torch.cat([torch.zeros_like(rise[:, :1]), rise], 1)
         return numbers[:, :1] + rise - rise[:, _MEDIAN : _MEDIAN + 1]
 
@@ -61,7 +71,11 @@ class QuantileModel(JoinedModel):
         """The pinball loss in the mean over the inner levels."""
 
         def loss(outputs: Tensor, observed: Tensor) -> Tensor:
-            beyond = torch.where(observed <= 0, -_BEYOND, torch.where(observed >= 1, 1 + _BEYOND, observed))
+            beyond = torch.where(
+                observed <= 0,
+                -_BEYOND,
+                torch.where(observed >= 1, 1 + _BEYOND, observed),
+            )
             return pinball(outputs, INNER, beyond)
 
         return loss
@@ -72,7 +86,9 @@ class QuantileModel(JoinedModel):
         none, whole = torch.zeros_like(inside[:, :2]), torch.ones_like(inside[:, :2])
         return QuantileDistribution(torch.cat([none, inside, whole], 1), _ALL)
 
-    def sharpen(self, distribution: TraversabilityDistribution) -> TraversabilityDistribution:
+    def sharpen(
+        self, distribution: TraversabilityDistribution
+    ) -> TraversabilityDistribution:
         """Applies the temperature T: quantiles at u are those that were at Φ(T·Φ⁻¹(u))."""
         if self.temperature == 1:
             return distribution
@@ -81,7 +97,8 @@ class QuantileModel(JoinedModel):
 
 
 def pinball(quantiles: Tensor, levels: tuple[float, ...], observed: Tensor) -> Tensor:
-    """Pinball loss: max(u e, (u − 1) e) at level u, where e is the observed λ less the quantile.
+    """Pinball loss: max(u e, (u − 1) e) at level u, where e is the observed λ less the
+    quantile.
 
     Args:
         quantiles: shape [B, Q, H, W].
@@ -93,6 +110,8 @@ def pinball(quantiles: Tensor, levels: tuple[float, ...], observed: Tensor) -> T
     """
     seen = observed.isfinite()
     error = torch.where(seen, observed, 0.5).unsqueeze(1) - quantiles
-    share = torch.tensor(levels, dtype=quantiles.dtype, device=quantiles.device).view(-1, 1, 1)
+    share = torch.tensor(levels, dtype=quantiles.dtype, device=quantiles.device).view(
+        -1, 1, 1
+    )
     loss = torch.maximum(share * error, (share - 1) * error).mean(1)
     return torch.where(seen, loss, 0.0).sum() / seen.sum().clamp(min=1)

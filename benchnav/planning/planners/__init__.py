@@ -1,1 +1,3 @@
-"""Planners: the protocol they share, and the shipped ones; `pyproject.toml` gives each its name."""
+"""Planners: the protocol they share, and the shipped ones; `pyproject.toml` gives each
+its name.
+"""

@@ -1,8 +1,9 @@
-"""The boundary between a planner and what it steers: copies go out, what comes back is checked.
+"""The boundary between a planner and what it steers: copies go out, what comes back is
+checked.
 
-A planner may write into whatever it is given without moving a robot or changing a map. An answer that no
-robot can carry out is a fault of its episodes, never an error of the loop. Letters in shapes: B episodes,
-S state and A action dimensions.
+A planner may write into whatever it is given without moving a robot or changing a map.
+An answer that no robot can carry out is a fault of its episodes, never an error of the
+loop. Letters in shapes: B episodes, S state and A action dimensions.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +25,8 @@ class Answer:
     """What a planner said, made safe.
 
     Args:
-        action: finite actions; zeros within the bounds for faulty episodes, shape [B, A].
+        action: finite actions; zeros within the bounds for faulty episodes, shape [B,
+            A].
         plan_state: to be handed back at the next step.
         plan: its status has shape [B]; layers that cannot be drawn are left out.
         faulty: which episodes got what no robot can do, bool, shape [B].
@@ -52,13 +54,17 @@ def begin(planner: Planner[Any], problem: Problem, generator: torch.Generator) -
     return planner.init(problem.clone(), generator)
 
 
-def revise(planner: Planner[Any], plan_state: Any, problem: Problem, generator: torch.Generator) -> Any:
-    """Lets a planner go on under another λ̂, on a copy of the problem; one that cannot begins anew.
+def revise(
+    planner: Planner[Any], plan_state: Any, problem: Problem, generator: torch.Generator
+) -> Any:
+    """Lets a planner go on under another λ̂, on a copy of the problem; one that cannot
+    begins anew.
 
     Args:
         planner: any planner; what it raises passes through.
         plan_state: from the last answer.
-        problem: B problems that start where the robots are; not changed, whatever the planner does.
+        problem: B problems that start where the robots are; not changed, whatever the
+            planner does.
         generator: the planner's randomness, for one that begins anew.
 
     Returns:
@@ -79,11 +85,14 @@ def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) ->
         problem: for the bounds of the actions; the planner is not given it.
 
     Returns:
-        The answer. A wrong type, shape, dtype or device makes every episode faulty, an action that is not
-        finite its own alone.
+        The answer. A wrong type, shape, dtype or device makes every episode faulty, an
+        action that is not finite its own alone.
     """
     said = planner.plan(step.clone(), plan_state)
-    standing, nothing = standing_actions(problem), Plan.empty(len(problem), step.state.device)
+    standing, nothing = (
+        standing_actions(problem),
+        Plan.empty(len(problem), step.state.device),
+    )
     if fault := find_fault(said, problem):
         everyone = torch.ones_like(step.traversability, dtype=torch.bool)
         return Answer(standing, plan_state, nothing, everyone, fault)
@@ -92,13 +101,23 @@ def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) ->
     if find_layer_faults(plan, problem):
         plan = replace(nothing, status=plan.status)
     return Answer(
-        torch.where(faulty[:, None], standing, action.detach()), following, plan, faulty, NOT_FINITE
+        torch.where(faulty[:, None], standing, action.detach()),
+        following,
+        plan,
+        faulty,
+        NOT_FINITE,
     )
 
 
 def standing_actions(problem: Problem) -> Tensor:
-    """What harms least where there is no answer: zeros, within the bounds, shape [B, A]."""
-    return torch.zeros_like(problem.action_bounds[0]).clamp(*problem.action_bounds).expand(len(problem), -1)
+    """What harms least where there is no answer: zeros, within the bounds, shape [B,
+    A].
+    """
+    return (
+        torch.zeros_like(problem.action_bounds[0])
+        .clamp(*problem.action_bounds)
+        .expand(len(problem), -1)
+    )
 
 
 def find_fault(said: Any, problem: Problem) -> str:
@@ -114,12 +133,18 @@ def find_fault(said: Any, problem: Problem) -> str:
     action, _, plan = said
     batch, like = len(problem), problem.start
     if fault := find_tensor_fault(
-        "actions", action, like.dtype, (batch, len(problem.robot.action_low)), like.device
+        "actions",
+        action,
+        like.dtype,
+        (batch, len(problem.robot.action_low)),
+        like.device,
     ):
         return fault
     if not isinstance(plan, Plan):
         return f"Expected a Plan beside the actions, got {type(plan).__name__}."
-    return find_tensor_fault("`Plan.status`", plan.status, torch.int64, (batch,), like.device)
+    return find_tensor_fault(
+        "`Plan.status`", plan.status, torch.int64, (batch,), like.device
+    )
 
 
 def find_layer_faults(plan: Plan, problem: Problem) -> list[str]:
@@ -135,5 +160,8 @@ def find_layer_faults(plan: Plan, problem: Problem) -> list[str]:
         got = list(layer.shape) if isinstance(layer, Tensor) else type(layer).__name__
         fits = isinstance(layer, Tensor) and layer.ndim == len(inner) + 2
         if not fits or (layer.shape[0], layer.shape[-1]) != (batch, 2):
-            faults.append(f"Expected `Plan.{name}` of shape [{batch}, {', '.join(inner)}, 2], got {got}.")
+            faults.append(
+                f"Expected `Plan.{name}` of shape [{batch}, {', '.join(inner)}, 2], "
+                f"got {got}."
+            )
     return faults

@@ -1,12 +1,12 @@
 """The one place that decides what is compiled.
 
-`torch.compile` fuses a rollout's many small operations, which pays once there are many rollouts. It needs
-a C++ compiler at run time; without one the same code runs eagerly, and one line says so. PyTorch's own
-switch `TORCH_COMPILE_DISABLE=1` turns it off.
+`torch.compile` fuses a rollout's many small operations, which pays once there are many
+rollouts. It needs a C++ compiler at run time; without one the same code runs eagerly,
+and one line says so. PyTorch's own switch `TORCH_COMPILE_DISABLE=1` turns it off.
 
-Whether a planner runs compiled depends on its settings and on the device alone: not on how many episodes
-a batch has, nor on what the process compiled before, since compiled and eager results differ in their last
-bits and much in speed.
+Whether a planner runs compiled depends on its settings and on the device alone: not on
+how many episodes a batch has, nor on what the process compiled before, since compiled
+and eager results differ in their last bits and much in speed.
 """
 
 import logging
@@ -23,13 +23,19 @@ R = TypeVar("R")
 
 
 def can_compile() -> bool:
-    """Tells whether anything is compiled here: PyTorch's switch is not off, and there is a C++ compiler."""
+    """Tells whether anything is compiled here: PyTorch's switch is not off, and there
+    is a C++ compiler.
+    """
     compilers = (os.environ.get("CXX", ""), "g++", "clang++")
-    return not _is_switched_off() and any(shutil.which(name) for name in compilers if name)
+    return not _is_switched_off() and any(
+        shutil.which(name) for name in compilers if name
+    )
 
 
 def _is_switched_off() -> bool:
-    """Return whether PyTorch compiles nothing; its compiler, which takes a second to import, need not be loaded."""
+    """Return whether PyTorch compiles nothing; its compiler, which takes a second to
+    import, need not be loaded.
+    """
     if "torch._dynamo" in sys.modules:
         return bool(torch._dynamo.config.disable)
     return os.environ.get("TORCH_COMPILE_DISABLE") == "1"
@@ -41,24 +47,37 @@ def worth_compiling(rollouts: int, least: int, device: torch.device) -> bool:
 
 
 class Fused(Generic[R]):
-    """A pure function that is compiled at its first call, or runs as it is where that cannot be done.
+    """A pure function that is compiled at its first call, or runs as it is where that
+    cannot be done.
 
-    It is compiled once for a single episode and once for any number of them, so that a batch may shrink. Each
+    It is compiled once for a single episode and once for any number of them, so that a
+    batch may shrink. Each
     holds its own verdict: one that cannot be compiled leaves all others as they are.
 
     Args:
-        function: takes and returns tensors, one of them first, alone or in named tuples; it must not change them.
+        function: takes and returns tensors, one of them first, alone or in named
+            tuples; it must not change them.
         rollouts: how many of an episode a call is for.
-        least: so many are worth the seconds that compiling takes. Fewer run eagerly, which takes the same time however
-            few they are.
-        batched: indices of the arguments whose first dimension is that of the episodes, each item of a tuple counted.
+        least: so many are worth the seconds that compiling takes. Fewer run eagerly,
+            which takes the same time however few they are.
+        batched: indices of the arguments whose first dimension is that of the episodes,
+            each item of a tuple counted.
     """
 
     def __init__(
-        self, function: Callable[..., R], rollouts: int, least: int, batched: tuple[int, ...] = ()
+        self,
+        function: Callable[..., R],
+        rollouts: int,
+        least: int,
+        batched: tuple[int, ...] = (),
     ) -> None:
         """Keeps the function; nothing is compiled yet."""
-        self._function, self._rollouts, self._least, self._batched = function, rollouts, least, batched
+        self._function, self._rollouts, self._least, self._batched = (
+            function,
+            rollouts,
+            least,
+            batched,
+        )
         self._fused: Callable[..., R] | None = None
         self._seen: set[tuple[object, ...]] = set()
         self.compiled: bool | None = None
@@ -68,33 +87,48 @@ class Fused(Generic[R]):
         """Calls the function."""
         if self.compiled is False:
             return self._function(*args)
-        items = [item for arg in args for item in (arg if isinstance(arg, tuple) else (arg,))]
+        items = [
+            item for arg in args for item in (arg if isinstance(arg, tuple) else (arg,))
+        ]
         if self.compiled is None and (
-            _is_switched_off() or not worth_compiling(self._rollouts, self._least, items[0].device)
+            _is_switched_off()
+            or not worth_compiling(self._rollouts, self._least, items[0].device)
         ):
             self.compiled = False
             return self._function(*args)
         signature = self._signature(items)
         try:
             result = self._call([type(arg) for arg in args], items, signature)
-        except (torch._dynamo.exc.TorchDynamoException, torch._dynamo.exc.FailOnRecompileLimitHit) as error:
+        except (
+            torch._dynamo.exc.TorchDynamoException,
+            torch._dynamo.exc.FailOnRecompileLimitHit,
+        ) as error:
             self.compiled = False
             reason = str(error).strip().splitlines()[0]
-            print(f"benchnav: running uncompiled, several times slower: {reason}", file=sys.stderr)
+            print(
+                f"benchnav: running uncompiled, several times slower: {reason}",
+                file=sys.stderr,
+            )
             return self._function(*args)
         self._seen.add(signature)
         self.compiled = True
         return result
 
-    def _call(self, kinds: list[type], items: list[Any], signature: tuple[object, ...]) -> R:
+    def _call(
+        self, kinds: list[type], items: list[Any], signature: tuple[object, ...]
+    ) -> R:
         """Runs what is compiled, for a new signature under the settings of compiling."""
         if self._fused is None:
-            self._fused = torch.compile(_of_items(self._function, kinds), dynamic=False, fullgraph=True)
+            self._fused = torch.compile(
+                _of_items(self._function, kinds), dynamic=False, fullgraph=True
+            )
         if signature in self._seen:
             try:
                 return self._fused(*items)
             except torch._dynamo.exc.FailOnRecompileLimitHit:
-                pass  # what it was compiled for has changed in what the signature does not tell
+                # what it was compiled for has changed in what the signature does not
+                # tell
+                pass
         with _compiling(checked=not all(map(_is_ours, items))):
             for index in self._batched:
                 # The number of episodes may be any, except one.
@@ -103,7 +137,9 @@ class Fused(Generic[R]):
             return self._fused(*items)
 
     def _signature(self, items: list[Any]) -> tuple[object, ...]:
-        """What a call is compiled for: shapes, dtypes and devices of tensors, the other arguments, PyTorch's modes."""
+        """What a call is compiled for: shapes, dtypes and devices of tensors, the other
+        arguments, PyTorch's modes.
+        """
         found: list[object] = [
             torch.is_inference_mode_enabled(),
             torch.is_grad_enabled(),
@@ -111,7 +147,11 @@ class Fused(Generic[R]):
         ]
         for index, item in enumerate(items):
             if isinstance(item, torch.Tensor):
-                shape = (len(item) > 1, item.shape[1:]) if index in self._batched else item.shape
+                shape = (
+                    (len(item) > 1, item.shape[1:])
+                    if index in self._batched
+                    else item.shape
+                )
                 found.append((shape, item.dtype, item.device))
             else:
                 found.append(_key(item))
@@ -119,7 +159,8 @@ class Fused(Generic[R]):
 
 
 def _of_items(function: Callable[..., R], kinds: list[type]) -> Callable[..., R]:
-    """Return a function of single items, whose checks at each call are cheaper than those of tuples.
+    """Return a function of single items, whose checks at each call are cheaper than
+    those of tuples.
 
     Args:
         function: takes arguments of these kinds.
@@ -140,20 +181,23 @@ def _of_items(function: Callable[..., R], kinds: list[type]) -> Callable[..., R]
 
 @contextmanager
 def _compiling(checked: bool) -> Iterator[None]:
-    """Settings of PyTorch under which a call is compiled; they take longer to set than a rollout, so only then.
+    """Settings of PyTorch under which a call is compiled; they take longer to set than
+    a rollout, so only then.
 
     Args:
         checked: whether indices are checked that are computed on the way.
     """
     import torch._inductor.config  # imported here: it takes a second
 
-    # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on the CPU.
+    # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on
+    # the CPU.
     notices = logging.getLogger("torch.utils.cpp_extension")
     level = notices.level
     notices.setLevel(logging.ERROR)
     try:
         with (
-            # PyTorch's own limit, a few shapes in a process, would make results depend on earlier runs.
+            # PyTorch's own limit, a few shapes in a process, would make results depend
+            # on earlier runs.
             torch._dynamo.config.patch(
                 recompile_limit=sys.maxsize,
                 accumulated_recompile_limit=sys.maxsize,
@@ -168,7 +212,9 @@ def _compiling(checked: bool) -> Iterator[None]:
 
 
 def _key(arg: object) -> object:
-    """An argument by its value where that has a hash; else which object it is, as of a frozen robot with a list."""
+    """An argument by its value where that has a hash; else which object it is, as of a
+    frozen robot with a list.
+    """
     try:
         hash(arg)
     except TypeError:
@@ -177,7 +223,8 @@ def _key(arg: object) -> object:
 
 
 def _is_ours(arg: object) -> bool:
-    """Tells what is of PyTorch or of this package, whose lookups keep to the map, from a user's robot or objective.
+    """Tells what is of PyTorch or of this package, whose lookups keep to the map, from
+    a user's robot or objective.
 
     To check each index takes a third of the time.
     """

@@ -1,12 +1,16 @@
-"""Risk of the cost: action sequences are rolled out on whole fields of λ, and judged by the tail of what they cost.
+"""Risk of the cost: action sequences are rolled out on whole fields of λ, and judged by
+the tail of what they cost.
 
-A risk map tells each cell's risk on its own. What a way costs adds up over cells that hang together, and its tail is
-that of the sum: CVaR over M fields of the cost of a sequence of actions on each. On fields and on a risk map alike,
-ground of little λ may immobilise a robot (`advance_entrapped`), of which the motion model alone does not know. Source:
-Cai et al. (2024), "EVORA: Deep evidential traversability learning for risk-aware off-road autonomy", CVaR-Cost.
+A risk map tells each cell's risk on its own. What a way costs adds up over cells that
+hang together, and its tail is
+that of the sum: CVaR over M fields of the cost of a sequence of actions on each. On
+fields and on a risk map alike, ground of little λ may immobilise a robot
+(`advance_entrapped`), of which the motion model alone does not know. Source: Cai et al.
+(2024), "EVORA: Deep evidential traversability learning for risk-aware off-road
+autonomy", CVaR-Cost.
 
-Letters in shapes: B episodes, M fields, K samples, T steps, S state and A action dimensions, H×W cells, N cells framed
-for lookups.
+Letters in shapes: B episodes, M fields, K samples, T steps, S state and A action
+dimensions, H×W cells, N cells framed for lookups.
 """
 
 import math
@@ -28,7 +32,8 @@ from benchnav.planning.robots import component_wise
 
 
 def framed_fields(problem: Problem, fields: Tensor) -> Tensor:
-    """Fields of λ with the problem's free space, as `Problem.padded_ground` has λ̂, an episode's one after another.
+    """Fields of λ with the problem's free space, as `Problem.padded_ground` has λ̂, an
+    episode's one after another.
 
     Args:
         problem: B problems.
@@ -42,7 +47,8 @@ def framed_fields(problem: Problem, fields: Tensor) -> Tensor:
 
 
 def within_reach(problem: Problem, state: Tensor, seconds: float) -> Tensor:
-    """Cells on which robots may be within some time, at top speed, bool, shape [B, H, W].
+    """Cells on which robots may be within some time, at top speed, bool, shape [B, H,
+    W].
 
     Args:
         problem: B problems.
@@ -53,11 +59,14 @@ def within_reach(problem: Problem, state: Tensor, seconds: float) -> Tensor:
     row, column = (torch.arange(size, device=state.device) for size in grid.shape)
     x, y = grid.centre_of(row[:, None], column)
     away = torch.hypot(x - state[:, 0, None, None], y - state[:, 1, None, None])
-    return away <= problem.robot.top_speed_mps * seconds + grid.resolution_m  # as far as a cell's corner
+    return (
+        away <= problem.robot.top_speed_mps * seconds + grid.resolution_m
+    )  # as far as a cell's corner
 
 
 def tail_cost(cost: Tensor, level: float) -> Tensor:
-    """CVaR of the cost over equally likely fields: the mean of the worst share 1 − level of them.
+    """CVaR of the cost over equally likely fields: the mean of the worst share 1 −
+    level of them.
 
     Args:
         cost: shape [B, M, K].
@@ -79,7 +88,8 @@ class Entrapment(NamedTuple):
 
     Args:
         goal: (x, y) of the goal, shape [B, 1, 2].
-        steps_left: from the first step of a rollout until the time is over, shape [B, 1].
+        steps_left: from the first step of a rollout until the time is over, shape [B,
+            1].
         goal_radius_m: how near the goal a robot has reached it.
         below: λ under which terrain immobilises a robot.
         max_steps: consecutive steps on such terrain after which a robot is immobilised.
@@ -102,17 +112,19 @@ def advance_entrapped(
     entrapment: Entrapment,
     dynamics: Dynamics,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Rolls samples out as `mppi.advance_chunk` does, where ground of little λ immobilises a robot.
+    """Rolls samples out as `mppi.advance_chunk` does, where ground of little λ
+    immobilises a robot.
 
-    One that was on such ground for `max_steps` steps in a row stops there, and pays J of standing there, with the
-    penalty of ground that is not free, until its time is over. Its states go on, and cost nothing more. One that has
-    been at the goal has arrived, and is not immobilised on ground behind it.
+    One that was on such ground for `max_steps` steps in a row stops there, and pays J
+    of standing there, with the penalty of ground that is not free, until its time is
+    over. Its states go on, and cost nothing more. One that has been at the goal has
+    arrived, and is not immobilised on ground behind it.
 
     Args:
         states: shape [B, K, S].
         cost: so far, shape [B, K].
-        held: steps in a row on immobilising ground, shape [B, K]; `max_steps` of one that has stopped, −1 of one
-            that has arrived.
+        held: steps in a row on immobilising ground, shape [B, K]; `max_steps` of one
+            that has stopped, −1 of one that has arrived.
         sampled: action sequences.
         padded_ground: as of `Problem`, shape [B, N].
         target: (x, y) to be reached, shape [B, 1, 2].
@@ -133,9 +145,13 @@ def advance_entrapped(
         longer = torch.where((held < 0) | (away < goal_radius_m), -1, longer)
         stops = going & (longer >= most)
         paid = stage_cost(objective, states, action, ground, target)
-        standing = stage_cost(objective, states, torch.zeros_like(action), ground, target)
+        standing = stage_cost(
+            objective, states, torch.zeros_like(action), ground, target
+        )
         rest = (steps_left - (step + 1)).clamp(min=0) * standing
         cost = cost + torch.where(going, paid + torch.where(stops, rest, 0), 0)
-        states = robot(states, action, motion_traversability(ground, min_traversability))
+        states = robot(
+            states, action, motion_traversability(ground, min_traversability)
+        )
         held = torch.where(going, longer, held)
     return component_wise(states), cost, held

@@ -1,6 +1,7 @@
 """Driving straight at the goal: the baseline that a planner has to beat.
 
-`Straight` is blind: it uses the goal alone. Planners with a global path recover by the same control law.
+`Straight` is blind: it uses the goal alone. Planners with a global path recover by the
+    same control law.
 Letters in shapes: B episodes, S state and A action dimensions.
 """
 
@@ -16,7 +17,8 @@ from benchnav.planning.sensing.sensor import Step
 
 # Turn commanded for a radian of heading error: rad/s of turn rate, or rad of steering.
 _TURN_GAIN = 4.0
-# A robot that looks farther away than this turns before it drives, so that it leaves narrow places straight.
+# A robot that looks farther away than this turns before it drives, so that it leaves
+# narrow places straight.
 _AWAY_RAD = 0.2
 # Greatest speed for a metre that is left, 1/s, so that a target is not overshot.
 _APPROACH = 2.0
@@ -27,7 +29,9 @@ STEERS = ((SPEED, TURN_RATE), (SPEED, STEERING))
 
 
 def turn_toward(state: Tensor, target_m: Tensor) -> Tensor:
-    """Angles from the headings of states [*B, S] to positions [*B, 2], in [−π, π), shape [*B]."""
+    """Angles from the headings of states [*B, S] to positions [*B, 2], in [−π, π),
+    shape [*B].
+    """
     offset = target_m - state[..., :2]
     missing = torch.atan2(offset[..., 1], offset[..., 0]) - state[..., 2]
     return torch.remainder(missing + math.pi, 2 * math.pi) - math.pi
@@ -50,9 +54,13 @@ def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
     gain = _TURN_GAIN if rates is None else min(_TURN_GAIN, 2 * rates[1] / high[1])
     least = 0.0 if TURN_RATE in robot.action_names else _CREEP
     aligned = high[0] * (1 - missing.abs() / _AWAY_RAD).clamp(min=least)
-    speed = torch.minimum(aligned, _APPROACH * torch.linalg.vector_norm(target_m - state[:, :2], dim=1))
+    speed = torch.minimum(
+        aligned, _APPROACH * torch.linalg.vector_norm(target_m - state[:, :2], dim=1)
+    )
     actions = zip((speed, gain * missing), low, high, strict=True)
-    return torch.stack([action.clamp(least, most) for action, least, most in actions], dim=1)
+    return torch.stack(
+        [action.clamp(least, most) for action, least, most in actions], dim=1
+    )
 
 
 class Straight(Planner[Problem]):

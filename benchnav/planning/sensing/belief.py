@@ -1,7 +1,10 @@
-"""What is believed of λ: the base class of beliefs, the law of the ground that they are told, and the static one.
+"""What is believed of λ: the base class of beliefs, the law of the ground that they are
+told, and the static one.
 
-A belief begins with a model's prediction and the law of the ground, is told what is sensed, and gives the distribution
-of λ in each cell. It is pure: what it knows is in a state that it is given and gives back.
+A belief begins with a model's prediction and the law of the ground, is told what is
+sensed, and gives the distribution
+of λ in each cell. It is pure: what it knows is in a state that it is given and gives
+    back.
 Letters in shapes: B episodes, H×W cells, M drawn fields.
 """
 
@@ -35,12 +38,14 @@ class Law:
 
     Args:
         grid: size and resolution of the maps.
-        correlation_m: ℓ: normal scores at distance d have the correlation exp(−d²/2ℓ²); 0 where every cell is for
-            itself.
-        nugget: share of the variance of a cell's normal score that is its own and no neighbour's, in [0, 1): 0 where
-            the prediction is each cell's true distribution. A model's errors make neighbours less alike than λ is.
+        correlation_m: ℓ: normal scores at distance d have the correlation exp(−d²/2ℓ²);
+            0 where every cell is for itself.
+        nugget: share of the variance of a cell's normal score that is its own and no
+            neighbour's, in [0, 1): 0 where the prediction is each cell's true
+            distribution. A model's errors make neighbours less alike than λ is.
         statistics: of the training maps; None where nothing needs them.
-        class_names: of the prediction's classes, in the order of their ids; empty where it tells none.
+        class_names: of the prediction's classes, in the order of their ids; empty where
+            it tells none.
     """
 
     grid: Grid
@@ -64,10 +69,12 @@ class Law:
 
 
 class Belief(Specified, ABC, Generic[State]):
-    """Turns what was sensed into the distribution of λ: the base class of the parts of kind `belief`.
+    """Turns what was sensed into the distribution of λ: the base class of the parts of
+    kind `belief`.
 
     Attributes:
-        learns: whether what is sensed of λ changes what is believed; one that does not is told new predictions alone.
+        learns: whether what is sensed of λ changes what is believed; one that does not
+            is told new predictions alone.
         needs_statistics: whether `Law.statistics` have to be there.
     """
 
@@ -84,7 +91,12 @@ class Belief(Specified, ABC, Generic[State]):
         """
 
     @abstractmethod
-    def update(self, state: State, sensed: Sensed, prior: TraversabilityDistribution | None = None) -> State:
+    def update(
+        self,
+        state: State,
+        sensed: Sensed,
+        prior: TraversabilityDistribution | None = None,
+    ) -> State:
         """What is known when more was sensed.
 
         Args:
@@ -107,7 +119,9 @@ class Belief(Specified, ABC, Generic[State]):
         return self.distribution(state).at(cells)
 
     def changed(self, before: State, after: State) -> Tensor:
-        """Return a mask of cells whose belief changed, bool, shape [B, H, W]; all of them if that is not known."""
+        """Return a mask of cells whose belief changed, bool, shape [B, H, W]; all of
+        them if that is not known.
+        """
         found = self.distribution(after)
         return torch.ones(found.shape, dtype=torch.bool, device=found.device)
 
@@ -118,14 +132,18 @@ class Belief(Specified, ABC, Generic[State]):
         Args:
             state: what is known.
             count: M.
-            keys: a stream key of each episode, B of them, so that its fields do not depend on the others.
+            keys: a stream key of each episode, B of them, so that its fields do not
+                depend on the others.
 
         Returns:
             λ in [0, 1], shape [B, M, H, W].
         """
 
-    def sample_cells(self, state: State, count: int, keys: Sequence[int], cells: Tensor) -> Tensor:
-        """Draws the fields of `sample_fields` where some cells alone are asked for; what others hold means nothing.
+    def sample_cells(
+        self, state: State, count: int, keys: Sequence[int], cells: Tensor
+    ) -> Tensor:
+        """Draws the fields of `sample_fields` where some cells alone are asked for;
+        what others hold means nothing.
 
         Args:
             state: what is known.
@@ -165,7 +183,9 @@ class Fields:
     names: tuple[int, ...]
 
     def sample(self, count: int, key: int, cells: Tensor | None = None) -> Tensor:
-        """Draws `count` fields of each episode, shape [B, M, H, W], by a root key; see `Problem.sample_fields`."""
+        """Draws `count` fields of each episode, shape [B, M, H, W], by a root key; see
+        `Problem.sample_fields`.
+        """
         keys = [rng.stream_key(key, "fields", name) for name in self.names]
         if cells is None:
             return self.belief.sample_fields(self.state, count, keys)
@@ -190,10 +210,12 @@ class Predicted(Batch):
     law: Law
 
     def fields(self, scores: Tensor, cells: Tensor | None = None) -> Tensor:
-        """λ of the ranks that normal scores have in the prediction, shape [B, M, H, W] of both.
+        """λ of the ranks that normal scores have in the prediction, shape [B, M, H, W]
+        of both.
 
-        Where quantiles take long λ is linear in the score between the values of `score_table`, which are exact, and
-        looked up in some cells alone, bool [B, H, W], where they are given.
+        Where quantiles take long λ is linear in the score between the values of
+        `score_table`, which are exact, and looked up in some cells alone, bool [B, H,
+        W], where they are given.
         """
         if self._rows is None:
             return fields_of(self.prior, scores)
@@ -207,7 +229,9 @@ class Predicted(Batch):
 
     @cached_property
     def _rows(self) -> Tensor | None:
-        """Scores of the values of each cell, float32, shape [B, H, W, K]; None where they are not needed."""
+        """Scores of the values of each cell, float32, shape [B, H, W, K]; None where
+        they are not needed.
+        """
         if not self.prior.searched:
             return None
         every = torch.ones(self.prior.shape, dtype=torch.bool, device=self.prior.device)
@@ -219,7 +243,8 @@ class Static(Belief[Predicted]):
     """The model's prediction; what is sensed on the way is ignored.
 
     Args:
-        correlated: fields that are drawn have the law's correlation; else every cell is drawn for itself.
+        correlated: fields that are drawn have the law's correlation; else every cell is
+            drawn for itself.
     """
 
     learns: ClassVar[bool] = False
@@ -231,7 +256,10 @@ class Static(Belief[Predicted]):
         return Predicted(prior=prior, law=law)
 
     def update(
-        self, state: Predicted, sensed: Sensed, prior: TraversabilityDistribution | None = None
+        self,
+        state: Predicted,
+        sensed: Sensed,
+        prior: TraversabilityDistribution | None = None,
     ) -> Predicted:
         """Takes a new prediction where there is one."""
         return state if prior is None else Predicted(prior=prior, law=state.law)
@@ -244,11 +272,15 @@ class Static(Belief[Predicted]):
         """Cells whose prediction is another."""
         return before.prior.differs(after.prior)
 
-    def sample_fields(self, state: Predicted, count: int, keys: Sequence[int]) -> Tensor:
+    def sample_fields(
+        self, state: Predicted, count: int, keys: Sequence[int]
+    ) -> Tensor:
         """Draws fields with the prediction's marginals."""
         return state.fields(self._scores(state, count, keys))
 
-    def sample_cells(self, state: Predicted, count: int, keys: Sequence[int], cells: Tensor) -> Tensor:
+    def sample_cells(
+        self, state: Predicted, count: int, keys: Sequence[int], cells: Tensor
+    ) -> Tensor:
         """Draws them, of some cells alone."""
         return state.fields(self._scores(state, count, keys), cells)
 
@@ -258,9 +290,11 @@ class Static(Belief[Predicted]):
 
 
 def draw_scores(law: Law, count: int, keys: Sequence[int]) -> Tensor:
-    """Draws normal scores that hang together as those of the world do, float32, shape [B, M, H, W].
+    """Draws normal scores that hang together as those of the world do, float32, shape
+    [B, M, H, W].
 
-    As two cells are correlated by the product over both axes, white noise passes a root of either axis' correlations.
+    As two cells are correlated by the product over both axes, white noise passes a root
+    of either axis' correlations.
 
     Args:
         law: how they hang together.
@@ -288,12 +322,16 @@ def _white(key: int, count: int, shape: tuple[int, int]) -> Tensor:
     numbers = count * math.prod(shape)
     # PyTorch draws sixteen at a time, and what is left over otherwise.
     whole = -(-numbers // 16) * 16
-    return torch.randn(whole, generator=rng.generator(key))[:numbers].view(count, *shape)
+    return torch.randn(whole, generator=rng.generator(key))[:numbers].view(
+        count, *shape
+    )
 
 
 @lru_cache(maxsize=64)
 def _root(size: int, correlation_cells: float) -> Tensor:
-    """The symmetric root of the correlations along one axis, float32, shape [size, size]."""
+    """The symmetric root of the correlations along one axis, float32, shape [size,
+    size].
+    """
     along = torch.from_numpy(correlations(size, correlation_cells))
     place = torch.arange(size)
     values, vectors = torch.linalg.eigh(along[(place[:, None] - place).abs()])
@@ -308,4 +346,6 @@ def fields_of(distribution: TraversabilityDistribution, scores: Tensor) -> Tenso
         scores: shape [B, M, H, W].
     """
     scores = scores.to(device=distribution.device, dtype=distribution.dtype)
-    return torch.stack([distribution.from_normal(each) for each in scores.unbind(1)], dim=1)
+    return torch.stack(
+        [distribution.from_normal(each) for each in scores.unbind(1)], dim=1
+    )

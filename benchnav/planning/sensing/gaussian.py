@@ -1,13 +1,16 @@
 """A field of correlated standard normals, given what is known of some of its cells.
 
-A cell's normal score is known as a number with noise, or to lie in an interval with noise, as where λ is 0 or 1.
-Numbers are conditioned on exactly. Intervals have no closed form: expectation propagation finds for each a Gaussian
-term whose product with the field has, cell by cell, the mean and variance that the interval gives (Minka 2001;
-equations as in Rasmussen and Williams 2006, section 3.6, with all terms updated at once and damped).
+A cell's normal score is known as a number with noise, or to lie in an interval with
+noise, as where λ is 0 or 1. Numbers are conditioned on exactly. Intervals have no
+closed form: expectation propagation finds for each a Gaussian term whose product with
+the field has, cell by cell, the mean and variance that the interval gives (Minka 2001;
+equations as in Rasmussen and Williams 2006, section 3.6, with all terms updated at once
+and damped).
 
-One field at a time, in NumPy, whose calls cost least where there is little to do; all in float64. PyTorch multiplies
-and solves, since what NumPy makes of that depends by rounding on how many threads it has. Letters in shapes: B fields,
-N observations, M cells, H×W map.
+One field at a time, in NumPy, whose calls cost least where there is little to do; all
+in float64. PyTorch multiplies and solves, since what NumPy makes of that depends by
+rounding on how many threads it has. Letters in shapes: B fields, N observations, M
+cells, H×W map.
 """
 
 import math
@@ -56,7 +59,8 @@ class Field(Batch):
         device: torch.device | str,
         nugget: float = 0.0,
     ) -> "Field":
-        """The fields that `benchnav.core.copula.correlated_normal` draws, with a nugget where there is one.
+        """The fields that `benchnav.core.copula.correlated_normal` draws, with a nugget
+        where there is one.
 
         Args:
             shape: (H, W).
@@ -64,12 +68,21 @@ class Field(Batch):
             device: where the correlations are.
             nugget: of all of them.
         """
-        known = {length: [correlations(size, length) for size in shape] for length in lengths}
+        known = {
+            length: [correlations(size, length) for size in shape] for length in lengths
+        }
         down, across = (
-            torch.from_numpy(np.stack([known[length][axis] for length in lengths])).to(device)
+            torch.from_numpy(np.stack([known[length][axis] for length in lengths])).to(
+                device
+            )
             for axis in (0, 1)
         )
-        return cls(torch.tensor(lengths, dtype=torch.float64, device=device), down, across, nugget)
+        return cls(
+            torch.tensor(lengths, dtype=torch.float64, device=device),
+            down,
+            across,
+            nugget,
+        )
 
     def write(self, own: int, field: "Field") -> None:
         """Writes the one field of another into this."""
@@ -77,7 +90,8 @@ class Field(Batch):
             getattr(self, name)[own] = getattr(field, name)[0]
 
     def covariance(self, member: int | Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-        """Correlations of cells so many rows and columns apart, of the shape to which all broadcast.
+        """Correlations of cells so many rows and columns apart, of the shape to which
+        all broadcast.
 
         Args:
             member: the field, or which one each is of, int64.
@@ -86,12 +100,20 @@ class Field(Batch):
         """
         found = self.shared(member, rows, columns)
         if self.nugget:
-            found = torch.where((rows == 0) & (columns == 0), found + self.nugget, found)
+            found = torch.where(
+                (rows == 0) & (columns == 0), found + self.nugget, found
+            )
         return found
 
     def shared(self, member: int | Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-        """Return what of `covariance` is shared with neighbours: all but the nugget, also of a cell with itself."""
-        return (1 - self.nugget) * self.down[member, rows.abs()] * self.across[member, columns.abs()]
+        """Return what of `covariance` is shared with neighbours: all but the nugget,
+        also of a cell with itself.
+        """
+        return (
+            (1 - self.nugget)
+            * self.down[member, rows.abs()]
+            * self.across[member, columns.abs()]
+        )
 
 
 @dataclass(frozen=True)
@@ -125,7 +147,8 @@ class Posterior:
     Args:
         root: √precision of the terms, shape [N].
         factor: Cholesky factor of I + √T K √T, shape [N, N].
-        weights: what multiplies covariances with the observed cells to give a mean, shape [N].
+        weights: what multiplies covariances with the observed cells to give a mean,
+            shape [N].
         precision: of the terms, shape [N].
         shift: of the terms, shape [N].
     """
@@ -137,14 +160,19 @@ class Posterior:
     shift: ndarray
 
     def moments(self, covariance: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-        """Moments of M cells of unit variance, from their covariances with the observed, [N, M].
+        """Moments of M cells of unit variance, from their covariances with the
+        observed, [N, M].
 
         Returns:
-            Mean [M], variance [M], and what the terms take from the covariances of these cells, as a matrix [N, M]
-            times its own transpose.
+            Mean [M], variance [M], and what the terms take from the covariances of
+            these cells, as a matrix [N, M] times its own transpose.
         """
         taken = _taken(self.factor, self.root, covariance)
-        return times(self.weights, covariance), (1 - np.square(taken).sum(0)).clip(0), taken
+        return (
+            times(self.weights, covariance),
+            (1 - np.square(taken).sum(0)).clip(0),
+            taken,
+        )
 
 
 def posterior(covariance: ndarray, precision: ndarray, shift: ndarray) -> Posterior:
@@ -160,15 +188,19 @@ def posterior(covariance: ndarray, precision: ndarray, shift: ndarray) -> Poster
     # (K⁻¹ + T)⁻¹ ν = K (ν − √T (I + √T K √T)⁻¹ √T K ν)
     pulled = torch.from_numpy(root * times(covariance, shift))
     weights = shift - root * torch.cholesky_solve(pulled[:, None], factor)[:, 0].numpy()
-    return Posterior(root=root, factor=factor, weights=weights, precision=precision, shift=shift)
+    return Posterior(
+        root=root, factor=factor, weights=weights, precision=precision, shift=shift
+    )
 
 
 def condition(covariance: ndarray, observed: Observed) -> Posterior:
-    """Conditions a field on numbers exactly, and then on intervals by expectation propagation.
+    """Conditions a field on numbers exactly, and then on intervals by expectation
+    propagation.
 
     Args:
         covariance: K of the observed cells, shape [N, N].
-        observed: what is known of them; the terms that it has are where intervals begin.
+        observed: what is known of them; the terms that it has are where intervals
+            begin.
     """
     held = observed.interval
     precision = np.where(held, 0.0, 1 / np.square(observed.std))
@@ -195,7 +227,8 @@ def condition(covariance: ndarray, observed: Observed) -> Posterior:
 def evidence(covariance: ndarray, observed: Observed, found: Posterior) -> float:
     """Log likelihood of what is observed, up to what does not depend on the field.
 
-    Numbers are exact. Intervals are by expectation propagation (Rasmussen and Williams 2006, equation 3.65).
+    Numbers are exact. Intervals are by expectation propagation (Rasmussen and Williams
+    2006, equation 3.65).
 
     Args:
         covariance: K of the observed cells, shape [N, N].
@@ -203,7 +236,9 @@ def evidence(covariance: ndarray, observed: Observed, found: Posterior) -> float
         found: the field given that, from `condition`.
     """
     mean, variance, _ = found.moments(covariance)
-    whole = 0.5 * (found.shift * mean).sum() - np.log(found.factor.diagonal().numpy()).sum()
+    whole = (
+        0.5 * (found.shift * mean).sum() - np.log(found.factor.diagonal().numpy()).sum()
+    )
     held = observed.interval
     terms = Terms(found.precision[held], found.shift[held])
     centre, without = terms.left_out(mean[held], variance[held].clip(LEAST_VARIANCE))
@@ -221,10 +256,12 @@ def predict(
 ) -> tuple[ndarray, ndarray, ndarray]:
     """Mean, variance and skewness of M cells, each of shape [M].
 
-    An interval leaves its cell skew, and by the correlation that is left its neighbours: a cell's third cumulant is the
-    sum of those of the intervals' cells times the cube of the cell's regression on each, which is right for a single
-    interval and of first order for several (Opper, Paquet and Winther 2013, "Perturbative corrections for approximate
-    inference in Gaussian latent variable models").
+    An interval leaves its cell skew, and by the correlation that is left its
+    neighbours: a cell's third cumulant is the sum of those of the intervals' cells
+    times the cube of the cell's regression on each, which is right for a single
+    interval and of first order for several (Opper, Paquet and Winther 2013,
+    "Perturbative corrections for approximate inference in Gaussian latent variable
+    models").
 
     Args:
         found: the field given what is observed, from `condition`.
@@ -238,13 +275,19 @@ def predict(
         return mean, variance, np.zeros_like(mean)
     own_mean, own_variance, own = found.moments(covariance[:, held])
     own_variance = own_variance.clip(LEAST_VARIANCE)
-    third = third_cumulants(observed, found.precision, found.shift, own_mean, own_variance)
+    third = third_cumulants(
+        observed, found.precision, found.shift, own_mean, own_variance
+    )
     regression = (block[held] - times(own.T, taken)) / own_variance[:, None]
     return mean, variance, skewness(third, regression, variance)
 
 
 def third_cumulants(
-    observed: Observed, precision: ndarray, shift: ndarray, mean: ndarray, variance: ndarray
+    observed: Observed,
+    precision: ndarray,
+    shift: ndarray,
+    mean: ndarray,
+    variance: ndarray,
 ) -> ndarray:
     """Return the third cumulants of the cells of intervals.
 
@@ -263,7 +306,9 @@ def third_cumulants(
 
 
 def skewness(third: ndarray, regression: ndarray, variance: ndarray) -> ndarray:
-    """Return the skewness of M cells, by third cumulants of intervals and the regression on these, [intervals, M]."""
+    """Return the skewness of M cells, by third cumulants of intervals and the
+    regression on these, [intervals, M].
+    """
     # Products and roots, which are far quicker than powers.
     found = times(third, regression * regression * regression)
     spread = variance.clip(LEAST_VARIANCE)
@@ -290,13 +335,17 @@ def times(one: ndarray, other: ndarray) -> ndarray:
 
 
 class Terms(NamedTuple):
-    """Gaussian terms, one a cell: exp(shift · z − precision · z² / 2), each of shape [N]."""
+    """Gaussian terms, one a cell: exp(shift · z − precision · z² / 2), each of shape
+    [N].
+    """
 
     precision: ndarray
     shift: ndarray
 
     def moments(self, covariance: ndarray, centre: ndarray) -> tuple[ndarray, ndarray]:
-        """Mean and variance of the cells of a field of covariance [N, N] and mean [N], given the terms."""
+        """Mean and variance of the cells of a field of covariance [N, N] and mean [N],
+        given the terms.
+        """
         root = np.sqrt(self.precision)
         taken = _taken(_factor(covariance, root), root, covariance)
         left = covariance - times(taken.T, taken)
@@ -309,18 +358,32 @@ class Terms(NamedTuple):
         return without * (mean / variance - self.shift), without
 
     def step(
-        self, mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray, std: ndarray
+        self,
+        mean: ndarray,
+        variance: ndarray,
+        lower: ndarray,
+        upper: ndarray,
+        std: ndarray,
     ) -> "tuple[Terms, bool]":
-        """Return the terms of `towards`, and whether none moves its own cell by more than `_ENOUGH`."""
+        """Return the terms of `towards`, and whether none moves its own cell by more
+        than `_ENOUGH`.
+        """
         new = self.towards(mean, variance, lower, upper, std)
         more = new.precision - self.precision
         moved = abs(new.shift - self.shift) + abs(more * mean)
         return new, bool((moved / (1 / variance + more.clip(0))).max() <= _ENOUGH)
 
     def towards(
-        self, mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray, std: ndarray
+        self,
+        mean: ndarray,
+        variance: ndarray,
+        lower: ndarray,
+        upper: ndarray,
+        std: ndarray,
     ) -> "Terms":
-        """Terms that give each cell more nearly the moments of its interval, all else as it is."""
+        """Terms that give each cell more nearly the moments of its interval, all else
+        as it is.
+        """
         centre, without = self.left_out(mean, variance)
         total = without + np.square(std)
         noisy_mean, noisy_variance = interval_moments(centre, total, lower, upper)
@@ -338,7 +401,8 @@ class Terms(NamedTuple):
 def interval_moments(
     mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray
 ) -> tuple[ndarray, ndarray]:
-    """Mean and variance of normal numbers that lie in intervals, also far out in a tail.
+    """Mean and variance of normal numbers that lie in intervals, also far out in a
+    tail.
 
     Args:
         mean: of the number, float64.
@@ -349,13 +413,17 @@ def interval_moments(
     low, high, log_mass, flipped = _standard(mean, variance, lower, upper)
     at_low, at_high = _density(low, log_mass), _density(high, log_mass)
     shift = at_low - at_high
-    share = (1 + _finite(low) * at_low - _finite(high) * at_high - np.square(shift)).clip(_LEAST_SHARE, 1)
+    share = (
+        1 + _finite(low) * at_low - _finite(high) * at_high - np.square(shift)
+    ).clip(_LEAST_SHARE, 1)
     shift = shift.clip(low, high)
     return mean + np.sqrt(variance) * np.where(flipped, -shift, shift), variance * share
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _third_cumulant(mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray) -> ndarray:
+def _third_cumulant(
+    mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray
+) -> ndarray:
     """Third cumulant of normal numbers that lie in intervals."""
     low, high, log_mass, flipped = _standard(mean, variance, lower, upper)
     at_low, at_high = _density(low, log_mass), _density(high, log_mass)
@@ -372,7 +440,9 @@ def _third_cumulant(mean: ndarray, variance: ndarray, lower: ndarray, upper: nda
 def _standard(
     mean: ndarray, variance: ndarray, lower: ndarray, upper: ndarray
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """An interval in standard deviations, the log of its probability, and whether it was flipped to low numbers."""
+    """An interval in standard deviations, the log of its probability, and whether it
+    was flipped to low numbers.
+    """
     std = np.sqrt(variance)
     low, high = (lower - mean) / std, (upper - mean) / std
     # On the side where Φ is small, so that nothing is lost to rounding.

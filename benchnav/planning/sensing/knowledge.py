@@ -1,9 +1,11 @@
-"""What robots know of their maps: what was seen and sensed, what is believed, and the λ̂ and free ground that follow.
+"""What robots know of their maps: what was seen and sensed, what is believed, and the
+λ̂ and free ground that follow.
 
-For a belief that learns λ is sensed at each step. Now and then the robot looks, and the belief is updated, after a new
-prediction where more was seen. A `Learner` holds how that is done, a `Knowledge` what is known by now; only sensors are
-given the `Truth`.
-Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of all maps together.
+For a belief that learns λ is sensed at each step. Now and then the robot looks, and the
+belief is updated, after a new prediction where more was seen. A `Learner` holds how
+that is done, a `Knowledge` what is known by now; only sensors are given the `Truth`.
+Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of all maps
+    together.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,13 +35,17 @@ from benchnav.planning.world.outcome import Outcome
 _PESSIMISTIC = 0.8  # level of the CVaR that is believed of unseen ground
 
 Predict = Callable[[Terrain, Observation], TraversabilityDistribution]
-"""Predicts from what was seen; the terrain, with λ as it is now, is for privileged models alone."""
+"""Predicts from what was seen; the terrain, with λ as it is now, is for privileged
+models alone.
+"""
 
 Result = TypeVar("Result")
 
 
 class KnowledgeError(BenchnavError):
-    """A sensor, a belief, a model or a risk measure raised on the way; the cause says what."""
+    """A sensor, a belief, a model or a risk measure raised on the way; the cause says
+    what.
+    """
 
     def __init__(self, message: str, outcome: Outcome) -> None:
         """Keeps how the episodes end for it."""
@@ -63,11 +69,16 @@ class Truth(Batch):
 
     def select(self, members: Tensor) -> "Truth":
         """Keeps some episodes, by index, int64."""
-        return replace(super().select(members), keys=tuple(self.keys[place] for place in members.tolist()))
+        return replace(
+            super().select(members),
+            keys=tuple(self.keys[place] for place in members.tolist()),
+        )
 
     def put(self, members: Tensor, others: "Truth") -> "Truth":
         """Puts episodes in the places of others, by index, int64."""
-        keys = dict(enumerate(self.keys)) | dict(zip(members.tolist(), others.keys, strict=True))
+        keys = dict(enumerate(self.keys)) | dict(
+            zip(members.tolist(), others.keys, strict=True)
+        )
         return replace(super().put(members, others), keys=tuple(keys.values()))
 
 
@@ -77,14 +88,16 @@ class Knowledge(Batch):
 
     Args:
         memory: of what was seen; None where the whole map was seen at the start.
-        news: episodes in which more was seen, or better, than the prediction knows of, bool, shape [B].
+        news: episodes in which more was seen, or better, than the prediction knows of,
+            bool, shape [B].
         sensed: of λ, since the belief was updated; of two looks at a cell the later.
         ever_sensed: cells whose λ was sensed, bool, shape [B, H, W].
         reached: cells that sensors told of in the last step, bool, shape [B, H, W].
         observation: what the model was given.
         believed: the state of the belief.
         risk_map: λ̂, shape [B, H, W].
-        spread: of what is believed (`TraversabilityDistribution.spread`), shape [B, H, W]; None where it is not kept.
+        spread: of what is believed (`TraversabilityDistribution.spread`), shape [B, H,
+            W]; None where it is not kept.
         free: free ground, without that at the goal, bool, shape [B, H, W].
     """
 
@@ -137,15 +150,20 @@ class Learner:
             ConfigError: there are none.
         """
         expect(
-            self.law.statistics is not None, "`Law.statistics` for a robot that does not see all, got None."
+            self.law.statistics is not None,
+            "`Law.statistics` for a robot that does not see all, got None.",
         )
         assert self.law.statistics is not None
         return self.law.statistics
 
     def begin(
-        self, truth: Truth, robot_state: Tensor, prediction: TraversabilityDistribution | None
+        self,
+        truth: Truth,
+        robot_state: Tensor,
+        prediction: TraversabilityDistribution | None,
     ) -> Knowledge:
-        """What is known when robots set out: what is seen from the start, and nothing of λ.
+        """What is known when robots set out: what is seen from the start, and nothing
+        of λ.
 
         Args:
             truth: for the sensor and for privileged models.
@@ -153,7 +171,8 @@ class Learner:
             prediction: of the whole map, where the sensor sees all; None elsewhere.
 
         Raises:
-            KnowledgeError: the sensor, the model, the belief or the risk measure raised, or gave what is none.
+            KnowledgeError: the sensor, the model, the belief or the risk measure
+                raised, or gave what is none.
         """
         memory, observation = None, truth.terrain.observe()
         if not self.sensor.sees_all:
@@ -168,7 +187,9 @@ class Learner:
         seen = None if memory is None else memory.seen
         return Knowledge(
             memory=memory,
-            news=torch.zeros(len(robot_state), dtype=torch.bool, device=robot_state.device),
+            news=torch.zeros(
+                len(robot_state), dtype=torch.bool, device=robot_state.device
+            ),
             sensed=nothing_sensed(truth.field),
             ever_sensed=torch.zeros_like(truth.field, dtype=torch.bool),
             reached=torch.zeros_like(truth.field, dtype=torch.bool),
@@ -185,7 +206,9 @@ class Learner:
         Raises:
             KnowledgeError: the belief raised.
         """
-        return call(Outcome.BELIEF_ERROR, lambda: self.belief.init(prediction.clone(), self.law))
+        return call(
+            Outcome.BELIEF_ERROR, lambda: self.belief.init(prediction.clone(), self.law)
+        )
 
     def sense(
         self,
@@ -198,8 +221,8 @@ class Learner:
     ) -> Knowledge:
         """Adds what is sensed in a step, and what is seen where a robot looks.
 
-        To look at each step tells hardly more than to look when what is known is updated, and takes far longer. A
-        belief that does not learn is told no λ.
+        To look at each step tells hardly more than to look when what is known is
+        updated, and takes far longer. A belief that does not learn is told no λ.
 
         Args:
             known: by now; not changed.
@@ -217,15 +240,23 @@ class Learner:
         """
         moment = Moment(truth.keys, step)
         known = replace(known, reached=torch.zeros_like(known.reached))
-        for sensor, asked in ((self.sensor, looks), (self.ground, feels & self.belief.learns)):
+        for sensor, asked in (
+            (self.sensor, looks),
+            (self.ground, feels & self.belief.learns),
+        ):
             if sensor.sees_all or not bool(asked.any()):
                 continue
-            new, told = self._look(sensor, truth, robot_state, moment), asked[:, None, None]
+            new, told = (
+                self._look(sensor, truth, robot_state, moment),
+                asked[:, None, None],
+            )
             mask, before = new.mask & told, known.sensed
             known = replace(
                 known,
                 sensed=Sensed(
-                    traversability=torch.where(mask, new.traversability, before.traversability),
+                    traversability=torch.where(
+                        mask, new.traversability, before.traversability
+                    ),
                     std=torch.where(mask, new.std, before.std),
                 ),
                 ever_sensed=known.ever_sensed | mask,
@@ -237,21 +268,26 @@ class Learner:
                 # A cell that is seen for the first time, or better than before.
                 more = (memory.doubt != known.memory.doubt).flatten(1).any(1)
                 reached = known.reached | appearance.seen
-                known = replace(known, memory=memory, news=known.news | more, reached=reached)
+                known = replace(
+                    known, memory=memory, news=known.news | more, reached=reached
+                )
         return known
 
     def update(self, known: Knowledge, truth: Truth) -> tuple[Knowledge, Tensor]:
-        """Updates prediction, belief, λ̂ and free ground with what was seen and sensed since.
+        """Updates prediction, belief, λ̂ and free ground with what was seen and sensed
+        since.
 
         Args:
             known: by now; not changed.
             truth: for privileged models alone.
 
         Returns:
-            What is known, and the cells of which something else is believed than before, bool, shape [B, H, W].
+            What is known, and the cells of which something else is believed than
+            before, bool, shape [B, H, W].
 
         Raises:
-            KnowledgeError: the model, the belief or the risk measure raised, or gave what is none.
+            KnowledgeError: the model, the belief or the risk measure raised, or gave
+                what is none.
         """
         news = bool(known.news.any())
         if not news and not bool(known.sensed.mask.any()):
@@ -259,9 +295,13 @@ class Learner:
         before, observation, prior = known.believed, known.observation, None
         if news and known.memory is not None:
             observation, prior = self._predict(known.memory, truth)
-        after = call(Outcome.BELIEF_ERROR, lambda: self.belief.update(before, known.sensed, prior))
+        after = call(
+            Outcome.BELIEF_ERROR,
+            lambda: self.belief.update(before, known.sensed, prior),
+        )
         changed = call(
-            Outcome.BELIEF_ERROR, lambda: self._checked_cells(self.belief.changed(before, after), known)
+            Outcome.BELIEF_ERROR,
+            lambda: self._checked_cells(self.belief.changed(before, after), known),
         )
         known = replace(
             known,
@@ -270,7 +310,9 @@ class Learner:
             observation=observation,
             believed=after,
         )
-        return (self._inferred(known, changed) if bool(changed.any()) else known), changed
+        return (
+            self._inferred(known, changed) if bool(changed.any()) else known
+        ), changed
 
     def at(self, known: Knowledge, cells: Tensor) -> TraversabilityDistribution:
         """What is believed of some cells, bool [B, H, W], as a map of one row, [1, N].
@@ -284,7 +326,8 @@ class Learner:
             believed = self.belief.at(known.believed, cells)
             expect(
                 believed.shape == wanted,
-                f"a distribution of shape {list(wanted)} from `at`, got {list(believed.shape)}.",
+                f"a distribution of shape {list(wanted)} from `at`, got "
+                f"{list(believed.shape)}.",
             )
             return believed
 
@@ -299,8 +342,15 @@ class Learner:
 
         def believe() -> TraversabilityDistribution:
             believed = self.belief.distribution(known.believed)
-            wanted, got = tuple(known.free.shape), getattr(believed, "shape", type(believed).__name__)
-            expect(got == wanted, f"a distribution of shape {list(wanted)} from `distribution`, got {got}.")
+            wanted, got = (
+                tuple(known.free.shape),
+                getattr(believed, "shape", type(believed).__name__),
+            )
+            expect(
+                got == wanted,
+                f"a distribution of shape {list(wanted)} from `distribution`, got "
+                f"{got}.",
+            )
             return believed
 
         return call(Outcome.BELIEF_ERROR, believe)
@@ -311,7 +361,9 @@ class Learner:
         Raises:
             KnowledgeError: the belief raised.
         """
-        believed = call(Outcome.BELIEF_ERROR, lambda: self.belief.select(known.believed, members))
+        believed = call(
+            Outcome.BELIEF_ERROR, lambda: self.belief.select(known.believed, members)
+        )
         return replace(replace(known, believed=None).select(members), believed=believed)
 
     def put(self, known: Knowledge, members: Tensor, others: Knowledge) -> Knowledge:
@@ -321,7 +373,8 @@ class Learner:
             KnowledgeError: the belief raised.
         """
         believed = call(
-            Outcome.BELIEF_ERROR, lambda: self.belief.put(known.believed, members, others.believed)
+            Outcome.BELIEF_ERROR,
+            lambda: self.belief.put(known.believed, members, others.believed),
         )
         whole, part = (replace(each, believed=None) for each in (known, others))
         return replace(whole.put(members, part), believed=believed)
@@ -329,39 +382,62 @@ class Learner:
     def _inferred(self, known: Knowledge, changed: Tensor) -> Knowledge:
         """Tells λ̂ and what is free of the cells of which something else is believed."""
         believed = self.at(known, changed)
-        one = map_tensors(believed, lambda values: values[None])  # a batch, as measures are given
+        one = map_tensors(
+            believed, lambda values: values[None]
+        )  # a batch, as measures are given
         found, spread = self._measured(one)
         seen = None if known.memory is None else known.memory.seen[changed][None]
-        free = call(Outcome.BELIEF_ERROR, lambda: self.rules.free(found[0], believed, seen))
+        free = call(
+            Outcome.BELIEF_ERROR, lambda: self.rules.free(found[0], believed, seen)
+        )
         told = replace(
             known,
-            risk_map=known.risk_map.index_put((changed,), found.flatten().to(known.risk_map.dtype)),
+            risk_map=known.risk_map.index_put(
+                (changed,), found.flatten().to(known.risk_map.dtype)
+            ),
             free=known.free.index_put((changed,), free[0]),
         )
         if known.spread is None or spread is None:
             return told
         return replace(
-            told, spread=known.spread.index_put((changed,), spread.flatten().to(known.spread.dtype))
+            told,
+            spread=known.spread.index_put(
+                (changed,), spread.flatten().to(known.spread.dtype)
+            ),
         )
 
-    def _measured(self, believed: TraversabilityDistribution) -> tuple[Tensor, Tensor | None]:
+    def _measured(
+        self, believed: TraversabilityDistribution
+    ) -> tuple[Tensor, Tensor | None]:
         """λ̂ and, where it is kept, the spread, of a batch of maps."""
 
         def measure() -> tuple[Tensor, Tensor | None]:
-            return risk.apply(self.measure, believed), believed.spread() if self.keeps_spread else None
+            return risk.apply(
+                self.measure, believed
+            ), believed.spread() if self.keeps_spread else None
 
         return call(Outcome.MODEL_ERROR, measure)
 
-    def _predict(self, memory: Memory, truth: Truth) -> tuple[Observation, TraversabilityDistribution]:
-        """What a model is given of what was seen, and what it makes of it; elsewhere what `rules.unseen` says."""
+    def _predict(
+        self, memory: Memory, truth: Truth
+    ) -> tuple[Observation, TraversabilityDistribution]:
+        """What a model is given of what was seen, and what it makes of it; elsewhere
+        what `rules.unseen` says.
+        """
         statistics = self.statistics
         observation = masked(memory, statistics.layer_means)
         terrain = replace(truth.terrain, traversability=truth.field)
-        predicted = call(Outcome.MODEL_ERROR, lambda: self.predict(terrain, observation))
-        unseen = unseen_ground(statistics, self.rules.unseen, memory.seen.shape, truth.field)
+        predicted = call(
+            Outcome.MODEL_ERROR, lambda: self.predict(terrain, observation)
+        )
+        unseen = unseen_ground(
+            statistics, self.rules.unseen, memory.seen.shape, truth.field
+        )
         return observation, choose(memory.seen, predicted, unseen)
 
-    def _look(self, sensor: Sensor, truth: Truth, robot_state: Tensor, moment: Moment) -> Sensed:
+    def _look(
+        self, sensor: Sensor, truth: Truth, robot_state: Tensor, moment: Moment
+    ) -> Sensed:
         def look() -> Sensed:
             given = truth.terrain, truth.field, robot_state
             # Our own change nothing that they are given.
@@ -370,7 +446,8 @@ class Learner:
             found = self._checked(sensor.sense(*given, moment), truth.field)
             expect(
                 sensor is not self.sensor or found.appearance is not None,
-                "`Sensed.appearance` from a sensor of appearance, got none. List λ sensors under `grounds`.",
+                "`Sensed.appearance` from a sensor of appearance, got none. List λ "
+                "sensors under `grounds`.",
             )
             return found
 
@@ -378,11 +455,17 @@ class Learner:
 
     def _checked(self, sensed: Any, like: Tensor) -> Sensed:
         """What a sensor said, where it is what a sensor may say."""
-        expect(isinstance(sensed, Sensed), f"a Sensed from `sense`, got {type(sensed).__name__}.")
+        expect(
+            isinstance(sensed, Sensed),
+            f"a Sensed from `sense`, got {type(sensed).__name__}.",
+        )
         for name in ("traversability", "std"):
             check_map(f"`Sensed.{name}`", getattr(sensed, name), like.dtype, like)
         found = sensed.traversability[sensed.mask]
-        expect(bool(((found >= 0) & (found <= 1)).all()), "`Sensed.traversability` in [0, 1], or NaN.")
+        expect(
+            bool(((found >= 0) & (found <= 1)).all()),
+            "`Sensed.traversability` in [0, 1], or NaN.",
+        )
         if sensed.appearance is not None:
             check_map("`Appearance.seen`", sensed.appearance.seen, torch.bool, like)
             check_map("`Appearance.doubt`", sensed.appearance.doubt, like.dtype, like)
@@ -421,7 +504,9 @@ def nothing_sensed(like: Tensor) -> Sensed:
 
 
 def sensor_keys(noise_key: int, maps: Any) -> tuple[int, ...]:
-    """Stream keys of the sensors' noise, by the root key of a world's noise and the names of its episodes."""
+    """Stream keys of the sensors' noise, by the root key of a world's noise and the
+    names of its episodes.
+    """
     return tuple(rng.stream_key(noise_key, "sensor", int(name)) for name in maps)
 
 

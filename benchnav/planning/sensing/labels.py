@@ -1,14 +1,18 @@
-"""Which of two classes cells are of: a Potts field of two states, sampled by 64 chains at once, a bit each.
+"""Which of two classes cells are of: a Potts field of two states, sampled by 64 chains
+at once, a bit each.
 
-Cells that may be of one of two classes have neighbours, of four, that may be of the same two. Zero field, strength β:
+Cells that may be of one of two classes have neighbours, of four, that may be of the
+same two. Zero field, strength β:
 
     P(labels) ∝ exp(β · number of such neighbours with one label).
 
-A cell's 64 labels are the bits of one integer, so that a few operations on integers sweep all chains (multi-spin
-coding). Heat-bath sweeps go over one colour of the checkerboard after the other. P(class) is estimated
-from clusters (Swendsen and Wang 1987): neighbours of one label are tied with the probability 1 − exp(−β), and cells
-that no ties join to evidence are of either class by half, whatever their bit. Random numbers are keyed by cell and by
-how many sweeps an episode has had, so that an episode has the same whoever is beside it.
+A cell's 64 labels are the bits of one integer, so that a few operations on integers
+sweep all chains (multi-spin coding). Heat-bath sweeps go over one colour of the
+checkerboard after the other. P(class) is estimated from clusters (Swendsen and Wang
+1987): neighbours of one label are tied with the probability 1 − exp(−β), and cells that
+no ties join to evidence are of either class by half, whatever their bit. Random numbers
+are keyed by cell and by how many sweeps an episode has had, so that an episode has the
+same whoever is beside it.
 Letters in shapes: B episodes, H×W cells, S chains.
 """
 
@@ -34,7 +38,8 @@ class Lattice:
     """Couplings between neighbouring cells.
 
     Args:
-        right: all bits set where a cell and the one to its right do, int64, shape [B, H, W].
+        right: all bits set where a cell and the one to its right do, int64, shape [B,
+            H, W].
         down: as much of the one below.
         strength: β.
     """
@@ -45,14 +50,22 @@ class Lattice:
 
     @classmethod
     def of(cls, pair: Tensor, strength: float) -> "Lattice":
-        """The lattice of cells of pairs, by the number of the pair, 0 for none, int64, shape [B, H, W]."""
+        """The lattice of cells of pairs, by the number of the pair, 0 for none, int64,
+        shape [B, H, W].
+        """
         right, down = torch.zeros_like(pair), torch.zeros_like(pair)
-        right[..., :-1] = -((pair[..., :-1] == pair[..., 1:]) & (pair[..., 1:] > 0)).long()
-        down[..., :-1, :] = -((pair[..., :-1, :] == pair[..., 1:, :]) & (pair[..., 1:, :] > 0)).long()
+        right[..., :-1] = -(
+            (pair[..., :-1] == pair[..., 1:]) & (pair[..., 1:] > 0)
+        ).long()
+        down[..., :-1, :] = -(
+            (pair[..., :-1, :] == pair[..., 1:, :]) & (pair[..., 1:, :] > 0)
+        ).long()
         return cls(right, down, strength)
 
     def neighbours(self, words: Tensor) -> tuple[Tensor, ...]:
-        """Words of the cells to the right, to the left, below and above, 0 where none hangs together."""
+        """Words of the cells to the right, to the left, below and above, 0 where none
+        hangs together.
+        """
         return (
             words.roll(-1, -1) & self.right,
             (words & self.right).roll(1, -1),
@@ -71,7 +84,8 @@ class Noise:
     """Random bits of a sweep.
 
     Args:
-        chosen: for 0 to 4 neighbours of the first class, whether the cell becomes of it, int64, five of [B, H, W].
+        chosen: for 0 to 4 neighbours of the first class, whether the cell becomes of
+            it, int64, five of [B, H, W].
         right: whether a cell is tied to its right neighbour, if they are of one class.
         down: as much of the one below.
     """
@@ -81,7 +95,14 @@ class Noise:
     down: Tensor
 
 
-def noise(sweep: Tensor, row: Tensor, column: Tensor, degree: Tensor, strength: float, size: int) -> Noise:
+def noise(
+    sweep: Tensor,
+    row: Tensor,
+    column: Tensor,
+    degree: Tensor,
+    strength: float,
+    size: int,
+) -> Noise:
     """The random bits of each episode's next sweep.
 
     Args:
@@ -95,14 +116,20 @@ def noise(sweep: Tensor, row: Tensor, column: Tensor, degree: Tensor, strength: 
     bank, uses = _bank(strength, size).to(row.device), sweep[:, None, None] // _SWEEPS
     turn = sweep[:, None, None] % _SWEEPS
     place = ((row + uses * _STEP[0]) % size) * size + (column + uses * _STEP[1]) % size
-    levels = [(2 * many - degree + _MOST).clamp(0, 2 * _MOST) for many in range(_MOST + 1)]
+    levels = [
+        (2 * many - degree + _MOST).clamp(0, 2 * _MOST) for many in range(_MOST + 1)
+    ]
     chosen = tuple(bank[turn, place, level] for level in levels)
-    return Noise(chosen, bank[turn, place, 2 * _MOST + 1], bank[turn, place, 2 * _MOST + 2])
+    return Noise(
+        chosen, bank[turn, place, 2 * _MOST + 1], bank[turn, place, 2 * _MOST + 2]
+    )
 
 
 @lru_cache(maxsize=4)
 def _bank(strength: float, size: int) -> Tensor:
-    """Bits of all sweeps: for log odds of −4β to 4β, and two ties; int64, shape [sweeps, size², 11]."""
+    """Bits of all sweeps: for log odds of −4β to 4β, and two ties; int64, shape
+    [sweeps, size², 11].
+    """
     key = rng.stream_key(0, "labels", "sweeps")
     chances = 1 / (1 + np.exp(-strength * np.arange(-_MOST, _MOST + 1)))
     found = np.empty((_SWEEPS, size * size, 2 * _MOST + 3), dtype=np.int64)
@@ -111,7 +138,9 @@ def _bank(strength: float, size: int) -> Tensor:
         for level, chance in enumerate(chances):
             found[sweep, :, level] = _packed(drawn[0] < chance)
         for way in (1, 2):
-            found[sweep, :, 2 * _MOST + way] = _packed(drawn[way] < -np.expm1(-strength))
+            found[sweep, :, 2 * _MOST + way] = _packed(
+                drawn[way] < -np.expm1(-strength)
+            )
     return torch.from_numpy(found)
 
 
@@ -121,11 +150,18 @@ def _packed(bits: np.ndarray) -> np.ndarray:
 
 def fair(height: int, width: int) -> Tensor:
     """Labels by the toss of a coin, int64, shape [H, W]."""
-    bits = rng.uniform(rng.stream_key(0, "labels", "first"), np.arange(height * width), (CHAINS,)) < 0.5
+    bits = (
+        rng.uniform(
+            rng.stream_key(0, "labels", "first"), np.arange(height * width), (CHAINS,)
+        )
+        < 0.5
+    )
     return torch.from_numpy(_packed(bits)).view(height, width)
 
 
-def swept(labels: Tensor, lattice: Lattice, free: Tensor, even: Tensor, drawn: Noise) -> Tensor:
+def swept(
+    labels: Tensor, lattice: Lattice, free: Tensor, even: Tensor, drawn: Noise
+) -> Tensor:
     """Draws labels anew given their neighbours', int64, shape [B, H, W].
 
     Args:
@@ -138,7 +174,12 @@ def swept(labels: Tensor, lattice: Lattice, free: Tensor, even: Tensor, drawn: N
     for colour in (free & even, free & ~even):
         right, left, below, above = lattice.neighbours(labels)
         # The number of neighbours of the first class, of three binary digits.
-        odd, pair, other, second = right ^ left, right & left, below ^ above, below & above
+        odd, pair, other, second = (
+            right ^ left,
+            right & left,
+            below ^ above,
+            below & above,
+        )
         ones, carry = odd ^ other, odd & other
         twos, fours = pair ^ second ^ carry, pair & second
         none = ~(ones | twos | fours)

@@ -1,9 +1,11 @@
-"""λ by normal score, cell by cell: a table that tells the distribution of a conditioned cell quickly.
+"""λ by normal score, cell by cell: a table that tells the distribution of a conditioned
+cell quickly.
 
-A row is of one cell and has the normal scores of `VALUES` under the cell's prediction, which give P(λ ≤ value) where
-something is known of the score. Rows are made of the cells that are asked for alone, and kept for when they are asked
-for again.
-Letters in shapes: B episodes, H×W cells, *B any leading dimensions, K values of λ, R rows, N cells.
+A row is of one cell and has the normal scores of `VALUES` under the cell's prediction,
+which give P(λ ≤ value) where something is known of the score. Rows are made of the
+cells that are asked for alone, and kept for when they are asked for again.
+Letters in shapes: B episodes, H×W cells, *B any leading dimensions, K values of λ, R
+    rows, N cells.
 """
 
 import math
@@ -49,24 +51,36 @@ class TabulatedDistribution(TraversabilityDistribution):
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
         """P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]; see the base."""
         at = torch.as_tensor(value, dtype=self.dtype, device=self.device)
-        after = torch.searchsorted(self._values(), at.contiguous()).clamp(1, len(VALUES) - 1)
+        after = torch.searchsorted(self._values(), at.contiguous()).clamp(
+            1, len(VALUES) - 1
+        )
         places = [own.expand(self.shape).unsqueeze(-3) for own in (after - 1, after)]
         low, high = (self.below.gather(-3, own).squeeze(-3) for own in places)
         before, behind = self._values()[after - 1], self._values()[after]
         inside = torch.lerp(low, high, ((at - before) / (behind - before)).clamp(0, 1))
-        return torch.where(at <= 0, 0.0, inside), torch.where(at < 0, 0.0, torch.where(at < 1, inside, 1.0))
+        return torch.where(at <= 0, 0.0, inside), torch.where(
+            at < 0, 0.0, torch.where(at < 1, inside, 1.0)
+        )
 
     def quantile(self, probability: Tensor | float) -> Tensor:
-        """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the base."""
-        share = torch.as_tensor(probability, dtype=self.dtype, device=self.device).expand(self.shape)
-        return value_at(self.below.movedim(-3, -1).contiguous(), share.unsqueeze(-1)).squeeze(-1)
+        """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the
+        base.
+        """
+        share = torch.as_tensor(
+            probability, dtype=self.dtype, device=self.device
+        ).expand(self.shape)
+        return value_at(
+            self.below.movedim(-3, -1).contiguous(), share.unsqueeze(-1)
+        ).squeeze(-1)
 
     def mean(self) -> Tensor:
         """E[λ], shape [*B, H, W]."""
         return self.cvar(0.0)
 
     def cvar(self, level: float) -> Tensor:
-        """Mean of λ over its worst share 1 − level, 1/p ∫₀¹ max(p − F, 0), shape [*B, H, W]; see the base."""
+        """Mean of λ over its worst share 1 − level, 1/p ∫₀¹ max(p − F, 0), shape [*B,
+        H, W]; see the base.
+        """
         tail = tail_of(level)
         below, step = self.below.movedim(-3, -1), self._values().diff()
         left = (tail - below).clamp(min=0)
@@ -79,7 +93,9 @@ class TabulatedDistribution(TraversabilityDistribution):
         return ((pieces @ step) / tail).clamp(max=1)  # which rounding may pass
 
     def expected_time(self, floor: float) -> Tensor:
-        """E[1 / max(λ, floor)] = 1 + ∫ F / λ² from the floor to 1, shape [*B, H, W]; see the base."""
+        """E[1 / max(λ, floor)] = 1 + ∫ F / λ² from the floor to 1, shape [*B, H, W];
+        see the base.
+        """
         check_floor(floor)
         low, high = np.array(VALUES[:-1]), np.array(VALUES[1:])
         start, end = np.maximum(low, floor), np.maximum(high, floor)
@@ -96,11 +112,14 @@ class TabulatedDistribution(TraversabilityDistribution):
         below, values = self.below.movedim(-3, -1), self._values()
         low, high = values[:-1], values[1:].clamp(min=floor)
         slope = below.diff(dim=-1) / values.diff()
-        # Where F passes p, the CDF of the tail is linear up to there, and 1 from there on.
+        # Where F passes p, the CDF of the tail is linear up to there, and 1 from there
+        # on.
         whole = low + (tail - below[..., :-1]).clamp(min=0) / slope.clamp(min=1e-30)
         split = torch.minimum(whole.clamp(min=floor), high)
         start = low.clamp(min=floor)
-        linear = (below[..., :-1] - slope * low) * (1 / start - 1 / split) + slope * (split / start).log()
+        linear = (below[..., :-1] - slope * low) * (1 / start - 1 / split) + slope * (
+            split / start
+        ).log()
         return 1 + (linear / tail + (1 / split - 1 / high)).sum(-1)
 
     def _values(self) -> Tensor:
@@ -128,7 +147,9 @@ def value_at(rows: Tensor, wanted: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Scores of `VALUES`, float32, shape [R, K]; of several episodes together, so that `select` leaves them."""
+    """Scores of `VALUES`, float32, shape [R, K]; of several episodes together, so that
+    `select` leaves them.
+    """
 
     scores: Tensor
 
@@ -172,14 +193,19 @@ class ScoreTable(Batch):
         lacking = cells & ~kept
         if not bool(lacking.any()):
             return self
-        rows = torch.cat((self.rows.scores[self.place[kept]], scores_of(prior.at(lacking))))
+        rows = torch.cat(
+            (self.rows.scores[self.place[kept]], scores_of(prior.at(lacking)))
+        )
         place = torch.full_like(self.place, -1)
         for which, first in ((kept, 0), (lacking, int(kept.sum()))):
-            place[which] = torch.arange(first, first + int(which.sum()), device=place.device)
+            place[which] = torch.arange(
+                first, first + int(which.sum()), device=place.device
+            )
         return ScoreTable(place, _Rows(rows))
 
     def below(self, cells: Tensor, mean: Tensor, std: Tensor, skew: Tensor) -> Tensor:
-        """P(λ ≤ value) at `VALUES`, at 1 P(λ < 1), of cells whose score has a posterior, shape [N, K].
+        """P(λ ≤ value) at `VALUES`, at 1 P(λ < 1), of cells whose score has a
+        posterior, shape [N, K].
 
         Args:
             cells: which of them, bool, shape [B, H, W]; each has a row.
@@ -192,23 +218,31 @@ class ScoreTable(Batch):
         away = (scores - mean[:, None]) / std[:, None]
         some = skew.abs() >= LEAST_SKEW
         if bool(some.any()):
-            away = away.index_put((some,), unskewed(away[some], skew[some, None]).to(away))
+            away = away.index_put(
+                (some,), unskewed(away[some], skew[some, None]).to(away)
+            )
         return (1 + torch.erf(away * math.sqrt(0.5))) / 2
 
 
 def scores_of(prior: TraversabilityDistribution) -> Tensor:
-    """Normal scores of `VALUES` in each cell of a map of one row, [1, R], float32, shape [R, K].
+    """Normal scores of `VALUES` in each cell of a map of one row, [1, R], float32,
+    shape [R, K].
 
     Of an atom at 0 and at 1 it is the end that is nearer to the other values.
     """
     count = prior.shape[-1]
-    parts = [_scores_of(prior, start, start + _AT_ONCE) for start in range(0, max(count, 1), _AT_ONCE)]
+    parts = [
+        _scores_of(prior, start, start + _AT_ONCE)
+        for start in range(0, max(count, 1), _AT_ONCE)
+    ]
     return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
 def _scores_of(prior: TraversabilityDistribution, start: int, end: int) -> Tensor:
     """Those of some cells, all values at once."""
-    cells = map_tensors(prior, lambda of: of[..., start:end].repeat_interleave(len(VALUES), dim=-1))
+    cells = map_tensors(
+        prior, lambda of: of[..., start:end].repeat_interleave(len(VALUES), dim=-1)
+    )
     value = torch.tensor(VALUES, dtype=torch.float64, device=prior.device).repeat(
         cells.shape[-1] // len(VALUES)
     )

@@ -1,6 +1,8 @@
-"""What labels of look-alike classes are drawn from: the cells around what is new, and the nearest observed ones.
+"""What labels of look-alike classes are drawn from: the cells around what is new, and
+the nearest observed ones.
 
-Letters in shapes: B episodes, H×W cells, R×C cells of a block, N observed cells, S chains.
+Letters in shapes: B episodes, H×W cells, R×C cells of a block, N observed cells, S
+    chains.
 """
 
 import math
@@ -16,7 +18,9 @@ from benchnav.planning.sensing.gaussian import Field
 from benchnav.planning.sensing.labels import Lattice, Noise, noise, unpacked
 
 _REACH = 12  # cells
-_SETTLED = 0.005  # probability of a label under which an observed cell is not drawn again
+_SETTLED = (
+    0.005  # probability of a label under which an observed cell is not drawn again
+)
 LEAST_CHANGE = 0.01
 """Of the probability of a cell that was not observed."""
 _LEAST_PRECISION = 1e-6  # of a term
@@ -28,13 +32,16 @@ class Evidence(Batch):
 
     Args:
         field: how the scores hang together, B of them.
-        lower: least observed score under the first and the second class, NaN where there is none, shape [B, 2, H, W].
+        lower: least observed score under the first and the second class, NaN where
+            there is none, shape [B, 2, H, W].
         upper: greatest observed score; where it is the least, the score itself.
         noise_std: standard deviation of the noise of the score, shape [B, H, W].
-        density: log f / φ of what was observed under either class, 0 where it is an interval, shape [B, 2, H, W].
+        density: log f / φ of what was observed under either class, 0 where it is an
+            interval, shape [B, 2, H, W].
         precision: of the Gaussian terms that stand for observations, shape [B, H, W].
         shift: precision times mean of the terms.
-        pair: number of the pair of which each cell may be, from 1; 0 for none, int64, shape [B, H, W].
+        pair: number of the pair of which each cell may be, from 1; 0 for none, int64,
+            shape [B, H, W].
         chance: of the first class given what was observed, float64, shape [B, H, W].
         labels: of the chains; a bit is set for the first class, int64, shape [B, H, W].
         sweeps: how many each episode had, int64, shape [B].
@@ -84,30 +91,49 @@ class Block:
     @classmethod
     def around(cls, evidence: Evidence, changed: Tensor, strength: float) -> "Block":
         """The block that has all cells in reach of what changed, and their neighbours."""
-        ends = torch.tensor([bounds(new) for new in changed.cpu().numpy()], device=changed.device)
+        ends = torch.tensor(
+            [bounds(new) for new in changed.cpu().numpy()], device=changed.device
+        )
         lines = []
-        for (low, high), size in zip(ends.permute(1, 2, 0), changed.shape[1:], strict=True):
+        for (low, high), size in zip(
+            ends.permute(1, 2, 0), changed.shape[1:], strict=True
+        ):
             most = min(int((high - low).max()) + 1 + 2 * (_REACH + 1), size)
             begin = (low - _REACH - 1).clamp(min=0).clamp(max=size - most)
             lines.append(begin[:, None] + torch.arange(most, device=low.device))
         row = lines[0][:, :, None].expand(-1, -1, lines[1].shape[1])
         column = lines[1][:, None].expand_as(row)
-        at = torch.arange(len(changed), device=changed.device)[:, None], row.flatten(1), column.flatten(1)
+        at = (
+            torch.arange(len(changed), device=changed.device)[:, None],
+            row.flatten(1),
+            column.flatten(1),
+        )
         pair, chance, observed = (
             values[at].view_as(row)
             for values in (evidence.pair, evidence.chance, ~evidence.noise_std.isnan())
         )
         away = torch.zeros_like(row)
-        for place, (low, high) in zip((row, column), ends.permute(1, 2, 0), strict=True):
+        for place, (low, high) in zip(
+            (row, column), ends.permute(1, 2, 0), strict=True
+        ):
             off = torch.maximum(low[:, None, None] - place, place - high[:, None, None])
             away = torch.maximum(away, off)
-        # Beyond the neighbours of cells in reach nothing counts: what is there depends on the other episodes.
+        # Beyond the neighbours of cells in reach nothing counts: what is there depends
+        # on the other episodes.
         pair, own = torch.where(away <= _REACH + 1, pair, 0), away <= _REACH
         lattice = Lattice.of(pair, strength)
         return cls(
-            at=at, row=row, column=column, pair=pair, chance=chance, observed=observed, own=own, lattice=lattice,
-            degree=lattice.degree(), torus=max(changed.shape[1:]),
-        )  # fmt: skip
+            at=at,
+            row=row,
+            column=column,
+            pair=pair,
+            chance=chance,
+            observed=observed,
+            own=own,
+            lattice=lattice,
+            degree=lattice.degree(),
+            torus=max(changed.shape[1:]),
+        )
 
     @property
     def free(self) -> Tensor:
@@ -121,13 +147,22 @@ class Block:
 
     @property
     def evidence(self) -> Tensor:
-        """All bits set where something is known of the label: observed, or out of reach and told by what is farther."""
+        """All bits set where something is known of the label: observed, or out of reach
+        and told by what is farther.
+        """
         told = ~self.own & ((self.chance - 0.5).abs() > LEAST_CHANGE)
         return -((self.pair > 0) & (self.observed | told)).long()
 
     def noise(self, sweeps: Tensor) -> Noise:
         """Random bits of the next sweep."""
-        return noise(sweeps, self.row, self.column, self.degree, self.lattice.strength, self.torus)
+        return noise(
+            sweeps,
+            self.row,
+            self.column,
+            self.degree,
+            self.lattice.strength,
+            self.torus,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,9 +180,11 @@ class Sites:
         upper: greatest score.
         density: log f / φ, 0 of intervals.
         std: of the noise, shape [B, N].
-        noise: variance of the noise, or of the term that stands for an interval, shape [B, N].
+        noise: variance of the noise, or of the term that stands for an interval, shape
+            [B, N].
         factor: Cholesky factor of the covariance of noisy scores, shape [B, N, N].
-        scores: noisy scores of each chain, 0 where they are new or empty, shape [B, S, N].
+        scores: noisy scores of each chain, 0 where they are new or empty, shape [B, S,
+            N].
         fresh: which are new, bool, shape [B, N].
         held: which are intervals that have a term.
         open: which are drawn.
@@ -173,33 +210,60 @@ class Sites:
     loose: Tensor
 
     @classmethod
-    def of(cls, evidence: Evidence, changed: Tensor, block: Block, window: int) -> "Sites":
+    def of(
+        cls, evidence: Evidence, changed: Tensor, block: Block, window: int
+    ) -> "Sites":
         """The observed cells nearest to what is new."""
         found = [
             nearest(known, new, window)
             for known, new in zip(
-                (~evidence.noise_std.isnan()).cpu().numpy(), changed.cpu().numpy(), strict=True
+                (~evidence.noise_std.isnan()).cpu().numpy(),
+                changed.cpu().numpy(),
+                strict=True,
             )
         ]
         row, column, there = (
-            pad_sequence([torch.from_numpy(own) for own in each], batch_first=True).flip(1).to(changed.device)
-            for each in zip(*((row, column, row >= 0) for row, column in found), strict=True)
+            pad_sequence([torch.from_numpy(own) for own in each], batch_first=True)
+            .flip(1)
+            .to(changed.device)
+            for each in zip(
+                *((row, column, row >= 0) for row, column in found), strict=True
+            )
         )
         at = block.at[0], row, column
-        top, left, across = block.row[:, 0, :1], block.column[:, 0, :1], block.row.shape[2]
+        top, left, across = (
+            block.row[:, 0, :1],
+            block.column[:, 0, :1],
+            block.row.shape[2],
+        )
         down, right = row - top, column - left
-        inside = there & (down >= 0) & (down < block.row.shape[1]) & (right >= 0) & (right < across)
+        inside = (
+            there
+            & (down >= 0)
+            & (down < block.row.shape[1])
+            & (right >= 0)
+            & (right < across)
+        )
         cell = torch.where(inside, down * across + right, 0)
         inside &= block.own.flatten(1).gather(1, cell)
         near, tied = _beside(cell, block.lattice)
 
         def both(values: Tensor) -> Tensor:
-            return torch.where(there[:, None], values.transpose(0, 1)[:, *at].transpose(0, 1), 0.0)
+            return torch.where(
+                there[:, None], values.transpose(0, 1)[:, *at].transpose(0, 1), 0.0
+            )
 
-        lower, upper, pair = both(evidence.lower), both(evidence.upper), evidence.pair[at] > 0
+        lower, upper, pair = (
+            both(evidence.lower),
+            both(evidence.upper),
+            evidence.pair[at] > 0,
+        )
         std = torch.where(there, evidence.noise_std[at], 1.0)
         fresh, interval = changed[at] & there, (upper > lower)[:, 0]
-        held, precision = interval & ~fresh, evidence.precision[at].clamp(min=_LEAST_PRECISION)
+        held, precision = (
+            interval & ~fresh,
+            evidence.precision[at].clamp(min=_LEAST_PRECISION),
+        )
         noise = torch.where(held, 1 / precision, std.square())
         apart = (place[:, :, None] - place[:, None] for place in (row, column))
         covariance = evidence.field.covariance(block.at[0][..., None], *apart)
@@ -207,18 +271,37 @@ class Sites:
         covariance.diagonal(dim1=1, dim2=2).copy_(torch.where(there, 1 + noise, 1.0))
         labels = unpacked(evidence.labels[at]).transpose(1, 2)
         scores = torch.where(labels, lower[:, :1], lower[:, 1:])
-        scores = torch.where(held[:, None], (evidence.shift[at] / precision)[:, None], scores)
+        scores = torch.where(
+            held[:, None], (evidence.shift[at] / precision)[:, None], scores
+        )
         unsettled = (evidence.chance[at] - 0.5).abs() < 0.5 - _SETTLED
         return cls(
-            row=row, column=column, cell=cell, near=near, tied=torch.where(inside[..., None], tied, 0),
-            strength=block.lattice.strength, lower=lower, upper=upper, density=both(evidence.density), std=std,
-            noise=noise, factor=torch.linalg.cholesky(covariance),
-            scores=torch.where((there & ~fresh)[:, None], scores, 0.0), fresh=fresh, held=held,
-            open=fresh | (inside & pair & unsettled), loose=inside & pair & ~interval,
-        )  # fmt: skip
+            row=row,
+            column=column,
+            cell=cell,
+            near=near,
+            tied=torch.where(inside[..., None], tied, 0),
+            strength=block.lattice.strength,
+            lower=lower,
+            upper=upper,
+            density=both(evidence.density),
+            std=std,
+            noise=noise,
+            factor=torch.linalg.cholesky(covariance),
+            scores=torch.where((there & ~fresh)[:, None], scores, 0.0),
+            fresh=fresh,
+            held=held,
+            open=fresh | (inside & pair & unsettled),
+            loose=inside & pair & ~interval,
+        )
 
     def draw(
-        self, place: int, mean: Tensor, variance: Tensor, labels: Tensor, uniforms: Tensor
+        self,
+        place: int,
+        mean: Tensor,
+        variance: Tensor,
+        labels: Tensor,
+        uniforms: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Draws the label of one cell of each episode, and a score within it.
 
@@ -230,15 +313,21 @@ class Sites:
             uniforms: shape [B, S, 2].
 
         Returns:
-            Whether the label is the first, the probability of that, the log density of what was observed, and the
-            score, each of shape [B, S].
+            Whether the label is the first, the probability of that, the log density of
+            what was observed, and the score, each of shape [B, S].
         """
         beside = labels.gather(1, self.near[:, place]) & self.tied[:, place]
-        odds = self.strength * (unpacked(beside).sum(1) * 2 + self.tied[:, place].sum(1)[:, None])
-        lower, upper, density = (own[:, :, place, None] for own in (self.lower, self.upper, self.density))
+        odds = self.strength * (
+            unpacked(beside).sum(1) * 2 + self.tied[:, place].sum(1)[:, None]
+        )
+        lower, upper, density = (
+            own[:, :, place, None] for own in (self.lower, self.upper, self.density)
+        )
         number, std, mean = upper <= lower, variance.sqrt()[:, None], mean[:, None]
         low, high = (lower - mean) / std, (upper - mean) / std
-        at_number = density - 0.5 * low.square() - std.log() - 0.5 * math.log(2 * math.pi)
+        at_number = (
+            density - 0.5 * low.square() - std.log() - 0.5 * math.log(2 * math.pi)
+        )
         # An interval on the side where Φ is small, so that nothing is lost to rounding.
         mirrored = low + high > 0
         low, high = torch.where(mirrored, -high, low), torch.where(mirrored, -low, high)
@@ -251,14 +340,25 @@ class Sites:
         rank = below + (torch.special.ndtr(high) - below) * uniforms[:, None, :, 1]
         inner = torch.special.ndtri(rank.clamp(min=1e-300))
         inner = mean + std * torch.where(mirrored, -inner, inner)
-        inner = torch.where(number, lower, torch.maximum(torch.minimum(inner, upper), lower))
-        return first, chance, by_class.logsumexp(1), torch.where(first, inner[:, 0], inner[:, 1])
+        inner = torch.where(
+            number, lower, torch.maximum(torch.minimum(inner, upper), lower)
+        )
+        return (
+            first,
+            chance,
+            by_class.logsumexp(1),
+            torch.where(first, inner[:, 0], inner[:, 1]),
+        )
 
 
 def _beside(cell: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
-    """The four cells beside some of a block, and all bits set where they hang together, each of shape [B, N, 4]."""
+    """The four cells beside some of a block, and all bits set where they hang together,
+    each of shape [B, N, 4].
+    """
     across, most = lattice.right.shape[2], lattice.right[0].numel() - 1
     every = lattice.neighbours(torch.full_like(lattice.right, -1))
     ties = torch.stack([part.flatten(1) for part in every], 2)
     steps = torch.tensor((1, -1, across, -across), device=cell.device)
-    return (cell[..., None] + steps).clamp(0, most), ties.gather(1, cell[..., None].expand(-1, -1, 4))
+    return (cell[..., None] + steps).clamp(0, most), ties.gather(
+        1, cell[..., None].expand(-1, -1, 4)
+    )

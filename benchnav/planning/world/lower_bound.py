@@ -1,30 +1,40 @@
-"""A lower bound of the time to the goal, for all planners, where λ stays what it is during an episode.
+"""A lower bound of the time to the goal, for all planners, where λ stays what it is
+during an episode.
 
-**Claim.** Let robots move as the shipped ones do: a time step leads from p to a point at most v·dt·λ(p) away, where v
-is the top speed. Let λ⁺(x) be the greatest λ(p) of the points p from which a step can lead to x or past it, |x − p| ≤
-v·dt·λ(p). Let W be continuous, 0 on the goal's disc, with |∇W| ≤ 1 / (v·λ⁺) almost everywhere. Then no trajectory from
-x arrives in less than W(x).
+**Claim.** Let robots move as the shipped ones do: a time step leads from p to a point
+at most v·dt·λ(p) away, where v is the top speed. Let λ⁺(x) be the greatest λ(p) of the
+points p from which a step can lead to x or past it, |x − p| ≤ v·dt·λ(p). Let W be
+continuous, 0 on the goal's disc, with |∇W| ≤ 1 / (v·λ⁺) almost everywhere. Then no
+trajectory from x arrives in less than W(x).
 
-**Proof.** Every point x of the segment from p to its successor q has |x − p| ≤ v·dt·λ(p), so that λ⁺(x) ≥ λ(p). Along
-the segment W falls by at most its length times the greatest slope, v·dt·λ(p) / (v·λ(p)) = dt. An arriving trajectory of
-K steps ends where W is 0, hence W(start) ≤ K·dt. On a triangulation W is linear on each closed triangle, and a segment
-along an edge lies in two of them; the bound of the slope is that of the greatest λ⁺ on the closed triangle.
+**Proof.** Every point x of the segment from p to its successor q has |x − p| ≤
+v·dt·λ(p), so that λ⁺(x) ≥ λ(p). Along the segment W falls by at most its length times
+the greatest slope, v·dt·λ(p) / (v·λ(p)) = dt. An arriving trajectory of K steps ends
+where W is 0, hence W(start) ≤ K·dt. On a triangulation W is linear on each closed
+triangle, and a segment along an edge lies in two of them; the bound of the slope is
+that of the greatest λ⁺ on the closed triangle.
 
-**Immobilising ground.** A robot is lost after its m-th step in a row from λ under `below`, if it has not arrived. A
-trajectory that arrives is a polygonal line. Take a point x of it in immobilising ground, and the longest piece around x
-that stays there. The piece comes in by a part of one step, at most v·dt long, or begins at the start; it has at most m
-steps of v·dt·`below` from inside; and it ends where it leaves such ground or reaches the goal's disc. So it is at most
-v·dt·(1 + m·`below`) long, and x is at most half of that away from other ground, the disc or the start. Deeper points
-are removed: no arriving trajectory has any. W need not be continuous across them, and where they separate start and
-goal no trajectory arrives.
+**Immobilising ground.** A robot is lost after its m-th step in a row from λ under
+`below`, if it has not arrived. A trajectory that arrives is a polygonal line. Take a
+point x of it in immobilising ground, and the longest piece around x that stays there.
+The piece comes in by a part of one step, at most v·dt long, or begins at the start; it
+has at most m steps of v·dt·`below` from inside; and it ends where it leaves such ground
+or reaches the goal's disc. So it is at most v·dt·(1 + m·`below`) long, and x is at most
+half of that away from other ground, the disc or the start. Deeper points
+are removed: no arriving trajectory has any. W need not be continuous across them, and
+where they separate start and goal no trajectory arrives.
 
-**The largest W.** Of all W the one with the greatest sum over the nodes is found by the augmented Lagrangian method,
-one Poisson equation and one projection on discs a step (Ennaji, Igbida and Nguyen, 2021, "Augmented Lagrangian methods
-for degenerate Hamilton–Jacobi equations"). How well it has converged bears on how large the bound is, and not on
-whether it holds: the slope of each triangle is measured in float64, and W divided by the greatest excess.
+**The largest W.** Of all W the one with the greatest sum over the nodes is found by the
+augmented Lagrangian method, one Poisson equation and one projection on discs a step
+(Ennaji, Igbida and Nguyen, 2021, "Augmented Lagrangian methods for degenerate
+Hamilton–Jacobi equations"). How well it has converged bears on how large the bound is,
+and not on
+whether it holds: the slope of each triangle is measured in float64, and W divided by
+    the greatest excess.
 
-λ and positions are of single precision: a step may lead farther, and be read farther off, by some units in the last
-place, which are added to steps and distances. Letters in shapes: H×W cells, N nodes, T triangles.
+λ and positions are of single precision: a step may lead farther, and be read farther
+off, by some units in the last place, which are added to steps and distances. Letters in
+shapes: H×W cells, N nodes, T triangles.
 """
 
 import math
@@ -39,7 +49,13 @@ from scipy.sparse.linalg import splu
 
 from benchnav.core.grid import Grid
 from benchnav.planning.free_space import Immobile
-from benchnav.planning.robots import Bicycle, DifferentialDrive, Robot, Unicycle, steps_in
+from benchnav.planning.robots import (
+    Bicycle,
+    DifferentialDrive,
+    Robot,
+    Unicycle,
+    steps_in,
+)
 
 BOUNDED_ROBOTS = (Unicycle, DifferentialDrive, Bicycle)
 
@@ -47,7 +63,8 @@ _MOST_SQUARES = 300_000  # of a map; the equations' factors stay under a gigabyt
 _LEAST_TRAVERSABILITY = 1e-3
 _ULPS = 4 * 2.0**-24  # of a position, as a share of the map's extent
 _RELAXATION = 1.6
-_WEIGHT = 5.0  # of what the gradient misses, in units of the flux at the goal over the slowness
+# of what the gradient misses, in units of the flux at the goal over the slowness
+_WEIGHT = 5.0
 _EXCESS = 1.004  # of slopes, at which to stop
 _CHECK_EVERY = 25  # steps
 _MOST_STEPS = 300
@@ -73,7 +90,9 @@ class Motion:
         return self.robot.top_speed_mps * self.robot.dt_s
 
 
-def lower_bound_s(field: ndarray, grid: Grid, motion: Motion, start_m: ndarray, goal_m: ndarray) -> float:
+def lower_bound_s(
+    field: ndarray, grid: Grid, motion: Motion, start_m: ndarray, goal_m: ndarray
+) -> float:
     """Bound the time to the goal from below, for all trajectories.
 
     Args:
@@ -92,7 +111,11 @@ def lower_bound_s(field: ndarray, grid: Grid, motion: Motion, start_m: ndarray, 
     times = squares.height // grid.height
     fine = np.asarray(field, np.float64).repeat(times, 0).repeat(times, 1)
     ends = _squares_within(squares, goal_m, motion.goal_radius_m + error_m)
-    begin = tuple((start_m[::-1] / squares.resolution_m).astype(int).clip(0, np.array(squares.shape) - 1))
+    begin = tuple(
+        (start_m[::-1] / squares.resolution_m)
+        .astype(int)
+        .clip(0, np.array(squares.shape) - 1)
+    )
     kept = np.ones_like(ends)
     if motion.immobile is not None:
         # In single precision, as the world compares.
@@ -103,14 +126,18 @@ def lower_bound_s(field: ndarray, grid: Grid, motion: Motion, start_m: ndarray, 
     kept = parts == parts[begin]
     if not (kept & ends).any():
         return math.inf
-    reach = _reached(fine, squares, motion.step_m, 2 * error_m) + error_m / motion.step_m
+    reach = (
+        _reached(fine, squares, motion.step_m, 2 * error_m) + error_m / motion.step_m
+    )
     slowness = 1 / (motion.robot.top_speed_mps * reach.clip(_LEAST_TRAVERSABILITY))
     mesh = Mesh(squares, slowness, kept, ends & kept)
     return mesh.value_at(largest(mesh, motion.goal_radius_m), start_m)
 
 
 def _refined(grid: Grid, step_m: float) -> Grid:
-    """Squares about as wide as a step, a whole number of them along each side of a cell."""
+    """Squares about as wide as a step, a whole number of them along each side of a
+    cell.
+    """
     times = max(1, math.ceil(grid.resolution_m / step_m - 1e-6))
     times = max(1, min(times, math.isqrt(_MOST_SQUARES // (grid.height * grid.width))))
     return Grid(grid.height * times, grid.width * times, grid.resolution_m / times)
@@ -122,20 +149,34 @@ def _deepest_m(motion: Motion, immobile: Immobile) -> float:
 
 
 def _squares_within(squares: Grid, point_m: ndarray, radius_m: float) -> ndarray:
-    """Tell which closed squares come as near to a point as a radius, bool, of the shape of the squares."""
+    """Tell which closed squares come as near to a point as a radius, bool, of the shape
+    of the squares.
+    """
     gaps_m = []
     for size, at_m in zip(squares.shape, point_m[::-1], strict=True):
         low_m = np.arange(size) * squares.resolution_m
-        gaps_m.append(np.maximum(np.maximum(low_m - at_m, at_m - low_m - squares.resolution_m), 0))
+        gaps_m.append(
+            np.maximum(np.maximum(low_m - at_m, at_m - low_m - squares.resolution_m), 0)
+        )
     return np.hypot(gaps_m[0][:, None], gaps_m[1]) <= radius_m
 
 
 def _around(squares: Grid, reach_m: float) -> list[tuple[int, int, float]]:
-    """Offsets of squares at most so far away, and how far: the least distance of the closed squares."""
+    """Offsets of squares at most so far away, and how far: the least distance of the
+    closed squares.
+    """
     most = math.floor(reach_m / squares.resolution_m) + 1
-    offsets = [(row, column) for row in range(-most, most + 1) for column in range(-most, most + 1)]
+    offsets = [
+        (row, column)
+        for row in range(-most, most + 1)
+        for column in range(-most, most + 1)
+    ]
     found = [
-        (*offset, squares.resolution_m * math.hypot(*(max(abs(part) - 1, 0) for part in offset)))
+        (
+            *offset,
+            squares.resolution_m
+            * math.hypot(*(max(abs(part) - 1, 0) for part in offset)),
+        )
         for offset in offsets
     ]
     return [each for each in found if each[2] <= reach_m]
@@ -158,11 +199,15 @@ def _near(exits: ndarray, squares: Grid, reach_m: float) -> ndarray:
 
 
 def _reached(fine: ndarray, squares: Grid, step_m: float, error_m: float) -> ndarray:
-    """λ⁺: the greatest λ from which one step leads into each square, of the shape of the squares."""
+    """λ⁺: the greatest λ from which one step leads into each square, of the shape of
+    the squares.
+    """
     found = fine.copy()
     for row, column, away_m in _around(squares, step_m + error_m):
         there = _shifted(fine, row, column)
-        found = np.where((there * step_m + error_m >= away_m) & (there > found), there, found)
+        found = np.where(
+            (there * step_m + error_m >= away_m) & (there > found), there, found
+        )
     return found
 
 
@@ -171,7 +216,8 @@ class Mesh:
 
     Args:
         squares: of the whole map.
-        slowness: greatest slope of W in each square, in seconds a metre, of the shape of the squares.
+        slowness: greatest slope of W in each square, in seconds a metre, of the shape
+            of the squares.
         kept: squares that are not removed, bool, of the same shape.
         ends: squares where W is 0, bool, of the same shape.
 
@@ -181,15 +227,22 @@ class Mesh:
         rise: greatest rise of W over a leg, in seconds, shape [T].
     """
 
-    def __init__(self, squares: Grid, slowness: ndarray, kept: ndarray, ends: ndarray) -> None:
+    def __init__(
+        self, squares: Grid, slowness: ndarray, kept: ndarray, ends: ndarray
+    ) -> None:
         """Lay triangles out."""
         self.squares = squares
-        node = np.arange((squares.height + 1) * (squares.width + 1)).reshape(squares.height + 1, -1)
+        node = np.arange((squares.height + 1) * (squares.width + 1)).reshape(
+            squares.height + 1, -1
+        )
         corners = node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]
         low, right, up, far = (corner[kept] for corner in corners)
         even = np.add.outer(*map(np.arange, squares.shape))[kept] % 2 == 0
-        # Right angles at the lower left and the upper right corner, or at the other two.
-        self.right = np.concatenate((np.where(even, low, right), np.where(even, far, up)))
+        # Right angles at the lower left and the upper right corner, or at the other
+        # two.
+        self.right = np.concatenate(
+            (np.where(even, low, right), np.where(even, far, up))
+        )
         across = np.concatenate((np.where(even, right, low), np.where(even, up, far)))
         upward = np.concatenate((np.where(even, up, far), np.where(even, right, low)))
         self.along = np.stack((across, upward))
@@ -201,11 +254,16 @@ class Mesh:
 
     @cached_property
     def rises(self) -> csr_array:
-        """From W at the free nodes to its rise over both legs of all triangles, shape [2·T, free nodes]."""
+        """From W at the free nodes to its rise over both legs of all triangles, shape
+        [2·T, free nodes].
+        """
         count, each = len(self.right), np.arange(len(self.right))
         values, rows = np.repeat([1.0, -1.0], count), np.tile(each, 2)
         shape = count, len(self.free)
-        legs = [csr_array((values, (rows, np.concatenate((end, self.right)))), shape) for end in self.along]
+        legs = [
+            csr_array((values, (rows, np.concatenate((end, self.right)))), shape)
+            for end in self.along
+        ]
         return csr_array(vstack(legs).tocsc()[:, self.free])
 
     def excess(self, value: ndarray) -> float:
@@ -214,16 +272,26 @@ class Mesh:
         return float((over / self.rise).max())
 
     def value_at(self, value: ndarray, point_m: ndarray) -> float:
-        """W at a point, from W at all nodes, shape [N]; of a removed square it means nothing."""
+        """W at a point, from W at all nodes, shape [N]; of a removed square it means
+        nothing.
+        """
         place = point_m / self.squares.resolution_m
-        column, row = np.floor(place).astype(int).clip(0, np.array(self.squares.shape)[::-1] - 1)
+        column, row = (
+            np.floor(place).astype(int).clip(0, np.array(self.squares.shape)[::-1] - 1)
+        )
         x, y = place - (column, row)
-        nodes = value.reshape(self.squares.height + 1, -1)[row : row + 2, column : column + 2]
+        nodes = value.reshape(self.squares.height + 1, -1)[
+            row : row + 2, column : column + 2
+        ]
         if (row + column) % 2:  # as seen in a mirror
             nodes, x = nodes[:, ::-1], 1 - x
         if x + y > 1:
             nodes, x, y = nodes[::-1, ::-1], 1 - x, 1 - y
-        return float(nodes[0, 0] + x * (nodes[0, 1] - nodes[0, 0]) + y * (nodes[1, 0] - nodes[0, 0]))
+        return float(
+            nodes[0, 0]
+            + x * (nodes[0, 1] - nodes[0, 0])
+            + y * (nodes[1, 0] - nodes[0, 0])
+        )
 
 
 def largest(mesh: Mesh, goal_radius_m: float) -> ndarray:
@@ -239,7 +307,9 @@ def largest(mesh: Mesh, goal_radius_m: float) -> ndarray:
         return value
     back = rises.T.tocsr()
     small = 1e-9 * identity(rises.shape[1])  # of nodes without a way to the goal
-    solve = splu((back @ rises + small).tocsc(), "MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve
+    solve = splu(
+        (back @ rises + small).tocsc(), "MMD_AT_PLUS_A", options={"SymmetricMode": True}
+    ).solve
     # Flux of a unit a node through the rim of the disc, over the slowness.
     flux = count / 2 * size**2 / (2 * math.pi * goal_radius_m)
     weight = _WEIGHT * flux * size / np.median(mesh.rise)

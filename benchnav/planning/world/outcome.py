@@ -20,13 +20,20 @@ class Outcome(IntEnum):
     RUNNING = 0
     SUCCESS = 1
     TIMEOUT = 2
-    STUCK = 3  # a timeout whose last 10 s drove and moved under 0.5 m: low λ stopped the robot
+    # a timeout whose last 10 s drove and moved under 0.5 m: low λ stopped the robot
+    STUCK = 3
     OUT_OF_BOUNDS = 4
     PLANNER_FAILURE = 5  # the planner gave up
-    STALLED = 6  # a timeout whose last 10 s did not drive and moved under 0.5 m: the planner stopped it
-    PLANNER_ERROR = 7  # the planner raised, ran out of time, or returned what no robot can do
+    # a timeout whose last 10 s did not drive and moved under 0.5 m: the planner stopped
+    # it
+    STALLED = 6
+    PLANNER_ERROR = (
+        7  # the planner raised, ran out of time, or returned what no robot can do
+    )
     MODEL_ERROR = 8  # the model or the risk measure raised, or gave no distribution
-    IMMOBILISED = 9  # on ground that immobilises a robot, for as long as the world allows
+    IMMOBILISED = (
+        9  # on ground that immobilises a robot, for as long as the world allows
+    )
     SENSOR_ERROR = 10  # the sensor raised, or gave what is none
     BELIEF_ERROR = 11  # the belief raised, or gave what is none
 
@@ -39,13 +46,15 @@ FAILURES = tuple(o for o in Outcome if o not in (Outcome.RUNNING, Outcome.SUCCES
 def tell_standstill(
     outcome: Tensor, steps: Tensor, positions_m: Tensor, driven_m: Tensor, dt_s: float
 ) -> Tensor:
-    """Tells timeouts in which the robot stood: stuck where it drove, stalled where it did not.
+    """Tells timeouts in which the robot stood: stuck where it drove, stalled where it
+    did not.
 
     Args:
         outcome: shape [B].
         steps: steps that each episode took, int64, shape [B].
         positions_m: shape [B, N + 1, 2], those after an episode's end not looked at.
-        driven_m: how far each step would have moved the robot on ground of λ = 1, shape [B, N].
+        driven_m: how far each step would have moved the robot on ground of λ = 1, shape
+            [B, N].
         dt_s: time step.
 
     Returns:
@@ -59,6 +68,10 @@ def tell_standstill(
     recent = positions_m.gather(1, place[..., None].expand(-1, -1, 2))
     moved = torch.linalg.vector_norm(recent - recent[:, :1], dim=2).amax(dim=1)
     taken = steps[:, None] + back[:-1]
-    drove = torch.where(taken >= 0, driven_m.gather(1, taken.clamp(min=0)), 0.0).sum(dim=1)
+    drove = torch.where(taken >= 0, driven_m.gather(1, taken.clamp(min=0)), 0.0).sum(
+        dim=1
+    )
     standing = torch.where(drove >= STUCK_DISTANCE_M, Outcome.STUCK, Outcome.STALLED)
-    return torch.where((outcome == Outcome.TIMEOUT) & (moved < STUCK_DISTANCE_M), standing, outcome)
+    return torch.where(
+        (outcome == Outcome.TIMEOUT) & (moved < STUCK_DISTANCE_M), standing, outcome
+    )

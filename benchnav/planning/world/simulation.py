@@ -1,7 +1,7 @@
 """The simulation: true episodes, stepped as one batch.
 
-It holds the true terrain; λ is read where the robot stands and scales its motion. Letters in shapes: B
-episodes, S state and A action dimensions.
+It holds the true terrain; λ is read where the robot stands and scales its motion.
+Letters in shapes: B episodes, S state and A action dimensions.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,8 @@ class SimulationState:
         state: robot states, shape [B, S].
         outcome: `Outcome` of each, int64, shape [B].
         step: steps taken by each, int64, shape [B].
-        held: steps in a row, up to now, on ground that immobilises a robot, int64, shape [B].
+        held: steps in a row, up to now, on ground that immobilises a robot, int64,
+            shape [B].
     """
 
     state: Tensor
@@ -56,8 +57,10 @@ class Simulation:
         robot: F.
         time_budget_s: T of each episode, shape [B].
         steps: T in time steps, int64, shape [B].
-        field: the λ of every cell where it stays what it is, shape [B, H, W]; None where it is resampled.
-        attempts: how many fields were drawn until ground joined start and goal, int64, shape [B].
+        field: the λ of every cell where it stays what it is, shape [B, H, W]; None
+            where it is resampled.
+        attempts: how many fields were drawn until ground joined start and goal, int64,
+            shape [B].
     """
 
     def __init__(
@@ -71,10 +74,18 @@ class Simulation:
     ) -> None:
         """Draws all noise."""
         self.robot = task.robot
-        self.time_budget_s = world.budget_s(places.reference_time_s, task.robot.top_speed_mps)
+        self.time_budget_s = world.budget_s(
+            places.reference_time_s, task.robot.top_speed_mps
+        )
         self.steps = world.steps(self.time_budget_s, task.robot.dt_s)
-        self._grid, self._goal_m, self._goal_radius_m = terrain.grid, places.goal_m, task.rules.goal_radius_m
-        self._realisation = Realisation(terrain, world, places, int(self.steps.max()), noise_key, maps)
+        self._grid, self._goal_m, self._goal_radius_m = (
+            terrain.grid,
+            places.goal_m,
+            task.rules.goal_radius_m,
+        )
+        self._realisation = Realisation(
+            terrain, world, places, int(self.steps.max()), noise_key, maps
+        )
         # Which `exchange_` changes in place.
         self.field, self.attempts = self._realisation.field, self._realisation.attempts
         self._immobile = world.immobile
@@ -83,13 +94,17 @@ class Simulation:
 
     @property
     def immobilising(self) -> Tensor:
-        """Cells that immobilise a robot, bool, shape [B, H, W]; none where λ is resampled or nothing immobilises."""
+        """Cells that immobilise a robot, bool, shape [B, H, W]; none where λ is
+        resampled or nothing immobilises.
+        """
         if self.field is None or self._immobile is None:
             return self._goal_m.new_zeros(len(self._goal_m), *self._grid.shape).bool()
         return self.field < self._immobile.below
 
     def field_at(self, step: int) -> Tensor:
-        """λ of every cell at a step, shape [B, H, W]; where it is resampled, as every robot would meet it then."""
+        """λ of every cell at a step, shape [B, H, W]; where it is resampled, as every
+        robot would meet it then.
+        """
         return self._realisation.field_at(step) if self.field is None else self.field
 
     def init(self, start: Tensor) -> SimulationState:
@@ -97,7 +112,9 @@ class Simulation:
         zero = torch.zeros(len(start), dtype=torch.int64, device=start.device)
         return SimulationState(start.clone(), zero, zero, zero)
 
-    def step(self, now: SimulationState, action: Tensor) -> tuple[SimulationState, Tensor]:
+    def step(
+        self, now: SimulationState, action: Tensor
+    ) -> tuple[SimulationState, Tensor]:
         """Advances the running episodes by one step; ended ones stay as they are.
 
         Args:
@@ -109,7 +126,9 @@ class Simulation:
         """
         traversability = self._realisation.at(now.state, now.step)
         # A robot of a user's may write into what it is given.
-        moved = self.robot(now.state.clone(), action.clamp(self._low, self._high), traversability)
+        moved = self.robot(
+            now.state.clone(), action.clamp(self._low, self._high), traversability
+        )
         state = torch.where(now.running[:, None], moved, now.state)
         step = now.step + now.running
         arrived = distance(state, self._goal_m) < self._goal_radius_m
@@ -126,22 +145,31 @@ class Simulation:
         return SimulationState(state, outcome, step, held), traversability
 
     def unhindered(self, now: SimulationState, action: Tensor) -> Tensor:
-        """Where an action would take the robots on ground of λ = 1, shape [B, S]; what was commanded."""
+        """Where an action would take the robots on ground of λ = 1, shape [B, S]; what
+        was commanded.
+        """
         ones = torch.ones_like(now.state[:, 0])
         return self.robot(now.state.clone(), action.clamp(self._low, self._high), ones)
 
     def exchange_(self, members: Tensor, others: "Simulation") -> None:
-        """Gives some episodes the maps, goals and noise of another simulation, in place; the rest keep theirs.
+        """Gives some episodes the maps, goals and noise of another simulation, in
+        place; the rest keep theirs.
 
         Args:
             members: indices of the episodes, int64, shape [M].
             others: M episodes of the same task and world.
         """
         for name in ("_goal_m", "time_budget_s", "steps"):
-            setattr(self, name, getattr(self, name).index_copy(0, members, getattr(others, name)))
+            setattr(
+                self,
+                name,
+                getattr(self, name).index_copy(0, members, getattr(others, name)),
+            )
         self._realisation.exchange_(members, others._realisation)
 
 
 def end(now: SimulationState, which: Tensor, outcome: Outcome) -> SimulationState:
-    """Ends running episodes, bool [B], with an outcome that the simulation cannot see itself."""
+    """Ends running episodes, bool [B], with an outcome that the simulation cannot see
+    itself.
+    """
     return replace(now, outcome=torch.where(now.running & which, outcome, now.outcome))

@@ -18,6 +18,10 @@ class SlopeModel(TraversabilityModel):
         self.fall, self.std = fall, std
 
     def predict(self, observation: Observation) -> TraversabilityMixture:
-        """One Gaussian in each cell, clipped to [0, 1]: weights, means and deviations of shape [B, K = 1, H, W]."""
+        """One Gaussian in each cell, clipped to [0, 1]: weights, means and deviations
+        of shape [B, K = 1, H, W].
+        """
         mean = (1 - self.fall * observation.slope_deg).unsqueeze(1)
-        return TraversabilityMixture(torch.ones_like(mean), mean, torch.full_like(mean, self.std))
+        return TraversabilityMixture(
+            torch.ones_like(mean), mean, torch.full_like(mean, self.std)
+        )

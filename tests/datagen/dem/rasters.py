@@ -20,15 +20,28 @@ rasterio = pytest.importorskip("rasterio")
 WEST, SOUTH = 500_000.0, 3_999_900.0
 STEP = 2.0**-13  # of stored elevation
 # 12 m × 8 m: not square, so that swapped axes show.
-RECIPE = replace(tiny_recipe(), id="real-v1", height=16, width=24, start_m=(2.2, 2.2), goal_m=(9.2, 5.2))
+RECIPE = replace(
+    tiny_recipe(),
+    id="real-v1",
+    height=16,
+    width=24,
+    start_m=(2.2, 2.2),
+    goal_m=(9.2, 5.2),
+)
 COUNTER = itertools.count()
 NAMES = [kind.name for kind in RECIPE.classes]
 
 
 def write(
-    path: Path, values: Any, cell: float = 0.5, offset: tuple[float, float] = (0, 0), **profile: Any
+    path: Path,
+    values: Any,
+    cell: float = 0.5,
+    offset: tuple[float, float] = (0, 0),
+    **profile: Any,
 ) -> Path:
-    """Writes a north-up GeoTIFF whose south-west corner lies `offset` metres off (WEST, SOUTH)."""
+    """Writes a north-up GeoTIFF whose south-west corner lies `offset` metres off (WEST,
+    SOUTH).
+    """
     values = np.asarray(values)
     values = values[None] if values.ndim == 2 else values
     bands, height, width = values.shape
@@ -44,37 +57,62 @@ def write(
 
 def centres(height: int, width: int, cell: float) -> tuple[np.ndarray, np.ndarray]:
     """x and y of a raster's cells from its south-west corner, rows southward."""
-    return (np.arange(width) + 0.5) * cell, (height - np.arange(height) - 0.5)[:, None] * cell
+    return (np.arange(width) + 0.5) * cell, (height - np.arange(height) - 0.5)[
+        :, None
+    ] * cell
 
 
-def plane(height: int, width: int, cell: float, slope_x: float = 0.2, slope_y: float = 0.1) -> np.ndarray:
+def plane(
+    height: int, width: int, cell: float, slope_x: float = 0.2, slope_y: float = 0.1
+) -> np.ndarray:
     x, y = centres(height, width, cell)
     return 900 + slope_x * x + slope_y * y
 
 
 def rough(height: int, width: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(100, 101, (height, width)).astype(np.float32)
+    return (
+        np.random.default_rng(seed)
+        .uniform(100, 101, (height, width))
+        .astype(np.float32)
+    )
 
 
 def run(dem: Path | str, out: Path, settings: dict[str, Any]) -> list[tuple[int, int]]:
     """Imports rasters by the settings of `Rasters` and of `import_dem`."""
     settings = {"recipe": RECIPE} | settings
-    files = {name: str(settings.pop(name, "")) for name in ("classes", "photo", "traversability")}
-    plain = {
-        name: settings.pop(name) for name in ("class_ids", "random_classes", "layer") if name in settings
+    files = {
+        name: str(settings.pop(name, ""))
+        for name in ("classes", "photo", "traversability")
     }
-    ground = {name: settings.pop(name) for name in ("dem_unit", "origin", "max_maps") if name in settings}
+    plain = {
+        name: settings.pop(name)
+        for name in ("class_ids", "random_classes", "layer")
+        if name in settings
+    }
+    ground = {
+        name: settings.pop(name)
+        for name in ("dem_unit", "origin", "max_maps")
+        if name in settings
+    }
     cut = cut_of(settings, ground=GroundOptions(**ground))
-    return list(import_dem(str(dem), out, rasters=Rasters(**files, **plain), cut=cut, **settings))
+    return list(
+        import_dem(
+            str(dem), out, rasters=Rasters(**files, **plain), cut=cut, **settings
+        )
+    )
 
 
 def cut_of(settings: dict[str, Any], **more: Any) -> Cut:
     """Take the settings of `Cut` out of others."""
     names = ("shares", "scenario", "stride_m", "solvable")
-    return Cut(**{name: settings.pop(name) for name in names if name in settings}, **more)
+    return Cut(
+        **{name: settings.pop(name) for name in names if name in settings}, **more
+    )
 
 
-def read(dem: Path | str, folder: Path | None = None, suffix: str = ".h5", **settings: Any) -> TerrainDataset:
+def read(
+    dem: Path | str, folder: Path | None = None, suffix: str = ".h5", **settings: Any
+) -> TerrainDataset:
     """Imports into a new file, which must be sound."""
     folder = folder or Path(dem).parent
     before = set(folder.iterdir())
@@ -90,13 +128,20 @@ def read(dem: Path | str, folder: Path | None = None, suffix: str = ".h5", **set
 def source_of(dataset: TerrainDataset) -> dict[str, Any]:
     (split,) = dataset.splits.values()
     (part,) = split["parts"]
-    assert part["maps"] == split["maps"] == len(part["source"]["kept"]) == len(part["source"]["lowest_m"])
+    assert (
+        part["maps"]
+        == split["maps"]
+        == len(part["source"]["kept"])
+        == len(part["source"]["lowest_m"])
+    )
     assert "recipe" not in part
     return part["source"]
 
 
 def tile_place(source: dict[str, Any], number: int) -> tuple[float, float]:
-    """Metres from the ground's south-west corner to that of a map, northward and eastward."""
+    """Metres from the ground's south-west corner to that of a map, northward and
+    eastward.
+    """
     row, column = divmod(number, source["tiles"][1])
     return row * source["stride_m"][1], column * source["stride_m"][0]
 

@@ -14,13 +14,22 @@ from benchnav.core.errors import DatasetError
 from benchnav.datagen.dem.drive_cells import elevation_under
 from benchnav.datagen.dem.drive_log import OVER_SPEED, DriveLog, Drives
 from benchnav.datagen.dem.drive_motion import compare_motion, compare_slopes
-from benchnav.datagen.dem.drive_tracks import find_jumped, speed_of_positions, track_of, velocity_of
+from benchnav.datagen.dem.drive_tracks import (
+    find_jumped,
+    speed_of_positions,
+    track_of,
+    velocity_of,
+)
 
 STEP_S = 0.1
 
 
-def drive(commanded: np.ndarray, traversability: np.ndarray, turn: np.ndarray | float = 0.0) -> pd.DataFrame:
-    """A drive whose positions, measured speed and command agree; `turn` is the rate of turn in rad/s."""
+def drive(
+    commanded: np.ndarray, traversability: np.ndarray, turn: np.ndarray | float = 0.0
+) -> pd.DataFrame:
+    """A drive whose positions, measured speed and command agree; `turn` is the rate of
+    turn in rad/s.
+    """
     speed = commanded * traversability
     heading = np.cumsum(np.broadcast_to(turn, len(speed))) * STEP_S + 0.3
     way = np.concatenate([[0], (speed * STEP_S)[1:]])
@@ -36,19 +45,31 @@ def drive(commanded: np.ndarray, traversability: np.ndarray, turn: np.ndarray | 
     )
 
 
-def log_of(rows: pd.DataFrame, speed: str = "", is_geographic: bool = False) -> DriveLog:
+def log_of(
+    rows: pd.DataFrame, speed: str = "", is_geographic: bool = False
+) -> DriveLog:
     names = tuple(f"drive-{index}" for index in range(rows["drive"].max() + 1))
     settings = Drives(file="log.csv", speed=speed)  # type: ignore[arg-type]
-    return DriveLog(settings=settings, sha256="", names=names, is_geographic=is_geographic, rows=rows)
+    return DriveLog(
+        settings=settings,
+        sha256="",
+        names=names,
+        is_geographic=is_geographic,
+        rows=rows,
+    )
 
 
 def rough_drive(rows: int = 600, seed: int = 0) -> pd.DataFrame:
-    """A minute of 0.5 to 1 m/s over terrain of changing λ, with noise of 3 % in the measured speed."""
+    """A minute of 0.5 to 1 m/s over terrain of changing λ, with noise of 3 % in the
+    measured speed.
+    """
     generator = np.random.default_rng(seed)
     commanded = np.repeat(generator.choice([0.5, 0.8, 1.0], rows // 50), 50)
     traversability = 0.75 + 0.2 * np.sin(np.arange(rows) / 37)
     table = drive(commanded, traversability, turn=0.1)
-    return table.assign(speed=table["speed"] * (1 + 0.03 * generator.standard_normal(rows)))
+    return table.assign(
+        speed=table["speed"] * (1 + 0.03 * generator.standard_normal(rows))
+    )
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.4])
@@ -78,7 +99,9 @@ def test_another_unit_is_named_with_its_factor(
     column: str, factor: float, unit: str, remedy: str, fix_rows: int
 ) -> None:
     rows = rough_drive()
-    rows[["x", "y"]] = rows[["x", "y"]].iloc[np.arange(600) // fix_rows * fix_rows].to_numpy()
+    rows[["x", "y"]] = (
+        rows[["x", "y"]].iloc[np.arange(600) // fix_rows * fix_rows].to_numpy()
+    )
     columns = column.split()
     rows[columns] *= factor
     with pytest.raises(DatasetError, match=f"which looks like {unit}\\. ") as caught:
@@ -90,7 +113,9 @@ def test_another_unit_is_named_with_its_factor(
     assert log.motion["pace"] == pytest.approx(1, abs=0.03)
     kept = compare_motion(log_of(rows, "measured")) if "speed" in columns else log
     assert len(kept.rows) == 600
-    if "speed" not in columns:  # off against the command as well, so that positions do not help
+    if (
+        "speed" not in columns
+    ):  # off against the command as well, so that positions do not help
         with pytest.raises(DatasetError, match=unit):
             compare_motion(log_of(rows, "positions"))
 
@@ -111,25 +136,34 @@ def test_a_unit_of_time_is_named_in_curves_and_without_measured_speed(
     factor: float, unit: str, remedy: float, turn: float, measured: bool
 ) -> None:
     rows = drive(np.ones(3000), 0.5 + 0.1 * np.sin(np.arange(3000) / 37), turn)
-    rows = rows.assign(time_s=rows["time_s"] * factor, speed=rows["speed"] if measured else np.nan)
+    rows = rows.assign(
+        time_s=rows["time_s"] * factor, speed=rows["speed"] if measured else np.nan
+    )
     for speed in ("", "positions") if measured else ("positions",):
         with pytest.raises(
-            DatasetError, match=rf"{unit}.* ultiply `time_s` by {remedy:.4g}".replace(" u", "[Mm]u")
+            DatasetError,
+            match=rf"{unit}.* ultiply `time_s` by {remedy:.4g}".replace(" u", "[Mm]u"),
         ):
             compare_motion(log_of(rows, speed, is_geographic=True))
 
 
-def test_positions_that_no_command_explains_are_rejected_and_slow_ones_are_not() -> None:
+def test_positions_that_no_command_explains_are_rejected_and_slow_ones_are_not() -> (
+    None
+):
     rows = drive(np.ones(900), np.repeat([0.02, 0.06], [800, 100]))
     compare_motion(log_of(rows.assign(speed=np.nan), "positions"))
     compare_motion(
-        log_of(drive(np.ones(900), np.full(900, 4.5)).assign(speed=np.nan, commanded=1.0), "positions")
+        log_of(
+            drive(np.ones(900), np.full(900, 4.5)).assign(speed=np.nan, commanded=1.0),
+            "positions",
+        )
     )
     compare_motion(log_of(rows.assign(speed=0.0), "positions"))  # it is immobilised
     tenth = drive(np.ones(900), np.full(900, 0.4)).assign(time_s=np.arange(900.0))
     for speed in (0.4, np.nan):
         with pytest.raises(
-            DatasetError, match=r"0\.04 times as far as `commanded_m_s` .* no unit .* in seconds"
+            DatasetError,
+            match=r"0\.04 times as far as `commanded_m_s` .* no unit .* in seconds",
         ):
             compare_motion(log_of(tenth.assign(speed=speed), "positions"))
 
@@ -138,7 +172,8 @@ def test_positions_of_few_decimals_name_no_unit() -> None:
     rows = drive(np.ones(900), np.full(900, 0.3), turn=0.05)
     log = log_of(rows.assign(x=rows["x"].round(-1), y=rows["y"].round(-1), speed=1.2))
     with pytest.raises(
-        DatasetError, match=r"no unit that is known, since positions are multiples of 10 m\. Log .* decimals"
+        DatasetError,
+        match=r"no unit that is known, since positions are multiples of 10 m\. Log .* decimals",
     ):
         compare_motion(replace(log, motion={"resolution_m": 10.0}))
 
@@ -150,7 +185,9 @@ def test_a_slalom_is_not_of_wheels() -> None:
 
 
 def test_few_straight_spans_name_no_unit_of_speed() -> None:
-    turning = drive(np.ones(30), np.full(30, 0.5), turn=np.repeat([0, 6.0, 0], 10)).assign(speed=1.0)
+    turning = drive(
+        np.ones(30), np.full(30, 0.5), turn=np.repeat([0, 6.0, 0], 10)
+    ).assign(speed=1.0)
     standing = drive(np.repeat([0.0, 1.0], [18, 12]), np.full(30, 0.5144))
     for rows in (turning, standing.assign(speed=standing["commanded"])):
         with pytest.raises(DatasetError, match="no unit that is known"):
@@ -164,7 +201,8 @@ def test_a_measured_speed_of_no_unit_is_rejected_too() -> None:
         (1 / 3.281, "3.2"),
     ):  # positions agree with the command: they are no feet
         with pytest.raises(
-            DatasetError, match=rf"got {ratio}\d* times .* like no unit that is known\. .* m, or pass"
+            DatasetError,
+            match=rf"got {ratio}\d* times .* like no unit that is known\. .* m, or pass",
         ):
             compare_motion(log_of(rows.assign(speed=rows["speed"] * factor)))
 
@@ -189,10 +227,15 @@ def test_curves_and_gaps_are_no_disagreement() -> None:
 
 @pytest.mark.parametrize("rows", [8, 15, 25])
 def test_short_drives_are_compared_too(rows: int) -> None:
-    parts = [drive(np.ones(rows), np.full(rows, 0.8)).assign(drive=index) for index in range(40)]
+    parts = [
+        drive(np.ones(rows), np.full(rows, 0.8)).assign(drive=index)
+        for index in range(40)
+    ]
     table = pd.concat(parts, ignore_index=True)
     for speed in ("", "measured"):
-        assert compare_motion(log_of(table, speed)).motion["pace"] == pytest.approx(1, abs=0.02)
+        assert compare_motion(log_of(table, speed)).motion["pace"] == pytest.approx(
+            1, abs=0.02
+        )
     with pytest.raises(DatasetError, match="knots"):
         compare_motion(log_of(table.assign(speed=table["speed"] / 0.5144)))
 
@@ -206,7 +249,9 @@ def test_a_log_without_motion_under_one_command_is_not_compared() -> None:
 
 @pytest.mark.parametrize("period_s", [1, 2, 5])
 @pytest.mark.parametrize("is_thinned", [True, False])
-def test_positions_that_come_seldom_name_no_false_unit(period_s: int, is_thinned: bool) -> None:
+def test_positions_that_come_seldom_name_no_false_unit(
+    period_s: int, is_thinned: bool
+) -> None:
     rows, step = rough_drive(6000), 10 * period_s
     if is_thinned:
         rows = rows.iloc[::step].reset_index(drop=True)
@@ -214,9 +259,15 @@ def test_positions_that_come_seldom_name_no_false_unit(period_s: int, is_thinned
         rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // step * step].to_numpy()
     log = compare_motion(log_of(rows))
     assert log.motion["pace"] == pytest.approx(1, abs=0.03)
-    with pytest.raises(DatasetError, match=r"like (knots|no unit that is known, since)"):
+    with pytest.raises(
+        DatasetError, match=r"like (knots|no unit that is known, since)"
+    ):
         compare_motion(log_of(rows.assign(speed=rows["speed"] / 0.5144)))
-    winding = drive(np.ones(6000), np.full(6000, 0.9), turn=0.6).iloc[::step].reset_index(drop=True)
+    winding = (
+        drive(np.ones(6000), np.full(6000, 0.9), turn=0.6)
+        .iloc[::step]
+        .reset_index(drop=True)
+    )
     if period_s > 2:  # chords are much shorter than their arcs
         with pytest.raises(DatasetError, match="no unit that is known, since"):
             compare_motion(log_of(winding))
@@ -236,7 +287,9 @@ def test_a_drive_that_disagrees_among_many_is_left_out_and_counted() -> None:
     assert log.left_out["off_pace"] == 600
     assert 3 not in set(log.rows["drive"])
     parts[4]["speed"] *= 1.3
-    with pytest.raises(DatasetError, match=r"got 1200 of 7200 .* disagree by more than 15 %"):
+    with pytest.raises(
+        DatasetError, match=r"got 1200 of 7200 .* disagree by more than 15 %"
+    ):
         compare_motion(log_of(pd.concat(parts, ignore_index=True)))
 
 
@@ -245,10 +298,14 @@ def test_the_unit_of_drives_that_disagree_is_named(factor: float, unit: str) -> 
     parts = [rough_drive(seed=seed).assign(drive=seed) for seed in range(6)]
     for index in (1, 4):
         parts[index]["speed"] *= factor
-    with pytest.raises(DatasetError, match=rf"1200 of 3600 .* like {unit} in drive-1, drive-4") as caught:
+    with pytest.raises(
+        DatasetError, match=rf"1200 of 3600 .* like {unit} in drive-1, drive-4"
+    ) as caught:
         compare_motion(log_of(pd.concat(parts, ignore_index=True)))
     for index in (1, 4):
-        parts[index]["speed"] *= float(str(caught.value).split("Multiply `measured_m_s` by ")[1].split()[0])
+        parts[index]["speed"] *= float(
+            str(caught.value).split("Multiply `measured_m_s` by ")[1].split()[0]
+        )
     log = compare_motion(log_of(pd.concat(parts, ignore_index=True)))
     assert log.left_out["off_pace"] == 0
 
@@ -261,7 +318,10 @@ def test_sliding_back_and_over_speed_are_kept() -> None:
         np.testing.assert_allclose(log.rows["traversability"], traversability)
     # From positions, away from the changes.
     log = compare_motion(log_of(drive(np.ones(600), traversability), "positions"))
-    away = np.abs(log.rows["time_s"].to_numpy()[:, None] - [10, 20, 30, 32]).min(axis=1) > 1
+    away = (
+        np.abs(log.rows["time_s"].to_numpy()[:, None] - [10, 20, 30, 32]).min(axis=1)
+        > 1
+    )
     actual = log.rows["traversability"][away]
     np.testing.assert_allclose(
         actual, traversability[(log.rows["time_s"][away] / STEP_S).round().astype(int)]
@@ -284,20 +344,25 @@ def test_no_ratio_to_the_command_stops_an_import(speed: str) -> None:
         ):
             compare_motion(log_of(rows, speed))
         log = compare_motion(log_of(rows.assign(commanded=2.0), speed))
-        assert len(log.rows) >= len(rows) - 2  # both ends have too few positions around them
+        assert (
+            len(log.rows) >= len(rows) - 2
+        )  # both ends have too few positions around them
 
 
 def skid_steer_log() -> pd.DataFrame:
     """Return a log of a skid-steer robot at 1.08 times its command, in knots.
 
-    The command changes often, and speed follows it with a time constant of 0.5 s, so that a tenth of the rows exceeds
-    1.2 times the command. Positions come once a second.
+    The command changes often, and speed follows it with a time constant of 0.5 s, so
+    that a tenth of the rows exceeds 1.2 times the command. Positions come once a
+    second.
     """
     generator = np.random.default_rng(4)
     commanded = generator.choice([0.15, 0.3, 0.45, 0.6], 20).repeat(60)
     followed = commanded.copy()
     for row in range(1, len(followed)):
-        followed[row] = followed[row - 1] + (commanded[row] - followed[row - 1]) * STEP_S / 0.5
+        followed[row] = (
+            followed[row - 1] + (commanded[row] - followed[row - 1]) * STEP_S / 0.5
+        )
     rows = drive(commanded, 1.08 * followed / commanded, turn=0.05)
     rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // 10 * 10].to_numpy()
     measured = rows["speed"] + 0.01 * generator.standard_normal(len(rows))
@@ -306,7 +371,9 @@ def skid_steer_log() -> pd.DataFrame:
 
 def test_a_log_in_knots_imports_by_its_remedy_though_it_exceeds_its_command() -> None:
     rows = skid_steer_log()
-    with pytest.raises(DatasetError, match=r"like knots\. Multiply `measured_m_s` by 0\.5144 "):
+    with pytest.raises(
+        DatasetError, match=r"like knots\. Multiply `measured_m_s` by 0\.5144 "
+    ):
         compare_motion(log_of(rows))
     for mended in (
         log_of(rows.assign(speed=rows["speed"] * 0.5144)),
@@ -323,7 +390,8 @@ def test_a_speed_of_the_other_sign_is_rejected() -> None:
     rows = drive(commanded, np.full(600, 0.9))
     unsigned = rows.assign(speed=rows["speed"].abs())
     with pytest.raises(
-        DatasetError, match=r"sign of .* got the other one in 300 of 300 rows commanded backward"
+        DatasetError,
+        match=r"sign of .* got the other one in 300 of 300 rows commanded backward",
     ):
         compare_motion(log_of(unsigned))
     for speed in ("measured", "positions"):
@@ -344,12 +412,16 @@ def test_an_immobilised_robot_is_no_frozen_receiver() -> None:
     frozen = compare_motion(log_of(rows))
     assert (frozen.left_out["frozen"], frozen.left_out["jumped"]) == (300, 0)
     rows.loc[200:1000, ["x", "y"]] = rows.loc[200, ["x", "y"]].to_numpy()
-    with pytest.raises(DatasetError, match="800 of 6000 that have a position that stays the same"):
+    with pytest.raises(
+        DatasetError, match="800 of 6000 that have a position that stays the same"
+    ):
         compare_motion(log_of(rows))
 
 
 def stuck_drive() -> pd.DataFrame:
-    """Ten minutes of λ 0.8 with 40 s of immobility, whose positions are exactly the same."""
+    """Ten minutes of λ 0.8 with 40 s of immobility, whose positions are exactly the
+    same.
+    """
     traversability = np.full(6000, 0.8)
     traversability[2000:2400] = 0
     rows = drive(np.ones(6000), traversability)
@@ -358,11 +430,15 @@ def stuck_drive() -> pd.DataFrame:
 
 @pytest.mark.parametrize("measured", ["of the drive", "of wheels", "missing"])
 @pytest.mark.parametrize("fix_rows", [1, 5])
-def test_positions_separate_immobility_from_a_frozen_receiver(measured: str, fix_rows: int) -> None:
+def test_positions_separate_immobility_from_a_frozen_receiver(
+    measured: str, fix_rows: int
+) -> None:
     rows = stuck_drive()
     if measured != "of the drive":
         rows["speed"] = 0.8 * rows["commanded"] if measured == "of wheels" else np.nan
-    rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+    rows[["x", "y"]] = (
+        rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+    )
     log = compare_motion(log_of(rows, "positions"))
     assert log.left_out["frozen"] == 0
     assert len(log.rows) > 5980
@@ -373,8 +449,12 @@ def test_positions_separate_immobility_from_a_frozen_receiver(measured: str, fix
         assert log.motion["standing"] == pytest.approx(400, abs=10)
     else:
         assert log.motion["standing"] == 0
-        left_out = compare_motion(log_of(rows)).left_out  # a measured speed that is used has to agree
-        assert left_out["frozen"] == pytest.approx(400 if measured == "of wheels" else 0, abs=10)
+        left_out = compare_motion(
+            log_of(rows)
+        ).left_out  # a measured speed that is used has to agree
+        assert left_out["frozen"] == pytest.approx(
+            400 if measured == "of wheels" else 0, abs=10
+        )
     frozen = rows.copy()  # the robot drives on, and the receiver comes back
     frozen.loc[4000:4300, ["x", "y"]] = frozen.loc[4000, ["x", "y"]].to_numpy()
     log = compare_motion(log_of(frozen, "positions"))
@@ -382,14 +462,21 @@ def test_positions_separate_immobility_from_a_frozen_receiver(measured: str, fix
     assert (log.rows["traversability"][log.rows["time_s"] > 300] > 0.7).all()
 
 
-def test_a_robot_that_stands_at_the_end_is_immobilised_unless_its_speed_says_no() -> None:
+def test_a_robot_that_stands_at_the_end_is_immobilised_unless_its_speed_says_no() -> (
+    None
+):
     rows = drive(np.ones(6000), np.repeat([0.8, 0], [5700, 300]))
     log = compare_motion(log_of(rows.assign(speed=np.nan), "positions"))
     assert log.left_out["frozen"] == 0
     assert log.motion["standing"] == 300
-    assert compare_motion(log_of(rows.assign(speed=0.8), "positions")).left_out["frozen"] == 300
+    assert (
+        compare_motion(log_of(rows.assign(speed=0.8), "positions")).left_out["frozen"]
+        == 300
+    )
     short = rows.iloc[5400:].reset_index(drop=True)
-    with pytest.raises(DatasetError, match=r"300 of 600 .* stays the same .* Log `measured_m_s`"):
+    with pytest.raises(
+        DatasetError, match=r"300 of 600 .* stays the same .* Log `measured_m_s`"
+    ):
         compare_motion(log_of(short.assign(speed=np.nan), "positions"))
     assert len(compare_motion(log_of(short, "positions")).rows) == 600
 
@@ -397,17 +484,23 @@ def test_a_robot_that_stands_at_the_end_is_immobilised_unless_its_speed_says_no(
 @pytest.mark.parametrize("speed", ["", "positions", "measured"])
 def test_positions_that_never_change_are_frozen(speed: str) -> None:
     rows = drive(np.ones(600), np.full(600, 0.9)).assign(x=5.0, y=5.0)
-    with pytest.raises(DatasetError, match="599 of 600 that have a position that stays the same"):
+    with pytest.raises(
+        DatasetError, match="599 of 600 that have a position that stays the same"
+    ):
         compare_motion(log_of(rows, speed))
 
 
 def test_positions_that_repeat_until_the_next_fix_are_not_frozen() -> None:
     rows = rough_drive()
-    rows[["x", "y"]] = rows[["x", "y"]].iloc[np.arange(600) // 20 * 20].to_numpy()  # every 2 s
+    rows[["x", "y"]] = (
+        rows[["x", "y"]].iloc[np.arange(600) // 20 * 20].to_numpy()
+    )  # every 2 s
     log = compare_motion(log_of(rows))
     assert not log.left_out["frozen"] + log.left_out["jumped"]
     assert log.motion["pace"] == pytest.approx(1, abs=0.05)
-    rows = drive(np.repeat([0.2, 1.0], [500, 200]), np.ones(700))  # much faster than usual at the end
+    rows = drive(
+        np.repeat([0.2, 1.0], [500, 200]), np.ones(700)
+    )  # much faster than usual at the end
     rows[["x", "y"]] = rows[["x", "y"]].iloc[np.arange(700) // 20 * 20].to_numpy()
     assert compare_motion(log_of(rows)).left_out["frozen"] == 0
 
@@ -427,26 +520,37 @@ def test_a_wrong_command_does_not_hide_jumps(speed: str) -> None:
     assert (left_out["jumped"], left_out["implausible"]) == (2, 2)
 
 
-@given(st.sets(st.integers(0, 599), max_size=55), st.floats(3, 1e6), st.integers(0, 2**32))
-def test_jumps_are_found_and_nothing_else(jumps: set[int], size_m: float, seed: int) -> None:
+@given(
+    st.sets(st.integers(0, 599), max_size=55), st.floats(3, 1e6), st.integers(0, 2**32)
+)
+def test_jumps_are_found_and_nothing_else(
+    jumps: set[int], size_m: float, seed: int
+) -> None:
     rows, away = rough_drive(), sorted(jumps)
     angle = np.random.default_rng(seed).uniform(0, 2 * np.pi, len(away))
     rows.loc[away, "x"] += size_m * np.cos(angle)
     rows.loc[away, "y"] += size_m * np.sin(angle)
     found = find_jumped(track_of(rows.sample(frac=1, random_state=seed % 2**31)), 1.5)
-    # A jump of 3 m is in reach again after 2 s, so that one after another may count as a track.
+    # A jump of 3 m is in reach again after 2 s, so that one after another may count as
+    # a track.
     assert set(found) == jumps or size_m < 100
 
 
 def test_times_that_restart_are_counted_and_rows_out_of_order_are_not() -> None:
     rows = rough_drive()
-    mixed = compare_motion(log_of(rows.sample(frac=1, random_state=0, ignore_index=True)))
+    mixed = compare_motion(
+        log_of(rows.sample(frac=1, random_state=0, ignore_index=True))
+    )
     assert mixed.left_out["restarted"] == 0
     assert mixed.motion["pace"] == pytest.approx(1, abs=0.03)
-    again = rows.assign(time_s=rows["time_s"].where(rows.index < 570, rows["time_s"] - 57))
+    again = rows.assign(
+        time_s=rows["time_s"].where(rows.index < 570, rows["time_s"] - 57)
+    )
     assert compare_motion(log_of(again)).left_out["restarted"] == 30
     twice = rows.assign(time_s=rows["time_s"] % 30)
-    with pytest.raises(DatasetError, match=r"299 of 600 that have a time before .* column `drive`"):
+    with pytest.raises(
+        DatasetError, match=r"299 of 600 that have a time before .* column `drive`"
+    ):
         compare_motion(log_of(twice))
     named = twice.assign(drive=rows.index // 300)
     assert len(compare_motion(log_of(named)).rows) == 600
@@ -459,15 +563,19 @@ def test_a_speed_that_is_the_command_is_of_wheels() -> None:
     rows = drive(np.ones(1200), np.repeat([1.0, 0.4, 1.0], 400)).assign(speed=1.0)
     log = compare_motion(log_of(rows))  # on most of the way they agree
     with pytest.raises(
-        DatasetError, match=r"equals `commanded_m_s` where positions do not .*--speed positions"
+        DatasetError,
+        match=r"equals `commanded_m_s` where positions do not .*--speed positions",
     ):
         compare_slopes(log, np.zeros(1200))
-    with pytest.raises(DatasetError, match=r"got 0.7 times .* like wheel odometry, since it equals"):
+    with pytest.raises(
+        DatasetError, match=r"got 0.7 times .* like wheel odometry, since it equals"
+    ):
         compare_motion(log_of(drive(np.ones(600), np.full(600, 0.7)).assign(speed=1.0)))
 
 
 @pytest.mark.parametrize(
-    ("radius_m", "noise_m"), [(np.inf, 0.0), (3.0, 0.0), (0.8, 0.0), (np.inf, 0.3), (3.0, 0.1)]
+    ("radius_m", "noise_m"),
+    [(np.inf, 0.0), (3.0, 0.0), (0.8, 0.0), (np.inf, 0.3), (3.0, 0.1)],
 )
 def test_a_robot_that_follows_its_command_over_ground_is_not_of_wheels(
     radius_m: float, noise_m: float
@@ -484,26 +592,36 @@ def test_a_robot_that_follows_its_command_over_ground_is_not_of_wheels(
 def test_wheels_in_a_part_of_a_drive_are_seen(part: float) -> None:
     rows = drive(np.ones(2400), 0.6 + 0.1 * np.sin(np.arange(2400) / 37), turn=0.1)
     rows["speed"] = rows["speed"].where(rows.index >= part * 2400, rows["commanded"])
-    with pytest.raises(DatasetError, match=r"over 15% less far in \d\d% of spans\), as wheel"):
+    with pytest.raises(
+        DatasetError, match=r"over 15% less far in \d\d% of spans\), as wheel"
+    ):
         compare_slopes(compare_motion(log_of(rows)), np.zeros(2400))
 
 
 @pytest.mark.parametrize(
-    ("noise", "rise", "is_wheels"), [(0.005, 1, True), (0.05, 1, False), (0.005, 0.2, False)]
+    ("noise", "rise", "is_wheels"),
+    [(0.005, 1, True), (0.05, 1, False), (0.005, 0.2, False)],
 )
 def test_a_speed_that_follows_the_command_up_and_down_is_of_wheels(
     noise: float, rise: float, is_wheels: bool
 ) -> None:
     rows = drive(np.ones(1200), np.full(1200, 0.95))
-    measured = rows["speed"] * (1 + noise * np.random.default_rng(0).standard_normal(60).repeat(20))
+    measured = rows["speed"] * (
+        1 + noise * np.random.default_rng(0).standard_normal(60).repeat(20)
+    )
     elevation = rise * 3 * np.sin(np.hypot(rows["x"], rows["y"]) / 12)  # up to 14°
     log = compare_motion(log_of(rows.assign(speed=measured)))
     if is_wheels:
-        with pytest.raises(DatasetError, match=r"to 2% on slopes of -1\d° to 1\d°.*--speed measured"):
+        with pytest.raises(
+            DatasetError, match=r"to 2% on slopes of -1\d° to 1\d°.*--speed measured"
+        ):
             compare_slopes(log, elevation.to_numpy())
     else:
         compare_slopes(log, elevation.to_numpy())
-    compare_slopes(compare_motion(log_of(rows.assign(speed=measured), "measured")), elevation.to_numpy())
+    compare_slopes(
+        compare_motion(log_of(rows.assign(speed=measured), "measured")),
+        elevation.to_numpy(),
+    )
 
 
 @pytest.mark.parametrize("height", [40, 200])
@@ -515,12 +633,17 @@ def test_elevation_is_interpolated_between_cells(height: int) -> None:
 
         def read(self, rows: range, columns: range) -> np.ndarray:
             row, column = np.meshgrid(
-                np.arange(rows.start - 1, rows.stop + 1), np.arange(-1, columns.stop + 1), indexing="ij"
+                np.arange(rows.start - 1, rows.stop + 1),
+                np.arange(-1, columns.stop + 1),
+                indexing="ij",
             )
             return (3.0 * row + 5.0 * column)[None]
 
     generator = np.random.default_rng(0)
-    row, column = generator.uniform(-0.5, height - 0.5, 500), generator.uniform(-0.5, 29.5, 500)
+    row, column = (
+        generator.uniform(-0.5, height - 0.5, 500),
+        generator.uniform(-0.5, 29.5, 500),
+    )
     log = log_of(drive(np.ones(500), np.ones(500)))
     actual = elevation_under(log, Plane(), row, column)  # type: ignore[arg-type]
     np.testing.assert_allclose(actual, 3 * row + 5 * column)
@@ -532,7 +655,9 @@ def test_elevation_is_interpolated_between_cells(height: int) -> None:
 def test_velocity_is_the_derivative_of_savitzky_and_golay() -> None:
     generator = np.random.default_rng(0)
     x = np.cumsum(generator.normal(0.05, 0.02, 500)) + 4e6
-    rows = pd.DataFrame({"x": x, "y": 0.0, "time_s": np.arange(500) * STEP_S, "drive": 0})
+    rows = pd.DataFrame(
+        {"x": x, "y": 0.0, "time_s": np.arange(500) * STEP_S, "drive": 0}
+    )
     velocity = velocity_of(track_of(rows), ["x"])["x"]
     expected = savgol_filter(x, 21, 2, deriv=1, delta=STEP_S)
     np.testing.assert_allclose(velocity[10:-10], expected[10:-10], atol=1e-6)
@@ -543,7 +668,9 @@ def test_the_error_of_a_velocity_is_that_of_its_noise() -> None:
     generator = np.random.default_rng(0)
     for step_s, spread_s2 in ((1.0, 2.0), (0.1, 7.7)):  # Σ t² of three fixes, and of 21
         time_s = np.arange(2000) * step_s
-        x, y = np.stack([0.8 * time_s, 0 * time_s]) + 0.1 * generator.standard_normal((2, 2000))
+        x, y = np.stack([0.8 * time_s, 0 * time_s]) + 0.1 * generator.standard_normal(
+            (2, 2000)
+        )
         rows = pd.DataFrame({"x": x, "y": y, "time_s": time_s, "drive": 0})
         error = velocity_of(track_of(rows), ["x", "y"])["error"][20:-20]
         expected = 0.1 / np.sqrt(spread_s2)
@@ -552,26 +679,37 @@ def test_the_error_of_a_velocity_is_that_of_its_noise() -> None:
 
 
 @pytest.mark.parametrize("fix_rows", [1, 3, 10])
-def test_speed_of_positions_is_that_of_the_drive_forward_and_backward(fix_rows: int) -> None:
+def test_speed_of_positions_is_that_of_the_drive_forward_and_backward(
+    fix_rows: int,
+) -> None:
     commanded = np.concatenate([np.full(300, 0.8), np.zeros(50), np.full(300, -0.6)])
     rows = drive(commanded, np.full(650, 0.75), turn=0.2)
-    rows[["x", "y"]] = rows[["x", "y"]].iloc[np.arange(650) // fix_rows * fix_rows].to_numpy()
+    rows[["x", "y"]] = (
+        rows[["x", "y"]].iloc[np.arange(650) // fix_rows * fix_rows].to_numpy()
+    )
     speed = speed_of_positions(track_of(rows), 0.1)
-    steady = (rows.index > 30) & (rows.index < 260) | (rows.index > 400) & (rows.index < 620)
+    steady = (rows.index > 30) & (rows.index < 260) | (rows.index > 400) & (
+        rows.index < 620
+    )
     np.testing.assert_allclose(speed[steady], 0.75 * commanded[steady], rtol=0.02)
 
 
 @pytest.mark.parametrize(
-    ("rate", "fix_rows", "noise_m"), [(0.5, 1, 0.02), (1.0, 1, 0.0), (-1.0, 5, 0.0), (0.6, 10, 0.0)]
+    ("rate", "fix_rows", "noise_m"),
+    [(0.5, 1, 0.02), (1.0, 1, 0.0), (-1.0, 5, 0.0), (0.6, 10, 0.0)],
 )
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_speed_of_positions_is_that_along_an_arc(
     rate: float, fix_rows: int, noise_m: float, direction: float
 ) -> None:
-    """Oracle: the arc of a circle of 0.8 m at 1 rad/s, on which a fitted line is 10 % shorter."""
+    """Oracle: the arc of a circle of 0.8 m at 1 rad/s, on which a fitted line is 10 %
+    shorter.
+    """
     rows = drive(np.full(900, direction), np.full(900, 0.8), turn=rate)
     rows[["x", "y"]] += noise_m * np.random.default_rng(0).standard_normal((900, 2))
-    rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+    rows[["x", "y"]] = (
+        rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+    )
     log = compare_motion(log_of(rows, "positions"))
     assert log.rows["traversability"][30:-30].mean() == pytest.approx(0.8, abs=0.01)
     assert log.motion["pace"] == pytest.approx(1, abs=0.02)
@@ -580,16 +718,22 @@ def test_speed_of_positions_is_that_along_an_arc(
 
 @pytest.mark.parametrize("fix_rows", [10, 20])
 def test_a_turn_between_fixes_is_no_slide(fix_rows: int) -> None:
-    """A skid-steer robot turns by half a circle at 2 rad/s, slowly, which at 1 Hz looks like a reversal."""
+    """A skid-steer robot turns by half a circle at 2 rad/s, slowly, which at 1 Hz looks
+    like a reversal.
+    """
     turns = np.tile(np.repeat([0.0, 2.0], [84, 16]), 12)
     rows = drive(np.where(turns > 0, 0.15, 1.0), np.full(1200, 0.8), turns)
-    rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+    rows[["x", "y"]] = (
+        rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+    )
     assert (compare_motion(log_of(rows, "positions")).rows["traversability"] >= 0).all()
 
 
 @pytest.mark.parametrize("noise_m", [0.05, 0.1, 0.3])
 @pytest.mark.parametrize("fix_rows", [1, 10])
-def test_noise_does_not_turn_an_immobilised_robot(noise_m: float, fix_rows: int) -> None:
+def test_noise_does_not_turn_an_immobilised_robot(
+    noise_m: float, fix_rows: int
+) -> None:
     for seed in range(8):
         generator = np.random.default_rng(seed)
         turn = np.repeat(
@@ -597,13 +741,17 @@ def test_noise_does_not_turn_an_immobilised_robot(noise_m: float, fix_rows: int)
         )  # every second one turns round at rest
         rows = drive(np.ones(900), np.repeat([0.8, 0, 0.8], [300, 200, 400]), turn)
         rows[["x", "y"]] += noise_m * generator.standard_normal((900, 2))
-        rows[["x", "y"]] = rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+        rows[["x", "y"]] = (
+            rows[["x", "y"]].iloc[rows.index // fix_rows * fix_rows].to_numpy()
+        )
         speed = speed_of_positions(track_of(rows), 0.1)
         moves = ~rows["time_s"].between(28, 52)
         assert (speed[moves].dropna() > 0).all(), seed
 
 
-@pytest.mark.parametrize(("noise_m", "rest"), [(0.0, 0), (0.05, 0), (0.05, 25), (0.1, 10)])
+@pytest.mark.parametrize(
+    ("noise_m", "rest"), [(0.0, 0), (0.05, 0), (0.05, 25), (0.1, 10)]
+)
 def test_sliding_back_is_seen_through_noise(noise_m: float, rest: int) -> None:
     for seed in range(8):
         generator = np.random.default_rng(seed)
@@ -613,15 +761,23 @@ def test_sliding_back_is_seen_through_noise(noise_m: float, rest: int) -> None:
         speed = speed_of_positions(track_of(rows), 0.1)
         start_s, end_s = (300 + rest) * STEP_S, (400 + rest) * STEP_S
         assert (speed[rows["time_s"].between(start_s + 1, end_s - 1)] < 0).all(), seed
-        assert (speed[~rows["time_s"].between(start_s - rest / 10 - 1, end_s + rest / 10 + 1)] > 0).all(), (
-            seed
-        )
+        assert (
+            speed[
+                ~rows["time_s"].between(start_s - rest / 10 - 1, end_s + rest / 10 + 1)
+            ]
+            > 0
+        ).all(), seed
 
 
 def test_speed_of_positions_goes_along_the_slope() -> None:
     rows = drive(np.ones(600), np.full(600, 0.9))
-    log = compare_motion(log_of(rows.drop(columns="speed").assign(speed=np.nan), "positions"))
-    assert (log.motion["pace"], log.motion["commanded_pace"]) == (None, pytest.approx(0.9))
+    log = compare_motion(
+        log_of(rows.drop(columns="speed").assign(speed=np.nan), "positions")
+    )
+    assert (log.motion["pace"], log.motion["commanded_pace"]) == (
+        None,
+        pytest.approx(0.9),
+    )
     height = np.tan(np.radians(20)) * np.hypot(log.rows["x"], log.rows["y"])
     along = compare_slopes(log, height.to_numpy()).rows["traversability"]
     np.testing.assert_allclose(along, 0.9 / np.cos(np.radians(20)), rtol=1e-6)

@@ -1,4 +1,6 @@
-"""Drive logs as robots, receivers and spreadsheets spoil them: each imports right, or stops with a working remedy."""
+"""Drive logs as robots, receivers and spreadsheets spoil them: each imports right, or
+stops with a working remedy.
+"""
 
 import re
 import shlex
@@ -26,7 +28,9 @@ def traversability(x_m: np.ndarray) -> np.ndarray:
 
 
 def clean_log() -> pd.DataFrame:
-    """Three drives eastward, which wind over hills at 0.8 and 1 m/s, with noise of 3 % in the measured speed."""
+    """Three drives eastward, which wind over hills at 0.8 and 1 m/s, with noise of 3 %
+    in the measured speed.
+    """
     generator, parts = np.random.default_rng(0), []
     for drive in range(3):
         commanded = np.where(np.arange(ROWS) // 50 % 2, 0.8, 1.0)
@@ -34,9 +38,14 @@ def clean_log() -> pd.DataFrame:
         for step in range(ROWS):
             speed = commanded[step] * float(traversability(np.array(x)))
             heading = 0.4 * np.sin(step / 40)
-            x, y = x + speed / RATE * np.cos(heading), y + speed / RATE * np.sin(heading)
+            x, y = (
+                x + speed / RATE * np.cos(heading),
+                y + speed / RATE * np.sin(heading),
+            )
             rows.append((step / RATE, WEST + x, SOUTH + y, commanded[step], speed))
-        table = pd.DataFrame(rows, columns=["time_s", "x_m", "y_m", "commanded_m_s", "measured_m_s"])
+        table = pd.DataFrame(
+            rows, columns=["time_s", "x_m", "y_m", "commanded_m_s", "measured_m_s"]
+        )
         table["measured_m_s"] *= 1 + 0.03 * generator.standard_normal(ROWS)
         parts.append(table.assign(drive=f"drive-{drive}"))
     return pd.concat(parts, ignore_index=True)
@@ -46,7 +55,11 @@ def clean_log() -> pd.DataFrame:
 def ground(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("ground")
     x, y = np.meshgrid(np.arange(WIDTH) * CELL, np.arange(HEIGHT) * CELL)
-    write(folder / "dem.tif", (100 + 2 * np.sin(x / 8) * np.cos(y / 8)).astype(np.float32), CELL)
+    write(
+        folder / "dem.tif",
+        (100 + 2 * np.sin(x / 8) * np.cos(y / 8)).astype(np.float32),
+        CELL,
+    )
     write(folder / "photo.tif", np.full((3, HEIGHT, WIDTH), 99, np.uint8), CELL)
     return folder
 
@@ -72,7 +85,9 @@ def some(fraction: float, seed: int = 1) -> np.ndarray:
 
 
 def jumping(fraction: float) -> Edit:
-    return lambda log: log.assign(x_m=log["x_m"] + 20.0 * np.isin(log.index, some(fraction)))
+    return lambda log: log.assign(
+        x_m=log["x_m"] + 20.0 * np.isin(log.index, some(fraction))
+    )
 
 
 def without(fraction: float) -> Edit:
@@ -110,12 +125,18 @@ def set_back(log: pd.DataFrame) -> pd.DataFrame:
 
 
 def angles(log: pd.DataFrame) -> pd.DataFrame:
-    places = transformed(rasterio.crs.CRS.from_epsg(32654), "EPSG:4326", log["x_m"], log["y_m"])
-    return log.assign(longitude_deg=places[0], latitude_deg=places[1]).drop(columns=["x_m", "y_m"])
+    places = transformed(
+        rasterio.crs.CRS.from_epsg(32654), "EPSG:4326", log["x_m"], log["y_m"]
+    )
+    return log.assign(longitude_deg=places[0], latitude_deg=places[1]).drop(
+        columns=["x_m", "y_m"]
+    )
 
 
 def swapped(*names: str) -> Edit:
-    return lambda log: log.rename(columns=dict(zip(names, reversed(names), strict=True)))
+    return lambda log: log.rename(
+        columns=dict(zip(names, reversed(names), strict=True))
+    )
 
 
 def backward(log: pd.DataFrame) -> pd.DataFrame:
@@ -137,7 +158,8 @@ def third_in_knots(log: pd.DataFrame) -> pd.DataFrame:
 def noisy(size_m: float) -> Edit:
     def edit(log: pd.DataFrame) -> pd.DataFrame:
         return log.assign(
-            y_m=log["y_m"] + size_m * np.random.default_rng(2).standard_normal(len(log)),
+            y_m=log["y_m"]
+            + size_m * np.random.default_rng(2).standard_normal(len(log)),
         )
 
     return edit
@@ -168,8 +190,8 @@ def identical(log: pd.DataFrame) -> pd.DataFrame:
     return log
 
 
-# What is spoilt, how, what is said, and the remedy (empty: the log imports right): options to pass, or what to do with
-# the log by the one line.
+# What is spoilt, how, what is said, and the remedy (empty: the log imports right):
+# options to pass, or what to do with the log by the one line.
 Case = tuple[str, Edit, str, str | Callable[[pd.DataFrame, str], pd.DataFrame]]
 CASES: list[Case] = [
     ("clean", identical, "", ""),
@@ -246,8 +268,14 @@ def run(options: str, capfd: pytest.CaptureFixture[str]) -> tuple[int, str]:
 def cells(dataset: TerrainDataset) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Actual λ of each map, NaN where it was not driven, and expected λ."""
     source = dataset.splits["train"]["parts"][0]["source"]
-    for number, actual in zip(source["kept"], dataset.read("train")["traversability"], strict=True):
-        west = source["origin_m"][0] - WEST + number % source["tiles"][1] * source["stride_m"][0]
+    for number, actual in zip(
+        source["kept"], dataset.read("train")["traversability"], strict=True
+    ):
+        west = (
+            source["origin_m"][0]
+            - WEST
+            + number % source["tiles"][1] * source["stride_m"][0]
+        )
         x = west + (np.arange(24) + 0.5) * CELL
         # Where λ changes, speeds of two seconds of positions are of both.
         expected = np.where(np.abs(x - 40) < 2, np.nan, traversability(x))
@@ -256,7 +284,8 @@ def cells(dataset: TerrainDataset) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 def check_right() -> None:
     actual, expected = (
-        np.concatenate(values) for values in zip(*cells(TerrainDataset("out.h5")), strict=True)
+        np.concatenate(values)
+        for values in zip(*cells(TerrainDataset("out.h5")), strict=True)
     )
     error = np.abs(actual - expected)
     error = error[~np.isnan(error)]
@@ -266,7 +295,9 @@ def check_right() -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "line", "remedy"), [case[1:] for case in CASES], ids=[case[0] for case in CASES]
+    ("spoil", "line", "remedy"),
+    [case[1:] for case in CASES],
+    ids=[case[0] for case in CASES],
 )
 def test_a_spoilt_log_imports_right_or_stops_with_a_remedy_that_works(
     spoil: Edit,
@@ -303,7 +334,13 @@ def reverses() -> pd.DataFrame:
     x = WEST + 20 + np.cumsum(speed) / RATE
     time_s = np.arange(len(x)) / RATE
     return pd.DataFrame(
-        {"time_s": time_s, "x_m": x, "y_m": SOUTH + 10.0, "commanded_m_s": 1.0, "measured_m_s": np.abs(speed)}
+        {
+            "time_s": time_s,
+            "x_m": x,
+            "y_m": SOUTH + 10.0,
+            "commanded_m_s": 1.0,
+            "measured_m_s": np.abs(speed),
+        }
     )
 
 
@@ -320,10 +357,22 @@ def reverses() -> pd.DataFrame:
             "--speed positions",
             "more than 10% of rows slide back by their positions, which looks wrong",
         ),
-        (clean_log()[::RATE], "--speed positions", "positions come every 1 s, too seldom to distinguish"),
-        (few_decimals(clean_log()), "--speed measured", "positions are multiples of 1 m: log more decimals"),
+        (
+            clean_log()[::RATE],
+            "--speed positions",
+            "positions come every 1 s, too seldom to distinguish",
+        ),
+        (
+            few_decimals(clean_log()),
+            "--speed measured",
+            "positions are multiples of 1 m: log more decimals",
+        ),
         (clean_log(), "", ""),
-        (reverses().assign(measured_m_s=np.tile(np.repeat([0.8, -0.6], 50), 4)), "", ""),
+        (
+            reverses().assign(measured_m_s=np.tile(np.repeat([0.8, -0.6], 50), 4)),
+            "",
+            "",
+        ),
         (clean_log(), "--speed positions", ""),
     ],
 )

@@ -1,7 +1,8 @@
-"""Rasters as they come: each is imported right, or stopped in one line whose remedy works when it is applied.
+"""Rasters as they come: each is imported right, or stopped in one line whose remedy
+works when it is applied.
 
-All are of a plane that rises 20 % eastward and 10 % northward, so the slope of what is imported says whether units,
-cells and missing values were read right.
+All are of a plane that rises 20 % eastward and 10 % northward, so the slope of what is
+imported says whether units, cells and missing values were read right.
 """
 
 import re
@@ -40,7 +41,8 @@ class Case:
         edit: Changes the open file.
         others: Write further rasters into a folder.
         words: Of the command.
-        fixes: Parts of the lines that the import stops with, in order; each is applied as a command or an option.
+        fixes: Parts of the lines that the import stops with, in order; each is applied
+            as a command or an option.
         fill: Values of the words in capitals of a remedy.
         maps: Number that is kept; 0 where the ground cannot be imported.
         out: Text of the last output.
@@ -71,14 +73,20 @@ def feet(crs: str, unit_m: float, west: float, south: float, **settings: Any) ->
     """Return a case of cells of 2 ft and elevations in feet."""
     north = south + 2 * FEET[0]
     profile = {"crs": crs, "transform": rasterio.Affine(2, 0, west, 0, -2, north)}
-    return Case(plane(*FEET, cell=2), profile=profile, **{"maps": 9, "atol": 0.5} | settings)
+    return Case(
+        plane(*FEET, cell=2), profile=profile, **{"maps": 9, "atol": 0.5} | settings
+    )
 
 
 def geographic(height: int = 150, width: int = 150) -> Case:
     """Return a case in degrees."""
     cell, south = 5e-6, 35.7
     metres = np.array([np.cos(np.radians(south)), 1]) * np.radians(cell) * 6378137
-    values = 500 + 0.2 * metres[0] * np.arange(width) - 0.1 * metres[1] * np.arange(height)[:, None]
+    values = (
+        500
+        + 0.2 * metres[0] * np.arange(width)
+        - 0.1 * metres[1] * np.arange(height)[:, None]
+    )
     transform = rasterio.Affine(cell, 0, 139.7, 0, -cell, south)
     return Case(values, profile={"crs": "EPSG:4326", "transform": transform}, maps=20)
 
@@ -87,7 +95,10 @@ def turned(affine: Any, size: int = 160) -> dict[str, Any]:
     """Return values and profile of a square raster that lies as a transform says."""
     column, row = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
     x, y = affine * (column, row)
-    return {"values": 0.2 * (x - WEST) + 0.1 * (y - SOUTH), "profile": {"transform": affine}}
+    return {
+        "values": 0.2 * (x - WEST) + 0.1 * (y - SOUTH),
+        "profile": {"transform": affine},
+    }
 
 
 def scale(factor: float, offset: float = 0.0) -> Callable[[Any], None]:
@@ -136,13 +147,17 @@ def photo(folder: Path) -> None:
     write(folder / "photo.tif", np.full((3, 66, 96), 99, np.uint8), offset=(1, 1))
 
 
-def measured(value: float, scale: float = 1.0, unit: str = "", **profile: Any) -> Callable[[Path], object]:
+def measured(
+    value: float, scale: float = 1.0, unit: str = "", **profile: Any
+) -> Callable[[Path], object]:
     """Return a writer of λ of 0.5 with a value in a corner."""
 
     def make(folder: Path) -> None:
         values = np.full((70, 100), 0.5 * scale, np.float32)
         values[-3:, :3] = value
-        with rasterio.open(write(folder / "measured.tif", values, **profile), "r+") as file:
+        with rasterio.open(
+            write(folder / "measured.tif", values, **profile), "r+"
+        ) as file:
             file.units = (unit,)
 
     return make
@@ -155,16 +170,24 @@ def corner(east: float, north: float) -> str:
 
 ARIZONA = ("EPSG:2223", 700_000, 1_000_000)
 CALIFORNIA = ("EPSG:2229", 6_500_000, 1_800_000)
-ROT = rasterio.Affine.translation(WEST, SOUTH) * rasterio.Affine.scale(0.5) * rasterio.Affine.rotation(20)
+ROT = (
+    rasterio.Affine.translation(WEST, SOUTH)
+    * rasterio.Affine.scale(0.5)
+    * rasterio.Affine.rotation(20)
+)
 LAMBDA = "--traversability measured.tif --random-classes"
 DECLARE = "rio edit-info --nodata "
 
 CASES: dict[str, Case] = {
     # right at once
     "metres": Case(out="elevations in metres (the raster declares no unit"),
-    "unit declared": Case(edit=unit("metre"), out="elevations in metres as the raster declares"),
+    "unit declared": Case(
+        edit=unit("metre"), out="elevations in metres as the raster declares"
+    ),
     "whole centimetres": Case(
-        (100 * plane(**HIGH, cell=0.5) - 9e4).astype("int16"), edit=scale(0.01, 900.0), atol=0.5
+        (100 * plane(**HIGH, cell=0.5) - 9e4).astype("int16"),
+        edit=scale(0.01, 900.0),
+        atol=0.5,
     ),
     "NaN": Case(holed(np.nan), maps=5, out="1 missing elevation"),
     "infinity": Case(holed(np.inf), maps=5, out="1 missing elevation"),
@@ -179,7 +202,10 @@ CASES: dict[str, Case] = {
         edit=unit("metre"),
         maps=9,
         atol=0.5,
-        profile={"crs": "EPSG:2229", "transform": rasterio.Affine(2, 0, 6_500_000, 0, -2, 1_800_200)},
+        profile={
+            "crs": "EPSG:2229",
+            "transform": rasterio.Affine(2, 0, 6_500_000, 0, -2, 1_800_200),
+        },
     ),
     "below the sea": Case(plane(**HIGH, cell=0.5) - 1330),
     "a shore": Case(np.maximum(plane(**HIGH, cell=0.5) - 900.5, 0).round(3)),
@@ -188,7 +214,8 @@ CASES: dict[str, Case] = {
     "a hole of no common value": Case(step(12, -4321), maps=5, out="1 too rough"),
     "an origin between cells": Case(words=f"--origin [{WEST + 0.13},{SOUTH + 0.29}]"),
     "colours that begin elsewhere": Case(
-        others=photo, words=f"--photo photo.tif --random-classes --origin [{WEST + 1},{SOUTH + 1}]"
+        others=photo,
+        words=f"--photo photo.tif --random-classes --origin [{WEST + 1},{SOUTH + 1}]",
     ),
     "cells of half the width": Case(plane(140, 200, 0.25), 0.25),
     # units
@@ -201,32 +228,62 @@ CASES: dict[str, Case] = {
         },
         fixes=("--dem-unit m",),
     ),
-    "feet declared": Case(plane(**HIGH, cell=0.5) / FT, edit=unit("ft"), fixes=("--dem-unit ft",)),
-    "centimetres declared": Case(100 * plane(**HIGH, cell=0.5), edit=unit("cm"), fixes=("--dem-unit 0.01",)),
+    "feet declared": Case(
+        plane(**HIGH, cell=0.5) / FT, edit=unit("ft"), fixes=("--dem-unit ft",)
+    ),
+    "centimetres declared": Case(
+        100 * plane(**HIGH, cell=0.5), edit=unit("cm"), fixes=("--dem-unit 0.01",)
+    ),
     "US feet above the sea": Case(
-        plane(**HIGH, cell=0.5) / US_FT, profile={"crs": "EPSG:32654+6360"}, fixes=("--dem-unit us-ft",)
+        plane(**HIGH, cell=0.5) / US_FT,
+        profile={"crs": "EPSG:32654+6360"},
+        fixes=("--dem-unit us-ft",),
     ),
     "inches declared": Case(
-        plane(**HIGH, cell=0.5) / 0.0254, edit=unit("Inches"), fixes=("--dem-unit 0.0254",)
+        plane(**HIGH, cell=0.5) / 0.0254,
+        edit=unit("Inches"),
+        fixes=("--dem-unit 0.0254",),
     ),
-    "feet declared of metres": Case(edit=unit("US survey foot"), fixes=("--dem-unit m",)),
+    "feet declared of metres": Case(
+        edit=unit("US survey foot"), fixes=("--dem-unit m",)
+    ),
     # values that stand for missing
     "-9999": Case(holed(-9999), fixes=(f"{DECLARE}-9999",), maps=5),
     "-1 in low ground": Case(
-        np.where(holed(np.nan) > 0, holed(0) - 940, -1), fixes=(f"{DECLARE}-1",), maps=5, atol=np.inf
+        np.where(holed(np.nan) > 0, holed(0) - 940, -1),
+        fixes=(f"{DECLARE}-1",),
+        maps=5,
+        atol=np.inf,
     ),
     "-999 in low ground": Case(holed(-999), fixes=(f"{DECLARE}-999",), maps=5),
     "-32768": Case(
-        holed(-32768, "int16", 0.1), edit=scale(0.1), fixes=(f"{DECLARE}-32768",), maps=5, atol=0.5
+        holed(-32768, "int16", 0.1),
+        edit=scale(0.1),
+        fixes=(f"{DECLARE}-32768",),
+        maps=5,
+        atol=0.5,
     ),
-    "65535": Case(holed(65535, "uint16", 0.02), edit=scale(0.02), fixes=(f"{DECLARE}65535",), maps=5),
-    "the largest float": Case(holed(FLOAT_MAX), fixes=(f"{DECLARE}3.40282347e+38",), maps=5),
-    "the smallest float": Case(holed(-FLOAT_MAX), fixes=(f"{DECLARE}-3.40282347e+38",), maps=5),
+    "65535": Case(
+        holed(65535, "uint16", 0.02),
+        edit=scale(0.02),
+        fixes=(f"{DECLARE}65535",),
+        maps=5,
+    ),
+    "the largest float": Case(
+        holed(FLOAT_MAX), fixes=(f"{DECLARE}3.40282347e+38",), maps=5
+    ),
+    "the smallest float": Case(
+        holed(-FLOAT_MAX), fixes=(f"{DECLARE}-3.40282347e+38",), maps=5
+    ),
     "a million": Case(holed(1e6), fixes=(f"{DECLARE}1000000",), maps=5),
     "-1 far below": Case(holed(-1), fixes=(f"{DECLARE}-1",), maps=5),
     "zero far below": Case(holed(0), fixes=(f"{DECLARE}0",), maps=5),
     "-9999 of scaled values": Case(
-        holed(-9999, "int16", 0.1), edit=scale(0.1), fixes=(f"{DECLARE}-9999",), maps=5, atol=0.5
+        holed(-9999, "int16", 0.1),
+        edit=scale(0.1),
+        fixes=(f"{DECLARE}-9999",),
+        maps=5,
+        atol=0.5,
     ),
     "-9999 of feet": Case(
         (holed(-9999 * FT) / FT).astype("float32"),
@@ -247,7 +304,10 @@ CASES: dict[str, Case] = {
         maps=5,
     ),
     "a second zero": Case(
-        holed(0), profile={"nodata": -9999}, fixes=("'(where (== (read 1) 0) -9999 (read 1))'",), maps=5
+        holed(0),
+        profile={"nodata": -9999},
+        fixes=("'(where (== (read 1) 0) -9999 (read 1))'",),
+        maps=5,
     ),
     "a value next to a mask": Case(
         holed(-999),
@@ -255,16 +315,24 @@ CASES: dict[str, Case] = {
         fixes=("rio calc --profile nodata=-999 '(read 1)'",),
         maps=4,
     ),
-    "a sea below a cliff of 97 m": Case(holed(803) - np.float32(803), profile={"nodata": -9999}),
+    "a sea below a cliff of 97 m": Case(
+        holed(803) - np.float32(803), profile={"nodata": -9999}
+    ),
     "a map of -9999": Case(
-        np.where(np.arange(100) < 32, -9999, plane(**HIGH, cell=0.5)), fixes=(f"{DECLARE}-9999",), maps=4
+        np.where(np.arange(100) < 32, -9999, plane(**HIGH, cell=0.5)),
+        fixes=(f"{DECLARE}-9999",),
+        maps=4,
     ),
     "measured λ in percent": Case(
         others=measured(80, 100), words=LAMBDA, fixes=("rio calc --not-masked",), maps=6
     ),
-    "measured λ of -1": Case(others=measured(-1), words=LAMBDA, fixes=(f"{DECLARE}-1",)),
+    "measured λ of -1": Case(
+        others=measured(-1), words=LAMBDA, fixes=(f"{DECLARE}-1",)
+    ),
     "a layer of -9999": Case(
-        others=measured(-9999), words="--layer wet=measured.tif", fixes=(f"{DECLARE}-9999",)
+        others=measured(-9999),
+        words="--layer wet=measured.tif",
+        fixes=(f"{DECLARE}-9999",),
     ),
     "a layer of a second -9999": Case(
         others=measured(-9999, nodata=-32768),
@@ -272,7 +340,9 @@ CASES: dict[str, Case] = {
         fixes=("'(where (== (read 1) -9999) -32768 (read 1))'",),
     ),
     "a layer of an endless value": Case(
-        others=measured(FLOAT_MAX), words="--layer wet=measured.tif", fixes=(f"{DECLARE}3.40282347e+38",)
+        others=measured(FLOAT_MAX),
+        words="--layer wet=measured.tif",
+        fixes=(f"{DECLARE}3.40282347e+38",),
     ),
     "a layer in yards": Case(
         others=measured(0, unit="yard"),
@@ -307,10 +377,14 @@ CASES: dict[str, Case] = {
     ),
     "few cells": coarse(30.0, 20, 20, fixes=("o.h5 resolution_m=15",), maps=1),
     "coarse and rotated": Case(
-        **turned(ROT * rasterio.Affine.scale(20), 40), fixes=("o.h5 resolution_m=5",), maps=1
+        **turned(ROT * rasterio.Affine.scale(20), 40),
+        fixes=("o.h5 resolution_m=5",),
+        maps=1,
     ),
     "very few cells": coarse(30.0, 10, 10, fixes=("height=16 width=16",), maps=1),
-    "side by side": coarse(10.0, words="--stride 16", fixes=("o.h5 resolution_m=10",), maps=16),
+    "side by side": coarse(
+        10.0, words="--stride 16", fixes=("o.h5 resolution_m=10",), maps=16
+    ),
     "too few cells": coarse(30.0, 3, 3, fixes=("Expected cells of `dem`",), maps=0),
     "drawn places": coarse(
         2.0,
@@ -320,14 +394,22 @@ CASES: dict[str, Case] = {
     ),
     "as coarse as it may be": coarse(2.0, 60, 60, words="--coarse", maps=49),
     "more maps than one wants": Case(
-        words="--stride 2 --max-maps 10", fixes=("--max-maps 10 --stride 10",), maps=8, out="one every 10 m"
+        words="--stride 2 --max-maps 10",
+        fixes=("--max-maps 10 --stride 10",),
+        maps=8,
+        out="one every 10 m",
     ),
     "22 201 maps": Case(
-        plane(180, 180, 0.5), words="--stride 0.5", fixes=("Expected at most 20,000 maps",), maps=0
+        plane(180, 180, 0.5),
+        words="--stride 0.5",
+        fixes=("Expected at most 20,000 maps",),
+        maps=0,
     ),
     "smooth and wanted": coarse(2.0, 60, 60, fixes=("--coarse",), maps=49),
     # where the ground lies
-    "no CRS": Case(profile={"crs": None}, fixes=("rio edit-info --crs",), fill={"CODE": "32654"}),
+    "no CRS": Case(
+        profile={"crs": None}, fixes=("rio edit-info --crs",), fill={"CODE": "32654"}
+    ),
     "no place": Case(
         profile={"transform": rasterio.Affine.identity()},
         fixes=("rio edit-info --transform",),
@@ -335,18 +417,28 @@ CASES: dict[str, Case] = {
     ),
     "two bands": Case(np.stack([plane(**HIGH, cell=0.5)] * 2), fixes=("rio stack",)),
     "an origin too far east": Case(
-        words=corner(40, 3), fixes=(f"--origin '[{WEST + 34:.0f},{SOUTH + 3:.0f}]'",), maps=2
+        words=corner(40, 3),
+        fixes=(f"--origin '[{WEST + 34:.0f},{SOUTH + 3:.0f}]'",),
+        maps=2,
     ),
-    "an origin too far north-east": Case(words=corner(49, 34), fixes=("--origin '[",), maps=1),
+    "an origin too far north-east": Case(
+        words=corner(49, 34), fixes=("--origin '[",), maps=1
+    ),
     "an origin too far for three splits": Case(
         plane(140, 200, 0.5),
         words=f"{corner(30, 60)} --stride 8 --splits train:0.6,valid:0.2,test/x:0.2",
         fixes=(f"--origin '[{WEST + 20:.0f},{SOUTH + 54:.0f}]'",),
         maps=0,
     ),
-    "an origin elsewhere": Case(words="--origin [0,0]", fixes=("Expected `origin` on `dem`",), maps=0),
-    "a unit of no length": Case(words="--dem-unit parsec", fixes=("Expected `dem_unit`",), maps=0),
-    "complex numbers": Case(plane(**HIGH, cell=0.5).astype("complex64"), fixes=("rio convert",)),
+    "an origin elsewhere": Case(
+        words="--origin [0,0]", fixes=("Expected `origin` on `dem`",), maps=0
+    ),
+    "a unit of no length": Case(
+        words="--dem-unit parsec", fixes=("Expected `dem_unit`",), maps=0
+    ),
+    "complex numbers": Case(
+        plane(**HIGH, cell=0.5).astype("complex64"), fixes=("rio convert",)
+    ),
 }
 
 
@@ -384,7 +476,10 @@ def mended(line: str, fix: str, case: Case, words: list[str]) -> list[str]:
 @pytest.mark.filterwarnings("ignore::numpy.exceptions.ComplexWarning")
 @pytest.mark.parametrize("name", CASES)
 def test_a_raster_is_imported_right_or_stopped_with_a_remedy(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     case = CASES[name]
@@ -395,7 +490,14 @@ def test_a_raster_is_imported_right_or_stopped_with_a_remedy(
     if case.others:
         case.others(tmp_path)
     recipe = [] if "--recipe" in case.words else ["--recipe", "tiny-v1"]
-    words = ["import-dem", "dem.tif", *recipe, "--out", "o.h5", *shlex.split(case.words)]
+    words = [
+        "import-dem",
+        "dem.tif",
+        *recipe,
+        "--out",
+        "o.h5",
+        *shlex.split(case.words),
+    ]
     for fix in case.fixes:
         assert call("datagen", *words) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
@@ -410,7 +512,9 @@ def test_a_raster_is_imported_right_or_stopped_with_a_remedy(
     assert find_faults(Path("o.h5")) == []
     dataset = TerrainDataset("o.h5")
     maps = [dataset.map_count(split) for split in dataset.splits]
-    assert sum(maps) == case.maps or (case.maps == 0 and min(maps) > 0 and sum(maps) <= 20_000)
+    assert sum(maps) == case.maps or (
+        case.maps == 0 and min(maps) > 0 and sum(maps) <= 20_000
+    )
     chosen = dataset.recipe
     if chosen.places:  # 1 m is 2.5 of the user's cells
         assert chosen.places.margin_m == pytest.approx(2.5 * chosen.resolution_m)

@@ -45,13 +45,25 @@ rasterio = pytest.importorskip("rasterio")
 
 
 def test_the_manifest_says_where_the_maps_came_from(tmp_path: Path) -> None:
-    dataset = read(write(tmp_path / "dem.tif", rough(16, 48)), shares={"test/hills": 1.0}, scenario="hs")
+    dataset = read(
+        write(tmp_path / "dem.tif", rough(16, 48)),
+        shares={"test/hills": 1.0},
+        scenario="hs",
+    )
     assert dataset.id == dataset.recipe.id == "real-v1"
     assert set(dataset.splits) == {"test/hills"}
     assert dataset.splits["test/hills"]["scenario"] == "hs"
-    assert dataset.recipe.splits["test/hills"].maps == dataset.splits["test/hills"]["maps"] == 2
+    assert (
+        dataset.recipe.splits["test/hills"].maps
+        == dataset.splits["test/hills"]["maps"]
+        == 2
+    )
     source = source_of(dataset)
-    assert (source["kind"], source["file"], source["crs"]) == ("dem", "dem.tif", "EPSG:32654")
+    assert (source["kind"], source["file"], source["crs"]) == (
+        "dem",
+        "dem.tif",
+        "EPSG:32654",
+    )
     assert source["resolution_m"] == [0.5, 0.5]
     assert source["classes"] is source["photo"] is None
     assert not dataset.has_photo("test/hills")
@@ -62,7 +74,10 @@ def test_with_solvable_maps_behind_a_wall_are_left_out(tmp_path: Path) -> None:
     values = np.full((16, 72), 10.0)
     values[:, 24 + 12 :] = 60  # through map 1, between start and goal
     flat = np.zeros((16, 72), np.uint8)
-    dem, classes = write(tmp_path / "dem.tif", values), write(tmp_path / "classes.tif", flat)
+    dem, classes = (
+        write(tmp_path / "dem.tif", values),
+        write(tmp_path / "classes.tif", flat),
+    )
     dataset = read(dem, classes=classes, solvable=True)
     assert source_of(dataset)["kept"] == [0, 2]
     assert source_of(dataset)["left_out"] == {
@@ -72,13 +87,19 @@ def test_with_solvable_maps_behind_a_wall_are_left_out(tmp_path: Path) -> None:
         "between_splits": 0,
     }
     times = maps_of(dataset)["reference_time_s"]
-    distance = 0.5 * (14 - 6 + 6 * np.sqrt(2))  # 14 cells east and 6 north, on eight headings
+    distance = 0.5 * (
+        14 - 6 + 6 * np.sqrt(2)
+    )  # 14 cells east and 6 north, on eight headings
     assert distance < times[0] < 1.1 * distance
     every = maps_of(read(dem, classes=classes))
-    np.testing.assert_array_equal(maps_of(dataset)["traversability"], every["traversability"][[0, 2]])
+    np.testing.assert_array_equal(
+        maps_of(dataset)["traversability"], every["traversability"][[0, 2]]
+    )
 
 
-@pytest.mark.parametrize("profile", [{}, {"transform": rasterio.Affine(0.3, 0.1, WEST, 0.1, -0.3, SOUTH)}])
+@pytest.mark.parametrize(
+    "profile", [{}, {"transform": rasterio.Affine(0.3, 0.1, WEST, 0.1, -0.3, SOUTH)}]
+)
 def test_a_map_is_the_same_however_many_are_made_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, profile: dict[str, Any]
 ) -> None:
@@ -88,7 +109,9 @@ def test_a_map_is_the_same_however_many_are_made_at_once(
     assert read(dem, stride_m=4.0).digest == at_once.digest
 
 
-def test_a_raster_is_never_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_raster_is_never_read_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     dem = write(tmp_path / "dem.tif", rough(16 * 8, 24 * 8))
     read_window, shapes = Layer.read, []
 
@@ -102,7 +125,9 @@ def test_a_raster_is_never_read_whole(tmp_path: Path, monkeypatch: pytest.Monkey
     assert shapes == [(16, 24 * 4)] * 16
 
 
-def test_an_import_that_stops_leaves_nothing_and_one_that_was_killed_is_cleared_away(tmp_path: Path) -> None:
+def test_an_import_that_stops_leaves_nothing_and_one_that_was_killed_is_cleared_away(
+    tmp_path: Path,
+) -> None:
     dem = write(tmp_path / "dem.tif", rough(16 * 8, 24 * 8))
     for name in ("out.h5", "out"):
         steps = import_dem(str(dem), tmp_path / name, RECIPE)
@@ -128,7 +153,9 @@ def test_only_one_import_writes_a_file(tmp_path: Path) -> None:
     assert find_faults(tmp_path / "out.h5") == []
 
 
-def test_a_folder_of_shards_holds_what_a_file_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_of_shards_holds_what_a_file_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(importer, "SHARD_CELLS", 16 * 24 * 3)
     monkeypatch.setattr(importer, "_CELLS_AT_ONCE", 16 * 24 * 2)
     dem = write(tmp_path / "dem.tif", rough(16 * 4, 24 * 8))
@@ -186,10 +213,15 @@ def test_maps_of_different_splits_show_ground_that_does_not_touch(
         counts[split] = entry["maps"]
         between.add(source["left_out"]["between_splits"])
         cells = np.zeros((height, width), dtype=bool)
-        for elevation, lowest in zip(maps["elevation_m"], source["lowest_m"], strict=True):
+        for elevation, lowest in zip(
+            maps["elevation_m"], source["lowest_m"], strict=True
+        ):
             cells |= np.isin(values, elevation.astype(np.float64) + lowest)
         shown[split] = cells
-    grown = {split: scipy.ndimage.binary_dilation(cells, np.ones((3, 3))) for split, cells in shown.items()}
+    grown = {
+        split: scipy.ndimage.binary_dilation(cells, np.ones((3, 3)))
+        for split, cells in shown.items()
+    }
     for one, other in itertools.permutations(shares, 2):
         assert not (grown[one] & shown[other]).any()
     assert list(dataset.splits) == list(shares)
@@ -211,7 +243,9 @@ def test_maps_closer_than_their_width_overlap(tmp_path: Path) -> None:
     assert (source["tiles"], source["stride_m"]) == ([1, 9], [1.5, 1.5])
     for number in range(9):
         own = values[::-1, 3 * number : 3 * number + 24].astype(np.float64)
-        np.testing.assert_allclose(stored[number] + source["lowest_m"][number], own, atol=STEP)
+        np.testing.assert_allclose(
+            stored[number] + source["lowest_m"][number], own, atol=STEP
+        )
 
 
 @pytest.mark.parametrize("suffix", [".h5", ""])
@@ -219,13 +253,18 @@ def test_maps_that_overlap_are_of_one_group_and_ground_apart_is_of_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:
     monkeypatch.setattr(importer, "SHARD_CELLS", 4 * 16 * 24)
-    monkeypatch.setattr(importer, "_CELLS_AT_ONCE", 4 * 16 * 24)  # so that a split has several files
+    monkeypatch.setattr(
+        importer, "_CELLS_AT_ONCE", 4 * 16 * 24
+    )  # so that a split has several files
     values = rough(16, 160)
     values[:, 70:80] = np.nan  # no map that shows these is kept
     dataset = read(write(tmp_path / "dem.tif", values), stride_m=1.5, suffix=suffix)
     assert dataset.field_names == (*FIELDS, "group")
     assert dataset.manifest["format_version"] == "1.3"
-    kept, groups = np.array(source_of(dataset)["kept"]), dataset.read("test/real", fields=["group"])["group"]
+    kept, groups = (
+        np.array(source_of(dataset)["kept"]),
+        dataset.read("test/real", fields=["group"])["group"],
+    )
     assert groups.dtype == np.int64
     assert set(kept) == {*range(16), *range(27, 46)}
     assert len(set(groups[kept < 16])) == len(set(groups[kept > 16])) == 1
@@ -234,8 +273,13 @@ def test_maps_that_overlap_are_of_one_group_and_ground_apart_is_of_another(
     assert some.tolist() == [groups[20], groups[3]]
 
 
-def test_the_numbers_of_groups_differ_between_grounds_and_maps_side_by_side_have_none(tmp_path: Path) -> None:
-    first, second = (write(tmp_path / f"{name}.tif", rough(16, 48, seed)) for seed, name in enumerate("ab"))
+def test_the_numbers_of_groups_differ_between_grounds_and_maps_side_by_side_have_none(
+    tmp_path: Path,
+) -> None:
+    first, second = (
+        write(tmp_path / f"{name}.tif", rough(16, 48, seed))
+        for seed, name in enumerate("ab")
+    )
     made = [read(dem, stride_m=1.5) for dem in (first, second)]
     groups = [set(maps_of(dataset)["group"].tolist()) for dataset in made]
     assert [len(own) for own in groups] == [1, 1]
@@ -247,7 +291,9 @@ def test_the_numbers_of_groups_differ_between_grounds_and_maps_side_by_side_have
     assert set(maps_of(TerrainDataset(both))["group"].tolist()) == groups[0] | groups[1]
     plain = read(first)
     assert plain.field_names == tuple(FIELDS)
-    with pytest.raises(DatasetError, match=r"unlike fields \(group of one alone: .*--stride\)"):
+    with pytest.raises(
+        DatasetError, match=r"unlike fields \(group of one alone: .*--stride\)"
+    ):
         list(merge([made[1].path, plain.path], tmp_path / "neither.h5"))
 
 
@@ -266,7 +312,9 @@ def test_a_stride_is_a_number_of_cells(tmp_path: Path, stride: float) -> None:
 def test_a_split_without_maps_is_named_with_the_reason(tmp_path: Path) -> None:
     values = rough(16, 24 * 7)
     values[:, 24 * 5 :] = np.nan
-    message = refusal(write(tmp_path / "dem.tif", values), shares={"train": 0.7, "valid": 0.3})
+    message = refusal(
+        write(tmp_path / "dem.tif", values), shares={"train": 0.7, "valid": 0.3}
+    )
     assert "split 'valid'" in message
     assert "of 2, 2 have cells without elevation" in message
 
@@ -275,12 +323,18 @@ def test_a_split_without_maps_is_named_with_the_reason(tmp_path: Path) -> None:
 
 
 BAD_GROUND: dict[str, tuple[dict[str, Any], list[str]]] = {
-    "no CRS": ({"crs": None}, ["`dem`", "coordinate reference system", "rio edit-info --crs"]),
+    "no CRS": (
+        {"crs": None},
+        ["`dem`", "coordinate reference system", "rio edit-info --crs"],
+    ),
     "heights in feet": (
         {"crs": "EPSG:26918+6360"},
         ["`dem`", "in metres", "US survey foot", "--dem-unit us-ft"],
     ),
-    "nowhere": ({"transform": rasterio.Affine.identity()}, ["`dem`", "geotransform", "rio edit-info"]),
+    "nowhere": (
+        {"transform": rasterio.Affine.identity()},
+        ["`dem`", "geotransform", "rio edit-info"],
+    ),
 }
 
 
@@ -296,7 +350,9 @@ def test_ground_in_no_usable_place_is_refused(tmp_path: Path, case: str) -> None
 def test_files_that_are_no_whole_raster_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.tif").write_text("hello")
     (tmp_path / "empty.tif").touch()
-    whole = write(tmp_path / "dem.tif", rough(160, 240), compress="deflate").read_bytes()
+    whole = write(
+        tmp_path / "dem.tif", rough(160, 240), compress="deflate"
+    ).read_bytes()
     (tmp_path / "cut.tif").write_bytes(whole[: len(whole) // 2])
     for name in ("text.tif", "empty.tif", "cut.tif", "none.tif"):
         message = refusal(tmp_path / name)
@@ -305,11 +361,17 @@ def test_files_that_are_no_whole_raster_are_refused(tmp_path: Path) -> None:
     assert "No such file" in message
     dem = write(tmp_path / "dem.tif", FLAT)
     for argument in ("classes", "photo", "traversability"):
-        message = refusal(dem, **{argument: tmp_path / "text.tif"}, **({} if argument == "classes" else ANY))
+        message = refusal(
+            dem,
+            **{argument: tmp_path / "text.tif"},
+            **({} if argument == "classes" else ANY),
+        )
         assert f"`{argument}` as a raster" in message
 
 
-def test_a_photo_that_is_damaged_is_blamed_rather_than_the_output(tmp_path: Path) -> None:
+def test_a_photo_that_is_damaged_is_blamed_rather_than_the_output(
+    tmp_path: Path,
+) -> None:
     dem = write(tmp_path / "dem.tif", rough(160, 240))
     colours = np.random.default_rng(5).integers(0, 255, (3, 160, 240)).astype(np.uint8)
     photo = write(tmp_path / "photo.tif", colours, compress="deflate")
@@ -324,16 +386,22 @@ def test_ground_that_gives_no_maps_is_refused(tmp_path: Path) -> None:
     message = refusal(write(tmp_path / "small.tif", FLAT[:-1]))
     assert "12 m × 8 m" in message
     assert "12 m × 7.5 m" in message
-    message = refusal(write(tmp_path / "gaps.tif", np.full((32, 24), -1, np.int16), nodata=-1))
+    message = refusal(
+        write(tmp_path / "gaps.tif", np.full((32, 24), -1, np.int16), nodata=-1)
+    )
     assert "of 2, 2 have cells without elevation." in message
     assert "one band" in refusal(write(tmp_path / "bands.tif", np.stack([FLAT, FLAT])))
     sentinel = FLAT.copy()
     sentinel[3, 3] = -9999
-    assert "rio edit-info --nodata -9999" in refusal(write(tmp_path / "undeclared.tif", sentinel))
+    assert "rio edit-info --nodata -9999" in refusal(
+        write(tmp_path / "undeclared.tif", sentinel)
+    )
     # Averaged with 624 others it would look like ground.
     many = np.zeros((400, 600), np.float32)
     many[77, 99] = -32767
-    assert "rio edit-info --nodata -32767" in refusal(write(tmp_path / "blended.tif", many, 0.02))
+    assert "rio edit-info --nodata -32767" in refusal(
+        write(tmp_path / "blended.tif", many, 0.02)
+    )
 
 
 def test_rasters_that_hold_something_else_are_refused(tmp_path: Path) -> None:
@@ -355,7 +423,9 @@ def test_unknown_classes_are_listed(tmp_path: Path) -> None:
     message = refusal(dem, classes=classes)
     assert "[12, 77]" in message
     assert "[77]" in refusal(dem, classes=classes, class_ids={0: "scree", 12: "gravel"})
-    message = refusal(dem, classes=classes, class_ids={0: "scree", 12: "lava", 77: "gravel"})
+    message = refusal(
+        dem, classes=classes, class_ids={0: "scree", 12: "lava", 77: "gravel"}
+    )
     assert "['lava']" in message
     message = refusal(dem, classes=write(tmp_path / "heights.tif", rough(16, 24)))
     assert "…" in message
@@ -381,7 +451,9 @@ def test_without_rasterio_the_message_says_how_to_get_it(
 ) -> None:
     dem = write(tmp_path / "dem.tif", FLAT)
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(ConfigError, match=r"Expected rasterio.*pip install 'benchnav\[geo\]'"):
+    with pytest.raises(
+        ConfigError, match=r"Expected rasterio.*pip install 'benchnav\[geo\]'"
+    ):
         next(import_dem(str(dem), tmp_path / "out.h5", RECIPE))
 
 
@@ -435,7 +507,8 @@ def test_the_paragraph_gives_maps_size_unit_and_origin_before_anything_is_read(
         next(steps)
     (paragraph,) = said
     rows, columns = (3200 - 2) // 8, (4800 - 1) // 12
-    # Colours of 3 bytes, class of 1, elevation, slope and λ of 4 each; environment, start, goal and time.
+    # Colours of 3 bytes, class of 1, elevation, slope and λ of 4 each; environment,
+    # start, goal and time.
     size = rows * columns * (16 * 24 * (3 + 1 + 3 * 4) + 2 + 8 + 8 + 4)
     for words in (
         "3200 × 4800 cells of 1 m × 1 m", "metres", f"{rows * columns:,} maps of 16 × 24 cells of 0.5 m",
@@ -444,28 +517,57 @@ def test_the_paragraph_gives_maps_size_unit_and_origin_before_anything_is_read(
         assert words in paragraph
 
 
-def test_ground_that_does_not_fit_is_rejected_with_settings_that_do(tmp_path: Path) -> None:
+def test_ground_that_does_not_fit_is_rejected_with_settings_that_do(
+    tmp_path: Path,
+) -> None:
     dem = write(tmp_path / "dem.tif", np.zeros((100, 100)), 10.0)
-    with pytest.raises(GroundError, match=r"--coarse .* resolution_m=10 .*class_periods_m=\[") as caught:
+    with pytest.raises(
+        GroundError, match=r"--coarse .* resolution_m=10 .*class_periods_m=\["
+    ) as caught:
         next(import_dem(str(dem), tmp_path / "o.h5", RECIPE))
     assert caught.value.changes["resolution_m"] == 10
     assert caught.value.stride_m is None
     with pytest.raises(ConfigError, match="`max_maps`"):
-        next(import_dem(str(dem), tmp_path / "o.h5", RECIPE, cut=Cut(ground=GroundOptions(max_maps=0))))
+        next(
+            import_dem(
+                str(dem),
+                tmp_path / "o.h5",
+                RECIPE,
+                cut=Cut(ground=GroundOptions(max_maps=0)),
+            )
+        )
 
 
-def test_an_origin_is_the_corner_of_the_first_map_around_drives_too(tmp_path: Path) -> None:
+def test_an_origin_is_the_corner_of_the_first_map_around_drives_too(
+    tmp_path: Path,
+) -> None:
     from tests.commands import call
 
     dem = write(tmp_path / "dem.tif", rough(200, 200))
     at = np.linspace(0, 1, 400)
-    columns = [at * 100, WEST + 20 + 60 * at, SOUTH + 20 + 60 * at, 1 + 0 * at, 0.85 + 0.1 * np.sin(40 * at)]
+    columns = [
+        at * 100,
+        WEST + 20 + 60 * at,
+        SOUTH + 20 + 60 * at,
+        1 + 0 * at,
+        0.85 + 0.1 * np.sin(40 * at),
+    ]
     header = "time_s,x_m,y_m,commanded_m_s,measured_m_s"
-    np.savetxt(tmp_path / "log.csv", np.transpose(columns), "%.6f", ",", header=header, comments="")
+    np.savetxt(
+        tmp_path / "log.csv",
+        np.transpose(columns),
+        "%.6f",
+        ",",
+        header=header,
+        comments="",
+    )
     photo = write(tmp_path / "photo.tif", np.full((3, 200, 200), 9, np.uint8))
     words = ("--dem", dem, "--photo", photo, "--recipe", "tiny-v1", "--splits", "train")
     log = ("import-drives", tmp_path / "log.csv", *words)
-    for origin, expected in ((None, [WEST + 18, SOUTH + 18]), ((WEST + 9, SOUTH + 8), [WEST + 9, SOUTH + 8])):
+    for origin, expected in (
+        (None, [WEST + 18, SOUTH + 18]),
+        ((WEST + 9, SOUTH + 8), [WEST + 9, SOUTH + 8]),
+    ):
         out = tmp_path / f"{origin is None}.h5"
         option = ("--origin", list(origin)) if origin else ()
         assert call("datagen", *log, "--out", out, *option) == 0
@@ -476,16 +578,22 @@ def test_an_origin_is_the_corner_of_the_first_map_around_drives_too(tmp_path: Pa
         assert origin is None or source["origin_m"] == expected
         maps = dataset.read("train", fields=["drive_count"])["drive_count"]
         cells = np.argwhere(maps[0] > 0)[:, ::-1] * 0.5 + 0.25 + source["origin_m"]
-        assert (np.abs(cells[:, 0] - WEST - (cells[:, 1] - SOUTH)) < 0.6).all()  # the drive is a diagonal
+        assert (
+            np.abs(cells[:, 0] - WEST - (cells[:, 1] - SOUTH)) < 0.6
+        ).all()  # the drive is a diagonal
 
 
-@pytest.mark.parametrize(("cell", "off_m"), [(0.5, 0.0), (0.5, 0.13), (0.25, 0.13), (0.7, 0.2)])
+@pytest.mark.parametrize(
+    ("cell", "off_m"), [(0.5, 0.0), (0.5, 0.13), (0.25, 0.13), (0.7, 0.2)]
+)
 def test_heights_are_those_of_the_maps_cells_from_the_origin_on(
     tmp_path: Path, cell: float, off_m: float
 ) -> None:
     size = round(40 / cell)
     origin = WEST + 4 * cell + off_m, SOUTH + 6 * cell + off_m
-    dataset = read(write(tmp_path / "dem.tif", plane(size, size, cell), cell), origin=origin)
+    dataset = read(
+        write(tmp_path / "dem.tif", plane(size, size, cell), cell), origin=origin
+    )
     source, maps = source_of(dataset), maps_of(dataset)
     assert source["origin_m"] == pytest.approx(origin)
     x, y = (
@@ -493,11 +601,15 @@ def test_heights_are_those_of_the_maps_cells_from_the_origin_on(
         (np.arange(16)[:, None] + 0.5) * 0.5 + origin[1] - SOUTH,
     )
     stored = maps["elevation_m"][0] + source["lowest_m"][0]
-    np.testing.assert_allclose(stored, 900 + 0.2 * x + 0.1 * y, atol=0.02 if cell == 0.25 else STEP)
+    np.testing.assert_allclose(
+        stored, 900 + 0.2 * x + 0.1 * y, atol=0.02 if cell == 0.25 else STEP
+    )
 
 
 @pytest.mark.parametrize("value", [-1, 255, 9999])
-def test_level_ground_at_a_common_value_is_level_ground(tmp_path: Path, value: float) -> None:
+def test_level_ground_at_a_common_value_is_level_ground(
+    tmp_path: Path, value: float
+) -> None:
     dataset = read(write(tmp_path / "dem.tif", np.full((16, 24), value, np.int16)))
     assert source_of(dataset)["lowest_m"] == [value]
 
@@ -530,7 +642,9 @@ def test_places_and_noise_are_drawn_on_real_ground_too(tmp_path: Path) -> None:
     assert (maps["traversability"] < 0.15).any()
     # A map's draws go by its number in the raster, whichever others are left out.
     values[0, 0] = -1
-    rest = read(write(tmp_path / "hole.tif", values, nodata=-1), recipe=recipe, solvable=True)
+    rest = read(
+        write(tmp_path / "hole.tif", values, nodata=-1), recipe=recipe, solvable=True
+    )
     assert source_of(rest)["kept"] == [0, 1, 3]
     for name, found in maps_of(rest).items():
         np.testing.assert_array_equal(found, maps[name][[0, 1, 3]])

@@ -35,7 +35,9 @@ def layered(dem: Path, *layers: str, **settings: Any) -> TerrainDataset:
 
 
 def values(height: int, width: int, seed: int = 1, most: float = 9.0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(0, most, (height, width)).astype(np.float32)
+    return (
+        np.random.default_rng(seed).uniform(0, most, (height, width)).astype(np.float32)
+    )
 
 
 def refusal(dem: Path, *layers: str, **settings: Any) -> str:
@@ -49,7 +51,10 @@ def refusal(dem: Path, *layers: str, **settings: Any) -> str:
 def test_a_layer_is_the_raster_on_the_maps_cells(tmp_path: Path) -> None:
     height_m, other = values(32, 48), values(32, 48, 2, 1e6)
     dem = write(tmp_path / "dem.tif", rough(32, 48))
-    canopy, rock = write(tmp_path / "canopy.tif", height_m), write(tmp_path / "rock.tif", other)
+    canopy, rock = (
+        write(tmp_path / "canopy.tif", height_m),
+        write(tmp_path / "rock.tif", other),
+    )
     dataset = layered(dem, f"vegetation_m={canopy}", f"rock_share={rock}")
     assert dataset.manifest["format_version"] == "1.3"
     assert dataset.layer_names == ("vegetation_m", "rock_share")
@@ -68,11 +73,17 @@ def test_the_manifest_holds_unit_meaning_and_digest_of_each(tmp_path: Path) -> N
     dem = write(tmp_path / "dem.tif", rough(16, 24))
     files = {
         name: write(tmp_path / f"{place}.tif", values(16, 24, place))
-        for place, name in enumerate(("vegetation_m", "wind_mps", "dust", "salt", "aspect_deg"))
+        for place, name in enumerate(
+            ("vegetation_m", "wind_mps", "dust", "salt", "aspect_deg")
+        )
     }
     units = {"salt": ":g/kg", "dust": ":percent"}
     dataset = layered(
-        dem, *(f"{name}={file}{units.get(name, '').replace('/', '_')}" for name, file in files.items())
+        dem,
+        *(
+            f"{name}={file}{units.get(name, '').replace('/', '_')}"
+            for name, file in files.items()
+        ),
     )
     fields = dataset.manifest["fields"]
     assert {name: fields[name]["unit"] for name in files} == {
@@ -82,25 +93,40 @@ def test_the_manifest_holds_unit_meaning_and_digest_of_each(tmp_path: Path) -> N
     layers = source_of(dataset)["layers"]
     assert list(layers) == list(files)
     for name, file in files.items():
-        assert layers[name] == {"file": file.name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
+        assert layers[name] == {
+            "file": file.name,
+            "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+        }
     assert "layers" not in source_of(read(dem))
 
 
 def test_finer_cells_are_averaged_but_directions_are_not(tmp_path: Path) -> None:
     fine = np.where(np.indices((32, 48)).sum(axis=0) % 2, 359.0, 1.0).astype(np.float32)
-    dem, raster = write(tmp_path / "dem.tif", FLAT), write(tmp_path / "rows.tif", fine, 0.25)
+    dem, raster = (
+        write(tmp_path / "dem.tif", FLAT),
+        write(tmp_path / "rows.tif", fine, 0.25),
+    )
     stored = maps_of(layered(dem, f"rows_azimuth_deg={raster}", f"rows_deg={raster}"))
-    assert set(np.unique(stored["rows_azimuth_deg"])) <= {1.0, 359.0}  # not 180, the opposite
+    assert set(np.unique(stored["rows_azimuth_deg"])) <= {
+        1.0,
+        359.0,
+    }  # not 180, the opposite
     np.testing.assert_allclose(stored["rows_deg"], 180.0)
 
 
-def test_another_projection_and_a_larger_raster_are_laid_on_the_same_cells(tmp_path: Path) -> None:
+def test_another_projection_and_a_larger_raster_are_laid_on_the_same_cells(
+    tmp_path: Path,
+) -> None:
     x, y = centres(80, 80, 1.0)
-    wide = write(tmp_path / "wide.tif", (x + 100 * y).astype(np.float32), 1.0, (-30.0, -30.0))
+    wide = write(
+        tmp_path / "wide.tif", (x + 100 * y).astype(np.float32), 1.0, (-30.0, -30.0)
+    )
     dem = write(tmp_path / "dem.tif", FLAT)
     stored = maps_of(layered(dem, f"place={wide}", f"again={wide}:cell"))
     cell_x, cell_y = (np.arange(n) * 0.5 + 0.25 for n in (24, 16))
-    expected = (np.floor(cell_x + 30) + 0.5) + 100 * (np.floor(cell_y + 30) + 0.5)[:, None]
+    expected = (np.floor(cell_x + 30) + 0.5) + 100 * (np.floor(cell_y + 30) + 0.5)[
+        :, None
+    ]
     np.testing.assert_array_equal(stored["place"][0], expected)
     np.testing.assert_array_equal(stored["place"], stored["again"])
 
@@ -109,26 +135,42 @@ def test_cells_without_a_value_are_nan_and_the_map_is_kept(tmp_path: Path) -> No
     holed = values(16, 48)
     holed[3:5, 7] = -9999
     dem = write(tmp_path / "dem.tif", rough(16, 48))
-    dataset = layered(dem, f"vegetation_m={write(tmp_path / 'canopy.tif', holed, nodata=-9999)}")
-    stored, expected = maps_of(dataset)["vegetation_m"], np.where(holed < 0, np.nan, holed)[::-1]
-    np.testing.assert_array_equal(stored, np.stack([expected[:, :24], expected[:, 24:]]))
+    dataset = layered(
+        dem, f"vegetation_m={write(tmp_path / 'canopy.tif', holed, nodata=-9999)}"
+    )
+    stored, expected = (
+        maps_of(dataset)["vegetation_m"],
+        np.where(holed < 0, np.nan, holed)[::-1],
+    )
+    np.testing.assert_array_equal(
+        stored, np.stack([expected[:, :24], expected[:, 24:]])
+    )
     assert np.isnan(stored).sum() == 2
     assert dataset.splits["test/real"]["maps"] == 2
     terrain = dataset.terrain("test/real")
-    np.testing.assert_array_equal(terrain.observe().layers["vegetation_m"].numpy(), stored)
+    np.testing.assert_array_equal(
+        terrain.observe().layers["vegetation_m"].numpy(), stored
+    )
 
 
-def test_layers_go_with_their_maps_where_others_are_left_out_and_maps_overlap(tmp_path: Path) -> None:
+def test_layers_go_with_their_maps_where_others_are_left_out_and_maps_overlap(
+    tmp_path: Path,
+) -> None:
     heights, canopy = rough(16, 96), values(16, 96)
     heights[:, 30] = np.nan
-    dem, raster = write(tmp_path / "dem.tif", heights), write(tmp_path / "canopy.tif", canopy)
+    dem, raster = (
+        write(tmp_path / "dem.tif", heights),
+        write(tmp_path / "canopy.tif", canopy),
+    )
     for suffix in (".h5", ""):
         dataset = layered(dem, f"vegetation_m={raster}", stride_m=6.0, suffix=suffix)
         assert list(dataset.fields)[-2:] == ["group", "vegetation_m"]
         kept = source_of(dataset)["kept"]
         assert 0 < len(kept) < 7
         for number, stored in zip(kept, maps_of(dataset)["vegetation_m"], strict=True):
-            np.testing.assert_array_equal(stored, canopy[::-1, 12 * number : 12 * number + 24])
+            np.testing.assert_array_equal(
+                stored, canopy[::-1, 12 * number : 12 * number + 24]
+            )
 
 
 @pytest.mark.parametrize(
@@ -136,7 +178,10 @@ def test_layers_go_with_their_maps_where_others_are_left_out_and_maps_overlap(tm
     [
         ("canopy.tif", "`layer` as NAME=RASTER or NAME=RASTER:UNIT, got 'canopy.tif'"),
         ("canopy=", "`layer` as NAME=RASTER"),
-        ("tree height=a.tif", "letters, digits and '_', not beginning with a digit, got 'tree height'"),
+        (
+            "tree height=a.tif",
+            "letters, digits and '_', not beginning with a digit, got 'tree height'",
+        ),
         ("2nd=a.tif", "got '2nd'"),
         ("höhe_m=a.tif", "got 'höhe_m'"),
         ("=a.tif", "got ''"),
@@ -174,7 +219,9 @@ def test_a_name_stands_once() -> None:
         ("vegetation_m=a.tif:m", "a.tif", "m"),
     ],
 )
-def test_a_unit_follows_the_last_colon_or_the_name(text: str, raster: str, unit: str) -> None:
+def test_a_unit_follows_the_last_colon_or_the_name(
+    text: str, raster: str, unit: str
+) -> None:
     own = read_layer(text)
     assert (own.raster, own.field.unit) == (raster, unit)
 
@@ -206,20 +253,27 @@ def test_a_raster_that_does_not_cover_the_ground_is_refused(tmp_path: Path) -> N
             {"nodata": -1},
             "`layer vegetation_m` with a value on some map, got none in",
         ),
-        (np.zeros((2, 16, 24), np.float32), {}, "Expected one band in `layer vegetation_m`, got 2"),
+        (
+            np.zeros((2, 16, 24), np.float32),
+            {},
+            "Expected one band in `layer vegetation_m`, got 2",
+        ),
     ],
 )
 def test_rasters_of_no_such_values_are_refused(
     tmp_path: Path, content: np.ndarray, profile: dict[str, Any], expected: str
 ) -> None:
     dem = write(tmp_path / "dem.tif", FLAT)
-    assert expected in refusal(dem, f"vegetation_m={write(tmp_path / 'canopy.tif', content, **profile)}")
+    assert expected in refusal(
+        dem, f"vegetation_m={write(tmp_path / 'canopy.tif', content, **profile)}"
+    )
 
 
 def test_a_raster_that_is_not_there_is_refused(tmp_path: Path) -> None:
     dem = write(tmp_path / "dem.tif", FLAT)
-    assert "Expected `layer moss` as a raster that GDAL can read, got nope.tif" in refusal(
-        dem, "moss=nope.tif"
+    assert (
+        "Expected `layer moss` as a raster that GDAL can read, got nope.tif"
+        in refusal(dem, "moss=nope.tif")
     )
 
 

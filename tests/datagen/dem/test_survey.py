@@ -1,4 +1,6 @@
-"""What rasters say of the ground; the oracles are closed forms, the raster's own numbers, and GDAL."""
+"""What rasters say of the ground; the oracles are closed forms, the raster's own
+numbers, and GDAL.
+"""
 
 import hashlib
 import zipfile
@@ -39,7 +41,16 @@ pytest.importorskip("rasterio.shutil")
 
 @pytest.mark.parametrize(
     ("cell", "off_by_deg"),
-    [(0.5, 0), (0.25, 0), (0.1, 0), (1.0, 0), (0.8, 0), (0.7, 0), (0.3, 0.2), (0.4, 0.2)],
+    [
+        (0.5, 0),
+        (0.25, 0),
+        (0.1, 0),
+        (1.0, 0),
+        (0.8, 0),
+        (0.7, 0),
+        (0.3, 0.2),
+        (0.4, 0.2),
+    ],
 )
 def test_a_plane_keeps_its_slope_and_rises_the_right_way(
     tmp_path: Path, cell: float, off_by_deg: float
@@ -51,15 +62,23 @@ def test_a_plane_keeps_its_slope_and_rises_the_right_way(
     expected = 0.2 * x + 0.1 * y
     assert len(maps["elevation_m"]) == 4
     for stored in maps["elevation_m"]:
-        np.testing.assert_allclose(stored, expected - expected.min(), atol=STEP if off_by_deg == 0 else 0.01)
+        np.testing.assert_allclose(
+            stored, expected - expected.min(), atol=STEP if off_by_deg == 0 else 0.01
+        )
     slope = np.degrees(np.arctan(np.hypot(0.2, 0.1)))
     np.testing.assert_allclose(maps["slope_deg"], slope, atol=0.05 + off_by_deg)
 
 
 def reprojected(
-    raster: Path, source: dict[str, Any], resampling: str, cells: tuple[int, int], frame: int = 0
+    raster: Path,
+    source: dict[str, Any],
+    resampling: str,
+    cells: tuple[int, int],
+    frame: int = 0,
 ) -> np.ndarray:
-    """GDAL's own answer for cells from the maps' south-west corner on, rows northward, framed by some more."""
+    """GDAL's own answer for cells from the maps' south-west corner on, rows northward,
+    framed by some more.
+    """
     west, south = (metres - 0.5 * frame for metres in source["origin_m"])
     expected = np.full([count + 2 * frame for count in cells], np.nan)
     with rasterio.open(raster) as file:
@@ -73,7 +92,9 @@ def reprojected(
 
 
 @pytest.mark.parametrize("stride", [None, 4.0])
-@pytest.mark.parametrize(("cell", "resampling"), [(1.0, "cubic"), (0.5, "nearest"), (0.25, "average")])
+@pytest.mark.parametrize(
+    ("cell", "resampling"), [(1.0, "cubic"), (0.5, "nearest"), (0.25, "average")]
+)
 def test_slopes_are_those_of_the_whole_ground_at_seams_too(
     tmp_path: Path, cell: float, resampling: str, stride: float | None
 ) -> None:
@@ -82,7 +103,9 @@ def test_slopes_are_those_of_the_whole_ground_at_seams_too(
     dataset = read(dem, stride_m=stride)
     source, maps = source_of(dataset), maps_of(dataset)
     assert source["tiles"] == ([3, 2] if stride is None else [6, 5])
-    frame = 1 if resampling == "cubic" else 0  # else the raster ends where the maps begin
+    frame = (
+        1 if resampling == "cubic" else 0
+    )  # else the raster ends where the maps begin
     cells = (56, 56) if frame else (60, 60)
     ground = quantise(reprojected(dem, source, resampling, cells, frame), 13)
     slopes = inclination_deg(*horn_gradient(framed(ground[None]), 0.5))[0]
@@ -96,22 +119,31 @@ def test_slopes_are_those_of_the_whole_ground_at_seams_too(
 
 def test_an_oblique_hill_is_shaded_as_in_the_raster(tmp_path: Path) -> None:
     x, y = centres(16, 24, 0.5)
-    ridge = 3 * np.exp(-(((x - 5) + (y - 4.5)) ** 2) / 6 - ((x - 5) - (y - 4.5)) ** 2 / 20)
+    ridge = 3 * np.exp(
+        -(((x - 5) + (y - 4.5)) ** 2) / 6 - ((x - 5) - (y - 4.5)) ** 2 / 20
+    )
     stored = maps_of(read(write(tmp_path / "dem.tif", ridge)))["elevation_m"]
-    # Cartographers' hillshade, on the raster's rows: azimuth clockwise from north, light from WNW.
+    # Cartographers' hillshade, on the raster's rows: azimuth clockwise from north,
+    # light from WNW.
     dz_southward, dz_eastward = np.gradient(ridge, 0.5)
     slope = np.arctan(np.hypot(dz_southward, dz_eastward))
     downhill = np.arctan2(-dz_eastward, dz_southward)
     azimuth, zenith = np.radians(295), np.radians(50)
-    hillshade = np.cos(zenith) * np.cos(slope) + np.sin(zenith) * np.sin(slope) * np.cos(azimuth - downhill)
+    hillshade = np.cos(zenith) * np.cos(slope) + np.sin(zenith) * np.sin(
+        slope
+    ) * np.cos(azimuth - downhill)
     light = light_direction(np.array([np.pi / 2 - azimuth]), np.array([np.cos(zenith)]))
     ours = shade(*horn_gradient(framed(stored.astype(np.float64)), 0.5), light, 0)[0]
     inside = (slice(1, -1), slice(1, -1))
     assert np.ptp(hillshade) > 0.5
-    np.testing.assert_allclose(ours[inside], np.maximum(hillshade[::-1], 0)[inside], atol=0.05)
+    np.testing.assert_allclose(
+        ours[inside], np.maximum(hillshade[::-1], 0)[inside], atol=0.05
+    )
 
 
-def test_at_its_own_resolution_a_tile_is_the_raster_at_its_recorded_origin(tmp_path: Path) -> None:
+def test_at_its_own_resolution_a_tile_is_the_raster_at_its_recorded_origin(
+    tmp_path: Path,
+) -> None:
     dem = write(tmp_path / "dem.tif", rough(3 * 16 + 5, 2 * 24 + 7), blockysize=8)
     dataset = read(dem)
     source, stored = source_of(dataset), maps_of(dataset)["elevation_m"]
@@ -120,8 +152,13 @@ def test_at_its_own_resolution_a_tile_is_the_raster_at_its_recorded_origin(tmp_p
     with rasterio.open(dem) as file:
         for index, number in enumerate(source["kept"]):
             row, column = divmod(number, 2)
-            west, south = source["origin_m"][0] + 12 * column, source["origin_m"][1] + 8 * row
-            window = rasterio.windows.from_bounds(west, south, west + 12, south + 8, file.transform)
+            west, south = (
+                source["origin_m"][0] + 12 * column,
+                source["origin_m"][1] + 8 * row,
+            )
+            window = rasterio.windows.from_bounds(
+                west, south, west + 12, south + 8, file.transform
+            )
             expected = file.read(1, window=window)[::-1].astype(np.float64)
             expected = quantise(expected, 13)
             assert source["lowest_m"][index] == expected.min()
@@ -133,7 +170,9 @@ def test_coarser_cells_are_block_means(tmp_path: Path) -> None:
     dataset = read(write(tmp_path / "dem.tif", fine, 0.5 / 3))
     means = fine.reshape(16, 3, 24, 3).mean(axis=(1, 3), dtype=np.float64)[::-1]
     stored = maps_of(dataset)["elevation_m"][0]
-    np.testing.assert_allclose(stored + source_of(dataset)["lowest_m"][0], means, atol=STEP)
+    np.testing.assert_allclose(
+        stored + source_of(dataset)["lowest_m"][0], means, atol=STEP
+    )
 
 
 def test_means_of_whole_numbers_are_not_rounded(tmp_path: Path) -> None:
@@ -144,10 +183,16 @@ def test_means_of_whole_numbers_are_not_rounded(tmp_path: Path) -> None:
     np.testing.assert_allclose(stored, means, atol=STEP)
 
 
-def test_cells_need_not_be_square_and_numbers_may_be_whole_and_scaled(tmp_path: Path) -> None:
+def test_cells_need_not_be_square_and_numbers_may_be_whole_and_scaled(
+    tmp_path: Path,
+) -> None:
     x, y = (np.arange(17) + 0.5) * 1.0, (52 - np.arange(52)[:, None] - 0.5) * 0.25
     stretched = rasterio.Affine(1, 0, WEST, 0, -0.25, SOUTH + 13)
-    path = write(tmp_path / "dem.tif", np.rint(100 * (x + 2 * y)).astype(np.int16), transform=stretched)
+    path = write(
+        tmp_path / "dem.tif",
+        np.rint(100 * (x + 2 * y)).astype(np.int16),
+        transform=stretched,
+    )
     with rasterio.open(path, "r+") as file:
         file.scales, file.offsets = (0.001,), (50.0,)
     dataset = read(path)
@@ -171,7 +216,9 @@ def test_ground_in_degrees_is_laid_in_its_utm_zone(tmp_path: Path) -> None:
     longitude = 139.7 + (np.arange(60) + 0.5) * step
     latitude = 35.7 - (np.arange(60)[:, None] + 0.5) * step
     x, y = rasterio.warp.transform(
-        "EPSG:4326", "EPSG:32654", *(v.ravel() for v in np.broadcast_arrays(longitude, latitude))
+        "EPSG:4326",
+        "EPSG:32654",
+        *(v.ravel() for v in np.broadcast_arrays(longitude, latitude)),
     )
     x0, y0 = min(x), min(y)
     values = (0.2 * (np.array(x) - x0) + 0.1 * (np.array(y) - y0)).reshape(60, 60)
@@ -194,43 +241,74 @@ def test_ground_in_degrees_is_laid_in_its_utm_zone(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("profile", "crs"),
     [
-        ({"crs": "EPSG:4326", "transform": rasterio.Affine(5e-6, 0, -70.4, 0, -5e-6, -23.6)}, "EPSG:32719"),
-        ({"crs": "EPSG:2263", "transform": rasterio.Affine(1, 0, 1e6, 0, -1, 2e5)}, "EPSG:32618"),
         (
-            {"crs": "EPSG:3857", "transform": rasterio.Affine(0.5, 0, 15551332, 0, -0.5, 4257980)},
+            {
+                "crs": "EPSG:4326",
+                "transform": rasterio.Affine(5e-6, 0, -70.4, 0, -5e-6, -23.6),
+            },
+            "EPSG:32719",
+        ),
+        (
+            {"crs": "EPSG:2263", "transform": rasterio.Affine(1, 0, 1e6, 0, -1, 2e5)},
+            "EPSG:32618",
+        ),
+        (
+            {
+                "crs": "EPSG:3857",
+                "transform": rasterio.Affine(0.5, 0, 15551332, 0, -0.5, 4257980),
+            },
             "EPSG:32654",
         ),
         ({"crs": "EPSG:32654+5773"}, "EPSG:32654"),
     ],
 )
-def test_ground_is_laid_where_metres_are_metres(tmp_path: Path, profile: dict[str, Any], crs: str) -> None:
+def test_ground_is_laid_where_metres_are_metres(
+    tmp_path: Path, profile: dict[str, Any], crs: str
+) -> None:
     dem = write(tmp_path / "dem.tif", np.zeros((120, 120)), **profile)
     assert source_of(read(dem, dem_unit="m"))["crs"] == crs
 
 
-# Radii in metres, the northing of a latitude, and how long a metre of ground is in the projection, eastward and
-# northward: closed forms of Snyder (1987), with the ellipsoid's radii of curvature N and M.
+# Radii in metres, the northing of a latitude, and how long a metre of ground is in the
+# projection, eastward and northward: closed forms of Snyder (1987), with the
+# ellipsoid's radii of curvature N and M.
 def cylindrical(radius: float, _: float, latitude: float) -> tuple[float, float, float]:
     return radius * latitude, 1 / np.cos(latitude), 1.0
 
 
-def mercator(semi_major: float, eccentricity: float, latitude: float) -> tuple[float, float, float]:
+def mercator(
+    semi_major: float, eccentricity: float, latitude: float
+) -> tuple[float, float, float]:
     sine = eccentricity * np.sin(latitude)
     isometric = np.arctanh(np.sin(latitude)) - eccentricity * np.arctanh(sine)
     scale = np.sqrt(1 - sine**2) / np.cos(latitude)
     return semi_major * isometric, scale, scale
 
 
-def web_mercator(semi_major: float, eccentricity: float, latitude: float) -> tuple[float, float, float]:
+def web_mercator(
+    semi_major: float, eccentricity: float, latitude: float
+) -> tuple[float, float, float]:
     sine, cosine = eccentricity * np.sin(latitude), np.cos(latitude)
-    across, along = 1 / np.sqrt(1 - sine**2), (1 - eccentricity**2) / (1 - sine**2) ** 1.5
-    return semi_major * np.arctanh(np.sin(latitude)), 1 / (across * cosine), 1 / (along * cosine)
+    across, along = (
+        1 / np.sqrt(1 - sine**2),
+        (1 - eccentricity**2) / (1 - sine**2) ** 1.5,
+    )
+    return (
+        semi_major * np.arctanh(np.sin(latitude)),
+        1 / (across * cosine),
+        1 / (along * cosine),
+    )
 
 
 BODIES = {
     "moon": (cylindrical, "+proj=eqc +R=1737400 +units=m +no_defs", 1737400.0, 0.0),
     "mars": (cylindrical, "IAU_2015:49910", 3396190.0, 0.0),
-    "mars ellipsoid": (mercator, "+proj=merc +a=3396190 +b=3376200 +units=m +no_defs", 3396190.0, 0.108337),
+    "mars ellipsoid": (
+        mercator,
+        "+proj=merc +a=3396190 +b=3376200 +units=m +no_defs",
+        3396190.0,
+        0.108337,
+    ),
     "earth": (web_mercator, "EPSG:3857", 6378137.0, 0.0818191908),
 }
 
@@ -243,19 +321,32 @@ def test_slopes_are_those_of_the_ground_wherever_the_scale_of_the_map_is_another
     formula, crs, radius, eccentricity = BODIES[body]
     north, across, along = formula(radius, eccentricity, np.radians(latitude))
     east, cells = radius * np.radians(10), np.arange(80) - 39.5
-    values = 50 + 0.2 * 0.5 * cells - 0.1 * 0.5 * cells[:, None]  # rising 20 % eastward, 10 % northward
+    values = (
+        50 + 0.2 * 0.5 * cells - 0.1 * 0.5 * cells[:, None]
+    )  # rising 20 % eastward, 10 % northward
     transform = rasterio.Affine(
-        across * 0.5, 0, east - 40 * across * 0.5, 0, -along * 0.5, north + 40 * along * 0.5
+        across * 0.5,
+        0,
+        east - 40 * across * 0.5,
+        0,
+        -along * 0.5,
+        north + 40 * along * 0.5,
     )
     dataset = read(write(tmp_path / "dem.tif", values, crs=crs, transform=transform))
     source, maps = source_of(dataset), maps_of(dataset)
-    # 40 m × 40 m of ground hold four rows of maps, and a column between the edges that interpolation lacks.
+    # 40 m × 40 m of ground hold four rows of maps, and a column between the edges that
+    # interpolation lacks.
     assert len(source["kept"]) >= 4
     np.testing.assert_allclose(source["resolution_m"], 0.5, rtol=0.02)
     inner = maps["slope_deg"][:, 2:-2, 2:-2]  # the raster's edge may lie oblique
-    np.testing.assert_allclose(inner, np.degrees(np.arctan(np.hypot(0.2, 0.1))), atol=0.1)
-    rises = (np.gradient(maps["elevation_m"][0], 0.5, axis=axis).mean() for axis in (1, 0))
-    # Northward is that of the projection: on the Earth UTM's grid is turned by its convergence.
+    np.testing.assert_allclose(
+        inner, np.degrees(np.arctan(np.hypot(0.2, 0.1))), atol=0.1
+    )
+    rises = (
+        np.gradient(maps["elevation_m"][0], 0.5, axis=axis).mean() for axis in (1, 0)
+    )
+    # Northward is that of the projection: on the Earth UTM's grid is turned by its
+    # convergence.
     turn = np.radians(7) if body == "earth" and latitude == 85 else 0.03
     np.testing.assert_allclose(list(rises), [0.2, 0.1], atol=0.01 + 0.25 * turn)
 
@@ -264,12 +355,21 @@ def test_ground_off_the_earth_may_be_in_degrees_and_its_own_metres_are_kept_wher
     tmp_path: Path,
 ) -> None:
     moon = "+proj=longlat +R=1737400 +no_defs"
-    cell = np.degrees(0.5 / 1737400)  # 0.5 m northward, and half of that eastward at 60°
+    cell = np.degrees(
+        0.5 / 1737400
+    )  # 0.5 m northward, and half of that eastward at 60°
     profile = {"crs": moon, "transform": rasterio.Affine(2 * cell, 0, 20, 0, -cell, 60)}
     maps = maps_of(read(write(tmp_path / "degrees.tif", plane(80, 80, 0.5), **profile)))
-    np.testing.assert_allclose(maps["slope_deg"], np.degrees(np.arctan(np.hypot(0.2, 0.1))), atol=0.02)
+    np.testing.assert_allclose(
+        maps["slope_deg"], np.degrees(np.arctan(np.hypot(0.2, 0.1))), atol=0.02
+    )
     plain = "+proj=stere +lat_0=-90 +R=1737400 +units=m +no_defs"
-    near = write(tmp_path / "pole.tif", FLAT, crs=plain, transform=rasterio.Affine(0.5, 0, 100, 0, -0.5, 100))
+    near = write(
+        tmp_path / "pole.tif",
+        FLAT,
+        crs=plain,
+        transform=rasterio.Affine(0.5, 0, 100, 0, -0.5, 100),
+    )
     assert source_of(read(near))["origin_m"] == [100, 92]
 
 
@@ -287,31 +387,60 @@ def test_a_raster_need_not_be_north_up(tmp_path: Path, turn: str) -> None:
     affine *= rasterio.Affine.rotation(20 if turn == "rotated" else 0)
     column, row = np.meshgrid(np.arange(200) + 0.5, np.arange(200) + 0.5)
     x, y = affine * (column, row)
-    dataset = read(write(tmp_path / "dem.tif", 0.2 * (x - WEST) + 0.1 * (y - SOUTH), transform=affine))
+    dataset = read(
+        write(
+            tmp_path / "dem.tif", 0.2 * (x - WEST) + 0.1 * (y - SOUTH), transform=affine
+        )
+    )
     source, maps = source_of(dataset), maps_of(dataset)
     west, south = source["origin_m"]
     for index, number in enumerate(source["kept"]):
         north, east = tile_place(source, number)
-        expected = 0.2 * (west + east + 0.25 - WEST) + 0.1 * (south + north + 0.25 - SOUTH)
+        expected = 0.2 * (west + east + 0.25 - WEST) + 0.1 * (
+            south + north + 0.25 - SOUTH
+        )
         assert source["lowest_m"][index] == pytest.approx(expected, abs=0.05)
         inner = maps["slope_deg"][index][1:-1, 1:-1]
-        np.testing.assert_allclose(np.median(inner), np.degrees(np.arctan(np.hypot(0.2, 0.1))), atol=0.2)
+        np.testing.assert_allclose(
+            np.median(inner), np.degrees(np.arctan(np.hypot(0.2, 0.1))), atol=0.2
+        )
     assert source["left_out"]["missing_elevation"] == (
         0 if turn == "mirrored" else source_tiles(source) - index - 1
     )
 
 
-def test_other_rasters_may_be_in_another_crs_and_their_gaps_leave_maps_out(tmp_path: Path) -> None:
+def test_other_rasters_may_be_in_another_crs_and_their_gaps_leave_maps_out(
+    tmp_path: Path,
+) -> None:
     dem = write(tmp_path / "dem.tif", rough(48, 72))
-    kinds = np.random.default_rng(3).integers(0, 3, (40, 40)).repeat(8, 0).repeat(8, 1).astype(np.uint8)
+    kinds = (
+        np.random.default_rng(3)
+        .integers(0, 3, (40, 40))
+        .repeat(8, 0)
+        .repeat(8, 1)
+        .astype(np.uint8)
+    )
     transform, width, height = rasterio.warp.calculate_default_transform(
-        "EPSG:32654", "EPSG:4326", 24, 24, left=WEST - 1, bottom=SOUTH - 1, right=WEST + 25, top=SOUTH + 25
+        "EPSG:32654",
+        "EPSG:4326",
+        24,
+        24,
+        left=WEST - 1,
+        bottom=SOUTH - 1,
+        right=WEST + 25,
+        top=SOUTH + 25,
     )
     scale = rasterio.Affine.scale(width / 320, height / 320)
-    classes = write(tmp_path / "classes.tif", kinds, crs="EPSG:4326", transform=transform * scale)
+    classes = write(
+        tmp_path / "classes.tif", kinds, crs="EPSG:4326", transform=transform * scale
+    )
     colours = np.stack([kinds * 50, kinds * 20 + 9, kinds + 100]).astype(np.uint8)
-    photo = write(tmp_path / "photo.tif", colours, crs="EPSG:4326", transform=transform * scale)
-    measured = write(tmp_path / "lambda.tif", kinds / 2, crs="EPSG:4326", transform=transform * scale)
+    photo = write(
+        tmp_path / "photo.tif", colours, crs="EPSG:4326", transform=transform * scale
+    )
+    measured = write(
+        tmp_path / "lambda.tif", kinds / 2, crs="EPSG:4326", transform=transform * scale
+    )
     dataset = read(dem, classes=classes, photo=photo, traversability=measured)
     source, maps = source_of(dataset), maps_of(dataset)
     # They end a metre beyond 24 m × 24 m, of which the ground has 36 m × 24 m.
@@ -325,7 +454,9 @@ def test_other_rasters_may_be_in_another_crs_and_their_gaps_leave_maps_out(tmp_p
         row, column = (int(2 * metres) for metres in tile_place(source, number))
         own = (slice(row, row + 16), slice(column, column + 24))
         np.testing.assert_array_equal(maps["class_id"][index], expected[own])
-        np.testing.assert_allclose(maps["traversability"][index], average[own], atol=1e-4)
+        np.testing.assert_allclose(
+            maps["traversability"][index], average[own], atol=1e-4
+        )
         np.testing.assert_allclose(maps["rgb"][index, 0], 100 * average[own], atol=0.51)
 
 
@@ -340,13 +471,21 @@ def test_rasters_are_found_by_any_address(tmp_path: Path) -> None:
     rasterio.shutil.copy(whole, rasters / "whole.vrt", driver="VRT")
     rasterio.shutil.copy(whole, rasters / "whole.img", driver="HFA")
     expected = read(whole, tmp_path)
-    assert source_of(expected)["sha256"] == hashlib.sha256(whole.read_bytes()).hexdigest()
-    addresses = [f"/vsizip/{zipped}/whole.tif", f"zip://{zipped}!whole.tif", *map(str, rasters.glob("*.vrt"))]
+    assert (
+        source_of(expected)["sha256"] == hashlib.sha256(whole.read_bytes()).hexdigest()
+    )
+    addresses = [
+        f"/vsizip/{zipped}/whole.tif",
+        f"zip://{zipped}!whole.tif",
+        *map(str, rasters.glob("*.vrt")),
+    ]
     for address in [*addresses, str(rasters / "whole.img")]:
         dataset = read(address, tmp_path)
         assert dataset.digest == expected.digest
         is_file = Path(address).is_file()
-        assert source_of(dataset)["file"] == (Path(address).name if is_file else address)
+        assert source_of(dataset)["file"] == (
+            Path(address).name if is_file else address
+        )
         assert (source_of(dataset)["sha256"] is None) == (not is_file)
     assert source_of(read(west, tmp_path))["tiles"] == [1, 1]
 
@@ -373,12 +512,20 @@ def test_only_the_touched_map_is_left_out_and_the_others_stay_as_they_are(
     whole = read(write(tmp_path / "whole.tif", values, cell))
     # In map 3, the second of the second row: 18 m east and 14 m north.
     row, column = height - 1 - int(14 / cell), int(18 / cell)
-    hole = (slice(row - int(1 / cell), row + int(1 / cell)), slice(column, column + int(2 / cell)))
+    hole = (
+        slice(row - int(1 / cell), row + int(1 / cell)),
+        slice(column, column + int(2 / cell)),
+    )
     holed = values.copy()
     holed[hole] = {"nodata": -9999, "nan": np.nan, "mask": 100}[kind]
-    path = write(tmp_path / "holed.tif", holed, cell, nodata=-9999 if kind == "nodata" else None)
+    path = write(
+        tmp_path / "holed.tif", holed, cell, nodata=-9999 if kind == "nodata" else None
+    )
     if kind == "mask":
-        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "r+") as file:
+        with (
+            rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
+            rasterio.open(path, "r+") as file,
+        ):
             mask = np.full(values.shape, 255, np.uint8)
             mask[hole] = 0
             file.write_mask(mask)
@@ -402,7 +549,9 @@ def test_what_is_missing_beyond_a_map_is_continued_linearly(tmp_path: Path) -> N
     dataset = read(write(tmp_path / "dem.tif", values))
     assert source_of(dataset)["kept"] == [0]
     np.testing.assert_allclose(
-        maps_of(dataset)["slope_deg"], np.degrees(np.arctan(np.hypot(0.2, 0.1))), atol=0.05
+        maps_of(dataset)["slope_deg"],
+        np.degrees(np.arctan(np.hypot(0.2, 0.1))),
+        atol=0.05,
     )
 
 
@@ -410,7 +559,9 @@ def test_a_cell_takes_what_of_it_is_there(tmp_path: Path) -> None:
     values = rough(32, 48)
     values[::2, ::2] = np.nan
     dataset = read(write(tmp_path / "dem.tif", values, 0.25))
-    expected = np.nanmean(values.reshape(16, 2, 24, 2).astype(np.float64), axis=(1, 3))[::-1]
+    expected = np.nanmean(values.reshape(16, 2, 24, 2).astype(np.float64), axis=(1, 3))[
+        ::-1
+    ]
     stored = maps_of(dataset)["elevation_m"][0] + source_of(dataset)["lowest_m"][0]
     np.testing.assert_allclose(stored, expected, atol=STEP)
 
@@ -421,7 +572,8 @@ def test_a_cell_takes_what_of_it_is_there(tmp_path: Path) -> None:
 def test_classes_are_mapped_by_name_and_the_largest_share_wins(tmp_path: Path) -> None:
     dem = write(tmp_path / "dem.tif", rough(16, 48))
     rng = np.random.default_rng(1)
-    # Cells of 0.125 m, 4×4 a map's cell, over a larger extent: 10 of 16 are of the class of the cell.
+    # Cells of 0.125 m, 4×4 a map's cell, over a larger extent: 10 of 16 are of the
+    # class of the cell.
     chosen = rng.integers(0, 3, (18, 52))
     fine = np.repeat(np.repeat(chosen, 4, axis=0), 4, axis=1)
     others = rng.random((18, 52, 16)).argsort(axis=2) < 6
@@ -431,17 +583,28 @@ def test_classes_are_mapped_by_name_and_the_largest_share_wins(tmp_path: Path) -
     classes = write(tmp_path / "classes.tif", values, 0.125, offset=(-1, -0.5))
     named = {40: "gravel", 5: "basalt", 100: "dune_sand", 7: "scree"}
     dataset = read(dem, classes=classes, class_ids=named)
-    expected = np.array([NAMES.index(n) for n in ("gravel", "basalt", "dune_sand")])[chosen[::-1]][1:17, 2:50]
+    expected = np.array([NAMES.index(n) for n in ("gravel", "basalt", "dune_sand")])[
+        chosen[::-1]
+    ][1:17, 2:50]
     maps = maps_of(dataset)
-    np.testing.assert_array_equal(np.concatenate(list(maps["class_id"]), axis=1), expected)
+    np.testing.assert_array_equal(
+        np.concatenate(list(maps["class_id"]), axis=1), expected
+    )
     assert maps["environment"].tolist() == [0, 0]
     recorded = source_of(dataset)["classes"]
-    assert recorded["ids"] == {"5": "basalt", "7": "scree", "40": "gravel", "100": "dune_sand"}
+    assert recorded["ids"] == {
+        "5": "basalt",
+        "7": "scree",
+        "40": "gravel",
+        "100": "dune_sand",
+    }
     assert recorded["file"] == "classes.tif"
     assert len(recorded["sha256"]) == 64
 
 
-def test_coarse_classes_are_indices_by_default_and_their_gaps_leave_painted_maps_out(tmp_path: Path) -> None:
+def test_coarse_classes_are_indices_by_default_and_their_gaps_leave_painted_maps_out(
+    tmp_path: Path,
+) -> None:
     dem = write(tmp_path / "dem.tif", rough(16, 48))
     values = np.arange(4 * 12).reshape(4, 12) % 9
     values[1, 8] = 255
@@ -454,7 +617,10 @@ def test_coarse_classes_are_indices_by_default_and_their_gaps_leave_painted_maps
 
 
 def test_a_class_of_no_name_leaves_its_painted_map_out(tmp_path: Path) -> None:
-    dem, values = write(tmp_path / "dem.tif", rough(16, 48)), np.full((16, 48), 7, np.uint8)
+    dem, values = (
+        write(tmp_path / "dem.tif", rough(16, 48)),
+        np.full((16, 48), 7, np.uint8),
+    )
     values[3, 3] = 9
     classes = write(tmp_path / "classes.tif", values)
     dataset = read(dem, classes=classes, class_ids={7: "scree", 9: None})
@@ -465,7 +631,10 @@ def test_a_class_of_no_name_leaves_its_painted_map_out(tmp_path: Path) -> None:
 
 
 def test_with_a_photo_cells_without_a_class_are_kept_as_such(tmp_path: Path) -> None:
-    dem, values = write(tmp_path / "dem.tif", rough(16, 72)), np.full((16, 72), 7, np.uint8)
+    dem, values = (
+        write(tmp_path / "dem.tif", rough(16, 72)),
+        np.full((16, 72), 7, np.uint8),
+    )
     values[0, :5] = 9  # the northern row of map 0
     values[:, 24:48] = 9  # all of map 1
     classes = write(tmp_path / "classes.tif", values)
@@ -479,17 +648,23 @@ def test_with_a_photo_cells_without_a_class_are_kept_as_such(tmp_path: Path) -> 
     wanted = np.full((2, 16, 24), NAMES.index("scree"))
     wanted[0, 15, :5] = UNLABELLED
     np.testing.assert_array_equal(maps["class_id"], wanted)
-    np.testing.assert_array_equal(np.isnan(maps["traversability"]), wanted == UNLABELLED)
+    np.testing.assert_array_equal(
+        np.isnan(maps["traversability"]), wanted == UNLABELLED
+    )
     truth = dataset.terrain("test/real").truth
     np.testing.assert_array_equal(truth.means[:, 0].isnan(), wanted == UNLABELLED)
     assert dataset.manifest["format_version"] == "1.2"  # which readers of 1.1 refuse
     # What was measured there is kept.
     measured = write(tmp_path / "lambda.tif", np.full((16, 72), 0.25))
-    known = read(dem, classes=classes, class_ids=table, photo=photo, traversability=measured)
+    known = read(
+        dem, classes=classes, class_ids=table, photo=photo, traversability=measured
+    )
     assert (maps_of(known)["traversability"] == 0.25).all()
     # Other cells are as they would be without.
     values[0, :5] = 7
-    whole = read(dem, classes=write(tmp_path / "whole.tif", values), class_ids=table, photo=photo)
+    whole = read(
+        dem, classes=write(tmp_path / "whole.tif", values), class_ids=table, photo=photo
+    )
     labelled, before = wanted != UNLABELLED, maps_of(whole)
     for name in ("traversability", "slope_deg", "rgb"):
         assert_same_cells(maps[name], before[name], labelled)
@@ -502,7 +677,10 @@ def assert_same_cells(found: np.ndarray, wanted: np.ndarray, where: np.ndarray) 
 
 
 def test_ground_without_a_class_is_no_way_to_the_goal(tmp_path: Path) -> None:
-    dem, values = write(tmp_path / "dem.tif", np.zeros((16, 48))), np.zeros((16, 48), np.uint8)
+    dem, values = (
+        write(tmp_path / "dem.tif", np.zeros((16, 48))),
+        np.zeros((16, 48), np.uint8),
+    )
     values[:, 12:14] = UNLABELLED  # across map 0, between start and goal
     classes = write(tmp_path / "classes.tif", values, nodata=UNLABELLED)
     photo = write(tmp_path / "photo.tif", np.full((3, 16, 48), 90, np.uint8))
@@ -511,11 +689,19 @@ def test_ground_without_a_class_is_no_way_to_the_goal(tmp_path: Path) -> None:
     assert source["left_out"]["not_solvable"] == 1
 
 
-def test_without_a_class_raster_the_recipe_lays_classes_out_by_map_number(tmp_path: Path) -> None:
+def test_without_a_class_raster_the_recipe_lays_classes_out_by_map_number(
+    tmp_path: Path,
+) -> None:
     maps = maps_of(read(write(tmp_path / "dem.tif", rough(48, 48))))
-    assert maps["environment"].tolist() == [number % RECIPE.environments for number in range(6)]
-    for environment, class_id in zip(maps["environment"], maps["class_id"], strict=True):
-        assert set(np.unique(class_id)) == set(RECIPE.environment_classes[int(environment)])
+    assert maps["environment"].tolist() == [
+        number % RECIPE.environments for number in range(6)
+    ]
+    for environment, class_id in zip(
+        maps["environment"], maps["class_id"], strict=True
+    ):
+        assert set(np.unique(class_id)) == set(
+            RECIPE.environment_classes[int(environment)]
+        )
     assert np.isnan(maps["reference_time_s"]).all()
 
 
@@ -530,19 +716,27 @@ def test_a_photo_keeps_its_colours(tmp_path: Path) -> None:
     photo = write(tmp_path / "photo.tif", fine.astype(np.uint8), 0.25)
     painted, real = read(dem), read(dem, photo=photo, random_classes=True)
     maps = maps_of(real)
-    np.testing.assert_array_equal(np.concatenate(list(maps["rgb"]), axis=2), cells[:, ::-1])
-    np.testing.assert_array_equal(maps["traversability"], maps_of(painted)["traversability"])
+    np.testing.assert_array_equal(
+        np.concatenate(list(maps["rgb"]), axis=2), cells[:, ::-1]
+    )
+    np.testing.assert_array_equal(
+        maps["traversability"], maps_of(painted)["traversability"]
+    )
     assert source_of(real)["photo"]["file"] == "photo.tif"
     # Transparent cells are missing.
     opaque = np.full((1, *fine.shape[1:]), 255)
     opaque[0, 10:12, 60:62] = 0
-    clear = write(tmp_path / "clear.tif", np.concatenate([fine, opaque]).astype(np.uint8), 0.25)
+    clear = write(
+        tmp_path / "clear.tif", np.concatenate([fine, opaque]).astype(np.uint8), 0.25
+    )
     source = source_of(read(dem, photo=clear, random_classes=True))
     assert source["kept"] == [0]
     assert source["left_out"]["missing_colours"] == 1
 
 
-def test_real_colours_and_measured_traversability_need_real_classes_or_a_word(tmp_path: Path) -> None:
+def test_real_colours_and_measured_traversability_need_real_classes_or_a_word(
+    tmp_path: Path,
+) -> None:
     dem = write(tmp_path / "dem.tif", FLAT)
     photo = write(tmp_path / "photo.tif", np.zeros((3, 16, 24), np.uint8))
     measured = write(tmp_path / "lambda.tif", FLAT)
@@ -551,16 +745,22 @@ def test_real_colours_and_measured_traversability_need_real_classes_or_a_word(tm
         assert f"`classes` with `{next(iter(given))}`" in message
         assert "--random-classes" in message
         read(dem, **given, random_classes=True)
-        read(dem, **given, classes=write(tmp_path / "classes.tif", FLAT.astype(np.uint8)))
+        read(
+            dem, **given, classes=write(tmp_path / "classes.tif", FLAT.astype(np.uint8))
+        )
         (tmp_path / "classes.tif").unlink()
     classes = write(tmp_path / "classes.tif", FLAT.astype(np.uint8))
-    assert "either `classes` or `random_classes`" in refusal(dem, classes=classes, random_classes=True)
+    assert "either `classes` or `random_classes`" in refusal(
+        dem, classes=classes, random_classes=True
+    )
 
 
 # Measured traversability
 
 
-def test_measured_traversability_is_averaged_and_what_was_not_observed_stays_so(tmp_path: Path) -> None:
+def test_measured_traversability_is_averaged_and_what_was_not_observed_stays_so(
+    tmp_path: Path,
+) -> None:
     dem, classes = (
         write(tmp_path / "dem.tif", rough(16, 48)),
         write(tmp_path / "classes.tif", np.zeros((16, 48))),
@@ -586,12 +786,19 @@ def test_measured_traversability_is_averaged_and_what_was_not_observed_stays_so(
     assert dataset.terrain("test/real").traversability.isnan().any()
 
 
-def test_measured_traversability_may_be_whole_numbers_with_a_scale(tmp_path: Path) -> None:
-    dem, values = write(tmp_path / "dem.tif", rough(16, 24)), np.arange(384).reshape(16, 24) % 256
+def test_measured_traversability_may_be_whole_numbers_with_a_scale(
+    tmp_path: Path,
+) -> None:
+    dem, values = (
+        write(tmp_path / "dem.tif", rough(16, 24)),
+        np.arange(384).reshape(16, 24) % 256,
+    )
     path = write(tmp_path / "lambda.tif", values.astype(np.uint8))
     with rasterio.open(path, "r+") as file:
         file.scales = (1 / 255,)
-    found = maps_of(read(dem, traversability=path, random_classes=True))["traversability"][0]
+    found = maps_of(read(dem, traversability=path, random_classes=True))[
+        "traversability"
+    ][0]
     np.testing.assert_allclose(found, values[::-1] / 255, atol=2.0**-16)
 
 
@@ -600,7 +807,10 @@ def test_measured_traversability_may_be_whole_numbers_with_a_scale(tmp_path: Pat
 def test_traversability_out_of_range_is_refused_however_small_its_share(
     tmp_path: Path, value: float, cell: float
 ) -> None:
-    dem, values = write(tmp_path / "dem.tif", FLAT), np.full((int(8 / cell), int(12 / cell)), 0.5)
+    dem, values = (
+        write(tmp_path / "dem.tif", FLAT),
+        np.full((int(8 / cell), int(12 / cell)), 0.5),
+    )
     values[3, 3] = value
     measured = write(tmp_path / "lambda.tif", values, cell)
     message = refusal(dem, traversability=measured, random_classes=True)
@@ -625,11 +835,17 @@ def test_zeros_for_missing_heights_are_refused_unless_something_is_declared(
     kept = read(write(tmp_path / "cliff.tif", cliff, cell, nodata=-9999))
     assert maps_of(kept)["slope_deg"].max() > 85
     # Down to the sea by steps of less than a metre.
-    sea = write(tmp_path / "sea.tif", np.linspace(0, 30, 64)[:, None].repeat(96, 1).round(), cell)
+    sea = write(
+        tmp_path / "sea.tif",
+        np.linspace(0, 30, 64)[:, None].repeat(96, 1).round(),
+        cell,
+    )
     assert len(maps_of(read(sea))["rgb"]) >= 1
 
 
-def test_a_map_of_no_class_is_kept_where_its_traversability_was_measured(tmp_path: Path) -> None:
+def test_a_map_of_no_class_is_kept_where_its_traversability_was_measured(
+    tmp_path: Path,
+) -> None:
     dem = write(tmp_path / "dem.tif", rough(16, 72))
     kinds = np.full((16, 72), 255, np.uint8)
     kinds[:, :24] = 1

@@ -18,7 +18,9 @@ def places(tiling: Tiling) -> dict[str, list[tuple[int, int]]]:
     found: dict[str, list[tuple[int, int]]] = {}
     for run in tiling.runs(7):
         assert 1 <= len(run.columns) <= 7
-        found.setdefault(run.split, []).extend((run.row, column) for column in run.columns)
+        found.setdefault(run.split, []).extend(
+            (run.row, column) for column in run.columns
+        )
     return found
 
 
@@ -30,7 +32,10 @@ def places(tiling: Tiling) -> dict[str, list[tuple[int, int]]]:
     weights=st.lists(st.integers(1, 9), min_size=1, max_size=4),
 )
 def test_maps_lie_on_the_ground_and_splits_a_map_apart(
-    cells: tuple[int, int], shape: tuple[int, int], stride: tuple[int, int], weights: list[int]
+    cells: tuple[int, int],
+    shape: tuple[int, int],
+    stride: tuple[int, int],
+    weights: list[int],
 ) -> None:
     shares = {f"split{i}": weight / sum(weights) for i, weight in enumerate(weights)}
     try:
@@ -48,12 +53,14 @@ def test_maps_lie_on_the_ground_and_splits_a_map_apart(
         assert own == sorted(set(own))
     for one, other in itertools.combinations(found, 2):
         edges = [
-            {(row * stride[0], column * stride[1]) for row, column in found[split]} for split in (one, other)
+            {(row * stride[0], column * stride[1]) for row, column in found[split]}
+            for split in (one, other)
         ]
         # Along the longer side, the nearest maps of the two.
         axis = 0 if tiling.tiles[0] > tiling.tiles[1] else 1
         low, high = sorted(
-            (min(e[axis] for e in own), max(e[axis] for e in own) + shape[axis]) for own in edges
+            (min(e[axis] for e in own), max(e[axis] for e in own) + shape[axis])
+            for own in edges
         )
         assert high[0] - low[1] >= shape[axis]
     assert tiling.maps == sum(map(len, found.values()))
@@ -82,7 +89,9 @@ def test_shares_are_kept_and_no_more_is_lost_than_the_gaps() -> None:
 
 def test_a_small_share_is_one_strip_and_small_ground_is_refused() -> None:
     shares = {"train": 0.98, "valid": 0.01, "test": 0.01}
-    assert [len(strip) for strip in cut((8, 56), (8, 8), (8, 8), shares).strips.values()] == [3, 1, 1]
+    assert [
+        len(strip) for strip in cut((8, 56), (8, 8), (8, 8), shares).strips.values()
+    ] == [3, 1, 1]
     with pytest.raises(DatasetError, match=r"ground for 3 splits.*got 4 maps"):
         cut((8, 39), (8, 8), (8, 8), shares)
 
@@ -120,7 +129,9 @@ def test_shares_of_another_form_are_refused(text: str, said: str) -> None:
 def test_maps_are_of_one_group_just_where_they_overlap_directly_or_by_others(
     shape: tuple[int, int], stride: tuple[int, int], numbers: set[int]
 ) -> None:
-    tiling = Tiling(shape=shape, stride=stride, tiles=(7, 6), strips={"train": range(7)})
+    tiling = Tiling(
+        shape=shape, stride=stride, tiles=(7, 6), strips={"train": range(7)}
+    )
     own = sorted(numbers)
     cells = {
         number: {
@@ -130,7 +141,11 @@ def test_maps_are_of_one_group_just_where_they_overlap_directly_or_by_others(
         }
         for number in own
     }
-    graph = nx.Graph([(one, other) for one in own for other in own if cells[one] & cells[other]])
-    expected = {number: min(part) for part in nx.connected_components(graph) for number in part}
+    graph = nx.Graph(
+        [(one, other) for one in own for other in own if cells[one] & cells[other]]
+    )
+    expected = {
+        number: min(part) for part in nx.connected_components(graph) for number in part
+    }
     assert tiling.groups(own).tolist() == [expected[number] for number in own]
     assert tiling.overlaps == (stride[0] < shape[0] or stride[1] < shape[1])

@@ -22,7 +22,10 @@ def content(path: Path) -> dict[str, np.ndarray]:
 
 
 def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
-    return all(np.array_equal(one[name], other[name], equal_nan=one[name].dtype.kind == "f") for name in one)
+    return all(
+        np.array_equal(one[name], other[name], equal_nan=one[name].dtype.kind == "f")
+        for name in one
+    )
 
 
 def flip(path: Path, split: str, field: str, index: int) -> None:
@@ -54,13 +57,17 @@ def test_a_flipped_byte_is_named_by_map_and_field(tmp_path: Path) -> None:
     assert len(TerrainDataset(path).read("train", sound)["slope_deg"]) == 7
 
 
-def test_changed_values_with_sound_checksums_are_named_by_map_and_field(tmp_path: Path) -> None:
+def test_changed_values_with_sound_checksums_are_named_by_map_and_field(
+    tmp_path: Path,
+) -> None:
     path = tiny_dataset(tmp_path / "d.h5")
     with h5py.File(path, "r+") as file:
         file["test/hs/traversability"][1, 2, 3] = 1.5
         file["train/elevation_m"][2, 0, 0] += 2.0**-13
         file["train/goal_m"][4] = [1, 1]
-        file["valid/traversability"][0, 5, 5] = np.nan  # as of a cell not observed: in range
+        file["valid/traversability"][0, 5, 5] = (
+            np.nan
+        )  # as of a cell not observed: in range
     found = {str(fault) for fault in find_faults(path)}
     assert found == {
         "test/hs: map 1: field 'traversability' is out of range",
@@ -80,7 +87,9 @@ def test_a_missing_and_a_foreign_array_are_named(tmp_path: Path) -> None:
     assert problems == {("valid", -1, "class_id"), ("train", -1, "environment")}
 
 
-def test_damaged_digests_beside_sound_maps_are_told_from_damaged_maps(tmp_path: Path) -> None:
+def test_damaged_digests_beside_sound_maps_are_told_from_damaged_maps(
+    tmp_path: Path,
+) -> None:
     path = tiny_dataset(tmp_path / "d.h5")
     with h5py.File(path, "r+") as file:
         file["train"][schema.ENTRY_DIGESTS][3, 2, 0] ^= 1
@@ -94,7 +103,9 @@ def test_maps_and_digests_changed_together_are_found(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file["train/class_id"][3] = 0
         changed = {name: file["train"][name][()] for name in schema.FIELDS}
-        file["train"][schema.ENTRY_DIGESTS][...] = schema.entry_digests(changed, schema.FIELDS)
+        file["train"][schema.ENTRY_DIGESTS][...] = schema.entry_digests(
+            changed, schema.FIELDS
+        )
     assert [f.map for f in find_faults(path)] == [-1]
 
 
@@ -145,9 +156,16 @@ def test_damaged_shards_are_named_and_they_alone_made_anew(tmp_path: Path) -> No
         Fault("train", 4, "rgb", "is damaged", damaged),
         Fault("test/hs", -1, "", "is missing or cannot be opened", gone),
     ]
-    assert list(summarise(find_faults(path)))[1] == f"train: map 4: field 'rgb' is damaged ({damaged})"
+    assert (
+        list(summarise(find_faults(path)))[1]
+        == f"train: map 4: field 'rgb' is damaged ({damaged})"
+    )
     (path / damaged).unlink()
-    kept = {file: file.stat().st_mtime_ns for file in rest if file.name not in (damaged, gone)}
+    kept = {
+        file: file.stat().st_mtime_ns
+        for file in rest
+        if file.name not in (damaged, gone)
+    }
     sharded(path)
     assert find_faults(path) == []
     assert TerrainDataset(path).digest == digest
@@ -155,7 +173,9 @@ def test_damaged_shards_are_named_and_they_alone_made_anew(tmp_path: Path) -> No
     assert all(file.stat().st_mtime_ns == when for file, when in kept.items())
 
 
-def test_a_cell_without_a_class_is_a_fault_where_none_was_said_to_be(tmp_path: Path) -> None:
+def test_a_cell_without_a_class_is_a_fault_where_none_was_said_to_be(
+    tmp_path: Path,
+) -> None:
     path = tiny_dataset(tmp_path / "d.h5")
     with h5py.File(path, "r+") as file:
         file["train/class_id"][5, 2, 3] = schema.UNLABELLED

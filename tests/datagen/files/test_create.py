@@ -24,7 +24,9 @@ CELLS = 32 * 32  # of a map of the tiny recipe
 
 
 def digests(path: Path) -> dict[str, str]:
-    return {name: split["digest"] for name, split in TerrainDataset(path).splits.items()}
+    return {
+        name: split["digest"] for name, split in TerrainDataset(path).splits.items()
+    }
 
 
 def creating(path: Path, train: int, jobs: int) -> subprocess.Popen[bytes]:
@@ -33,7 +35,9 @@ def creating(path: Path, train: int, jobs: int) -> subprocess.Popen[bytes]:
         "from benchnav.datagen.files.create import create\n"
         f"for _ in create(tiny_recipe(train={train}), Path({str(path)!r}), jobs={jobs}, shard_cells={20 * CELLS}): pass"
     )
-    return subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, start_new_session=True)
+    return subprocess.Popen(
+        [sys.executable, "-c", code], cwd=ROOT, start_new_session=True
+    )
 
 
 def alive(group: int) -> bool:
@@ -65,7 +69,9 @@ def test_an_existing_file_is_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_killed_run_leaves_no_file_and_no_process_and_keeps_its_shards(tmp_path: Path, jobs: int) -> None:
+def test_a_killed_run_leaves_no_file_and_no_process_and_keeps_its_shards(
+    tmp_path: Path, jobs: int
+) -> None:
     path = tmp_path / "d.h5"
     process = creating(path, 4000, jobs)
     folder = tmp_path / ".d.h5.partial"
@@ -136,7 +142,9 @@ def test_two_runs_on_one_file_refuse_each_other(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("room", [2_000, 30_000, 150_000, 280_000, 330_000])
-def test_a_full_disk_is_named_and_leaves_no_half_file(tmp_path: Path, room: int) -> None:
+def test_a_full_disk_is_named_and_leaves_no_half_file(
+    tmp_path: Path, room: int
+) -> None:
     path = tmp_path / "d.h5"
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -184,7 +192,10 @@ def make(path: Path, recipe: Recipe | None = None, **how: Any) -> Path:
 
 
 def test_a_folder_of_shards_holds_what_a_file_does(tmp_path: Path) -> None:
-    folder, file = TerrainDataset(make(tmp_path / "d")), TerrainDataset(make(tmp_path / "d.h5"))
+    folder, file = (
+        TerrainDataset(make(tmp_path / "d")),
+        TerrainDataset(make(tmp_path / "d.h5")),
+    )
     assert folder.digest == file.digest
     assert folder.manifest["format_version"] == "1.2"
     assert file.manifest["format_version"] == "1.0"
@@ -208,7 +219,14 @@ def test_shares_of_a_folder_are_made_by_any_number_of_processes(tmp_path: Path) 
     path = tmp_path / "d"
     made = []
     for index in (2, 1, 3):
-        steps = list(create(tiny_recipe(), path, shard=Shard(index=index, of=3), shard_cells=3 * CELLS))
+        steps = list(
+            create(
+                tiny_recipe(),
+                path,
+                shard=Shard(index=index, of=3),
+                shard_cells=3 * CELLS,
+            )
+        )
         made.append(steps[-1][1])
         assert (path / "manifest.json").exists() == (index == 3)
     assert sum(made) == 17
@@ -237,11 +255,15 @@ def test_a_folder_that_holds_anything_else_is_left_alone(tmp_path: Path) -> None
         with pytest.raises(ConfigError, match=r"holds notes\.txt"):
             make(folder, other, **how)
         (folder / "notes.txt").unlink()
-    with pytest.raises(ConfigError, match=r"one recipe and version, got .*\.h5 of another"):
+    with pytest.raises(
+        ConfigError, match=r"one recipe and version, got .*\.h5 of another"
+    ):
         make(folder, replace(tiny_recipe(), seed=3))
     assert {file: file.read_bytes() for file in folder.iterdir()} == before
     make(folder, replace(tiny_recipe(), seed=3), overwrite=True)
-    assert digests(folder) == digests(tiny_dataset(tmp_path / "o.h5", replace(tiny_recipe(), seed=3)))
+    assert digests(folder) == digests(
+        tiny_dataset(tmp_path / "o.h5", replace(tiny_recipe(), seed=3))
+    )
     with pytest.raises(ConfigError, match="folder, since a shard"):
         make(tmp_path / "e.h5", shard=Shard(index=1, of=2))
 
@@ -265,7 +287,9 @@ def test_the_name_tells_a_file_from_a_folder(tmp_path: Path, name: str) -> None:
     assert TerrainDataset(path).map_count("train") == 8
 
 
-def test_a_finished_folder_is_there_until_what_replaces_it_is_whole(tmp_path: Path) -> None:
+def test_a_finished_folder_is_there_until_what_replaces_it_is_whole(
+    tmp_path: Path,
+) -> None:
     path, other = make(tmp_path / "d"), replace(tiny_recipe(), seed=3)
     before = digests(path)
     steps = create(other, path, overwrite=True, shard_cells=3 * CELLS)
@@ -285,9 +309,12 @@ def test_a_finished_folder_is_there_until_what_replaces_it_is_whole(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    "name", ["notes.txt", ".git", "maps.h5", "radar-20240101-20240131.h5", "manifest.json"]
+    "name",
+    ["notes.txt", ".git", "maps.h5", "radar-20240101-20240131.h5", "manifest.json"],
 )
-def test_a_folder_with_a_file_of_a_user_is_never_replaced(tmp_path: Path, name: str) -> None:
+def test_a_folder_with_a_file_of_a_user_is_never_replaced(
+    tmp_path: Path, name: str
+) -> None:
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / name).write_text("mine")
     for overwrite in (False, True):
@@ -297,8 +324,16 @@ def test_a_folder_with_a_file_of_a_user_is_never_replaced(tmp_path: Path, name: 
 
 
 def begun(path: Path, recipe: Recipe, share: int, overwrite: bool = False) -> Any:
-    """The making of a share of two that has looked at what is there, and has made nothing yet."""
-    steps = create(recipe, path, shard=Shard(index=share, of=2), overwrite=overwrite, shard_cells=3 * CELLS)
+    """The making of a share of two that has looked at what is there, and has made
+    nothing yet.
+    """
+    steps = create(
+        recipe,
+        path,
+        shard=Shard(index=share, of=2),
+        overwrite=overwrite,
+        shard_cells=3 * CELLS,
+    )
     next(steps)
     return steps
 
@@ -312,7 +347,9 @@ def finish(*making: Any) -> None:
 def test_unlike_shares_that_are_made_at_once_are_no_dataset(tmp_path: Path) -> None:
     path, recipe = tmp_path / "d", tiny_recipe()
     one, other = begun(path, recipe, 1), begun(path, replace(recipe, seed=3), 2)
-    with pytest.raises(ConfigError, match=r"one recipe and version, got .*\.h5 of another"):
+    with pytest.raises(
+        ConfigError, match=r"one recipe and version, got .*\.h5 of another"
+    ):
         finish(one, other)
     assert not (path / "manifest.json").exists()
     finish(begun(path, recipe, 2, overwrite=True))
@@ -346,7 +383,9 @@ def test_a_share_keeps_out_who_makes_the_whole(tmp_path: Path) -> None:
     assert [item.name for item in tmp_path.iterdir()] == ["d"]
 
 
-def test_a_kill_while_a_new_folder_takes_its_place_loses_neither(tmp_path: Path) -> None:
+def test_a_kill_while_a_new_folder_takes_its_place_loses_neither(
+    tmp_path: Path,
+) -> None:
     path, dropped = make(tmp_path / "d"), tmp_path / ".d.dropped"
     before = digests(path)
     path.rename(dropped)
@@ -395,7 +434,9 @@ def test_a_refusal_keeps_what_was_made_so_far(tmp_path: Path) -> None:
 def test_what_is_put_into_a_folder_while_it_is_replaced_is_kept(tmp_path: Path) -> None:
     path = make(tmp_path / "d")
     before = digests(path)
-    steps = create(replace(tiny_recipe(), seed=3), path, overwrite=True, shard_cells=3 * CELLS)
+    steps = create(
+        replace(tiny_recipe(), seed=3), path, overwrite=True, shard_cells=3 * CELLS
+    )
     next(steps)
     (path / "notes.txt").write_text("mine")
     with pytest.raises(ConfigError, match=r"holds notes\.txt"):
@@ -404,7 +445,9 @@ def test_what_is_put_into_a_folder_while_it_is_replaced_is_kept(tmp_path: Path) 
     assert digests(path) == before
 
 
-def test_the_folder_that_one_stands_in_may_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_folder_that_one_stands_in_may_be_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "d").mkdir()
     monkeypatch.chdir(tmp_path / "d")
     make(Path())

@@ -15,10 +15,17 @@ def test_digests_stand_in_one_column_whatever_the_names_of_splits(
     path = tiny_dataset(tmp_path / "d.h5")
     described = describe(TerrainDataset(path))
     described["splits"][LONG] = described["splits"]["train"]
-    lines = [line for line in tables(described) if isinstance(line, str) and line.startswith("  ")]
+    lines = [
+        line
+        for line in tables(described)
+        if isinstance(line, str) and line.startswith("  ")
+    ]
     assert any(line.startswith(f"  {LONG} ") for line in lines)
     assert len({line.rindex(" ") for line in lines}) == 1
     splits = TerrainDataset(path).splits
     monkeypatch.setattr(TerrainDataset, "splits", {**splits, LONG: splits["train"]})
     written(path)
-    assert len({line.rindex(" ") for line in capsys.readouterr().out.splitlines()[1:]}) == 1
+    assert (
+        len({line.rindex(" ") for line in capsys.readouterr().out.splitlines()[1:]})
+        == 1
+    )

@@ -1,4 +1,6 @@
-"""Datasets edited at random: every command and reader gives one line, or what was stored."""
+"""Datasets edited at random: every command and reader gives one line, or what was
+stored.
+"""
 
 import json
 import random
@@ -21,7 +23,9 @@ from tests.commands import call
 from tests.factories import tiny_dataset, tiny_recipe
 
 EDITS = pytest.mark.parametrize(
-    "seeds", [range(30), pytest.param(range(30, 350), marks=pytest.mark.slow)], ids=["30", "320"]
+    "seeds",
+    [range(30), pytest.param(range(30, 350), marks=pytest.mark.slow)],
+    ids=["30", "320"],
 )
 VALUES: list[Any] = [None, -1, 0, 3, 10**30, 0.5, "", "x", "../x.h5", [], {}, True]
 
@@ -48,7 +52,11 @@ def edit_manifest(path: Path, rng: random.Random) -> None:
     place: Any = manifest
     while True:
         key = rng.choice(list(place) if isinstance(place, dict) else range(len(place)))
-        if not isinstance(place[key], dict | list) or not place[key] or rng.random() < 0.2:
+        if (
+            not isinstance(place[key], dict | list)
+            or not place[key]
+            or rng.random() < 0.2
+        ):
             break
         place = place[key]
     if rng.random() < 0.3:
@@ -66,15 +74,21 @@ def edit_manifest(path: Path, rng: random.Random) -> None:
 
 def edit_array(path: Path, rng: random.Random) -> None:
     """Changes an attribute, renames, removes or reshapes an array."""
-    with h5py.File(rng.choice(sorted(path.glob("*.h5"))) if path.is_dir() else path, "r+") as file:
-        split = rng.choice([name for name in ("train", "valid", "test/hg") if name in file] or ["test"])
+    with h5py.File(
+        rng.choice(sorted(path.glob("*.h5"))) if path.is_dir() else path, "r+"
+    ) as file:
+        split = rng.choice(
+            [name for name in ("train", "valid", "test/hg") if name in file] or ["test"]
+        )
         if split == "test":
             split = f"test/{next(iter(file['test']))}"
         name = rng.choice(list(file[split]))
         how = rng.choice(["attribute", "remove", "rename", "shorten", "kind"])
         stored = file[split][name]
         if how == "attribute":
-            stored.attrs[rng.choice(["unit", "meaning", "new"])] = rng.choice(["", 3, "x"])
+            stored.attrs[rng.choice(["unit", "meaning", "new"])] = rng.choice(
+                ["", 3, "x"]
+            )
             return
         values = stored[:]
         del file[split][name]
@@ -122,7 +136,9 @@ def test_an_edited_dataset_is_one_line_or_what_was_stored(
         with suppress(BenchnavError):
             given = content(edited)
             for name in set(given) & set(expected):
-                np.testing.assert_array_equal(given[name], expected[name], err_msg=f"seed {seed}")
+                np.testing.assert_array_equal(
+                    given[name], expected[name], err_msg=f"seed {seed}"
+                )
         commands = {"show": [], "validate": []}
         if seed % 4 == 0:  # slower than the others
             commands["preview"] = ["--maps", "[0]", "--out", str(tmp_path / "p.png")]

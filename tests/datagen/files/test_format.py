@@ -1,7 +1,7 @@
 """Formats 1.0 and 1.1 stay readable, and their maps stay the same on every machine.
 
-`tests/data/golden-1.0.h5` was made by `benchnav-datagen create tests/data/golden.yaml`, and
-`golden-1.1.h5` by `benchnav-datagen create tests/datagen/files/golden-1.1.yaml`.
+`tests/data/golden-1.0.h5` was made by `benchnav-datagen create tests/data/golden.yaml`,
+and `golden-1.1.h5` by `benchnav-datagen create tests/datagen/files/golden-1.1.yaml`.
 """
 
 import json
@@ -91,7 +91,11 @@ def test_the_golden_file_is_laid_out_as_documented() -> None:
             assert array.dtype.str == field.dtype
             assert array.shape == (3, *field.entry_shape(16, 20))
             assert array.chunks[0] == (1 if "H" in field.shape else 3)
-            assert (array.compression, array.shuffle, array.fletcher32) == ("gzip", True, True)
+            assert (array.compression, array.shuffle, array.fletcher32) == (
+                "gzip",
+                True,
+                True,
+            )
             assert array.attrs["unit"] == field.unit
         assert file["test/hg/entry_digests"].shape == (3, 9, 32)
     manifest = json.loads(text)
@@ -109,13 +113,21 @@ def test_the_golden_file_is_laid_out_as_documented() -> None:
 @pytest.mark.parametrize(
     "settings",
     [
-        {"NPY_DISABLE_CPU_FEATURES": " ".join(dispatched()), "ATEN_CPU_CAPABILITY": "default"},
-        {"OPENBLAS_CORETYPE": "Prescott", "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F"},
+        {
+            "NPY_DISABLE_CPU_FEATURES": " ".join(dispatched()),
+            "ATEN_CPU_CAPABILITY": "default",
+        },
+        {
+            "OPENBLAS_CORETYPE": "Prescott",
+            "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F",
+        },
         {"OMP_NUM_THREADS": "3", "OPENBLAS_NUM_THREADS": "3"},
     ],
     ids=["no vector instructions", "plain BLAS and C library", "threads"],
 )
-def test_digests_are_the_same_on_other_processors(tmp_path: Path, settings: dict[str, str]) -> None:
+def test_digests_are_the_same_on_other_processors(
+    tmp_path: Path, settings: dict[str, str]
+) -> None:
     sources = [str(DATA / "golden.yaml"), str(SECOND.with_suffix(".yaml"))]
     code = (
         "from pathlib import Path; from benchnav.datagen.recipe.recipe import load_recipe; "
@@ -123,7 +135,12 @@ def test_digests_are_the_same_on_other_processors(tmp_path: Path, settings: dict
         f"for number, source in enumerate({sources!r}):\n"
         "    for _ in create(load_recipe(source), Path(f'{number}.h5')): pass"
     )
-    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=os.environ | settings, check=True)
+    subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | settings,
+        check=True,
+    )
     for number, digests in enumerate((DIGESTS, SECOND_DIGESTS)):
         made = TerrainDataset(tmp_path / f"{number}.h5")
         assert {name: entry["digest"] for name, entry in made.splits.items()} == digests

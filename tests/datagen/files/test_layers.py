@@ -35,8 +35,12 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_dataset(tmp_path_factory.mktemp("layers") / "small.h5", overgrown())
 
 
-def foreign(folder: Path, unit: str = "1", **fields: tuple[str, tuple[str, ...]]) -> TerrainDataset:
-    """A dataset with fields of its own, by dtype and shape, all zero but a NaN in floats."""
+def foreign(
+    folder: Path, unit: str = "1", **fields: tuple[str, tuple[str, ...]]
+) -> TerrainDataset:
+    """A dataset with fields of its own, by dtype and shape, all zero but a NaN in
+    floats.
+    """
     recipe = replace(tiny_recipe(), splits={"train": Split(scenario="std", maps=2)})
     own = {
         name: schema.Field(kind, shape, unit, -np.inf, np.inf, "mine")
@@ -64,7 +68,8 @@ def test_a_dataset_with_vegetation_is_of_1_3_and_lists_it(path: Path) -> None:
     assert find_faults(path) == []
     made = generate(overgrown(), "train", np.arange(8))
     np.testing.assert_array_equal(
-        dataset.read("train", fields=["vegetation_m"])["vegetation_m"], made["vegetation_m"]
+        dataset.read("train", fields=["vegetation_m"])["vegetation_m"],
+        made["vegetation_m"],
     )
     assert made["vegetation_m"].any()
 
@@ -82,18 +87,23 @@ def test_terrain_and_what_is_seen_of_it_have_the_layers(path: Path) -> None:
     for layers in (terrain.layers, terrain.observe().layers):
         assert list(layers) == ["vegetation_m"]
         assert layers["vegetation_m"].dtype == torch.float32
-        np.testing.assert_array_equal(layers["vegetation_m"].numpy(), stored["vegetation_m"])
+        np.testing.assert_array_equal(
+            layers["vegetation_m"].numpy(), stored["vegetation_m"]
+        )
 
 
 def test_maps_for_training_have_a_layer_by_name(path: Path) -> None:
     for in_memory in (False, True):
         maps = TerrainMaps(path, "train", ("vegetation_m", "rgb"), in_memory)
         np.testing.assert_array_equal(
-            maps[3]["vegetation_m"].numpy(), TerrainDataset(path).read("train", [3])["vegetation_m"][0]
+            maps[3]["vegetation_m"].numpy(),
+            TerrainDataset(path).read("train", [3])["vegetation_m"][0],
         )
 
 
-def test_float_maps_that_are_not_known_are_layers_and_nothing_else_is(tmp_path: Path) -> None:
+def test_float_maps_that_are_not_known_are_layers_and_nothing_else_is(
+    tmp_path: Path,
+) -> None:
     dataset = foreign(
         tmp_path,
         thermal_inertia=("<f4", ("H", "W")),
@@ -109,7 +119,9 @@ def test_float_maps_that_are_not_known_are_layers_and_nothing_else_is(tmp_path: 
     assert layer.isnan().sum() == 1
 
 
-def test_optional_fields_that_are_known_are_no_layers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_optional_fields_that_are_known_are_no_layers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """What else a dataset may say of λ, say, is not for a model to see."""
     spread = {"spread": schema.Field("<f4", ("H", "W"), "1", 0, 1, "of measured λ")}
     assert schema.layer_names(schema.FIELDS | spread) == ("spread",)
@@ -137,28 +149,42 @@ def test_datasets_with_one_set_of_layers_merge_and_others_are_refused_in_one_lin
         pass
     both = TerrainDataset(tmp_path / "both.h5")
     assert both.layer_names == ("vegetation_m",)
-    parts = [TerrainDataset(each).read("train")["vegetation_m"] for each in (path, sibling)]
-    np.testing.assert_array_equal(both.read("train")["vegetation_m"], np.concatenate(parts))
+    parts = [
+        TerrainDataset(each).read("train")["vegetation_m"] for each in (path, sibling)
+    ]
+    np.testing.assert_array_equal(
+        both.read("train")["vegetation_m"], np.concatenate(parts)
+    )
     bare = tiny_dataset(tmp_path / "c.h5", small_stakes(seed=5))
     with pytest.raises(DatasetError) as caught:
         next(merge([path, bare], tmp_path / "no.h5"))
     assert "unlike fields (vegetation_m of one alone)" in str(caught.value)
     assert "\n" not in str(caught.value)
-    other = tiny_dataset(tmp_path / "d.h5", grown(small_stakes(seed=6), 5.0, wet_clay=GRASS))
+    other = tiny_dataset(
+        tmp_path / "d.h5", grown(small_stakes(seed=6), 5.0, wet_clay=GRASS)
+    )
     with pytest.raises(DatasetError, match="have unlike layers"):
         next(merge([path, other], tmp_path / "no.h5"))
 
 
-def test_layers_of_one_name_and_another_unit_or_order_are_not_merged(tmp_path: Path) -> None:
+def test_layers_of_one_name_and_another_unit_or_order_are_not_merged(
+    tmp_path: Path,
+) -> None:
     plane = ("<f4", ("H", "W"))
     datasets = []
     for name, unit, fields in (("x", "1", "ab"), ("y", "1", "ba"), ("z", "m", "ab")):
         (tmp_path / name).mkdir()
-        datasets.append(foreign(tmp_path / name, unit, **dict.fromkeys(fields, plane)).path)
+        datasets.append(
+            foreign(tmp_path / name, unit, **dict.fromkeys(fields, plane)).path
+        )
     first, swapped, measured = datasets
-    with pytest.raises(DatasetError, match=r"unlike order of fields \(.*a, b / .*b, a\)"):
+    with pytest.raises(
+        DatasetError, match=r"unlike order of fields \(.*a, b / .*b, a\)"
+    ):
         next(merge([first, swapped], tmp_path / "no.h5"))
-    with pytest.raises(DatasetError, match=r"fields of unlike dtype, unit or meaning \(a, b\)"):
+    with pytest.raises(
+        DatasetError, match=r"fields of unlike dtype, unit or meaning \(a, b\)"
+    ):
         next(merge([first, measured], tmp_path / "no.h5"))
 
 
@@ -171,14 +197,22 @@ def test_damaged_and_impossible_values_are_found(path: Path, tmp_path: Path) -> 
         file["train/vegetation_m"][4, 0, 0] = np.nan
     found = {(fault.map, fault.field, fault.problem) for fault in find_faults(copy)}
     assert found == {
-        *((number, "vegetation_m", "does not match its digest") for number in (2, 3, 4)),
+        *(
+            (number, "vegetation_m", "does not match its digest")
+            for number in (2, 3, 4)
+        ),
         *((number, "vegetation_m", "is out of range") for number in (2, 3)),
     }
 
 
 def test_what_models_record_covers_what_grows(path: Path, tmp_path: Path) -> None:
     dataset = TerrainDataset(path)
-    taller = grown(overgrown(), wet_clay=replace(GRASS, height_m=(0.1, 0.9)), gravel=GRASS, scree=GRASS)
+    taller = grown(
+        overgrown(),
+        wet_clay=replace(GRASS, height_m=(0.1, 0.9)),
+        gravel=GRASS,
+        scree=GRASS,
+    )
     other = TerrainDataset(tiny_dataset(tmp_path / "t.h5", taller))
     assert dataset.about_digest("train") != other.about_digest("train")
 
@@ -193,7 +227,9 @@ def test_the_command_refuses_unlike_layers_in_one_line(
     assert not (tmp_path / "no.h5").exists()
 
 
-def test_the_commands_name_layers(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_commands_name_layers(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     def said(*words: str) -> str:
         assert call("datagen", *words) == 0
         return capsys.readouterr().out

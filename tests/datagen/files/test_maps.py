@@ -18,7 +18,12 @@ from tests.factories import tiny_dataset, tiny_recipe
 
 @pytest.mark.parametrize("in_memory", [False, True])
 def test_maps_are_what_is_stored(dataset_path: Path, in_memory: bool) -> None:
-    maps = TerrainMaps(dataset_path, "train", ("slope_deg", "environment", "start_m"), in_memory=in_memory)
+    maps = TerrainMaps(
+        dataset_path,
+        "train",
+        ("slope_deg", "environment", "start_m"),
+        in_memory=in_memory,
+    )
     stored = TerrainDataset(dataset_path).read("train")
     assert len(maps) == 8
     for index in (0, 5, -1):
@@ -31,16 +36,24 @@ def test_maps_are_what_is_stored(dataset_path: Path, in_memory: bool) -> None:
 
 @pytest.mark.parametrize("context", ["fork", "spawn"])
 @pytest.mark.parametrize("in_memory", [False, True])
-def test_workers_read_what_this_process_reads(dataset_path: Path, context: str, in_memory: bool) -> None:
+def test_workers_read_what_this_process_reads(
+    dataset_path: Path, context: str, in_memory: bool
+) -> None:
     maps = TerrainMaps(dataset_path, "train", in_memory=in_memory)
-    here = torch.stack([maps[i]["rgb"] for i in range(len(maps))])  # and so the file is open already
+    here = torch.stack(
+        [maps[i]["rgb"] for i in range(len(maps))]
+    )  # and so the file is open already
     workers = {"fork": 2, "spawn": 1}[context]
-    loader = DataLoader(maps, batch_size=2, num_workers=workers, multiprocessing_context=context)
+    loader = DataLoader(
+        maps, batch_size=2, num_workers=workers, multiprocessing_context=context
+    )
     assert torch.equal(torch.cat([batch["rgb"] for batch in loader]), here)
     assert torch.equal(maps[3]["rgb"], here[3])
 
 
-def test_another_process_opens_the_file_for_itself(dataset_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_another_process_opens_the_file_for_itself(
+    dataset_path: Path, monkeypatch
+) -> None:  # type: ignore[no-untyped-def]
     maps = TerrainMaps(dataset_path, "train")
     here = [maps.dataset._open(dataset_path)[0] for _ in range(2)]
     monkeypatch.setattr("os.getpid", lambda: -1)
@@ -71,9 +84,14 @@ def test_bad_requests_and_damage_are_named(tmp_path: Path) -> None:
         maps[1]
 
 
-def test_maps_from_memory_are_copies_and_relative_paths_hold(dataset_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_maps_from_memory_are_copies_and_relative_paths_hold(
+    dataset_path: Path, monkeypatch
+) -> None:  # type: ignore[no-untyped-def]
     monkeypatch.chdir(dataset_path.parent)
-    maps = [TerrainMaps(dataset_path.name, "train", in_memory=there) for there in (False, True)]
+    maps = [
+        TerrainMaps(dataset_path.name, "train", in_memory=there)
+        for there in (False, True)
+    ]
     monkeypatch.chdir("/")
     before = maps[0][2]["rgb"].clone()
     for source in maps:
@@ -89,7 +107,9 @@ def test_a_missing_array_is_damage(tmp_path: Path) -> None:
         TerrainMaps(path, "train")[0]
 
 
-def test_maps_of_a_folder_are_those_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_maps_of_a_folder_are_those_of_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for _ in create(tiny_recipe(), tmp_path / "d", shard_cells=3 * 32 * 32):
         pass
     monkeypatch.setattr(reader, "_MOST_OPEN", 2)
@@ -99,7 +119,9 @@ def test_maps_of_a_folder_are_those_of_a_file(tmp_path: Path, monkeypatch: pytes
         for name, values in parts[index].items():
             assert torch.equal(values, whole[index][name])
     assert len(parts.dataset._opened) == 2
-    loaded = torch.cat([batch["rgb"] for batch in DataLoader(parts, batch_size=3, num_workers=2)])
+    loaded = torch.cat(
+        [batch["rgb"] for batch in DataLoader(parts, batch_size=3, num_workers=2)]
+    )
     assert torch.equal(loaded, torch.stack([whole[index]["rgb"] for index in range(8)]))
 
 
@@ -111,7 +133,11 @@ def shards(tmp_path: Path) -> TerrainMaps:
     return TerrainMaps(tmp_path / "d", "train", ("rgb", "start_m"))
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 @given(st.lists(st.integers(0, 7), max_size=12))
 def test_maps_of_shards_are_read_in_any_order_and_more_than_once(
     shards: TerrainMaps, indices: list[int]
@@ -128,15 +154,21 @@ def test_maps_that_lie_side_by_side_are_read_together(
     monkeypatch.setattr(
         reader,
         "_values",
-        lambda array, which: runs.append((which.start, which.stop)) or plainly(array, which),
+        lambda array, which: (
+            runs.append((which.start, which.stop)) or plainly(array, which)
+        ),
     )
     shards.read([4, 0, 3, 2, 7])
     assert runs[::2] == [(0, 1), (2, 3), (0, 2), (1, 2)]
 
 
-def test_a_file_that_is_one_too_many_is_closed(shards: TerrainMaps, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_is_one_too_many_is_closed(
+    shards: TerrainMaps, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def count() -> int:
-        return h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE | h5py.h5f.OBJ_DATASET)
+        return h5py.h5f.get_obj_count(
+            h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE | h5py.h5f.OBJ_DATASET
+        )
 
     monkeypatch.setattr(reader, "_MOST_OPEN", 2)
     before = count()

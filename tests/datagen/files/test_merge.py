@@ -29,7 +29,9 @@ def test_splits_made_apart_are_the_whole(tmp_path: Path) -> None:
     recipe = tiny_recipe()
     whole = TerrainDataset(tiny_dataset(tmp_path / "whole.h5", recipe))
     some = tiny_dataset(tmp_path / "a.h5", only(recipe, "train", "valid"))
-    rest = tiny_dataset(tmp_path / "b.h5", only(recipe, "test/std", "test/hg", "test/hs"))
+    rest = tiny_dataset(
+        tmp_path / "b.h5", only(recipe, "test/std", "test/hg", "test/hs")
+    )
     assert run([some, rest], tmp_path / "m.h5").digest == whole.digest
 
 
@@ -41,7 +43,9 @@ def test_siblings_are_joined_end_to_end(tmp_path: Path) -> None:
     for split in merged.splits:
         halves = [TerrainDataset(path).read(split) for path in (first, second)]
         for name, values in merged.read(split).items():
-            np.testing.assert_array_equal(values, np.concatenate([half[name] for half in halves]))
+            np.testing.assert_array_equal(
+                values, np.concatenate([half[name] for half in halves])
+            )
     third = tiny_dataset(tmp_path / "c.h5", replace(tiny_recipe(), seed=2))
     assert run([merged.path, third], tmp_path / "n.h5").splits["train"]["maps"] == 24
 
@@ -51,7 +55,9 @@ def test_all_reasons_are_given_at_once(tmp_path: Path) -> None:
     first = tiny_dataset(tmp_path / "a.h5", only(recipe, "train", "test/hs"))
     classes = (replace(recipe.classes[0], scale=9.0), *recipe.classes[1:])
     scenarios = recipe.scenarios | {"hs": replace(recipe.scenarios["hs"], ambient=0.5)}
-    unlike = replace(recipe, seed=5, classes=classes, resolution_m=0.6, scenarios=scenarios)
+    unlike = replace(
+        recipe, seed=5, classes=classes, resolution_m=0.6, scenarios=scenarios
+    )
     second = tiny_dataset(tmp_path / "b.h5", only(unlike, "train", "test/hs"))
     with pytest.raises(DatasetError) as caught:
         run([first, second, first], tmp_path / "m.h5", "no spaces")
@@ -83,32 +89,42 @@ def test_maps_made_in_another_way_are_refused(tmp_path: Path) -> None:
         ("correlation_m", replace(recipe, correlation_m=1.0)),
         ("synthesis", plain),
     ):
-        path = tiny_dataset(tmp_path / "other.h5", only(replace(other, seed=3), "train"))
+        path = tiny_dataset(
+            tmp_path / "other.h5", only(replace(other, seed=3), "train")
+        )
         with pytest.raises(DatasetError, match=f"unlike {name} ") as caught:
             run([first, path], tmp_path / "n.h5")
         assert "Rule(" not in str(caught.value)
         path.unlink()
 
 
-def test_a_damaged_source_is_refused_and_an_existing_target_kept(tmp_path: Path) -> None:
+def test_a_damaged_source_is_refused_and_an_existing_target_kept(
+    tmp_path: Path,
+) -> None:
     recipe = tiny_recipe()
     first = tiny_dataset(tmp_path / "a.h5", only(recipe, "train"))
     second = tiny_dataset(tmp_path / "b.h5", only(recipe, "valid"))
     with h5py.File(second, "r+") as file:
         file["valid/class_id"][1] = 3
-    with pytest.raises(DatasetError, match=r"valid: map 1: field 'class_id' does not match"):
+    with pytest.raises(
+        DatasetError, match=r"valid: map 1: field 'class_id' does not match"
+    ):
         run([first, second], tmp_path / "m.h5")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.h5", "b.h5"]
     with pytest.raises(ConfigError, match="exists"):
         run([first, second], first)
 
 
-def test_unlike_scenarios_are_found_in_files_that_were_merged_before(tmp_path: Path) -> None:
+def test_unlike_scenarios_are_found_in_files_that_were_merged_before(
+    tmp_path: Path,
+) -> None:
     recipe = tiny_recipe()
     first = tiny_dataset(tmp_path / "a.h5", only(recipe, "train"))
     second = tiny_dataset(tmp_path / "b.h5", only(recipe, "test/hs"))
     scenarios = recipe.scenarios | {"hs": replace(recipe.scenarios["hs"], ambient=0.5)}
-    third = tiny_dataset(tmp_path / "c.h5", only(replace(recipe, seed=9, scenarios=scenarios), "test/hs"))
+    third = tiny_dataset(
+        tmp_path / "c.h5", only(replace(recipe, seed=9, scenarios=scenarios), "test/hs")
+    )
     both = run([first, second], tmp_path / "ab.h5").path
     for order in ([both, third], [third, both]):
         with pytest.raises(DatasetError, match=r"unlike scenarios .*'test/hs'"):
@@ -123,14 +139,20 @@ def test_what_a_killed_run_made_of_the_same_name_is_kept(tmp_path: Path) -> None
     steps.close()
     kept = set((tmp_path / ".m.h5.partial").glob("*.h5"))
     assert kept
-    parts = [tiny_dataset(tmp_path / f"{name}.h5", only(recipe, name)) for name in ("train", "valid")]
+    parts = [
+        tiny_dataset(tmp_path / f"{name}.h5", only(recipe, name))
+        for name in ("train", "valid")
+    ]
     run(parts, tmp_path / "m.h5")
     assert kept <= set((tmp_path / ".m.h5.partial").glob("*.h5"))
 
 
 def test_a_folder_is_replaced_only_where_it_is_a_dataset(tmp_path: Path) -> None:
     recipe = tiny_recipe()
-    parts = [tiny_dataset(tmp_path / f"{name}.h5", only(recipe, name)) for name in ("train", "valid")]
+    parts = [
+        tiny_dataset(tmp_path / f"{name}.h5", only(recipe, name))
+        for name in ("train", "valid")
+    ]
     out = tmp_path / "out"
     out.mkdir()
     (out / "notes.txt").write_text("mine")
@@ -142,10 +164,17 @@ def test_a_folder_is_replaced_only_where_it_is_a_dataset(tmp_path: Path) -> None
     both = run(parts, out)
     assert both.digest == run(parts, tmp_path / "both.h5").digest
     # Its files have the names that they came with.
-    assert sorted(item.name for item in out.iterdir()) == ["manifest.json", "train.h5", "valid.h5"]
+    assert sorted(item.name for item in out.iterdir()) == [
+        "manifest.json",
+        "train.h5",
+        "valid.h5",
+    ]
     with pytest.raises(ConfigError, match="exists"):
         run(parts, out)
     for _ in merge(parts[::-1], out, "again", True):
         pass
-    assert (TerrainDataset(out).id, list(TerrainDataset(out).splits)) == ("again", ["valid", "train"])
+    assert (TerrainDataset(out).id, list(TerrainDataset(out).splits)) == (
+        "again",
+        ["valid", "train"],
+    )
     assert find_faults(out) == []

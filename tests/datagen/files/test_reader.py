@@ -36,10 +36,14 @@ def test_what_is_read_is_what_was_generated(dataset_path: Path) -> None:
     terrain = dataset.terrain("train", [3, 5])
     assert terrain.class_id.dtype == torch.int64
     assert terrain.truth.stds.dtype == torch.float32
-    np.testing.assert_array_equal(terrain.rgb, dataset.read("train", [3, 5], ["rgb"])["rgb"])
+    np.testing.assert_array_equal(
+        terrain.rgb, dataset.read("train", [3, 5], ["rgb"])["rgb"]
+    )
 
 
-def test_the_truth_of_a_dataset_is_known_where_that_of_all_splits_is(dataset_path: Path) -> None:
+def test_the_truth_of_a_dataset_is_known_where_that_of_all_splits_is(
+    dataset_path: Path,
+) -> None:
     dataset = TerrainDataset(dataset_path)
     assert dataset.truth == "generated"
     dataset.manifest["splits"]["valid"]["parts"][0] = {
@@ -55,7 +59,9 @@ def test_a_locked_file_is_called_locked(dataset_path: Path, tmp_path: Path) -> N
     shutil.copy(dataset_path, path)
     with open(path) as other:
         fcntl.flock(other, fcntl.LOCK_EX)
-        with pytest.raises(DatasetError, match=r"locked\.h5 is locked: .*Close what writes to it\.$"):
+        with pytest.raises(
+            DatasetError, match=r"locked\.h5 is locked: .*Close what writes to it\.$"
+        ):
             TerrainDataset(path)
     TerrainDataset(path)
 
@@ -69,12 +75,18 @@ def test_dimensions_have_scales_with_the_centres_of_cells(dataset_path: Path) ->
             for name, array in file[split].items():
                 if array.is_scale:
                     continue
-                labels = [[scale.name for scale in dimension.values()] for dimension in array.dims]
+                labels = [
+                    [scale.name for scale in dimension.values()]
+                    for dimension in array.dims
+                ]
                 assert [label[0].rsplit("/")[-1] for label in labels] == {
                     **{name: ["map_index", "y_m", "x_m"] for name in schema.MAP_FIELDS},
                     "rgb": ["map_index", "axis_3", "y_m", "x_m"],
                     **{key: ["map_index", "axis_2"] for key in ("start_m", "goal_m")},
-                    **{key: ["map_index"] for key in ("environment", "reference_time_s")},
+                    **{
+                        key: ["map_index"]
+                        for key in ("environment", "reference_time_s")
+                    },
                     "entry_digests": ["map_index", "axis_9", "axis_32"],
                 }[name], name
                 for size, dimension in zip(array.shape, array.dims, strict=True):
@@ -89,7 +101,9 @@ def test_a_damaged_scale_is_found(dataset_path: Path, tmp_path: Path) -> None:
     with h5py.File(dataset_path) as file:
         raw[file["valid/y_m"].id.get_chunk_info(0).byte_offset + 3] ^= 1
     path.write_bytes(raw)
-    assert [str(fault) for fault in find_faults(path)] == ["valid: field 'y_m' is damaged"]
+    assert [str(fault) for fault in find_faults(path)] == [
+        "valid: field 'y_m' is damaged"
+    ]
 
 
 def test_foreign_newer_and_missing_files_are_refused(tmp_path: Path) -> None:
@@ -141,7 +155,9 @@ def test_bad_requests_are_named(dataset_path: Path) -> None:
 
 
 def test_components_belong_to_the_class_whose_soft_spots_they_hold() -> None:
-    """The truth as one class, and what looks alike by its classes: single-class settings choose among these."""
+    """The truth as one class, and what looks alike by its classes: single-class
+    settings choose among these.
+    """
     recipe = small_stakes()
     terrain = terrain_of(generate(recipe, "train", np.arange(4)), recipe)
     assert terrain.truth.group == (0, 0)
@@ -156,7 +172,9 @@ def test_components_belong_to_the_class_whose_soft_spots_they_hold() -> None:
     assert {len(own) for own in table} == {1, 2}
     # Under each class with its own λ.
     own = torch.tensor(seen.group)[:, None, None] == terrain.class_id[:, None]
-    of_class = TraversabilityMixture(torch.where(own, seen.weights, 0.0), seen.means, seen.stds)
+    of_class = TraversabilityMixture(
+        torch.where(own, seen.weights, 0.0), seen.means, seen.stds
+    )
     torch.testing.assert_close(of_class.mean(), terrain.truth.mean())
 
 
@@ -204,7 +222,10 @@ def test_recorded_digests_cover_what_maps_mean(tmp_path: Path) -> None:
     assert (dataset.truth_of(split), other.truth_of(split)) == ("generated", "unknown")
     assert other.truth_of("valid") == "generated"
     mixed = TerrainDataset(dataset.path)
-    mixed.manifest["splits"][split]["parts"] = [{"maps": 7, "recipe": 0}, {"maps": 1, "source": {}}]
+    mixed.manifest["splits"][split]["parts"] = [
+        {"maps": 7, "recipe": 0},
+        {"maps": 1, "source": {}},
+    ]
     assert mixed.truth_of(split) == "unknown"
     digests.add(other.split_digest(split))
     assert len(digests) == 5

@@ -13,11 +13,17 @@ from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from tests.datagen.small import small_stakes
 from tests.docs.pages import DOCS, blocks
 
-PAGE = {block.file: block.body for block in blocks(DOCS / "how-to" / "own-layer.md") if block.file}
+PAGE = {
+    block.file: block.body
+    for block in blocks(DOCS / "how-to" / "own-layer.md")
+    if block.file
+}
 
 
 def write_page(folder: Path) -> Path:
-    """Write the layer and the recipe of the page, with fewer maps; return the recipe's path."""
+    """Write the layer and the recipe of the page, with fewer maps; return the recipe's
+    path.
+    """
     (folder / "wet.py").write_text(PAGE["wet.py"])
     recipe = yaml.safe_load(PAGE["wet.yaml"])
     recipe["splits"] = {
@@ -44,7 +50,9 @@ def wetness(folder: Path) -> type[Layer]:
 
 
 class Plain(Layer):
-    """A layer that shows nothing and leaves λ as it is, but that says that it changes both."""
+    """A layer that shows nothing and leaves λ as it is, but that says that it changes
+    both.
+    """
 
     name = "plain"
 
@@ -59,5 +67,7 @@ class Plain(Layer):
     ) -> tuple[ndarray, ndarray]:
         return mean + 0 * values, std
 
-    def class_weights(self, weights: ndarray, values: ndarray, maps: DrawnMaps) -> ndarray:
+    def class_weights(
+        self, weights: ndarray, values: ndarray, maps: DrawnMaps
+    ) -> ndarray:
         return np.copy(weights)

@@ -1,4 +1,6 @@
-"""What every layer keeps: bits, batches, ranges; a layer without effect leaves all else as it is."""
+"""What every layer keeps: bits, batches, ranges; a layer without effect leaves all else
+as it is.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -67,7 +69,9 @@ def test_values_lie_within_the_range_and_fill_some_of_it(recipe: Recipe) -> None
 
 
 def test_what_a_layer_does_not_name_stays(recipe: Recipe) -> None:
-    maps, without = (generate(each, "train", MAPS) for each in (recipe, replace(recipe, layers=())))
+    maps, without = (
+        generate(each, "train", MAPS) for each in (recipe, replace(recipe, layers=()))
+    )
     (spec,) = recipe.layers
     changed = {"rgb", "traversability"} if spec.affects else {"rgb"}
     for name in set(without) - changed:
@@ -79,22 +83,32 @@ def test_a_layer_without_effect_leaves_colours_and_lambda_as_they_are() -> None:
     recipe = small_stakes()
     layered = replace(recipe, layers=(Plain(),))
     for split in recipe.splits:
-        maps, without = (generate(each, split, np.arange(3)) for each in (layered, recipe))
+        maps, without = (
+            generate(each, split, np.arange(3)) for each in (layered, recipe)
+        )
         for name in FIELDS:
             np.testing.assert_array_equal(maps[name], without[name])
-        truth = latent.truth(maps["class_id"], maps["slope_deg"].astype(np.float64), recipe.classes)
+        truth = latent.truth(
+            maps["class_id"], maps["slope_deg"].astype(np.float64), recipe.classes
+        )
         for name, values in zip(TRUTH, truth[1:], strict=True):
             np.testing.assert_array_equal(maps[name], values.astype(np.float32))
     own, bare = terrain_of(maps, layered), terrain_of(without, recipe)
     assert own.look_alikes is not None
     assert bare.look_alikes is not None
-    torch.testing.assert_close(own.look_alikes(own).mean(), bare.look_alikes(bare).mean(), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        own.look_alikes(own).mean(), bare.look_alikes(bare).mean(), rtol=0, atol=1e-6
+    )
 
 
 def test_lambda_follows_the_distribution_that_the_layer_makes(tmp_path: Path) -> None:
-    """By hand: of soft spots and of firm ground the mean falls by the wetness, and the deviation stays."""
+    """By hand: of soft spots and of firm ground the mean falls by the wetness, and the
+    deviation stays.
+    """
     recipe = wet(tmp_path, loss=0.7)
-    maps, bare = (generate(each, "train", MAPS) for each in (recipe, replace(recipe, layers=())))
+    maps, bare = (
+        generate(each, "train", MAPS) for each in (recipe, replace(recipe, layers=()))
+    )
     weights, means, stds = latent.stored_truth(bare, recipe.classes)
     keeps = 1 - 0.7 * maps["wetness"].astype(np.float64)[:, None]
     expected = np.where(weights > 0, means * keeps, means)
@@ -108,32 +122,48 @@ def test_lambda_follows_the_distribution_that_the_layer_makes(tmp_path: Path) ->
     seen = terrain.look_alikes(terrain).mean().double().numpy()
     slope = maps["slope_deg"].astype(np.float64)
     pair = [
-        number for number, item in enumerate(recipe.classes) if item.name in ("packed_soil", "crusted_soil")
+        number
+        for number, item in enumerate(recipe.classes)
+        if item.name in ("packed_soil", "crusted_soil")
     ]
     expected_means = []
     for number in pair:
         _, mean, std = latent.truth(np.full(slope.shape, number), slope, recipe.classes)
-        expected_means.append(latent.expected_traversability(mean[:, 0] * keeps[:, 0], std[:, 0]))
+        expected_means.append(
+            latent.expected_traversability(mean[:, 0] * keeps[:, 0], std[:, 0])
+        )
     cells = np.isin(maps["class_id"], pair)
     assert cells.any()
-    np.testing.assert_allclose(seen[cells], np.mean(expected_means, axis=0)[cells], atol=1e-5)
+    np.testing.assert_allclose(
+        seen[cells], np.mean(expected_means, axis=0)[cells], atol=1e-5
+    )
 
 
-def test_a_solvable_split_goes_by_the_lambda_that_the_layer_makes(tmp_path: Path) -> None:
+def test_a_solvable_split_goes_by_the_lambda_that_the_layer_makes(
+    tmp_path: Path,
+) -> None:
     recipe = wet(tmp_path, loss=0.6)
-    recipe = replace(recipe, splits={"all": Split(scenario="std", maps=4, solvable=True)})
-    maps, bare = (generate(each, "all", np.arange(4)) for each in (recipe, replace(recipe, layers=())))
+    recipe = replace(
+        recipe, splits={"all": Split(scenario="std", maps=4, solvable=True)}
+    )
+    maps, bare = (
+        generate(each, "all", np.arange(4))
+        for each in (recipe, replace(recipe, layers=()))
+    )
     assert (maps["reference_time_s"] > bare["reference_time_s"]).all()
 
 
 def test_layers_change_colours_and_lambda_in_their_order(tmp_path: Path) -> None:
-    """Grass hides wet soil if it is drawn later; the values of both are those of each layer alone."""
+    """Grass hides wet soil if it is drawn later; the values of both are those of each
+    layer alone.
+    """
     layers = wetness(tmp_path)(), Vegetation(period_m=4.0, classes={"wet_clay": GRASS})
     bright = replace(small_stakes().scenarios["std"], ambient=1.0)
     splits = {"train": Split(scenario="std", maps=6)}
     recipe = small_stakes(scenarios={"std": bright}, splits=splits)
     hidden, shown = (
-        generate(replace(recipe, layers=order), "train", MAPS) for order in (layers, layers[::-1])
+        generate(replace(recipe, layers=order), "train", MAPS)
+        for order in (layers, layers[::-1])
     )
     cells = hidden["vegetation_m"] > 0
     colours = [np.moveaxis(maps["rgb"], 1, -1)[cells] for maps in (hidden, shown)]
@@ -147,7 +177,10 @@ def test_layers_change_colours_and_lambda_in_their_order(tmp_path: Path) -> None
 
 def test_streams_differ_by_name_seed_split_and_rejected_draws() -> None:
     recipe = replace(small_stakes(), layers=(Plain(),))
-    sibling, split = replace(recipe, seed=5), replace(recipe, splits={"valid": recipe.splits["train"]})
+    sibling, split = (
+        replace(recipe, seed=5),
+        replace(recipe, splits={"valid": recipe.splits["train"]}),
+    )
     drawn = [
         generate(recipe, "train", MAPS)["plain"],
         generate(sibling, "train", MAPS)["plain"],
@@ -171,7 +204,10 @@ def test_vegetation_is_one_layer_however_it_is_named() -> None:
     assert recipe == keys
     assert recipe.to_dict() == keys.to_dict()
     assert "layers" not in recipe.to_dict()
-    assert read_layer(Vegetation(period_m=4.0, classes={"wet_clay": GRASS})) == recipe.layers[0]
+    assert (
+        read_layer(Vegetation(period_m=4.0, classes={"wet_clay": GRASS}))
+        == recipe.layers[0]
+    )
 
 
 class Broken(Plain):
@@ -230,9 +266,22 @@ def test_layers_that_are_none_are_rejected(layers: object, expected: str) -> Non
 
 
 @pytest.mark.parametrize(
-    "name", ["", "2d", "soil type", "λ", "slope_deg", "drive_std", "truth_mean", "goal", "seen"]
+    "name",
+    [
+        "",
+        "2d",
+        "soil type",
+        "λ",
+        "slope_deg",
+        "drive_std",
+        "truth_mean",
+        "goal",
+        "seen",
+    ],
 )
-def test_names_that_are_taken_or_no_names_are_rejected(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_that_are_taken_or_no_names_are_rejected(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Broken, "name", name)
     with pytest.raises(ConfigError, match=r"Expected `name` of layer .*Broken"):
         replace(small_stakes(), layers=(Broken(),))
@@ -240,34 +289,53 @@ def test_names_that_are_taken_or_no_names_are_rejected(name: str, monkeypatch: p
 
 def test_a_class_that_the_recipe_lacks_is_named() -> None:
     flat = np.zeros((1, 3, 3))
-    maps = DrawnMaps(flat.astype(int), flat, flat, small_stakes().grid, small_stakes().classes)
-    with pytest.raises(ConfigError, match="Expected a class of the recipe among basalt"):
+    maps = DrawnMaps(
+        flat.astype(int), flat, flat, small_stakes().grid, small_stakes().classes
+    )
+    with pytest.raises(
+        ConfigError, match="Expected a class of the recipe among basalt"
+    ):
         maps.cells_of("ice")
 
 
 def test_layers_scale_with_their_maps_and_name_what_changed() -> None:
     """Of vegetation by the key of recipes, of others by their place among `layers`."""
-    grass, taller = (read_layer(Vegetation(period_m=m, classes={"scree": GRASS})) for m in (4.0, 1.0))
+    grass, taller = (
+        read_layer(Vegetation(period_m=m, classes={"scree": GRASS})) for m in (4.0, 1.0)
+    )
     assert grass.scaled(0.5, 0.5).options["period_m"] == 2.0
     assert grass.scaled(0.25, 1.0).options["period_m"] == 2.0  # two cells at least
-    assert overrides_of((grass,), (grass.scaled(0.5, 0.5),)) == {"vegetation_period_m": 2.0}
+    assert overrides_of((grass,), (grass.scaled(0.5, 0.5),)) == {
+        "vegetation_period_m": 2.0
+    }
     other = replace(taller, part="file.py:Other")
     after = replace(other, options={**other.options, "period_m": 3.0})
-    assert overrides_of((grass, other), (grass, after)) == {"layers.0.options.period_m": 3.0}
+    assert overrides_of((grass, other), (grass, after)) == {
+        "layers.0.options.period_m": 3.0
+    }
 
 
 def test_an_import_draws_no_layer_that_changes_lambda(tmp_path: Path) -> None:
     recipe = replace(small_stakes(), layers=(Plain(),))
-    with pytest.raises(ConfigError, match="`layers` leave λ as it is, since an import draws none, got plain"):
+    with pytest.raises(
+        ConfigError,
+        match="`layers` leave λ as it is, since an import draws none, got plain",
+    ):
         next(import_dem("none.tif", tmp_path / "d.h5", recipe))
 
 
-def test_what_does_not_lie_in_the_range_of_a_users_layer_is_a_fault(tmp_path: Path) -> None:
+def test_what_does_not_lie_in_the_range_of_a_users_layer_is_a_fault(
+    tmp_path: Path,
+) -> None:
     path = tiny_dataset(tmp_path / "d.h5", wet(tmp_path))
     with h5py.File(path, "r+") as file:
         file["train/wetness"][2, 0, 0] = 1.5
         file["train/truth_mean"][3, 0, 0, 0] = np.nan
-    found = {(fault.map, fault.field) for fault in find_faults(path) if fault.problem == "is out of range"}
+    found = {
+        (fault.map, fault.field)
+        for fault in find_faults(path)
+        if fault.problem == "is out of range"
+    }
     assert found == {(2, "wetness"), (3, "truth_mean")}
 
 
@@ -275,7 +343,9 @@ def test_modes_without_weight_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(Broken, "affect", lambda _, mean, std, *__: (mean, 0.5 * std))
     recipe = replace(small_stakes(), layers=(Broken(),))
     maps = generate(recipe, "train", MAPS)
-    weights, _, stds = latent.truth(maps["class_id"], maps["slope_deg"].astype(np.float64), recipe.classes)
+    weights, _, stds = latent.truth(
+        maps["class_id"], maps["slope_deg"].astype(np.float64), recipe.classes
+    )
     assert (weights == 0).any()
     expected = np.where(weights > 0, 0.5 * stds, stds).astype(np.float32)
     np.testing.assert_array_equal(maps["truth_std"], expected)

@@ -1,4 +1,6 @@
-"""A user's layer from a file, through the commands: made, drawn, shown, read without its code, driven on."""
+"""A user's layer from a file, through the commands: made, drawn, shown, read without
+its code, driven on.
+"""
 
 import json
 from pathlib import Path
@@ -8,7 +10,13 @@ import pytest
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
-from benchnav.datagen import TerrainDataset, create_dataset, generate, load_recipe, recipe_from_dict
+from benchnav.datagen import (
+    TerrainDataset,
+    create_dataset,
+    generate,
+    load_recipe,
+    recipe_from_dict,
+)
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.layers.layer import Layer
 from tests.commands import call
@@ -18,7 +26,9 @@ from tests.datagen.small import small_stakes
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the layer and the recipe of the page, and its dataset as the command makes it."""
+    """A folder with the layer and the recipe of the page, and its dataset as the
+    command makes it.
+    """
     folder = tmp_path_factory.mktemp("own")
     write_page(folder)
     with pytest.MonkeyPatch.context() as patch:
@@ -60,12 +70,28 @@ def test_the_commands_show_it(
     assert call("datagen", "show", "one.h5", "--json") == 0
     assert json.loads(capsys.readouterr().out)["drawn_layers"][0]["name"] == "wetness"
     assert call("datagen", "validate", "one.h5") == 0
-    assert call("datagen", "preview", "one.h5", "--split", "train", "--maps", "[0]", "--out", "p.png") == 0
+    assert (
+        call(
+            "datagen",
+            "preview",
+            "one.h5",
+            "--split",
+            "train",
+            "--maps",
+            "[0]",
+            "--out",
+            "p.png",
+        )
+        == 0
+    )
     assert (folder / "p.png").stat().st_size > 10_000
 
 
 def test_a_dataset_is_read_and_driven_on_without_the_code(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)  # where there is no wet.py
     dataset = TerrainDataset(folder / "one.h5")
@@ -86,11 +112,16 @@ def test_a_dataset_is_read_and_driven_on_without_the_code(
         "--maps",
         2,
     )
-    assert call("eval", "run", "--data", dataset.path, *words, "--out", "run", "--jobs", 2) == 0
+    assert (
+        call("eval", "run", "--data", dataset.path, *words, "--out", "run", "--jobs", 2)
+        == 0
+    )
     capsys.readouterr()
     with pytest.raises(ConfigError) as caught:
         generate(dataset.recipe, "train", np.arange(1))
-    assert str(caught.value).startswith("The code of layer 'wetness' is needed to generate maps")
+    assert str(caught.value).startswith(
+        "The code of layer 'wetness' is needed to generate maps"
+    )
     assert "\n" not in str(caught.value)
 
 
@@ -98,9 +129,14 @@ def test_other_code_than_was_recorded_is_rejected(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "wet.py").write_text(PAGE["wet.py"].replace("0.3 * hollows", "0.4 * hollows"))
+    (tmp_path / "wet.py").write_text(
+        PAGE["wet.py"].replace("0.3 * hollows", "0.4 * hollows")
+    )
     recipe = TerrainDataset(folder / "one.h5").recipe
-    with pytest.raises(ConfigError, match="Expected the code of layer 'wetness' that the dataset records"):
+    with pytest.raises(
+        ConfigError,
+        match="Expected the code of layer 'wetness' that the dataset records",
+    ):
         generate(recipe, "train", np.arange(1))
     # With the code as it was, the maps are made again, bit for bit.
     (tmp_path / "wet.py").write_text(PAGE["wet.py"])
@@ -113,14 +149,26 @@ def test_other_code_than_was_recorded_is_rejected(
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (("return mean *", "return 3 + mean *"), "means of `affect` of layer 'wetness' in [0, 1]"),
+        (
+            ("return mean *", "return 3 + mean *"),
+            "means of `affect` of layer 'wetness' in [0, 1]",
+        ),
         (
             ("return rgb *", "return np.nan * rgb *"),
             "colours of `look` of layer 'wetness' in [0, 255], got nan",
         ),
-        (("return np.clip", "return noise[0]; np.clip"), "values of `draw` of layer 'wetness' of shape"),
-        (("np.clip(0.5", "np.slip(0.5"), "`draw` of layer 'wetness' failed: AttributeError"),
-        (("class Wetness(Layer)", "class Wetness"), "to be a subclass of benchnav.datagen.Layer"),
+        (
+            ("return np.clip", "return noise[0]; np.clip"),
+            "values of `draw` of layer 'wetness' of shape",
+        ),
+        (
+            ("np.clip(0.5", "np.slip(0.5"),
+            "`draw` of layer 'wetness' failed: AttributeError",
+        ),
+        (
+            ("class Wetness(Layer)", "class Wetness"),
+            "to be a subclass of benchnav.datagen.Layer",
+        ),
     ],
 )
 def test_a_bad_layer_ends_the_command_in_one_line(
@@ -136,7 +184,9 @@ def test_a_bad_layer_ends_the_command_in_one_line(
     (tmp_path / "wet.py").write_text(PAGE["wet.py"].replace(*change))
     assert call("datagen", "create", "wet.yaml", "--out", "d.h5") == 2
     error = capsys.readouterr().err
-    assert [line for line in error.splitlines() if "error:" in line] == error.splitlines()[-1:]
+    assert [
+        line for line in error.splitlines() if "error:" in line
+    ] == error.splitlines()[-1:]
     assert expected in error
     assert not (tmp_path / "d.h5").exists()
 

@@ -18,7 +18,9 @@ STAKES = load_recipe("stakes-v1")
 def packs(draw: st.DrawFn) -> tuple[tuple[AlikeClasses, ...], int]:
     sizes = draw(st.lists(st.integers(1, 3), min_size=1, max_size=9))
     ends = np.cumsum(sizes).tolist()
-    units = tuple(tuple(range(end - size, end)) for size, end in zip(sizes, ends, strict=True))
+    units = tuple(
+        tuple(range(end - size, end)) for size, end in zip(sizes, ends, strict=True)
+    )
     return units, draw(st.integers(1, ends[-1]))
 
 
@@ -26,12 +28,16 @@ def can_be_filled(sizes: list[int], room: int) -> bool:
     """By trying every choice."""
     if room == 0 or not sizes:
         return room == 0
-    return can_be_filled(sizes[1:], room) or (sizes[0] <= room and can_be_filled(sizes[1:], room - sizes[0]))
+    return can_be_filled(sizes[1:], room) or (
+        sizes[0] <= room and can_be_filled(sizes[1:], room - sizes[0])
+    )
 
 
 @given(packs())
 @settings(max_examples=200, deadline=None)
-def test_deals_are_full_distinct_whole_and_fair(pack: tuple[tuple[AlikeClasses, ...], int]) -> None:
+def test_deals_are_full_distinct_whole_and_fair(
+    pack: tuple[tuple[AlikeClasses, ...], int],
+) -> None:
     units, shown = pack
     lost = never_shown(units, shown)
     for unit in units:
@@ -50,7 +56,9 @@ def test_deals_are_full_distinct_whole_and_fair(pack: tuple[tuple[AlikeClasses, 
         assert sum(map(len, whole)) == shown
         times.update(whole)
     # The one that is shown least comes next, so that none starves.
-    assert min(times[unit] for unit in units) >= rounds * shown / sum(map(len, units)) / 3
+    assert (
+        min(times[unit] for unit in units) >= rounds * shown / sum(map(len, units)) / 3
+    )
 
 
 def test_more_environments_leave_the_first_as_they_are() -> None:
@@ -65,7 +73,9 @@ def test_single_classes_are_dealt_equally_and_few_environments_are_alike() -> No
     assert len({tuple(sorted(dealt)) for dealt in table.tolist()}) >= 8
 
 
-def test_the_environments_of_stakes_show_every_class_alike_and_look_alikes_together() -> None:
+def test_the_environments_of_stakes_show_every_class_alike_and_look_alikes_together() -> (
+    None
+):
     names = [item.name for item in STAKES.classes]
     table = STAKES.environment_classes
     assert np.bincount(table.ravel()).tolist() == [4] * 12
@@ -83,17 +93,27 @@ def test_recipes_of_synthesis_1_deal_as_they_did() -> None:
 
 
 def test_each_of_two_look_alikes_takes_each_band_of_the_noise_equally_often() -> None:
-    recipe = small_stakes(height=16, width=16, places=None, start_m=(1, 1), goal_m=(7, 7))
+    recipe = small_stakes(
+        height=16, width=16, places=None, start_m=(1, 1), goal_m=(7, 7)
+    )
     names = [item.name for item in recipe.classes]
     pair = [names.index("packed_soil"), names.index("crusted_soil")]
     shows = [e for e in range(12) if pair[0] in recipe.environment_classes[e]]
     indices = np.sort(np.concatenate([e + 12 * np.arange(500) for e in shows]))
     maps = class_map(recipe, "train", indices)
     # The bands of 30 % differ from those of 20 % by how much of a map they cover.
-    wide = np.stack([(maps == member).mean(axis=(1, 2)) > 0.25 for member in pair], axis=1)
-    for share, expected in ((wide.mean(axis=0), 0.5), ((wide[:, 0] & wide[:, 1]).mean(), 1 / 6)):
-        np.testing.assert_allclose(share, expected, atol=4 * 0.5 / np.sqrt(len(indices)))
-    # Which one borders on more of the others tells nothing: both lie alike in the noise's order.
+    wide = np.stack(
+        [(maps == member).mean(axis=(1, 2)) > 0.25 for member in pair], axis=1
+    )
+    for share, expected in (
+        (wide.mean(axis=0), 0.5),
+        ((wide[:, 0] & wide[:, 1]).mean(), 1 / 6),
+    ):
+        np.testing.assert_allclose(
+            share, expected, atol=4 * 0.5 / np.sqrt(len(indices))
+        )
+    # Which one borders on more of the others tells nothing: both lie alike in the
+    # noise's order.
     inner = np.stack([(maps[:, 8, 8] == member).mean() for member in pair])
     assert abs(inner[0] - inner[1]) < 4 * np.sqrt(0.5 / len(indices))
 
@@ -103,22 +123,30 @@ def test_tables_that_cannot_be_dealt_are_refused_by_name() -> None:
         ("sand", 1, 0.0), ("dust", 1, 0.5), ("clay", 2, 0.0), ("silt", 2, 0.5),
     ))  # fmt: skip
     assert small_stakes(classes=classes, occupancy=(0.5, 0.5)).units == ((0, 1), (2, 3))
-    with pytest.raises(ConfigError, match=r"3 at a time.*goes with sand, dust") as caught:
+    with pytest.raises(
+        ConfigError, match=r"3 at a time.*goes with sand, dust"
+    ) as caught:
         small_stakes(classes=classes, occupancy=(0.4, 0.3, 0.3))
     assert "\n" not in str(caught.value)
 
 
 def test_look_alikes_that_hardly_differ_are_refused_by_name() -> None:
     def table(offset: float, **changes: object) -> tuple:
-        return terrain_class("sand", 1, offset=0.2), terrain_class("dust", 1, offset=offset, **changes)
+        return terrain_class("sand", 1, offset=0.2), terrain_class(
+            "dust", 1, offset=offset, **changes
+        )
 
     # Both far from 0 and 1, E[λ] is 1 less the offset.
     assert small_stakes(classes=table(0.51), occupancy=(0.5, 0.5))
-    with pytest.raises(ConfigError, match=r"0\.3 in E\[λ\] on flat ground, got 0\.79\d for 'sand' and 0\.51"):
+    with pytest.raises(
+        ConfigError,
+        match=r"0\.3 in E\[λ\] on flat ground, got 0\.79\d for 'sand' and 0\.51",
+    ):
         small_stakes(classes=table(0.49), occupancy=(0.5, 0.5))
     # Soft spots count.
     from benchnav.datagen.recipe.classes import SoftSpots
 
     assert small_stakes(
-        classes=table(0.4, soft=SoftSpots(weight=0.3, mean=0.0, std=0.01)), occupancy=(0.5, 0.5)
+        classes=table(0.4, soft=SoftSpots(weight=0.3, mean=0.0, std=0.01)),
+        occupancy=(0.5, 0.5),
     )

@@ -11,14 +11,25 @@ from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.layers.layer import DrawnMaps
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.classes import ClassTable, SoftSpots, TerrainClass, look_alike_classes
+from benchnav.datagen.recipe.classes import (
+    ClassTable,
+    SoftSpots,
+    TerrainClass,
+    look_alike_classes,
+)
 from benchnav.datagen.schema import UNLABELLED
 from tests.datagen.small import SOFT, terrain_class
 
 TABLE = (
     terrain_class("firm", 10),
     terrain_class("wet", 20, soft=SoftSpots(weight=0.25, mean=0.1, std=0.05)),
-    terrain_class("dune", 30, offset=0.2, noise=0.2, soft=SoftSpots(weight=0.4, mean=0.3, std=0.02)),
+    terrain_class(
+        "dune",
+        30,
+        offset=0.2,
+        noise=0.2,
+        soft=SoftSpots(weight=0.4, mean=0.3, std=0.02),
+    ),
 )
 DRAWS = 200_000
 
@@ -32,18 +43,26 @@ def as_mixture(parameters: latent.Parameters) -> TraversabilityMixture:
     return TraversabilityMixture(*(torch.from_numpy(values) for values in parameters))
 
 
-def drawn(item: TerrainClass, slope_deg: float, generator: np.random.Generator) -> np.ndarray:
+def drawn(
+    item: TerrainClass, slope_deg: float, generator: np.random.Generator
+) -> np.ndarray:
     """λ of a class as its definition says, drawn one by one."""
     mean = 1 - (item.scale * 1e-3 * slope_deg**item.exponent + item.offset)
     value = mean + item.noise * generator.standard_normal(DRAWS)
     if item.soft:
         is_soft = generator.random(DRAWS) < item.soft.weight
-        value = np.where(is_soft, item.soft.mean + item.soft.std * generator.standard_normal(DRAWS), value)
+        value = np.where(
+            is_soft,
+            item.soft.mean + item.soft.std * generator.standard_normal(DRAWS),
+            value,
+        )
     return value.clip(0, 1)
 
 
 @pytest.mark.parametrize("slope_deg", [0.0, 8.0, 25.0])
-def test_truth_is_the_distribution_that_classes_are_drawn_from(slope_deg: float) -> None:
+def test_truth_is_the_distribution_that_classes_are_drawn_from(
+    slope_deg: float,
+) -> None:
     class_id, slope = cells(0, 1, 2, slope_deg=slope_deg)
     parameters = latent.truth(class_id, slope, TABLE)
     assert all(values.shape == (1, 2, 1, 3) for values in parameters)
@@ -71,7 +90,9 @@ def test_a_table_without_soft_spots_has_one_component() -> None:
     assert all(values.shape == (1, 1, 1, 2) for values in parameters)
     mean, std = (values[:, 0] for values in parameters[1:])
     # The same bits as by the function of version 0.1.
-    np.testing.assert_array_equal(latent.expected_of(parameters), latent.expected_traversability(mean, std))
+    np.testing.assert_array_equal(
+        latent.expected_of(parameters), latent.expected_traversability(mean, std)
+    )
 
 
 @pytest.mark.parametrize(
@@ -81,20 +102,36 @@ def test_a_table_without_soft_spots_has_one_component() -> None:
         {"weight": float("nan")},
     ],
 )  # fmt: skip
-def test_soft_spots_that_are_no_distribution_are_refused(numbers: dict[str, float]) -> None:
+def test_soft_spots_that_are_no_distribution_are_refused(
+    numbers: dict[str, float],
+) -> None:
     with pytest.raises(ConfigError, match="soft spots"):
         SoftSpots(**{"weight": 0.1, "mean": 0.05, "std": 0.05} | numbers)
 
 
-def look_alikes(class_id: np.ndarray, slope_deg: np.ndarray, table: ClassTable) -> latent.Parameters:
+def look_alikes(
+    class_id: np.ndarray, slope_deg: np.ndarray, table: ClassTable
+) -> latent.Parameters:
     """What colours tell of maps without layers."""
     flat = np.zeros(class_id.shape)
-    return latent.look_alikes(DrawnMaps(class_id, flat, slope_deg, Grid(3, 3, 0.5), table))
+    return latent.look_alikes(
+        DrawnMaps(class_id, flat, slope_deg, Grid(3, 3, 0.5), table)
+    )
 
 
 def test_look_alikes_are_classes_of_one_colour() -> None:
-    table = tuple(terrain_class(name, red) for name, red in zip("abcdef", (1, 2, 1, 3, 1, 2), strict=True))
-    assert look_alike_classes(table) == [(0, 2, 4), (1, 5), (0, 2, 4), (3,), (0, 2, 4), (1, 5)]
+    table = tuple(
+        terrain_class(name, red)
+        for name, red in zip("abcdef", (1, 2, 1, 3, 1, 2), strict=True)
+    )
+    assert look_alike_classes(table) == [
+        (0, 2, 4),
+        (1, 5),
+        (0, 2, 4),
+        (3,),
+        (0, 2, 4),
+        (1, 5),
+    ]
 
 
 def test_what_looks_alike_is_the_average_over_its_classes() -> None:
@@ -107,7 +144,9 @@ def test_what_looks_alike_is_the_average_over_its_classes() -> None:
     found = look_alikes(class_id, slope, table)
     # One component a class, and a second of its soft spots.
     assert all(values.shape == (1, 9, 1, 6) for values in found)
-    np.testing.assert_allclose(found[0][0, :, 0, 2], [1 / 3, 0, 0, 0.3, 0.1 / 3, 0, 0, 1 / 3, 0])
+    np.testing.assert_allclose(
+        found[0][0, :, 0, 2], [1 / 3, 0, 0, 0.3, 0.1 / 3, 0, 0, 1 / 3, 0]
+    )
     np.testing.assert_allclose(found[0].sum(1), 1)
     own = as_mixture(latent.truth(class_id, slope, table))
     alike = as_mixture(found)
@@ -115,7 +154,9 @@ def test_what_looks_alike_is_the_average_over_its_classes() -> None:
         single = own.cdf(value)[0, 0].numpy()
         for number, group in enumerate(look_alike_classes(table)):
             expected = np.mean([single[member] for member in group])
-            assert float(alike.cdf(value)[0, 0, number]) == pytest.approx(expected, abs=1e-12)
+            assert float(alike.cdf(value)[0, 0, number]) == pytest.approx(
+                expected, abs=1e-12
+            )
     # What is seen is the same whichever of the look-alikes it is.
     mean = alike.mean()[0, 0]
     assert mean[0] == pytest.approx(float(mean[2]), abs=1e-9)
@@ -123,12 +164,19 @@ def test_what_looks_alike_is_the_average_over_its_classes() -> None:
 
 
 def test_of_a_cell_without_a_class_nothing_is_known() -> None:
-    table = (terrain_class("a", 1), terrain_class("b", 2, soft=SOFT), terrain_class("c", 1, offset=0.4))
+    table = (
+        terrain_class("a", 1),
+        terrain_class("b", 2, soft=SOFT),
+        terrain_class("c", 1, offset=0.4),
+    )
     known, slope = cells(0, 1, 2, slope_deg=6.0)
     holed = known.copy()
     holed[..., 1] = UNLABELLED
     for measure in (latent.truth, look_alikes):
-        found, wanted = (as_mixture(measure(ids, slope, table)).mean()[0, 0] for ids in (holed, known))
+        found, wanted = (
+            as_mixture(measure(ids, slope, table)).mean()[0, 0]
+            for ids in (holed, known)
+        )
         assert found.isnan().tolist() == [False, True, False]
         assert torch.equal(found[[0, 2]], wanted[[0, 2]])
     drawn = latent.quantile_of(latent.truth(holed, slope, table), np.zeros(holed.shape))
@@ -136,7 +184,10 @@ def test_of_a_cell_without_a_class_nothing_is_known() -> None:
 
 
 def test_colours_that_all_differ_tell_the_truth() -> None:
-    seen, own = (as_mixture(measure(*cells(0, 1), TABLE)) for measure in (look_alikes, latent.truth))
+    seen, own = (
+        as_mixture(measure(*cells(0, 1), TABLE))
+        for measure in (look_alikes, latent.truth)
+    )
     for value in (0.0, 0.3, 0.9):
         assert torch.equal(seen.cdf(value), own.cdf(value))
 
@@ -160,10 +211,16 @@ def test_quantiles_are_those_of_the_mixture(
     weights = np.stack([1 - weight, weight])
     parameters = tuple(values[None, :, None] for values in (weights, means, stds))
     found = latent.quantile_of(parameters, normal[None, None])
-    expected = as_mixture(parameters).from_normal(torch.from_numpy(normal[None, None])).numpy()
-    # Between two narrow modes that are far apart the CDF is flat: many values have one rank to rounding.
+    expected = (
+        as_mixture(parameters).from_normal(torch.from_numpy(normal[None, None])).numpy()
+    )
+    # Between two narrow modes that are far apart the CDF is flat: many values have one
+    # rank to rounding.
     same_value = np.isclose(found, expected, rtol=0, atol=2.0**-24)
-    ranks = [(weights * stats.norm.cdf(values, means, stds)).sum(axis=0) for values in (found, expected)]
+    ranks = [
+        (weights * stats.norm.cdf(values, means, stds)).sum(axis=0)
+        for values in (found, expected)
+    ]
     same_rank = np.isclose(*ranks, rtol=0, atol=1e-14)
     assert (same_value | same_rank).all(), (found, expected)
 
@@ -174,13 +231,17 @@ def test_quantiles_of_one_component_are_in_closed_form() -> None:
     firm = latent.quantile_of(latent.truth(class_id, slope, TABLE[:1]), normal)
     np.testing.assert_array_equal(firm, (0.95 + 0.1 * normal).clip(0, 1))
     # A class without soft spots in a table that has some takes the same.
-    np.testing.assert_array_equal(firm, latent.quantile_of(latent.truth(class_id, slope, TABLE), normal))
+    np.testing.assert_array_equal(
+        firm, latent.quantile_of(latent.truth(class_id, slope, TABLE), normal)
+    )
 
 
 def test_quantiles_of_standard_normals_have_the_distribution() -> None:
     generator = np.random.default_rng(0)
     class_id, slope = cells(*([2] * 20_000))
     parameters = latent.truth(class_id, slope, TABLE)
-    draws = latent.quantile_of(parameters, generator.standard_normal(class_id.shape)).ravel()
+    draws = latent.quantile_of(
+        parameters, generator.standard_normal(class_id.shape)
+    ).ravel()
     reference = drawn(TABLE[2], 8.0, generator)
     assert stats.ks_2samp(draws, reference).pvalue > 1e-3

@@ -38,10 +38,15 @@ def vegetation_of(recipe: Recipe) -> Vegetation:
 
 
 def told(
-    recipe: Recipe, class_id: np.ndarray, slope_deg: np.ndarray, height_m: np.ndarray | None = None
+    recipe: Recipe,
+    class_id: np.ndarray,
+    slope_deg: np.ndarray,
+    height_m: np.ndarray | None = None,
 ) -> latent.Parameters:
     """What colours tell of maps, with vegetation where heights are given."""
-    maps = DrawnMaps(class_id, np.zeros(class_id.shape), slope_deg, recipe.grid, recipe.classes)
+    maps = DrawnMaps(
+        class_id, np.zeros(class_id.shape), slope_deg, recipe.grid, recipe.classes
+    )
     if height_m is None:
         return latent.look_alikes(maps)
     return latent.look_alikes(maps, [vegetation_of(recipe)], {"vegetation_m": height_m})
@@ -50,7 +55,9 @@ def told(
 def maps_in(scenario: Scenario, recipe: Recipe | None = None) -> dict[str, np.ndarray]:
     """Maps of one split, so that only the scenario differs."""
     recipe = replace(
-        recipe or tiny_recipe(), scenarios={"mine": scenario}, splits={"all": Split(scenario="mine", maps=6)}
+        recipe or tiny_recipe(),
+        scenarios={"mine": scenario},
+        splits={"all": Split(scenario="mine", maps=6)},
     )
     return generate(recipe, "all", np.arange(6))
 
@@ -61,7 +68,9 @@ def maps_in(scenario: Scenario, recipe: Recipe | None = None) -> dict[str, np.nd
 def test_a_tint_changes_the_colours_of_its_classes_and_nothing_else() -> None:
     recipe = tiny_recipe()
     tints = (Tint(classes=("gravel", "scree"), colour=(30, 20, 10), share=0.25), SNOW)
-    plain, tinted = (maps_in(Scenario(tints=own, ambient=1.0)) for own in ((), tints))  # all in full light
+    plain, tinted = (
+        maps_in(Scenario(tints=own, ambient=1.0)) for own in ((), tints)
+    )  # all in full light
     for name in set(plain) - {"rgb"}:
         np.testing.assert_array_equal(plain[name], tinted[name])
     own = np.array([item.colour for item in recipe.classes], dtype=float)
@@ -76,7 +85,9 @@ def test_a_tint_is_shaded_as_ground_is() -> None:
     tints = (Tint(classes=("gravel",), colour=(0, 0, 0), share=0.5),)
     plain, tinted = (maps_in(Scenario(tints=own)) for own in ((), tints))
     gravel = plain["class_id"] == 4
-    before, after = (np.moveaxis(maps["rgb"], 1, -1).astype(float) for maps in (plain, tinted))
+    before, after = (
+        np.moveaxis(maps["rgb"], 1, -1).astype(float) for maps in (plain, tinted)
+    )
     np.testing.assert_array_equal(before[~gravel], after[~gravel])
     assert np.abs(after[gravel] - before[gravel] / 2).max() <= 0.75
     assert gravel.any()
@@ -85,13 +96,16 @@ def test_a_tint_is_shaded_as_ground_is() -> None:
 @pytest.mark.parametrize("synthesis", [1, 2])
 @pytest.mark.parametrize("preset", ["snow", "wet"])
 def test_severity_moves_the_share_of_a_preset(preset: str, synthesis: int) -> None:
-    data = yaml.safe_load(PRESETS.read_text())["scenarios-2" if synthesis == 2 else "scenarios"][preset]
+    data = yaml.safe_load(PRESETS.read_text())[
+        "scenarios-2" if synthesis == 2 else "scenarios"
+    ][preset]
     (tint,) = data["tints"]
-    entries = {f"s{s}": {"preset": preset, "severity": s} for s in (0, 0.25, 0.5, 1, 1.25)} | {
-        "std": {"preset": "std"}
-    }
+    entries = {
+        f"s{s}": {"preset": preset, "severity": s} for s in (0, 0.25, 0.5, 1, 1.25)
+    } | {"std": {"preset": "std"}}
     recipe = recipe_from_dict(
-        small_stakes().to_dict() | {"scenarios": entries, "splits": {"train": {"scenario": "std", "maps": 1}}}
+        small_stakes().to_dict()
+        | {"scenarios": entries, "splits": {"train": {"scenario": "std", "maps": 1}}}
         if synthesis == 2
         else tiny_recipe().to_dict()
         | {"scenarios": entries, "splits": {"train": {"scenario": "std", "maps": 1}}},
@@ -112,21 +126,30 @@ def test_what_a_scenario_says_of_tints_stands_in_place_of_its_presets() -> None:
     data["splits"] = {"train": {"scenario": "std", "maps": 1}}
     assert recipe_from_dict(data, "test").scenarios["std"] == Scenario()
     data["scenarios"] = {
-        "std": {"preset": "hs", "tints": [{"classes": ["gravel"], "colour": [9, 9, 9], "share": 0.3}]}
+        "std": {
+            "preset": "hs",
+            "tints": [{"classes": ["gravel"], "colour": [9, 9, 9], "share": 0.3}],
+        }
     }
     recipe = recipe_from_dict(data, "test")
-    assert recipe.scenarios["std"].tints == (Tint(classes=("gravel",), colour=(9, 9, 9), share=0.3),)
+    assert recipe.scenarios["std"].tints == (
+        Tint(classes=("gravel",), colour=(9, 9, 9), share=0.3),
+    )
     assert recipe.scenarios["std"].light_height == pytest.approx((0.3, 0.8))
     assert recipe_from_dict(recipe.to_dict(), "manifest") == recipe
 
 
 def test_a_manifest_names_tints_only_where_there_are_some() -> None:
     recipe = tiny_recipe()
-    assert all("tints" not in scenario for scenario in recipe.to_dict()["scenarios"].values())
-    snowy = replace(recipe, scenarios=recipe.scenarios | {"hs": Scenario(tints=(SNOW,))}).to_dict()[
-        "scenarios"
+    assert all(
+        "tints" not in scenario for scenario in recipe.to_dict()["scenarios"].values()
+    )
+    snowy = replace(
+        recipe, scenarios=recipe.scenarios | {"hs": Scenario(tints=(SNOW,))}
+    ).to_dict()["scenarios"]
+    assert snowy["hs"]["tints"] == [
+        {"classes": [], "colour": [240, 244, 248], "share": 0.6}
     ]
-    assert snowy["hs"]["tints"] == [{"classes": [], "colour": [240, 244, 248], "share": 0.6}]
     assert "tints" not in snowy["std"]
 
 
@@ -147,11 +170,16 @@ def test_a_recipe_without_scenarios_has_the_three_of_before() -> None:
             {"share": 0.995},
             "as they are in the class table, got 'basalt' and 'wet_clay' in one colour. Lower",
         ),
-        ({"classes": ["packed_soil"]}, "got 'packed_soil' and 'crusted_soil' in two colours. Tint both."),
+        (
+            {"classes": ["packed_soil"]},
+            "got 'packed_soil' and 'crusted_soil' in two colours. Tint both.",
+        ),
         ({"depth": 1}, "'depth'"),
     ],
 )
-def test_bad_tints_are_refused_in_one_line(tint: dict[str, object], expected: str) -> None:
+def test_bad_tints_are_refused_in_one_line(
+    tint: dict[str, object], expected: str
+) -> None:
     own = {"colour": [240, 244, 248], "share": 0.5} | tint
     data = small_stakes().to_dict() | {"scenarios": {"std": {"tints": [own]}}}
     data["splits"] = {"train": {"scenario": "std", "maps": 1}}
@@ -164,11 +192,18 @@ def test_bad_tints_are_refused_in_one_line(tint: dict[str, object], expected: st
 def test_a_tint_may_not_give_ground_the_colour_of_vegetation() -> None:
     recipe = overgrown(wet_clay=grass(0.4))
     colour = np.array(recipe.classes[4].colour)
-    towards = tuple((colour + 2 * (np.array([60, 110, 30]) - colour)).clip(0, 255).tolist())
+    towards = tuple(
+        (colour + 2 * (np.array([60, 110, 30]) - colour)).clip(0, 255).tolist()
+    )
     assert towards == (0, 94, 0)  # half way there gravel is (76, 110, 50)
     halved = Tint(classes=("gravel",), colour=(0, 94, 0), share=0.5)
-    muddy = replace(recipe, scenarios=recipe.scenarios | {"mud": Scenario(tints=(halved,))})
-    with pytest.raises(ConfigError, match="on 'wet_clay' of a `colour` that no ground has in scenario 'mud'"):
+    muddy = replace(
+        recipe, scenarios=recipe.scenarios | {"mud": Scenario(tints=(halved,))}
+    )
+    with pytest.raises(
+        ConfigError,
+        match="on 'wet_clay' of a `colour` that no ground has in scenario 'mud'",
+    ):
         grown(muddy, wet_clay=replace(grass(0.4), colour=(76, 110, 50)))
 
 
@@ -176,9 +211,13 @@ def test_vegetation_keeps_its_colour_under_a_tint() -> None:
     recipe = overgrown(wet_clay=grass(0.4))
     maps = maps_in(Scenario(tints=(SNOW,), ambient=1.0), recipe)
     cells = maps["vegetation_m"] > 0
-    assert np.unique(np.moveaxis(maps["rgb"], 1, -1)[cells], axis=0).tolist() == [[60, 110, 30]]
+    assert np.unique(np.moveaxis(maps["rgb"], 1, -1)[cells], axis=0).tolist() == [
+        [60, 110, 30]
+    ]
     shown = shown_colours(recipe.classes, Scenario(tints=(SNOW,)))
-    np.testing.assert_allclose(shown[0], 0.4 * np.array([72, 62, 58]) + 0.6 * np.array([240, 244, 248]))
+    np.testing.assert_allclose(
+        shown[0], 0.4 * np.array([72, 62, 58]) + 0.6 * np.array([240, 244, 248])
+    )
 
 
 def test_blending_leaves_the_base_as_it_is() -> None:
@@ -189,13 +228,22 @@ def test_blending_leaves_the_base_as_it_is() -> None:
 
 
 def frequencies(recipe: Recipe, maps: int, number: int, overgrown: bool) -> np.ndarray:
-    """How often each class lies in cells that look like one class's, bare or overgrown, on maps; shape [C]."""
-    made = generate(replace(recipe, splits={"all": Split(scenario="std", maps=maps)}), "all", np.arange(maps))
+    """How often each class lies in cells that look like one class's, bare or overgrown,
+    on maps; shape [C].
+    """
+    made = generate(
+        replace(recipe, splits={"all": Split(scenario="std", maps=maps)}),
+        "all",
+        np.arange(maps),
+    )
 
     growths = vegetation_of(recipe).classes
     looks: list[object] = [item.colour for item in recipe.classes]
     if overgrown:
-        looks = [growths[item.name].colour if item.name in growths else None for item in recipe.classes]
+        looks = [
+            growths[item.name].colour if item.name in growths else None
+            for item in recipe.classes
+        ]
     alike = np.array([look == looks[number] for look in looks])
     cells = alike[made["class_id"]] & ((made["vegetation_m"] > 0) == overgrown)
     counts = np.bincount(made["class_id"][cells], minlength=len(recipe.classes))
@@ -204,30 +252,52 @@ def frequencies(recipe: Recipe, maps: int, number: int, overgrown: bool) -> np.n
 
 def test_classes_below_one_vegetation_weigh_as_they_are_covered() -> None:
     """By Bayes, and as often as they lie there on maps that are drawn."""
-    recipe = overgrown(packed_soil=grass(0.25), crusted_soil=grass(0.25, 0.5), wet_clay=grass(0.75, 1.0))
+    recipe = overgrown(
+        packed_soil=grass(0.25),
+        crusted_soil=grass(0.25, 0.5),
+        wet_clay=grass(0.75, 1.0),
+    )
     table, (packed, crusted, wet) = recipe.classes, (2, 10, 1)
     class_id = np.array([[[packed, crusted, wet, 0]], [[packed, crusted, packed, 0]]])
-    slope, height_m = np.full(class_id.shape, 5.0), np.array([[[0.1, 0.5, 1.0, 0.0]]] * 2)
+    slope, height_m = (
+        np.full(class_id.shape, 5.0),
+        np.array([[[0.1, 0.5, 1.0, 0.0]]] * 2),
+    )
     weights, means, _ = told(recipe, class_id, slope, height_m)
     np.testing.assert_allclose(weights.sum(axis=1), 1)
 
     def share(of: int, where: tuple[int, int]) -> float:
-        own = latent.truth(np.full_like(class_id, of), slope, table)[1][where[0], 0, 0, where[1]]
+        own = latent.truth(np.full_like(class_id, of), slope, table)[1][
+            where[0], 0, 0, where[1]
+        ]
         return float(
-            weights[where[0], np.isclose(means[where[0], :, 0, where[1]], own), 0, where[1]].sum()
+            weights[
+                where[0], np.isclose(means[where[0], :, 0, where[1]], own), 0, where[1]
+            ].sum()
             / 0.9 ** (of == wet)
         )
 
     for cell in range(3):  # of the first map, which shows all three: 1 : 1 : 3
-        assert [share(of, (0, cell)) for of in (packed, crusted, wet)] == pytest.approx([0.2, 0.2, 0.6])
+        assert [share(of, (0, cell)) for of in (packed, crusted, wet)] == pytest.approx(
+            [0.2, 0.2, 0.6]
+        )
     for cell in range(3):  # the second has no wet clay, so it is not below
-        assert [share(of, (1, cell)) for of in (packed, crusted)] == pytest.approx([0.5, 0.5])
+        assert [share(of, (1, cell)) for of in (packed, crusted)] == pytest.approx(
+            [0.5, 0.5]
+        )
     # The same on maps that show all three.
     recipe = replace(
-        recipe, occupancy=(0.4, 0.3, 0.3), environments=1, classes=tuple(table[k] for k in (1, 2, 10))
+        recipe,
+        occupancy=(0.4, 0.3, 0.3),
+        environments=1,
+        classes=tuple(table[k] for k in (1, 2, 10)),
     )
-    assert frequencies(recipe, 300, 0, overgrown=True) == pytest.approx([0.6, 0.2, 0.2], abs=0.03)
-    assert frequencies(recipe, 300, 1, overgrown=False) == pytest.approx([0.0, 0.5, 0.5], abs=0.03)
+    assert frequencies(recipe, 300, 0, overgrown=True) == pytest.approx(
+        [0.6, 0.2, 0.2], abs=0.03
+    )
+    assert frequencies(recipe, 300, 1, overgrown=False) == pytest.approx(
+        [0.0, 0.5, 0.5], abs=0.03
+    )
 
 
 def test_bare_cells_tell_what_they_told_without_vegetation() -> None:
@@ -236,19 +306,29 @@ def test_bare_cells_tell_what_they_told_without_vegetation() -> None:
     slope = maps["slope_deg"].astype(np.float64)
     none = told(recipe, maps["class_id"], slope)
     bare = maps["vegetation_m"] == 0
-    with_layer = told(recipe, maps["class_id"], slope, maps["vegetation_m"].astype(np.float64))
+    with_layer = told(
+        recipe, maps["class_id"], slope, maps["vegetation_m"].astype(np.float64)
+    )
     for one, other in zip(none, with_layer, strict=True):
-        for cells in (bare, ~bare):  # where look-alikes have one vegetation, below it too
+        for cells in (
+            bare,
+            ~bare,
+        ):  # where look-alikes have one vegetation, below it too
             np.testing.assert_array_equal(
                 np.moveaxis(one, 1, 0)[:, cells], np.moveaxis(other, 1, 0)[:, cells]
             )
 
 
 def test_a_terrain_tells_what_its_vegetation_hides() -> None:
-    """Of a class that looks like no other: its own truth on bare ground, that of both classes below the grass."""
+    """Of a class that looks like no other: its own truth on bare ground, that of both
+    classes below the grass.
+    """
     recipe = overgrown(wet_clay=grass(0.5), gravel=grass(0.5, 0.5))
     recipe = replace(
-        recipe, occupancy=(0.5, 0.5), environments=1, classes=tuple(recipe.classes[k] for k in (1, 4))
+        recipe,
+        occupancy=(0.5, 0.5),
+        environments=1,
+        classes=tuple(recipe.classes[k] for k in (1, 4)),
     )
     terrain = terrain_of(generate(recipe, "train", np.arange(2)), recipe)
     assert terrain.look_alikes is not None

@@ -24,19 +24,27 @@ def by_rejection(places: PlacesRule, count: int) -> np.ndarray:
     low = places.margin_m
     high = np.array(GRID.extent_m) - places.margin_m
     pairs = generator.uniform(low, high, (60 * count, 2, 2))
-    return pairs[np.hypot(*(pairs[:, 1] - pairs[:, 0]).T) >= places.least_distance_m][:count]
+    return pairs[np.hypot(*(pairs[:, 1] - pairs[:, 0]).T) >= places.least_distance_m][
+        :count
+    ]
 
 
 @pytest.mark.parametrize(("least", "margin"), [(1.0, 0.0), (10.0, 3.0), (20.0, 2.0)])
-def test_places_are_uniform_inside_the_margin_given_their_distance(least: float, margin: float) -> None:
+def test_places_are_uniform_inside_the_margin_given_their_distance(
+    least: float, margin: float
+) -> None:
     places = PlacesRule(least_distance_m=least, margin_m=margin)
     pairs = np.stack(draw_places(places, GRID, KEY, np.arange(2000)), axis=1)
     expected = by_rejection(places, 2000)
     assert len(expected) == 2000
     for number in range(4):
-        drawn, reference = (values.reshape(-1, 4)[:, number] for values in (pairs, expected))
+        drawn, reference = (
+            values.reshape(-1, 4)[:, number] for values in (pairs, expected)
+        )
         assert stats.ks_2samp(drawn, reference).pvalue > 1e-3
-    drawn, reference = (np.hypot(*(values[:, 1] - values[:, 0]).T) for values in (pairs, expected))
+    drawn, reference = (
+        np.hypot(*(values[:, 1] - values[:, 0]).T) for values in (pairs, expected)
+    )
     assert drawn.min() >= least
     assert stats.ks_2samp(drawn, reference).pvalue > 1e-3
     assert pairs.min() >= margin
@@ -66,7 +74,9 @@ def test_places_keep_to_any_rule_that_there_is_room_for(
     start, goal = draw_places(places, grid, KEY, np.arange(20))
     assert (np.hypot(*(goal - start).T) >= places.least_distance_m).all()
     for position in (start, goal):
-        np.testing.assert_array_equal(position.astype(np.float32).astype(np.float64), position)
+        np.testing.assert_array_equal(
+            position.astype(np.float32).astype(np.float64), position
+        )
         assert (position >= margin_m).all()
         assert (position < np.array(grid.extent_m) - margin_m).all()
 
@@ -74,7 +84,9 @@ def test_places_keep_to_any_rule_that_there_is_room_for(
 def test_a_distance_that_hardly_any_two_places_have_gives_opposite_corners() -> None:
     places = PlacesRule(least_distance_m=float(np.hypot(26, 14)) - 0.01, margin_m=3)
     start, goal = draw_places(places, GRID, KEY, np.arange(50))
-    corners = (np.abs(start - [3, 3]).max(axis=1) < 0.02) & (np.abs(goal - [29, 17]).max(axis=1) < 0.02)
+    corners = (np.abs(start - [3, 3]).max(axis=1) < 0.02) & (
+        np.abs(goal - [29, 17]).max(axis=1) < 0.02
+    )
     assert corners.all()
 
 
@@ -85,26 +97,39 @@ def test_a_map_has_its_places_in_any_batch_and_each_stream_its_own() -> None:
         np.stack(draw_places(places, GRID, KEY, np.array([2, 5]))), whole[:, [2, 5]]
     )
     assert len(np.unique(whole.reshape(-1, 2), axis=0)) == 18
-    recipe = small_stakes(splits={"a": Split(scenario="std", maps=4), "b": Split(scenario="std", maps=4)})
+    recipe = small_stakes(
+        splits={"a": Split(scenario="std", maps=4), "b": Split(scenario="std", maps=4)}
+    )
     drawn = [
         generate(made, split, np.arange(4))["start_m"]
-        for made, split in ((recipe, "a"), (recipe, "b"), (replace(recipe, seed=1), "a"))
+        for made, split in (
+            (recipe, "a"),
+            (recipe, "b"),
+            (replace(recipe, seed=1), "a"),
+        )
     ]
     assert len(np.unique(np.concatenate(drawn), axis=0)) == 12
 
 
 def test_a_map_drawn_again_has_other_places() -> None:
     # A wall of λ_stuck so high that few draws can be crossed.
-    recipe = small_stakes(stuck_threshold=0.75, places=PlacesRule(least_distance_m=12, margin_m=1))
+    recipe = small_stakes(
+        stuck_threshold=0.75, places=PlacesRule(least_distance_m=12, margin_m=1)
+    )
     asked = replace(recipe, splits={"test/hg": Split(scenario="hg", maps=12)})
-    first, kept = (generate(made, "test/hg", np.arange(12)) for made in (asked, replace_solvable(asked)))
+    first, kept = (
+        generate(made, "test/hg", np.arange(12))
+        for made in (asked, replace_solvable(asked))
+    )
     again = (first["elevation_m"] != kept["elevation_m"]).any(axis=(1, 2))
     assert 0 < again.sum() < 12
     assert ((first["start_m"] != kept["start_m"]).any(axis=1) == again).all()
 
 
 def replace_solvable(recipe):
-    return replace(recipe, splits={"test/hg": Split(scenario="hg", maps=12, solvable=True)})
+    return replace(
+        recipe, splits={"test/hg": Split(scenario="hg", maps=12, solvable=True)}
+    )
 
 
 @pytest.mark.parametrize(
@@ -135,10 +160,14 @@ def test_a_recipe_has_either_places_or_a_start_and_a_goal() -> None:
     assert "places" not in made.to_dict()
     assert made.to_dict()["start_m"] == [8, 8]
     for changes in ({}, {"start_m": [8, 8]}, {"goal_m": [8, 8]}):
-        with pytest.raises(ConfigError, match="either `start_m` and `goal_m`, or `places`"):
+        with pytest.raises(
+            ConfigError, match="either `start_m` and `goal_m`, or `places`"
+        ):
             recipe_from_dict(fixed | changes, "test")
     for changes in ({"start_m": [8, 8], "goal_m": [9, 9]}, {"start_m": [8, 8]}):
         with pytest.raises(ConfigError, match=r"got start_m and .*places"):
             recipe_from_dict(data | changes, "test")
     with pytest.raises(ConfigError, match=r"at most 36\.76 m"):
-        recipe_from_dict(data | {"places": {"least_distance_m": 37, "margin_m": 3}}, "test")
+        recipe_from_dict(
+            data | {"places": {"least_distance_m": 37, "margin_m": 3}}, "test"
+        )

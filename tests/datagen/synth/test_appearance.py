@@ -34,11 +34,16 @@ def test_shading_is_lamberts_law() -> None:
     _, x = np.mgrid[:5, :5] * 0.5
     slope = np.tan(np.radians(20))
     plane = horn_gradient(framed((slope * x)[None]), 0.5)
-    light = appearance.light_direction(np.array([np.pi]), np.array([np.cos(np.radians(20))]))
-    # Light along the plane's normal: full brightness. Overhead: cos 20°. Behind: ambient alone.
+    light = appearance.light_direction(
+        np.array([np.pi]), np.array([np.cos(np.radians(20))])
+    )
+    # Light along the plane's normal: full brightness. Overhead: cos 20°. Behind:
+    # ambient alone.
     np.testing.assert_allclose(appearance.shade(*plane, light, 0.1), 1)
     overhead = np.array([[0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(appearance.shade(*plane, overhead, 0.1), 0.1 + 0.9 * np.cos(np.radians(20)))
+    np.testing.assert_allclose(
+        appearance.shade(*plane, overhead, 0.1), 0.1 + 0.9 * np.cos(np.radians(20))
+    )
     grazing = np.array([[1.0, 0.0, 0.0]])
     np.testing.assert_allclose(appearance.shade(*plane, grazing, 0.1), 0.1)
 
@@ -54,5 +59,11 @@ def test_latent_functions_follow_their_formula() -> None:
     class_id, slope = np.array([[[3, 9]]]), np.array([[[10.0, 80.0]]])
     c = classes[3]
     expected = 1 - (c.scale * 1e-3 * 10**c.exponent + c.offset)
-    assert latent_mean(class_id, slope, classes)[0, 0].tolist() == [pytest.approx(expected), 0]
-    assert latent_std(class_id, classes)[0, 0].tolist() == [classes[3].noise, classes[9].noise]
+    assert latent_mean(class_id, slope, classes)[0, 0].tolist() == [
+        pytest.approx(expected),
+        0,
+    ]
+    assert latent_std(class_id, classes)[0, 0].tolist() == [
+        classes[3].noise,
+        classes[9].noise,
+    ]

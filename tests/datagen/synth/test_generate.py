@@ -7,7 +7,11 @@ import torch
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.datagen.recipe.latent import expected_traversability, latent_mean, latent_std
+from benchnav.datagen.recipe.latent import (
+    expected_traversability,
+    latent_mean,
+    latent_std,
+)
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.datagen.schema import FIELDS
 from benchnav.datagen.synth.generate import generate
@@ -27,7 +31,9 @@ def test_a_map_is_the_same_in_any_batch() -> None:
 def test_a_map_with_craters_is_the_same_alone() -> None:
     whole = generate(PAPER, "test/hg", np.arange(20))
     for i in range(20):
-        np.testing.assert_array_equal(generate(PAPER, "test/hg", np.array([i]))["rgb"][0], whole["rgb"][i])
+        np.testing.assert_array_equal(
+            generate(PAPER, "test/hg", np.array([i]))["rgb"][0], whole["rgb"][i]
+        )
 
 
 def test_std_terrain_has_the_figures_it_is_known_by() -> None:
@@ -44,7 +50,9 @@ def test_environments_use_every_class_alike_and_splits_differ() -> None:
     assert all(len(set(row)) == 4 for row in shown.tolist())
     assert np.bincount(shown.ravel()).tolist() == [4] * 10
     assert len({tuple(sorted(row)) for row in shown.tolist()}) == 10
-    train, valid = (generate(PAPER, split, np.arange(10)) for split in ("train", "valid"))
+    train, valid = (
+        generate(PAPER, split, np.arange(10)) for split in ("train", "valid")
+    )
     assert (train["environment"] == valid["environment"]).all()
     for i in range(10):
         assert set(np.unique(train["class_id"][i])) == set(shown[i])
@@ -83,8 +91,16 @@ def test_solvable_maps_have_the_reference_time_of_networkx() -> None:
             for j in range(32):
                 for di, dj in ((0, 1), (1, 0), (1, 1), (1, -1)):
                     k, m = i + di, j + dj
-                    if k < 32 and 0 <= m < 32 and min(expected[b, i, j], expected[b, k, m]) > 0.3:
-                        time = 0.25 * np.hypot(di, dj) * (1 / expected[b, i, j] + 1 / expected[b, k, m])
+                    if (
+                        k < 32
+                        and 0 <= m < 32
+                        and min(expected[b, i, j], expected[b, k, m]) > 0.3
+                    ):
+                        time = (
+                            0.25
+                            * np.hypot(di, dj)
+                            * (1 / expected[b, i, j] + 1 / expected[b, k, m])
+                        )
                         graph.add_edge((i, j), (k, m), weight=time)
         time = networkx.dijkstra_path_length(graph, (8, 8), (24, 24))
         assert maps["reference_time_s"][b] == pytest.approx(time, rel=1e-5)
@@ -109,8 +125,12 @@ def test_start_and_goal_are_free_in_the_cells_that_a_robot_stands_in() -> None:
         splits={"test/std": tiny.splits["test/std"]},
     )
     maps = generate(recipe, "test/std", np.arange(60))
-    mean = latent_mean(maps["class_id"], maps["slope_deg"].astype(np.float64), recipe.classes)
-    expected = expected_traversability(mean, latent_std(maps["class_id"], recipe.classes))
+    mean = latent_mean(
+        maps["class_id"], maps["slope_deg"].astype(np.float64), recipe.classes
+    )
+    expected = expected_traversability(
+        mean, latent_std(maps["class_id"], recipe.classes)
+    )
     for name in ("start_m", "goal_m"):
         row, column = recipe.grid.cell_of(*torch.from_numpy(maps[name][0]))
         assert (expected[:, row, column] > recipe.stuck_threshold).all()

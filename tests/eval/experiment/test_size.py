@@ -1,11 +1,19 @@
-"""How large a run, a product of settings and an episode may be; nothing of what is larger is built."""
+"""How large a run, a product of settings and an episode may be; nothing of what is
+larger is built.
+"""
 
 import pytest
 import torch
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.registry import Part
-from benchnav.eval.experiment.suite import MAX_CONDITIONS, MAX_EPISODES, MAX_UNITS, Suite, check_size
+from benchnav.eval.experiment.suite import (
+    MAX_CONDITIONS,
+    MAX_EPISODES,
+    MAX_UNITS,
+    Suite,
+    check_size,
+)
 from benchnav.eval.experiment.sweep import each_mapping, each_part
 from benchnav.planning.world.world import MAX_STEPS, World
 
@@ -18,7 +26,9 @@ def test_a_run_has_up_to_so_many_episodes_and_units() -> None:
         (100, 1, 10_000, 51, 50),
         (MAX_UNITS + 1, 1, 1, 1),
     ):
-        with pytest.raises(ConfigError, match="at most 100,000,000 episodes in 1,000,000 units"):
+        with pytest.raises(
+            ConfigError, match="at most 100,000,000 episodes in 1,000,000 units"
+        ):
             check_size(*given)
 
 
@@ -38,7 +48,12 @@ def test_a_product_is_refused_from_the_lengths_of_its_lists() -> None:
     assert len(each_mapping({"a": numbers, "b": [1, 2]})) == 2000
     with pytest.raises(ConfigError, match="List fewer"):
         each_part(
-            "planner", Part(part="mppi", label="mppi", options={"samples": [*range(1, MAX_CONDITIONS + 2)]})
+            "planner",
+            Part(
+                part="mppi",
+                label="mppi",
+                options={"samples": [*range(1, MAX_CONDITIONS + 2)]},
+            ),
         )
     with pytest.raises(ConfigError, match=r"1000 × 1000 × 1000 values"):
         each_mapping({"a": numbers, "b": {"c": numbers}, "d": numbers, "e": [1]})

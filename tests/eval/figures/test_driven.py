@@ -43,7 +43,11 @@ def ground(**changes: Any) -> Ground:
 def episodes(ended: dict[int, list[bool]]) -> pd.DataFrame:
     """Rows of three risk settings: of each map, which of them succeeded."""
     return made.rows(
-        made.row(made.condition(risk=risk, world="stakes"), map_index, 30.0 + place if success else None)
+        made.row(
+            made.condition(risk=risk, world="stakes"),
+            map_index,
+            30.0 + place if success else None,
+        )
         for map_index, successes in ended.items()
         for place, (risk, success) in enumerate(zip(RISKS, successes, strict=False))
     )
@@ -63,66 +67,104 @@ def draw_driven(driven: Driven) -> Figure:
 def drawn(figure: Any) -> tuple[Axes, dict[str, np.ndarray]]:
     panel = figure.axes[0]
     return panel, {
-        line.get_label(): np.array(line.get_data()).T for line in panel.lines if line.get_label()[0] != "_"
+        line.get_label(): np.array(line.get_data()).T
+        for line in panel.lines
+        if line.get_label()[0] != "_"
     }
 
 
 def test_every_path_is_drawn_to_its_end_with_its_outcome() -> None:
     rows = episodes({1: [True, False, True]})
-    panel, lines = drawn(draw_driven(Driven(ground=ground(), rows=rows, tracks=[track(i) for i in range(3)])))
+    panel, lines = drawn(
+        draw_driven(
+            Driven(ground=ground(), rows=rows, tracks=[track(i) for i in range(3)])
+        )
+    )
     for place, label in enumerate(
         ("mean: success, 30 s", "CVaR₀.₅: timeout, 100 s", "CVaR₀.₉: success, 32 s")
     ):
         np.testing.assert_array_equal(lines[label], track(place))
     np.testing.assert_array_equal(lines["goal"], [[24, 15]])
     np.testing.assert_array_equal(lines["start"], track(0)[:1])
-    (end,) = [line for line in panel.lines if line.get_marker() is MARKS["out of time"]["marker"]]
+    (end,) = [
+        line
+        for line in panel.lines
+        if line.get_marker() is MARKS["out of time"]["marker"]
+    ]
     np.testing.assert_array_equal(np.ravel(end.get_data()), track(1)[-1])
     labelled = [line for line in panel.lines if " s" in line.get_label()]
     assert end.get_color() == labelled[1].get_color()
     assert len({line.get_color() for line in labelled}) == 3
-    # In grey the paths differ by their dashes; `get_linestyle` gives "--" for each pattern.
+    # In grey the paths differ by their dashes; `get_linestyle` gives "--" for each
+    # pattern.
     assert len({str(line._dash_pattern) for line in labelled}) == 3
 
 
 def test_an_end_says_how_it_ended() -> None:
-    rows = episodes({1: [False, False, False]}).assign(outcome=["immobilised", "stuck", "planner_error"])
-    figure = draw_driven(Driven(ground=ground(), rows=rows, tracks=[track(i) for i in range(3)]))
+    rows = episodes({1: [False, False, False]}).assign(
+        outcome=["immobilised", "stuck", "planner_error"]
+    )
+    figure = draw_driven(
+        Driven(ground=ground(), rows=rows, tracks=[track(i) for i in range(3)])
+    )
     names = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    ends = [f"{name}, in the colour of its path" for name in ("immobilised", "out of time", "failed")]
+    ends = [
+        f"{name}, in the colour of its path"
+        for name in ("immobilised", "out of time", "failed")
+    ]
     assert names[-3:] == ends
     assert [name for name in names if " s" in name] == names[:3], "paths come first"
     drawn_marks = [line.get_marker() for line in figure.axes[0].lines]
-    assert all(MARKS[name]["marker"] in drawn_marks for name in ("immobilised", "out of time", "failed"))
+    assert all(
+        MARKS[name]["marker"] in drawn_marks
+        for name in ("immobilised", "out of time", "failed")
+    )
 
 
 def test_ends_that_coincide_stand_apart_each_joined_to_where_it_is() -> None:
     rows = episodes({1: [False, False, False]})
     tracks = [track(0) + np.float32(0.1 * place) for place in range(3)]
     panel, _ = drawn(draw_driven(Driven(ground=ground(), rows=rows, tracks=tracks)))
-    ends = [line for line in panel.lines if line.get_marker() is MARKS["out of time"]["marker"]]
+    ends = [
+        line
+        for line in panel.lines
+        if line.get_marker() is MARKS["out of time"]["marker"]
+    ]
     boxes = [line.get_window_extent() for line in ends]
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
     for end, own in zip(ends, tracks, strict=True):
         (line,) = [
-            line for line in panel.lines if line.get_color() == end.get_color() and len(line.get_xdata()) == 2
+            line
+            for line in panel.lines
+            if line.get_color() == end.get_color() and len(line.get_xdata()) == 2
         ]
         joined = np.array(line.get_data()).T
         np.testing.assert_allclose(joined, [own[-1], np.ravel(end.get_data())])
 
 
 def test_the_title_and_the_legend_are_apart_and_planners_go_by_their_names() -> None:
-    rows = made.rows(made.row(made.condition(name, world="stakes"), 1) for name in ("astar_dwa", "mppi"))
-    figure = draw_driven(Driven(ground=ground(), rows=rows, tracks=[track(0), track(1)]))
+    rows = made.rows(
+        made.row(made.condition(name, world="stakes"), 1)
+        for name in ("astar_dwa", "mppi")
+    )
+    figure = draw_driven(
+        Driven(ground=ground(), rows=rows, tracks=[track(0), track(1)])
+    )
     figure.draw_without_rendering()
     legend = figure.axes[0].get_legend()
-    assert not figure.axes[0].title.get_window_extent().overlaps(legend.get_window_extent())
+    assert (
+        not figure.axes[0]
+        .title.get_window_extent()
+        .overlaps(legend.get_window_extent())
+    )
     assert legend.get_texts()[0].get_text() == "A*+DWA: success, 30 s"
     colours = [line.get_color() for line in legend.get_lines()[:2]]
     assert colours == list(planner_colours(["astar_dwa", "mppi"]).values())
 
 
-def test_what_immobilises_a_robot_stands_out_and_resampled_ground_is_faded_terrain() -> None:
+def test_what_immobilises_a_robot_stands_out_and_resampled_ground_is_faded_terrain() -> (
+    None
+):
     rows = episodes({1: [True]})
     panel, _ = drawn(draw_driven(Driven(ground=ground(), rows=rows, tracks=[track(0)])))
     shown = np.asarray(panel.images[0].get_array())
@@ -132,11 +174,15 @@ def test_what_immobilises_a_robot_stands_out_and_resampled_ground_is_faded_terra
     assert (np.diff(greys[:, 0]) >= 0).all()
     faded = ground(field=None, immobilising=np.zeros((40, 60), bool))
     panel, _ = drawn(draw_driven(Driven(ground=faded, rows=rows, tracks=[track(0)])))
-    np.testing.assert_allclose(np.asarray(panel.images[0].get_array()), 0.6 + 0.4 * 100 / 255)
+    np.testing.assert_allclose(
+        np.asarray(panel.images[0].get_array()), 0.6 + 0.4 * 100 / 255
+    )
 
 
 def run_data(folder: Path, rows: pd.DataFrame, **more: Any) -> RunData:
-    return RunData(about={}, summary=made.summarised(rows), episodes=rows, folder=folder, **more)
+    return RunData(
+        about={}, summary=made.summarised(rows), episodes=rows, folder=folder, **more
+    )
 
 
 def with_steps(folder: Path, rows: pd.DataFrame) -> None:
@@ -149,7 +195,12 @@ def with_steps(folder: Path, rows: pd.DataFrame) -> None:
                                         strict=True)))
                 for i in unit["map"]
             )  # fmt: skip
-            path = folder / "steps" / f"condition={condition}" / f"{seed}-{realisation}-00000.parquet"
+            path = (
+                folder
+                / "steps"
+                / f"condition={condition}"
+                / f"{seed}-{realisation}-00000.parquet"
+            )
             forge_steps(path, steps)
 
 
@@ -164,8 +215,9 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(tmp_path: Path) -> None:
     assert driven
     data = run_data(folder, rows)
     assert DrivenPaths().needs(data)
-    assert "std, map 1, seed 0, realisation 0. On this map outcomes differ most." in DrivenPaths().caption(
-        data
+    assert (
+        "std, map 1, seed 0, realisation 0. On this map outcomes differ most."
+        in DrivenPaths().caption(data)
     )
     assert driven.rows["map"].tolist() == [1, 1, 1]
     for place, positions in enumerate(driven.tracks):
@@ -175,22 +227,33 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("seed", "realisation"), [(0, 0), (0, 1), (7, 0), (7, 1)])
-def test_the_paths_are_those_of_the_maps_own_noise(seed: int, realisation: int, tmp_path: Path) -> None:
+def test_the_paths_are_those_of_the_maps_own_noise(
+    seed: int, realisation: int, tmp_path: Path
+) -> None:
     rows = made.rows(
         made.row(made.condition(risk=risk, world="stakes"), map_index, seed=one, realisation=draw)
         for risk in RISKS for one in (0, 7) for draw in (0, 1) for map_index in (0, 1)
     )  # fmt: skip
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
-    ground(about={**ground().about, "seed": seed, "realisation": realisation}).save(folder / GROUND)
+    ground(about={**ground().about, "seed": seed, "realisation": realisation}).save(
+        folder / GROUND
+    )
     data = run_data(folder, rows)
-    assert f"std, map 1, seed {seed}, realisation {realisation}." in DrivenPaths().caption(data)
+    assert (
+        f"std, map 1, seed {seed}, realisation {realisation}."
+        in DrivenPaths().caption(data)
+    )
     assert data.driven
     own, tracks = data.driven.rows, data.driven.tracks
     assert own["risk"].tolist() == list(RISKS)
-    assert set(zip(own["seed"], own["realisation"], own["map"], strict=True)) == {(seed, realisation, 1)}
+    assert set(zip(own["seed"], own["realisation"], own["map"], strict=True)) == {
+        (seed, realisation, 1)
+    }
     for place, positions in enumerate(tracks):
-        np.testing.assert_allclose(positions, track(place) + 1 + 5 * seed + 9 * realisation)
+        np.testing.assert_allclose(
+            positions, track(place) + 1 + 5 * seed + 9 * realisation
+        )
 
 
 @pytest.mark.parametrize(
@@ -207,7 +270,9 @@ def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(
     most = 8
     rows = made.rows(
         made.row(
-            made.condition(risk=f"cvar:0.{i:02}", world="stakes"), map_index, 30.0 if arrives(i) else None
+            made.condition(risk=f"cvar:0.{i:02}", world="stakes"),
+            map_index,
+            30.0 if arrives(i) else None,
         )
         for map_index in range(2)
         for i in range(most + 2)
@@ -220,7 +285,9 @@ def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(
     assert words in DrivenPaths().caption(data)
     figure = DrivenPaths()(data)
     legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert [name.split(":")[0] for name in legend[:most]] == [f"CVaR₀.₀{'₀₁₂₃₄₅₆₇₈₉'[i]}" for i in wanted]
+    assert [name.split(":")[0] for name in legend[:most]] == [
+        f"CVaR₀.₀{'₀₁₂₃₄₅₆₇₈₉'[i]}" for i in wanted
+    ]
     _, lines = drawn(figure)
     for place, name in zip(wanted, legend, strict=False):
         np.testing.assert_allclose(lines[name], track(place) + 1)
@@ -236,10 +303,22 @@ def test_trajectories_are_of_that_map_as_many_that_arrived_as_not() -> None:
         for place, risk in enumerate(risks)
     )
     kept = made.recording(
-        20, about={"condition": rows["condition"][0], "map": "1", "seed": "0", "realisation": "0"}
+        20,
+        about={
+            "condition": rows["condition"][0],
+            "map": "1",
+            "seed": "0",
+            "realisation": "0",
+        },
     )
     other = made.recording(
-        20, about={"condition": rows["condition"][1], "map": "0", "seed": "0", "realisation": "0"}
+        20,
+        about={
+            "condition": rows["condition"][1],
+            "map": "0",
+            "seed": "0",
+            "realisation": "0",
+        },
     )
     asked: list[str] = []
 
@@ -250,7 +329,9 @@ def test_trajectories_are_of_that_map_as_many_that_arrived_as_not() -> None:
     def shown(recordings: list[Recording], record: Any) -> list[Any]:
         data = RunData(about={}, summary=rows, episodes=rows, record_driven=record)
         # As read of the folder of a run.
-        vars(data).update(recordings=recordings, driven=Driven(ground=ground(), rows=rows, tracks=()))
+        vars(data).update(
+            recordings=recordings, driven=Driven(ground=ground(), rows=rows, tracks=())
+        )
         return data.on_one_map
 
     assert shown([kept, other], again) == [kept, "cvar:0.1", "cvar:0.4", "cvar:0.5"]

@@ -45,16 +45,27 @@ def draw_failures(lines: list[FailedLine]) -> Figure:
 
 def test_each_outcome_is_shown_before_any_twice() -> None:
     rows = failures(["immobilised"] * 5 + ["stuck", "timeout", "timeout"])
-    assert list(choose_failures(rows)["outcome"]) == ["immobilised", "timeout", "stuck", "immobilised"]
+    assert list(choose_failures(rows)["outcome"]) == [
+        "immobilised",
+        "timeout",
+        "stuck",
+        "immobilised",
+    ]
     assert list(choose_failures(failures(["stuck"] * 6))["map"]) == [0, 1, 2, 3]
     assert choose_failures(failures(["stuck"], x_m=np.nan)).empty
 
 
 def test_panels_say_where_when_and_why() -> None:
-    rows = failures(["immobilised", "out_of_bounds"], x_m=[1.2, 6.5], last_traversability=[0.04, np.nan])
+    rows = failures(
+        ["immobilised", "out_of_bounds"],
+        x_m=[1.2, 6.5],
+        last_traversability=[0.04, np.nan],
+    )
     line = shown(rows)
     figure = draw_failures([line])
-    panels = [panel for panel in figure.axes if panel.get_visible() and panel.get_title()]
+    panels = [
+        panel for panel in figure.axes if panel.get_visible() and panel.get_title()
+    ]
     told = line.recordings[0].predicted[4, 2]
     assert [panel.get_title() for panel in panels] == [
         f"hg, map 0: immobilised, 20 s\nλ̂ = {told:.2f}, observed λ = 0.04",
@@ -62,7 +73,9 @@ def test_panels_say_where_when_and_why() -> None:
     ]
     assert panels[0].get_ylabel() == "MPPI, mean\n(2 of 9 failures)"
     for panel, place in zip(panels, range(2), strict=True):
-        np.testing.assert_array_equal(panel.images[0].get_array(), line.recordings[place].predicted)
+        np.testing.assert_array_equal(
+            panel.images[0].get_array(), line.recordings[place].predicted
+        )
         marked = [mark for mark in panel.lines if mark.get_marker() != "None"]
         marks = {mark.get_marker(): mark.get_xydata()[0].tolist() for mark in marked}
         assert marks[("X", "s")[place]] == rows.loc[place, ["x_m", "y_m"]].tolist()
@@ -73,7 +86,9 @@ def test_panels_say_where_when_and_why() -> None:
     assert wide.get_figwidth() * 25.4 == pytest.approx(180)
 
 
-def test_ground_that_immobilises_a_robot_is_drawn_and_named_where_there_is_such() -> None:
+def test_ground_that_immobilises_a_robot_is_drawn_and_named_where_there_is_such() -> (
+    None
+):
     rows = failures(["immobilised"])
     immobilising = np.zeros((8, 12), bool)
     immobilising[3, 4] = True
@@ -83,4 +98,6 @@ def test_ground_that_immobilises_a_robot_is_drawn_and_named_where_there_is_such(
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == ["immobilises a robot", "driven", "start", "goal", "immobilised"]
     plain = draw_failures([shown(rows)])
-    assert "immobilises a robot" not in [text.get_text() for text in plain.legends[0].get_texts()]
+    assert "immobilises a robot" not in [
+        text.get_text() for text in plain.legends[0].get_texts()
+    ]

@@ -1,4 +1,6 @@
-"""Figures of robots that learn: what is drawn is what was known then, and what the steps of a run tell."""
+"""Figures of robots that learn: what is drawn is what was known then, and what the
+steps of a run tell.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -66,10 +68,16 @@ def test_four_moments_from_start_to_end_show_what_was_known_by_then() -> None:
                 as_lines(hatching(~known.seen, 0.5)),
                 as_lines(outline(known.sensed, 0.5)),
             ]
-            (reach,) = [line for line in panel.lines if line.get_label() == "reach of the sensors"]
+            (reach,) = [
+                line
+                for line in panel.lines
+                if line.get_label() == "reach of the sensors"
+            ]
             np.testing.assert_array_equal(np.transpose(reach.get_data()), known.outline)
             (driven,) = [line for line in panel.lines if line.get_label() == "driven"]
-            np.testing.assert_array_equal(np.transpose(driven.get_data()), recording.track[: step + 1])
+            np.testing.assert_array_equal(
+                np.transpose(driven.get_data()), recording.track[: step + 1]
+            )
             assert (panel.get_xlim(), panel.get_ylim()) == ((0, 30), (0, 20))
     assert [above.get_title() for above, _ in shown] == [
         "t = 0.0 s", "t = 3.3 s", "t = 6.7 s", "t = 10.0 s\nimmobilised"
@@ -83,15 +91,23 @@ def test_the_robot_stands_where_it_was_and_its_end_is_marked() -> None:
         heading = robot_marker(recording.states[step, 2]).get_transform().get_matrix()
         for panel in panels:
             (robot,) = [line for line in panel.lines if line.get_label() == "robot"]
-            np.testing.assert_array_equal(np.ravel(robot.get_data()), recording.track[step])
-            np.testing.assert_allclose(robot._marker.get_transform().get_matrix(), heading)  # type: ignore[attr-defined]
+            np.testing.assert_array_equal(
+                np.ravel(robot.get_data()), recording.track[step]
+            )
+            np.testing.assert_allclose(
+                robot._marker.get_transform().get_matrix(), heading
+            )  # type: ignore[attr-defined]
             assert "immobilised" not in [line.get_label() for line in panel.lines]
     for panel in last:
         labels = {line.get_label(): line for line in panel.lines}
         assert "robot" not in labels
         assert labels["immobilised"].get_marker() == MARKS["immobilised"]["marker"]
-        np.testing.assert_array_equal(np.ravel(labels["goal"].get_data()), recording.goal_m)
-        np.testing.assert_array_equal(np.ravel(labels["start"].get_data()), recording.track[0])
+        np.testing.assert_array_equal(
+            np.ravel(labels["goal"].get_data()), recording.goal_m
+        )
+        np.testing.assert_array_equal(
+            np.ravel(labels["start"].get_data()), recording.track[0]
+        )
 
 
 def test_the_legend_names_what_there_is_alone() -> None:
@@ -121,7 +137,9 @@ def draw_learning(curves: pd.DataFrame, summary: pd.DataFrame) -> Figure:
 
 
 def learners() -> pd.DataFrame:
-    """Rows of two conditions that learn, and of one that does not, on nine maps, two of which are one group."""
+    """Rows of two conditions that learn, and of one that does not, on nine maps, two of
+    which are one group.
+    """
     return made.rows(
         made.row(made.condition(planner), place, group=min(place, MAPS - 2))
         for planner in ("astar_dwa", "astar_mppi", "mppi")
@@ -130,16 +148,28 @@ def learners() -> pd.DataFrame:
 
 
 def write_steps(folder: Path, rows: pd.DataFrame, seconds: float = 6.0) -> None:
-    """Steps each 0.5 s of 1 s: RMSE is 0.1 × map + time, log score its negative; NaN for who does not learn."""
+    """Steps each 0.5 s of 1 s: RMSE is 0.1 × map + time, log score its negative; NaN
+    for who does not learn.
+    """
     time_s = np.arange(0, seconds, 0.5)
     for (condition, place), own in rows.groupby(["condition", "map"]):
-        # The first map's episode ends early, and a step without an evaluation lies between any two.
+        # The first map's episode ends early, and a step without an evaluation lies
+        # between any two.
         told = np.where(np.arange(len(time_s)) % 2 == 0, 0.1 * place + time_s, np.nan)  # type: ignore[operator]
         told = np.where(own["planner"].iloc[0] == "mppi", np.nan, told)
         table = pd.DataFrame(
-            {"seed": 0, "realisation": 0, "map": place, "step": range(len(time_s)), "time_s": time_s}
+            {
+                "seed": 0,
+                "realisation": 0,
+                "map": place,
+                "step": range(len(time_s)),
+                "time_s": time_s,
+            }
         )
-        numbers = {name: told.astype(np.float32) for name in ("x_m", "y_m", "traversability", "ahead_rmse")}
+        numbers = {
+            name: told.astype(np.float32)
+            for name in ("x_m", "y_m", "traversability", "ahead_rmse")
+        }
         table = table.assign(**numbers, ahead_log_score=-numbers["ahead_rmse"])
         table = table.head(4 if place == 0 else len(table))
         path = folder / "steps" / f"condition={condition}" / f"0-0-{place}.parquet"
@@ -158,7 +188,9 @@ def test_curves_are_means_over_maps_of_those_that_still_drive(tmp_path: Path) ->
     assert own["time_s"].tolist() == [1.0]
     assert own["maps"].tolist() == [LEAST_MAPS]
     # Evaluated at 0 and 1 s; the maps of a group count once.
-    by_map = [0.1 * place + 0.5 for place in range(MAPS - 2)] + [0.1 * (MAPS - 1.5) + 0.5]
+    by_map = [0.1 * place + 0.5 for place in range(MAPS - 2)] + [
+        0.1 * (MAPS - 1.5) + 0.5
+    ]
     assert own["ahead_rmse"].iloc[0] == pytest.approx(np.mean(by_map), abs=1e-6)
     for name, sign in (("ahead_rmse", 1), ("ahead_log_score", -1)):
         middle, low, high = own[[name, f"{name}_low", f"{name}_high"]].iloc[0]
@@ -200,15 +232,24 @@ def curves_of(summary: pd.DataFrame) -> pd.DataFrame:
                 )
             )
     ends = ("", "_low", "_high")
-    columns = ["condition", "time_s", "maps", *(f"{name}{end}" for name in METRICS for end in ends)]
+    columns = [
+        "condition",
+        "time_s",
+        "maps",
+        *(f"{name}{end}" for name in METRICS for end in ends),
+    ]
     return pd.DataFrame(rows, columns=columns)
 
 
 def conditions(**several: list[str]) -> pd.DataFrame:
     """Labels of all combinations."""
-    labels = pd.DataFrame([made.condition(ground="contact", belief="copula", sensor="full")])
+    labels = pd.DataFrame(
+        [made.condition(ground="contact", belief="copula", sensor="full")]
+    )
     for name, values in several.items():
-        labels = labels.drop(columns=name).merge(pd.DataFrame({name: values}), how="cross")
+        labels = labels.drop(columns=name).merge(
+            pd.DataFrame({name: values}), how="cross"
+        )
     return labels.assign(condition=[f"t{place}" for place in range(len(labels))])
 
 
@@ -216,10 +257,16 @@ def test_a_line_a_condition_with_its_band_named_by_what_differs() -> None:
     summary = conditions(ground=["contact", "probe radius_m=1", "probe radius_m=2"])
     curves = curves_of(summary)
     figure = draw_learning(curves, summary)
-    assert names_in_legend(figure) == ["contact", "probe radius_m=1", "probe radius_m=2"]
+    assert names_in_legend(figure) == [
+        "contact",
+        "probe radius_m=1",
+        "probe radius_m=2",
+    ]
     looks = set()
     for panel, name in zip(figure.axes, METRICS, strict=True):
-        for line, band, condition in zip(panel.lines, panel.collections, summary["condition"], strict=True):
+        for line, band, condition in zip(
+            panel.lines, panel.collections, summary["condition"], strict=True
+        ):
             own = curves[curves["condition"] == condition]
             np.testing.assert_array_equal(line.get_xdata(), own["time_s"])
             np.testing.assert_array_equal(line.get_ydata(), own[name])
@@ -243,24 +290,35 @@ def test_where_lines_are_many_panels_are_split_and_lines_look_alike_in_all() -> 
     assert [len(panel.lines) for panel in panels] == [4] * 16
     names = ["contact, static", "contact, copula", "probe, static", "probe, copula"]
     assert sorted(names_in_legend(figure)) == sorted(names)
-    looks = {line.get_label(): set[tuple[Any, Any]]() for panel in panels for line in panel.lines}
+    looks = {
+        line.get_label(): set[tuple[Any, Any]]()
+        for panel in panels
+        for line in panel.lines
+    }
     for panel in panels:
         for line in panel.lines:
             looks[line.get_label()].add((line.get_color(), line.get_linestyle()))
     assert [len(look) for look in looks.values()] == [1] * 4
-    titles = [panel.get_title().replace("\n", " ") for panel in panels if panel.get_title()]
+    titles = [
+        panel.get_title().replace("\n", " ") for panel in panels if panel.get_title()
+    ]
     assert len(set(titles)) == 8
     assert "MPPI, mean, oracle" in titles
     fewer = conditions(ground=["contact", "probe"], scenario=["std", "hard"])
     figure = draw_learning(curves_of(fewer), fewer)
-    assert [panel.get_title() for panel in figure.axes if panel.get_title()] == ["std", "hard"]
+    assert [panel.get_title() for panel in figure.axes if panel.get_title()] == [
+        "std",
+        "hard",
+    ]
     alone = conditions()
     assert names_in_legend(draw_learning(curves_of(alone), alone)) == ["mean over maps"]
 
 
 def labelled(recording: Recording, rows: pd.DataFrame, condition: str) -> Recording:
     row = rows[rows["condition"] == condition].iloc[0]
-    about = {name: str(row[name]) for name in recording.about if name in row} | {"map": "0"}
+    about = {name: str(row[name]) for name in recording.about if name in row} | {
+        "map": "0"
+    }
     return replace(recording, about=about)
 
 
@@ -282,8 +340,12 @@ def test_a_report_holds_what_robots_knew_where_they_learnt(
     write_steps(folder, rows)
     first, second, other = rows["condition"].unique()
     for condition in (first, second):
-        labelled(made.learning_recording(30), rows, condition).save(folder / "playback" / f"{condition}.npz")
-    labelled(made.held_recording(30), rows, other).save(folder / "playback" / f"{other}.npz")
+        labelled(made.learning_recording(30), rows, condition).save(
+            folder / "playback" / f"{condition}.npz"
+        )
+    labelled(made.held_recording(30), rows, other).save(
+        folder / "playback" / f"{other}.npz"
+    )
     write.write_report(folder)
     text = (folder / "summary.md").read_text()
     for name in ("learning", "knowledge-1", "knowledge-2"):

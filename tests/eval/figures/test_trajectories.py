@@ -16,17 +16,34 @@ from benchnav.viz.style import TWO_COLUMNS_IN, bytes_of, save_twice
 from tests.eval.report import made
 
 
-def recording(condition: str = "t", map_index: int = 0, seed: int = 0, **labels: str) -> Recording:
-    about = made.condition(**labels) | {"condition": condition, "map": str(map_index), "seed": str(seed)}
-    return made.recording(about=about | {"realisation": "0", "outcome": "out_of_bounds"})
+def recording(
+    condition: str = "t", map_index: int = 0, seed: int = 0, **labels: str
+) -> Recording:
+    about = made.condition(**labels) | {
+        "condition": condition,
+        "map": str(map_index),
+        "seed": str(seed),
+    }
+    return made.recording(
+        about=about | {"realisation": "0", "outcome": "out_of_bounds"}
+    )
 
 
 def chosen(recordings: list[Recording], conditions: list[str]) -> list[tuple[str, str]]:
-    return [(s.about["condition"], s.about["map"]) for s in choose_recordings(recordings, conditions)]
+    return [
+        (s.about["condition"], s.about["map"])
+        for s in choose_recordings(recordings, conditions)
+    ]
 
 
 def test_one_a_condition_on_one_map_in_the_tables_order() -> None:
-    every = [recording("b", 10), recording("b", 9), recording("a", 9), recording("a", 10), recording("c", 3)]
+    every = [
+        recording("b", 10),
+        recording("b", 9),
+        recording("a", 9),
+        recording("a", 10),
+        recording("c", 3),
+    ]
     assert chosen(every, ["c", "b", "a"]) == [("c", "3"), ("b", "9"), ("a", "9")]
     assert chosen(every, ["a", "b"]) == [("a", "9"), ("b", "9")]
     mixed = [recording("a", 2), recording("b", 1), recording("b", 2)]
@@ -34,12 +51,19 @@ def test_one_a_condition_on_one_map_in_the_tables_order() -> None:
     assert chosen([], ["a"]) == []
 
 
-def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do_not() -> None:
+def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do_not() -> (
+    None
+):
     def ended(condition: str, map_index: int, outcome: str) -> Recording:
         made = recording(condition, map_index)
         return replace(made, about={**made.about, "outcome": outcome})
 
-    outcomes = {("a", 1): "success", ("b", 1): "success", ("a", 2): "success", ("b", 2): "immobilised"}
+    outcomes = {
+        ("a", 1): "success",
+        ("b", 1): "success",
+        ("a", 2): "success",
+        ("b", 2): "immobilised",
+    }
     every = [ended(*place, outcome) for place, outcome in outcomes.items()]
     every += [
         ended("a", 3, "success"),
@@ -48,7 +72,9 @@ def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do
         ended("c", 0, "success"),
     ]
     assert chosen(every, ["a", "b", "c"]) == [("a", "2"), ("b", "2"), ("c", "0")]
-    alike = [ended(name, 1, "success") for name in "ab"] + [ended(name, 2, "stuck") for name in "ab"]
+    alike = [ended(name, 1, "success") for name in "ab"] + [
+        ended(name, 2, "stuck") for name in "ab"
+    ]
     assert chosen(alike, ["a", "b"]) == [("a", "2"), ("b", "2")]
     assert chosen(alike[:2], ["a", "b"]) == [("a", "1"), ("b", "1")]
 
@@ -78,20 +104,35 @@ def test_what_is_drawn_is_what_was_planned_and_driven_by_then() -> None:
     taken = recording()
     above, below = shown(draw_trajectories([taken]))
     now = taken.now
-    assert above.get_title() == f"MPPI, CVaR\nt = {now / 10:g} s; out of bounds after {taken.end_s:g} s"
+    assert (
+        above.get_title()
+        == f"MPPI, CVaR\nt = {now / 10:g} s; out of bounds after {taken.end_s:g} s"
+    )
     for panel in (above, below):
-        lines = [path.vertices for layer in panel.collections for path in layer.get_paths()]
+        lines = [
+            path.vertices for layer in panel.collections for path in layer.get_paths()
+        ]
         for layer in taken.plan.lines.values():
             for line in layer:
                 assert any(np.array_equal(line, drawn) for drawn in lines)
     (met,) = (layer for layer in above.collections if layer.get_array() is not None)
     np.testing.assert_array_equal(met.get_array(), taken.traversability[:now])
-    np.testing.assert_array_equal(met.get_paths()[-1].vertices, taken.track[now - 1 : now + 1])
+    np.testing.assert_array_equal(
+        met.get_paths()[-1].vertices, taken.track[now - 1 : now + 1]
+    )
     # On the map of λ̂ in black, since it has the colours of λ.
-    black = [line for line in below.lines if line.get_color() == "black" and len(line.get_xdata()) > 1]
-    np.testing.assert_array_equal(np.stack(black[0].get_data(), axis=1), taken.track[: now + 1])
+    black = [
+        line
+        for line in below.lines
+        if line.get_color() == "black" and len(line.get_xdata()) > 1
+    ]
+    np.testing.assert_array_equal(
+        np.stack(black[0].get_data(), axis=1), taken.track[: now + 1]
+    )
     (shown_map,) = below.get_images()
-    np.testing.assert_array_equal(shown_map.get_array(), known_colours(taken, now)["risk"])
+    np.testing.assert_array_equal(
+        shown_map.get_array(), known_colours(taken, now)["risk"]
+    )
     closed = (np.asarray(shown_map.get_array()) == bytes_of(CLOSED)[:3]).all(axis=-1)
     np.testing.assert_array_equal(closed, ~taken.free)
 
@@ -113,20 +154,35 @@ def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended()
     assert paths
     for line in paths:
         np.testing.assert_array_equal(np.stack(line.get_data(), axis=1), taken.track)
-    marks = {line.get_marker(): line for line in last.lines if line.get_marker() != "None"}
-    assert marks.keys() == {MARKS[name]["marker"] for name in ("start", "goal", "immobilised")}
+    marks = {
+        line.get_marker(): line for line in last.lines if line.get_marker() != "None"
+    }
+    assert marks.keys() == {
+        MARKS[name]["marker"] for name in ("start", "goal", "immobilised")
+    }
     for name, place in (("start", taken.track[0]), ("goal", taken.goal_m)):
-        np.testing.assert_array_equal(np.ravel(marks[MARKS[name]["marker"]].get_data()), place)
+        np.testing.assert_array_equal(
+            np.ravel(marks[MARKS[name]["marker"]].get_data()), place
+        )
     end = marks[MARKS["immobilised"]["marker"]]
     np.testing.assert_array_equal(np.ravel(end.get_data()), taken.track[-1])
     assert last.get_title() == "whole path, over the λ field"
-    # Where it was by the moment of the plan is told by the panels above, and where it headed.
+    # Where it was by the moment of the plan is told by the panels above, and where it
+    # headed.
     heading = robot_marker(taken.states[taken.now, 2]).get_transform()
     for panel in (above, below):
         (robot,) = [line for line in panel.lines if line.get_label() == "robot"]
-        np.testing.assert_array_equal(np.ravel(robot.get_data()), taken.track[taken.now])
-        np.testing.assert_allclose(robot._marker.get_transform().get_matrix(), heading.get_matrix())
-        assert not [line for line in panel.lines if (line.get_marker(), line.get_color()) == ("X", "black")]
+        np.testing.assert_array_equal(
+            np.ravel(robot.get_data()), taken.track[taken.now]
+        )
+        np.testing.assert_allclose(
+            robot._marker.get_transform().get_matrix(), heading.get_matrix()
+        )
+        assert not [
+            line
+            for line in panel.lines
+            if (line.get_marker(), line.get_color()) == ("X", "black")
+        ]
         assert max(len(line.get_xdata()) for line in panel.lines) == taken.now + 1 < 170
 
 
@@ -150,7 +206,9 @@ def test_only_panels_whose_λ_stayed_have_a_third() -> None:
     assert sum("λ field" in title for title in titles) == 2
     figure.draw_without_rendering()
     columns = [
-        axes.get_subplotspec().colspan.start for axes in shown(figure) if "λ field" in axes.get_title()
+        axes.get_subplotspec().colspan.start
+        for axes in shown(figure)
+        if "λ field" in axes.get_title()
     ]
     assert columns == [1, 1]
 
@@ -158,14 +216,24 @@ def test_only_panels_whose_λ_stayed_have_a_third() -> None:
 def test_titles_tell_models_and_worlds_apart_where_they_differ() -> None:
     def titles(*labels: dict[str, str]) -> list[str]:
         figure = draw_trajectories([recording(**one) for one in labels])
-        return [axes.get_title().split("\n")[0] for axes in shown(figure) if " after " in axes.get_title()]
+        return [
+            axes.get_title().split("\n")[0]
+            for axes in shown(figure)
+            if " after " in axes.get_title()
+        ]
 
     blind = {"planner": "straight", "model": "–", "risk": "–"}
     assert titles({}, blind) == ["MPPI, CVaR", "straight"]
     told = {"model": "clairvoyant", "risk": "–"}
     assert titles(told) == ["MPPI, clairvoyant"]
-    assert titles({"model": "oracle"}, told) == ["MPPI, oracle, CVaR", "MPPI, clairvoyant"]
-    assert titles({}, {"world": "stakes"}) == ["MPPI, paper, CVaR", "MPPI, stakes, CVaR"]
+    assert titles({"model": "oracle"}, told) == [
+        "MPPI, oracle, CVaR",
+        "MPPI, clairvoyant",
+    ]
+    assert titles({}, {"world": "stakes"}) == [
+        "MPPI, paper, CVaR",
+        "MPPI, stakes, CVaR",
+    ]
 
 
 def test_without_a_recorded_plan_the_whole_path_is_shown_and_how_it_ended() -> None:
@@ -176,7 +244,9 @@ def test_without_a_recorded_plan_the_whole_path_is_shown_and_how_it_ended() -> N
     np.testing.assert_array_equal(driven.get_array(), taken.traversability)
     assert max(len(line.get_xdata()) for line in below.lines) == 171
     for panel in (above, below):
-        assert MARKS["immobilised"]["marker"] in [line.get_marker() for line in panel.lines]
+        assert MARKS["immobilised"]["marker"] in [
+            line.get_marker() for line in panel.lines
+        ]
     names = names_in_legend(figure)
     assert "immobilised" in names
     assert not {"robot", "planned", "samples", "tree", "reference path"} & set(names)
@@ -191,11 +261,19 @@ def names_in_legend(figure: Figure) -> list[str]:
     ("changes", "names"),
     [
         ({}, [SOFT_WORDS, "not free", "immobilised", "immobilises a robot"]),
-        ({"soft": np.zeros((40, 60), bool)}, ["not free", "immobilised", "immobilises a robot"]),
-        ({"immobilising": np.zeros((40, 60), bool)}, [SOFT_WORDS, "not free", "immobilised"]),
+        (
+            {"soft": np.zeros((40, 60), bool)},
+            ["not free", "immobilised", "immobilises a robot"],
+        ),
+        (
+            {"immobilising": np.zeros((40, 60), bool)},
+            [SOFT_WORDS, "not free", "immobilised"],
+        ),
     ],
 )
-def test_the_legend_names_what_the_ground_has(changes: dict[str, Any], names: list[str]) -> None:
+def test_the_legend_names_what_the_ground_has(
+    changes: dict[str, Any], names: list[str]
+) -> None:
     ground = (SOFT_WORDS, "not free", "immobilised", "immobilises a robot")
     shown = names_in_legend(draw_trajectories([held(**changes)]))
     assert {name for name in shown if name in ground} == set(names)
@@ -204,7 +282,15 @@ def test_the_legend_names_what_the_ground_has(changes: dict[str, Any], names: li
 def test_the_legend_names_layers_that_are_there() -> None:
     names = names_in_legend(draw_trajectories([recording()]))
     below = ["not free", "driven; above in the colour of the observed λ"]
-    assert set(names) == {"samples", "reference path", "planned", "start", "goal", "robot", *below}
+    assert set(names) == {
+        "samples",
+        "reference path",
+        "planned",
+        "start",
+        "goal",
+        "robot",
+        *below,
+    }
     taken = recording()
     everywhere = replace(taken, free=np.ones_like(taken.free))
     assert "not free" not in names_in_legend(draw_trajectories([everywhere]))
@@ -213,7 +299,9 @@ def test_the_legend_names_layers_that_are_there() -> None:
 def test_whose_map_of_λ_it_is_stands_above_it() -> None:
     blind = {"planner": "straight", "model": "–", "risk": "–"}
     learns = recording(belief="copula", ground="probe:1")
-    *_, given, none, first = shown(draw_trajectories([recording(), recording(**blind), learns]))
+    *_, given, none, first = shown(
+        draw_trajectories([recording(), recording(**blind), learns])
+    )
     assert given.get_title() == "λ̂ given to the planner"
     assert none.get_title() == "true E[λ]; the planner uses no map"
     assert first.get_title() == "λ̂ at the start"
@@ -230,5 +318,7 @@ def test_λ_hat_of_a_robot_that_learns_is_that_known_at_the_moment() -> None:
     assert known is not None
     assert 0 < known.step < 170
     _, below, _ = shown(draw_trajectories([taken]))
-    np.testing.assert_array_equal(below.get_images()[0].get_array(), known_colours(taken, taken.now)["risk"])
+    np.testing.assert_array_equal(
+        below.get_images()[0].get_array(), known_colours(taken, taken.now)["risk"]
+    )
     assert below.get_title() == "λ̂ known by then"

@@ -29,8 +29,12 @@ def run(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "run"))
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "null", '{"format": "benchnav-run"}', "[" * 100000])
-def test_an_empty_or_truncated_file_is_damaged_and_a_missing_one_is_none(text: str, run: Path) -> None:
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", "null", '{"format": "benchnav-run"}', "[" * 100000]
+)
+def test_an_empty_or_truncated_file_is_damaged_and_a_missing_one_is_none(
+    text: str, run: Path
+) -> None:
     (run / "run.json").write_text(text)
     with pytest.raises(ConfigError, match=r"run\.json is damaged: "):
         open_run(run)
@@ -40,13 +44,20 @@ def test_an_empty_or_truncated_file_is_damaged_and_a_missing_one_is_none(text: s
 
 
 @pytest.mark.parametrize("version", [5, 7])
-def test_runs_of_other_formats_are_refused_with_what_reads_them(version: int, run: Path) -> None:
-    (run / "run.json").write_text(json.dumps({**open_run(run).about, "format_version": version}))
+def test_runs_of_other_formats_are_refused_with_what_reads_them(
+    version: int, run: Path
+) -> None:
+    (run / "run.json").write_text(
+        json.dumps({**open_run(run).about, "format_version": version})
+    )
     remedy = {
         5: r"Run its suite again, or read it with benchnav 1\.3",
         7: "Read it with a newer benchnav: pip install --upgrade benchnav",
     }[version]
-    with pytest.raises(ConfigError, match=rf"format version 6, got .* of version {version}\. {remedy}\.$"):
+    with pytest.raises(
+        ConfigError,
+        match=rf"format version 6, got .* of version {version}\. {remedy}\.$",
+    ):
         open_run(run)
 
 
@@ -65,7 +76,9 @@ def test_a_table_or_a_seal_that_was_changed_or_taken_away_is_damage(run: Path) -
         read_table(run, EPISODES)
     about = open_run(run).about
     (run / "run.json").write_text(
-        json.dumps({name: value for name, value in about.items() if name != "manifest_digest"})
+        json.dumps(
+            {name: value for name, value in about.items() if name != "manifest_digest"}
+        )
     )
     with pytest.raises(ConfigError, match="changed after benchnav wrote it"):
         open_run(run)

@@ -14,7 +14,13 @@ from benchnav.core.errors import ConfigError
 from benchnav.eval.cli import _report
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import units
-from benchnav.eval.folder.run_folder import EPISODES, find_units, open_run, read_table, unit_rows
+from benchnav.eval.folder.run_folder import (
+    EPISODES,
+    find_units,
+    open_run,
+    read_table,
+    unit_rows,
+)
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.folder.verify import verify_run
 from benchnav.eval.recording import GROUND, Ground, Recording
@@ -84,7 +90,9 @@ def test_a_whole_run_has_no_damage(run: Path) -> None:
     assert verify_run(run) == ([], [])
 
 
-def test_a_flipped_bit_is_found_or_makes_no_difference(run: Path, tmp_path: Path) -> None:
+def test_a_flipped_bit_is_found_or_makes_no_difference(
+    run: Path, tmp_path: Path
+) -> None:
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     whole = list(everything(copy))
     files = sorted(path for path in copy.rglob("*") if path.is_file())
@@ -97,16 +105,23 @@ def test_a_flipped_bit_is_found_or_makes_no_difference(run: Path, tmp_path: Path
         damage, _ = verify_run(copy)
         found += bool(damage)
         try:
-            assert same(list(everything(copy)), whole), f"{path} is read with other values"
+            assert same(list(everything(copy)), whole), (
+                f"{path} is read with other values"
+            )
         except ConfigError:
             assert damage, f"{path} is refused, and not found damaged"
-        if path.parts[-2] in ("figures", "playback") or path.name in ("report.html", "summary.csv"):
+        if path.parts[-2] in ("figures", "playback") or path.name in (
+            "report.html",
+            "summary.csv",
+        ):
             assert damage, f"{path} is not found damaged"
         path.write_bytes(content)
     assert found > 0.8 * FLIPS
 
 
-@pytest.mark.parametrize("kind", ["units/*/*.parquet", "steps/*/*.parquet", "playback/*.npz"])
+@pytest.mark.parametrize(
+    "kind", ["units/*/*.parquet", "steps/*/*.parquet", "playback/*.npz"]
+)
 def test_a_damaged_unit_is_run_again_with_one_line(
     kind: str, run: Path, suite: Suite, tmp_path: Path
 ) -> None:
@@ -129,16 +144,24 @@ def test_a_damaged_unit_is_run_again_with_one_line(
     assert verify_run(copy) == ([], [])
 
 
-def test_missing_files_and_units_of_another_run_are_told(run: Path, tmp_path: Path) -> None:
+def test_missing_files_and_units_of_another_run_are_told(
+    run: Path, tmp_path: Path
+) -> None:
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     first, second = sorted(copy.glob("steps/*/*.parquet"))
     (copy / "summary.csv").unlink()
     damage, notes = verify_run(copy)
     assert damage == []
     count = len((run / "SHA256SUMS").read_text().splitlines())
-    assert notes == [f"1 of {count} files in SHA256SUMS are missing, the first summary.csv"]
+    assert notes == [
+        f"1 of {count} files in SHA256SUMS are missing, the first summary.csv"
+    ]
     shutil.copyfile(second, first)  # a whole file, of another unit
-    unit = next((copy / "units" / first.parent.name.removeprefix("condition=")).glob("*.parquet"))
+    unit = next(
+        (copy / "units" / first.parent.name.removeprefix("condition=")).glob(
+            "*.parquet"
+        )
+    )
     damage, _ = verify_run(copy)
     assert damage == []  # its key is another's, so that the unit lacks its steps
     unit.unlink()
@@ -176,5 +199,8 @@ def test_the_command_prints_what_is_damaged_and_ends_with_status_1(
     assert "it was changed after benchnav wrote it" in line
     shutil.copyfile(run / "run.json", copy / "run.json")
     assert call("eval", "verify", copy) == 1
-    assert "damaged: summary.md: it was changed after benchnav wrote it\n" in capsys.readouterr().out
+    assert (
+        "damaged: summary.md: it was changed after benchnav wrote it\n"
+        in capsys.readouterr().out
+    )
     assert call("eval", "verify", tmp_path) == 2

@@ -14,7 +14,12 @@ PLANNERS = "benchnav.planning.planners."
 
 def condition(**parts: str) -> Condition:
     given = {"model": "oracle", "planners": "straight", "risks": "mean"} | parts
-    suite = Suite(**{name: value if name == "model" else (value,) for name, value in given.items()})  # type: ignore[arg-type]
+    suite = Suite(
+        **{
+            name: value if name == "model" else (value,)
+            for name, value in given.items()
+        }
+    )  # type: ignore[arg-type]
     (found,) = conditions_of(suite, lambda data: ["std"])
     return found
 
@@ -25,7 +30,11 @@ def condition(**parts: str) -> Condition:
         ({"planners": "mppi"}, PLANNERS + "mppi", PLANNERS + "cl_rrt.cl_rrt"),
         ({"planners": "cl_rrt"}, PLANNERS + "cl_rrt.tree", PLANNERS + "astar.dwa"),
         ({"planners": "astar_dwa"}, PLANNERS + "astar.dwa", PLANNERS + "mppi"),
-        ({"planners": "mppi", "model": "paper-v1"}, "benchnav.models.fused", PLANNERS + "cl_rrt.cl_rrt"),
+        (
+            {"planners": "mppi", "model": "paper-v1"},
+            "benchnav.models.fused",
+            PLANNERS + "cl_rrt.cl_rrt",
+        ),
     ],
 )
 def test_the_code_of_a_unit_is_what_its_own_parts_import(
@@ -49,7 +58,9 @@ def test_a_part_of_a_users_own_is_known_by_its_digest(tmp_path: Path) -> None:
     assert list(before["parts"]) == [f"risk {path}:worst"]
 
 
-def test_of_a_checkpoint_of_a_users_class_both_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_a_checkpoint_of_a_users_class_both_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     example = Path(__file__).parents[3] / "examples" / "own_model.py"
     Path("own.py").write_text(example.read_text())
@@ -63,21 +74,36 @@ def test_of_a_checkpoint_of_a_users_class_both_count(tmp_path: Path, monkeypatch
         data_id="x",
         data_digest="y",
     )
-    save_checkpoint("c", Checkpoint(class_names=(), parts={"CellModel": part}, model="CellModel", code="z"))
+    save_checkpoint(
+        "c",
+        Checkpoint(
+            class_names=(), parts={"CellModel": part}, model="CellModel", code="z"
+        ),
+    )
     given = {"model": "own.py:CellModel@c"}
 
     def parts() -> dict[str, str]:
         return describe_parts(condition(planners="mppi", **given))["parts"]
 
     first = parts()
-    assert set(first) == {"model own.py:CellModel@c", "class of model own.py:CellModel@c"}
+    assert set(first) == {
+        "model own.py:CellModel@c",
+        "class of model own.py:CellModel@c",
+    }
     Path("own.py").write_text(example.read_text() + "\nMORE = 1\n")
     second = parts()
-    assert {name for name in first if first[name] != second[name]} == {"class of model own.py:CellModel@c"}
+    assert {name for name in first if first[name] != second[name]} == {
+        "class of model own.py:CellModel@c"
+    }
     save_checkpoint(
-        "c", Checkpoint(class_names=("a",), parts={"CellModel": part}, model="CellModel", code="z")
+        "c",
+        Checkpoint(
+            class_names=("a",), parts={"CellModel": part}, model="CellModel", code="z"
+        ),
     )
-    assert {name for name in first if parts()[name] != second[name]} == {"model own.py:CellModel@c"}
+    assert {name for name in first if parts()[name] != second[name]} == {
+        "model own.py:CellModel@c"
+    }
 
 
 @pytest.mark.parametrize("name", ["./payload.py:Family", "payload:Family"])

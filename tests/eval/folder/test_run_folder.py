@@ -13,11 +13,16 @@ def rows(**changes: list[object]) -> pd.DataFrame:
     return pd.DataFrame(columns | changes)
 
 
-def told(one: pd.DataFrame, other: pd.DataFrame) -> dict[tuple[object, ...], tuple[object, object]]:
+def told(
+    one: pd.DataFrame, other: pd.DataFrame
+) -> dict[tuple[object, ...], tuple[object, object]]:
     """What each cell that differs holds in two tables, by episode and column."""
     cells, lacking = differences(one, other)
     assert lacking.empty
-    return {place: tuple(values) for place, values in zip(cells.index, cells.to_numpy(), strict=True)}
+    return {
+        place: tuple(values)
+        for place, values in zip(cells.index, cells.to_numpy(), strict=True)
+    }
 
 
 def test_the_same_rows_in_another_order_are_the_same() -> None:
@@ -38,7 +43,10 @@ def test_a_value_that_is_missing_on_one_side_is_a_difference() -> None:
 
 
 def test_every_column_of_a_row_that_differs_is_named() -> None:
-    found = told(rows(), rows(outcome=["success", "timeout", "stuck"], total_time_s=[1.0, 40.0, 40.0]))
+    found = told(
+        rows(),
+        rows(outcome=["success", "timeout", "stuck"], total_time_s=[1.0, 40.0, 40.0]),
+    )
     assert found == {
         ("b", 0, 0, 4, "outcome"): ("success", "stuck"),
         ("b", 0, 0, 4, "total_time_s"): (3.0, 40.0),
@@ -53,5 +61,7 @@ def test_episodes_that_one_table_lacks_are_differences() -> None:
 
 
 def test_columns_of_one_table_alone_are_told_and_not_compared() -> None:
-    assert differing_columns(rows(), rows(rejected_draws=[0, 0, 0])) == ["rejected_draws"]
+    assert differing_columns(rows(), rows(rejected_draws=[0, 0, 0])) == [
+        "rejected_draws"
+    ]
     assert told(rows(), rows(rejected_draws=[0, 0, 0])) == {}

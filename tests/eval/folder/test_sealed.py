@@ -8,7 +8,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from benchnav.eval.folder.sealed import DamageError, content_digest, metadata, read_sealed, with_metadata
+from benchnav.eval.folder.sealed import (
+    DamageError,
+    content_digest,
+    metadata,
+    read_sealed,
+    with_metadata,
+)
 
 TABLE = pa.table(
     {
@@ -48,7 +54,9 @@ def test_every_bit_counts_or_makes_no_difference(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "other",
     [
-        TABLE.set_column(0, "x_m", pa.array([0.5, np.nan, 0.0], pa.float32())),  # the sign of zero
+        TABLE.set_column(
+            0, "x_m", pa.array([0.5, np.nan, 0.0], pa.float32())
+        ),  # the sign of zero
         TABLE.set_column(0, "x_m", pa.array([0.5, np.nan, -0.0], pa.float64())),
         TABLE.rename_columns(["y_m", *TABLE.column_names[1:]]),
         TABLE.set_column(3, "error", pa.array(["f", "ault", "–"])),
@@ -64,7 +72,9 @@ def test_another_table_has_another_digest(other: pa.Table) -> None:
 def test_the_order_of_columns_and_those_without_a_value_do_not_count() -> None:
     """As when steps get the columns of another robot's actions."""
     missing = pa.array(np.full(3, np.nan, np.float32))
-    wider = TABLE.select(TABLE.column_names[::-1]).append_column("steering_rad", missing)
+    wider = TABLE.select(TABLE.column_names[::-1]).append_column(
+        "steering_rad", missing
+    )
     assert content_digest(wider) == content_digest(TABLE)
 
 

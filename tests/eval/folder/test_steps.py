@@ -23,11 +23,19 @@ from benchnav.eval.run.runner import run_suite
 from tests.edits import edit_table
 from tests.eval.run.test_rows import made, unit
 
-PLANNERS: tuple[Any, ...] = ({"part": "tests.eval.parts:Faulty", "label": "slow"}, "straight")
+PLANNERS: tuple[Any, ...] = (
+    {"part": "tests.eval.parts:Faulty", "label": "slow"},
+    "straight",
+)
 
 
 def run(dataset: Path, folder: Path, **changes: Any) -> Path:
-    given = {"planners": PLANNERS, "risks": ("mean", "cvar"), "maps": 2, "seeds": (0, 5)}
+    given = {
+        "planners": PLANNERS,
+        "risks": ("mean", "cvar"),
+        "maps": 2,
+        "seeds": (0, 5),
+    }
     given |= {"record": "steps"} | changes
     suite = Suite(
         data=str(dataset), scenarios=("std",), model="oracle", world={"noise": "stored", "time_budget_s": 4.0},
@@ -64,16 +72,18 @@ def test_one_episode_is_read_with_filters_by_any_reader(folder: Path) -> None:
     for condition in rows["condition"].unique():
         filters = [("condition", "==", condition), ("map", "==", 1), ("seed", "==", 5)]
         steps = pd.read_parquet(folder / "steps", filters=filters)
-        (row,) = rows[(rows["condition"] == condition) & (rows["map"] == 1) & (rows["seed"] == 5)].to_dict(
-            "records"
-        )
+        (row,) = rows[
+            (rows["condition"] == condition) & (rows["map"] == 1) & (rows["seed"] == 5)
+        ].to_dict("records")
         assert set(steps["condition"]) == {condition}
         assert steps["time_s"].max() == pytest.approx(row["end_time_s"])
-        assert np.nanmean(steps["traversability"].to_numpy(np.float64)) == pytest.approx(
-            row["traversability"]
-        )
+        assert np.nanmean(
+            steps["traversability"].to_numpy(np.float64)
+        ) == pytest.approx(row["traversability"])
         ours = read_steps(folder, condition=condition, map=1, seed=5)
-        pd.testing.assert_frame_equal(ours[steps.columns.drop("condition")], steps.drop(columns="condition"))
+        pd.testing.assert_frame_equal(
+            ours[steps.columns.drop("condition")], steps.drop(columns="condition")
+        )
         assert ours["condition"].tolist() == [condition] * len(ours)
 
 
@@ -88,17 +98,27 @@ def test_steps_are_found_by_what_tables_call_their_conditions(folder: Path) -> N
         named["slow", "cvar"], named["straight", "–"]
     }  # fmt: skip
     assert len(read_steps(folder, planner="slow", risk="–")) == 0
-    assert set(read_steps(folder, condition=named["slow", "mean"], risk="mean")["condition"]) == {
-        named["slow", "mean"]
-    }
+    assert set(
+        read_steps(folder, condition=named["slow", "mean"], risk="mean")["condition"]
+    ) == {named["slow", "mean"]}
     assert len(read_steps(folder, condition=named["slow", "mean"], risk="cvar")) == 0
-    with pytest.raises(ConfigError, match=r"Expected filters among .*map.* got 'instanse'"):
+    with pytest.raises(
+        ConfigError, match=r"Expected filters among .*map.* got 'instanse'"
+    ):
         read_steps(folder, instanse=1)
 
 
-def test_robots_of_other_actions_share_the_columns(dataset_path: Path, tmp_path: Path) -> None:
+def test_robots_of_other_actions_share_the_columns(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     """Also where a run is extended by them; readers take the columns of the first file."""
-    place = run(dataset_path, tmp_path / "run", planners=PLANNERS[:1], risks=("mean",), seeds=(0,))
+    place = run(
+        dataset_path,
+        tmp_path / "run",
+        planners=PLANNERS[:1],
+        risks=("mean",),
+        seeds=(0,),
+    )
     run(
         dataset_path, place, risks=("mean",), seeds=(0,), robots=("bicycle",),
         planners=({"part": "mppi", "options": {"samples": 4, "horizon_s": 0.3}},),
@@ -113,7 +133,9 @@ def test_robots_of_other_actions_share_the_columns(dataset_path: Path, tmp_path:
         assert own["speed_mps"].notna().any()
 
 
-def test_a_run_that_keeps_rows_alone_has_no_steps(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_run_that_keeps_rows_alone_has_no_steps(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     none = run(dataset_path, tmp_path / "none", record="none")
     assert not (none / "steps").exists()
     with pytest.raises(ConfigError, match="--record steps"):
@@ -126,13 +148,16 @@ def test_files_that_agree_are_left_alone(folder: Path, dataset_path: Path) -> No
     suite = Suite(data=str(dataset_path), model="oracle", planners=PLANNERS, risks=("mean", "cvar"),
                   world={"noise": "stored", "time_budget_s": 4.0})  # fmt: skip
     conditions = {
-        t.id: (t, Extent.product((0, 5), 1, 2)) for t in conditions_of(suite, lambda data: ("std",))
+        t.id: (t, Extent.product((0, 5), 1, 2))
+        for t in conditions_of(suite, lambda data: ("std",))
     }
     align_steps(folder, units(conditions))
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
-def test_a_file_that_was_cut_short_is_named_when_the_run_is_finished(folder: Path, tmp_path: Path) -> None:
+def test_a_file_that_was_cut_short_is_named_when_the_run_is_finished(
+    folder: Path, tmp_path: Path
+) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "run"))
     path = next(copy.glob("steps/*/*"))
     path.write_bytes(path.read_bytes()[:200])
@@ -150,10 +175,15 @@ def test_an_episode_that_ended_at_once_has_its_one_state() -> None:
 
 
 @pytest.mark.parametrize("count", [20, pytest.param(300, marks=pytest.mark.slow)])
-def test_edited_steps_are_read_or_refused_in_one_line(count: int, folder: Path, tmp_path: Path) -> None:
+def test_edited_steps_are_read_or_refused_in_one_line(
+    count: int, folder: Path, tmp_path: Path
+) -> None:
     rows, said = read_table(folder, EPISODES), []
     for seed in range(count):
-        chance, place = random.Random(seed), Path(shutil.copytree(folder, tmp_path / "run"))
+        chance, place = (
+            random.Random(seed),
+            Path(shutil.copytree(folder, tmp_path / "run")),
+        )
         edit_table(chance.choice(sorted(place.glob("steps/*/*.parquet"))), chance)
         try:
             read_steps(place)

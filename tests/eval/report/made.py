@@ -18,23 +18,50 @@ from benchnav.metrics import SHIPPED
 
 PAPER = {
     "world": {"noise": "resampled", "time_budget_s": 100.0},
-    "rules": {"free_space": {"by": "risk", "above": 0.3}, "min_traversability": 0.3, "goal_radius_m": 1.0},
+    "rules": {
+        "free_space": {"by": "risk", "above": 0.3},
+        "min_traversability": 0.3,
+        "goal_radius_m": 1.0,
+    },
 }
 
 
-def condition(planner: str = "mppi", risk: str = "cvar", **labels: str) -> dict[str, str]:
+def condition(
+    planner: str = "mppi", risk: str = "cvar", **labels: str
+) -> dict[str, str]:
     """Labels of a condition."""
-    same = {"data": "paper-v1", "scenario": "std", "world": "paper", "robot": "unicycle"}
+    same = {
+        "data": "paper-v1",
+        "scenario": "std",
+        "world": "paper",
+        "robot": "unicycle",
+    }
     given = (
-        same | {"objective": "goal_distance", "model": "paper-v1", "planner": planner, "risk": risk} | labels
+        same
+        | {
+            "objective": "goal_distance",
+            "model": "paper-v1",
+            "planner": planner,
+            "risk": risk,
+        }
+        | labels
     )
-    unused = {"sensor": given["model"] == "–", "ground": True, "belief": given["risk"] == "–"}
+    unused = {
+        "sensor": given["model"] == "–",
+        "ground": True,
+        "belief": given["risk"] == "–",
+    }
     defaults = {"sensor": "full", "ground": "contact", "belief": "static"}
-    return {name: "–" if unused[name] else default for name, default in defaults.items()} | given
+    return {
+        name: "–" if unused[name] else default for name, default in defaults.items()
+    } | given
 
 
 def row(
-    labels: dict[str, str], map_index: int = 0, time_s: float | None = 30.0, **changes: Any
+    labels: dict[str, str],
+    map_index: int = 0,
+    time_s: float | None = 30.0,
+    **changes: Any,
 ) -> dict[str, Any]:
     """An episode; a time of None is a timeout."""
     success = time_s is not None
@@ -56,22 +83,36 @@ def row(
 
 def rows(*episodes: dict[str, Any] | Iterable[dict[str, Any]]) -> pd.DataFrame:
     """A table of episodes."""
-    flat = [e for group in episodes for e in ([group] if isinstance(group, dict) else group)]
+    flat = [
+        e for group in episodes for e in ([group] if isinstance(group, dict) else group)
+    ]
     return pd.DataFrame(flat)
 
 
-def conditions(episodes: pd.DataFrame, **notes: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def conditions(
+    episodes: pd.DataFrame, **notes: dict[str, Any]
+) -> dict[str, dict[str, Any]]:
     """What `run.json` says of the conditions; `follows` and `remarks` by planner."""
     return {
-        name: {"value": PAPER | _parts(group), "labels": {label: group[label].iloc[0] for label in LABELS}}
-        | {"follows": "", "remarks": [], "changed": [], "seeds": sorted(set(group["seed"].tolist()))}
+        name: {
+            "value": PAPER | _parts(group),
+            "labels": {label: group[label].iloc[0] for label in LABELS},
+        }
+        | {
+            "follows": "",
+            "remarks": [],
+            "changed": [],
+            "seeds": sorted(set(group["seed"].tolist())),
+        }
         | notes.get(group["planner"].iloc[0], {})
         for name, group in episodes.groupby("condition", sort=False)
     }
 
 
 def _parts(rows: pd.DataFrame) -> dict[str, Any]:
-    """Model, planner and risk by their labels; of planners that look at nothing, the stand-in."""
+    """Model, planner and risk by their labels; of planners that look at nothing, the
+    stand-in.
+    """
     labels = rows[["model", "planner", "risk"]].iloc[0].to_dict()
     if labels["model"] == "–":
         labels["model"] = "oracle"
@@ -88,7 +129,9 @@ def bold_cells(table: Table) -> set[tuple[int, int]]:
     }
 
 
-def summarised(episodes: pd.DataFrame, world: dict[str, Any] = PAPER["world"]) -> pd.DataFrame:
+def summarised(
+    episodes: pd.DataFrame, world: dict[str, Any] = PAPER["world"]
+) -> pd.DataFrame:
     """A row a condition, all of one world."""
     return summarise(episodes, dict.fromkeys(episodes["condition"].unique(), world))
 
@@ -96,25 +139,39 @@ def summarised(episodes: pd.DataFrame, world: dict[str, Any] = PAPER["world"]) -
 def summary(episodes: pd.DataFrame) -> pd.DataFrame:
     """What a report makes of rows."""
     table = summarised(episodes)
-    return table.merge(against_best(episodes, table, privileged_models(conditions(episodes))), on="condition")
+    return table.merge(
+        against_best(episodes, table, privileged_models(conditions(episodes))),
+        on="condition",
+    )
 
 
 def run_data(summary: pd.DataFrame | None = None, **more: Any) -> RunData:
     """What figures are drawn from."""
     nothing = pd.DataFrame()
-    given = {"about": {}, "summary": nothing if summary is None else summary, "episodes": nothing}
+    given = {
+        "about": {},
+        "summary": nothing if summary is None else summary,
+        "episodes": nothing,
+    }
     return RunData(**(given | more))
 
 
 def recording(
-    steps: int = 200, dt_s: float = 0.1, labels: dict[str, str] | None = None, **changes: Any
+    steps: int = 200,
+    dt_s: float = 0.1,
+    labels: dict[str, str] | None = None,
+    **changes: Any,
 ) -> Recording:
-    """An episode on a map that is not square, of a robot with five states and two actions."""
+    """An episode on a map that is not square, of a robot with five states and two
+    actions.
+    """
     labels = labels or condition()
     generator = np.random.default_rng(3)
     x = 2 + np.arange(steps + 1) * dt_s
     states = np.stack((x, 3 + 0.5 * x, np.full(steps + 1, 0.46)), axis=1)
-    states = np.concatenate((states, np.zeros((steps + 1, 2))), axis=1).astype(np.float32)
+    states = np.concatenate((states, np.zeros((steps + 1, 2))), axis=1).astype(
+        np.float32
+    )
     predicted = generator.random((40, 60)).astype(np.float32) ** 0.5
     made: dict[str, Any] = {
         "about": {"condition": "t", **labels, "seed": "0", "realisation": "0", "map": "4", "outcome": "success"},
@@ -132,22 +189,40 @@ def recording(
 
 
 def held_recording(steps: int = 80, **changes: Any) -> Recording:
-    """An episode on λ that stays, of a robot that was immobilised; no map of it is like another's mirror."""
+    """An episode on λ that stays, of a robot that was immobilised; no map of it is like
+    another's mirror.
+    """
     generator = np.random.default_rng(4)
     field = generator.random((40, 60)).astype(np.float32)
-    about = {"condition": "t", **condition(world="stakes"), "seed": "0", "realisation": "0", "map": "4"}
-    ground = {"field": field, "soft": generator.random((40, 60)) < 0.2, "immobilising": field < 0.15}
-    return recording(steps, **({"about": about | {"outcome": "immobilised"}} | ground | changes))
+    about = {
+        "condition": "t",
+        **condition(world="stakes"),
+        "seed": "0",
+        "realisation": "0",
+        "map": "4",
+    }
+    ground = {
+        "field": field,
+        "soft": generator.random((40, 60)) < 0.2,
+        "immobilising": field < 0.15,
+    }
+    return recording(
+        steps, **({"about": about | {"outcome": "immobilised"}} | ground | changes)
+    )
 
 
 def learning_recording(steps: int = 80, every: int = 5, **changes: Any) -> Recording:
-    """An episode of a robot that learns twice a second: it sees 6 m and senses λ within 2 m."""
+    """An episode of a robot that learns twice a second: it sees 6 m and senses λ within
+    2 m.
+    """
     recording = held_recording(steps, **changes)
     return replace(recording, known=known_maps(recording, range(0, steps + 1, every)))
 
 
 def known_maps(recording: Recording, steps: Iterable[int]) -> tuple[KnownMap, ...]:
-    """What a robot knows that believes in the field where it sensed it, and knows little elsewhere."""
+    """What a robot knows that believes in the field where it sensed it, and knows
+    little elsewhere.
+    """
     rows, columns = np.mgrid[:40, :60]
     known, seen, sensed = [], np.zeros((40, 60), bool), np.zeros((40, 60), bool)
     assert recording.field is not None
@@ -167,9 +242,15 @@ def known_maps(recording: Recording, steps: Iterable[int]) -> tuple[KnownMap, ..
 
 
 def plan(step: int, state: np.ndarray) -> Any:
-    """A plan of 20 points ahead, with a reference that has two unused ones, and three samples."""
-    ahead = torch.tensor(state[:2]) + torch.linspace(0, 4, 20)[:, None] * torch.tensor([0.9, 0.45])
+    """A plan of 20 points ahead, with a reference that has two unused ones, and three
+    samples.
+    """
+    ahead = torch.tensor(state[:2]) + torch.linspace(0, 4, 20)[:, None] * torch.tensor(
+        [0.9, 0.45]
+    )
     reference = torch.cat((ahead, torch.full((2, 2), torch.nan)))
-    spread = torch.stack([ahead + torch.linspace(0, 1, 20)[:, None] * k for k in (-1.0, 0.5, 1.0)])
+    spread = torch.stack(
+        [ahead + torch.linspace(0, 1, 20)[:, None] * k for k in (-1.0, 0.5, 1.0)]
+    )
     layers = {"path": ahead[None], "samples": spread, "reference": reference[None]}
     return drawn_plan(step, layers | {"tree": torch.empty(0, 0, 2)})

@@ -68,7 +68,10 @@ def test_an_extension_after_the_hypotheses_is_told() -> None:
         ({"kind": "superiority", "supported": False}, "superiority not shown"),
         ({"kind": "difference", "direction": ""}, "significantly different"),
         ({"kind": "difference", "direction": "lower"}, "significantly lower"),
-        ({"kind": "difference", "direction": "lower", "supported": False}, "not significantly lower"),
+        (
+            {"kind": "difference", "direction": "lower", "supported": False},
+            "not significantly lower",
+        ),
     ],
 )
 def test_a_verdict_is_that_of_its_kind(changes: dict[str, Any], words: str) -> None:
@@ -77,59 +80,105 @@ def test_a_verdict_is_that_of_its_kind(changes: dict[str, Any], words: str) -> N
     assert bool(made.bold_cells(table)) == (changes.get("supported", True))
 
 
-def test_a_difference_of_time_says_that_its_interval_and_its_p_are_of_two_kinds() -> None:
-    for test, said in ((a_test(kind="difference"), True), (a_test(), False), (a_test(**OTHER), False)):
+def test_a_difference_of_time_says_that_its_interval_and_its_p_are_of_two_kinds() -> (
+    None
+):
+    for test, said in (
+        (a_test(kind="difference"), True),
+        (a_test(), False),
+        (a_test(**OTHER), False),
+    ):
         explained = hypothesis_table(pd.DataFrame([test]), "map").explained
-        assert any("where the interval holds 0" in text for _, text in explained) == said
+        assert (
+            any("where the interval holds 0" in text for _, text in explained) == said
+        )
 
 
 def test_a_forest_has_a_panel_a_metric_with_points_intervals_and_margins() -> None:
     rows = [
         a_test(),
         a_test(**OTHER),
-        a_test(supported=False, difference=2.0, kind="non-inferiority", direction="lower"),
+        a_test(
+            supported=False, difference=2.0, kind="non-inferiority", direction="lower"
+        ),
         a_test(supported=False, kind="superiority", direction="lower"),
         a_test(supported=False, kind="superiority", direction="higher"),
     ]
     success, time = Forest().draw(made.run_data(tests=pd.DataFrame(rows))).axes
-    assert [panel.get_xlabel() for panel in (success, time)] == ["Δ success [points]", "Δ T_total [s]"]
+    assert [panel.get_xlabel() for panel in (success, time)] == [
+        "Δ success [points]",
+        "Δ T_total [s]",
+    ]
     points = [line for line in time.lines if line.get_marker() == "o"]
     assert [float(point.get_xdata()[0]) for point in points] == [0.1, 2.0, 0.1, 0.1]
-    assert [point.get_markerfacecolor() == "white" for point in points] == [False, True, True, True]
-    spans = {tuple(map(float, line.get_xdata())) for line in time.lines if len(line.get_xdata()) == 2}
+    assert [point.get_markerfacecolor() == "white" for point in points] == [
+        False,
+        True,
+        True,
+        True,
+    ]
+    spans = {
+        tuple(map(float, line.get_xdata()))
+        for line in time.lines
+        if len(line.get_xdata()) == 2
+    }
     assert {(-0.25, 0.45), (-0.2, 0.4)} <= spans
     bands = [band.get_paths()[0].get_extents() for band in time.collections]
     assert (bands[0].x0, bands[0].x1) == (-0.5, 0.5)
-    assert bands[1].x0 == time.get_xlim()[0]  # of what is better the lower all below the margin is
+    assert (
+        bands[1].x0 == time.get_xlim()[0]
+    )  # of what is better the lower all below the margin is
     assert bands[1].x1 == 0.5
     assert (bands[2].x0, bands[2].x1) == (time.get_xlim()[0], -0.5)
     assert (bands[3].x0, bands[3].x1) == (0.5, time.get_xlim()[1])
     assert not success.collections
-    assert [label.get_text() for label in success.get_yticklabels()] == ["2. CVaR\n− mean"]
-    assert [label.get_text().split(".")[0] for label in time.get_yticklabels()] == ["1", "3", "4", "5"]
+    assert [label.get_text() for label in success.get_yticklabels()] == [
+        "2. CVaR\n− mean"
+    ]
+    assert [label.get_text().split(".")[0] for label in time.get_yticklabels()] == [
+        "1",
+        "3",
+        "4",
+        "5",
+    ]
 
 
 def test_a_forest_is_drawn_where_no_episode_tells_anything() -> None:
     nothing = dict.fromkeys(("difference", "low", "high", "low_90", "high_90"), np.nan)
     (panel,) = (
         Forest()
-        .draw(made.run_data(tests=pd.DataFrame([a_test(kind="difference", margin=0.0, **nothing)])))
+        .draw(
+            made.run_data(
+                tests=pd.DataFrame([a_test(kind="difference", margin=0.0, **nothing)])
+            )
+        )
         .axes
     )
     assert np.isfinite(panel.get_xlim()).all()
 
 
-def test_a_report_tests_them_first_and_heads_the_rest_exploratory(tmp_path: Path) -> None:
+def test_a_report_tests_them_first_and_heads_the_rest_exploratory(
+    tmp_path: Path,
+) -> None:
     rows = made.rows(
-        made.row(made.condition(risk=risk), i, 30.0 + i) for risk in ("mean", "cvar") for i in range(8)
+        made.row(made.condition(risk=risk), i, 30.0 + i)
+        for risk in ("mean", "cvar")
+        for i in range(8)
     )
     one, other = rows["condition"].unique()[::-1]
     plain = {name: a_test(one=one, other=other, margin=5.0)[name] for name in
              ("one", "other", "names", "metric", "kind", "direction", "margin", "claim")}  # fmt: skip
-    hypotheses = {"tests": [plain], "digest": digest_of_tests([plain]), "episodes": {one: 8, other: 8}}
+    hypotheses = {
+        "tests": [plain],
+        "digest": digest_of_tests([plain]),
+        "episodes": {one: 8, other: 8},
+    }
     folder = run_folder(tmp_path / "run", rows, hypotheses=hypotheses)
     report = write_report(folder)
-    assert [title.split(",")[0] for title in report.findings] == ["Hypotheses", "Exploratory: std"]
+    assert [title.split(",")[0] for title in report.findings] == [
+        "Hypotheses",
+        "Exploratory: std",
+    ]
     assert report.tests["difference"].tolist() == [0]
     text = (folder / "summary.md").read_text()
     assert text.index("forest.png") < text.index("success.png")

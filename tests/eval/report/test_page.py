@@ -90,7 +90,9 @@ def test_the_table_has_its_cells_and_bold_where_it_belongs(page: Page) -> None:
     tags = [tag for tag, _ in page.tags]
     assert (tags.count("th"), tags.count("td")) == (2, 4)
     assert tags.count("button") == 2
-    assert [attributes["type"] for tag, attributes in page.tags if tag == "input"] == ["search"]
+    assert [attributes["type"] for tag, attributes in page.tags if tag == "input"] == [
+        "search"
+    ]
     cells = [place for place, tag in enumerate(tags) if tag == "td"]
     assert [tags[place + 1] == "b" for place in cells] == [False, False, False, True]
     assert page.text[page.text.index("Bold") + 1].endswith("the best")
@@ -110,7 +112,9 @@ def test_hypotheses_are_a_table_of_their_own(tmp_path: Path) -> None:
     report = read_report(folder)
     assert len(tables(report)) == 1
     tests = pd.DataFrame({"one": [1]})
-    own = Table(headings=("hypothesis", "p"), rows=(("a beats b", "0.01"),), notes=("Holm.",))
+    own = Table(
+        headings=("hypothesis", "p"), rows=(("a beats b", "0.01"),), notes=("Holm.",)
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Report, "hypotheses", own)
         first, second = tables(replace(report, tests=tests))
@@ -124,12 +128,19 @@ def tables(report: Report) -> list[list[list[str]]]:
     found = re.findall(r"<table>(.*?)</table>", page, re.DOTALL)
     rows = [re.findall(r"<tr>(.*?)</tr>", table, re.DOTALL) for table in found]
     return [
-        [[re.sub("<[^>]*>", "", cell) for cell in re.findall(r"<t[hd][ >].*?</t[hd]>", row)] for row in table]
+        [
+            [
+                re.sub("<[^>]*>", "", cell)
+                for cell in re.findall(r"<t[hd][ >].*?</t[hd]>", row)
+            ]
+            for row in table
+        ]
         for table in rows
     ]
 
 
-# Clicks on the headings and words in the filter, one after the other; then what is shown, and how it is sorted.
+# Clicks on the headings and words in the filter, one after the other; then what is
+# shown, and how it is sorted.
 _USES = (
     ("", "", "b a c d", ""),
     ("Succ.", "", "c a b d", "ascending"),
@@ -143,14 +154,18 @@ _USES = (
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="needs a browser")
-def test_a_browser_sorts_and_filters_the_table_and_a_phone_shows_all_of_its_width(tmp_path: Path) -> None:
+def test_a_browser_sorts_and_filters_the_table_and_a_phone_shows_all_of_its_width(
+    tmp_path: Path,
+) -> None:
     rows = (
         ("b", "10.5 (9–12)", "CVaR₀.₅"),
         ("a", "≤ 9", "CVaR₀.₉"),
         ("c", "−2", "CVaR₀.₉₂"),
         ("d", "–", "chance"),
     )
-    report = replace(read_report(run_folder(tmp_path / "run", episodes())), name="x" * 200)
+    report = replace(
+        read_report(run_folder(tmp_path / "run", episodes())), name="x" * 200
+    )
     table = Table(headings=("planner", "Succ.", "risk"), rows=rows)
     page = render("report.html", replace(report, table=table), {})
     script = """
@@ -188,6 +203,8 @@ def test_a_browser_sorts_and_filters_the_table_and_a_phone_shows_all_of_its_widt
         ["chromium", *(f"--{name}" for name in options), (tmp_path / "phone.html").as_uri()],
         capture_output=True, text=True, check=True, timeout=120,
     ).stdout  # fmt: skip
-    said, fits = json.loads(html.unescape(shown.partition("<pre>")[2].partition("</pre>")[0]))
+    said, fits = json.loads(
+        html.unescape(shown.partition("<pre>")[2].partition("</pre>")[0])
+    )
     assert said == [[rows, order] for _, _, rows, order in _USES]
     assert fits

@@ -28,20 +28,29 @@ def episodes() -> pd.DataFrame:
             for i in range(2)
             for s in (0, 7)
         ),
-        (made.row(blind, i, None, seed=s, outcome="stuck") for i in range(2) for s in (0, 7)),
+        (
+            made.row(blind, i, None, seed=s, outcome="stuck")
+            for i in range(2)
+            for s in (0, 7)
+        ),
     )
 
 
 def draws(rows: pd.DataFrame) -> list[list[int]]:
     """How often a condition was run, as `run.json` says it."""
     counted = rows.groupby(["seed", "realisation"], sort=False)["map"].nunique()
-    return [[seed, realisation, count] for (seed, realisation), count in counted.items()]
+    return [
+        [seed, realisation, count] for (seed, realisation), count in counted.items()
+    ]
 
 
 def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
-    """A run folder with what a report reads of it; parts of the conditions stand in for any."""
+    """A run folder with what a report reads of it; parts of the conditions stand in for
+    any.
+    """
     parts = {
-        kind: {"part": kind, "options": {}} for kind in ("model", "risk", "planner", "robot", "objective")
+        kind: {"part": kind, "options": {}}
+        for kind in ("model", "risk", "planner", "robot", "objective")
     }
     known = made.conditions(rows, cl_rrt={"follows": "its own time"})
     known = {
@@ -113,7 +122,8 @@ def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run", rows)
     for name, group in rows.groupby("condition", sort=False):
         labels = {
-            label: group[label].iloc[0] for label in ("planner", "risk", "scenario", "model", "data", "world")
+            label: group[label].iloc[0]
+            for label in ("planner", "risk", "scenario", "model", "data", "world")
         }
         about = {
             "condition": str(name),
@@ -123,7 +133,9 @@ def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
             "realisation": "0",
             "outcome": "stuck",
         }
-        made.recording(20, about=about).save(folder / "playback" / f"{labels['planner']}.npz")
+        made.recording(20, about=about).save(
+            folder / "playback" / f"{labels['planner']}.npz"
+        )
     write_report(folder)
     assert (folder / "figures" / "trajectories.png").stat().st_size > 10_000
     text = (folder / "summary.md").read_text()
@@ -133,7 +145,8 @@ def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
 
 def test_a_figure_with_λ_as_it_was_says_so(tmp_path: Path) -> None:
     rows = made.rows(
-        made.row(made.condition(world="stakes"), i, None, outcome="immobilised") for i in range(5)
+        made.row(made.condition(world="stakes"), i, None, outcome="immobilised")
+        for i in range(5)
     )
     folder = run_folder(tmp_path / "run", rows)
     about = {**made.held_recording().about, "condition": rows["condition"][0]}
@@ -145,10 +158,15 @@ def test_a_figure_with_λ_as_it_was_says_so(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("outcome", ["planner_error", "model_error"])
 def test_tracebacks_are_pointed_at(outcome: str, tmp_path: Path) -> None:
-    rows = made.rows(made.row(made.condition(), 0), made.row(made.condition(), 1, None, outcome=outcome))
+    rows = made.rows(
+        made.row(made.condition(), 0),
+        made.row(made.condition(), 1, None, outcome=outcome),
+    )
     folder = run_folder(tmp_path / "run", rows)
     warning = read_report(folder).warnings[0]
-    assert warning.startswith("warning: a planner, model, sensor or belief failed in 1 episode; see ")
+    assert warning.startswith(
+        "warning: a planner, model, sensor or belief failed in 1 episode; see "
+    )
     assert str(folder / "errors.txt") in warning
     write_report(folder)
     assert warning in (folder / "summary.md").read_text()
@@ -179,17 +197,24 @@ def test_an_unfinished_run_and_no_run_are_refused(tmp_path: Path) -> None:
         write_report(tmp_path)
 
 
-def test_the_share_of_lambda_drawn_again_is_that_of_frozen_worlds_whatever_failed(tmp_path: Path) -> None:
-    """Two conditions met the same three draws, of which one was the third; one of a resampled world met none."""
+def test_the_share_of_lambda_drawn_again_is_that_of_frozen_worlds_whatever_failed(
+    tmp_path: Path,
+) -> None:
+    """Two conditions met the same three draws, of which one was the third; one of a
+    resampled world met none.
+    """
     worlds = {"a": "frozen", "b": "frozen", "c": "resampled"}
-    conditions = {name: {"value": {"world": {"noise": noise}}} for name, noise in worlds.items()}
+    conditions = {
+        name: {"value": {"world": {"noise": noise}}} for name, noise in worlds.items()
+    }
     rows = pd.DataFrame(
         {
             "condition": ["a"] * 2 + ["b"] * 2 + ["c"] * 2,
             "data": "d", "scenario": "std", "seed": 0, "realisation": 0,
             "world": ["stakes"] * 4 + ["paper"] * 2,
             "map": [0, 1] * 3,
-            "rejected_draws": [0, 0, 2, 0, 0, 0],  # the model of the first failed: it drew nothing
+            # the model of the first failed: it drew nothing
+            "rejected_draws": [0, 0, 2, 0, 0, 0],
         }
     )  # fmt: skip
     (line,) = write._rejected_draws(rows, conditions)
@@ -199,7 +224,9 @@ def test_the_share_of_lambda_drawn_again_is_that_of_frozen_worlds_whatever_faile
 
 def test_a_sweep_has_its_figure(tmp_path: Path) -> None:
     rows = made.rows(
-        made.row(made.condition(risk=f"cvar:{level}"), i) for level in (0.5, 0.8, 0.9) for i in range(2)
+        made.row(made.condition(risk=f"cvar:{level}"), i)
+        for level in (0.5, 0.8, 0.9)
+        for i in range(2)
     )
     folder = run_folder(tmp_path / "run", rows)
     about = json.loads((folder / "run.json").read_text())
@@ -209,15 +236,22 @@ def test_a_sweep_has_its_figure(tmp_path: Path) -> None:
     write_run(folder, about)
     write_report(folder)
     assert (folder / "figures" / "over-level.pdf").stat().st_size > 1000
-    assert "![over-level](figures/over-level.png)" in (folder / "summary.md").read_text()
+    assert (
+        "![over-level](figures/over-level.png)" in (folder / "summary.md").read_text()
+    )
 
 
 def test_provenance_of_a_run() -> None:
     about = {
-        "history": [{"commit": "old", "benchnav": "0"}, {"commit": "abc", "benchnav": "1.2"}],
+        "history": [
+            {"commit": "old", "benchnav": "0"},
+            {"commit": "abc", "benchnav": "1.2"},
+        ],
         "codes": {
             "a": code_with(parts={"model m": "1f"}),
-            "b": code_with(parts={"risk r.py:f": "9e"}, environment={"compiles": False}),
+            "b": code_with(
+                parts={"risk r.py:f": "9e"}, environment={"compiles": False}
+            ),
         },
         "machine": {"processor": "x86_64", "cores": 2},
         "datasets": {"paper-v1": {"id": "paper-v1", "maps": {"test/std": ["d"] * 20}}},

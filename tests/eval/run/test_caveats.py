@@ -1,4 +1,6 @@
-"""What readers of a run's tables should know: pairs that were left out, and what was warned of."""
+"""What readers of a run's tables should know: pairs that were left out, and what was
+warned of.
+"""
 
 import json
 from collections.abc import Callable
@@ -29,9 +31,7 @@ FREE, STEERING = "tests.eval.parts:Faulty", "tests.eval.parts:Steering"
 TWO_MODES = "tests.eval.parts:TwoModes"
 HAZARD = {"part": "optimal", "label": "careful", "options": {"hazard": True}}
 LINE = "left out: planner Steering, robot bicycle: Expected a robot with actions"
-WARNING = (
-    "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within the time budget T"
-)
+WARNING = "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within the time budget T"
 
 
 def suite_on(dataset: Path, **changes: Any) -> Suite:
@@ -49,15 +49,24 @@ def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
     said: list[str] = []
     folder = tmp_path / "run"
     list(run_suite(suite_on(dataset_path), folder, say=said.append))
-    assert all(any(line.startswith(known) for line in said) for known in (LINE, WARNING))
+    assert all(
+        any(line.startswith(known) for line in said) for known in (LINE, WARNING)
+    )
     run = open_run(folder)
     pairs = {
-        (condition.labels["planner"], condition.labels["robot"]) for condition, _ in run.conditions.values()
+        (condition.labels["planner"], condition.labels["robot"])
+        for condition, _ in run.conditions.values()
     }
-    assert pairs == {("Faulty", "unicycle"), ("Faulty", "bicycle"), ("Steering", "unicycle")}
+    assert pairs == {
+        ("Faulty", "unicycle"),
+        ("Faulty", "bicycle"),
+        ("Steering", "unicycle"),
+    }
     (dropped,) = run.about["dropped"]
     assert (dropped["planner"], dropped["robot"]) == ("Steering", "bicycle")
-    assert dropped["reason"].startswith("Expected a robot with actions (speed_mps, turn_rate_radps)")
+    assert dropped["reason"].startswith(
+        "Expected a robot with actions (speed_mps, turn_rate_radps)"
+    )
     assert run.about["warnings"].count(WARNING.removeprefix("warning: ")) == 1
     report = write_report(folder)
     print_report(report)
@@ -65,7 +74,10 @@ def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
     table = to_terminal(report.table).rstrip()
     below = printed.partition(table)[2]
     assert below
-    text, page = (folder / "summary.md").read_text(), (folder / "report.html").read_text()
+    text, page = (
+        (folder / "summary.md").read_text(),
+        (folder / "report.html").read_text(),
+    )
     for line in (LINE, WARNING):
         assert line not in table
         assert line in below
@@ -75,7 +87,9 @@ def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
     # The family of tests is that of the conditions that were run.
     compared, shown = compare_runs([folder], "", "mean", {}, 0.05)
     assert len(compared) == 3
-    assert all(any(line.startswith(known) for line in shown.notes) for known in (LINE, WARNING))
+    assert all(
+        any(line.startswith(known) for line in shown.notes) for known in (LINE, WARNING)
+    )
     _, shown = compare_runs([folder], "", "mean", {"robot": ["unicycle"]}, 0.05)
     assert WARNING in shown.notes
     assert not any(line.startswith(LINE) for line in shown.notes)
@@ -85,10 +99,15 @@ def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
     next(steps := rerun(folder, tmp_path / "again"))
     steps.close()
     again = open_run(tmp_path / "again").about
-    assert (again["dropped"], again["warnings"]) == ([dropped], open_run(folder).about["warnings"])
+    assert (again["dropped"], again["warnings"]) == (
+        [dropped],
+        open_run(folder).about["warnings"],
+    )
 
 
-def test_a_run_in_which_nothing_is_left_is_refused(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_run_in_which_nothing_is_left_is_refused(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     suite = suite_on(dataset_path, planners=(STEERING,), robots=("bicycle",))
     with pytest.raises(ConfigError, match="Expected a robot with actions"):
         list(run_suite(suite, tmp_path / "run"))
@@ -98,14 +117,22 @@ def test_a_run_in_which_nothing_is_left_is_refused(dataset_path: Path, tmp_path:
 def test_a_world_without_a_feasible_path_is_refused_before_anything_is_run(
     dataset_path: Path, tmp_path: Path
 ) -> None:
-    world = {"preset": "stakes", "immobile": {"below": 0.999, "for_s": 2}, "time_budget_s": 3.0}
+    world = {
+        "preset": "stakes",
+        "immobile": {"below": 0.999, "for_s": 2},
+        "time_budget_s": 3.0,
+    }
     suite = suite_on(dataset_path, planners=(FREE,), robots=("unicycle",), world=world)
-    with pytest.raises(ConfigError, match="Expected a feasible path from start to goal"):
+    with pytest.raises(
+        ConfigError, match="Expected a feasible path from start to goal"
+    ):
         list(run_suite(suite, tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
 
-def test_a_merged_run_says_what_its_shards_said(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_merged_run_says_what_its_shards_said(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     parts = [tmp_path / "1", tmp_path / "2"]
     for index, part in enumerate(parts, start=1):
         list(run_suite(suite_on(dataset_path), part, shard=Shard(index=index, of=2)))
@@ -113,7 +140,9 @@ def test_a_merged_run_says_what_its_shards_said(dataset_path: Path, tmp_path: Pa
     about = open_run(tmp_path / "all").about
     assert about["dropped"] == open_run(parts[0]).about["dropped"]
     assert about["warnings"] == open_run(parts[1]).about["warnings"]
-    assert json.dumps(about["history"]).count(str(dataset_path)) == len(about["history"])
+    assert json.dumps(about["history"]).count(str(dataset_path)) == len(
+        about["history"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -132,7 +161,12 @@ def test_a_suite_in_which_no_combination_can_be_run_is_refused_before_anything_i
     dataset_path: Path, tmp_path: Path, changes: dict[str, Any], words: str
 ) -> None:
     planner = changes.pop("planner")
-    suite = {"planners": (planner,), "robots": ("unicycle",), "risks": ("mean",), "world": "stakes"} | changes
+    suite = {
+        "planners": (planner,),
+        "robots": ("unicycle",),
+        "risks": ("mean",),
+        "world": "stakes",
+    } | changes
     with pytest.raises(ConfigError, match=words):
         list(run_suite(suite_on(dataset_path, **suite), tmp_path / "run"))
     assert not (tmp_path / "run").exists()
@@ -143,15 +177,22 @@ POSSIBLE: tuple[Callable[[dict[str, str]], bool], ...] = (
     lambda cell: not (cell["risk"] == "single-class" and cell["model"] == "TwoModes"),
     lambda cell: not (cell["risk"] == "single-class" and cell["belief"] == "copula"),
     lambda cell: (
-        not (cell["planner"] in ("optimal", "careful", "near_optimal") and cell["belief"] == "copula")
+        not (
+            cell["planner"] in ("optimal", "careful", "near_optimal")
+            and cell["belief"] == "copula"
+        )
     ),
-    lambda cell: not (cell["planner"] == "near_optimal" and cell["model"] != "clairvoyant"),
+    lambda cell: (
+        not (cell["planner"] == "near_optimal" and cell["model"] != "clairvoyant")
+    ),
     lambda cell: not (cell["planner"] == "careful" and cell["world"] == "paper"),
     lambda cell: not (cell["model"] == "clairvoyant" and cell["world"] == "paper"),
 )
 
 
-def test_of_a_product_exactly_the_combinations_that_can_be_run_are_left(dataset_path: Path) -> None:
+def test_of_a_product_exactly_the_combinations_that_can_be_run_are_left(
+    dataset_path: Path,
+) -> None:
     listed: dict[str, Any] = {
         "planners": (FREE, "straight", "optimal", HAZARD, "near_optimal"),
         "models": ("oracle", TWO_MODES, "clairvoyant"),
@@ -167,12 +208,17 @@ def test_of_a_product_exactly_the_combinations_that_can_be_run_are_left(dataset_
     assert left == expected
     assert 0 < len(left) < len(labels)
     # Each combination is named once, and its labels are in no condition that is left.
-    pairs = [{name: label for name, label in entry.items() if name != "reason"} for entry in checked.dropped]
+    pairs = [
+        {name: label for name, label in entry.items() if name != "reason"}
+        for entry in checked.dropped
+    ]
     assert len({tuple(pair.items()) for pair in pairs}) == len(pairs)
     for cell in labels:
         assert (cell in left) != any(pair.items() <= cell.items() for pair in pairs)
     assert {"model": "TwoModes", "risk": "single-class"} in pairs
-    assert all(set(pair) < {*columns, "sensor", "robot", "objective", "data"} for pair in pairs)
+    assert all(
+        set(pair) < {*columns, "sensor", "robot", "objective", "data"} for pair in pairs
+    )
 
 
 def test_what_is_left_out_is_told_before_anything_is_run_and_until_it_can_be_run(
@@ -198,9 +244,15 @@ def test_what_is_left_out_is_told_before_anything_is_run_and_until_it_can_be_run
     assert open_run(tmp_path / "run").about["dropped"] == []
 
 
-def test_a_planner_whose_settings_are_never_prepared_is_refused(dataset_path: Path) -> None:
-    """Its settings are at fault, where what drops out would be all that the suite has of it."""
-    suite = suite_on(dataset_path, planners=(FREE, HAZARD), robots=("unicycle",), world="paper")
+def test_a_planner_whose_settings_are_never_prepared_is_refused(
+    dataset_path: Path,
+) -> None:
+    """Its settings are at fault, where what drops out would be all that the suite has
+    of it.
+    """
+    suite = suite_on(
+        dataset_path, planners=(FREE, HAZARD), robots=("unicycle",), world="paper"
+    )
     with pytest.raises(ConfigError, match="immobilises robots for `hazard`"):
         check_suite(suite, elsewhere=False)
     left = check_suite(replace(suite, world=("paper", "stakes")), elsewhere=False)
@@ -217,7 +269,11 @@ def test_a_planner_whose_settings_are_never_prepared_is_refused(dataset_path: Pa
     ],
 )  # fmt: skip
 def test_a_hypothesis_on_what_is_left_out_is_refused(
-    dataset_path: Path, tmp_path: Path, one: dict[str, str], other: dict[str, str], words: str
+    dataset_path: Path,
+    tmp_path: Path,
+    one: dict[str, str],
+    other: dict[str, str],
+    words: str,
 ) -> None:
     suite = suite_on(
         dataset_path, planners=(FREE,), robots=("unicycle",), models=("oracle", TWO_MODES),
@@ -231,22 +287,48 @@ def test_a_hypothesis_on_what_is_left_out_is_refused(
 
 
 @pytest.mark.parametrize("once", [False, True])
-def test_risk_on_the_cost_is_run_by_its_options(dataset_path: Path, tmp_path: Path, once: bool) -> None:
-    options = {"samples": 32, "horizon_s": 1.0, "risk_on": "cost", "fields": 20, "level": 0.5, "once": once}
+def test_risk_on_the_cost_is_run_by_its_options(
+    dataset_path: Path, tmp_path: Path, once: bool
+) -> None:
+    options = {
+        "samples": 32,
+        "horizon_s": 1.0,
+        "risk_on": "cost",
+        "fields": 20,
+        "level": 0.5,
+        "once": once,
+    }
     planners = ({"part": "mppi", "options": options},)
-    suite = suite_on(dataset_path, planners=planners, robots=("unicycle",), risks=("mean",), world="stakes")
+    suite = suite_on(
+        dataset_path,
+        planners=planners,
+        robots=("unicycle",),
+        risks=("mean",),
+        world="stakes",
+    )
     list(run_suite(suite, tmp_path / "run"))
     rows = pd.read_parquet(tmp_path / "run" / "episodes.parquet")
     assert not rows["outcome"].isin(["planner_error", "model_error"]).any()
 
 
-def test_optimal_planners_are_run_by_their_names(dataset_path: Path, tmp_path: Path) -> None:
+def test_optimal_planners_are_run_by_their_names(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     conditions = [
-        {"planners": ["optimal", {"part": "optimal", "label": "careful", "options": {"hazard": True}}]},
+        {
+            "planners": [
+                "optimal",
+                {"part": "optimal", "label": "careful", "options": {"hazard": True}},
+            ]
+        },
         {"planners": ["optimal", "near_optimal"], "models": ["clairvoyant"]},
     ]
     suite = suite_on(
-        dataset_path, conditions=conditions, robots=("unicycle",), risks=("mean",), world="stakes"
+        dataset_path,
+        conditions=conditions,
+        robots=("unicycle",),
+        risks=("mean",),
+        world="stakes",
     )
     folder = tmp_path / "run"
     list(run_suite(suite, folder))
@@ -255,6 +337,7 @@ def test_optimal_planners_are_run_by_their_names(dataset_path: Path, tmp_path: P
     known = rows[rows["model"] == "clairvoyant"]
     assert (known["outcome"] == "success").all()
     bound, plain = (
-        known[known["planner"] == name]["end_time_s"].to_numpy() for name in ("near_optimal", "optimal")
+        known[known["planner"] == name]["end_time_s"].to_numpy()
+        for name in ("near_optimal", "optimal")
     )
     assert (bound <= plain + 0.5).all()

@@ -1,4 +1,6 @@
-"""A run on a real Dask cluster has the rows of one process, whatever happens to workers and scheduler."""
+"""A run on a real Dask cluster has the rows of one process, whatever happens to workers
+and scheduler.
+"""
 
 import os
 import shutil
@@ -29,7 +31,9 @@ from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings
 from tests.commands import call
 
-pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="the extra dask is not installed")
+pytestmark = pytest.mark.skipif(
+    find_spec("distributed") is None, reason="the extra dask is not installed"
+)
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 600  # a busy machine takes its time to start processes
@@ -50,7 +54,9 @@ class Cluster:
         try:
             from distributed import Client
 
-            with Client(self.address, timeout=PATIENCE_S, set_as_default=False) as client:
+            with Client(
+                self.address, timeout=PATIENCE_S, set_as_default=False
+            ) as client:
                 client.wait_for_workers(workers, timeout=PATIENCE_S)
         except BaseException:
             self.stop()
@@ -85,7 +91,11 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def suite_on(dataset: Path, log: Path, **changes: object) -> Suite:
-    held = {"part": "tests.eval.parts:Held", "label": "held", "options": {"log": str(log)}}
+    held = {
+        "part": "tests.eval.parts:Held",
+        "label": "held",
+        "options": {"log": str(log)},
+    }
     given = {
         "data": str(dataset), "model": "oracle", "planners": (held,), "risks": ("mean", "cvar"),
         "scenarios": ("std", "hs"), "maps": 2, "seeds": (0, 1), "world": {"noise": "stored", "time_budget_s": 30.0},
@@ -94,16 +104,25 @@ def suite_on(dataset: Path, log: Path, **changes: object) -> Suite:
 
 
 def same(one: Path, other: Path, without: tuple[str, ...] = ()) -> None:
-    """Asserts that two runs have the same rows in the same order, but for some columns, steps and recordings."""
+    """Asserts that two runs have the same rows in the same order, but for some columns,
+    steps and recordings.
+    """
     first, second = (
-        pd.read_parquet(run / "episodes.parquet").drop(columns=list(without)) for run in (one, other)
+        pd.read_parquet(run / "episodes.parquet").drop(columns=list(without))
+        for run in (one, other)
     )
     assert not second.duplicated(KEYS).any()
     pd.testing.assert_frame_equal(
-        *(rows[[c for c in rows if not c.startswith("planning_")]] for rows in (first, second))
+        *(
+            rows[[c for c in rows if not c.startswith("planning_")]]
+            for rows in (first, second)
+        )
     )
     pd.testing.assert_frame_equal(*(read_steps(run) for run in (one, other)))
-    recordings = [sorted(path.name for path in (run / "playback").glob("*")) for run in (one, other)]
+    recordings = [
+        sorted(path.name for path in (run / "playback").glob("*"))
+        for run in (one, other)
+    ]
     assert recordings[0] == recordings[1] != []
 
 
@@ -132,22 +151,33 @@ def test_a_worker_that_is_killed_in_the_middle_loses_nothing_and_doubles_nothing
 
 
 def test_a_worker_of_other_code_or_without_the_data_is_named(
-    cluster_of_two: Cluster, dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cluster_of_two: Cluster,
+    dataset_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    suite = suite_on(dataset_path, tmp_path / "log", risks=("mean",), scenarios=("std",), seeds=(0,))
+    suite = suite_on(
+        dataset_path, tmp_path / "log", risks=("mean",), scenarios=("std",), seeds=(0,)
+    )
     modules = provenance.package_modules
     with monkeypatch.context() as patch:
         patch.setattr(
-            provenance, "package_modules", lambda names: modules(names) | {"benchnav.eval.run.rollout": "0"}
+            provenance,
+            "package_modules",
+            lambda names: modules(names) | {"benchnav.eval.run.rollout": "0"},
         )
         with pytest.raises(
-            ConfigError, match=r"tcp://127\.0\.0\.1:\d+: .*got changes: benchnav\.eval\.run\.rollout"
+            ConfigError,
+            match=r"tcp://127\.0\.0\.1:\d+: .*got changes: benchnav\.eval\.run\.rollout",
         ):
             list(run_suite(suite, tmp_path / "run", jobs=cluster_of_two.address))
     assert not list((tmp_path / "run").glob("units/*/*"))
-    # What only a unit can tell: a part's file, and the maps, that are not there when it begins.
+    # What only a unit can tell: a part's file, and the maps, that are not there when it
+    # begins.
     mine, data = tmp_path / "mine.py", shutil.copy(dataset_path, tmp_path / "tiny.h5")
-    mine.write_text("from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n")
+    mine.write_text(
+        "from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n"
+    )
     suite = suite_on(data, tmp_path / "log", planners=(f"{mine}:Mine",))
     for change, expected in (
         (
@@ -156,7 +186,9 @@ def test_a_worker_of_other_code_or_without_the_data_is_named(
         ),
         (data.unlink, r"\d+: .*tiny\.h5"),
     ):
-        steps = run_suite(suite, tmp_path / "run", overwrite=True, jobs=cluster_of_two.address)
+        steps = run_suite(
+            suite, tmp_path / "run", overwrite=True, jobs=cluster_of_two.address
+        )
         next(steps)
         change()
         with pytest.raises(BenchnavError, match=rf"tcp://127\.0\.0\.1:{expected}"):
@@ -179,10 +211,14 @@ def test_planners_with_a_time_limit_have_processes_of_their_own_on_workers_too(
     )
     begun = log.read_text().split()
     assert len(begun) == 2  # the unit, and one robot alone for its latency
-    assert not set(begun) & {str(pid) for pid in (os.getpid(), *(w.pid for w in cluster_of_two.workers))}
+    assert not set(begun) & {
+        str(pid) for pid in (os.getpid(), *(w.pid for w in cluster_of_two.workers))
+    }
     list(run_suite(suite, tmp_path / "here"))
     assert log.read_text().split() == [*begun, str(os.getpid()), str(os.getpid())]
-    same(tmp_path / "here", tmp_path / "cluster", without=("code",))  # of which a time limit is part
+    same(
+        tmp_path / "here", tmp_path / "cluster", without=("code",)
+    )  # of which a time limit is part
 
 
 def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(
@@ -200,7 +236,10 @@ def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(
     with pytest.raises(BenchnavError, match=r"was lost\. Finished work is kept"):
         list(steps)
     cluster_of_two.stop()
-    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").glob("units/*/*.parquet")}
+    kept = {
+        path: path.stat().st_mtime_ns
+        for path in (tmp_path / "run").glob("units/*/*.parquet")
+    }
     assert len(kept) == 4
     list(run_suite(suite, tmp_path / "run"))
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
@@ -209,10 +248,15 @@ def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(
 
 
 def test_a_scheduler_that_cannot_be_reached_is_one_line_and_drops_nothing(
-    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    dataset_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(dask, "_REACH_S", 0.2)
-    suite = suite_on(dataset_path, tmp_path / "log", scenarios=("std",), risks=("mean",), seeds=(0,))
+    suite = suite_on(
+        dataset_path, tmp_path / "log", scenarios=("std",), risks=("mean",), seeds=(0,)
+    )
     list(run_suite(suite, tmp_path / "run"))
     before = sorted((tmp_path / "run").rglob("*"))
     with socket.socket() as free:  # bound, and nobody listens
@@ -247,16 +291,21 @@ def test_a_scheduler_that_cannot_be_reached_is_one_line_and_drops_nothing(
 
 
 @pytest.mark.parametrize(
-    "address", ["127.0.0.1:8786", "tcp://127.0.0.1", "http://a:1", "tcp://a:b", "tcp://:1"]
+    "address",
+    ["127.0.0.1:8786", "tcp://127.0.0.1", "http://a:1", "tcp://a:b", "tcp://:1"],
 )
-def test_an_address_is_as_dask_writes_it(address: str, dataset_path: Path, tmp_path: Path) -> None:
+def test_an_address_is_as_dask_writes_it(
+    address: str, dataset_path: Path, tmp_path: Path
+) -> None:
     suite = suite_on(dataset_path, tmp_path / "log")
     with pytest.raises(ConfigError, match="tcp://HOST:PORT"):
         list(run_suite(suite, tmp_path / "run", jobs=address))
     assert not (tmp_path / "run").exists()
 
 
-def test_parts_of_this_process_alone_are_refused(dataset_path: Path, tmp_path: Path) -> None:
+def test_parts_of_this_process_alone_are_refused(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     from benchnav.core import registry
     from tests.eval.parts import Faulty
 
@@ -269,7 +318,9 @@ def test_parts_of_this_process_alone_are_refused(dataset_path: Path, tmp_path: P
 def worker_of(folder: Path, threads: int = 1) -> Any:
     """What a unit sees of the worker that it is on."""
     return SimpleNamespace(
-        address="tcp://w", local_directory=str(folder), state=SimpleNamespace(nthreads=threads)
+        address="tcp://w",
+        local_directory=str(folder),
+        state=SimpleNamespace(nthreads=threads),
     )
 
 
@@ -305,7 +356,9 @@ def test_a_worker_runs_units_on_the_device_and_under_the_limit_of_the_run(
     monkeypatch.setattr(cluster, "run_unit", lambda *words: given.append(words[-1]))
     asked = [Settings(), Settings(device="cuda", planner_limit_s=3.0)]
     for settings in asked:
-        assert run_on_worker(tmp_path, unit, Settings().origins().of(unit), settings) == (unit, {})
+        assert run_on_worker(
+            tmp_path, unit, Settings().origins().of(unit), settings
+        ) == (unit, {})
     assert given == asked
 
 
@@ -320,7 +373,9 @@ def test_the_rows_of_a_unit_come_last_since_they_say_that_it_is_finished(
         written.append(path.relative_to(tmp_path).parts[0])
 
     monkeypatch.setattr(cluster, "replacing", replacing)
-    monkeypatch.setattr(cluster, "clear_unit", lambda folder, unit: written.append("cleared"))
+    monkeypatch.setattr(
+        cluster, "clear_unit", lambda folder, unit: written.append("cleared")
+    )
     files = {"units/a.parquet": b"", "playback/a.npz": b"", "steps/a.parquet": b""}
     cluster.store_files(tmp_path, None, files)  # type: ignore[arg-type]
     assert written == ["cleared", "playback", "steps", "units"]

@@ -1,4 +1,6 @@
-"""A suite can be asked whether its conditions repeat, and names those that do not, with the cause."""
+"""A suite can be asked whether its conditions repeat, and names those that do not, with
+the cause.
+"""
 
 from pathlib import Path
 
@@ -57,7 +59,9 @@ class Counting(Steady):
 """
 
 
-def test_conditions_that_do_not_repeat_are_named_with_the_cause(dataset_path: Path, tmp_path: Path) -> None:
+def test_conditions_that_do_not_repeat_are_named_with_the_cause(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     (tmp_path / "parts.py").write_text(PARTS)
     names = ("Steady", "Clock", "Python", "NumPy", "Torch", "Counting")
     suite = Suite(
@@ -68,7 +72,10 @@ def test_conditions_that_do_not_repeat_are_named_with_the_cause(dataset_path: Pa
     count, lines = check_determinism(suite, said.append)
     assert count == len(names)
     assert len(said) == 1
-    causes = {line.partition("planner ")[2].partition(",")[0]: line.rpartition("; ")[2] for line in lines}
+    causes = {
+        line.partition("planner ")[2].partition(",")[0]: line.rpartition("; ")[2]
+        for line in lines
+    }
     assert causes == {
         "Clock": "a part depends on something outside, such as a clock, entropy or the order of threads",
         "Python": "a part draws from the global generator of random",

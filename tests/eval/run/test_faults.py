@@ -13,14 +13,25 @@ from benchnav.eval.run.unit import Settings
 
 
 def run(
-    dataset_path: Path, folder: Path, fault: str, jobs: int = 1, limit_s: float = 0.0, **changes: object
+    dataset_path: Path,
+    folder: Path,
+    fault: str,
+    jobs: int = 1,
+    limit_s: float = 0.0,
+    **changes: object,
 ) -> pd.DataFrame:
-    faulty = {"part": "tests.eval.parts:Faulty", "label": "faulty", "options": {"fault": fault}}
+    faulty = {
+        "part": "tests.eval.parts:Faulty",
+        "label": "faulty",
+        "options": {"fault": fault},
+    }
     given = {
         "data": str(dataset_path), "models": ("oracle",), "planners": (faulty,), "risks": ("mean",),
         "scenarios": ("std",), "maps": 2, "world": {"noise": "stored", "time_budget_s": 30.0}, "record": "none",
     } | changes  # fmt: skip
-    for _ in run_suite(Suite(**given), folder, jobs, settings=Settings(planner_limit_s=limit_s)):  # type: ignore[arg-type]
+    for _ in run_suite(
+        Suite(**given), folder, jobs, settings=Settings(planner_limit_s=limit_s)
+    ):  # type: ignore[arg-type]
         pass
     return pd.read_parquet(folder / "episodes.parquet")
 
@@ -55,7 +66,9 @@ def test_an_action_that_is_not_finite_ends_its_own_episode(
     pd.testing.assert_series_equal(rows[MEASURES].iloc[1], sound[MEASURES].iloc[1])
 
 
-@pytest.mark.parametrize(("fault", "word"), [("shape", "shape"), ("raise", "no way on")])
+@pytest.mark.parametrize(
+    ("fault", "word"), [("shape", "shape"), ("raise", "no way on")]
+)
 def test_a_raise_or_a_wrong_shape_ends_the_unfinished_episodes(
     fault: str, word: str, dataset_path: Path, tmp_path: Path
 ) -> None:
@@ -90,7 +103,11 @@ def test_a_planner_that_raises_at_the_beginning_leaves_rows_without_measures(
 ) -> None:
     rows = run(dataset_path, tmp_path / "run", "raise in init")
     assert rows["outcome"].tolist() == ["planner_error"] * 2
-    assert rows[["traversability", "path_length_m", "stuck_share", "roughness_radps2"]].isna().all(axis=None)
+    assert (
+        rows[["traversability", "path_length_m", "stuck_share", "roughness_radps2"]]
+        .isna()
+        .all(axis=None)
+    )
     assert rows["end_time_s"].tolist() == [0, 0]
     assert rows["total_time_s"].tolist() == [30.0, 30.0]
 
@@ -107,25 +124,34 @@ def test_a_planner_that_exits_is_a_fault_like_any_other(
 def test_a_robot_that_fails_in_the_simulation_ends_the_run_and_blames_no_planner(
     dataset_path: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(BenchnavError, match="Robot Rusty failed in the simulation: ValueError: seized"):
+    with pytest.raises(
+        BenchnavError, match="Robot Rusty failed in the simulation: ValueError: seized"
+    ):
         run(dataset_path, tmp_path / "run", "none", robots=("tests.eval.parts:Rusty",))
 
 
 def test_a_planner_that_is_made_here_and_not_in_a_unit_ends_its_own_units(
     dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    picky = {"part": "tests.eval.parts:Picky", "options": {"log": str(tmp_path / "seen")}}
+    picky = {
+        "part": "tests.eval.parts:Picky",
+        "options": {"log": str(tmp_path / "seen")},
+    }
     rows = run(dataset_path, tmp_path / "run", "none", planners=(picky, "straight"))
     assert set(rows[rows["planner"] == "Picky"]["outcome"]) == {"planner_error"}
     assert rows[rows["planner"] == "straight"]["success"].all()
 
 
-def test_a_worker_that_is_killed_ends_the_run_with_a_line(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_worker_that_is_killed_ends_the_run_with_a_line(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     with pytest.raises(BenchnavError, match="A worker was killed"):
         run(dataset_path, tmp_path / "run", "kill", jobs=2)
 
 
-def test_a_planner_that_gives_up_is_no_fault(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_planner_that_gives_up_is_no_fault(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     rows = run(dataset_path, tmp_path / "run", "give up")
     assert rows["outcome"].tolist() == ["planner_failure"] * 2
     assert not (tmp_path / "run" / ERRORS).exists()
@@ -143,17 +169,29 @@ def test_a_planner_that_hangs_is_stopped_and_the_others_go_on(
     assert hung["outcome"].tolist() == ["planner_error"] * 2
     assert hung["end_time_s"].tolist() == pytest.approx([1.0, 1.0])
     assert "within 3 s" in hung["error"].iloc[0]
-    pd.testing.assert_frame_equal(fine[MEASURES].reset_index(drop=True), sound[MEASURES])
+    pd.testing.assert_frame_equal(
+        fine[MEASURES].reset_index(drop=True), sound[MEASURES]
+    )
 
 
-def test_a_raise_in_a_process_of_its_own_keeps_its_traceback(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_raise_in_a_process_of_its_own_keeps_its_traceback(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     rows = run(dataset_path, tmp_path / "run", "raise", limit_s=60.0)
     assert rows["error"].tolist() == ["RuntimeError: no way on"] * 2
     assert 'raise RuntimeError("no way on")' in (tmp_path / "run" / ERRORS).read_text()
 
 
-def test_a_model_that_raises_ends_its_own_conditions_alone(dataset_path: Path, tmp_path: Path) -> None:
-    rows = run(dataset_path, tmp_path / "run", "none", jobs=2, models=("oracle", "tests.eval.parts:Broken"))
+def test_a_model_that_raises_ends_its_own_conditions_alone(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    rows = run(
+        dataset_path,
+        tmp_path / "run",
+        "none",
+        jobs=2,
+        models=("oracle", "tests.eval.parts:Broken"),
+    )
     by_model = {model: set(group["outcome"]) for model, group in rows.groupby("model")}
     assert by_model.pop("oracle") == {"success"}
     assert list(by_model.values()) == [{"model_error"}]
@@ -163,8 +201,14 @@ def test_a_model_that_raises_ends_its_own_conditions_alone(dataset_path: Path, t
     assert 'raise ValueError("no idea")' in (tmp_path / "run" / ERRORS).read_text()
 
 
-def test_a_risk_measure_that_gives_no_map_is_a_model_error(dataset_path: Path, tmp_path: Path) -> None:
-    broken = {"part": "tests.eval.parts:least", "label": "nan", "options": {"factor": float("nan")}}
+def test_a_risk_measure_that_gives_no_map_is_a_model_error(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    broken = {
+        "part": "tests.eval.parts:least",
+        "label": "nan",
+        "options": {"factor": float("nan")},
+    }
     rows = run(dataset_path, tmp_path / "run", "none", risks=("mean", broken))
     assert rows[rows["risk"] == "nan"]["outcome"].tolist() == ["model_error"] * 2
     assert rows[rows["risk"] == "mean"]["success"].all()

@@ -34,7 +34,14 @@ from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.knowledge import KnowledgeError, Learner, Truth
 from benchnav.planning.sensing.near import Near
 from benchnav.planning.sensing.score_table import TabulatedDistribution
-from benchnav.planning.sensing.sensor import Contact, Full, Moment, Probe, Sensed, Sensor
+from benchnav.planning.sensing.sensor import (
+    Contact,
+    Full,
+    Moment,
+    Probe,
+    Sensed,
+    Sensor,
+)
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.realisation import joined
 from benchnav.planning.world.simulation import Simulation
@@ -49,8 +56,12 @@ WORLD = World(noise="stored", immobile=IMMOBILE, time_budget_s=24.0)
 RULES = Rules(free_space=FreeSpace(by="mean", above=0.1), min_traversability=0.05)
 LAW = made.law(SIZE, SIZE, 1.5)
 KEYS = tuple(range(BATCH))
-SHIPPED = sorted(set(NAMES) - {"straight", "optimal"})  # which uses no map, and which plans once
-CONFIG = AStarDWAConfig(dwa=DWAConfig(speeds=5, turn_rates=11, horizon_s=4.0))  # few arcs, which is quick
+SHIPPED = sorted(
+    set(NAMES) - {"straight", "optimal"}
+)  # which uses no map, and which plans once
+CONFIG = AStarDWAConfig(
+    dwa=DWAConfig(speeds=5, turn_rates=11, horizon_s=4.0)
+)  # few arcs, which is quick
 
 
 def astar_dwa() -> AStarDWA:
@@ -70,7 +81,14 @@ class Drives:
     learning: Learning
 
     def run(self, planner: Any, learning: Learning | None, **options: Any) -> Episodes:
-        return run_episodes(planner, self.problem, self.simulation, generator(), learning=learning, **options)
+        return run_episodes(
+            planner,
+            self.problem,
+            self.simulation,
+            generator(),
+            learning=learning,
+            **options,
+        )
 
 
 def learning(problem: Problem, truth: Truth, **changes: Any) -> Learning:
@@ -81,24 +99,40 @@ def learning(problem: Problem, truth: Truth, **changes: Any) -> Learning:
     }  # fmt: skip
     learner = Learner(**given | changes)
     return Learning(
-        learner=learner, start=learner.begin(truth, problem.start, problem.distribution), truth=truth
+        learner=learner,
+        start=learner.begin(truth, problem.start, problem.distribution),
+        truth=truth,
     )
 
 
 def drives(seed: int = 0, replan_every_s: float = 0.5, **changes: Any) -> Drives:
     # The first draws with a feasible path.
     truth = made.mixture(40, SIZE, SIZE, seed=3)
-    truth = type(truth)(truth.weights.float(), truth.means.float(), truth.stds.float(), (0, 1))
-    start, goal = (torch.tensor([place] * 40) for place in ((1.25, 1.25), (10.25, 9.75)))
-    places = Places(start_m=start, goal_m=goal, reference_time_s=torch.full((40,), torch.nan))
+    truth = type(truth)(
+        truth.weights.float(), truth.means.float(), truth.stds.float(), (0, 1)
+    )
+    start, goal = (
+        torch.tensor([place] * 40) for place in ((1.25, 1.25), (10.25, 9.75))
+    )
+    places = Places(
+        start_m=start, goal_m=goal, reference_time_s=torch.full((40,), torch.nan)
+    )
     field = truth.from_normal(made.scores(LAW, 40, seed).float())
     kept = joined(field >= IMMOBILE.below, LAW.grid, places).nonzero()[:BATCH, 0]
     truth, field, places = truth.select(kept), field[kept], places.select(kept)
     start, goal, terrain = places.start_m, places.goal_m, made.terrain(truth, field)
     rules = replace(RULES, replan_every_s=replan_every_s)
-    task = Task(robot=Unicycle(), objective=TravelTime(robot=Unicycle(), goal_radius_m=1.0), rules=rules)
-    simulation = Simulation(terrain, task, WORLD, places, rng.stream_key(0, "noise"), range(BATCH))
-    problem = pose_problem(task, Prediction(terrain.observe(), truth, measure(truth)), start, goal, 24.0)
+    task = Task(
+        robot=Unicycle(),
+        objective=TravelTime(robot=Unicycle(), goal_radius_m=1.0),
+        rules=rules,
+    )
+    simulation = Simulation(
+        terrain, task, WORLD, places, rng.stream_key(0, "noise"), range(BATCH)
+    )
+    problem = pose_problem(
+        task, Prediction(terrain.observe(), truth, measure(truth)), start, goal, 24.0
+    )
     known = Truth(terrain=terrain, field=field, keys=KEYS)
     how = learning(problem, known, **changes)
     believed = how.learner.distribution(how.start)
@@ -136,7 +170,9 @@ class Same(Static):
 
 @pytest.mark.parametrize("name", SHIPPED)
 @pytest.mark.parametrize("belief", [Deaf(), Same()])
-def test_a_belief_that_learns_nothing_drives_as_if_there_were_none(name: str, belief: Belief[Any]) -> None:
+def test_a_belief_that_learns_nothing_drives_as_if_there_were_none(
+    name: str, belief: Belief[Any]
+) -> None:
     given = drives(belief=belief)
     options: dict[str, Any] = {"enough": lambda step: step == 12}
     found = given.run(make(name), given.learning, **options)
@@ -156,7 +192,10 @@ def test_who_probes_the_ground_is_immobilised_less_often(probed: Episodes) -> No
     assert int((probed.outcome == Outcome.IMMOBILISED).sum()) == 0
     both = (static.outcome == Outcome.SUCCESS) & (probed.outcome == Outcome.SUCCESS)
     assert int(both.sum()) >= 5
-    assert float(probed.steps[both].double().mean()) < float(static.steps[both].double().mean()) - 3
+    assert (
+        float(probed.steps[both].double().mean())
+        < float(static.steps[both].double().mean()) - 3
+    )
 
 
 class Noting(Sensor):
@@ -165,10 +204,14 @@ class Noting(Sensor):
     def __init__(self, inner: Sensor, noted: Tensor) -> None:
         self.inner, self.noted, self.sees_all = inner, noted, inner.sees_all  # type: ignore[misc]
 
-    def sense(self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
+    def sense(
+        self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment
+    ) -> Sensed:
         sensed = self.inner.sense(terrain, field, robot_state, moment)
         members = torch.tensor([KEYS.index(key) for key in moment.keys])
-        self.noted[members] |= sensed.mask if sensed.appearance is None else sensed.appearance.seen
+        self.noted[members] |= (
+            sensed.mask if sensed.appearance is None else sensed.appearance.seen
+        )
         return sensed
 
 
@@ -190,7 +233,8 @@ SENSES = [
 ]
 
 
-# Every planner meets every sensor, ground sensor and belief, and every combination some planner.
+# Every planner meets every sensor, ground sensor and belief, and every combination some
+# planner.
 @pytest.mark.parametrize(
     ("name", "sensor", "ground", "belief"),
     [
@@ -207,11 +251,15 @@ def test_what_was_not_sensed_changes_no_action(
     given = drives()
     before, posed = given.learning.truth.terrain.select(few), given.problem.select(few)
     posed = replace(posed, distribution=before.truth)
-    sensed = torch.zeros(2, len(few), SIZE, SIZE, dtype=torch.bool)  # what it looks like, and its λ
+    sensed = torch.zeros(
+        2, len(few), SIZE, SIZE, dtype=torch.bool
+    )  # what it looks like, and its λ
     sensed[0] = sensor.sees_all
 
     def drive(terrain: Terrain, noted: Tensor) -> Episodes:
-        truth = Truth(terrain=terrain, field=terrain.traversability, keys=KEYS[: len(few)])
+        truth = Truth(
+            terrain=terrain, field=terrain.traversability, keys=KEYS[: len(few)]
+        )
         how = learning(
             posed, truth, sensor=Noting(sensor, noted[0]), ground=Noting(ground, noted[1]), belief=BELIEFS[belief],
             law=ALIKE, predict=lambda terrain, seen: Oracle().predict_terrain(terrain),
@@ -223,24 +271,41 @@ def test_what_was_not_sensed_changes_no_action(
             distribution=how.learner.distribution(known),
         )  # fmt: skip
         nan = torch.full((len(few),), torch.nan)
-        places = Places(start_m=problem.start[:, :2], goal_m=problem.goal_m, reference_time_s=nan)
-        simulation = Simulation(terrain, problem.task, WORLD, places, 1, range(len(few)))
+        places = Places(
+            start_m=problem.start[:, :2], goal_m=problem.goal_m, reference_time_s=nan
+        )
+        simulation = Simulation(
+            terrain, problem.task, WORLD, places, 1, range(len(few))
+        )
         return run_episodes(
-            make(name), problem, simulation, generator(), learning=how, enough=lambda step: step == steps
+            make(name),
+            problem,
+            simulation,
+            generator(),
+            learning=how,
+            enough=lambda step: step == steps,
         )
 
     first = drive(before, sensed)
     # Robots met the λ of the cells that they drove on.
     row, column = before.grid.cell_of(first.states[..., 0], first.states[..., 1])
-    met = torch.zeros_like(sensed[1]).flatten(1).scatter(1, row * SIZE + column, True).view_as(sensed[1])
+    met = (
+        torch.zeros_like(sensed[1])
+        .flatten(1)
+        .scatter(1, row * SIZE + column, True)
+        .view_as(sensed[1])
+    )
     seen, known = sensed[0], sensed[1] | met
     assert bool((~known).any())
     other = made.mixture(len(few), SIZE, SIZE, seed=9)
-    # A model that sees all has the true distribution of each cell, and the noise of sensed λ is by it.
+    # A model that sees all has the true distribution of each cell, and the noise of
+    # sensed λ is by it.
     kept = (seen | known)[:, None]
     after = replace(
         before,
-        traversability=torch.where(known, before.traversability, 1 - before.traversability),
+        traversability=torch.where(
+            known, before.traversability, 1 - before.traversability
+        ),
         truth=replace(
             before.truth,
             weights=torch.where(kept, before.truth.weights, other.weights.float()),
@@ -266,7 +331,9 @@ def told(how: Learning, problem: Problem, steps: int) -> list[tuple[int, Problem
 
 
 @pytest.mark.parametrize("every", [0.1, 0.5, 1.0])
-def test_maps_are_revised_when_it_is_due_and_where_something_is_known(every: float) -> None:
+def test_maps_are_revised_when_it_is_due_and_where_something_is_known(
+    every: float,
+) -> None:
     given = drives(replan_every_s=every)
     found = told(given.learning, given.problem, 30)
     assert found
@@ -284,7 +351,10 @@ def test_maps_are_revised_when_it_is_due_and_where_something_is_known(every: flo
             new
             if sensed is None
             else Sensed(
-                traversability=torch.where(new.mask, new.traversability, sensed.traversability), std=new.std
+                traversability=torch.where(
+                    new.mask, new.traversability, sensed.traversability
+                ),
+                std=new.std,
             )
         )
         if now % round(every / 0.1) == 0:
@@ -294,10 +364,16 @@ def test_maps_are_revised_when_it_is_due_and_where_something_is_known(every: flo
     assert (last.risk_map - measure(believed)).abs().max() < 0.035
     assert (last.risk_map - given.problem.risk_map).abs().max() > 0.3
     closed = (believed.mean() < 0.09) & ~given.problem.free
-    assert not last.free[(believed.mean() < 0.09) & given.problem.free].any() or bool(closed.any())
-    torch.testing.assert_close(last.distribution.mean(), believed.mean(), atol=1e-5, rtol=0)
+    assert not last.free[(believed.mean() < 0.09) & given.problem.free].any() or bool(
+        closed.any()
+    )
+    torch.testing.assert_close(
+        last.distribution.mean(), believed.mean(), atol=1e-5, rtol=0
+    )
     assert torch.equal(last.start[:, 1:], given.problem.start[:, 1:])
-    assert float(last.start[0, 0] - given.problem.start[0, 0]) == pytest.approx(0.1 * step, abs=1e-5)
+    assert float(last.start[0, 0] - given.problem.start[0, 0]) == pytest.approx(
+        0.1 * step, abs=1e-5
+    )
 
 
 def test_the_goal_stays_free_whatever_is_known_of_it() -> None:
@@ -306,7 +382,9 @@ def test_the_goal_stays_free_whatever_is_known_of_it() -> None:
     truth = given.learning.truth
     field = truth.field.clone()
     field[:, row - 4 : row + 5, column - 4 : column + 5] = 0
-    (_, first), *_ = told(replace(given.learning, truth=replace(truth, field=field)), given.problem, 3)
+    (_, first), *_ = told(
+        replace(given.learning, truth=replace(truth, field=field)), given.problem, 3
+    )
     assert first.free[:, row, column].all()
     assert not first.free[:, row - 3, column - 2].any()
     at_goal = cells_at_goal(LAW.grid, given.problem.goal_m, RULES.goal_radius_m)
@@ -318,12 +396,18 @@ def test_the_goal_that_stays_free_is_that_of_the_episode_that_is_left() -> None:
     given = drives(ground=Probe(30.0))
     goal = given.problem.goal_m.clone()
     goal[1] = torch.tensor([5.25, 8.25])
-    truth = replace(given.learning.truth, field=torch.zeros_like(given.learning.truth.field))
-    knowing = Knowing(replace(given.learning, truth=truth), replace(given.problem, goal_m=goal))
+    truth = replace(
+        given.learning.truth, field=torch.zeros_like(given.learning.truth.field)
+    )
+    knowing = Knowing(
+        replace(given.learning, truth=truth), replace(given.problem, goal_m=goal)
+    )
     knowing.keep(torch.tensor([1]))
     told = knowing.learn(0, given.problem.start[1:2], torch.ones(1, dtype=torch.bool))
     assert told is not None
-    assert torch.equal(told.free, cells_at_goal(LAW.grid, goal[1:2], RULES.goal_radius_m))
+    assert torch.equal(
+        told.free, cells_at_goal(LAW.grid, goal[1:2], RULES.goal_radius_m)
+    )
 
 
 def test_a_robot_that_has_ended_sees_and_senses_nothing_more() -> None:
@@ -365,7 +449,9 @@ class Wrong(Sensor):
     def __init__(self, said: Callable[..., Any]) -> None:
         self.said = said
 
-    def sense(self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment) -> Any:
+    def sense(
+        self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment
+    ) -> Any:
         return self.said(field)
 
 
@@ -374,12 +460,20 @@ class Wrong(Sensor):
     [
         (fails(), "ValueError: no echo"),
         (lambda field: None, "Expected a Sensed from `sense`, got NoneType."),
-        (lambda field: Sensed(traversability=field[:1], std=field), "`Sensed.traversability`"),
-        (lambda field: Sensed(traversability=field, std=field.double()), "`Sensed.std`"),
+        (
+            lambda field: Sensed(traversability=field[:1], std=field),
+            "`Sensed.traversability`",
+        ),
+        (
+            lambda field: Sensed(traversability=field, std=field.double()),
+            "`Sensed.std`",
+        ),
         (lambda field: Sensed(traversability=field + 1, std=field), "in [0, 1]"),
     ],
 )
-def test_a_sensor_that_fails_ends_its_episodes(said: Callable[..., Any], words: str) -> None:
+def test_a_sensor_that_fails_ends_its_episodes(
+    said: Callable[..., Any], words: str
+) -> None:
     given = drives(ground=Wrong(said))
     found = given.run(astar_dwa(), given.learning)
     assert (found.outcome == Outcome.SENSOR_ERROR).all()
@@ -395,17 +489,29 @@ def test_a_sensor_under_the_key_of_the_other_kind_is_refused() -> None:
     # What senses both may stand under either.
     both = Wrong(
         lambda field: Sensed(
-            traversability=field, std=torch.full_like(field, 0.1), appearance=looks_of(truth, field)
+            traversability=field,
+            std=torch.full_like(field, 0.1),
+            appearance=looks_of(truth, field),
         )
     )
-    assert learning(given.problem, truth, sensor=both, law=ALIKE, predict=lambda t, o: t.truth)
-    found = given.run(astar_dwa(), learning(given.problem, truth, ground=both), enough=lambda step: step == 6)
+    assert learning(
+        given.problem, truth, sensor=both, law=ALIKE, predict=lambda t, o: t.truth
+    )
+    found = given.run(
+        astar_dwa(),
+        learning(given.problem, truth, ground=both),
+        enough=lambda step: step == 6,
+    )
     assert set(found.errors) == {""}
 
 
 def looks_of(truth: Truth, field: Tensor) -> Any:
     moment = Moment(KEYS, 0)
-    return Full().sense(truth.terrain, field, torch.zeros(len(field), 3), moment).appearance
+    return (
+        Full()
+        .sense(truth.terrain, field, torch.zeros(len(field), 3), moment)
+        .appearance
+    )
 
 
 @pytest.mark.parametrize("call", ["update", "at", "changed"])
@@ -430,12 +536,16 @@ def test_a_belief_whose_cells_are_none_is_to_blame_itself(said: str) -> None:
     given = drives(belief=Misfit())
     found = given.run(astar_dwa(), given.learning)
     assert (found.outcome == Outcome.BELIEF_ERROR).all()
-    expected = "a distribution of shape [1, " if said == "shape" else "ValueError: no mean"
+    expected = (
+        "a distribution of shape [1, " if said == "shape" else "ValueError: no mean"
+    )
     assert all(expected in error for error in found.errors), found.errors[0]
 
 
 class _NoMean(TabulatedDistribution):
-    """Has an expected time, by which risk is told, and no mean, by which ground is free."""
+    """Has an expected time, by which risk is told, and no mean, by which ground is
+    free.
+    """
 
     def mean(self) -> Tensor:
         raise ValueError("no mean")
@@ -454,7 +564,9 @@ def test_cells_that_are_no_map_are_the_beliefs_fault() -> None:
 
 def test_a_planner_in_a_process_of_its_own_learns_as_one_here() -> None:
     suite = Suite(
-        model="oracle", planners=({"part": "astar_dwa", "options": asdict(CONFIG)},), risks=("mean",)
+        model="oracle",
+        planners=({"part": "astar_dwa", "options": asdict(CONFIG)},),
+        risks=("mean",),
     )
     (condition,) = conditions_of(suite, lambda data: ["std"])
     given = drives()
@@ -488,7 +600,9 @@ def test_a_planner_that_raises_while_robots_learn_is_a_planner_error() -> None:
 
 def test_a_sensor_and_a_belief_may_write_into_what_they_are_given() -> None:
     class Scribbles(Sensor):
-        def sense(self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
+        def sense(
+            self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment
+        ) -> Sensed:
             sensed = Probe(1.5).sense(terrain, field, robot_state, moment)
             field.zero_()
             robot_state.zero_()
@@ -504,7 +618,9 @@ def test_a_sensor_and_a_belief_may_write_into_what_they_are_given() -> None:
     given = drives()
     options: dict[str, Any] = {"enough": lambda step: step == 40}
     wanted = given.run(astar_dwa(), given.learning, **options)
-    scribbled = learning(given.problem, given.learning.truth, ground=Scribbles(), belief=Scrawls())
+    scribbled = learning(
+        given.problem, given.learning.truth, ground=Scribbles(), belief=Scrawls()
+    )
     wrote = given.run(astar_dwa(), scribbled, **options)
     assert same(wanted, wrote)
 
@@ -519,7 +635,8 @@ def test_a_planner_that_begins_anew_learns_too() -> None:
     found = given.run(Forgets(CONFIG), given.learning, **options)
     assert (found.revisions > 5).all()
     assert not same(given.run(Forgets(CONFIG), None, **options), found)
-    # All that A*+DWA keeps is a velocity: begun anew from it, the unicycle takes the same way.
+    # All that A*+DWA keeps is a velocity: begun anew from it, the unicycle takes the
+    # same way.
     assert same(given.run(astar_dwa(), given.learning, **options), found)
 
 
@@ -560,12 +677,16 @@ def test_what_is_measured_ahead_is_what_each_cell_ahead_tells() -> None:
                 turn = (turn + math.pi) % (2 * math.pi) - math.pi
                 known = bool(knowing.known.ever_sensed[own, row, column])
                 if math.hypot(*away) <= 5 and abs(turn) <= math.pi / 4 and not known:
-                    errors.append(float(mean[own, row, column] - truth.field[own, row, column]))
+                    errors.append(
+                        float(mean[own, row, column] - truth.field[own, row, column])
+                    )
                     scores.append(float(probability[own, row, column]))
         assert len(errors) >= 3
         rmse = math.sqrt(sum(error**2 for error in errors) / len(errors))
         assert float(found[own, 0]) == pytest.approx(rmse, abs=0.005)
-        assert float(found[own, 1]) == pytest.approx(sum(scores) / len(scores), abs=0.01)
+        assert float(found[own, 1]) == pytest.approx(
+            sum(scores) / len(scores), abs=0.01
+        )
 
 
 def part_of(given: Drives, members: list[int]) -> Drives:
@@ -579,7 +700,9 @@ def part_of(given: Drives, members: list[int]) -> Drives:
     simulation = Simulation(own.terrain, problem.task, WORLD, places, 0, members)
     learner = given.learning.learner
     start = learner.begin(own, problem.start, own.terrain.truth)
-    return Drives(problem, simulation, Learning(learner=learner, start=start, truth=own))
+    return Drives(
+        problem, simulation, Learning(learner=learner, start=start, truth=own)
+    )
 
 
 EXPLORES = AStarDWA(replace(CONFIG, explore=1.0))
@@ -594,14 +717,20 @@ def test_what_an_episode_learns_depends_on_no_other(planner: Any) -> None:
     for members in ([2], [7, 1]):
         part = part_of(given, members)
         alone = part.run(one, part.learning, **options)
-        torch.testing.assert_close(alone.states, whole.states[members], atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            alone.states, whole.states[members], atol=1e-4, rtol=0
+        )
         assert torch.equal(alone.revisions, whole.revisions[members])
         assert alone.ahead is not None
         assert whole.ahead is not None
-        torch.testing.assert_close(alone.ahead, whole.ahead[members], atol=1e-4, rtol=0, equal_nan=True)
+        torch.testing.assert_close(
+            alone.ahead, whole.ahead[members], atol=1e-4, rtol=0, equal_nan=True
+        )
 
 
-def test_who_has_ended_senses_nothing_more_whenever_it_leaves_the_batch(probed: Episodes) -> None:
+def test_who_has_ended_senses_nothing_more_whenever_it_leaves_the_batch(
+    probed: Episodes,
+) -> None:
     given, whole = drives(), probed
     first = int(whole.steps.argmin())
     part = part_of(given, [first])
@@ -645,5 +774,7 @@ def test_λ_that_is_drawn_anew_is_what_it_is_in_each_step(belief: Belief[Any]) -
         told = knowing.known.sensed
         if belief.learns and step % 5:
             assert told.mask.sum() == 3
-            assert told.traversability[told.mask].tolist() == pytest.approx([0.1 * (step + 1)] * 3)
+            assert told.traversability[told.mask].tolist() == pytest.approx(
+                [0.1 * (step + 1)] * 3
+            )
     assert drawn == (list(range(8)) if belief.learns else [0, 5])

@@ -1,4 +1,6 @@
-"""Runs of robots that learn on their way: what suites ask for reaches them; rows are the same whoever makes them."""
+"""Runs of robots that learn on their way: what suites ask for reaches them; rows are
+the same whoever makes them.
+"""
 
 import shutil
 from dataclasses import replace
@@ -20,7 +22,13 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder.provenance import describe_parts
-from benchnav.eval.folder.run_folder import EPISODES, ERRORS, differences, open_run, read_table
+from benchnav.eval.folder.run_folder import (
+    EPISODES,
+    ERRORS,
+    differences,
+    open_run,
+    read_table,
+)
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.run.recordings import find_recording
 from benchnav.eval.run.rerun import compare, rerun
@@ -34,8 +42,15 @@ from benchnav.planning.world.lower_bound import Motion, lower_bound_s
 from tests import factories
 from tests.commands import call
 
-DRIVES = {"part": "tests.eval.parts:Faulty", "label": "ahead", "options": {"after_s": 1e9}}
-SEARCHES = {"part": "astar_dwa", "options": {"dwa": {"turn_rates": 7, "horizon_s": 1.5}}}
+DRIVES = {
+    "part": "tests.eval.parts:Faulty",
+    "label": "ahead",
+    "options": {"after_s": 1e9},
+}
+SEARCHES = {
+    "part": "astar_dwa",
+    "options": {"dwa": {"turn_rates": 7, "horizon_s": 1.5}},
+}
 NEAR = {"part": "near", "options": {"range_m": 3.0}}
 KEYS = ["planner", *KNOWLEDGE, "seed", "realisation", "map"]
 OWN = """
@@ -115,8 +130,12 @@ def same(first: pd.DataFrame, second: pd.DataFrame) -> bool:
 
 
 @pytest.fixture(scope="module")
-def finished(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Suite, Path]:
-    """A run of two planners that see all or what is near, and learn of the ground or do not."""
+def finished(
+    dataset_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Suite, Path]:
+    """A run of two planners that see all or what is near, and learn of the ground or do
+    not.
+    """
     suite, folder = suite_on(dataset_path), tmp_path_factory.mktemp("learning") / "run"
     finish(suite, folder)
     return suite, folder
@@ -150,9 +169,20 @@ def test_rows_tell_who_learnt_what(finished: tuple[Suite, Path]) -> None:
     _, folder = finished
     rows = pd.read_parquet(folder / "episodes.parquet")
     found = set(zip(rows["sensor"], rows["ground"], rows["belief"], strict=True))
-    assert found == {(s, *rest) for s in ("full", "near") for rest in (("–", "static"), ("probe", "copula"))}
+    assert found == {
+        (s, *rest)
+        for s in ("full", "near")
+        for rest in (("–", "static"), ("probe", "copula"))
+    }
     assert len(rows) == 16
-    learnt = ["revisions", "seen_cells", "sensed_cells", "ahead_rmse", "ahead_log_score", "learning_ms"]
+    learnt = [
+        "revisions",
+        "seen_cells",
+        "sensed_cells",
+        "ahead_rmse",
+        "ahead_log_score",
+        "learning_ms",
+    ]
     still = (rows["sensor"] == "full") & (rows["belief"] == "static")
     assert rows.loc[still, learnt].isna().all(axis=None)
     moving = rows[~still]
@@ -167,7 +197,9 @@ def test_rows_tell_who_learnt_what(finished: tuple[Suite, Path]) -> None:
     assert (moving["learning_ms"] > 0).all()
 
 
-def test_what_was_sensed_is_what_sensors_told_on_the_driven_path(finished: tuple[Suite, Path]) -> None:
+def test_what_was_sensed_is_what_sensors_told_on_the_driven_path(
+    finished: tuple[Suite, Path],
+) -> None:
     _, folder = finished
     for planner in ("ahead", "astar_dwa"):
         unit, rows = unit_of(folder, planner=planner, sensor="full", belief="copula")
@@ -182,22 +214,37 @@ def test_what_was_sensed_is_what_sensors_told_on_the_driven_path(finished: tuple
             sensed = torch.zeros_like(own.field, dtype=torch.bool)
             for step in range((steps - 1) // 5 * 5 + 1):
                 sensed |= (
-                    Probe().sense(own.terrain, own.field, track[step][None], Moment(own.keys, step)).mask
+                    Probe()
+                    .sense(
+                        own.terrain,
+                        own.field,
+                        track[step][None],
+                        Moment(own.keys, step),
+                    )
+                    .mask
                 )
             assert rows["sensed_cells"][member] == int(sensed.sum())
             kept = read_steps(folder, condition=unit.condition.id, map=member)
             due = np.arange(steps + 1) % 5 == 0
             due[-1] = False
             assert (kept["ahead_rmse"].notna().to_numpy() == due).all()
-            assert rows["ahead_rmse"][member] == pytest.approx(kept["ahead_rmse"].mean(), rel=1e-6)
-            assert rows["ahead_log_score"][member] == pytest.approx(kept["ahead_log_score"].mean(), rel=1e-6)
+            assert rows["ahead_rmse"][member] == pytest.approx(
+                kept["ahead_rmse"].mean(), rel=1e-6
+            )
+            assert rows["ahead_log_score"][member] == pytest.approx(
+                kept["ahead_log_score"].mean(), rel=1e-6
+            )
 
 
-def test_rows_do_not_depend_on_workers(finished: tuple[Suite, Path], tmp_path: Path) -> None:
+def test_rows_do_not_depend_on_workers(
+    finished: tuple[Suite, Path], tmp_path: Path
+) -> None:
     suite, folder = finished
     finish(suite, tmp_path / "two", jobs=2)
     assert same(*(read_table(place, EPISODES) for place in (folder, tmp_path / "two")))
-    pd.testing.assert_frame_equal(*(read_steps(place) for place in (folder, tmp_path / "two")))
+    pd.testing.assert_frame_equal(
+        *(read_steps(place) for place in (folder, tmp_path / "two"))
+    )
 
 
 def test_a_run_that_is_not_whole_goes_on_to_the_same_rows(
@@ -216,7 +263,9 @@ def test_a_run_that_is_not_whole_goes_on_to_the_same_rows(
     assert same(*(read_table(place, EPISODES) for place in (whole, folder)))
 
 
-def test_a_learning_run_is_repeated(finished: tuple[Suite, Path], tmp_path: Path) -> None:
+def test_a_learning_run_is_repeated(
+    finished: tuple[Suite, Path], tmp_path: Path
+) -> None:
     _, folder = finished
     list(rerun(folder, tmp_path / "again"))
     alike, lines = compare(folder, tmp_path / "again")
@@ -227,7 +276,12 @@ def test_an_episode_that_was_not_recorded_is_repeated_with_what_was_known(
     finished: tuple[Suite, Path], tmp_path: Path
 ) -> None:
     _, folder = finished
-    asked = {"planner": ["astar_dwa"], "sensor": ["near"], "belief": ["copula"], "ground": ["probe"]}
+    asked = {
+        "planner": ["astar_dwa"],
+        "sensor": ["near"],
+        "belief": ["copula"],
+        "ground": ["probe"],
+    }
     ((unit, member),) = find_episodes(folder, asked, 0, 0, 1)
     _, rows = unit_of(folder, planner="astar_dwa", sensor="near", belief="copula")
     found = find_recording(folder, unit, member, tmp_path)
@@ -254,7 +308,10 @@ def test_everyone_meets_the_same_noise(finished: tuple[Suite, Path]) -> None:
             learning = build(changed, origins.of(changed)).learning
             assert learning is not None
             keys[planner, name] = learning.truth.keys
-    assert all(keys["ahead", name] == keys["astar_dwa", name] for name in ("same", "alone", "seed", "draw"))
+    assert all(
+        keys["ahead", name] == keys["astar_dwa", name]
+        for name in ("same", "alone", "seed", "draw")
+    )
     whole = keys["ahead", "same"]
     assert keys["ahead", "alone"] == whole[1:]
     assert len({*whole, *keys["ahead", "seed"], *keys["ahead", "draw"]}) == 6
@@ -262,7 +319,9 @@ def test_everyone_meets_the_same_noise(finished: tuple[Suite, Path]) -> None:
 
 
 @pytest.mark.parametrize("every", [0.2, 1.0])
-def test_what_a_suite_says_of_updates_is_obeyed(every: float, dataset_path: Path, tmp_path: Path) -> None:
+def test_what_a_suite_says_of_updates_is_obeyed(
+    every: float, dataset_path: Path, tmp_path: Path
+) -> None:
     suite = suite_on(
         dataset_path,
         planners=(DRIVES,),
@@ -284,7 +343,10 @@ def test_a_planner_is_given_what_was_seen_and_what_the_rules_say_of_the_rest(
     unseen: str, dataset_path: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "log").mkdir()
-    noting = {"part": "tests.eval.parts:Noting", "options": {"log": str(tmp_path / "log")}}
+    noting = {
+        "part": "tests.eval.parts:Noting",
+        "options": {"log": str(tmp_path / "log")},
+    }
     suite = suite_on(
         dataset_path, planners=(noting,), sensors=({"part": "near", "options": {"range_m": 3.0, "colour_noise": 0.0}},),
         beliefs=("static",), task={"unseen": unseen}, world={"noise": "stored", "time_budget_s": 1.0},
@@ -293,22 +355,31 @@ def test_a_planner_is_given_what_was_seen_and_what_the_rules_say_of_the_rest(
     first = torch.load(sorted((tmp_path / "log").iterdir())[0])
     seen = first["seen"].bool()
     truth = TerrainDataset(find_dataset(str(dataset_path))).terrain("test/std", (0, 1))
-    assert torch.equal(first["rgb"].movedim(1, -1)[seen], truth.rgb.movedim(1, -1)[seen])
+    assert torch.equal(
+        first["rgb"].movedim(1, -1)[seen], truth.rgb.movedim(1, -1)[seen]
+    )
     dark = first["rgb"].movedim(1, -1)[~seen]
     assert len(dark.unique(dim=0)) == 1
     believed = first["risk_map"][~seen].unique()
     assert len(believed) == 1
     assert (float(believed) == 1) == (unseen == "optimistic")
-    torch.testing.assert_close(first["risk_map"][seen], truth.truth.mean()[seen], atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        first["risk_map"][seen], truth.truth.mean()[seen], atol=1e-5, rtol=0
+    )
 
 
-def rows_of_own(own: Path, dataset: Path, folder: Path, *words: str, status: int = 0) -> pd.DataFrame:
+def rows_of_own(
+    own: Path, dataset: Path, folder: Path, *words: str, status: int = 0
+) -> pd.DataFrame:
     asked = (
         "--planners", "['tests.eval.parts:Faulty',straight]", "--risks", "[mean]", "--scenarios", "[std]",
         "--maps", "2",
         "--model", "oracle", "--world", "{preset: stakes, immobile: null, time_budget_s: 3}", "--record", "none",
     )  # fmt: skip
-    assert call("eval", "run", "--data", dataset, "--out", folder, *asked, *words) == status
+    assert (
+        call("eval", "run", "--data", dataset, "--out", folder, *asked, *words)
+        == status
+    )
     return read_table(folder, EPISODES)
 
 
@@ -339,11 +410,15 @@ def test_an_own_sensor_and_an_own_belief_from_a_file_run_in_two_processes(
     assert {"Feeler", "Remembers", "Eye", "statistics of the ground"} <= names
 
 
-@pytest.mark.parametrize(("kind", "outcome"), [("grounds", "sensor_error"), ("beliefs", "belief_error")])
+@pytest.mark.parametrize(
+    ("kind", "outcome"), [("grounds", "sensor_error"), ("beliefs", "belief_error")]
+)
 def test_an_own_part_that_fails_ends_its_episodes_with_its_name(
     kind: str, outcome: str, own: Path, dataset_path: Path, tmp_path: Path
 ) -> None:
-    rows = rows_of_own(own, dataset_path, tmp_path / "run", *parts_of(own, **{kind: "lost"}), status=1)
+    rows = rows_of_own(
+        own, dataset_path, tmp_path / "run", *parts_of(own, **{kind: "lost"}), status=1
+    )
     drove, blind = (rows[rows["planner"] == name] for name in ("Faulty", "straight"))
     assert drove["outcome"].tolist() == [outcome] * 2
     assert drove["error"].tolist() == ["ValueError: lost"] * 2
@@ -352,16 +427,32 @@ def test_an_own_part_that_fails_ends_its_episodes_with_its_name(
     text = (tmp_path / "run" / ERRORS).read_text()
     assert "raise ValueError(self.fault)" in text
     # What was known by then is told.
-    assert drove["end_time_s"].tolist() == pytest.approx([0.7, 0.7] if kind == "grounds" else [0.5, 0.5])
+    assert drove["end_time_s"].tolist() == pytest.approx(
+        [0.7, 0.7] if kind == "grounds" else [0.5, 0.5]
+    )
 
 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--risks", "[single-class]", "--beliefs", "[copula]"), "Expected a belief that does not learn"),
-        (("--grounds", "['probe:-1']", "--beliefs", "[copula]"), "`radius_m` of the ground probe > 0"),
+        (
+            ("--risks", "[single-class]", "--beliefs", "[copula]"),
+            "Expected a belief that does not learn",
+        ),
+        (
+            ("--grounds", "['probe:-1']", "--beliefs", "[copula]"),
+            "`radius_m` of the ground probe > 0",
+        ),
         (("--grounds", "['probe:-1']"), "`radius_m`"),  # which `static` does not ask
-        (("--grounds", "[{part: probe, options: {noise_std: 0}}]", "--beliefs", "[copula]"), "`noise_std`"),
+        (
+            (
+                "--grounds",
+                "[{part: probe, options: {noise_std: 0}}]",
+                "--beliefs",
+                "[copula]",
+            ),
+            "`noise_std`",
+        ),
         (("--sensors", "[{part: near, options: {fov_deg: 0}}]"), "`fov_deg`"),
         (("--beliefs", "[{part: copula, options: {window: 0}}]"), "`window`"),
     ],
@@ -380,51 +471,86 @@ def test_what_robots_cannot_learn_by_is_refused_before_the_run_in_a_line(
         "oracle",
     )
     chosen = asked if "--risks" in words else (*asked, "--risks", "[mean]")
-    assert call("eval", "run", "--data", dataset_path, "--out", tmp_path / "run", *chosen, *words) == 2
+    assert (
+        call(
+            "eval",
+            "run",
+            "--data",
+            dataset_path,
+            "--out",
+            tmp_path / "run",
+            *chosen,
+            *words,
+        )
+        == 2
+    )
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert told in line
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_near_without_statistics_of_the_ground_is_refused_before_the_run(jobs: int, tmp_path: Path) -> None:
+def test_near_without_statistics_of_the_ground_is_refused_before_the_run(
+    jobs: int, tmp_path: Path
+) -> None:
     recipe = load_recipe("tiny-v1")
     first, *rest = recipe.classes
-    other = replace(factories.tiny_recipe(), classes=(replace(first, noise=0.123), *rest))
+    other = replace(
+        factories.tiny_recipe(), classes=(replace(first, noise=0.123), *rest)
+    )
     dataset = factories.tiny_dataset(tmp_path / "other.h5", other)
     suite = suite_on(dataset, planners=(DRIVES,), record="none", maps=1)
     with pytest.raises(
-        ConfigError, match=r"Expected statistics of the ground in .*other\.ground\.json, got none"
+        ConfigError,
+        match=r"Expected statistics of the ground in .*other\.ground\.json, got none",
     ):
         finish(suite, tmp_path / "run", jobs)
     assert not (tmp_path / "run").exists()
     # A blind planner, and one that sees all, need none.
-    rows = finish(replace(suite, planners=(DRIVES, "straight"), sensors=("full",)), tmp_path / "run", jobs)
+    rows = finish(
+        replace(suite, planners=(DRIVES, "straight"), sensors=("full",)),
+        tmp_path / "run",
+        jobs,
+    )
     assert (rows["error"] == "").all()
 
 
-def test_other_statistics_of_the_ground_are_another_origin(dataset_path: Path, tmp_path: Path) -> None:
+def test_other_statistics_of_the_ground_are_another_origin(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     dataset = tmp_path / "tiny.h5"
     dataset.write_bytes(dataset_path.read_bytes())
     suite = suite_on(dataset, planners=(DRIVES,), record="none", maps=1)
     finish(suite, tmp_path / "run")
-    conditions = [condition for condition, _ in open_run(tmp_path / "run").conditions.values()]
-    before = {condition.id: describe_parts(condition)["parts"] for condition in conditions}
+    conditions = [
+        condition for condition, _ in open_run(tmp_path / "run").conditions.values()
+    ]
+    before = {
+        condition.id: describe_parts(condition)["parts"] for condition in conditions
+    }
     recipes = Path(load_recipe.__code__.co_filename).parent
     text = (recipes / "ground" / "tiny-v1.json").read_text()
-    (tmp_path / "tiny.ground.json").write_text(text.replace('"potts_strength": ', '"potts_strength": 1'))
+    (tmp_path / "tiny.ground.json").write_text(
+        text.replace('"potts_strength": ', '"potts_strength": 1')
+    )
     said: list[str] = []
     for condition in conditions:
         changed = describe_parts(condition)["parts"] != before[condition.id]
         assert changed == (condition.sensor.part == "near")
     finish(suite, tmp_path / "run", say=said.append)
-    assert any("(statistics of the ground) and are run again" in line for line in said), said
+    assert any(
+        "(statistics of the ground) and are run again" in line for line in said
+    ), said
 
 
-def test_the_time_of_a_planner_alone_is_measured_by_what_it_knows(finished: tuple[Suite, Path]) -> None:
+def test_the_time_of_a_planner_alone_is_measured_by_what_it_knows(
+    finished: tuple[Suite, Path],
+) -> None:
     _, folder = finished
     entries = [
-        e for e in open_run(folder).about["conditions"].values() if e["labels"]["planner"] == "astar_dwa"
+        e
+        for e in open_run(folder).about["conditions"].values()
+        if e["labels"]["planner"] == "astar_dwa"
     ]
     assert len(entries) == 4
     assert len({entry["latency"]["median_ms"] for entry in entries}) == 4
@@ -433,7 +559,11 @@ def test_the_time_of_a_planner_alone_is_measured_by_what_it_knows(finished: tupl
 def test_rows_of_a_planner_that_is_given_the_ground_have_a_lower_bound_and_others_none(
     dataset_path: Path, tmp_path: Path
 ) -> None:
-    world = {"noise": "stored", "time_budget_s": 60.0, "immobile": {"below": 0.75, "for_s": 0.3}}
+    world = {
+        "noise": "stored",
+        "time_budget_s": 60.0,
+        "immobile": {"below": 0.75, "for_s": 0.3},
+    }
     suite = Suite(
         data=str(dataset_path), models=("clairvoyant",), planners=("near_optimal", SEARCHES), risks=("mean",),
         scenarios=("std",), maps=2, record="none", world=(world,), task=({"min_traversability": 0.05},),
@@ -449,7 +579,9 @@ def test_rows_of_a_planner_that_is_given_the_ground_have_a_lower_bound_and_other
     assert (arrived["lower_bound_s"] > 0.7 * arrived["total_time_s"]).all()
     dataset = TerrainDataset(dataset_path)
     places = dataset.read("test/std", fields=["start_m", "goal_m", "traversability"])
-    motion = Motion(robot=Unicycle(), goal_radius_m=1.0, immobile=Immobile(below=0.75, for_s=0.3))
+    motion = Motion(
+        robot=Unicycle(), goal_radius_m=1.0, immobile=Immobile(below=0.75, for_s=0.3)
+    )
     for row in known.to_dict("records"):
         field, start_m, goal_m = (
             places[name][row["map"]] for name in ("traversability", "start_m", "goal_m")

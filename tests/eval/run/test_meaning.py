@@ -1,7 +1,9 @@
-"""What each unit of a suite is given: every setting reaches the episodes that it is meant for, and no other.
+"""What each unit of a suite is given: every setting reaches the episodes that it is
+meant for, and no other.
 
-A spy planner writes down what it sees, on 54 maps that are not square, in two blocks a cell, with two
-workers; expectations are worked out here from the dataset and the random streams alone.
+A spy planner writes down what it sees, on 54 maps that are not square, in two blocks a
+cell, with two workers; expectations are worked out here from the dataset and the random
+streams alone.
 """
 
 from collections import Counter
@@ -24,7 +26,10 @@ MAPS, SEEDS, REALISATIONS = 54, (3, 4), 2
 SCENARIOS = ("std", "hg")
 RISKS = {"mean": lambda m: m.mean(), "cvar:0.5": lambda m: m.cvar(0.5)}
 GAINS = {"quiet": 1.0, "loud": 2.5}
-WORLDS = {"paper time_budget_s=0.6": "resampled", "paper noise=stored time_budget_s=0.6": "stored"}
+WORLDS = {
+    "paper time_budget_s=0.6": "resampled",
+    "paper noise=stored time_budget_s=0.6": "stored",
+}
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +38,15 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> TerrainDataset:
         factories.tiny_recipe(train=1, valid=1, test_std=MAPS, test_hg=MAPS, test_hs=1),
         height=24, width=36, start_m=(3.0, 4.0), goal_m=(15.0, 9.0),
     )  # fmt: skip
-    return TerrainDataset(factories.tiny_dataset(tmp_path_factory.mktemp("data") / "wide.h5", recipe))
+    return TerrainDataset(
+        factories.tiny_dataset(tmp_path_factory.mktemp("data") / "wide.h5", recipe)
+    )
 
 
 @pytest.fixture(scope="module")
-def ran(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Any], pd.DataFrame]:
+def ran(
+    dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[list[Any], pd.DataFrame]:
     """What the spy saw, unit by unit, and the run's rows."""
     folder = tmp_path_factory.mktemp("spied")
     (folder / "log").mkdir()
@@ -67,17 +76,26 @@ def risk_maps(dataset: TerrainDataset, scenario: str, risk: str) -> torch.Tensor
 
 
 @cache
-def ground_at_start(dataset: TerrainDataset, scenario: str, map_index: int) -> tuple[float, float, float]:
+def ground_at_start(
+    dataset: TerrainDataset, scenario: str, map_index: int
+) -> tuple[float, float, float]:
     """λ, and mean and standard deviation of the distribution it was drawn from."""
     terrain = dataset.terrain(f"test/{scenario}", [map_index])
     row, column = int(4.0 // 0.5), int(3.0 // 0.5)
-    mean, std = (float(t[0, 0, row, column]) for t in (terrain.truth.means, terrain.truth.stds))
+    mean, std = (
+        float(t[0, 0, row, column]) for t in (terrain.truth.means, terrain.truth.stds)
+    )
     return float(terrain.traversability[0, row, column]), mean, std
 
 
 @cache
 def expected_noise(
-    dataset: TerrainDataset, scenario: str, map_index: int, seed: int, realisation: int, noise: str
+    dataset: TerrainDataset,
+    scenario: str,
+    map_index: int,
+    seed: int,
+    realisation: int,
+    noise: str,
 ) -> np.ndarray:
     """λ of the first three steps at the start, from the streams."""
     stored, mean, std = ground_at_start(dataset, scenario, map_index)
@@ -89,15 +107,21 @@ def expected_noise(
     return np.clip(mean + std * drawn, 0, 1)
 
 
-def identify(dataset: TerrainDataset, note: dict[str, Any]) -> tuple[str, str, tuple[int, ...]]:
+def identify(
+    dataset: TerrainDataset, note: dict[str, Any]
+) -> tuple[str, str, tuple[int, ...]]:
     """Scenario, risk and maps of a unit, told by the maps it was given."""
     for scenario in SCENARIOS:
         for risk in RISKS:
             maps = risk_maps(dataset, scenario, risk)
-            same = (note["risk_map"][:, None] - maps[None]).abs().amax(dim=(2, 3)) < 1e-6
+            same = (note["risk_map"][:, None] - maps[None]).abs().amax(
+                dim=(2, 3)
+            ) < 1e-6
             if bool(same.any(dim=1).all()):
                 return scenario, risk, tuple(same.int().argmax(dim=1).tolist())
-    raise AssertionError("a unit was given maps that are those of no scenario and risk setting")
+    raise AssertionError(
+        "a unit was given maps that are those of no scenario and risk setting"
+    )
 
 
 def test_each_unit_meets_its_own_maps_risk_seed_noise_and_options(
@@ -119,7 +143,9 @@ def test_each_unit_meets_its_own_maps_risk_seed_noise_and_options(
             if _planner_seed(s, scenario, r) == note["generator"]
         )
         (realisation,) = (
-            r for r in range(REALISATIONS) if _planner_seed(seed, scenario, r) == note["generator"]
+            r
+            for r in range(REALISATIONS)
+            if _planner_seed(seed, scenario, r) == note["generator"]
         )
         observed = note["observed"].numpy()
         noises = [
@@ -128,12 +154,18 @@ def test_each_unit_meets_its_own_maps_risk_seed_noise_and_options(
             if np.allclose(
                 observed,
                 np.stack(
-                    [expected_noise(dataset, scenario, i, seed, realisation, noise) for i in maps], axis=1
+                    [
+                        expected_noise(dataset, scenario, i, seed, realisation, noise)
+                        for i in maps
+                    ],
+                    axis=1,
                 ),
                 atol=1e-5,
             )
         ]
-        assert len(noises) == 1, "observed λ is that of no noise under this unit's seed and maps"
+        assert len(noises) == 1, (
+            "observed λ is that of no noise under this unit's seed and maps"
+        )
         met[scenario, risk, maps, seed, realisation, noises[0], note["gain"]] += 1
         assert note["goal_m"].tolist() == [[15.0, 9.0]] * len(maps)
         assert note["start"][:, :2].tolist() == [[3.0, 4.0]] * len(maps)
@@ -150,8 +182,13 @@ def test_each_unit_meets_its_own_maps_risk_seed_noise_and_options(
         for noise in WORLDS.values()
         for gain in GAINS.values()
     }
-    alone = {(SCENARIOS[0], "mean", (0,), SEEDS[0], 0, "resampled", gain) for gain in GAINS.values()}
-    assert set(met) == wanted | alone  # one robot alone of each planner, for its latency
+    alone = {
+        (SCENARIOS[0], "mean", (0,), SEEDS[0], 0, "resampled", gain)
+        for gain in GAINS.values()
+    }
+    assert (
+        set(met) == wanted | alone
+    )  # one robot alone of each planner, for its latency
     assert set(met.values()) == {1}
 
 
@@ -176,12 +213,20 @@ def test_each_row_is_that_of_its_own_episode(
     stored = rows[rows["world"].str.contains("stored")]
     for row in stored.sample(40, random_state=0).to_dict("records"):
         expected = expected_noise(
-            dataset, row["scenario"], row["map"], row["seed"], row["realisation"], "stored"
+            dataset,
+            row["scenario"],
+            row["map"],
+            row["seed"],
+            row["realisation"],
+            "stored",
         )
         assert row["traversability"] == pytest.approx(expected[0], abs=1e-5)
     drawn = rows[~rows["world"].str.contains("stored")]
-    # Planners and risk settings meet the same noise; seeds, realisations and maps do not.
-    same = drawn.groupby(["scenario", "seed", "realisation", "map"])["traversability"].nunique()
+    # Planners and risk settings meet the same noise; seeds, realisations and maps do
+    # not.
+    same = drawn.groupby(["scenario", "seed", "realisation", "map"])[
+        "traversability"
+    ].nunique()
     assert set(same) == {1}
     other = drawn.groupby(["scenario", "map"])["traversability"].nunique()
     assert set(other) == {len(SEEDS) * REALISATIONS}

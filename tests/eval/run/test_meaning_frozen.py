@@ -1,6 +1,8 @@
-"""What each unit of a suite meets where λ is frozen: worked out here from the dataset and the streams alone.
+"""What each unit of a suite meets where λ is frozen: worked out here from the dataset
+and the streams alone.
 
-A spy planner writes down what it sees, on 53 maps with places of their own, in two blocks, with two workers.
+A spy planner writes down what it sees, on 53 maps with places of their own, in two
+blocks, with two workers.
 """
 
 from collections import Counter
@@ -28,16 +30,22 @@ BLOCKS = (tuple(range(50)), tuple(range(50, MAPS)))
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> TerrainDataset:
-    recipe = factories.tiny_recipe(train=1, valid=1, test_std=MAPS, test_hg=1, test_hs=1)
+    recipe = factories.tiny_recipe(
+        train=1, valid=1, test_std=MAPS, test_hg=1, test_hs=1
+    )
     recipe = replace(
         recipe, synthesis=2, start_m=None, goal_m=None, correlation_m=1.0,
         places=PlacesRule(least_distance_m=9.0, margin_m=2.0),
     )  # fmt: skip
-    return TerrainDataset(factories.tiny_dataset(tmp_path_factory.mktemp("data") / "d.h5", recipe))
+    return TerrainDataset(
+        factories.tiny_dataset(tmp_path_factory.mktemp("data") / "d.h5", recipe)
+    )
 
 
 @pytest.fixture(scope="module")
-def ran(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Any], pd.DataFrame]:
+def ran(
+    dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[list[Any], pd.DataFrame]:
     folder = tmp_path_factory.mktemp("spied")
     (folder / "log").mkdir()
     worlds = [
@@ -80,10 +88,16 @@ def field(
     noise = rng.stream_key(seed, "simulation", *names)
     for attempt in range(100):
         key = rng.stream_key(noise, map_index, "field", attempt)
-        normal = correlated_normal(key, np.zeros(1, np.int64), (32, 32), length / 0.5)[0]
-        mean, std = (t[0, 0].double().numpy() for t in (terrain.truth.means, terrain.truth.stds))
+        normal = correlated_normal(key, np.zeros(1, np.int64), (32, 32), length / 0.5)[
+            0
+        ]
+        mean, std = (
+            t[0, 0].double().numpy() for t in (terrain.truth.means, terrain.truth.stds)
+        )
         met = np.clip(mean + std * normal, 0, 1)
-        if has_way(met >= WORLDS[length], cell(places["start_m"][0]), cell(places["goal_m"][0])):
+        if has_way(
+            met >= WORLDS[length], cell(places["start_m"][0]), cell(places["goal_m"][0])
+        ):
             return torch.from_numpy(met), attempt
     raise AssertionError("no way in a hundred draws")
 
@@ -111,7 +125,9 @@ def test_each_unit_meets_the_field_of_its_own_world_seed_realisation_and_maps(
         rows = list(block)
         np.testing.assert_allclose(note["start"][:, :2], places["start_m"][rows])
         np.testing.assert_allclose(note["goal_m"], places["goal_m"][rows])
-        np.testing.assert_allclose(note["time_budget_s"], RATIO * places["reference_time_s"][rows], rtol=1e-5)
+        np.testing.assert_allclose(
+            note["time_budget_s"], RATIO * places["reference_time_s"][rows], rtol=1e-5
+        )
         # Free by the mean, whatever the risk setting; motion at no less than 0.05.
         mean = truth.select(torch.tensor(rows)).mean()
         torch.testing.assert_close(note["motion_map"], note["risk_map"].clamp(min=0.05))
@@ -121,10 +137,14 @@ def test_each_unit_meets_the_field_of_its_own_world_seed_realisation_and_maps(
             key
             for key, known in fields.items()
             if key[3] == block
-            and np.allclose(observed, [known[b][at] for b, at in enumerate(starts)], atol=1e-5)
+            and np.allclose(
+                observed, [known[b][at] for b, at in enumerate(starts)], atol=1e-5
+            )
         ]
         assert len(fitting) == 1
-        assert torch.equal(note["observed"], note["observed"][:1].expand_as(note["observed"]))
+        assert torch.equal(
+            note["observed"], note["observed"][:1].expand_as(note["observed"])
+        )
         known = fields[fitting[0]]
         if torch.allclose(note["risk_map"].double(), known, atol=1e-5):
             setting = "clairvoyant"
@@ -136,7 +156,11 @@ def test_each_unit_meets_the_field_of_its_own_world_seed_realisation_and_maps(
                 torch.testing.assert_close(note["risk_map"], chosen)
             assert ((note["free"] != (mean > 0.1)).flatten(1).sum(1) <= 40).all()
         met[setting, *fitting[0]] += 1
-    wanted = {(setting, *key) for setting in ("mean", "cvar:0.5", "clairvoyant") for key in fields}
+    wanted = {
+        (setting, *key)
+        for setting in ("mean", "cvar:0.5", "clairvoyant")
+        for key in fields
+    }
     assert set(met) == wanted
     assert set(met.values()) == {1}
 
@@ -151,8 +175,12 @@ def test_rows_tell_what_was_drawn_again_and_the_clairvoyant_runs_once(
     }  # fmt: skip
     assert rows["rejected_draws"].max() > 0
     for row in (
-        rows[rows["world"].str.contains("correlation_m=2")].sample(20, random_state=1).to_dict("records")
+        rows[rows["world"].str.contains("correlation_m=2")]
+        .sample(20, random_state=1)
+        .to_dict("records")
     ):
         told = field(dataset, row["map"], row["seed"], row["realisation"], 2.0)
         assert row["rejected_draws"] == told[1]
-        assert row["total_time_s"] == pytest.approx(RATIO * row["reference_time_s"], rel=1e-4)
+        assert row["total_time_s"] == pytest.approx(
+            RATIO * row["reference_time_s"], rel=1e-4
+        )

@@ -1,4 +1,6 @@
-"""Shards that are merged are the run of one process, and nothing that is no such run is made."""
+"""Shards that are merged are the run of one process, and nothing that is no such run is
+made.
+"""
 
 import json
 import multiprocessing
@@ -50,7 +52,10 @@ def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def made(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Its shards; to be copied by those who change them."""
     folder = tmp_path_factory.mktemp("shards")
-    return [finish(suite, folder / f"part{i}", Shard(index=i, of=OF)) for i in range(1, OF + 1)]
+    return [
+        finish(suite, folder / f"part{i}", Shard(index=i, of=OF))
+        for i in range(1, OF + 1)
+    ]
 
 
 @pytest.fixture
@@ -79,19 +84,29 @@ def killed_after(count: int, steps: Callable[[], Iterator[tuple[int, int]]]) -> 
 
 
 def same(one: Path, other: Path) -> None:
-    """Asserts that two runs have the same rows in the same order, steps, faults and recordings."""
+    """Asserts that two runs have the same rows in the same order, steps, faults and
+    recordings.
+    """
     first, second = (pd.read_parquet(run / "episodes.parquet") for run in (one, other))
     assert not second.duplicated(KEYS).any()
     pd.testing.assert_frame_equal(
-        *(rows[[c for c in rows if not c.startswith("planning_")]] for rows in (first, second))
+        *(
+            rows[[c for c in rows if not c.startswith("planning_")]]
+            for rows in (first, second)
+        )
     )
     pd.testing.assert_frame_equal(*(read_steps(run) for run in (one, other)))
     assert (one / "errors.txt").read_text() == (other / "errors.txt").read_text()
-    recordings = [sorted(path.name for path in (run / "playback").glob("*")) for run in (one, other)]
+    recordings = [
+        sorted(path.name for path in (run / "playback").glob("*"))
+        for run in (one, other)
+    ]
     assert recordings[0] == recordings[1] != []
 
 
-def test_merged_shards_are_the_run_of_one_process(whole: Path, parts: list[Path], tmp_path: Path) -> None:
+def test_merged_shards_are_the_run_of_one_process(
+    whole: Path, parts: list[Path], tmp_path: Path
+) -> None:
     counts = [len(list(part.glob("units/*/*.parquet"))) for part in parts]
     assert sum(counts) == 12
     assert min(counts) > 0
@@ -102,23 +117,36 @@ def test_merged_shards_are_the_run_of_one_process(whole: Path, parts: list[Path]
     first, merged = open_run(whole), open_run(tmp_path / "all")
     assert merged.shard is None
     assert merged.conditions == first.conditions
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["all", *(part.name for part in parts)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "all",
+        *(part.name for part in parts),
+    ]
 
 
-def test_planning_times_of_several_machines_are_warned_of(parts: list[Path], tmp_path: Path) -> None:
+def test_planning_times_of_several_machines_are_warned_of(
+    parts: list[Path], tmp_path: Path
+) -> None:
     runs = [open_run(part) for part in parts]
     assert merge._about(runs)["warnings"] == runs[0].about["warnings"]
     other = {**runs[0].about["machine"], "processor": "Abacus", "host": "elsewhere"}
     write_run(parts[1], {**runs[1].about, "machine": other})
     list(merge_shards(parts, tmp_path / "all"))
-    (line,) = [line for line in caveats(open_run(tmp_path / "all").about) if "planning times" in line]
+    (line,) = [
+        line
+        for line in caveats(open_run(tmp_path / "all").about)
+        if "planning times" in line
+    ]
     assert line.startswith("warning: the shards ran on 2 machines (")
     assert "Abacus with " in line
 
 
-def test_a_merged_run_is_gone_on_with_and_extended(suite: Suite, parts: list[Path], tmp_path: Path) -> None:
+def test_a_merged_run_is_gone_on_with_and_extended(
+    suite: Suite, parts: list[Path], tmp_path: Path
+) -> None:
     list(merge_shards(parts, tmp_path / "all"))
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "all").glob("units/*/*")}
+    before = {
+        path: path.stat().st_mtime_ns for path in (tmp_path / "all").glob("units/*/*")
+    }
     said: list[str] = []
     list(run_suite(suite, tmp_path / "all", say=said.append))
     assert said == ["12 of 12 units were there already"]
@@ -128,7 +156,9 @@ def test_a_merged_run_is_gone_on_with_and_extended(suite: Suite, parts: list[Pat
     same(finish(longer, tmp_path / "fresh"), tmp_path / "all")
 
 
-def test_shards_that_are_killed_and_extended_are_the_extended_run(suite: Suite, tmp_path: Path) -> None:
+def test_shards_that_are_killed_and_extended_are_the_extended_run(
+    suite: Suite, tmp_path: Path
+) -> None:
     longer = replace(suite, seeds=(0, 1, 2, 3), scenarios=("std",))
     shards = [Shard(index=i, of=2) for i in (1, 2)]
     folders = [tmp_path / "one", tmp_path / "two"]
@@ -148,17 +178,23 @@ def test_a_shard_has_rows_and_no_tables(parts: list[Path]) -> None:
     assert {path.name for path in part.iterdir()} <= {
         "run.json", "units", "steps", "playback", "errors.txt", "SHA256SUMS"
     }  # fmt: skip
-    with pytest.raises(ConfigError, match=r"shard 1/3 of a run and has no tables.*benchnav-eval merge"):
+    with pytest.raises(
+        ConfigError, match=r"shard 1/3 of a run and has no tables.*benchnav-eval merge"
+    ):
         read_table(part, "episodes.parquet")
 
 
 @pytest.mark.parametrize("other", [None, Shard(index=2, of=OF), Shard(index=1, of=2)])
-def test_a_folder_holds_one_shard(suite: Suite, parts: list[Path], other: Shard | None) -> None:
+def test_a_folder_holds_one_shard(
+    suite: Suite, parts: list[Path], other: Shard | None
+) -> None:
     with pytest.raises(ConfigError, match="holds shard 1/3"):
         finish(suite, parts[0], other)
 
 
-def test_a_whole_run_is_no_shard(suite: Suite, whole: Path, parts: list[Path], tmp_path: Path) -> None:
+def test_a_whole_run_is_no_shard(
+    suite: Suite, whole: Path, parts: list[Path], tmp_path: Path
+) -> None:
     with pytest.raises(ConfigError, match="holds a whole run"):
         finish(suite, whole, Shard(index=1, of=OF))
     with pytest.raises(ConfigError, match="whole run"):
@@ -171,7 +207,10 @@ def test_a_shard_without_units_is_not_needed(suite: Suite, tmp_path: Path) -> No
     folders = [tmp_path / f"part{i}" for i in (1, 2)]
     for i, folder in enumerate(folders, start=1):
         steps = [
-            tuple(step) for step in run_suite(small, folder, shard=Shard(index=i, of=2), say=said.append)
+            tuple(step)
+            for step in run_suite(
+                small, folder, shard=Shard(index=i, of=2), say=said.append
+            )
         ]
         assert steps in ([], [(0, 1), (1, 1)])
     full = [folder for folder in folders if (folder / "units").exists()]
@@ -183,12 +222,17 @@ def test_a_shard_without_units_is_not_needed(suite: Suite, tmp_path: Path) -> No
     assert len(pd.read_parquet(tmp_path / "all" / "episodes.parquet")) == 2
 
 
-def test_missing_units_are_told_with_their_shards(parts: list[Path], tmp_path: Path) -> None:
+def test_missing_units_are_told_with_their_shards(
+    parts: list[Path], tmp_path: Path
+) -> None:
     gone = next(parts[2].glob("units/*/*.parquet"))
     gone.unlink()
     count = len(list(parts[1].glob("units/*/*")))
     for given, expected in (
-        ([parts[0], parts[2]], rf"got none for: {count} units of shard 2/3, 1 unit of shard 3/3 in .*part3"),
+        (
+            [parts[0], parts[2]],
+            rf"got none for: {count} units of shard 2/3, 1 unit of shard 3/3 in .*part3",
+        ),
         (parts, r"got none for: 1 unit of shard 3/3 in .*part3"),
     ):
         with pytest.raises(ConfigError, match=expected):
@@ -235,7 +279,12 @@ def test_shards_of_other_runs_are_refused_by_what_differs(
         ("environment", "processor", "ABACUS", "processor"),
         ("environment", "planner_limit_s", 5.0, "planner_limit_s"),
         ("environment", "device", "cuda", "device"),
-        ("parts", "planner tests.eval.parts:Faulty", "0", "planner tests.eval.parts:Faulty"),
+        (
+            "parts",
+            "planner tests.eval.parts:Faulty",
+            "0",
+            "planner tests.eval.parts:Faulty",
+        ),
     ],
 )
 def test_shards_that_other_code_made_are_refused_by_what_differs(
@@ -246,26 +295,34 @@ def test_shards_that_other_code_made_are_refused_by_what_differs(
     about["code"][group][name] = value
     pq.write_table(with_metadata(pq.read_table(path, partitioning=None), about), path)
     with pytest.raises(
-        ConfigError, match=rf"Expected shards made by one code, got .*, which differ in ({expected})"
+        ConfigError,
+        match=rf"Expected shards made by one code, got .*, which differ in ({expected})",
     ):
         list(merge_shards(parts, tmp_path / "all"))
     assert not (tmp_path / "all").exists()
 
 
-def test_a_unit_may_be_there_twice_if_it_is_the_same(whole: Path, parts: list[Path], tmp_path: Path) -> None:
+def test_a_unit_may_be_there_twice_if_it_is_the_same(
+    whole: Path, parts: list[Path], tmp_path: Path
+) -> None:
     again = shutil.copytree(parts[0], tmp_path / "again")
     unit = next(again.glob("units/*/*.parquet"))
     table = pq.read_table(unit, partitioning=None)
     later = table.set_column(
-        table.schema.get_field_index("planning_ms"), "planning_ms", pa.array([1e6] * len(table))
+        table.schema.get_field_index("planning_ms"),
+        "planning_ms",
+        pa.array([1e6] * len(table)),
     )
     pq.write_table(with_metadata(later, metadata(unit)), unit)
     list(merge_shards([*parts, again], tmp_path / "all"))
     same(whole, tmp_path / "all")
-    other = table.set_column(table.schema.get_field_index("score"), "score", pa.array([0.25] * len(table)))
+    other = table.set_column(
+        table.schema.get_field_index("score"), "score", pa.array([0.25] * len(table))
+    )
     pq.write_table(with_metadata(other, metadata(unit)), unit)
     with pytest.raises(
-        ConfigError, match=rf"{unit.stem.rpartition('-')[0]} .* differs between .*part1.* and .*again"
+        ConfigError,
+        match=rf"{unit.stem.rpartition('-')[0]} .* differs between .*part1.* and .*again",
     ):
         list(merge_shards([*parts, again], tmp_path / "all2"))
 
@@ -312,20 +369,32 @@ def test_the_commands(  # type: ignore[no-untyped-def]
     assert "Faulty" in printed
     assert (Path(out[2]) / "summary.md").exists()
     commands = open_run(Path(out[2])).about["history"]
-    assert [entry["command"].split()[1] for entry in commands] == ["run", "run", "merge"]
+    assert [entry["command"].split()[1] for entry in commands] == [
+        "run",
+        "run",
+        "merge",
+    ]
     assert told("report", out[2])[0] == 0
     assert told(*run, "--shard", "3/2", "--out", out[0])[0] == 2
     assert told("merge", out[2])[0] == 2
     # A shard in which a part failed says so.
     bad = ["{part: tests.eval.parts:Faulty, options: {fault: raise}}"]
     status, _, error = told(
-        *run, "--planners", f"[{bad[0]}]", "--shard", "1/1", "--out", str(tmp_path / "bad")
+        *run,
+        "--planners",
+        f"[{bad[0]}]",
+        "--shard",
+        "1/1",
+        "--out",
+        str(tmp_path / "bad"),
     )
     assert status == 1
     assert "errors.txt" in error
 
 
-def test_shards_of_one_suite_share_their_hypotheses(suite: Suite, parts: list[Path], tmp_path: Path) -> None:
+def test_shards_of_one_suite_share_their_hypotheses(
+    suite: Suite, parts: list[Path], tmp_path: Path
+) -> None:
     claim = {
         "one": {"planner": "bad"},
         "other": {"planner": "Faulty"},
@@ -333,7 +402,9 @@ def test_shards_of_one_suite_share_their_hypotheses(suite: Suite, parts: list[Pa
         "direction": "lower",
     }
     shard = Shard(index=2, of=OF)
-    parts[1] = finish(replace(suite, hypotheses=(claim,)), tmp_path / "other" / "part2", shard)
+    parts[1] = finish(
+        replace(suite, hypotheses=(claim,)), tmp_path / "other" / "part2", shard
+    )
     with pytest.raises(ConfigError, match="part2: hypotheses"):
         list(merge_shards(parts, tmp_path / "all"))
 
@@ -346,14 +417,21 @@ def test_damaged_units_and_parts_that_read_something_else_are_not_merged(
     others = list(parts[0].glob("units/*/*.parquet"))
     for path in others:
         read = {**metadata(path), "touched": {"file a.npz": "1"}}
-        pq.write_table(with_metadata(pq.read_table(path, partitioning=None), read), path)
-    pq.write_table(with_metadata(table, {**about, "touched": {"file a.npz": "2"}}), unit)
+        pq.write_table(
+            with_metadata(pq.read_table(path, partitioning=None), read), path
+        )
+    pq.write_table(
+        with_metadata(table, {**about, "touched": {"file a.npz": "2"}}), unit
+    )
     with pytest.raises(
-        ConfigError, match=r"parts read the same, got .*part\d.*differs .* in file a\.npz\. Give"
+        ConfigError,
+        match=r"parts read the same, got .*part\d.*differs .* in file a\.npz\. Give",
     ):
         list(merge_shards(parts, tmp_path / "all"))
     scores = pa.array([0.25] * len(table))
-    pq.write_table(table.set_column(table.schema.get_field_index("score"), "score", scores), unit)
+    pq.write_table(
+        table.set_column(table.schema.get_field_index("score"), "score", scores), unit
+    )
     with pytest.raises(ConfigError, match=rf"part2 is damaged: units/.*{unit.name}"):
         list(merge_shards(parts, tmp_path / "all"))
     assert not (tmp_path / "all").exists()

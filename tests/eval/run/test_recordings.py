@@ -1,4 +1,6 @@
-"""What is made again of a run: the map of driven paths and the ground of failures, against what the run was on."""
+"""What is made again of a run: the map of driven paths and the ground of failures,
+against what the run was on.
+"""
 
 import itertools
 import json
@@ -33,7 +35,11 @@ PLANNERS = ("straight", "tests.eval.parts:Faulty")
 def on_map(folder: Path, about: Mapping[str, Any]) -> list[Recording]:
     """The recordings of a run on one map under one draw of λ."""
     named = ("scenario", "seed", "realisation", "map")
-    return [one for one in recordings(folder) if all(one.about[name] == str(about[name]) for name in named)]
+    return [
+        one
+        for one in recordings(folder)
+        if all(one.about[name] == str(about[name]) for name in named)
+    ]
 
 
 def test_the_map_that_is_kept_is_the_telling_one_with_λ_as_robots_met_it(
@@ -49,12 +55,25 @@ def test_the_map_that_is_kept_is_the_telling_one_with_λ_as_robots_met_it(
             np.testing.assert_array_equal(getattr(kept, name), getattr(recording, name))
 
 
-def test_whichever_map_is_telling_is_kept_under_its_own_noise(dataset: Path, tmp_path: Path) -> None:
-    folder = run(dataset, tmp_path / "run", planners=PLANNERS, risks=("mean",), maps=2, realisations=2)
+def test_whichever_map_is_telling_is_kept_under_its_own_noise(
+    dataset: Path, tmp_path: Path
+) -> None:
+    folder = run(
+        dataset,
+        tmp_path / "run",
+        planners=PLANNERS,
+        risks=("mean",),
+        maps=2,
+        realisations=2,
+    )
     rows = pd.read_parquet(folder / "episodes.parquet")
     fields = set()
     for seed, realisation, map_index in itertools.product(SEEDS, range(2), range(2)):
-        here = (rows["seed"] == seed) & (rows["realisation"] == realisation) & (rows["map"] == map_index)
+        here = (
+            (rows["seed"] == seed)
+            & (rows["realisation"] == realisation)
+            & (rows["map"] == map_index)
+        )
         # All succeed but one of the two on this map.
         arrived = ~here | (rows["planner"] == "straight")
         forge_rows(folder, rows.assign(outcome=np.where(arrived, "success", "timeout")))
@@ -66,14 +85,22 @@ def test_whichever_map_is_telling_is_kept_under_its_own_noise(dataset: Path, tmp
         assert len(same) == 2
         for recording in same:
             for name in ("field", "immobilising", "rgb", "goal_m"):
-                np.testing.assert_array_equal(getattr(kept, name), getattr(recording, name))
+                np.testing.assert_array_equal(
+                    getattr(kept, name), getattr(recording, name)
+                )
         assert kept.field is not None
         fields.add(kept.field.tobytes())
     assert len(fields) == 8
 
 
 def test_no_map_is_kept_where_no_steps_are(dataset: Path, tmp_path: Path) -> None:
-    folder = run(dataset, tmp_path / "run", planners=("straight",), risks=("mean",), record="none")
+    folder = run(
+        dataset,
+        tmp_path / "run",
+        planners=("straight",),
+        risks=("mean",),
+        record="none",
+    )
     assert (folder / "episodes.parquet").exists()
     assert not (folder / GROUND).exists()
 
@@ -84,7 +111,11 @@ RISKS = ("mean", "cvar:0.5", "cvar:0.9")
 def episodes(ended: dict[int, list[bool]]) -> pd.DataFrame:
     """Rows of three risk settings: of each map, which of them succeeded."""
     return made.rows(
-        made.row(made.condition(risk=risk, world="stakes"), map_index, 30.0 + place if success else None)
+        made.row(
+            made.condition(risk=risk, world="stakes"),
+            map_index,
+            30.0 + place if success else None,
+        )
         for map_index, successes in ended.items()
         for place, (risk, success) in enumerate(zip(RISKS, successes, strict=False))
     )
@@ -98,7 +129,9 @@ def episodes(ended: dict[int, list[bool]]) -> pd.DataFrame:
         ({0: [True, False], 4: [False, False, True]}, 4),  # more conditions
     ],
 )
-def test_the_map_is_one_on_which_outcomes_differ(ended: dict[int, list[bool]], map_index: int) -> None:
+def test_the_map_is_one_on_which_outcomes_differ(
+    ended: dict[int, list[bool]], map_index: int
+) -> None:
     about = telling_map(episodes(ended))
     assert about == {"data": "paper-v1", "scenario": "std", "world": "stakes", "seed": 0, "realisation": 0,
                      "map": map_index}  # fmt: skip
@@ -106,7 +139,9 @@ def test_the_map_is_one_on_which_outcomes_differ(ended: dict[int, list[bool]], m
 
 
 def test_noise_and_worlds_tell_maps_apart() -> None:
-    labels = [made.condition(risk=risk, world=world) for world in ("a", "b") for risk in RISKS]
+    labels = [
+        made.condition(risk=risk, world=world) for world in ("a", "b") for risk in RISKS
+    ]
     rows = made.rows(
         made.row(one, seed=seed, realisation=draw, time_s=None if (seed, draw, one["risk"], one["world"]) ==
                  (7, 1, "mean", "b") else 9.0)
@@ -139,7 +174,9 @@ def failed(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def test_the_ground_is_that_of_each_episode_under_its_own_noise(failed: Path) -> None:
-    rows = read_table(failed, "episodes.parquet")  # whether they failed does not matter here
+    rows = read_table(
+        failed, "episodes.parquet"
+    )  # whether they failed does not matter here
     assert len(rows) == 8
     mixed = rows.sort_values("map")
     taken = record_driven(failed, mixed)
@@ -151,27 +188,37 @@ def test_the_ground_is_that_of_each_episode_under_its_own_noise(failed: Path) ->
         problem, simulation = built.problem, built.simulation
         np.testing.assert_array_equal(recording.predicted, problem.risk_map[0].numpy())
         assert simulation.field is not None
-        np.testing.assert_array_equal(recording.immobilising, (simulation.field[0] < FAILED_BELOW).numpy())
+        np.testing.assert_array_equal(
+            recording.immobilising, (simulation.field[0] < FAILED_BELOW).numpy()
+        )
         np.testing.assert_array_equal(recording.goal_m, problem.goal_m[0].numpy())
         assert recording.about["outcome"] == row["outcome"]
         steps = read_steps(failed, map=row["map"], **noise)
         np.testing.assert_array_equal(recording.track, steps[["x_m", "y_m"]])
-        np.testing.assert_array_equal(recording.traversability, steps["traversability"].iloc[:-1])
+        np.testing.assert_array_equal(
+            recording.traversability, steps["traversability"].iloc[:-1]
+        )
     # Each is held elsewhere, so that no ground passes for another's.
     assert all(recording.immobilising.any() for recording in taken)
     assert len({recording.immobilising.tobytes() for recording in taken}) == 8
 
 
-def test_the_report_shows_failures_and_says_what_the_planner_was_told(failed: Path) -> None:
+def test_the_report_shows_failures_and_says_what_the_planner_was_told(
+    failed: Path,
+) -> None:
     report = write_report(failed, partial(record_driven, failed))
     assert (failed / "figures" / "failures.png").stat().st_size > 5000
     assert "![failures](figures/failures.png)" in (failed / "summary.md").read_text()
-    assert any("the predicted λ̂ was " in said for said in next(iter(report.findings.values())))
+    assert any(
+        "the predicted λ̂ was " in said for said in next(iter(report.findings.values()))
+    )
     assert report.warnings == () or "No sheet" not in report.warnings[-1]
 
 
 @pytest.mark.parametrize("part", ["datasets", "codes"])
-def test_other_maps_and_models_than_those_of_the_run_are_not_shown(part: str, failed: Path) -> None:
+def test_other_maps_and_models_than_those_of_the_run_are_not_shown(
+    part: str, failed: Path
+) -> None:
     about = json.loads((failed / "run.json").read_text())
     before = json.dumps(about)
     if part == "datasets":
@@ -186,6 +233,8 @@ def test_other_maps_and_models_than_those_of_the_run_are_not_shown(part: str, fa
         with pytest.raises(BenchnavError, match="Expected"):
             record_driven(failed, rows)
         report = write_report(failed, partial(record_driven, failed))
-        assert report.warnings[-1].startswith("note: a figure of failures is missing: Expected")
+        assert report.warnings[-1].startswith(
+            "note: a figure of failures is missing: Expected"
+        )
     finally:
         (failed / "run.json").write_text(before)

@@ -1,4 +1,6 @@
-"""A run that is repeated says truly whether its rows came out the same, and what differs around it."""
+"""A run that is repeated says truly whether its rows came out the same, and what
+differs around it.
+"""
 
 import inspect
 import json
@@ -58,7 +60,9 @@ def change_rows(run: Path, changes: Mapping[str, object], where: str) -> None:
     forge_rows(run, rows)
 
 
-def test_a_run_that_was_extended_by_commands_is_repeated_whole(suite: Suite, tmp_path: Path) -> None:
+def test_a_run_that_was_extended_by_commands_is_repeated_whole(
+    suite: Suite, tmp_path: Path
+) -> None:
     run = finish(suite, tmp_path / "run")
     finish(replace(suite, seeds=(3,), maps=1), run)
     finish(replace(suite, scenarios=("hs",), realisations=2), run)
@@ -102,9 +106,15 @@ def test_the_device_is_repeated_and_refused_where_it_is_not(
     assert "running on a GPU" in told
 
 
-def test_rows_that_differ_are_counted_and_the_first_named(suite: Suite, tmp_path: Path) -> None:
+def test_rows_that_differ_are_counted_and_the_first_named(
+    suite: Suite, tmp_path: Path
+) -> None:
     run = finish(replace(suite, seeds=(0, 1, 2, 3)), tmp_path / "run")
-    change_rows(run, {"outcome": "timeout", "total_time_s": 12.5}, "planner == 'Mine' and seed > 0")
+    change_rows(
+        run,
+        {"outcome": "timeout", "total_time_s": 12.5},
+        "planner == 'Mine' and seed > 0",
+    )
     same, lines = repeat(run, tmp_path / "again")
     assert not same
     assert lines[0] == "6 of 16 rows came out differently, in 1 of 2 conditions:"
@@ -114,7 +124,9 @@ def test_rows_that_differ_are_counted_and_the_first_named(suite: Suite, tmp_path
     assert len(named) == 5
     assert "seed 1, realisation 0, map 0: " in named[0]
     assert "total_time_s 12.5 → " in named[0]
-    time_s = pd.read_parquet(tmp_path / "again" / "episodes.parquet").query("planner == 'Mine' and seed > 0")
+    time_s = pd.read_parquet(tmp_path / "again" / "episodes.parquet").query(
+        "planner == 'Mine' and seed > 0"
+    )
     greatest = (time_s["total_time_s"] - 12.5).abs().max()
     assert f"greatest differences: total_time_s {greatest:.3g}" in lines
 
@@ -125,15 +137,21 @@ def test_wall_time_is_no_difference(suite: Suite, tmp_path: Path) -> None:
     assert repeat(run, tmp_path / "again")[0]
 
 
-def test_code_that_changed_is_named_beside_the_rows(suite: Suite, tmp_path: Path) -> None:
+def test_code_that_changed_is_named_beside_the_rows(
+    suite: Suite, tmp_path: Path
+) -> None:
     run = finish(suite, tmp_path / "run")
     slower = MINE.replace(
-        "pass", "def __init__(self, fault='none', after_s=1.0):\n        super().__init__('give up', 2.0)"
+        "pass",
+        "def __init__(self, fault='none', after_s=1.0):\n        super().__init__('give up', 2.0)",
     )
     (tmp_path / "mine.py").write_text(slower)
     _, lines = repeat(run, tmp_path / "again")
     assert lines[0].startswith("2 of 4 rows came out differently")
-    assert len([line for line in lines if "outcome success → planner_failure" in line]) == 2
+    assert (
+        len([line for line in lines if "outcome success → planner_failure" in line])
+        == 2
+    )
     assert lines[-1].startswith("the environments differ in: ")
     assert "mine.py" in lines[-1]
 
@@ -151,10 +169,16 @@ def test_files_that_a_part_imports_or_is_named_are_seen_by_extension_resumption_
         "class Mine(Faulty):\n    def __init__(self, weights: str = ''):\n"
         "        super().__init__('give up', float(open(weights).read()))\n"
     )
-    own = {"part": f"{tmp_path / 'mine.py'}:Mine", "options": {"weights": "weights.txt"}}
+    own = {
+        "part": f"{tmp_path / 'mine.py'}:Mine",
+        "options": {"weights": "weights.txt"},
+    }
     suite = replace(suite, planners=(own,))
     run = finish(suite, tmp_path / "run")
-    assert repeat(run, tmp_path / "same")[1][-1] == "no difference between the recorded environments"
+    assert (
+        repeat(run, tmp_path / "same")[1][-1]
+        == "no difference between the recorded environments"
+    )
     name = f"planner {tmp_path / 'mine.py'}:Mine"
     for changed, content, told in (
         (helper, "from tests.eval.parts import Faulty\nx = 1\n", f"({name})"),
@@ -171,19 +195,26 @@ def test_files_that_a_part_imports_or_is_named_are_seen_by_extension_resumption_
         if changed is weights:
             _, lines = repeat(run, tmp_path / "again")
             assert lines[0].startswith("2 of 2 rows came out differently")
-            assert lines[-1] == f"the environments differ in: weights.txt of {name}; file weights.txt"
+            assert (
+                lines[-1]
+                == f"the environments differ in: weights.txt of {name}; file weights.txt"
+            )
         changed.write_text(before)
     steps = run_suite(suite, tmp_path / "other")
     next(steps)
     weights.write_text("3.0")
-    with pytest.raises(ConfigError, match=r"that the run was begun with, got changes: weights\.txt of"):
+    with pytest.raises(
+        ConfigError, match=r"that the run was begun with, got changes: weights\.txt of"
+    ):
         list(steps)
     del sys.modules["helper_of_mine"]
 
 
 def test_maps_that_changed_are_named(suite: Suite, tmp_path: Path) -> None:
     run = finish(suite, tmp_path / "run")
-    factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
+    factories.tiny_dataset(
+        tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1)
+    )
     (tmp_path / "other.h5").replace(tmp_path / "tiny.h5")
     same, lines = repeat(run, tmp_path / "again")
     assert not same
@@ -195,9 +226,13 @@ def test_versions_processor_and_machine_are_named_though_rows_are_the_same(
 ) -> None:
     run = finish(suite, tmp_path / "run")
     torch_version = provenance.version("torch")
-    monkeypatch.setattr(provenance, "version", lambda name: "9.9" if name == "torch" else version(name))
+    monkeypatch.setattr(
+        provenance, "version", lambda name: "9.9" if name == "torch" else version(name)
+    )
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "ABACUS")
-    monkeypatch.setattr(provenance, "describe_machine", lambda: {"processor": "bead", "cores": 7})
+    monkeypatch.setattr(
+        provenance, "describe_machine", lambda: {"processor": "bead", "cores": 7}
+    )
     same, lines = repeat(run, tmp_path / "again")
     assert same
     assert f"torch ({torch_version} to 9.9)" in lines[-1]
@@ -205,12 +240,17 @@ def test_versions_processor_and_machine_are_named_though_rows_are_the_same(
     assert "to bead, 7 cores)" in lines[-1]
 
 
-def test_all_that_is_no_longer_there_is_told_before_anything_is_run(suite: Suite, tmp_path: Path) -> None:
-    run = finish(replace(suite, risks=("mean", "tests.eval.parts:least")), tmp_path / "run")
+def test_all_that_is_no_longer_there_is_told_before_anything_is_run(
+    suite: Suite, tmp_path: Path
+) -> None:
+    run = finish(
+        replace(suite, risks=("mean", "tests.eval.parts:least")), tmp_path / "run"
+    )
     (tmp_path / "mine.py").unlink()
     (tmp_path / "tiny.h5").unlink()
     with pytest.raises(
-        ConfigError, match=r"that .*run was made with, got a lack: .*dataset.*tiny\.h5.*mine\.py"
+        ConfigError,
+        match=r"that .*run was made with, got a lack: .*dataset.*tiny\.h5.*mine\.py",
     ):
         repeat(run, tmp_path / "again")
     assert not (tmp_path / "again").exists()
@@ -220,17 +260,24 @@ def test_a_dataset_with_fewer_maps_is_told(suite: Suite, tmp_path: Path) -> None
     run = finish(suite, tmp_path / "run")
     (tmp_path / "tiny.h5").unlink()
     factories.tiny_dataset(tmp_path / "tiny.h5", factories.tiny_recipe(test_std=1))
-    with pytest.raises(ConfigError, match=r"Expected `maps` at most 1, the maps of test/std in .*, got 2"):
+    with pytest.raises(
+        ConfigError,
+        match=r"Expected `maps` at most 1, the maps of test/std in .*, got 2",
+    ):
         repeat(run, tmp_path / "again")
 
 
-def test_a_folder_of_other_conditions_is_left_as_it_is(suite: Suite, tmp_path: Path) -> None:
+def test_a_folder_of_other_conditions_is_left_as_it_is(
+    suite: Suite, tmp_path: Path
+) -> None:
     run = finish(suite, tmp_path / "run")
     other = finish(replace(suite, risks=("cvar",)), tmp_path / "other")
     before = {path: path.read_bytes() for path in other.rglob("*") if path.is_file()}
     with pytest.raises(ConfigError, match="with other conditions"):
         repeat(run, other)
-    assert {path: path.read_bytes() for path in other.rglob("*") if path.is_file()} == before
+    assert {
+        path: path.read_bytes() for path in other.rglob("*") if path.is_file()
+    } == before
 
 
 def test_what_cannot_be_repeated_is_refused(suite: Suite, tmp_path: Path) -> None:
@@ -256,7 +303,10 @@ def test_what_cannot_be_repeated_is_refused(suite: Suite, tmp_path: Path) -> Non
     ],
 )
 def test_the_command_repeats_with_the_workers_that_are_asked_for(
-    words: tuple[str, ...], expected: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: tuple[str, ...],
+    expected: dict[str, object],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     given: list[dict[str, object]] = []
 
@@ -268,7 +318,10 @@ def test_the_command_repeats_with_the_workers_that_are_asked_for(
     assert call("eval", "rerun", tmp_path / "run", *words) == 2
     (told,) = given
     assert {name: told[name] for name in expected} == expected
-    assert (told["run_folder"], told["folder"]) == (tmp_path / "run", tmp_path / "run-rerun")
+    assert (told["run_folder"], told["folder"]) == (
+        tmp_path / "run",
+        tmp_path / "run-rerun",
+    )
 
 
 def test_the_command_ends_with_0_1_or_2(  # type: ignore[no-untyped-def]

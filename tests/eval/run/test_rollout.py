@@ -30,7 +30,9 @@ class Clock:
 
 
 class Slow(Planner[int]):
-    """Stands still; takes 5 s to begin, and 1 s for its first step, 2 s for its second and so on."""
+    """Stands still; takes 5 s to begin, and 1 s for its first step, 2 s for its second
+    and so on.
+    """
 
     def __init__(self, clock: Clock, raises_at: int = 99) -> None:
         self.clock = clock
@@ -49,24 +51,37 @@ class Slow(Planner[int]):
 
 def run(monkeypatch: pytest.MonkeyPatch, **options: int) -> rollout.Episodes:
     clock = Clock()
-    monkeypatch.setattr(rollout, "time", SimpleNamespace(perf_counter=clock.perf_counter))
+    monkeypatch.setattr(
+        rollout, "time", SimpleNamespace(perf_counter=clock.perf_counter)
+    )
     ground, world = torch.full((BATCH, 16, 16), 0.8), World(time_budget_s=0.4)
     problem = factories.problem(ground, time_budget_s=0.4)
     goal = torch.tensor([[6.75, 6.75]] * BATCH)
     simulation = Simulation(
-        factories.terrain(ground), factories.task(), world, factories.places(goal), 0, range(BATCH)
+        factories.terrain(ground),
+        factories.task(),
+        world,
+        factories.places(goal),
+        0,
+        range(BATCH),
     )
-    return rollout.run_episodes(Slow(clock, **options), problem, simulation, torch.Generator())
+    return rollout.run_episodes(
+        Slow(clock, **options), problem, simulation, torch.Generator()
+    )
 
 
-def test_wall_time_is_told_of_the_beginning_and_of_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wall_time_is_told_of_the_beginning_and_of_each_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     episodes = run(monkeypatch)
     assert episodes.begin_s == 5
     assert episodes.planning_s.tolist() == [1, 2, 3, 4]
     assert episodes.actions.shape[1] == 4
 
 
-def test_a_plan_that_was_never_made_has_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_that_was_never_made_has_no_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     episodes = run(monkeypatch, raises_at=3)
     assert episodes.planning_s.tolist() == [1, 2]
     assert episodes.errors == ("RuntimeError: enough",) * BATCH
@@ -92,11 +107,18 @@ def test_a_planner_is_told_the_time_by_the_steps_of_its_robot(dt_s: float) -> No
     problem = factories.problem(ground, robot=robot, time_budget_s=1.0)
     goals = factories.places(torch.tensor([[6.75, 6.75]] * BATCH))
     simulation = Simulation(
-        factories.terrain(ground), factories.task(robot), World(time_budget_s=1.0), goals, 0, range(BATCH)
+        factories.terrain(ground),
+        factories.task(robot),
+        World(time_budget_s=1.0),
+        goals,
+        0,
+        range(BATCH),
     )
     planner: Any = Watch()
     rollout.run_episodes(planner, problem, simulation, torch.Generator())
-    assert planner.told == pytest.approx([dt_s * step for step in range(round(1 / dt_s))])
+    assert planner.told == pytest.approx(
+        [dt_s * step for step in range(round(1 / dt_s))]
+    )
 
 
 class Steady(Watch):
@@ -111,7 +133,12 @@ def test_commanded_speed_and_turn_rate_are_those_of_undisturbed_motion() -> None
     problem = factories.problem(ground, robot=robot, time_budget_s=1.0)
     goals = factories.places(torch.tensor([[6.75, 6.75]] * BATCH))
     simulation = Simulation(
-        factories.terrain(ground), factories.task(robot), World(time_budget_s=1.0), goals, 0, range(BATCH)
+        factories.terrain(ground),
+        factories.task(robot),
+        World(time_budget_s=1.0),
+        goals,
+        0,
+        range(BATCH),
     )
     planner: Any = Steady()
     episodes = rollout.run_episodes(planner, problem, simulation, torch.Generator())
@@ -120,7 +147,9 @@ def test_commanded_speed_and_turn_rate_are_those_of_undisturbed_motion() -> None
 
 
 class Homing(Planner[Problem]):
-    """Drives at the goal by what it kept of the problem; notes for which goals it was asked."""
+    """Drives at the goal by what it kept of the problem; notes for which goals it was
+    asked.
+    """
 
     def __init__(self) -> None:
         self.asked: list[list[float]] = []
@@ -168,10 +197,14 @@ def home(
         planned.append((step, members, plan.path[:, 0, 0].tolist()))
 
     observer = rollout.Observer(plan=None if planned is None else watch, every=5)
-    return rollout.run_episodes(planner, problem, simulation, torch.Generator(), observer)
+    return rollout.run_episodes(
+        planner, problem, simulation, torch.Generator(), observer
+    )
 
 
-def test_episodes_that_have_ended_are_planned_for_no_more_and_nothing_else_changes() -> None:
+def test_episodes_that_have_ended_are_planned_for_no_more_and_nothing_else_changes() -> (
+    None
+):
     staying, leaving = Homing(), Leaving()
     whole, part = home(staying), home(leaving)
     assert {len(goals) for goals in staying.asked} == {4}
@@ -195,7 +228,9 @@ def test_episodes_that_have_ended_are_planned_for_no_more_and_nothing_else_chang
 def test_who_watches_is_told_whose_plans_they_are() -> None:
     planned: list[tuple[int, list[int], list[float]]] = []
     episodes = home(Leaving(), planned)
-    assert [step for step, _, _ in planned] == list(range(0, episodes.actions.shape[1], 5))
+    assert [step for step, _, _ in planned] == list(
+        range(0, episodes.actions.shape[1], 5)
+    )
     for _, members, goals in planned:
         assert goals == GOALS[members, 0].tolist()
     assert planned[0][1] == [0, 1, 2, 3]
@@ -215,7 +250,9 @@ def test_a_planner_that_cannot_be_left_is_blamed() -> None:
 
 def test_calls_are_timed_one_by_one_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = iter([0.0, 2.0, 10.0, 11.5])
-    monkeypatch.setattr(rollout, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))
+    monkeypatch.setattr(
+        rollout, "time", SimpleNamespace(perf_counter=lambda: next(ticks))
+    )
     timer = rollout.Clock(torch.device("cpu"))
     for _ in range(2):
         with timer.timed():

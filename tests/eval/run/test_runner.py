@@ -80,7 +80,9 @@ def quick(dataset: Path, **changes: object) -> Suite:
     return suite_on(dataset, **given)
 
 
-def finish(suite: Suite, folder: Path, jobs: int = 1, **options: object) -> pd.DataFrame:
+def finish(
+    suite: Suite, folder: Path, jobs: int = 1, **options: object
+) -> pd.DataFrame:
     for _ in run_suite(suite, folder, jobs, **options):  # type: ignore[arg-type]
         pass
     return pd.read_parquet(folder / "episodes.parquet")
@@ -102,13 +104,16 @@ def unused(suite: Suite, folder: Path, **options: object) -> str:
 
 def same(first: pd.DataFrame, second: pd.DataFrame) -> None:
     first, second = (
-        rows.sort_values(KEYS).drop(columns=TIMING).reset_index(drop=True) for rows in (first, second)
+        rows.sort_values(KEYS).drop(columns=TIMING).reset_index(drop=True)
+        for rows in (first, second)
     )
     pd.testing.assert_frame_equal(first, second)
 
 
 @pytest.fixture(scope="module")
-def finished(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Suite, Path]:
+def finished(
+    dataset_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Suite, Path]:
     """A run of every planner under two risk settings on two scenarios."""
     suite = suite_on(dataset_path)
     folder = tmp_path_factory.mktemp("run") / "run"
@@ -135,7 +140,9 @@ def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> 
     about = json.loads((folder / "run.json").read_text())
     assert (about["format"], about["format_version"]) == ("benchnav-run", 6)
     environments = [code["environment"] for code in about["codes"].values()]
-    assert {known["torch"] for known in environments} == {torch.__version__.split("+")[0]}
+    assert {known["torch"] for known in environments} == {
+        torch.__version__.split("+")[0]
+    }
     (data,) = about["datasets"].values()
     assert [len(digests) for digests in data["maps"].values()] == [2, 2]
     assert len({digest for digests in data["maps"].values() for digest in digests}) == 4
@@ -146,18 +153,28 @@ def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> 
     assert not list(folder.rglob("*partial*"))
     assert not list(folder.parent.glob(".*"))
     # A unit is one file, in the folder of its condition.
-    assert sorted(p.parent.name for p in folder.glob("units/*/*")) == sorted(about["conditions"])
+    assert sorted(p.parent.name for p in folder.glob("units/*/*")) == sorted(
+        about["conditions"]
+    )
 
 
-def test_recordings_verify_and_hold_the_driven_path(finished: tuple[Suite, Path]) -> None:
+def test_recordings_verify_and_hold_the_driven_path(
+    finished: tuple[Suite, Path],
+) -> None:
     _, folder = finished
     write_viewer_files(folder)
     recordings = sorted((folder / "playback").glob("*.rrd"))
     conditions = open_run(folder).conditions
     assert len(recordings) == len(conditions) == (1 + 3 * 2) * 2
-    paths = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    paths = {
+        **os.environ,
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+    }
     subprocess.run(
-        ["rerun", "rrd", "verify", *map(str, recordings)], check=True, capture_output=True, env=paths
+        ["rerun", "rrd", "verify", *map(str, recordings)],
+        check=True,
+        capture_output=True,
+        env=paths,
     )
     for planner in PLANNERS:
         ((unit, member),) = find_episodes(folder, {"planner": [planner]}, None, 0, 0)
@@ -166,17 +183,26 @@ def test_recordings_verify_and_hold_the_driven_path(finished: tuple[Suite, Path]
         episode = read_steps(folder, condition=unit.condition.id, map=0)
         times, positions = read_path(path)
         np.testing.assert_allclose(times, episode["time_s"], atol=1e-6)
-        np.testing.assert_array_equal(positions[:, :2], episode[["x_m", "y_m"]].to_numpy())
+        np.testing.assert_array_equal(
+            positions[:, :2], episode[["x_m", "y_m"]].to_numpy()
+        )
 
 
-def test_rows_do_not_depend_on_workers(finished: tuple[Suite, Path], tmp_path: Path) -> None:
+def test_rows_do_not_depend_on_workers(
+    finished: tuple[Suite, Path], tmp_path: Path
+) -> None:
     suite, folder = finished
-    same(finish(suite, tmp_path / "two", jobs=2), pd.read_parquet(folder / "episodes.parquet"))
+    same(
+        finish(suite, tmp_path / "two", jobs=2),
+        pd.read_parquet(folder / "episodes.parquet"),
+    )
     steps = [read_steps(place) for place in (folder, tmp_path / "two")]
     pd.testing.assert_frame_equal(*steps)
 
 
-def test_a_killed_run_goes_on_to_the_same_rows(finished: tuple[Suite, Path], tmp_path: Path) -> None:
+def test_a_killed_run_goes_on_to_the_same_rows(
+    finished: tuple[Suite, Path], tmp_path: Path
+) -> None:
     suite, whole = finished
     folder = tmp_path / "run"
     code = (
@@ -191,18 +217,30 @@ def test_a_killed_run_goes_on_to_the_same_rows(finished: tuple[Suite, Path], tmp
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert not (folder / "episodes.parquet").exists()
-    kept = {path: path.stat().st_mtime_ns for path in folder.glob("units/*/[!.]*.parquet")}
+    kept = {
+        path: path.stat().st_mtime_ns for path in folder.glob("units/*/[!.]*.parquet")
+    }
     said: list[str] = []
-    same(finish(suite, folder, say=said.append), pd.read_parquet(whole / "episodes.parquet"))
+    same(
+        finish(suite, folder, say=said.append),
+        pd.read_parquet(whole / "episodes.parquet"),
+    )
     assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
     measured = "measuring the planning time of one robot alone"
     assert said == [f"{len(kept)} of 14 units were there already", measured]
 
 
-def test_workers_end_with_a_command_that_was_killed(dataset_path: Path, tmp_path: Path) -> None:
+def test_workers_end_with_a_command_that_was_killed(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     (tmp_path / "begun").mkdir()
-    asleep = {"part": "tests.eval.parts:Asleep", "options": {"folder": str(tmp_path / "begun")}}
-    suite = quick(dataset_path, planners=(asleep,), risks=("mean", "cvar"), scenarios=("std",))
+    asleep = {
+        "part": "tests.eval.parts:Asleep",
+        "options": {"folder": str(tmp_path / "begun")},
+    }
+    suite = quick(
+        dataset_path, planners=(asleep,), risks=("mean", "cvar"), scenarios=("std",)
+    )
     code = (
         "from pathlib import Path; from benchnav.eval.experiment.suite import Suite\n"
         "from benchnav.eval.run.runner import run_suite\n"
@@ -267,57 +305,97 @@ def test_a_run_is_extended_by_what_is_missing(
     before = {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")}
     extended = finish(quick(dataset_path, **change), folder)
     assert (extended["condition"].nunique(), len(extended)) == (conditions, rows)
-    assert sum(path.stat().st_mtime_ns == when for path, when in before.items()) == kept == len(before)
+    assert (
+        sum(path.stat().st_mtime_ns == when for path, when in before.items())
+        == kept
+        == len(before)
+    )
     # What was there and what came make the rows of a run that had all at once.
-    fresh = {"risks": ("cvar", "mean", "var")} if change == {"risks": ("var",)} else change
+    fresh = (
+        {"risks": ("cvar", "mean", "var")} if change == {"risks": ("var",)} else change
+    )
     fresh = {"seeds": (0, 5)} if change == {"seed": 5} else fresh
     if not {"scenarios", "world", "maps"} & set(change):
         same(extended, finish(quick(dataset_path, **fresh), tmp_path / "fresh"))
 
 
 def test_a_run_is_extended_by_maps(tmp_path: Path) -> None:
-    dataset = factories.tiny_dataset(tmp_path / "tiny.h5", factories.tiny_recipe(test_std=53))
-    folder, suite = tmp_path / "run", quick(dataset, scenarios=("std",), risks=("mean",))
+    dataset = factories.tiny_dataset(
+        tmp_path / "tiny.h5", factories.tiny_recipe(test_std=53)
+    )
+    folder, suite = (
+        tmp_path / "run",
+        quick(dataset, scenarios=("std",), risks=("mean",)),
+    )
     sizes = []
     for maps in (50, 52, 0, 4):
         rows = finish(replace(suite, maps=maps), folder)
         sizes.append((len(rows), len(list(folder.glob("units/*/*")))))
-    assert sizes == [(50, 1), (52, 2), (53, 3), (53, 3)]  # a last block of more maps is another unit
+    assert sizes == [
+        (50, 1),
+        (52, 2),
+        (53, 3),
+        (53, 3),
+    ]  # a last block of more maps is another unit
     same(rows, finish(replace(suite, maps=0), tmp_path / "fresh"))
 
 
-def test_a_run_is_extended_by_another_dataset(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_run_is_extended_by_another_dataset(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     finish(quick(dataset_path, scenarios=("std",), risks=("mean",)), tmp_path / "run")
-    other = factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
+    other = factories.tiny_dataset(
+        tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1)
+    )
     rows = finish(quick(other, scenarios=("std",), risks=("mean",)), tmp_path / "run")
-    assert rows.groupby("data").size().to_dict() == {str(dataset_path): 2, str(other): 2}
+    assert rows.groupby("data").size().to_dict() == {
+        str(dataset_path): 2,
+        str(other): 2,
+    }
     assert len(open_run(tmp_path / "run").about["datasets"]) == 2
 
 
-def test_an_extension_under_a_label_that_is_taken_is_refused(dataset_path: Path, tmp_path: Path) -> None:
+def test_an_extension_under_a_label_that_is_taken_is_refused(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     finish(quick(dataset_path, scenarios=("std",)), tmp_path / "run")
     late = {"part": "tests.eval.parts:Faulty", "options": {"after_s": 2.0}}
     with pytest.raises(ConfigError, match="both called 'Faulty'"):
-        finish(quick(dataset_path, scenarios=("std",), planners=(late,)), tmp_path / "run")
+        finish(
+            quick(dataset_path, scenarios=("std",), planners=(late,)), tmp_path / "run"
+        )
 
 
-def test_code_that_changes_while_a_run_goes_on_makes_no_table(dataset_path: Path, tmp_path: Path) -> None:
+def test_code_that_changes_while_a_run_goes_on_makes_no_table(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     mine = tmp_path / "mine.py"
-    mine.write_text("from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n")
-    suite = quick(dataset_path, planners=(f"{mine}:Mine",), scenarios=("std",), risks=("mean",))
+    mine.write_text(
+        "from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n"
+    )
+    suite = quick(
+        dataset_path, planners=(f"{mine}:Mine",), scenarios=("std",), risks=("mean",)
+    )
     steps = run_suite(suite, tmp_path / "run")
     next(steps)
     mine.write_text(mine.read_text() + "# edited\n")
-    with pytest.raises(ConfigError, match=r"that the run was begun with, got changes: .*mine\.py"):
+    with pytest.raises(
+        ConfigError, match=r"that the run was begun with, got changes: .*mine\.py"
+    ):
         list(steps)
     assert not (tmp_path / "run" / "episodes.parquet").exists()
 
 
-def test_a_unit_of_another_run_counts_if_the_same_made_it(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_unit_of_another_run_counts_if_the_same_made_it(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     suite = quick(dataset_path, scenarios=("std",), risks=("mean",))
     for name in ("one", "two"):
         finish(suite, tmp_path / name)
-    (unit,) = (path.relative_to(tmp_path / "one") for path in (tmp_path / "one").glob("units/*/*"))
+    (unit,) = (
+        path.relative_to(tmp_path / "one")
+        for path in (tmp_path / "one").glob("units/*/*")
+    )
     (tmp_path / "two" / unit).unlink()
     shutil.copy(tmp_path / "one" / unit, tmp_path / "two" / unit)
     said: list[str] = []
@@ -328,7 +406,8 @@ def test_a_unit_of_another_run_counts_if_the_same_made_it(dataset_path: Path, tm
     assert said == ["1 of 1 units were there already"]
     # Under other seeds it is another unit, also where it lies under its name.
     shutil.copy(
-        tmp_path / "one" / unit, (tmp_path / "two" / unit).with_name(unit.name.replace("0-", "5-", 1))
+        tmp_path / "one" / unit,
+        (tmp_path / "two" / unit).with_name(unit.name.replace("0-", "5-", 1)),
     )
     said.clear()
     finish(replace(suite, seed=5), tmp_path / "two", say=said.append)
@@ -362,13 +441,16 @@ def test_a_narrower_command_runs_no_more_than_it_names(
     assert "report" in told.out
     assert "--partial" in told.out
     assert not (folder / "report.html").exists()
-    # What is lacking may come in parts; the part that completes the run makes its table.
+    # What is lacking may come in parts; the part that completes the run makes its
+    # table.
     for risk in ("mean", "cvar"):
         list(run_suite(replace(wide, risks=(risk,)), folder))
     same(pd.read_parquet(folder / EPISODES), whole)
 
 
-def test_a_block_of_maps_stays_whole_under_a_narrower_command(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_block_of_maps_stays_whole_under_a_narrower_command(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     wide = quick(dataset_path, scenarios=("std",), risks=("mean", "cvar"), maps=2)
     next(steps := run_suite(wide, tmp_path / "run"))
     steps.close()
@@ -406,17 +488,22 @@ def test_progress_names_what_is_run_and_counts_episodes(
     assert last.doing.removeprefix("finished ") in names
     (between,) = middle
     assert between.doing.startswith("running" if jobs == 1 else "finished")
-    assert [(step.size_done, step.size, step.sized) for step in (first, between, last)] == [
-        (done, 4, "episodes") for done in (0, 2, 4)
-    ]
+    assert [
+        (step.size_done, step.size, step.sized) for step in (first, between, last)
+    ] == [(done, 4, "episodes") for done in (0, 2, 4)]
 
 
-@pytest.mark.parametrize("risk", ["cvar:1.5", "var:-0.1", "expected-time:-1", "chance:2", "single-class:1"])
+@pytest.mark.parametrize(
+    "risk", ["cvar:1.5", "var:-0.1", "expected-time:-1", "chance:2", "single-class:1"]
+)
 def test_options_that_a_risk_measure_cannot_take_are_refused_before_the_run(
     dataset_path: Path, tmp_path: Path, risk: str
 ) -> None:
     with pytest.raises(ConfigError, match=r"Expected .* in [\[(]0, 1[\])], got"):
-        finish(quick(dataset_path, scenarios=("std",), risks=("mean", risk)), tmp_path / "run")
+        finish(
+            quick(dataset_path, scenarios=("std",), risks=("mean", risk)),
+            tmp_path / "run",
+        )
     assert not (tmp_path / "run" / "units").exists()
 
 
@@ -452,7 +539,10 @@ def test_every_unit_is_run_on_the_device_that_is_asked_for(
     assert open_run(tmp_path / "cuda").about["gpu"] == "a GPU"
     given.clear()
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "another")
-    assert unused(suite, tmp_path / "cuda", settings=Settings.on("cuda")) == "device (a GPU to another)"
+    assert (
+        unused(suite, tmp_path / "cuda", settings=Settings.on("cuda"))
+        == "device (a GPU to another)"
+    )
     given.clear()
     finish(suite, tmp_path / "cpu", settings=Settings.on("cpu"))
     assert set(given) == {"cpu"}
@@ -468,7 +558,9 @@ def test_units_of_other_code_or_maps_are_kept_and_not_used_and_what_changed_is_n
 ) -> None:
     data, mine, folder = tmp_path / "tiny.h5", tmp_path / "mine.py", tmp_path / "run"
     shutil.copy(dataset_path, data)
-    mine.write_text("from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n")
+    mine.write_text(
+        "from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n"
+    )
     suite = quick(data, planners=(f"{mine}:Mine",), scenarios=("std",))
     rows = finish(suite, folder)
     modules = provenance.package_modules
@@ -482,17 +574,24 @@ def test_units_of_other_code_or_maps_are_kept_and_not_used_and_what_changed_is_n
     for name, (place, attribute, changed) in changes.items():
         with monkeypatch.context() as patch:
             patch.setattr(place, attribute, changed)
-            assert unused(suite, shutil.copytree(folder, tmp_path / name)).startswith(name)
+            assert unused(suite, shutil.copytree(folder, tmp_path / name)).startswith(
+                name
+            )
     mine.write_text(mine.read_text() + "# another\n")
     assert "mine.py" in unused(suite, shutil.copytree(folder, tmp_path / "other code"))
     mine.write_text(mine.read_text().removesuffix("# another\n"))
-    factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
+    factories.tiny_dataset(
+        tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1)
+    )
     os.replace(data, tmp_path / "first.h5")
     os.replace(tmp_path / "other.h5", data)
     assert unused(suite, folder) == "maps"
     # As it was, all is there again, and the table is of it.
     os.replace(tmp_path / "first.h5", data)
-    files, said = {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")}, list[str]()
+    files, said = (
+        {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")},
+        list[str](),
+    )
     same(finish(suite, folder, say=said.append), rows)
     assert said == ["2 of 2 units were there already"]
     assert {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")} == files
@@ -504,12 +603,16 @@ def test_units_of_other_code_are_taken_when_asked_for_and_marked(
 ) -> None:
     mine, folder = tmp_path / "mine.py", tmp_path / "run"
     mine.write_text(MINE)
-    suite = quick(dataset_path, planners=(f"{mine}:Mine",), scenarios=("std",), risks=("mean",))
+    suite = quick(
+        dataset_path, planners=(f"{mine}:Mine",), scenarios=("std",), risks=("mean",)
+    )
     first = finish(suite, folder)
     first_key = next(folder.glob("units/*/*.parquet")).stem.rpartition("-")[2]
     mine.write_text(MINE + "# the same, in other words\n")
     said: list[str] = []
-    rows = finish(replace(suite, seeds=(0, 5)), folder, reuse_code=True, say=said.append)
+    rows = finish(
+        replace(suite, seeds=(0, 5)), folder, reuse_code=True, say=said.append
+    )
     assert "1 of 2 units were there already" in said
     assert not any("not used" in line for line in said)
     codes = dict(zip(rows["seed"], rows["code"], strict=True))
@@ -528,13 +631,18 @@ def test_units_of_other_code_are_taken_when_asked_for_and_marked(
     finish(replace(suite, seeds=(0, 5)), folder)
     assert open_run(folder).about["reused"] == ""
     assert len(set(read_table(folder, "episodes.parquet")["code"])) == 1
-    # Where a unit is there of this code too, that one is taken, though other code's is newer.
+    # Where a unit is there of this code too, that one is taken, though other code's is
+    # newer.
     for path in folder.glob(f"units/*/*-{first_key}.parquet"):
         os.utime(path, (time.time() + 60,) * 2)
     finish(replace(suite, seeds=(0, 5)), folder, reuse_code=True)
-    assert set(read_table(folder, "episodes.parquet").query("risk == 'mean'")["code"]) == {codes[5]}
+    assert set(
+        read_table(folder, "episodes.parquet").query("risk == 'mean'")["code"]
+    ) == {codes[5]}
     # Of other maps nothing is ever taken.
-    other = factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
+    other = factories.tiny_dataset(
+        tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1)
+    )
     data = tmp_path / "data.h5"
     shutil.copy(dataset_path, data)
     moved = replace(suite, data=str(data))
@@ -543,12 +651,20 @@ def test_units_of_other_code_are_taken_when_asked_for_and_marked(
     assert unused(moved, tmp_path / "moved", reuse_code=True) == "maps"
 
 
-def test_what_was_recorded_by_other_code_is_not_taken_for_this(dataset_path: Path, tmp_path: Path) -> None:
-    """Steps and recordings lie once; rows of each code stay. Back at old code only its rows are of it."""
+def test_what_was_recorded_by_other_code_is_not_taken_for_this(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    """Steps and recordings lie once; rows of each code stay. Back at old code only its
+    rows are of it.
+    """
     mine, folder = tmp_path / "mine.py", tmp_path / "run"
     mine.write_text(MINE)
     suite = quick(
-        dataset_path, planners=(f"{mine}:Mine",), scenarios=("std",), risks=("mean",), record="steps"
+        dataset_path,
+        planners=(f"{mine}:Mine",),
+        scenarios=("std",),
+        risks=("mean",),
+        record="steps",
     )
     finish(suite, folder)
     driven = read_steps(folder)
@@ -600,17 +716,23 @@ def test_overwrite_drops_run_folders_alone(dataset_path: Path, tmp_path: Path) -
         finish(quick(dataset_path), tmp_path / "run")
     assert precious.read_text() == "years"
     finish(quick(dataset_path, scenarios=("std", "hs")), tmp_path / "other")
-    rows = finish(quick(dataset_path, scenarios=("std",)), tmp_path / "other", overwrite=True)
+    rows = finish(
+        quick(dataset_path, scenarios=("std",)), tmp_path / "other", overwrite=True
+    )
     assert set(rows["scenario"]) == {"std"}
 
 
-def test_replay_repeats_an_episode_that_was_not_recorded(finished: tuple[Suite, Path]) -> None:
+def test_replay_repeats_an_episode_that_was_not_recorded(
+    finished: tuple[Suite, Path],
+) -> None:
     _, folder = finished
     asked = {"planner": ["astar_dwa"], "risk": ["mean"], "scenario": ["hs"]}
     ((unit, member),) = find_episodes(folder, asked, None, 0, 1)
     recording = find_recording(folder, unit, member)
     steps = read_steps(folder, planner="astar_dwa", risk="mean", scenario="hs", map=1)
-    np.testing.assert_array_equal(recording.states[:, :2], steps[["x_m", "y_m"]].to_numpy())
+    np.testing.assert_array_equal(
+        recording.states[:, :2], steps[["x_m", "y_m"]].to_numpy()
+    )
     write_viewer_files(folder)
     _, positions = read_path(folder / unit.recording_path(member, ".rrd"))
     np.testing.assert_array_equal(positions[:, :2], recording.states[:, :2])
@@ -629,7 +751,9 @@ def test_what_the_caller_set_is_left_alone(dataset_path: Path, tmp_path: Path) -
     assert list(warnings.filters) == filters
 
 
-def test_suites_are_checked_before_anything_is_run_or_dropped(dataset_path: Path, tmp_path: Path) -> None:
+def test_suites_are_checked_before_anything_is_run_or_dropped(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     finish(quick(dataset_path, scenarios=("std",), risks=("mean",)), tmp_path / "run")
     kept = sorted((tmp_path / "run").rglob("*"))
     for change, expected in (
@@ -645,7 +769,10 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(dataset_path: Path
         ({"planners": ("astar_dwa",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ("cl_rrt",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ({"part": "mppi", "options": {"noise": [0.5]}},)}, "noise"),
-        ({"robots": ("tests.eval.parts:Faulty",)}, "a subclass of benchnav.planning.Robot, got Faulty"),
+        (
+            {"robots": ("tests.eval.parts:Faulty",)},
+            "a subclass of benchnav.planning.Robot, got Faulty",
+        ),
         (
             {"planners": ("benchnav.planning.robots:Unicycle",)},
             r"a subclass of benchnav.planning.Planner, got Unicycle\. Write class Unicycle\(Planner\)",
@@ -680,19 +807,39 @@ def test_parts_of_this_process_alone_are_refused_for_workers(
 
 def test_what_a_user_should_know_is_said(dataset_path: Path, tmp_path: Path) -> None:
     said: list[str] = []
-    suite = quick(dataset_path, task={"free_space": {"above": 0.1}}, model="paper-v1", scenarios=("std",))
-    other = replace(factories.tiny_recipe(), classes=factories.tiny_recipe().classes[:4], environments=1)
+    suite = quick(
+        dataset_path,
+        task={"free_space": {"above": 0.1}},
+        model="paper-v1",
+        scenarios=("std",),
+    )
+    other = replace(
+        factories.tiny_recipe(),
+        classes=factories.tiny_recipe().classes[:4],
+        environments=1,
+    )
     data = factories.tiny_dataset(tmp_path / "four.h5", other)
     finish(replace(suite, data=str(data)), tmp_path / "run", say=said.append)
-    assert any("ground above 0.3" in line and "free ground is above 0.1" in line for line in said)
+    assert any(
+        "ground above 0.3" in line and "free ground is above 0.1" in line
+        for line in said
+    )
     assert any("class" in line and "paper-v1" in line for line in said)
 
 
-def test_a_planner_that_gives_up_at_once_is_recorded_and_reported(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_planner_that_gives_up_at_once_is_recorded_and_reported(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     hopeless = {
         "part": "tests.eval.parts:Faulty", "label": "hopeless", "options": {"fault": "give up", "after_s": 0.0},
     }  # fmt: skip
-    suite = quick(dataset_path, planners=(hopeless,), scenarios=("std",), risks=("mean",), record="first")
+    suite = quick(
+        dataset_path,
+        planners=(hopeless,),
+        scenarios=("std",),
+        risks=("mean",),
+        record="first",
+    )
     episodes = finish(suite, tmp_path / "run")
     assert episodes["outcome"].tolist() == ["planner_failure"] * 2
     assert episodes["end_time_s"].tolist() == [0, 0]
@@ -705,9 +852,13 @@ def test_a_planner_that_gives_up_at_once_is_recorded_and_reported(dataset_path: 
 
 
 def test_a_run_that_lacks_maps_tells_how_they_are_made(tmp_path: Path) -> None:
-    """Of a file with some maps of a shipped recipe; of others there is nothing to be told."""
+    """Of a file with some maps of a shipped recipe; of others there is nothing to be
+    told.
+    """
     recipe = load_recipe("tiny-v1")
-    few = {name: replace(recipe.splits[name], maps=2) for name in ("test/std", "test/hg")}
+    few = {
+        name: replace(recipe.splits[name], maps=2) for name in ("test/std", "test/hg")
+    }
     path = factories.tiny_dataset(tmp_path / "few.h5", replace(recipe, splits=few))
     made = "All maps of tiny-v1 are made with `benchnav-datagen create tiny-v1`"
     for changes, told in (
@@ -722,21 +873,23 @@ def test_a_run_that_lacks_maps_tells_how_they_are_made(tmp_path: Path) -> None:
         assert (made in str(refused.value)) == told, changes
 
 
-def test_goals_out_of_reach_are_told_before_the_run(dataset_path: Path, tmp_path: Path) -> None:
+def test_goals_out_of_reach_are_told_before_the_run(
+    dataset_path: Path, tmp_path: Path
+) -> None:
     def told(budget: float, robot: str | dict[str, Any] = "unicycle") -> list[str]:
         lines: list[str] = []
         suite = Suite(
             data=str(dataset_path), model="oracle", planners=("straight",), scenarios=("std",), maps=2,
             world={"time_budget_s": budget}, robots=(robot,), record="steps",
         )  # fmt: skip
-        for _ in run_suite(suite, tmp_path / f"{budget}-{len(str(robot))}", say=lines.append):
+        for _ in run_suite(
+            suite, tmp_path / f"{budget}-{len(str(robot))}", say=lines.append
+        ):
             pass
         return [line for line in lines if "within the time budget T" in line]
 
     # 8 m by 8 m to the goal, of which the last metre is not driven: 10.3 s at 1 m/s.
-    line = (
-        "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within the time budget T"
-    )
+    line = "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within the time budget T"
     assert told(10.2) == [line]
     assert told(10.4) == []
     assert told(10.2, {"part": "unicycle", "options": {"speed_mps": [0.0, 2.0]}}) == []
@@ -755,7 +908,10 @@ def test_a_world_that_cannot_be_drawn_is_refused_before_a_run_is_dropped(
     )
     before = finish(suite, tmp_path / "run")
     for world, expected in (
-        ({"noise": "frozen", "correlation_m": 4.1}, r"`world.correlation_m` of at most 4 m.* got 4.1 m"),
+        (
+            {"noise": "frozen", "correlation_m": 4.1},
+            r"`world.correlation_m` of at most 4 m.* got 4.1 m",
+        ),
         ({"noise": "frozen", "immobile": {"below": 0.99}}, "none for map"),
     ):
         for place in ("run", "new"):
@@ -765,13 +921,23 @@ def test_a_world_that_cannot_be_drawn_is_refused_before_a_run_is_dropped(
     assert not (tmp_path / "new").exists()
 
 
-def test_a_command_that_may_start_no_processes_runs_its_units_itself(tmp_path: Path) -> None:
+def test_a_command_that_may_start_no_processes_runs_its_units_itself(
+    tmp_path: Path,
+) -> None:
     config = tmp_path / "suite.yaml"
     data = factories.tiny_dataset(tmp_path / "d.h5")
     config.write_text(f"data: {data}\nscenarios: [std]\nmaps: 1\nrecord: none\n"
                       "conditions:\n  - {planners: [straight]}\n")  # fmt: skip
     code = "from benchnav.eval import cli; cli._finish = cli._failed; cli.main()"
-    words = ["run", "--config", str(config), "--jobs", "2", "--out", str(tmp_path / "run")]
+    words = [
+        "run",
+        "--config",
+        str(config),
+        "--jobs",
+        "2",
+        "--out",
+        str(tmp_path / "run"),
+    ]
     ran = subprocess.run(
         [sys.executable, "-c", code, *words], env={**os.environ, "JOBLIB_MULTIPROCESSING": "0"},
         capture_output=True, text=True,
@@ -780,8 +946,13 @@ def test_a_command_that_may_start_no_processes_runs_its_units_itself(tmp_path: P
     assert (tmp_path / "run" / "episodes.parquet").exists()
 
 
-def test_hypotheses_are_fixed_before_the_first_unit_and_stay(dataset_path: Path, tmp_path: Path) -> None:
-    faulty, straight = {"planner": "Faulty", "risk": "mean"}, {"planner": "Faulty", "risk": "cvar"}
+def test_hypotheses_are_fixed_before_the_first_unit_and_stay(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    faulty, straight = (
+        {"planner": "Faulty", "risk": "mean"},
+        {"planner": "Faulty", "risk": "cvar"},
+    )
     given = {"one": faulty, "other": straight, "metric": "success"}
     suite = quick(dataset_path, scenarios=("std",), hypotheses=(given,))
     folder, steps = tmp_path / "run", run_suite(suite, tmp_path / "run")
@@ -790,13 +961,17 @@ def test_hypotheses_are_fixed_before_the_first_unit_and_stay(dataset_path: Path,
     fixed = about["hypotheses"]
     assert not list(folder.glob("units/*/*"))
     (test,) = fixed["tests"]
-    assert [about["conditions"][test[side]]["labels"]["risk"] for side in ("one", "other")] == [
+    assert [
+        about["conditions"][test[side]]["labels"]["risk"] for side in ("one", "other")
+    ] == [
         "mean",
         "cvar",
     ]
     assert fixed["episodes"] == {test["one"]: 2, test["other"]: 2}
     list(steps)
-    finish(quick(dataset_path, scenarios=("std",), seed=5), folder)  # without them the run goes on
+    finish(
+        quick(dataset_path, scenarios=("std",), seed=5), folder
+    )  # without them the run goes on
     assert open_run(folder).about["hypotheses"] == fixed
     report = write_report(folder)
     assert report.tests["n_episodes"].tolist() == [4]

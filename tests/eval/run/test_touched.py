@@ -98,7 +98,9 @@ def paths(own: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         cached.cache_clear()
 
 
-def run(own: Path, dataset: Path, name: str, planner_limit_s: float = 0.0, **options: bool) -> list[str]:
+def run(
+    own: Path, dataset: Path, name: str, planner_limit_s: float = 0.0, **options: bool
+) -> list[str]:
     """Run the part and a shipped planner; gives what was said."""
     suite = Suite(
         data=str(dataset), model="oracle", planners=(f"{own / 'part.py'}:Own", "straight"), risks=("mean",),
@@ -125,7 +127,9 @@ def records(own: Path, name: str) -> list[dict[str, str]]:
 
 def files_of(own: Path, touched: Mapping[str, str]) -> set[str]:
     """Recorded files, by name where they lie beside the part, but for those of the installed packages."""
-    paths = [Path(name.removeprefix("file ")) for name in touched if name.startswith("file ")]
+    paths = [
+        Path(name.removeprefix("file ")) for name in touched if name.startswith("file ")
+    ]
     return {
         path.name if path.parent == own else str(path)
         for path in paths
@@ -139,28 +143,39 @@ def test_what_a_part_reads_is_recorded_and_a_change_runs_its_unit_again(
     run(own, dataset_path, "run")
     nothing, touched = records(own, "run")
     assert nothing == {}
-    assert files_of(own, touched) == {"speed.json", "helper.py"}  # neither its output nor a temporary file
+    assert files_of(own, touched) == {
+        "speed.json",
+        "helper.py",
+    }  # neither its output nor a temporary file
     assert [name for name in touched if name.startswith("variable ")] == [
         "variable OWN_GAIN"
     ]  # no copy of all
     assert touched["package ownlib"] == touched["package ownmore"] == "1.0"
     # dateutil is what pandas requires, and that what ownlib does.
-    assert {"package torch", "package pandas", "package python-dateutil"} <= set(touched)
+    assert {"package torch", "package pandas", "package python-dateutil"} <= set(
+        touched
+    )
     assert not {"package benchnav", "package h5py", "package gymnasium"} & set(touched)
     assert changes_since(touched) == []
-    assert touched in [code["touched"] for code in open_run(own.parent / "run").about["codes"].values()]
+    assert touched in [
+        code["touched"] for code in open_run(own.parent / "run").about["codes"].values()
+    ]
     assert run(own, dataset_path, "run") == ["2 of 2 units were there already"]
 
     monkeypatch.setenv("OWN_GAIN", "0.5")
     assert changes_since(touched) == ["variable OWN_GAIN"]
-    assert run(own, dataset_path, "run", reuse_code=True) == ["2 of 2 units were there already"]
+    assert run(own, dataset_path, "run", reuse_code=True) == [
+        "2 of 2 units were there already"
+    ]
     reused = open_run(own.parent / "run").about["reused"]
     assert reused.startswith("1 of 2 units were made by other code (variable OWN_GAIN)")
     (own / "speed.json").write_text("0.4")
     (own / "helper.py").write_text("FACTOR = 0.9")
     _install(own.parent / "site", "ownlib", "2.0")
     sys.modules.pop("helper")
-    for name in [name for name in sys.modules if name.startswith("benchnav_file_part_")]:
+    for name in [
+        name for name in sys.modules if name.startswith("benchnav_file_part_")
+    ]:
         del sys.modules[name]
     sources.load_file.cache_clear()  # as in a new process
     done, again, *_ = run(own, dataset_path, "run")
@@ -179,11 +194,16 @@ def test_a_process_that_imported_a_part_earlier_cannot_run_it_on_a_changed_file(
     """Its module read the file once; the same process would use what it read then."""
     run(own, dataset_path, "run")
     (own / "speed.json").write_text("0.4")
-    with pytest.raises(ConfigError, match=r"stay the same during the run, got changes: file .*speed\.json"):
+    with pytest.raises(
+        ConfigError,
+        match=r"stay the same during the run, got changes: file .*speed\.json",
+    ):
         run(own, dataset_path, "run")
 
 
-def test_a_planner_in_a_process_of_its_own_is_watched_too(own: Path, dataset_path: Path) -> None:
+def test_a_planner_in_a_process_of_its_own_is_watched_too(
+    own: Path, dataset_path: Path
+) -> None:
     run(own, dataset_path, "limited", planner_limit_s=60.0)
     _, touched = records(own, "limited")
     assert files_of(own, touched) == {"speed.json", "helper.py"}
@@ -201,7 +221,8 @@ def test_what_changes_during_a_run_ends_it(
 
     monkeypatch.setattr(runner, "measure_latencies", change)
     with pytest.raises(
-        ConfigError, match=r"stay the same during the run, got changes: file .*speed\.json\. Give"
+        ConfigError,
+        match=r"stay the same during the run, got changes: file .*speed\.json\. Give",
     ):
         run(own, dataset_path, "run")
 
@@ -223,6 +244,9 @@ def test_runs_whose_parts_read_something_else_are_of_other_code() -> None:
     """As `merge` and `compare` ask."""
     code = {"modules": {}, "environment": {}, "parts": {}}
     one = {**code, "touched": {"file a.npz": "1", "package x": "1.0", "variable A": ""}}
-    other = {**code, "touched": {"file a.npz": "2", "package x": "2.0", "variable B": "3"}}
+    other = {
+        **code,
+        "touched": {"file a.npz": "2", "package x": "2.0", "variable B": "3"},
+    }
     assert code_differences(one, other) == ["file a.npz", "package x (1.0 to 2.0)"]
     assert code_differences(code, other) == []  # a run of version 1.0 recorded nothing

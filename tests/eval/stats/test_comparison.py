@@ -19,14 +19,21 @@ def pair(
     draws: int = 1,
     budgets_s: tuple[float, float] = (100.0, 100.0),
 ) -> Pair:
-    """Times of two conditions by episode, T of a failure; `draws` episodes in a row are on one map."""
+    """Times of two conditions by episode, T of a failure; `draws` episodes in a row are
+    on one map.
+    """
     maps = np.arange(len(one)) // draws
     episodes = pd.DataFrame({"map": maps, "group": maps})
-    for suffix, times, budget_s in (("", one, budgets_s[0]), ("_other", other, budgets_s[1])):
+    for suffix, times, budget_s in (
+        ("", one, budgets_s[0]),
+        ("_other", other, budgets_s[1]),
+    ):
         episodes[f"success{suffix}"] = np.array(times) < budget_s
         episodes[f"total_time_s{suffix}"] = times
         episodes[f"time_budget_s{suffix}"] = budget_s
-    return Pair(one=names[0], other=names[1], shared={"planner": "mppi"}, episodes=episodes)
+    return Pair(
+        one=names[0], other=names[1], shared={"planner": "mppi"}, episodes=episodes
+    )
 
 
 A = [30.0, 35, 100, 40, 31, 100, 33, 36]
@@ -35,7 +42,13 @@ B = [29.0, 100, 100, 100, 30, 28, 32, 100]
 
 def test_a_pair_of_one_episode_a_map() -> None:
     (row,) = compare([pair(A, B)]).to_dict("records")
-    assert (row["one"], row["other"], row["planner"], row["n_maps"], row["n_episodes"]) == (
+    assert (
+        row["one"],
+        row["other"],
+        row["planner"],
+        row["n_maps"],
+        row["n_episodes"],
+    ) == (
         "cvar",
         "mean",
         "mppi",
@@ -45,9 +58,11 @@ def test_a_pair_of_one_episode_a_map() -> None:
     assert (row["success_one"], row["success_other"]) == (6 / 8, 4 / 8)
     gain = np.array([0, 1, 0, 1, 0, -1, 0, 1])
     _, low, high = success_interval(gain, 1)
-    assert (row["success_difference"], row["success_low"], row["success_high"]) == pytest.approx(
-        (0.25, low, high)
-    )
+    assert (
+        row["success_difference"],
+        row["success_low"],
+        row["success_high"],
+    ) == pytest.approx((0.25, low, high))
     assert row["success_p"] == pytest.approx(binomtest(3, 4).pvalue)
     late = np.array(A) - B
     assert row["time_difference_s"] == pytest.approx(late.mean())
@@ -73,7 +88,8 @@ def test_episodes_of_a_map_are_one_number() -> None:
 def test_holm_is_over_all_pairs_for_each_measure() -> None:
     generator = np.random.default_rng(0)
     times = [
-        np.where(generator.random(60) < rate, 30 + generator.random(60), 100) for rate in (0.5, 0.6, 0.8, 0.9)
+        np.where(generator.random(60) < rate, 30 + generator.random(60), 100)
+        for rate in (0.5, 0.6, 0.8, 0.9)
     ]
     pairs = [pair(list(times[i]), list(times[0]), (str(i), "0")) for i in (1, 2, 3)]
     table = compare(pairs)
@@ -89,7 +105,10 @@ def test_holm_is_over_all_pairs_for_each_measure() -> None:
 
 
 def test_maps_are_counted_for_the_difference_that_is_asked_for() -> None:
-    few, many = (compare([pair(A, B)], difference)["maps_needed"][0] for difference in (0.2, 0.02))
+    few, many = (
+        compare([pair(A, B)], difference)["maps_needed"][0]
+        for difference in (0.2, 0.02)
+    )
     assert many == pytest.approx(100 * few, rel=0.05)
 
 
@@ -100,7 +119,9 @@ def test_pairs_of_which_never_both_arrived_have_no_time_of_arrival() -> None:
 
 
 def test_a_difference_of_time_knows_what_failures_cost() -> None:
-    """Both arrive everywhere and as fast as each other: what few maps could not show is in the interval."""
+    """Both arrive everywhere and as fast as each other: what few maps could not show is
+    in the interval.
+    """
     same = [30.0 + i % 3 for i in range(20)]
     _, low, high = time_difference(pair(same, same).episodes)
     _, fewer, more = success_interval(np.zeros(20, dtype=int), 1)
@@ -125,7 +146,9 @@ def test_a_group_of_maps_is_one_number() -> None:
 
 
 def test_maps_with_unequally_many_draws_all_count() -> None:
-    """Twenty maps under seed 0, of which nine under seed 1 too: a map that both arrived on more often has its share."""
+    """Twenty maps under seed 0, of which nine under seed 1 too: a map that both arrived
+    on more often has its share.
+    """
     one, other = [30.0] * 29, [30.0] * 20 + [100.0] * 9
     given = pair(one, other)
     given.episodes["map"] = [*range(20), *range(9)]
@@ -137,19 +160,28 @@ def test_maps_with_unequally_many_draws_all_count() -> None:
 
 
 def test_times_under_unlike_budgets_are_compared_in_shares_of_them() -> None:
-    """A slow robot and one of thrice its speed that ends each drive alike: it has a third of the time."""
+    """A slow robot and one of thrice its speed that ends each drive alike: it has a
+    third of the time.
+    """
     slow = np.array([30.0, 60, 300, 45, 300, 90, 75, 33])
-    (seconds,) = compare([pair(list(slow), list(slow / 3), budgets_s=(300.0, 300.0))]).to_dict("records")
+    (seconds,) = compare(
+        [pair(list(slow), list(slow / 3), budgets_s=(300.0, 300.0))]
+    ).to_dict("records")
     assert seconds["time_difference_s"] == pytest.approx((slow - slow / 3).mean())
     given = pair(list(slow), list(slow / 3), budgets_s=(300.0, 100.0))
     table = compare([given, pair(A, B)])
-    assert table["time_difference_share"].to_numpy() == pytest.approx([0, (np.array(A) - B).mean() / 100])
+    assert table["time_difference_share"].to_numpy() == pytest.approx(
+        [0, (np.array(A) - B).mean() / 100]
+    )
     assert not {"time_difference_s", "time_low_s", "time_high_s"} & set(table)
     assert table["time_p"][0] == 1
     late = (np.array(A) - B) / 100
     assert table["time_p"][1] == pytest.approx(wilcoxon(late).pvalue)
-    # Of episodes in which both arrived there is no penalty, so that their seconds can be compared.
-    assert table["arrival_time_difference_s"][0] == pytest.approx((slow - slow / 3)[slow < 300].mean())
+    # Of episodes in which both arrived there is no penalty, so that their seconds can
+    # be compared.
+    assert table["arrival_time_difference_s"][0] == pytest.approx(
+        (slow - slow / 3)[slow < 300].mean()
+    )
 
 
 def test_an_episode_that_began_at_its_goal_took_no_share() -> None:

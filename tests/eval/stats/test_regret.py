@@ -1,4 +1,6 @@
-"""Chains of regret: which conditions are in one, and that their differences are paired and add up."""
+"""Chains of regret: which conditions are in one, and that their differences are paired
+and add up.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -38,12 +40,19 @@ def name_of(planner: str, model: str, risk: str = "cvar") -> str:
     return f"{planner}+{model}+{risk}"
 
 
-def episodes(times: list[list[float | None]] = TIMES, risk: str = "cvar") -> pd.DataFrame:
+def episodes(
+    times: list[list[float | None]] = TIMES, risk: str = "cvar"
+) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     for (planner, model), own in zip(CHAIN, times, strict=True):
-        labels = made.condition(planner, "–" if model == "clairvoyant" else risk, model=model)
+        labels = made.condition(
+            planner, "–" if model == "clairvoyant" else risk, model=model
+        )
         name = name_of(planner, model, labels["risk"])
-        rows += [made.row(labels, place, time, condition=name) for place, time in enumerate(own)]
+        rows += [
+            made.row(labels, place, time, condition=name)
+            for place, time in enumerate(own)
+        ]
     return pd.DataFrame(rows)
 
 
@@ -53,7 +62,9 @@ def conditions(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
 
 def split(rows: pd.DataFrame) -> pd.DataFrame:
     return split_regret(
-        conditions(rows), rows, dict.fromkeys(rows["condition"].unique(), made.PAPER["world"])
+        conditions(rows),
+        rows,
+        dict.fromkeys(rows["condition"].unique(), made.PAPER["world"]),
     )
 
 
@@ -65,7 +76,9 @@ def test_a_chain_goes_from_the_planner_to_the_reference() -> None:
 
 
 @pytest.mark.parametrize("missing", CHAIN)
-def test_without_one_of_its_conditions_there_is_no_chain(missing: tuple[str, str]) -> None:
+def test_without_one_of_its_conditions_there_is_no_chain(
+    missing: tuple[str, str],
+) -> None:
     rows = episodes()
     rows = rows[(rows["planner"] != missing[0]) | (rows["model"] != missing[1])]
     assert find_chains(conditions(rows)) == []
@@ -73,10 +86,15 @@ def test_without_one_of_its_conditions_there_is_no_chain(missing: tuple[str, str
 
 
 @pytest.mark.parametrize("model", ["ideal", "oracle", "clairvoyant"])
-def test_another_planner_with_a_privileged_model_neither_begins_a_chain_nor_stands_in_one(model: str) -> None:
+def test_another_planner_with_a_privileged_model_neither_begins_a_chain_nor_stands_in_one(
+    model: str,
+) -> None:
     rows = episodes()
     labels = made.condition("astar_dwa", "cvar", model=model)
-    added = [made.row(labels, place, 30.0, condition=name_of("astar_dwa", model)) for place in range(10)]
+    added = [
+        made.row(labels, place, 30.0, condition=name_of("astar_dwa", model))
+        for place in range(10)
+    ]
     more = pd.concat([rows, pd.DataFrame(added)])
     assert find_chains(conditions(more)) == find_chains(conditions(rows))
     fewer = more[more["planner"].eq("astar_dwa") | more["model"].ne(model)]
@@ -104,7 +122,9 @@ def test_each_of_two_references_ends_a_chain() -> None:
 
 
 def test_risk_settings_have_chains_of_their_own_and_share_the_reference() -> None:
-    rows = pd.concat([episodes(), episodes(risk="mean")]).drop_duplicates(["condition", "map"])
+    rows = pd.concat([episodes(), episodes(risk="mean")]).drop_duplicates(
+        ["condition", "map"]
+    )
     chains = find_chains(conditions(rows))
     assert len(chains) == 2
     for risk, chain in zip(("cvar", "mean"), chains, strict=True):
@@ -139,13 +159,19 @@ def test_differences_are_paired_and_add_up_to_the_whole() -> None:
     time = np.array([[100.0 if one is None else one for one in own] for own in TIMES])
     arrived = np.array([[one is not None for one in own] for own in TIMES])
     for place, row in enumerate(table.to_dict("records")):
-        assert row["time_difference"] == pytest.approx(time[place].mean() - time[place + 1].mean())
-        assert row["success_difference"] == pytest.approx(arrived[place].mean() - arrived[place + 1].mean())
+        assert row["time_difference"] == pytest.approx(
+            time[place].mean() - time[place + 1].mean()
+        )
+        assert row["success_difference"] == pytest.approx(
+            arrived[place].mean() - arrived[place + 1].mean()
+        )
         assert row["time_one"] == pytest.approx(time[place].mean())
         assert row["success_other"] == pytest.approx(arrived[place + 1].mean())
         assert row["time_low"] < row["time_difference"] < row["time_high"]
         assert row["success_low"] <= row["success_difference"] <= row["success_high"]
-    assert table["time_difference"].sum() == pytest.approx(time[0].mean() - time[-1].mean())
+    assert table["time_difference"].sum() == pytest.approx(
+        time[0].mean() - time[-1].mean()
+    )
     # Against all that vary by map, what is paired is known well.
     last = table.iloc[2]
     assert last["other_model"] == "oracle"
@@ -156,13 +182,23 @@ def test_episodes_that_one_condition_lacks_are_left_out_of_all() -> None:
     rows = episodes()
     fewer = rows[(rows["planner"] != "near_optimal") | (rows["map"] > 0)]
     wanted = episodes([own[1:] for own in TIMES])
-    columns = ["time_difference", "time_low", "time_high", "success_difference", "n_maps"]
+    columns = [
+        "time_difference",
+        "time_low",
+        "time_high",
+        "success_difference",
+        "n_maps",
+    ]
     pd.testing.assert_frame_equal(split(fewer)[columns], split(wanted)[columns])
 
 
 def texts_of(table: pd.DataFrame) -> list[str]:
     figure = Regret().draw(made.run_data(regret=table))
-    return [text.get_text() for panel in figure.axes for text in (*panel.texts, *panel.get_yticklabels())]
+    return [
+        text.get_text()
+        for panel in figure.axes
+        for text in (*panel.texts, *panel.get_yticklabels())
+    ]
 
 
 def test_the_waterfall_says_each_step_with_sign_and_interval() -> None:
@@ -179,20 +215,33 @@ def test_the_waterfall_says_each_step_with_sign_and_interval() -> None:
     assert any(text.startswith(points) for text in texts)
 
 
-def test_bars_are_orange_where_the_next_is_better_and_lines_are_their_intervals() -> None:
+def test_bars_are_orange_where_the_next_is_better_and_lines_are_their_intervals() -> (
+    None
+):
     """Less time is better, and more success."""
     table = split(episodes())
     figure = Regret().draw(made.run_data(regret=table))
-    for panel, (measure, factor) in zip(figure.axes, (("success", 100.0), ("time", 1.0)), strict=False):
-        bars = [bar for bar in panel.patches if bar.get_facecolor()[:3] != to_rgba(_ENDS)[:3]]
+    for panel, (measure, factor) in zip(
+        figure.axes, (("success", 100.0), ("time", 1.0)), strict=False
+    ):
+        bars = [
+            bar
+            for bar in panel.patches
+            if bar.get_facecolor()[:3] != to_rgba(_ENDS)[:3]
+        ]
         lines = [line for line in panel.lines if line.get_color() == "black"]
         assert len(bars) == len(lines) == 4
         for row, bar, line in zip(table.to_dict("records"), bars, lines, strict=True):
-            one, gain = factor * row[f"{measure}_one"], -factor * row[f"{measure}_difference"]
+            one, gain = (
+                factor * row[f"{measure}_one"],
+                -factor * row[f"{measure}_difference"],
+            )
             low, high = (factor * row[f"{measure}_{end}"] for end in ("low", "high"))
             assert (bar.get_x(), bar.get_width()) == pytest.approx((one, gain))
             # Of success no further than all or none.
-            ends = np.clip([one - high, one - low], 0, 100 if measure == "success" else None)
+            ends = np.clip(
+                [one - high, one - low], 0, 100 if measure == "success" else None
+            )
             assert line.get_xdata() == pytest.approx(ends)
             better = gain > 0 if measure == "success" else gain < 0
             colour = ORANGE if better else BLUE
@@ -206,7 +255,12 @@ def test_the_report_of_a_run_with_a_chain_has_it(tmp_path: Path) -> None:
     known = {
         name: about
         | {
-            "value": {"data": "paper-v1", "split": "test/std", **parts, **about["value"]},
+            "value": {
+                "data": "paper-v1",
+                "split": "test/std",
+                **parts,
+                **about["value"],
+            },
             "draws": [[0, 0, 10]],
         }
         for name, about in conditions(rows).items()
@@ -217,14 +271,19 @@ def test_the_report_of_a_run_with_a_chain_has_it(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(report.regret, split(rows))
     assert (folder / "figures/regret.png").is_file()
     assert len(pd.read_csv(folder / "regret.csv")) == 4
-    assert "in another order steps would be others" in (folder / "report.html").read_text()
+    assert (
+        "in another order steps would be others" in (folder / "report.html").read_text()
+    )
     said = (folder / "summary.md").read_text()
     # 40 s and the limit of 100 s on the last two maps, and the limit on both.
     assert f"T_total {0.09 * 234 + 14:.1f} to {0.1 * 234 + 20:.1f} s" in said
     assert "success 80.0 to 90.0 %" in said
     one = rows[rows["planner"] == "astar_dwa"]
     folder = forge_run(
-        tmp_path / "alone", one, {name: known[name] for name in set(one["condition"])}, history=history
+        tmp_path / "alone",
+        one,
+        {name: known[name] for name in set(one["condition"])},
+        history=history,
     )
     write_report(folder)
     assert not (folder / "regret.csv").exists()
@@ -244,11 +303,15 @@ def test_the_lower_bound_stands_beside_the_reference_where_its_rows_have_one() -
     table = split(bounded_episodes())
     limit_s = made.PAPER["world"]["time_budget_s"]
     assert table["success_bound"].eq(0.9).all()
-    assert table["time_bound"].to_numpy() == pytest.approx(0.1 * (0.9 * 234 + 40 + limit_s))
+    assert table["time_bound"].to_numpy() == pytest.approx(
+        0.1 * (0.9 * 234 + 40 + limit_s)
+    )
     drawn = [
         line
         for panel in Regret().draw(made.run_data(regret=table)).axes
         for line in panel.get_lines()
         if line.get_linestyle() == "--"
     ]
-    assert [line.get_xdata()[0] for line in drawn] == pytest.approx([90.0, table["time_bound"][0]])
+    assert [line.get_xdata()[0] for line in drawn] == pytest.approx(
+        [90.0, table["time_bound"][0]]
+    )

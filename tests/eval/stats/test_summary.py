@@ -18,24 +18,38 @@ def summary_of(*episodes: dict) -> pd.Series:  # type: ignore[type-arg]
 
 def test_success_and_times() -> None:
     times = (30.0, 40.0, None, 44.0)
-    found = summary_of(*(row(condition(), map_index, time) for map_index, time in enumerate(times)))
+    found = summary_of(
+        *(row(condition(), map_index, time) for map_index, time in enumerate(times))
+    )
     assert (found["n_episodes"], found["n_maps"]) == (4, 4)
     assert found["success_rate"] == 0.75
-    assert (found["success_low"], found["success_high"]) == pytest.approx(wilson_interval(0.75, 4))
+    assert (found["success_low"], found["success_high"]) == pytest.approx(
+        wilson_interval(0.75, 4)
+    )
     assert found["total_time_mean_s"] == pytest.approx((30 + 40 + 100 + 44) / 4)
     assert found["total_time_std_s"] == pytest.approx(np.std([30, 40, 100, 44], ddof=1))
     assert found["success_time_mean_s"] == pytest.approx(38)
     assert found["success_time_std_s"] == pytest.approx(np.std([30, 40, 44], ddof=1))
-    assert (found["total_time_n"], found["success_time_n"], found["time_ratio_n"]) == (4, 3, 3)
+    assert (found["total_time_n"], found["success_time_n"], found["time_ratio_n"]) == (
+        4,
+        3,
+        3,
+    )
     assert found["time_ratio_mean"] == pytest.approx(38 / 25)
-    assert found["score_mean"] == pytest.approx((12.5 / 30 + 12.5 / 40 + 0 + 12.5 / 44) / 4)
+    assert found["score_mean"] == pytest.approx(
+        (12.5 / 30 + 12.5 / 40 + 0 + 12.5 / 44) / 4
+    )
 
 
 def test_what_an_episode_does_not_have_is_not_averaged() -> None:
     names = ("traversability", "path_length_m", "stuck_share", "roughness_radps2")
-    at_once = row(condition(), 1, None, outcome="planner_failure", **dict.fromkeys(names, np.nan))
+    at_once = row(
+        condition(), 1, None, outcome="planner_failure", **dict.fromkeys(names, np.nan)
+    )
     found = summary_of(
-        row(condition(), 0, traversability=0.6), at_once, row(condition(), 2, traversability=0.8)
+        row(condition(), 0, traversability=0.6),
+        at_once,
+        row(condition(), 2, traversability=0.8),
     )
     assert found["traversability_mean"] == pytest.approx(0.7)
     assert found["path_length_mean_m"] == 22
@@ -59,7 +73,8 @@ def test_failures_are_counted_by_their_outcome() -> None:
     ]
     outcomes += ["planner_error", "model_error", "model_error"]
     found = summary_of(
-        *(row(condition(), i, None, outcome=o) for i, o in enumerate(outcomes)), row(condition(), 99)
+        *(row(condition(), i, None, outcome=o) for i, o in enumerate(outcomes)),
+        row(condition(), 99),
     )
     assert {name: found[f"{name}_count"] for name in dict.fromkeys(outcomes)} == {
         "timeout": 1, "stuck": 2, "out_of_bounds": 1, "planner_failure": 1, "stalled": 3, "planner_error": 1,
@@ -74,7 +89,9 @@ def test_a_row_a_condition_in_order_of_appearance() -> None:
         condition("cl_rrt", scenario="std"),
         condition("cl_rrt", scenario="hg"),
     ]
-    summary = made.summarised(rows(*(row(labels, i) for i in range(2) for labels in order)))
+    summary = made.summarised(
+        rows(*(row(labels, i) for i in range(2) for labels in order))
+    )
     assert summary[["planner", "scenario"]].to_numpy().tolist() == [
         ["mppi", "std"], ["cl_rrt", "std"], ["cl_rrt", "hg"]
     ]  # fmt: skip
@@ -84,11 +101,19 @@ def test_a_row_a_condition_in_order_of_appearance() -> None:
 
 def test_time_has_the_interval_of_its_own_condition_over_maps() -> None:
     generator = np.random.default_rng(4)
-    taken = {name: generator.uniform(20, 60, (12, 3)) + late for name, late in (("mppi", 0), ("cl_rrt", 30))}
+    taken = {
+        name: generator.uniform(20, 60, (12, 3)) + late
+        for name, late in (("mppi", 0), ("cl_rrt", 30))
+    }
     taken["cl_rrt"][2, 1] = taken["cl_rrt"][7] = 100
     summary = made.summarised(
         rows(
-            row(condition(name), m, time if (time := taken[name][m, seed]) < 100 else None, seed=seed)
+            row(
+                condition(name),
+                m,
+                time if (time := taken[name][m, seed]) < 100 else None,
+                seed=seed,
+            )
             for seed in range(3)
             for m in range(12)
             for name in taken
@@ -98,14 +123,26 @@ def test_time_has_the_interval_of_its_own_condition_over_maps() -> None:
         found, failed = summary.loc[name], times >= 100
         ends = 1 - found["success_high"], 1 - found["success_low"]
         _, low, high = total_time_interval(
-            times.mean(1), failed.mean(1), ends, 100 - times[~failed].mean(), int((~failed).any(1).sum())
+            times.mean(1),
+            failed.mean(1),
+            ends,
+            100 - times[~failed].mean(),
+            int((~failed).any(1).sum()),
         )
-        assert (found["total_time_low_s"], found["total_time_high_s"]) == pytest.approx((low, min(high, 100)))
-        assert found["total_time_low_s"] < found["total_time_mean_s"] < found["total_time_high_s"]
+        assert (found["total_time_low_s"], found["total_time_high_s"]) == pytest.approx(
+            (low, min(high, 100))
+        )
+        assert (
+            found["total_time_low_s"]
+            < found["total_time_mean_s"]
+            < found["total_time_high_s"]
+        )
 
 
 def test_a_time_budget_that_is_a_ratio_is_that_of_each_map() -> None:
-    """A robot of 2 m/s: T is three times half of the reference time; failures say it themselves."""
+    """A robot of 2 m/s: T is three times half of the reference time; failures say it
+    themselves.
+    """
     reference = np.array([20.0, 30.0, 40.0])
     found = time_budgets(
         rows(
@@ -119,10 +156,13 @@ def test_a_time_budget_that_is_a_ratio_is_that_of_each_map() -> None:
     assert list(time_budgets(rows(row(condition())), {"time_budget_s": 70.0})) == [70.0]
 
 
-def test_rare_failures_that_were_not_met_widen_the_interval_by_what_they_would_cost() -> None:
+def test_rare_failures_that_were_not_met_widen_the_interval_by_what_they_would_cost() -> (
+    None
+):
     arrived = [row(condition(), i, 30.0 + i % 3) for i in range(20)]
     tight, dear = (
-        made.summarised(rows(*arrived), {"time_budget_s": budget}).iloc[0] for budget in (40.0, 400.0)
+        made.summarised(rows(*arrived), {"time_budget_s": budget}).iloc[0]
+        for budget in (40.0, 400.0)
     )
     mean = tight["total_time_mean_s"]
     cost = (1 - tight["success_low"]) * np.array([40 - mean, 400 - mean])
@@ -138,7 +178,9 @@ def test_what_never_arrived_has_an_interval_up_to_its_budget() -> None:
 
 
 def test_maps_of_one_group_are_one_unit() -> None:
-    """Ten maps of five groups; all maps of a group end alike, so that five is what they tell."""
+    """Ten maps of five groups; all maps of a group end alike, so that five is what they
+    tell.
+    """
     labels = condition()
     alone = [row(labels, i, 30.0 + i // 2 if i >= 2 else None) for i in range(10)]
     grouped = [{**one, "group": one["map"] // 2} for one in alone]
@@ -151,12 +193,15 @@ def test_maps_of_one_group_are_one_unit() -> None:
     assert np.isnan(by_group["total_time_low_s"])  # of five there is none
 
 
-def test_a_further_metric_has_students_interval_over_maps_and_counts_those_that_have_it() -> None:
+def test_a_further_metric_has_students_interval_over_maps_and_counts_those_that_have_it() -> (
+    None
+):
     # Ten maps with two episodes each; of map 9 neither episode has a value.
     energies = np.arange(20.0) ** 2
     energies[18:] = np.nan
     episodes = rows(
-        row(condition(), i // 2, realisation=i % 2, energy_j=energy) for i, energy in enumerate(energies)
+        row(condition(), i // 2, realisation=i % 2, energy_j=energy)
+        for i, energy in enumerate(energies)
     )
     worlds = {str(episodes["condition"][0]): made.PAPER["world"]}
     (found,) = summarise(episodes, worlds, [Energy().quantity]).to_dict("records")
@@ -169,6 +214,8 @@ def test_a_further_metric_has_students_interval_over_maps_and_counts_those_that_
     assert found["energy_std_j"] == pytest.approx(energies[:18].std(ddof=1))
     assert found["energy_n"] == 18
     # Where a part of a run does not have the column yet, nothing is known of it.
-    (found,) = summarise(episodes.drop(columns="energy_j"), worlds, [Energy().quantity]).to_dict("records")
+    (found,) = summarise(
+        episodes.drop(columns="energy_j"), worlds, [Energy().quantity]
+    ).to_dict("records")
     assert np.isnan([found["energy_mean_j"], found["energy_low_j"]]).all()
     assert found["energy_n"] == 0

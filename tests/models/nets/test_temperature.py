@@ -27,7 +27,9 @@ def draw(cells: int, temperature: float) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize("temperature", [0.4, 1.0, 2.5])
-def test_the_temperature_that_the_classes_were_drawn_with_is_found(temperature: float) -> None:
+def test_the_temperature_that_the_classes_were_drawn_with_is_found(
+    temperature: float,
+) -> None:
     found = fit_temperature(*draw(50_000, temperature))
     assert found == pytest.approx(temperature, rel=0.02)
 
@@ -37,7 +39,9 @@ def test_no_other_temperature_is_more_likely() -> None:
     found = fit_temperature(logits, class_id)
 
     def loss(temperature: float) -> float:
-        return float(torch.nn.functional.cross_entropy(logits.double() / temperature, class_id))
+        return float(
+            torch.nn.functional.cross_entropy(logits.double() / temperature, class_id)
+        )
 
     assert loss(found) < min(loss(found * factor) for factor in (0.9, 0.99, 1.01, 1.1))
 
@@ -77,16 +81,21 @@ CLASSES, STRENGTH = 3, 2.5
 
 
 class Witness(torch.nn.Module):
-    """A classifier whose evidence is one channel of the image in three, its own errors in it."""
+    """A classifier whose evidence is one channel of the image in three, its own errors
+    in it.
+    """
 
     def __init__(self, channel: int, boldness: float, temperature: float = 1.0) -> None:
         super().__init__()
         self.channel, self.boldness, self.temperature = channel, boldness, temperature
 
     def forward(self, maps: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        # A channel holds the evidence for each of three classes in a third of the byte's levels each.
+        # A channel holds the evidence for each of three classes in a third of the
+        # byte's levels each.
         level = maps["rgb"][:, self.channel].long()
-        evidence = torch.stack([level % 6, level // 6 % 6, level // 36 % 6], 1).float() - 2.5
+        evidence = (
+            torch.stack([level % 6, level // 6 % 6, level // 36 % 6], 1).float() - 2.5
+        )
         return self.boldness * evidence / self.temperature
 
 
@@ -94,19 +103,32 @@ class Held(MapDataset):
     """Maps of no dataset."""
 
     def __init__(self, rgb: torch.Tensor, class_id: torch.Tensor) -> None:
-        self._memory, self._maps, self.every = {"rgb": rgb, "class_id": class_id}, len(rgb), 1
+        self._memory, self._maps, self.every = (
+            {"rgb": rgb, "class_id": class_id},
+            len(rgb),
+            1,
+        )
         self.given, self.masks = ("rgb", "class_id"), None
 
-    def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, dict[str, torch.Tensor]]]:
+    def chunks(
+        self, device: torch.device = CPU
+    ) -> Iterator[tuple[range, dict[str, torch.Tensor]]]:
         every = range(len(self))
         yield every, self.read(every)
 
 
 def witnessed(maps: int, seed: int) -> MapDataset:
-    """Maps of single cells' classes; each channel has noisy evidence of its own, in six steps a class."""
+    """Maps of single cells' classes; each channel has noisy evidence of its own, in six
+    steps a class.
+    """
     generator = torch.Generator().manual_seed(seed)
     class_id = torch.randint(0, CLASSES, (maps, 16, 16), generator=generator)
-    shown = torch.nn.functional.one_hot(class_id, CLASSES).movedim(-1, 1).unsqueeze(1).float()
+    shown = (
+        torch.nn.functional.one_hot(class_id, CLASSES)
+        .movedim(-1, 1)
+        .unsqueeze(1)
+        .float()
+    )
     noise = torch.randn(maps, 3, CLASSES, 16, 16, generator=generator)
     steps = (2 + STRENGTH * (shown - 0.2) + noise).round().clamp(0, 5).long()
     rgb = steps[:, :, 0] + 6 * steps[:, :, 1] + 36 * steps[:, :, 2]
@@ -122,9 +144,13 @@ def ece(probabilities: torch.Tensor, class_id: torch.Tensor) -> float:
 def test_a_pool_that_is_calibrated_as_a_whole_is_right_as_often_as_it_says() -> None:
     maps, fresh = witnessed(100, 0), witnessed(100, 1)
     members = []
-    for channel, boldness in enumerate((0.5, 2.0, 6.0)):  # each miscalibrated in its own way
+    for channel, boldness in enumerate(
+        (0.5, 2.0, 6.0)
+    ):  # each miscalibrated in its own way
         own = Witness(channel, boldness)
-        members.append(Witness(channel, boldness, fit_temperature(*sample_logits(own, maps))))
+        members.append(
+            Witness(channel, boldness, fit_temperature(*sample_logits(own, maps)))
+        )
     stored = fresh.read(range(len(fresh)))
     class_id = stored["class_id"]
     alone = [member(stored).softmax(1) for member in members]
@@ -141,18 +167,28 @@ def test_of_one_classifier_the_pool_temperature_is_what_its_own_leaves_over() ->
     maps = witnessed(50, 2)
     own = fit_temperature(*sample_logits(Witness(0, 3.0), maps))
     assert fit_pool_temperature([Witness(0, 3.0)], maps) == pytest.approx(own, rel=1e-3)
-    assert fit_pool_temperature([Witness(0, 3.0, own)], maps) == pytest.approx(1, rel=1e-3)
+    assert fit_pool_temperature([Witness(0, 3.0, own)], maps) == pytest.approx(
+        1, rel=1e-3
+    )
 
 
-# --- distributions of λ ----------------------------------------------------------------------------
+# --- distributions of λ
+# ----------------------------------------------------------------------------
 
 
-def scores(temperature: float, atoms: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
-    """Normal scores of what was observed where a temperature would make predictions right."""
-    z = temperature * torch.randn(60_000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+def scores(
+    temperature: float, atoms: bool = False
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Normal scores of what was observed where a temperature would make predictions
+    right.
+    """
+    z = temperature * torch.randn(
+        60_000, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     if not atoms:
         return z, z
-    # All below −0.5 is one atom, and all above 0.8 another: of these the interval alone is known.
+    # All below −0.5 is one atom, and all above 0.8 another: of these the interval alone
+    # is known.
     low = torch.where(z < -0.5, -torch.inf, torch.where(z > 0.8, 0.8, z))
     return low, torch.where(z < -0.5, -0.5, torch.where(z > 0.8, torch.inf, z))
 
@@ -162,12 +198,16 @@ def scores(temperature: float, atoms: bool = False) -> tuple[torch.Tensor, torch
 def test_the_temperature_of_distributions_is_found_with_and_without_atoms(
     temperature: float, atoms: bool
 ) -> None:
-    assert fit_width(*scores(temperature, atoms)) == pytest.approx(temperature, rel=0.02)
+    assert fit_width(*scores(temperature, atoms)) == pytest.approx(
+        temperature, rel=0.02
+    )
 
 
 def test_the_rounding_of_a_cdf_is_no_atom() -> None:
     z, _ = scores(1.6)
-    assert fit_width(torch.nextafter(z, torch.full_like(z, -torch.inf)), z) == fit_width(z, z)
+    assert fit_width(
+        torch.nextafter(z, torch.full_like(z, -torch.inf)), z
+    ) == fit_width(z, z)
 
 
 def test_distributions_that_are_right_are_left_as_they_are() -> None:
@@ -175,7 +215,9 @@ def test_distributions_that_are_right_are_left_as_they_are() -> None:
     assert fit_width(*scores(1.01)) == 1  # for a gain below 0.001 nats a cell
 
 
-def test_an_observation_outside_a_predictions_support_leaves_a_finite_temperature() -> None:
+def test_an_observation_outside_a_predictions_support_leaves_a_finite_temperature() -> (
+    None
+):
     low, high = (values.clone() for values in scores(1.5))
     low[0] = high[0] = torch.inf
     low[1] = high[1] = -torch.inf
@@ -193,7 +235,9 @@ def test_sampled_scores_are_those_of_the_cells_that_were_observed() -> None:
     def predict(layers: dict[str, torch.Tensor]) -> TraversabilityMixture:
         assert set(layers) == {"slope_deg"}
         own = layers["slope_deg"].unsqueeze(1)
-        return TraversabilityMixture(torch.ones_like(own), own, 0.2 * torch.ones_like(own))
+        return TraversabilityMixture(
+            torch.ones_like(own), own, 0.2 * torch.ones_like(own)
+        )
 
     low, high = sample_scores(predict, held, ("slope_deg",), seed=5)
     known = observed.isfinite()
@@ -201,7 +245,10 @@ def test_sampled_scores_are_those_of_the_cells_that_were_observed() -> None:
     inside = (observed > 0) & (observed < 1) & known
     wanted = ((observed - mean) / 0.2)[inside]
     torch.testing.assert_close(
-        high[low == high].sort().values.float(), wanted.sort().values, rtol=1e-3, atol=1e-3
+        high[low == high].sort().values.float(),
+        wanted.sort().values,
+        rtol=1e-3,
+        atol=1e-3,
     )
     assert int(low.isinf().sum()) == int((observed == 0).sum())
     assert int(high.isinf().sum()) == int((observed == 1).sum())

@@ -34,10 +34,17 @@ def test_a_table_is_printed_and_nothing_written(
     out, err = capfd.readouterr()
     quality = dict(evaluate(ColourModel(), dataset))["test/hs"]
     (row,) = [line for line in out.splitlines() if line.startswith("test/hs")]
-    for value in (quality.classes[0].ece, quality.traversability.nll, quality.traversability.coverage):
+    for value in (
+        quality.classes[0].ece,
+        quality.traversability.nll,
+        quality.traversability.coverage,
+    ):
         assert f"{value:.4f}" in row
     assert f"test/hs {nearest_colour_accuracy(dataset, 'test/hs'):.4f}" in out
-    assert out.splitlines()[-1] == "columns: --out FOLDER writes quality.md, which explains them"
+    assert (
+        out.splitlines()[-1]
+        == "columns: --out FOLDER writes quality.md, which explains them"
+    )
     assert max(map(len, out.splitlines())) <= 124
     assert err.splitlines() == ["splits: 0/2", "splits: 1/2", "splits: 2/2"]
     assert list(tmp_path.iterdir()) == []
@@ -49,7 +56,17 @@ def test_json_alone_is_written_for_other_programs(
     report = tmp_path / "report.json"
     monkeypatch.setenv("HOME", str(tmp_path))
     assert (
-        call("train", "evaluate", "colours", "--data", dataset.path, "--json=~/report.json", "--seed", 5) == 0
+        call(
+            "train",
+            "evaluate",
+            "colours",
+            "--data",
+            dataset.path,
+            "--json=~/report.json",
+            "--seed",
+            5,
+        )
+        == 0
     )
     found = json.loads(report.read_text())
     assert list(found["splits"]) == ["test/std", "test/hs"]
@@ -58,7 +75,9 @@ def test_json_alone_is_written_for_other_programs(
     quality = dict(evaluate(ColourModel(), dataset, seed=5))["test/hs"]
     assert tuple(found["splits"]["test/hs"]["pit"]) == quality.traversability.pit
     assert found["splits"]["test/hs"]["accuracy"] == quality.classes[0].accuracy
-    assert found["nearest_colour_accuracy"]["test/hs"] == nearest_colour_accuracy(dataset, "test/hs")
+    assert found["nearest_colour_accuracy"]["test/hs"] == nearest_colour_accuracy(
+        dataset, "test/hs"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
 
@@ -72,27 +91,60 @@ def test_a_folder_holds_report_page_and_figures(
     out = tmp_path / "new" / "quality"
     asked = ["colours", "--data", dataset.path, "--out", out, "--maps", 1]
     draw, titles = figures.map_sheet_figure, []
-    monkeypatch.setattr(figures, "map_sheet_figure", lambda *given: titles.append(given[-1]) or draw(*given))
+    monkeypatch.setattr(
+        figures,
+        "map_sheet_figure",
+        lambda *given: titles.append(given[-1]) or draw(*given),
+    )
     assert call("train", "evaluate", *asked) == 0
     assert titles == ["model colours on dataset tiny-v1"] * 2
-    assert {path.name for path in out.iterdir()} == {"quality.json", "quality.csv", "quality.md", "figures"}
+    assert {path.name for path in out.iterdir()} == {
+        "quality.json",
+        "quality.csv",
+        "quality.md",
+        "figures",
+    }
     files = {path.name for path in (out / "figures").iterdir()}
-    names = {"confusion", "reliability", "pit", "latent", "maps-test-std", "maps-test-hs"}
+    names = {
+        "confusion",
+        "reliability",
+        "pit",
+        "latent",
+        "maps-test-std",
+        "maps-test-hs",
+    }
     assert files == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
     printed = capfd.readouterr().out
     assert "no series" in printed
-    assert printed.splitlines()[-1] == f"columns and figures are explained in {out}/quality.md"
+    assert (
+        printed.splitlines()[-1]
+        == f"columns and figures are explained in {out}/quality.md"
+    )
     page = (out / "quality.md").read_text()
     assert all(f"(figures/{name}.png)" in page for name in names)
     assert "nearest colour" in page
     assert len(list(csv.DictReader((out / "quality.csv").open()))) == 2
 
-    # Another evaluation takes its place only when asked to, and leaves no figure of the first.
-    assert call("train", "evaluate", "oracle", "--data", dataset.path, "--out", out) == 2
+    # Another evaluation takes its place only when asked to, and leaves no figure of the
+    # first.
+    assert (
+        call("train", "evaluate", "oracle", "--data", dataset.path, "--out", out) == 2
+    )
     assert "--overwrite" in capfd.readouterr().err
     assert json.loads((out / "quality.json").read_text())["model"] == "colours"
     assert (
-        call("train", "evaluate", "oracle", "--data", dataset.path, "--out", out, "--maps", 0, "--overwrite")
+        call(
+            "train",
+            "evaluate",
+            "oracle",
+            "--data",
+            dataset.path,
+            "--out",
+            out,
+            "--maps",
+            0,
+            "--overwrite",
+        )
         == 0
     )
     assert {path.name for path in (out / "figures").iterdir()} == {"pit.png", "pit.pdf"}
@@ -100,7 +152,10 @@ def test_a_folder_holds_report_page_and_figures(
     assert "predicts no classes" in said
     assert "no Gaussian processes" in said
     assert "nearest colour" not in said
-    assert "accuracy" not in json.loads((out / "quality.json").read_text())["splits"]["test/hs"]
+    assert (
+        "accuracy"
+        not in json.loads((out / "quality.json").read_text())["splits"]["test/hs"]
+    )
 
 
 def test_a_series_is_drawn_where_there_is_one(
@@ -109,16 +164,30 @@ def test_a_series_is_drawn_where_there_is_one(
     monkeypatch.setattr("benchnav.models.quality.output.DPI", 30)
     held = dict(dataset.manifest["splits"])
     monkeypatch.setattr(
-        TerrainDataset, "splits", property(lambda self: {**held, "test/hs-100": held["test/hs"]})
+        TerrainDataset,
+        "splits",
+        property(lambda self: {**held, "test/hs-100": held["test/hs"]}),
     )
     read = TerrainDataset.read
     monkeypatch.setattr(
-        TerrainDataset, "read", lambda self, split, *rest: read(self, split.removesuffix("-100"), *rest)
+        TerrainDataset,
+        "read",
+        lambda self, split, *rest: read(self, split.removesuffix("-100"), *rest),
     )
-    asked = ["oracle", "--data", dataset.path, "--splits", "[test/std,test/hs-100]", "--maps", 0]
+    asked = [
+        "oracle",
+        "--data",
+        dataset.path,
+        "--splits",
+        "[test/std,test/hs-100]",
+        "--maps",
+        0,
+    ]
     assert call("train", "evaluate", *asked, "--out", tmp_path / "q") == 0
     assert (tmp_path / "q" / "figures" / "severity.png").is_file()
-    assert list(json.loads((tmp_path / "q" / "quality.json").read_text())["series"]) == ["test/hs"]
+    assert list(
+        json.loads((tmp_path / "q" / "quality.json").read_text())["series"]
+    ) == ["test/hs"]
 
 
 @pytest.mark.parametrize(
@@ -130,11 +199,20 @@ def test_a_series_is_drawn_where_there_is_one(
         (["oracle", "--data", "DATA", "--json", "no/such/folder.json"], "no/such"),
         (["oracle", "--data", "DATA", "--json", "folder"], "folder"),
         (["oracle", "--data", "DATA", "--out", "folder"], "something else"),
-        (["oracle", "--data", "DATA", "--out", "folder/file/deeper/out"], "folder/file"),
+        (
+            ["oracle", "--data", "DATA", "--out", "folder/file/deeper/out"],
+            "folder/file",
+        ),
         (["oracle", "--data", "DATA", "--out", "x", "--maps", "-1"], "maps"),
-        (["oracle", "--data", "DATA", "--seed", "-1"], "Expected `seed` in 0–9223372036854775807, got -1."),
+        (
+            ["oracle", "--data", "DATA", "--seed", "-1"],
+            "Expected `seed` in 0–9223372036854775807, got -1.",
+        ),
         (["oracle", "--data", "DATA", "--splits", "[]"], "Expected `splits` among "),
-        (["other", "--data", "DATA", "--out", "new/x", "--json", "y.json"], "class table"),
+        (
+            ["other", "--data", "DATA", "--out", "new/x", "--json", "y.json"],
+            "class table",
+        ),
     ],
 )
 def test_bad_input_is_refused_in_one_line_before_any_work(
@@ -159,7 +237,12 @@ def test_bad_input_is_refused_in_one_line_before_any_work(
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "file").write_text("mine")
     assert (
-        call("train", "evaluate", *(str(dataset.path) if item == "DATA" else item for item in arguments)) == 2
+        call(
+            "train",
+            "evaluate",
+            *(str(dataset.path) if item == "DATA" else item for item in arguments),
+        )
+        == 2
     )
     out, err = capfd.readouterr()
     assert len(err.strip().splitlines()) == 1, err
@@ -175,7 +258,9 @@ def test_the_command_is_light_to_import() -> None:
         "import sys, benchnav.models.quality.command; "
         "print(sorted({'torch', 'torchmetrics', 'matplotlib', 'pandas'} & set(sys.modules)))"
     )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert ran.stdout.strip() == "[]"
 
 
@@ -194,10 +279,22 @@ def test_maps_that_the_model_was_trained_on_are_named(
         report = tmp_path / "report.json"
         asked = ("--data", copy, "--splits", splits, "--json", report)
         assert call("train", "evaluate", checkpoint_path, *asked) == 0
-        warned = [line for line in capfd.readouterr().out.splitlines() if "was trained" in line]
-        assert warned == [note for note in json.loads(report.read_text())["notes"] if "was trained" in note]
-        assert [line.partition("maps of ")[2][: len(named)] for line in warned] == [named] * bool(named)
-    assert call("train", "evaluate", "colours", "--data", copy, "--splits", "[train]") == 0
+        warned = [
+            line
+            for line in capfd.readouterr().out.splitlines()
+            if "was trained" in line
+        ]
+        assert warned == [
+            note
+            for note in json.loads(report.read_text())["notes"]
+            if "was trained" in note
+        ]
+        assert [line.partition("maps of ")[2][: len(named)] for line in warned] == [
+            named
+        ] * bool(named)
+    assert (
+        call("train", "evaluate", "colours", "--data", copy, "--splits", "[train]") == 0
+    )
     assert "was trained" not in capfd.readouterr().out
 
 
@@ -209,10 +306,27 @@ def test_a_model_that_is_right_less_often_than_the_nearest_colour_is_told_so(
 ) -> None:
     monkeypatch.setattr("benchnav.models.quality.output.DPI", 30)
     shares = {"test/std": 0.999, "test/hs": 0.0}
-    monkeypatch.setattr(baselines, "nearest_colour_accuracy", lambda _, split: shares[split])
-    line = "warning: the model's accuracy is below that of the nearest colour on test/std"
+    monkeypatch.setattr(
+        baselines, "nearest_colour_accuracy", lambda _, split: shares[split]
+    )
+    line = (
+        "warning: the model's accuracy is below that of the nearest colour on test/std"
+    )
     out = tmp_path / "quality"
-    assert call("train", "evaluate", "colours", "--data", dataset.path, "--out", out, "--maps", 0) == 0
+    assert (
+        call(
+            "train",
+            "evaluate",
+            "colours",
+            "--data",
+            dataset.path,
+            "--out",
+            out,
+            "--maps",
+            0,
+        )
+        == 0
+    )
     assert line in capfd.readouterr().out.splitlines()
     assert line in (out / "quality.md").read_text().splitlines()
     shares["test/std"] = 0.0

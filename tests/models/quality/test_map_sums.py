@@ -26,19 +26,27 @@ class Colours(torch.nn.Module):
 MODEL = FusedModel([Colours()], linear_table(), ("a", "b", "c"))
 
 
-def measured(model: TraversabilityModel, *chunks: Terrain, truth: bool = True) -> tuple[Quality, MapTally]:
-    quality = measure(model, chunks, torch.Generator().manual_seed(1), (), truth, by_map=True)
+def measured(
+    model: TraversabilityModel, *chunks: Terrain, truth: bool = True
+) -> tuple[Quality, MapTally]:
+    quality = measure(
+        model, chunks, torch.Generator().manual_seed(1), (), truth, by_map=True
+    )
     assert quality.by_map
     return quality, quality.by_map
 
 
 def whole(tally: MapTally) -> dict[str, float]:
-    (row,) = summarise(tuple(SCORES.values()), {"model": tally.sums()}).to_dict("records")
+    (row,) = summarise(tuple(SCORES.values()), {"model": tally.sums()}).to_dict(
+        "records"
+    )
     return {str(name): value for name, value in row.items()}
 
 
 def holed() -> Terrain:
-    """Maps some of whose cells were not observed, and others have no class; the last has no λ at all."""
+    """Maps some of whose cells were not observed, and others have no class; the last
+    has no λ at all.
+    """
     terrain = make_terrain(batch=4)
     terrain.traversability[0, :5], terrain.traversability[3] = math.nan, math.nan
     terrain.class_id[1, :, :9] = UNLABELLED
@@ -46,11 +54,15 @@ def holed() -> Terrain:
 
 
 @pytest.mark.parametrize("model", [MODEL, Oracle()])
-def test_sums_over_all_maps_give_the_measures_of_evaluate(model: TraversabilityModel) -> None:
+def test_sums_over_all_maps_give_the_measures_of_evaluate(
+    model: TraversabilityModel,
+) -> None:
     quality, tally = measured(model, make_terrain(batch=3, seed=1), holed())
     found = whole(tally)
     for name in ("rmse_observed", "rmse_expected", "nll", "crps", "coverage"):
-        assert found[name] == pytest.approx(getattr(quality.traversability, name), rel=1e-9, abs=1e-12), name
+        assert found[name] == pytest.approx(
+            getattr(quality.traversability, name), rel=1e-9, abs=1e-12
+        ), name
     assert found["tail_rate_90"] == pytest.approx(quality.traversability.tail_rate)
     assert tuple(tally.pit) == quality.traversability.pit
     for classes in quality.classes:
@@ -79,7 +91,9 @@ def test_each_map_has_the_sums_that_it_has_alone() -> None:
             "under_90",
             "under_95",
         }:  # with other draws within atoms
-            np.testing.assert_allclose(sums[name][2 + place], alone[name][0], rtol=1e-6, err_msg=name)
+            np.testing.assert_allclose(
+                sums[name][2 + place], alone[name][0], rtol=1e-6, err_msg=name
+            )
 
 
 def test_the_measures_of_a_comparison_are_those_computed_by_hand() -> None:
@@ -100,7 +114,9 @@ def test_the_measures_of_a_comparison_are_those_computed_by_hand() -> None:
     assert found["ause"] == pytest.approx(np.mean(areas), rel=1e-5)
     left_out, by_width, by_error = tally.curves()
     assert by_width[0] == pytest.approx(float(error.mean()), rel=1e-5)
-    assert by_error[25] == pytest.approx(float(np.mean([own[1, 511] for own in curves])), rel=1e-5)
+    assert by_error[25] == pytest.approx(
+        float(np.mean([own[1, 511] for own in curves])), rel=1e-5
+    )
     assert left_out[25] == 0.5
     assert np.mean(by_width - by_error) == pytest.approx(found["ause"], rel=0.05)
 
@@ -122,7 +138,9 @@ def test_maps_of_a_group_are_one_unit_and_maps_without_a_cell_none() -> None:
 
 def test_a_model_of_other_classes_is_measured_by_its_traversability_alone() -> None:
     terrain = make_terrain(batch=2)
-    quality = measure(ColourModel(), [terrain], torch.Generator(), by_map=True, classes=False)
+    quality = measure(
+        ColourModel(), [terrain], torch.Generator(), by_map=True, classes=False
+    )
     assert quality.classes == ()
     assert quality.by_map
     assert "true" not in quality.by_map.sums()
@@ -137,5 +155,7 @@ def test_a_class_that_is_nowhere_true_has_no_share_in_the_miou() -> None:
 
 def test_gaps_of_the_tail_do_not_cancel() -> None:
     sums = {"cells": [100], "under_80": [15], "under_90": [13], "under_95": [5]}
-    value = SCORES["tail_error"].value({name: np.array(own, dtype=float) for name, own in sums.items()})
+    value = SCORES["tail_error"].value(
+        {name: np.array(own, dtype=float) for name, own in sums.items()}
+    )
     assert value == pytest.approx((0.05 + 0.03 + 0) / 3)

@@ -30,7 +30,9 @@ Qualities = dict[str, Quality]
 
 
 def page_of(qualities: Qualities) -> str:
-    return Page(title="title", tables=[quality_table("title", qualities, whole=True)]).to_markdown()
+    return Page(
+        title="title", tables=[quality_table("title", qualities, whole=True)]
+    ).to_markdown()
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +56,9 @@ def test_the_table_has_a_row_a_split_and_fits(qualities: Qualities) -> None:
     assert not any("…" in line for line in lines)
 
 
-def test_what_there_is_not_is_left_out_or_dashed(qualities: Qualities, dataset: TerrainDataset) -> None:
+def test_what_there_is_not_is_left_out_or_dashed(
+    qualities: Qualities, dataset: TerrainDataset
+) -> None:
     oracle = dict(evaluate(Oracle(), dataset, ["valid"]))
     page = page_of(oracle)
     assert "mIoU" not in page
@@ -65,7 +69,9 @@ def test_what_there_is_not_is_left_out_or_dashed(qualities: Qualities, dataset: 
     assert "–" in row
 
 
-def test_json_holds_everything_and_nothing_that_is_no_json(qualities: Qualities) -> None:
+def test_json_holds_everything_and_nothing_that_is_no_json(
+    qualities: Qualities,
+) -> None:
     single = replace(qualities["valid"].classes[0], mutual_information=float("nan"))
     whole = {**qualities, "valid": replace(qualities["valid"], classes=(single,))}
 
@@ -76,13 +82,20 @@ def test_json_holds_everything_and_nothing_that_is_no_json(qualities: Qualities)
     assert found["model"] == "m"
     assert found["splits"]["valid"]["mutual_information"] is None
     assert found["series"] == {
-        "test/hs": [{"severity": 0.0, "split": "test/std"}, {"severity": 0.5, "split": "test/hs-050"}]
+        "test/hs": [
+            {"severity": 0.0, "split": "test/std"},
+            {"severity": 0.5, "split": "test/hs-050"},
+        ]
     }
     split, quality = found["splits"]["test/std"], qualities["test/std"]
     assert split["maps"] == quality.maps
     assert split["accuracy"] == quality.classes[0].accuracy
     assert tuple(split["pit"]) == quality.traversability.pit
-    assert sum(map(sum, split["confusion"])) == sum(split["reliability"]["cells"]) == sum(split["pit"])
+    assert (
+        sum(map(sum, split["confusion"]))
+        == sum(split["reliability"]["cells"])
+        == sum(split["pit"])
+    )
     assert set(COLUMNS) - set(LOOK_ALIKES) <= set(split)
 
 
@@ -99,8 +112,15 @@ def test_csv_has_scenario_severity_and_every_number(qualities: Qualities) -> Non
 
 
 def test_the_page_shows_table_notes_and_figures(qualities: Qualities) -> None:
-    figures = [("figures/pit.png", "PIT", "What it shows."), ("figures/maps-a.png", "Maps of a", "Maps.")]
-    page = Page(title="title", tables=[quality_table("title", qualities, whole=True)], notes=["a note"])
+    figures = [
+        ("figures/pit.png", "PIT", "What it shows."),
+        ("figures/maps-a.png", "Maps of a", "Maps."),
+    ]
+    page = Page(
+        title="title",
+        tables=[quality_table("title", qualities, whole=True)],
+        notes=["a note"],
+    )
     lines = page.to_markdown(figures).splitlines()
     assert lines[0] == "# title"
     header, rule, *rows = [line for line in lines if line.startswith("|")]
@@ -121,8 +141,12 @@ def test_every_column_of_the_page_is_explained_and_no_other(
     for measured in (qualities, oracle):
         lines = page_of(measured).splitlines()
         headings = [cell.strip() for cell in lines[2].strip("|").split("|")]
-        explained = [line[4:].partition("**: ") for line in lines if line.startswith("- **")]
-        assert [heading for heading, _, _ in explained] == [h for h in headings if h != "maps"]
+        explained = [
+            line[4:].partition("**: ") for line in lines if line.startswith("- **")
+        ]
+        assert [heading for heading, _, _ in explained] == [
+            h for h in headings if h != "maps"
+        ]
         assert all(sentence.endswith(".") for _, _, sentence in explained)
 
 
@@ -134,7 +158,9 @@ class Quantiles(TraversabilityModel):
         return QuantileDistribution(share * torch.tensor(LEVELS).view(-1, 1, 1))
 
 
-def test_the_likelihood_of_what_has_no_density_is_a_dash_and_null(dataset: TerrainDataset) -> None:
+def test_the_likelihood_of_what_has_no_density_is_a_dash_and_null(
+    dataset: TerrainDataset,
+) -> None:
     found = dict(evaluate(Quantiles(), dataset, ["valid"]))
     assert math.isnan(found["valid"].traversability.nll)
     assert 0 < found["valid"].traversability.crps < 1
@@ -142,7 +168,9 @@ def test_the_likelihood_of_what_has_no_density_is_a_dash_and_null(dataset: Terra
     assert table.rows[0][table.headings.index(COLUMNS["nll"][0])] == "–"
     assert json.loads(quality_json({}, found))["splits"]["valid"]["nll"] is None
     assert next(csv.DictReader(io.StringIO(quality_csv(found))))["nll"] == ""
-    data = QualityData(title="title", model=Quantiles(), dataset=dataset, qualities=found, maps=1)
+    data = QualityData(
+        title="title", model=Quantiles(), dataset=dataset, qualities=found, maps=1
+    )
     assert [figure.name for figure in quality_figures(data)] == ["pit", "maps-valid"]
     for figure in quality_figures(data):
         figure(data)

@@ -14,7 +14,12 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch.utils.data import DataLoader
 
-from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError, DatasetError
+from benchnav.core.errors import (
+    BenchnavError,
+    CheckpointError,
+    ConfigError,
+    DatasetError,
+)
 from benchnav.core.store import sole_writer
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
@@ -54,7 +59,9 @@ class KillIn(KeepBest):
 def train(
     dataset: TerrainDataset, folder: Path, resume: bool = False, **trainer: object
 ) -> TerrainClassifier:
-    options = FitOptions(device="cpu", folder=folder, resume=resume, trainer={**EXACT, **trainer})
+    options = FitOptions(
+        device="cpu", folder=folder, resume=resume, trainer={**EXACT, **trainer}
+    )
     return fit_network(trainable(SMALL), dataset, 1, options)[0]
 
 
@@ -67,7 +74,9 @@ def whole(
 
 
 @pytest.fixture
-def cut(dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cut(
+    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
     """The folder of a training that was killed in its third epoch."""
     monkeypatch.setattr(networks, "KeepBest", KillIn)
     with pytest.raises(Killed):
@@ -107,7 +116,9 @@ class Counting(lightning.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=1.0)
 
 
-def test_the_best_epoch_before_a_kill_is_kept_when_it_is_resumed(tmp_path: Path) -> None:
+def test_the_best_epoch_before_a_kill_is_kept_when_it_is_resumed(
+    tmp_path: Path,
+) -> None:
     class KillInTheThird(Callback):
         def on_train_epoch_start(self, trainer, module) -> None:  # type: ignore[no-untyped-def]
             if trainer.current_epoch == 2:
@@ -117,8 +128,12 @@ def test_the_best_epoch_before_a_kill_is_kept_when_it_is_resumed(tmp_path: Path)
     data = {"train_dataloaders": loader, "val_dataloaders": loader}
 
     def run(module: Counting, resume: bool, *callbacks: Callback) -> dict[str, float]:
-        options = FitOptions(device="cpu", folder=tmp_path, resume=resume, trainer=EXACT)
-        return fit(module, "x", options, {}, [KeepBest(), *callbacks], data, max_epochs=4)
+        options = FitOptions(
+            device="cpu", folder=tmp_path, resume=resume, trainer=EXACT
+        )
+        return fit(
+            module, "x", options, {}, [KeepBest(), *callbacks], data, max_epochs=4
+        )
 
     with pytest.raises(Killed):
         run(Counting(), False, KillInTheThird())
@@ -135,7 +150,10 @@ def test_the_temperature_is_of_the_validation_maps(
     bare = copy.deepcopy(whole[1])
     bare.temperature = 1.0
     data = MapData(dataset, 4, 1)
-    of_valid, of_train = (fit_temperature(*sample_logits(bare, maps, 1)) for maps in (data.valid, data.train))
+    of_valid, of_train = (
+        fit_temperature(*sample_logits(bare, maps, 1))
+        for maps in (data.valid, data.train)
+    )
     assert whole[1].temperature == pytest.approx(of_valid, rel=1e-6)
     assert of_train != pytest.approx(of_valid, rel=0.01)
 
@@ -156,18 +174,28 @@ def test_settings_of_the_optimiser_reach_it(dataset: TerrainDataset) -> None:
     assert seen == [(0.123, 0.045)]
 
 
-def test_logs_have_a_row_an_epoch_and_events_for_tensorboard(whole: tuple[Path, TerrainClassifier]) -> None:
+def test_logs_have_a_row_an_epoch_and_events_for_tensorboard(
+    whole: tuple[Path, TerrainClassifier],
+) -> None:
     folder = whole[0] / "classifier"
     table = pd.read_csv(folder / "metrics.csv")
     assert list(table["epoch"]) == [1, 2, 3, 4]
-    assert {"train_loss", "valid_loss", "valid_accuracy", "valid_miou", "learning_rate"} <= set(table)
+    assert {
+        "train_loss",
+        "valid_loss",
+        "valid_accuracy",
+        "valid_miou",
+        "learning_rate",
+    } <= set(table)
     assert table.notna().all(axis=None)
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(folder))
     events.Reload()
     logged = [event.value for event in events.Scalars("valid_loss")]
-    torch.testing.assert_close(torch.tensor(logged), torch.tensor(table["valid_loss"].to_numpy()).float())
+    torch.testing.assert_close(
+        torch.tensor(logged), torch.tensor(table["valid_loss"].to_numpy()).float()
+    )
 
 
 @pytest.mark.parametrize("other", [{"max_epochs": 5}, {"jitter": 0.0}, "seed", "half"])
@@ -179,7 +207,11 @@ def test_a_training_of_other_settings_is_not_gone_on_with(
     name = next(iter(other)) if isinstance(other, dict) else other
     with pytest.raises(CheckpointError, match=f"to resume it, got another `{name}"):
         fit_network(
-            trainable(config), dataset, 2 if other == "seed" else 1, options, half_precision=other == "half"
+            trainable(config),
+            dataset,
+            2 if other == "seed" else 1,
+            options,
+            half_precision=other == "half",
         )
 
 
@@ -196,19 +228,33 @@ OTHER_TRAINERS = {
 def test_a_training_is_not_gone_on_with_under_other_settings_of_the_trainer(
     dataset: TerrainDataset, cut: Path
 ) -> None:
-    before = sorted((path, path.read_bytes()) for path in (cut / "classifier").iterdir())
+    before = sorted(
+        (path, path.read_bytes()) for path in (cut / "classifier").iterdir()
+    )
     for name, value in OTHER_TRAINERS.items():
-        with pytest.raises(CheckpointError, match=rf"got another `trainer\.{name}`\. Repeat"):
+        with pytest.raises(
+            CheckpointError, match=rf"got another `trainer\.{name}`\. Repeat"
+        ):
             train(dataset, cut, resume=True, **{name: value})
-    assert sorted((path, path.read_bytes()) for path in (cut / "classifier").iterdir()) == before
+    assert (
+        sorted((path, path.read_bytes()) for path in (cut / "classifier").iterdir())
+        == before
+    )
 
 
-def test_settings_of_the_trainer_that_change_nothing_are_neither_kept_nor_compared() -> None:
+def test_settings_of_the_trainer_that_change_nothing_are_neither_kept_nor_compared() -> (
+    None
+):
     plain, same, other = (
         FitOptions(device="cpu", trainer={**EXACT, **more}).trainer_settings
         for more in (
             {},
-            {"log_every_n_steps": 3, "devices": 1, "gradient_clip_val": None, "limit_val_batches": None},
+            {
+                "log_every_n_steps": 3,
+                "devices": 1,
+                "gradient_clip_val": None,
+                "limit_val_batches": None,
+            },
             {"gradient_clip_val": 0.5},
         )
     )
@@ -230,10 +276,16 @@ def test_a_trainer_that_would_learn_or_measure_nothing_is_refused_first(
     trainer: dict[str, object], why: str, dataset: TerrainDataset
 ) -> None:
     check_network(
-        trainable(SMALL), dataset, FitOptions(device="cpu", trainer={**EXACT, "limit_train_batches": 0.5})
+        trainable(SMALL),
+        dataset,
+        FitOptions(device="cpu", trainer={**EXACT, "limit_train_batches": 0.5}),
     )
     with pytest.raises(ConfigError, match=why):
-        check_network(trainable(SMALL), dataset, FitOptions(device="cpu", trainer={**EXACT, **trainer}))
+        check_network(
+            trainable(SMALL),
+            dataset,
+            FitOptions(device="cpu", trainer={**EXACT, **trainer}),
+        )
 
 
 def test_a_training_that_ends_before_it_was_measured_does_not_blame_the_learning_rate(
@@ -251,11 +303,15 @@ def test_maps_on_which_nothing_is_known_are_refused_first(
     options, read = FitOptions(device="cpu", trainer=EXACT), TerrainDataset.read
 
     def lacking(field: str, split: str) -> None:
-        def hide(self: TerrainDataset, name: str, *rest: object) -> dict[str, np.ndarray]:
+        def hide(
+            self: TerrainDataset, name: str, *rest: object
+        ) -> dict[str, np.ndarray]:
             maps = read(self, name, *rest)  # type: ignore[arg-type]
             gone = {"class_id": UNLABELLED, "traversability": np.nan}[field]
             return (
-                {**maps, field: np.full_like(maps[field], gone)} if name == split and field in maps else maps
+                {**maps, field: np.full_like(maps[field], gone)}
+                if name == split and field in maps
+                else maps
             )
 
         monkeypatch.setattr(TerrainDataset, "read", hide)
@@ -266,15 +322,25 @@ def test_maps_on_which_nothing_is_known_are_refused_first(
             check_network(trainable(SMALL), dataset, options)
         check_network(trainable(MDNConfig(encoder="mobilenet_v2")), dataset, options)
         lacking("traversability", split)
-        with pytest.raises(DatasetError, match=f"observed traversability in split {split}"):
-            check_network(trainable(MDNConfig(encoder="mobilenet_v2")), dataset, options)
+        with pytest.raises(
+            DatasetError, match=f"observed traversability in split {split}"
+        ):
+            check_network(
+                trainable(MDNConfig(encoder="mobilenet_v2")), dataset, options
+            )
         check_network(trainable(SMALL), dataset, options)
 
 
-def test_a_network_that_does_not_take_the_maps_is_refused_first(dataset: TerrainDataset) -> None:
-    config = ClassifierConfig(architecture="dpt", encoder="tu-vit_tiny_patch16_224", batch_size=4)
+def test_a_network_that_does_not_take_the_maps_is_refused_first(
+    dataset: TerrainDataset,
+) -> None:
+    config = ClassifierConfig(
+        architecture="dpt", encoder="tu-vit_tiny_patch16_224", batch_size=4
+    )
     with pytest.raises(ConfigError, match=r"batches of 2 maps of 32×32 cells, got dpt"):
-        check_network(trainable(config), dataset, FitOptions(device="cpu", trainer=EXACT))
+        check_network(
+            trainable(config), dataset, FitOptions(device="cpu", trainer=EXACT)
+        )
 
 
 def test_a_damaged_state_is_refused(dataset: TerrainDataset, cut: Path) -> None:
@@ -286,13 +352,20 @@ def test_a_damaged_state_is_refused(dataset: TerrainDataset, cut: Path) -> None:
             train(dataset, cut, resume=True)
 
 
-def test_one_process_at_a_time_trains_in_a_folder(dataset: TerrainDataset, tmp_path: Path) -> None:
+def test_one_process_at_a_time_trains_in_a_folder(
+    dataset: TerrainDataset, tmp_path: Path
+) -> None:
     (tmp_path / "classifier").mkdir()
-    with sole_writer(tmp_path / "classifier", "it"), pytest.raises(BenchnavError, match="Another run"):
+    with (
+        sole_writer(tmp_path / "classifier", "it"),
+        pytest.raises(BenchnavError, match="Another run"),
+    ):
         train(dataset, tmp_path)
 
 
-def test_a_new_training_drops_what_an_old_one_left(dataset: TerrainDataset, cut: Path) -> None:
+def test_a_new_training_drops_what_an_old_one_left(
+    dataset: TerrainDataset, cut: Path
+) -> None:
     (cut / "classifier/.last.ckpt.1.partial").write_text("half")
     before = {path.name for path in (cut / "classifier").glob("events*")}
     fit_network(
@@ -326,20 +399,38 @@ def test_settings_reach_the_trainer(dataset: TerrainDataset) -> None:
             seen.append((trainer.num_training_batches, trainer.accumulate_grad_batches))
 
     options = FitOptions(
-        device="cpu", trainer={**EXACT, "limit_train_batches": 1, "accumulate_grad_batches": 2}
+        device="cpu",
+        trainer={**EXACT, "limit_train_batches": 1, "accumulate_grad_batches": 2},
     )
     data = MapData(dataset, 4, 0)
     model = TerrainClassifier(SMALL).build(data.scale(("rgb",)), names(10))
-    fit(model, "x", options, {}, [KeepBest(), Watch()], {"datamodule": data}, max_epochs=1)
+    fit(
+        model,
+        "x",
+        options,
+        {},
+        [KeepBest(), Watch()],
+        {"datamodule": data},
+        max_epochs=1,
+    )
     assert seen == [(1, 2)]
     with pytest.raises(ConfigError, match="Lightning takes"):
-        fit(model, "x", FitOptions(device="cpu", trainer={"precision": "8-tiny"}), {}, [], {})
+        fit(
+            model,
+            "x",
+            FitOptions(device="cpu", trainer={"precision": "8-tiny"}),
+            {},
+            [],
+            {},
+        )
 
 
 def test_bfloat16_is_chosen_where_it_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for known, precision in ((True, "bf16-mixed"), (False, "32-true")):
-        monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation, k=known: k)
+        monkeypatch.setattr(
+            torch.cuda, "is_bf16_supported", lambda including_emulation, k=known: k
+        )
         assert default_precision("cuda") == precision
 
 
@@ -347,7 +438,9 @@ def test_the_precision_is_that_of_what_is_trained_on(
     dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
+    monkeypatch.setattr(
+        torch.cuda, "is_bf16_supported", lambda including_emulation: True
+    )
     monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
     assert default_precision("cpu") == "32-true"
     seen = []
@@ -358,7 +451,9 @@ def test_the_precision_is_that_of_what_is_trained_on(
 
     monkeypatch.undo()
     asked: list[str] = []
-    monkeypatch.setattr(fit_module, "default_precision", lambda name: asked.append(name) or "bf16-mixed")
+    monkeypatch.setattr(
+        fit_module, "default_precision", lambda name: asked.append(name) or "bf16-mixed"
+    )
     data = MapData(dataset, 4, 0)
     model = TerrainClassifier(SMALL).build(data.scale(("rgb",)), names(10))
     options = FitOptions(device="cpu", trainer={"limit_train_batches": 1})
@@ -372,13 +467,22 @@ def test_gradients_are_clipped_under_mixed_precision(dataset: TerrainDataset) ->
 
     class Watch(Callback):
         def on_train_batch_end(self, trainer, module, *given) -> None:  # type: ignore[no-untyped-def]
-            gradients = [value.grad.norm() for value in module.parameters() if value.grad is not None]
+            gradients = [
+                value.grad.norm()
+                for value in module.parameters()
+                if value.grad is not None
+            ]
             norms.append(float(torch.stack(gradients).norm()))
 
     data = MapData(dataset, 4, 0)
     for settings in ({}, {"gradient_clip_val": 1e-3}):
         model = TerrainClassifier(SMALL).build(data.scale(("rgb",)), names(10))
-        trainer = {**EXACT, "precision": "bf16-mixed", "limit_train_batches": 1, **settings}
+        trainer = {
+            **EXACT,
+            "precision": "bf16-mixed",
+            "limit_train_batches": 1,
+            **settings,
+        }
         fit(
             model,
             "x",
@@ -397,13 +501,34 @@ def test_a_command_that_is_killed_and_resumed_ends_as_if_it_had_not_been(
     dataset: TerrainDataset, whole: tuple[Path, TerrainClassifier], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    command = [sys.executable, "-c", "from benchnav.models.cli import main; main()", "classifier"]
-    command += ["--data", str(dataset.path), "--out", str(tmp_path / "m"), "--seed", "1"]
-    command += ["--trainer.precision", "32-true", "--device", "cpu", "--half-precision", "false"]
+    command = [
+        sys.executable,
+        "-c",
+        "from benchnav.models.cli import main; main()",
+        "classifier",
+    ]
+    command += [
+        "--data",
+        str(dataset.path),
+        "--out",
+        str(tmp_path / "m"),
+        "--seed",
+        "1",
+    ]
+    command += [
+        "--trainer.precision",
+        "32-true",
+        "--device",
+        "cpu",
+        "--half-precision",
+        "false",
+    ]
     settings = json.loads(json.dumps(plain_config(SMALL)))
     command += [f"--classifier.{name}={value}" for name, value in settings.items()]
     environment = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, env=environment
+    )
     assert process.stderr
     while "epoch 3/4" not in (line := process.stderr.readline()):
         assert line, "it ended before it could be killed"
@@ -423,17 +548,49 @@ def test_a_command_that_is_killed_and_resumed_ends_as_if_it_had_not_been(
     assert not (tmp_path / "m.training/classifier/last.ckpt").exists()
 
 
-def test_two_processes_train_one_classifier(dataset: TerrainDataset, tmp_path: Path) -> None:
-    command = [sys.executable, "-c", "from benchnav.models.cli import main; main()", "classifier"]
-    command += ["--data", str(dataset.path), "--out", str(tmp_path / "m"), "--trainer.strategy", "ddp_fork"]
-    command += ["--device", "cpu", "--trainer.devices", "2", "--trainer.max_epochs", "2"]
-    command += ["--trainer.precision", "32-true", "--classifier.encoder", "mobilenet_v2"]
+def test_two_processes_train_one_classifier(
+    dataset: TerrainDataset, tmp_path: Path
+) -> None:
+    command = [
+        sys.executable,
+        "-c",
+        "from benchnav.models.cli import main; main()",
+        "classifier",
+    ]
+    command += [
+        "--data",
+        str(dataset.path),
+        "--out",
+        str(tmp_path / "m"),
+        "--trainer.strategy",
+        "ddp_fork",
+    ]
+    command += [
+        "--device",
+        "cpu",
+        "--trainer.devices",
+        "2",
+        "--trainer.max_epochs",
+        "2",
+    ]
+    command += [
+        "--trainer.precision",
+        "32-true",
+        "--classifier.encoder",
+        "mobilenet_v2",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert [line for line in done.stderr.splitlines() if line.startswith("classifier: epoch 2/2")]
+    assert [
+        line
+        for line in done.stderr.splitlines()
+        if line.startswith("classifier: epoch 2/2")
+    ]
     assert done.stdout.count("wrote") == 1
     (row,) = (
         row
-        for row in pd.read_csv(tmp_path / "m.training/classifier/metrics.csv").itertuples()
+        for row in pd.read_csv(
+            tmp_path / "m.training/classifier/metrics.csv"
+        ).itertuples()
         if row.epoch == 2
     )
     metrics = load_checkpoint(tmp_path / "m").part("classifier").metrics
@@ -441,7 +598,9 @@ def test_two_processes_train_one_classifier(dataset: TerrainDataset, tmp_path: P
     assert row.valid_accuracy > 0.05
 
 
-def test_no_more_processes_than_processors_are_started(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_more_processes_than_processors_are_started(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     FitOptions(device="cpu", trainer={"devices": os.cpu_count()})
     for devices in (0, (os.cpu_count() or 1) + 1):

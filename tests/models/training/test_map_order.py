@@ -21,7 +21,9 @@ SEEDS = st.integers(0, 3), st.integers(0, 5)
 
 
 def windows_of(order: np.ndarray, shards: Sequence[int], most: int) -> list[set[int]]:
-    """Cuts an order into the windows of shards that it was drawn from, of nearly the same number each."""
+    """Cuts an order into the windows of shards that it was drawn from, of nearly the
+    same number each.
+    """
     owner = np.repeat(np.arange(len(shards)), shards)[order]
     count = -(-len(shards) // most)
     windows, start = [], 0
@@ -64,12 +66,19 @@ def test_every_map_comes_once_and_every_window_is_of_whole_shards(
     assert max(map(len, windows)) - min(map(len, windows)) <= 1
 
 
-def test_shards_and_maps_are_drawn_by_seed_and_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shards_and_maps_are_drawn_by_seed_and_epoch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(module, "WINDOW_SHARDS", 5)
     shards = [7] * 20
-    orders = [map_order(shards, seed, epoch) for seed, epoch in ((0, 0), (0, 0), (0, 1), (1, 0))]
+    orders = [
+        map_order(shards, seed, epoch)
+        for seed, epoch in ((0, 0), (0, 0), (0, 1), (1, 0))
+    ]
     np.testing.assert_array_equal(orders[0], orders[1])
-    first, _, *others = ([frozenset(one) for one in windows_of(order, shards, 5)] for order in orders)
+    first, _, *others = (
+        [frozenset(one) for one in windows_of(order, shards, 5)] for order in orders
+    )
     for order, windows in zip(orders[2:], others, strict=True):
         assert (order != orders[0]).mean() > 0.9
         assert set(windows) != set(first)  # other shards are together
@@ -94,13 +103,17 @@ def test_a_map_may_come_at_any_time_and_beside_any_shard_of_its_window(
 def test_batches_of_many_shards_are_the_same_however_they_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for _ in create(tiny_recipe(), tmp_path / "d", shard_cells=32 * 32):  # a map a shard
+    for _ in create(
+        tiny_recipe(), tmp_path / "d", shard_cells=32 * 32
+    ):  # a map a shard
         pass
     monkeypatch.setattr(module, "WINDOW_SHARDS", 3)
     monkeypatch.setattr(reader, "_MOST_OPEN", 4)
     opened = []
     plainly = reader.open_file
-    monkeypatch.setattr(reader, "open_file", lambda path: opened.append(path) or plainly(path))
+    monkeypatch.setattr(
+        reader, "open_file", lambda path: opened.append(path) or plainly(path)
+    )
     dataset = TerrainDataset(tmp_path / "d")
     data = MapData(dataset, 2, seed=4)
     order = map_order([1] * 8, 4, 0)
@@ -108,17 +121,27 @@ def test_batches_of_many_shards_are_the_same_however_they_are_read(
     sampler = data.train_dataloader().sampler
     assert torch.cat([index for index, *_ in sampler]).tolist() == order.tolist()
     plain = [batch["rgb"] for batch in data.train_dataloader()]
-    assert sorted(opened) == sorted(piece.path for piece in dataset.pieces["train"])  # each once
+    assert sorted(opened) == sorted(
+        piece.path for piece in dataset.pieces["train"]
+    )  # each once
     for how in ({"workers": 2}, {"in_memory": True}):
         other = MapData(dataset, 2, seed=4, loading=Loading(**how)).train_dataloader()
-        assert all(torch.equal(*pair) for pair in zip(plain, (batch["rgb"] for batch in other), strict=True))
+        assert all(
+            torch.equal(*pair)
+            for pair in zip(plain, (batch["rgb"] for batch in other), strict=True)
+        )
 
 
 def test_processes_share_batches_of_windows() -> None:
     shards = (3, 1, 4) * 50
     whole = [index for index, *_ in MapSampler(400, 7, 2, shuffle=True, shards=shards)]
     shares = [
-        [index for index, *_ in MapSampler(400, 7, 2, shuffle=True, shards=shards, share=(which, 2))]
+        [
+            index
+            for index, *_ in MapSampler(
+                400, 7, 2, shuffle=True, shards=shards, share=(which, 2)
+            )
+        ]
         for which in (0, 1)
     ]
     for batch, one, two in zip(whole, *shares, strict=True):

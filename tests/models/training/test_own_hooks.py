@@ -1,4 +1,6 @@
-"""What a user's model may not do is told in one line, before anything is trained where it can be."""
+"""What a user's model may not do is told in one line, before anything is trained where
+it can be.
+"""
 
 import re
 from pathlib import Path
@@ -19,13 +21,24 @@ from benchnav.models.training.networks import is_trainable
 from tests.commands import call
 from tests.models.training.conftest import EXAMPLE
 
-QUICK = ("--trainer.precision", "32-true", "--trainer.max_epochs", "1", "--settings.batch_size", "5")
+QUICK = (
+    "--trainer.precision",
+    "32-true",
+    "--trainer.max_epochs",
+    "1",
+    "--settings.batch_size",
+    "5",
+)
 
 
 def with_hook(code: str) -> None:
     """Writes the example with one hook more."""
-    text = EXAMPLE.read_text().replace("    def to_distribution", f"    {code}\n\n    def to_distribution")
-    text = text.replace("import math", "import math\nfrom torchmetrics import MeanAbsoluteError", 1)
+    text = EXAMPLE.read_text().replace(
+        "    def to_distribution", f"    {code}\n\n    def to_distribution"
+    )
+    text = text.replace(
+        "import math", "import math\nfrom torchmetrics import MeanAbsoluteError", 1
+    )
     Path("own.py").write_text(text)
 
 
@@ -101,7 +114,19 @@ def test_a_hook_that_does_not_fit_is_refused_before_anything_is_trained(
     text = EXAMPLE.read_text()
     assert old in text
     Path("own.py").write_text(text.replace(old, new) + DISTRIBUTIONS)
-    assert call("train", "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 2
+    assert (
+        call(
+            "train",
+            "fit",
+            "own.py:CellModel",
+            "--data",
+            dataset.path,
+            "--out",
+            "c",
+            *QUICK,
+        )
+        == 2
+    )
     (line,) = capfd.readouterr().err.strip().splitlines()
     assert re.search(expected, line)
     assert not Path("c").exists()
@@ -109,17 +134,26 @@ def test_a_hook_that_does_not_fit_is_refused_before_anything_is_trained(
 
 
 HOOKS = {
-    "no metric": ("def configure_metrics(self): return {'mae': 3}", "Expected a network that takes batches"),
+    "no metric": (
+        "def configure_metrics(self): return {'mae': 3}",
+        "Expected a network that takes batches",
+    ),
     "metrics": (
         "def update_metrics(self, outputs, target): self.metrics['rmse'].update(target, 3)",
         "Expected a network that takes batches",
     ),
-    "schedule": ("def configure_schedule(self, optimizer, steps): return 1 / 0", "ZeroDivisionError"),
+    "schedule": (
+        "def configure_schedule(self, optimizer, steps): return 1 / 0",
+        "ZeroDivisionError",
+    ),
     "predict": (
         "def predict(self, observation): return super().predict(observation).mean()",
         "Expected the model to give a TraversabilityDistribution .* got Tensor",
     ),
-    "predict raises": ("def predict(self, observation): return 1 / 0", "ZeroDivisionError"),
+    "predict raises": (
+        "def predict(self, observation): return 1 / 0",
+        "ZeroDivisionError",
+    ),
     "stride": ("stride = 0", "`stride` of CellModel ≥ 1, got 0"),
     "inputs": ("inputs = 3", "CellModel with `inputs` .* TypeError"),
 }
@@ -131,7 +165,19 @@ def test_every_other_hook_is_tried_too(
 ) -> None:
     code, expected = HOOKS[fault]
     with_hook(code)
-    assert call("train", "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 2
+    assert (
+        call(
+            "train",
+            "fit",
+            "own.py:CellModel",
+            "--data",
+            dataset.path,
+            "--out",
+            "c",
+            *QUICK,
+        )
+        == 2
+    )
     (line,) = capfd.readouterr().err.strip().splitlines()
     assert re.search(expected, line)
     assert not Path("c.training").exists()
@@ -140,9 +186,25 @@ def test_every_other_hook_is_tried_too(
 def test_settings_that_no_checkpoint_could_keep_are_refused(
     own: Path, dataset: TerrainDataset, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    text = EXAMPLE.read_text().replace("import math", "import math\nfrom pathlib import Path", 1)
-    Path("own.py").write_text(text.replace("hidden: int = 32", "hidden: int = 32\n    log: Path = Path('a')"))
-    assert call("train", "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 2
+    text = EXAMPLE.read_text().replace(
+        "import math", "import math\nfrom pathlib import Path", 1
+    )
+    Path("own.py").write_text(
+        text.replace("hidden: int = 32", "hidden: int = 32\n    log: Path = Path('a')")
+    )
+    assert (
+        call(
+            "train",
+            "fit",
+            "own.py:CellModel",
+            "--data",
+            dataset.path,
+            "--out",
+            "c",
+            *QUICK,
+        )
+        == 2
+    )
     assert "settings that JSON can keep" in capfd.readouterr().err
     assert not Path("c.training").exists()
 
@@ -151,10 +213,25 @@ def test_settings_that_no_checkpoint_could_keep_are_refused(
 def test_a_class_of_a_name_that_is_ours_is_refused(
     own: Path, dataset: TerrainDataset, name: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    Path("own.py").write_text(EXAMPLE.read_text().replace("class CellModel", f"class {name}"))
-    assert call("train", "fit", f"own.py:{name}", "--data", dataset.path, "--out", "c", *QUICK) == 2
+    Path("own.py").write_text(
+        EXAMPLE.read_text().replace("class CellModel", f"class {name}")
+    )
     assert (
-        f"a class with a name of its own, which its checkpoints bear, got {name!r}" in capfd.readouterr().err
+        call(
+            "train",
+            "fit",
+            f"own.py:{name}",
+            "--data",
+            dataset.path,
+            "--out",
+            "c",
+            *QUICK,
+        )
+        == 2
+    )
+    assert (
+        f"a class with a name of its own, which its checkpoints bear, got {name!r}"
+        in capfd.readouterr().err
     )
 
 
@@ -165,8 +242,14 @@ def test_a_class_of_a_name_that_is_ours_is_refused(
             ["own.py:CellModel", "--settings.inputs", "[rgb, elevation]"],
             r"got 'elevation'\. Did you mean 'elevation_m'\?",
         ),
-        (["own.py:CellModel", "--settings.inputs", "[rgb, vegetation_m]"], "got 'vegetation_m'"),
-        (["own.py:CellModel", "--settings.inputs", "[]"], "`inputs` as layers, each once"),
+        (
+            ["own.py:CellModel", "--settings.inputs", "[rgb, vegetation_m]"],
+            "got 'vegetation_m'",
+        ),
+        (
+            ["own.py:CellModel", "--settings.inputs", "[]"],
+            "`inputs` as layers, each once",
+        ),
         (["own.py:CellModel", "--settings.width", "3"], "got 'width'"),
         (["own.py:CellModel", "--crop", "33"], r"`crop` in 8–32 cells"),
         (["own.py:CellModel", "--members", "0"], "`members` in 1–1000"),
@@ -176,11 +259,20 @@ def test_a_class_of_a_name_that_is_ours_is_refused(
         ),
         (["own.py:CellMode"], "Did you mean 'CellModel'"),
         (["oracle"], "got 'oracle'"),
-        (["mdm"], "can be trained, fused, evidential, .* or FILE.py:Class, got 'mdm'. Did you mean 'mdn'"),
+        (
+            ["mdm"],
+            "can be trained, fused, evidential, .* or FILE.py:Class, got 'mdm'. Did you mean 'mdn'",
+        ),
         (["mdn", "--settings.architecture", "unett"], "unett"),
         (["mdn", "--settings.encoder", "resnet19"], "resnet19"),
-        (["mdn", "--settings.encoder", "tu-hf-hub:someone/net"], "got 'tu-hf-hub:someone/net'"),
-        (["fused", "--settings.clasifier.dice", "1"], "`settings` of 'fused' among classifier, gp"),
+        (
+            ["mdn", "--settings.encoder", "tu-hf-hub:someone/net"],
+            "got 'tu-hf-hub:someone/net'",
+        ),
+        (
+            ["fused", "--settings.clasifier.dice", "1"],
+            "`settings` of 'fused' among classifier, gp",
+        ),
         (["fused", "--settings.classifier.architecture", "unett"], "unett"),
     ],
 )
@@ -197,9 +289,23 @@ def test_bad_input_is_one_line_before_anything_is_trained(
     assert not Path("c").exists()
 
 
-def test_metrics_of_ones_own_are_updated_by_the_mean(own: Path, dataset: TerrainDataset) -> None:
+def test_metrics_of_ones_own_are_updated_by_the_mean(
+    own: Path, dataset: TerrainDataset
+) -> None:
     with_hook("def configure_metrics(self): return {'mae': MeanAbsoluteError()}")
-    assert call("train", "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 0
+    assert (
+        call(
+            "train",
+            "fit",
+            "own.py:CellModel",
+            "--data",
+            dataset.path,
+            "--out",
+            "c",
+            *QUICK,
+        )
+        == 0
+    )
     part = load_checkpoint("c").part("CellModel")
     assert set(part.metrics) >= {"valid_loss", "valid_mae"}
     assert 0 < part.metrics["valid_mae"] < 1
@@ -209,8 +315,23 @@ def test_a_calibration_that_fails_ends_in_one_line(
     own: Path, dataset: TerrainDataset, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with_hook("def calibrate(self, maps, device): return 1 / 0")
-    assert call("train", "fit", "own.py:CellModel", "--data", dataset.path, "--out", "c", *QUICK) == 2
-    assert "Expected `calibrate` of CellModel to succeed, got: ZeroDivisionError" in capfd.readouterr().err
+    assert (
+        call(
+            "train",
+            "fit",
+            "own.py:CellModel",
+            "--data",
+            dataset.path,
+            "--out",
+            "c",
+            *QUICK,
+        )
+        == 2
+    )
+    assert (
+        "Expected `calibrate` of CellModel to succeed, got: ZeroDivisionError"
+        in capfd.readouterr().err
+    )
     assert not Path("c").exists()
 
 
@@ -241,26 +362,43 @@ def test_what_an_epoch_draws_hangs_on_seed_and_epoch(
         seeds.append(torch.initial_seed())
 
     monkeypatch.setattr(TrainableNetwork, "on_train_epoch_start", watch)
-    where = ("fit", "own.py:CellModel", "--data", dataset.path, *QUICK, "--trainer.max_epochs", 3)
+    where = (
+        "fit",
+        "own.py:CellModel",
+        "--data",
+        dataset.path,
+        *QUICK,
+        "--trainer.max_epochs",
+        3,
+    )
     for out, seed in (("a", 4), ("b", 5), ("c", 4)):
         assert call("train", *where, "--out", out, "--seed", seed) == 0
     assert len({*seeds[:6]}) == 6
     assert seeds[6:] == seeds[:3]
 
 
-def test_a_loss_that_divides_by_no_cell_is_told_why(own: Path, dataset: TerrainDataset) -> None:
+def test_a_loss_that_divides_by_no_cell_is_told_why(
+    own: Path, dataset: TerrainDataset
+) -> None:
     text = EXAMPLE.read_text().replace("seen.sum().clamp(min=1)", "seen.sum()")
     network = load_file(own / "own.py", text.encode()).CellModel().build()
     maps = MapDataset(dataset.path, "train", fields_of(network)).read([0, 1])
     try_network(network, maps)
-    unseen = {**maps, "traversability": torch.full_like(maps["traversability"], torch.nan)}
+    unseen = {
+        **maps,
+        "traversability": torch.full_like(maps["traversability"], torch.nan),
+    }
     with pytest.raises(
-        ConfigError, match=r"got nan\. λ, NaN where it was not observed, is so in the whole batch"
+        ConfigError,
+        match=r"got nan\. λ, NaN where it was not observed, is so in the whole batch",
     ):
         try_network(network, unseen)
 
 
 def test_the_help_of_fit_names_all_that_can_be_trained() -> None:
     names = [FUSED, *(name for name in registry.names("model") if is_trainable(name))]
-    (told,) = re.findall(r"a model that can be trained \(([^)]+)\)", " ".join((fit.__doc__ or "").split()))
+    (told,) = re.findall(
+        r"a model that can be trained \(([^)]+)\)",
+        " ".join((fit.__doc__ or "").split()),
+    )
     assert sorted(told.split(", ")) == sorted(names)

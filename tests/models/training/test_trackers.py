@@ -1,4 +1,6 @@
-"""A user's loggers and callbacks are made from text, write where they should, and callbacks are recorded."""
+"""A user's loggers and callbacks are made from text, write where they should, and
+callbacks are recorded.
+"""
 
 import json
 from pathlib import Path
@@ -31,35 +33,72 @@ class Note(Callback):
 
 
 def train(dataset: TerrainDataset, out: Path, file: Path = OWN, **trainer: Any) -> None:
-    options = TrainOptions(device="cpu", trainer={"max_epochs": 2, "precision": "32-true", **trainer})
-    fit_model(options, f"{file}:CellModel", str(dataset.path), str(out), {"batch_size": 5, "hidden": 4})
+    options = TrainOptions(
+        device="cpu", trainer={"max_epochs": 2, "precision": "32-true", **trainer}
+    )
+    fit_model(
+        options,
+        f"{file}:CellModel",
+        str(dataset.path),
+        str(out),
+        {"batch_size": 5, "hidden": 4},
+    )
 
 
-def test_loggers_write_what_is_measured_and_change_nothing(dataset: TerrainDataset, tmp_path: Path) -> None:
+def test_loggers_write_what_is_measured_and_change_nothing(
+    dataset: TerrainDataset, tmp_path: Path
+) -> None:
     train(dataset, tmp_path / "plain")
-    train(dataset, tmp_path / "logged", logger=["CSVLogger", {"class_path": "TensorBoardLogger"}])
+    train(
+        dataset,
+        tmp_path / "logged",
+        logger=["CSVLogger", {"class_path": "TensorBoardLogger"}],
+    )
     logs = tmp_path / "logged.training" / "CellModel"
     table = pd.read_csv(logs / "lightning_logs" / "version_0" / "metrics.csv")
     own = pd.read_csv(logs / "metrics.csv")  # ours is there as ever
-    assert table["valid_loss"].dropna().tolist() == pytest.approx(own["valid_loss"].tolist())
+    assert table["valid_loss"].dropna().tolist() == pytest.approx(
+        own["valid_loss"].tolist()
+    )
     told = (logs / "lightning_logs" / "version_0" / "hparams.yaml").read_text()
     assert "hidden: 4" in told
     assert "seed: 0" in told
     assert list(logs.glob("lightning_logs/version_*/events.out.tfevents.*"))
-    assert not list(logs.glob("events.out.tfevents.*"))  # where loggers are named, these alone write
-    assert list((tmp_path / "plain.training" / "CellModel").glob("events.out.tfevents.*"))
-    first, second = (load_checkpoint(tmp_path / name).parts["CellModel"] for name in ("plain", "logged"))
-    assert all((first.tensors[name] == second.tensors[name]).all() for name in first.tensors)
+    assert not list(
+        logs.glob("events.out.tfevents.*")
+    )  # where loggers are named, these alone write
+    assert list(
+        (tmp_path / "plain.training" / "CellModel").glob("events.out.tfevents.*")
+    )
+    first, second = (
+        load_checkpoint(tmp_path / name).parts["CellModel"]
+        for name in ("plain", "logged")
+    )
+    assert all(
+        (first.tensors[name] == second.tensors[name]).all() for name in first.tensors
+    )
     assert first.trainer == second.trainer
 
 
-def test_a_callback_of_a_file_is_called_and_recorded(dataset: TerrainDataset, tmp_path: Path) -> None:
+def test_a_callback_of_a_file_is_called_and_recorded(
+    dataset: TerrainDataset, tmp_path: Path
+) -> None:
     file, log = tmp_path / "note.py", tmp_path / "log.txt"
     file.write_text(CALLBACK)
-    given = {"class_path": f"{file}:Note", "init_args": {"path": str(log), "word": "after"}}
-    train(dataset, tmp_path / "out", callbacks=[given, "DeviceStatsMonitor"], logger="CSVLogger")
+    given = {
+        "class_path": f"{file}:Note",
+        "init_args": {"path": str(log), "word": "after"},
+    }
+    train(
+        dataset,
+        tmp_path / "out",
+        callbacks=[given, "DeviceStatsMonitor"],
+        logger="CSVLogger",
+    )
     assert log.read_text() == "after 0\nafter 1\n"
-    (note, stats) = load_checkpoint(tmp_path / "out").parts["CellModel"].trainer["callbacks"]
+    (note, stats) = (
+        load_checkpoint(tmp_path / "out").parts["CellModel"].trainer["callbacks"]
+    )
     assert note["init_args"]["word"] == "after"
     assert stats == {"class_path": "DeviceStatsMonitor"}
     before = note["digest"]
@@ -89,7 +128,9 @@ def test_a_callback_of_a_file_is_called_and_recorded(dataset: TerrainDataset, tm
         ({"callbacks": "pathlib.Path"}, "lightning's Callback"),
     ],
 )
-def test_what_cannot_be_made_is_refused_before_training(trainer: dict[str, Any], said: str) -> None:
+def test_what_cannot_be_made_is_refused_before_training(
+    trainer: dict[str, Any], said: str
+) -> None:
     with pytest.raises(ConfigError) as refused:
         FitOptions(device="cpu", trainer=trainer)
     assert said in str(refused.value)
@@ -111,7 +152,9 @@ def test_a_missing_package_is_named_with_its_command() -> None:
     if mlflow._MLFLOW_AVAILABLE:
         pytest.skip("mlflow is installed")
     with pytest.raises(ConfigError, match="pip install mlflow"):
-        FitOptions(device="cpu", trainer={"logger": "lightning.pytorch.loggers.MLFlowLogger"})
+        FitOptions(
+            device="cpu", trainer={"logger": "lightning.pytorch.loggers.MLFlowLogger"}
+        )
 
 
 @pytest.mark.parametrize(
@@ -128,8 +171,13 @@ def test_a_missing_package_is_named_with_its_command() -> None:
 def test_callbacks_whose_effect_would_be_undone_are_refused_by_name(
     name: str, init_args: dict[str, Any], remedy: str
 ) -> None:
-    with pytest.raises(ConfigError, match=rf"got {name}, whose effect would be undone\. .*{remedy}"):
-        FitOptions(device="cpu", trainer={"callbacks": {"class_path": name, "init_args": init_args}})
+    with pytest.raises(
+        ConfigError, match=rf"got {name}, whose effect would be undone\. .*{remedy}"
+    ):
+        FitOptions(
+            device="cpu",
+            trainer={"callbacks": {"class_path": name, "init_args": init_args}},
+        )
 
 
 CHANGE = """
@@ -162,7 +210,9 @@ def test_a_callback_that_changes_the_trained_weights_is_refused_by_name(
     if is_allowed:
         train(dataset, tmp_path / "out", callbacks=f"{file}:Change")
         return
-    with pytest.raises(ConfigError, match=f"weights that `{hook}` of Change changed.*callback out"):
+    with pytest.raises(
+        ConfigError, match=f"weights that `{hook}` of Change changed.*callback out"
+    ):
         train(dataset, tmp_path / "out", callbacks=f"{file}:Change")
     assert not (tmp_path / "out").exists()
 
@@ -182,7 +232,8 @@ def test_a_model_may_change_its_weights_after_the_best_are_back(
     file.write_text(OWN.read_text().replace(where, where + added))
     if hook == "on_train_end":
         with pytest.raises(
-            ConfigError, match=r"`on_train_end` of CellModel changed.*in `on_fit_end` of the model"
+            ConfigError,
+            match=r"`on_train_end` of CellModel changed.*in `on_fit_end` of the model",
         ):
             train(dataset, tmp_path / "out", file)
         return

@@ -44,7 +44,9 @@ def make(name: str, seed: int = 0, **changes: Any) -> Any:
 def to_train(name: str, **changes: Any) -> Trainable:
     """A model of the zoo, to be trained."""
     kind, config = ZOO[name]
-    return Trainable(kind=kind, config=replace(config, **changes), name=name, family=name)
+    return Trainable(
+        kind=kind, config=replace(config, **changes), name=name, family=name
+    )
 
 
 class Killed(Exception):

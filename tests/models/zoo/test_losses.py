@@ -1,4 +1,6 @@
-"""The losses and distributions of the zoo against scipy, closed forms and other libraries."""
+"""The losses and distributions of the zoo against scipy, closed forms and other
+libraries.
+"""
 
 import math
 from functools import cache
@@ -36,23 +38,33 @@ def maps(values: Tensor) -> Tensor:
     return values.view(1, 1, 1, -1)
 
 
-# --- mean and variance ---------------------------------------------------------------------------
+# --- mean and variance
+# ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.5, 1.0])
 def test_each_cell_counts_by_the_power_of_its_variance(beta: float) -> None:
-    means, stds = torch.tensor([0.1, 0.0, 0.5, 0.6, 1.1]), torch.tensor([0.1, 0.2, 0.3, 0.1, 0.4])
+    means, stds = (
+        torch.tensor([0.1, 0.0, 0.5, 0.6, 1.1]),
+        torch.tensor([0.1, 0.2, 0.3, 0.1, 0.4]),
+    )
     found = beta_nll(maps(means), maps(stds), OBSERVED.view(1, 1, -1), beta)
     law = stats.norm(means.numpy(), stds.numpy())
     density = law.logpdf(OBSERVED.numpy())
-    density[0], density[-1] = law.logcdf(0)[0], law.logsf(1)[-1]  # what is clipped to 0 and to 1
-    assert float(found) == pytest.approx(-(density * stds.numpy() ** (2 * beta)).mean(), rel=1e-5)
+    density[0], density[-1] = (
+        law.logcdf(0)[0],
+        law.logsf(1)[-1],
+    )  # what is clipped to 0 and to 1
+    assert float(found) == pytest.approx(
+        -(density * stds.numpy() ** (2 * beta)).mean(), rel=1e-5
+    )
 
 
 def test_the_power_of_the_variance_has_no_gradient() -> None:
     std = torch.full((1, 1, 1, 1), 0.2, requires_grad=True)
     beta_nll(torch.full_like(std, 0.5), std, torch.full((1, 1, 1), 0.7), 1.0).backward()
-    # d/dσ of −log N(0.7; 0.5, σ) is (1 − z²) / σ, which is 0 at z = 1, but for the weight.
+    # d/dσ of −log N(0.7; 0.5, σ) is (1 − z²) / σ, which is 0 at z = 1, but for the
+    # weight.
     assert std.grad is not None
     assert float(std.grad.abs()) < 1e-6
 
@@ -80,18 +92,29 @@ def test_several_gaussians_are_averaged_as_a_pool_is() -> None:
     for value in (0.0, 0.3, 0.9):
         torch.testing.assert_close(found.cdf(value), pooled.cdf(value))
     observed = OBSERVED.expand(1, 2, 5)
-    torch.testing.assert_close(beta_nll(means, stds, observed), -pooled.log_prob(observed).mean())
+    torch.testing.assert_close(
+        beta_nll(means, stds, observed), -pooled.log_prob(observed).mean()
+    )
 
 
-# --- quantiles -----------------------------------------------------------------------------------
+# --- quantiles
+# -----------------------------------------------------------------------------------
 
 
 @settings(max_examples=50, deadline=None)
-@given(quantile=st.floats(-0.5, 1.5), observed=st.floats(0, 1), level=st.floats(0.01, 0.99))
-def test_the_pinball_loss_by_its_definition(quantile: float, observed: float, level: float) -> None:
-    found = pinball(torch.full((1, 1, 1, 1), quantile), (level,), torch.full((1, 1, 1), observed))
+@given(
+    quantile=st.floats(-0.5, 1.5), observed=st.floats(0, 1), level=st.floats(0.01, 0.99)
+)
+def test_the_pinball_loss_by_its_definition(
+    quantile: float, observed: float, level: float
+) -> None:
+    found = pinball(
+        torch.full((1, 1, 1, 1), quantile), (level,), torch.full((1, 1, 1), observed)
+    )
     error = observed - quantile
-    assert float(found) == pytest.approx(level * error if error > 0 else (level - 1) * error, abs=1e-6)
+    assert float(found) == pytest.approx(
+        level * error if error > 0 else (level - 1) * error, abs=1e-6
+    )
 
 
 def test_the_pinball_loss_is_least_at_the_quantiles() -> None:
@@ -100,7 +123,9 @@ def test_the_pinball_loss_is_least_at_the_quantiles() -> None:
     observed = torch.from_numpy(drawn).float().view(1, 1, -1)
 
     def loss(quantiles: Tensor) -> float:
-        return float(pinball(quantiles.expand(-1, -1, -1, observed.shape[-1]), INNER, observed))
+        return float(
+            pinball(quantiles.expand(-1, -1, -1, observed.shape[-1]), INNER, observed)
+        )
 
     least = loss(right)
     for place in (0, 20, 35, len(INNER) - 1):
@@ -114,7 +139,9 @@ def test_the_pinball_loss_is_least_at_the_quantiles() -> None:
 @given(st.integers(0, 10_000), st.floats(0.1, 30))
 def test_quantiles_never_cross_and_stay_in_range(seed: int, spread: float) -> None:
     network = untrained()
-    numbers = spread * torch.randn(1, len(INNER), 2, 2, generator=torch.Generator().manual_seed(seed))
+    numbers = spread * torch.randn(
+        1, len(INNER), 2, 2, generator=torch.Generator().manual_seed(seed)
+    )
     found = network.to_distribution(network.to_outputs(numbers))
     assert found.levels[2:-2] == INNER == LEVELS[1:-1]
     assert bool((found.values.diff(dim=1) >= 0).all())
@@ -126,36 +153,52 @@ def test_the_median_and_the_slopes_by_hand() -> None:
     numbers = network.first_numbers().view(1, -1, 1, 1)
     found = network.to_distribution(network.to_outputs(numbers))
     for level in (0.01, 0.2, 0.5, 0.9):
-        assert float(found.quantile(level)) == pytest.approx(stats.norm.ppf(level, 0.5, 0.2), abs=1e-5)
+        assert float(found.quantile(level)) == pytest.approx(
+            stats.norm.ppf(level, 0.5, 0.2), abs=1e-5
+        )
     other = numbers.clone()
     other[:, 0], other[:, 1:] = 0.3, math.log(math.expm1(0.05))
     found = network.to_distribution(network.to_outputs(other))
     for level in (0.01, 0.2, 0.5, 0.9):
-        assert float(found.quantile(level)) == pytest.approx(stats.norm.ppf(level, 0.3, 0.05), abs=1e-5)
+        assert float(found.quantile(level)) == pytest.approx(
+            stats.norm.ppf(level, 0.3, 0.05), abs=1e-5
+        )
 
 
 def test_an_atom_is_learned_beyond_the_range_and_clipped_to_it() -> None:
-    """The pinball loss of λ with atoms at 0 and 1 is least where the clipped quantiles are those of λ."""
-    drawn = torch.from_numpy(np.random.default_rng(0).normal(0.8, 0.3, 2_001).clip(0, 1)).float()
+    """The pinball loss of λ with atoms at 0 and 1 is least where the clipped quantiles
+    are those of λ.
+    """
+    drawn = torch.from_numpy(
+        np.random.default_rng(0).normal(0.8, 0.3, 2_001).clip(0, 1)
+    ).float()
     network, observed = make("quantile"), drawn.view(1, 1, -1)
     raw = network.first_numbers().view(1, -1, 1, 1).clone().requires_grad_()
     optimizer = torch.optim.Adam([raw], lr=0.1)
     for step in range(200):
         optimizer.param_groups[0]["lr"] = 0.1 * (1 - step / 200)
         optimizer.zero_grad()
-        network.loss(network.to_outputs(raw).expand(-1, -1, 1, 2_001), observed).backward()
+        network.loss(
+            network.to_outputs(raw).expand(-1, -1, 1, 2_001), observed
+        ).backward()
         optimizer.step()
     found = network.to_distribution(network.to_outputs(raw.detach()))
     for level in (0.02, 0.1, 0.3, 0.5, 0.7):
-        assert float(found.quantile(level)) == pytest.approx(float(drawn.quantile(level)), abs=0.03)
+        assert float(found.quantile(level)) == pytest.approx(
+            float(drawn.quantile(level)), abs=0.03
+        )
     below, _ = found.cdf_limits(1.0)
     assert float(below) == pytest.approx(float((drawn < 1).float().mean()), abs=0.03)
-    assert float(found.cdf(0.0)) == pytest.approx(float((drawn == 0).float().mean()), abs=0.01)
+    assert float(found.cdf(0.0)) == pytest.approx(
+        float((drawn == 0).float().mean()), abs=0.01
+    )
 
 
 def test_the_temperature_moves_quantiles_as_normal_scores() -> None:
     network = make("quantile")
-    before = network.to_distribution(network.to_outputs(network.first_numbers().view(1, -1, 1, 1)))
+    before = network.to_distribution(
+        network.to_outputs(network.first_numbers().view(1, -1, 1, 1))
+    )
     assert network.sharpen(before) is before
     network.temperature = 2.0
     after = network.sharpen(before)
@@ -173,14 +216,20 @@ def test_no_observation_is_impossible() -> None:
     assert float(found.cdf(0.0)) == pytest.approx(0.0005)
 
 
-# --- evidence ------------------------------------------------------------------------------------
+# --- evidence
+# ------------------------------------------------------------------------------------
 
 
 def evidence(gamma: float, nu: float, alpha: float, beta: float) -> tuple[Tensor, ...]:
     return tuple(torch.full((1, 1, 1, 5), value) for value in (gamma, nu, alpha, beta))
 
 
-EVIDENCE = [(0.6, 1.0, 1.001, 0.05), (0.2, 0.3, 2.0, 0.1), (0.9, 10.0, 40.0, 1.0), (0.4, 2.0, 1.5, 0.001)]
+EVIDENCE = [
+    (0.6, 1.0, 1.001, 0.05),
+    (0.2, 0.3, 2.0, 0.1),
+    (0.9, 10.0, 40.0, 1.0),
+    (0.4, 2.0, 1.5, 0.001),
+]
 
 
 def student(gamma: float, nu: float, alpha: float, beta: float) -> stats.rv_continuous:
@@ -188,10 +237,14 @@ def student(gamma: float, nu: float, alpha: float, beta: float) -> stats.rv_cont
 
 
 @pytest.mark.parametrize("values", EVIDENCE)
-def test_the_evidential_loss_is_that_of_the_students_t(values: tuple[float, float, float, float]) -> None:
+def test_the_evidential_loss_is_that_of_the_students_t(
+    values: tuple[float, float, float, float],
+) -> None:
     observed = OBSERVED.view(1, 1, -1)
     found = evidential_loss(evidence(*values), observed, 0.0)  # type: ignore[arg-type]
-    assert float(found) == pytest.approx(-student(*values).logpdf(OBSERVED.numpy()).mean(), rel=1e-4)
+    assert float(found) == pytest.approx(
+        -student(*values).logpdf(OBSERVED.numpy()).mean(), rel=1e-4
+    )
     gamma, nu, alpha, _ = values
     more = evidential_loss(evidence(*values), observed, 0.3) - found  # type: ignore[arg-type]
     expected = 0.3 * (OBSERVED - gamma).abs().mean() * (2 * nu + alpha)
@@ -199,10 +252,14 @@ def test_the_evidential_loss_is_that_of_the_students_t(values: tuple[float, floa
 
 
 @pytest.mark.parametrize("values", EVIDENCE)
-def test_the_mixture_is_the_students_t_clipped(values: tuple[float, float, float, float]) -> None:
+def test_the_mixture_is_the_students_t_clipped(
+    values: tuple[float, float, float, float],
+) -> None:
     found = make("evidential").to_distribution(evidence(*values))
     for value in (0.0, 0.01, 0.2, 0.5, 0.8, 0.99, 1 - 1e-6):
-        assert float(found.cdf(value)[0, 0, 0]) == pytest.approx(student(*values).cdf(value), abs=1.2e-4)
+        assert float(found.cdf(value)[0, 0, 0]) == pytest.approx(
+            student(*values).cdf(value), abs=1.2e-4
+        )
 
 
 def test_the_regulariser_is_the_one_that_was_asked_for() -> None:
@@ -216,11 +273,15 @@ def test_evidence_begins_where_it_says() -> None:
     network = make("evidential")
     found = network.to_outputs(network.first_numbers().view(1, -1, 1, 1))
     torch.testing.assert_close(
-        torch.cat(found).flatten(), torch.tensor([0.5, 1.0, 2.0, 0.1]), atol=2e-3, rtol=0
+        torch.cat(found).flatten(),
+        torch.tensor([0.5, 1.0, 2.0, 0.1]),
+        atol=2e-3,
+        rtol=0,
     )
 
 
-# --- settings ------------------------------------------------------------------------------------
+# --- settings
+# ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -242,14 +303,18 @@ def test_evidence_begins_where_it_says() -> None:
         (JoinedConfig, "inputs", ("slope_deg",)),
     ],
 )
-def test_settings_that_cannot_train_are_refused(kind: type, name: str, value: object) -> None:
+def test_settings_that_cannot_train_are_refused(
+    kind: type, name: str, value: object
+) -> None:
     with pytest.raises(ConfigError, match=name):
         kind(**{name: value})
 
 
 def test_a_lesser_depth_and_hidden_width_make_a_smaller_network() -> None:
     def size(**changes: int) -> int:
-        return sum(value.numel() for value in make("mean_variance", **changes).parameters())
+        return sum(
+            value.numel() for value in make("mean_variance", **changes).parameters()
+        )
 
     assert size(encoder_depth=2) < size(encoder_depth=3)
     assert size(hidden=8) < size(hidden=16)

@@ -1,4 +1,6 @@
-"""SWAG: moments of the weights against NumPy, draws against plain networks of the drawn weights."""
+"""SWAG: moments of the weights against NumPy, draws against plain networks of the drawn
+weights.
+"""
 
 from typing import Any
 
@@ -47,10 +49,16 @@ def test_moments_are_those_of_the_last_steps(trained: Any) -> None:
     assert int(model.collected) == 6
     assert len(Watched.weights) == 12
     for name in PLACES:
-        seen = np.stack([weights[name].double().numpy() for weights in Watched.weights[-6:]])
+        seen = np.stack(
+            [weights[name].double().numpy() for weights in Watched.weights[-6:]]
+        )
         place = model.names.index(name)
-        np.testing.assert_allclose(model.get_buffer(f"mean_{place}"), seen.mean(0), rtol=1e-4, atol=1e-6)
-        np.testing.assert_allclose(model.get_buffer(f"std_{place}"), seen.std(0), rtol=2e-3, atol=1e-6)
+        np.testing.assert_allclose(
+            model.get_buffer(f"mean_{place}"), seen.mean(0), rtol=1e-4, atol=1e-6
+        )
+        np.testing.assert_allclose(
+            model.get_buffer(f"std_{place}"), seen.std(0), rtol=2e-3, atol=1e-6
+        )
         assert float(model.get_buffer(f"std_{place}").max()) > 1e-4
 
 
@@ -60,9 +68,16 @@ def test_training_does_not_stop_early_and_keeps_the_last_weights(
     model, metrics = trained
     assert metrics["epoch"] == 6
     for name in PLACES:
-        assert torch.equal(dict(model.named_parameters())[name].detach(), Watched.weights[-1][name])
+        assert torch.equal(
+            dict(model.named_parameters())[name].detach(), Watched.weights[-1][name]
+        )
     impatient = to_train("swag", patience=1, learning_rate=0.3, max_epochs=4)
-    assert fit_network(impatient, dataset, 3, FitOptions(device="cpu", trainer=EXACT))[1]["epoch"] == 4
+    assert (
+        fit_network(impatient, dataset, 3, FitOptions(device="cpu", trainer=EXACT))[1][
+            "epoch"
+        ]
+        == 4
+    )
 
 
 def test_the_rate_falls_and_stays(trained: Any) -> None:
@@ -72,7 +87,9 @@ def test_the_rate_falls_and_stays(trained: Any) -> None:
     assert Watched.rates[0] < max(Watched.rates)
 
 
-def test_the_share_and_the_rate_are_those_that_were_asked_for(dataset: TerrainDataset) -> None:
+def test_the_share_and_the_rate_are_those_that_were_asked_for(
+    dataset: TerrainDataset,
+) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(networks, "KeepBest", Watched)
         how = to_train("swag", collect=0.2, collect_rate=0.7, max_epochs=5)
@@ -94,8 +111,16 @@ def test_a_prediction_is_the_average_of_plain_networks_of_the_drawn_weights(
     batches = list(data.train_dataloader())
     for index in range(3):
         plain = make("mean_variance")
-        tensors = {name: value for name, value in model.state_dict().items() if name in plain.state_dict()}
-        weights = {name: value for name, value in model.draw(index).items() if "running" not in name}
+        tensors = {
+            name: value
+            for name, value in model.state_dict().items()
+            if name in plain.state_dict()
+        }
+        weights = {
+            name: value
+            for name, value in model.draw(index).items()
+            if "running" not in name
+        }
         plain.load_state_dict({**tensors, **weights})
         for layer in plain.modules():
             if isinstance(layer, torch.nn.BatchNorm2d):
@@ -106,8 +131,12 @@ def test_a_prediction_is_the_average_of_plain_networks_of_the_drawn_weights(
             for batch in batches:
                 plain(batch)
         mixture = plain.predict(seen)
-        torch.testing.assert_close(found.means[:, index], mixture.means[:, 0], rtol=1e-3, atol=1e-4)
-        torch.testing.assert_close(found.stds[:, index], mixture.stds[:, 0], rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(
+            found.means[:, index], mixture.means[:, 0], rtol=1e-3, atol=1e-4
+        )
+        torch.testing.assert_close(
+            found.stds[:, index], mixture.stds[:, 0], rtol=1e-3, atol=1e-4
+        )
     assert float((found.means[:, 0] - found.means[:, 1]).abs().max()) > 1e-4
 
 
@@ -115,37 +144,53 @@ def test_draws_are_normal_about_the_mean_and_of_the_seed(trained: Any) -> None:
     model, _ = trained
     place = model.names.index("network.head.1.weight")
     mean, std = model.get_buffer(f"mean_{place}"), model.get_buffer(f"std_{place}")
-    drawn = torch.stack([model.draw(index)["network.head.1.weight"] for index in range(3)])
+    drawn = torch.stack(
+        [model.draw(index)["network.head.1.weight"] for index in range(3)]
+    )
     scores = ((drawn - mean) / std)[:, std > 0]
     assert abs(float(scores.mean())) < 0.15
     assert abs(float(scores.std()) - 1) < 0.1
     assert torch.equal(model.draw(1)["head.bias"], model.draw(1)["head.bias"])
     other = ZOO["swag"][0].from_tensors(model.settings(), (), model.state_dict())
-    assert torch.equal(other.draw(2)["head.bias"], model.draw(2)["head.bias"])  # of the seed that is kept
+    assert torch.equal(
+        other.draw(2)["head.bias"], model.draw(2)["head.bias"]
+    )  # of the seed that is kept
     other.draw_seed += 1
     assert not torch.equal(other.draw(2)["head.bias"], model.draw(2)["head.bias"])
 
 
-def test_weights_that_are_kept_in_half_precision_keep_their_deviations(dataset: TerrainDataset) -> None:
+def test_weights_that_are_kept_in_half_precision_keep_their_deviations(
+    dataset: TerrainDataset,
+) -> None:
     how, options = to_train("swag"), FitOptions(device="cpu", trainer=EXACT)
-    whole, half = (fit_network(how, dataset, 3, options, half_precision=half)[0] for half in (False, True))
+    whole, half = (
+        fit_network(how, dataset, 3, options, half_precision=half)[0]
+        for half in (False, True)
+    )
     seen = dataset.terrain("valid", [0]).observe()
     layers = {"rgb": seen.rgb, "slope_deg": seen.slope_deg}
     first, second = whole.predict_raw(layers), half.predict_raw(layers)
     torch.testing.assert_close(first.means, second.means, rtol=0.02, atol=0.02)
     place = whole.names.index("joint.0.weight")
     torch.testing.assert_close(
-        whole.get_buffer(f"std_{place}"), half.get_buffer(f"std_{place}"), rtol=1e-2, atol=1e-7
+        whole.get_buffer(f"std_{place}"),
+        half.get_buffer(f"std_{place}"),
+        rtol=1e-2,
+        atol=1e-7,
     )
 
 
 def test_what_is_measured_is_of_the_draws(dataset: TerrainDataset) -> None:
-    model, metrics = fit_network(to_train("swag"), dataset, 3, FitOptions(device="cpu", trainer=EXACT))
+    model, metrics = fit_network(
+        to_train("swag"), dataset, 3, FitOptions(device="cpu", trainer=EXACT)
+    )
     data = MapData(dataset, 5, 3, ("rgb", "slope_deg", "traversability"))
     measured = model.measure(data.valid)
     assert {name: metrics[name] for name in measured} == pytest.approx(measured)
     model.is_drawn.fill_(False)
-    assert model.measure(data.valid)["valid_loss"] != pytest.approx(metrics["valid_loss"], rel=1e-4)
+    assert model.measure(data.valid)["valid_loss"] != pytest.approx(
+        metrics["valid_loss"], rel=1e-4
+    )
 
 
 def test_other_seeds_make_other_draws() -> None:

@@ -39,7 +39,12 @@ def first(problem: Problem, draw: bool = False) -> Step:
 
 
 def step_at(state: Tensor, draw: bool = False) -> Step:
-    return Step(state=state, traversability=torch.full_like(state[:, 0], torch.nan), time_s=0.0, draw=draw)
+    return Step(
+        state=state,
+        traversability=torch.full_like(state[:, 0], torch.nan),
+        time_s=0.0,
+        draw=draw,
+    )
 
 
 def with_start(problem: Problem, *start: float) -> Problem:
@@ -49,7 +54,11 @@ def with_start(problem: Problem, *start: float) -> Problem:
 
 def known_world(problem: Problem) -> World:
     """One λ field an episode, which immobilises robots as the problem says."""
-    return World(noise="stored", immobile=problem.immobile, time_budget_s=float(problem.time_budget_s.max()))
+    return World(
+        noise="stored",
+        immobile=problem.immobile,
+        time_budget_s=float(problem.time_budget_s.max()),
+    )
 
 
 def drive(
@@ -60,20 +69,29 @@ def drive(
     immobile: Immobile | None = None,
     world: World | None = None,
 ) -> Drive:
-    """Runs episodes where the truth is what is predicted, unless it is given, shape [B, H, W]."""
+    """Runs episodes where the truth is what is predicted, unless it is given, shape [B,
+    H, W].
+    """
     ground = problem.risk_map if truth is None else truth
     terrain = replace(factories.terrain(ground, 0.05), grid=problem.grid)
     world = world or World(time_budget_s=time_budget_s, immobile=immobile)
     noise = rng.stream_key(0, "noise")
     simulation = Simulation(
-        terrain, problem.task, world, factories.places(problem.goal_m), noise, range(len(problem))
+        terrain,
+        problem.task,
+        world,
+        factories.places(problem.goal_m),
+        noise,
+        range(len(problem)),
     )
     now = simulation.init(problem.start)
     plan_state = planner.init(problem, generator())
     states, actions = [now.state], []
     observed = torch.full_like(problem.start[:, 0], torch.nan)
     while bool(now.running.any()):
-        step = Step(state=now.state, traversability=observed, time_s=len(actions) * problem.dt_s)
+        step = Step(
+            state=now.state, traversability=observed, time_s=len(actions) * problem.dt_s
+        )
         action, plan_state, _ = planner.plan(step, plan_state)
         now, observed = simulation.step(now, action)
         states.append(now.state)
@@ -83,7 +101,9 @@ def drive(
 
 @contextmanager
 def fake_cuda(problem: Problem) -> Iterator[Problem]:
-    """The problem on tensors of a CUDA device that need no GPU: shapes and devices alone are followed."""
+    """The problem on tensors of a CUDA device that need no GPU: shapes and devices
+    alone are followed.
+    """
     with FakeTensorMode(allow_non_fake_inputs=True):
         moved = problem.to("cuda")
         assert moved.start.device.type == "cuda"
@@ -95,12 +115,18 @@ def on_cuda(*tensors: Tensor) -> bool:
     return all(tensor.device.type == "cuda" for tensor in tensors)
 
 
-def rollout_cost(problem: Problem, state: Tensor, mean: Tensor, noise: Tensor, target_m: Tensor) -> Tensor:
-    """J and the penalty of ground that is not free along MPPI's sampled action sequences, shape [B, K]."""
+def rollout_cost(
+    problem: Problem, state: Tensor, mean: Tensor, noise: Tensor, target_m: Tensor
+) -> Tensor:
+    """J and the penalty of ground that is not free along MPPI's sampled action
+    sequences, shape [B, K].
+    """
     states, cost, _ = roll_out(problem, state, mean, noise, target_m, advance_chunk)
     return cost + problem.terminal_cost(states, target_m[:, None])
 
 
 def held_paths(problem: Problem, state: Tensor, pairs: Tensor, steps: int) -> Tensor:
-    """Positions along pairs (v, ω) [B, M, 2] that are held, the first included, shape [B, M, T + 1, 2]."""
+    """Positions along pairs (v, ω) [B, M, 2] that are held, the first included, shape
+    [B, M, T + 1, 2].
+    """
     return rollout_path(problem, state, pairs.mT[:, None].expand(-1, steps, -1, -1))

@@ -5,7 +5,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav.planning.planners.boundary import NOT_FINITE, Answer, act, begin, find_layer_faults
+from benchnav.planning.planners.boundary import (
+    NOT_FINITE,
+    Answer,
+    act,
+    begin,
+    find_layer_faults,
+)
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
@@ -33,7 +39,9 @@ def problem(**changes: Any) -> Problem:
 
 
 def step_of(given: Problem) -> Step:
-    return Step(state=given.start, traversability=given.start[:, 0] * torch.nan, time_s=0.0)
+    return Step(
+        state=given.start, traversability=given.start[:, 0] * torch.nan, time_s=0.0
+    )
 
 
 def ask(*answer: Any, **changes: Any) -> Answer:
@@ -47,7 +55,10 @@ def ahead() -> Tensor:
 
 def test_a_sound_answer_passes_as_it_is() -> None:
     plan = Plan.empty(
-        BATCH, status=torch.tensor([0, 1, 2]), path=torch.rand(BATCH, 4, 2), tree=torch.rand(BATCH, 5, 3, 2)
+        BATCH,
+        status=torch.tensor([0, 1, 2]),
+        path=torch.rand(BATCH, 4, 2),
+        tree=torch.rand(BATCH, 5, 3, 2),
     )
     answer = ask(ahead(), "next", plan)
     assert torch.equal(answer.action, ahead())
@@ -79,7 +90,10 @@ def test_what_a_planner_does_to_its_arguments_reaches_nobody() -> None:
     step, before = step_of(given), [tensor.clone() for tensor in tensors(given)]
     plan_state = begin(Vandal(), given, torch.Generator())
     act(Vandal(), step, plan_state, given)
-    assert all(torch.equal(kept, tensor) for kept, tensor in zip(before, tensors(given), strict=True))
+    assert all(
+        torch.equal(kept, tensor)
+        for kept, tensor in zip(before, tensors(given), strict=True)
+    )
     assert step.traversability.isnan().all()
 
 
@@ -124,7 +138,9 @@ WHOLE = {
 
 
 @pytest.mark.parametrize(("said", "reason"), WHOLE.values(), ids=WHOLE.keys())
-def test_an_answer_of_another_form_is_every_episodes_fault(said: tuple[Any, ...], reason: str) -> None:
+def test_an_answer_of_another_form_is_every_episodes_fault(
+    said: tuple[Any, ...], reason: str
+) -> None:
     answer = ask(*said)
     assert answer.faulty.tolist() == [True] * BATCH
     assert reason in answer.reason
@@ -154,7 +170,9 @@ def test_layers_that_cannot_be_drawn_are_left_out_and_harm_no_episode() -> None:
     assert not answer.faulty.any()
     assert answer.plan.path.shape == (BATCH, 0, 2)
     assert answer.plan.status.tolist() == [0, 1, 2]
-    assert find_layer_faults(plan, problem()) == ["Expected `Plan.path` of shape [3, N, 2], got [1, 4, 2]."]
+    assert find_layer_faults(plan, problem()) == [
+        "Expected `Plan.path` of shape [3, N, 2], got [1, 4, 2]."
+    ]
     samples = replace(Plan.empty(BATCH), samples=torch.rand(BATCH, 4, 2), tree=None)  # type: ignore[arg-type]
     assert find_layer_faults(samples, problem()) == [
         "Expected `Plan.samples` of shape [3, M, N, 2], got [3, 4, 2].",

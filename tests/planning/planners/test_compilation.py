@@ -40,7 +40,9 @@ compiling = torch.compiler.is_compiling
 @pytest.fixture(autouse=True)
 def _fresh() -> Iterator[None]:
     eager.clear()
-    with torch._dynamo.config.patch(disable=False):  # `make test` turns compiling off elsewhere
+    with torch._dynamo.config.patch(
+        disable=False
+    ):  # `make test` turns compiling off elsewhere
         yield
 
 
@@ -55,7 +57,9 @@ def test_what_is_worth_compiling_depends_on_rollouts_and_device_alone() -> None:
     assert worth_compiling(10, 2000, torch.device("cuda"))
 
 
-def test_more_shapes_than_pytorch_allows_stay_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_shapes_than_pytorch_allows_stay_compiled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     # The limit is the tracer's, so that no C++ need be compiled.
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
     limit = torch._dynamo.config.recompile_limit
@@ -111,7 +115,11 @@ def test_without_a_compiler_it_runs_eagerly(capsys: pytest.CaptureFixture[str]) 
     fused = Fused(scaled, *MANY)
     x, factor = inputs(43)
     with torch._inductor.config.patch(
-        {"cpp.cxx": ("no-such-compiler",), "force_disable_caches": True, "cpp_wrapper": False}
+        {
+            "cpp.cxx": ("no-such-compiler",),
+            "force_disable_caches": True,
+            "cpp_wrapper": False,
+        }
     ):
         torch.testing.assert_close(fused(x, factor), (x * 2 + 1).sin())
     assert fused.compiled is False
@@ -182,10 +190,14 @@ def test_compiled_and_eager_planners_agree(monkeypatch: pytest.MonkeyPatch) -> N
     uncompilable_problem = factories.problem(maps, objective=Doubtful())
     actions = []
     for worth in (False, True):
-        monkeypatch.setattr(compilation, "worth_compiling", lambda *_, worth=worth: worth)
+        monkeypatch.setattr(
+            compilation, "worth_compiling", lambda *_, worth=worth: worth
+        )
         planner = MPPI(SMALL)
         assert planner.compiled is None
-        action, state, _ = planner.plan(first(problem), planner.init(problem, generator()))
+        action, state, _ = planner.plan(
+            first(problem), planner.init(problem, generator())
+        )
         actions.append(torch.cat((action, state.mean.flatten(1)), dim=1))
         assert planner.compiled is worth
     torch.testing.assert_close(actions[0], actions[1], atol=1e-4, rtol=1e-4)
@@ -197,25 +209,42 @@ def test_compiled_and_eager_planners_agree(monkeypatch: pytest.MonkeyPatch) -> N
     assert torch.equal(action, actions[1][:, :2])
 
 
-def test_compiled_and_eager_rollouts_on_fields_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiled_and_eager_rollouts_on_fields_agree(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """With risk on the cost, rollouts that stop for good, and A*'s cost to go."""
     maps = 0.02 + 0.9 * torch.rand(2, 16, 20, generator=generator())
     known = factories.normal(maps, torch.full_like(maps, 0.05))
     belief = Static()
     source = Fields(
-        belief, belief.init(known, Law(grid=factories.problem(maps).grid, correlation_m=1.0)), (7, 3)
+        belief,
+        belief.init(known, Law(grid=factories.problem(maps).grid, correlation_m=1.0)),
+        (7, 3),
     )
     problem = replace(
-        factories.problem(maps), distribution=known, fields=source, immobile=Immobile(below=0.3, for_s=0.2)
+        factories.problem(maps),
+        distribution=known,
+        fields=source,
+        immobile=Immobile(below=0.3, for_s=0.2),
     )
     config = MPPIConfig(
-        samples=64, horizon_s=0.4, risk_on="cost", level=0.5, fields=20, entrapment=True, cost_to_go="map"
+        samples=64,
+        horizon_s=0.4,
+        risk_on="cost",
+        level=0.5,
+        fields=20,
+        entrapment=True,
+        cost_to_go="map",
     )
     actions = []
     for worth in (False, True):
-        monkeypatch.setattr(compilation, "worth_compiling", lambda *_, worth=worth: worth)
+        monkeypatch.setattr(
+            compilation, "worth_compiling", lambda *_, worth=worth: worth
+        )
         planner = MPPI(config)
-        action, state, _ = planner.plan(first(problem), planner.init(problem, generator()))
+        action, state, _ = planner.plan(
+            first(problem), planner.init(problem, generator())
+        )
         actions.append(torch.cat((action, state.mean.flatten(1)), dim=1))
         assert planner.compiled is worth
     torch.testing.assert_close(actions[0], actions[1], atol=1e-4, rtol=1e-4)
@@ -229,11 +258,17 @@ def test_a_unit_of_three_episodes_and_one_of_twenty_agree_on_compiling() -> None
         assert planner.compiled is False
 
 
-def test_one_function_serves_any_number_of_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_function_serves_any_number_of_episodes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
     fused = Fused(scaled, *MANY, batched=(0,))
     traced, real = [], compilation._compiling
-    monkeypatch.setattr(compilation, "_compiling", lambda checked: traced.append(checked) or real(checked))
+    monkeypatch.setattr(
+        compilation,
+        "_compiling",
+        lambda checked: traced.append(checked) or real(checked),
+    )
     factor = torch.tensor(2.0)
     for rows in (7, 3, 1, 20, 1):
         x = torch.rand(rows, 46, generator=generator())
@@ -249,7 +284,10 @@ def test_a_solve_is_the_same_compiled_and_eager_alone_and_in_a_batch_on_one_thre
     maps = 0.35 + 0.6 * torch.rand(3, 24, 20, generator=generator())
     problem = factories.problem(maps, start=(1.25, 1.25), goal=(8.25, 9.25))
     monkeypatch.setattr(compilation, "worth_compiling", lambda *_: compiled)
-    few, short = MPPIConfig(samples=300, horizon_s=0.4), AStarDWAConfig(dwa=DWAConfig(horizon_s=0.4))
+    few, short = (
+        MPPIConfig(samples=300, horizon_s=0.4),
+        AStarDWAConfig(dwa=DWAConfig(horizon_s=0.4)),
+    )
     found: dict[tuple[bool, int, int], torch.Tensor] = {}
     threads = torch.get_num_threads()
     for compiled in (False, True):
@@ -258,15 +296,21 @@ def test_a_solve_is_the_same_compiled_and_eager_alone_and_in_a_batch_on_one_thre
                 torch.set_num_threads(count)
                 planner: Any = MPPI(few) if name == "mppi" else AStarDWA(short)
                 posed = problem.select(torch.arange(episodes))
-                action, _, _ = planner.plan(first(posed), planner.init(posed, generator()))
+                action, _, _ = planner.plan(
+                    first(posed), planner.init(posed, generator())
+                )
                 assert planner.compiled is compiled
                 found[compiled, count, episodes] = action
     torch.set_num_threads(threads)
     for action in found.values():
-        torch.testing.assert_close(action, found[False, 1, 3][: len(action)], atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            action, found[False, 1, 3][: len(action)], atol=1e-4, rtol=0
+        )
 
 
-def test_another_mode_of_pytorch_is_compiled_for_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_mode_of_pytorch_is_compiled_for_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
     fused, factor = Fused(scaled, *MANY, batched=(0,)), torch.tensor(2.0)
     with torch.inference_mode():
@@ -281,9 +325,14 @@ def test_another_mode_of_pytorch_is_compiled_for_too(monkeypatch: pytest.MonkeyP
 def test_indices_of_users_parts_stay_checked(monkeypatch: pytest.MonkeyPatch) -> None:
     told, real = [], compilation._compiling
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
-    monkeypatch.setattr(compilation, "_compiling", lambda checked: told.append(checked) or real(checked))
+    monkeypatch.setattr(
+        compilation, "_compiling", lambda checked: told.append(checked) or real(checked)
+    )
     problem = factories.problem(torch.full((2, 16, 20), 0.8))
-    for robot in (problem.robot, type("Mine", (type(problem.robot),), {"__module__": "mine"})()):
+    for robot in (
+        problem.robot,
+        type("Mine", (type(problem.robot),), {"__module__": "mine"})(),
+    ):
         posed = replace(problem, task=replace(problem.task, robot=robot))
         planner = MPPI(MPPIConfig(samples=2000, horizon_s=0.2))
         planner.plan(first(posed), planner.init(posed, generator()))
@@ -291,7 +340,9 @@ def test_indices_of_users_parts_stay_checked(monkeypatch: pytest.MonkeyPatch) ->
     assert told == [False, False, True, False]
 
 
-def test_a_robot_without_a_hash_is_compiled_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_without_a_hash_is_compiled_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     @dataclass(frozen=True, kw_only=True)
     class Listed(Unicycle):
         gears: list[float] = field(default_factory=lambda: [1.0])

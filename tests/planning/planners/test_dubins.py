@@ -1,4 +1,6 @@
-"""Dubins paths to points, against closed forms, the symmetries of the plane and random paths of their kind."""
+"""Dubins paths to points, against closed forms, the symmetries of the plane and random
+paths of their kind.
+"""
 
 import math
 
@@ -14,7 +16,9 @@ from benchnav.planning.planners.dubins import (
     sample_segments,
 )
 
-WORDS = np.array([(a, b, c) for a in (1, 0, -1) for b in (1, 0, -1) for c in (1, 0, -1)])
+WORDS = np.array(
+    [(a, b, c) for a in (1, 0, -1) for b in (1, 0, -1) for c in (1, 0, -1)]
+)
 COORDINATE = st.floats(-8, 8, allow_nan=False)
 ANGLE = st.floats(-math.pi, math.pi, allow_nan=False)
 POSE = st.tuples(COORDINATE, COORDINATE, ANGLE)
@@ -31,8 +35,12 @@ def random_poses(count: int, seed: int, size_m: float = 6.0) -> torch.Tensor:
     return uniform * tensor(size_m, size_m, math.tau) - tensor(0, 0, math.pi)
 
 
-def drive(start: np.ndarray, word: np.ndarray, lengths: np.ndarray, radius: float) -> np.ndarray:
-    """Ends of paths of arcs and straights by turning about circle centres in the complex plane."""
+def drive(
+    start: np.ndarray, word: np.ndarray, lengths: np.ndarray, radius: float
+) -> np.ndarray:
+    """Ends of paths of arcs and straights by turning about circle centres in the
+    complex plane.
+    """
     position, heading = start[:, 0] + 1j * start[:, 1], start[:, 2].copy()
     for side, length in zip(word.T, lengths.T, strict=True):
         turn = side * length / radius
@@ -57,26 +65,36 @@ def drive(start: np.ndarray, word: np.ndarray, lengths: np.ndarray, radius: floa
         ((0, 1), 1.0, math.acos(7 / 8) + math.tau - math.acos(1 / 4)),
     ],
 )
-def test_length_in_closed_form(point: tuple[float, ...], radius: float, length: float) -> None:
-    # The last point is the centre of the circle: the circles' centres are 2 apart, the point 2 from one of
-    # them and 1 from the other, which by the law of cosines gives both angles.
+def test_length_in_closed_form(
+    point: tuple[float, ...], radius: float, length: float
+) -> None:
+    # The last point is the centre of the circle: the circles' centres are 2 apart, the
+    # point 2 from one of them and 1 from the other, which by the law of cosines gives
+    # both angles.
     got = dubins_length_to_point(tensor(0, 0, 0), tensor(*point), radius).item()
     assert got == pytest.approx(length, abs=1e-8)
 
 
 def test_no_path_of_arcs_and_straights_is_shorter() -> None:
-    # With the next test, which drives a path of that length, this makes the length exact.
+    # With the next test, which drives a path of that length, this makes the length
+    # exact.
     rng = np.random.default_rng(0)
     count, radius = 100_000, 0.8
     start = random_poses(count, seed=1).numpy()
     word = WORDS[rng.integers(len(WORDS), size=count)]
-    lengths = rng.uniform(0, math.tau * radius, (count, 3)) * rng.choice((1.0, 0.3, 0.02, 0.0), (count, 3))
+    lengths = rng.uniform(0, math.tau * radius, (count, 3)) * rng.choice(
+        (1.0, 0.3, 0.02, 0.0), (count, 3)
+    )
     point = torch.from_numpy(drive(start, word, lengths, radius))
     shortest = dubins_length_to_point(torch.from_numpy(start), point, radius).numpy()
-    # On the turning circles the length jumps: just within, the point is no longer reached by the arc alone.
+    # On the turning circles the length jumps: just within, the point is no longer
+    # reached by the arc alone.
     beside = radius * np.stack((-np.sin(start[:, 2]), np.cos(start[:, 2])), axis=1)
     off_circle = [
-        np.abs(np.linalg.norm(point.numpy() - start[:, :2] - side * beside, axis=1) - radius)
+        np.abs(
+            np.linalg.norm(point.numpy() - start[:, :2] - side * beside, axis=1)
+            - radius
+        )
         for side in (1, -1)
     ]
     clear = np.minimum(*off_circle) > 1e-6
@@ -85,19 +103,27 @@ def test_no_path_of_arcs_and_straights_is_shorter() -> None:
     assert (shortest <= lengths.sum(axis=1) + 1e-6)[clear].all()
     assert optimal.mean() > 0.1
     away_and_back = (
-        (word[:, 0] * word[:, 1] == -1) & (lengths[:, :2] > 0.01).all(axis=1) & (lengths[:, 2] == 0)
+        (word[:, 0] * word[:, 1] == -1)
+        & (lengths[:, :2] > 0.01).all(axis=1)
+        & (lengths[:, 2] == 0)
     )
-    assert (optimal & away_and_back).sum() > 50  # to points within the turning circles, the harder case
+    assert (
+        optimal & away_and_back
+    ).sum() > 50  # to points within the turning circles, the harder case
 
 
 @pytest.mark.parametrize("size_m", [2.0, 6.0])
-def test_path_reaches_the_point_at_its_length_forward_and_no_tighter_than_the_radius(size_m: float) -> None:
+def test_path_reaches_the_point_at_its_length_forward_and_no_tighter_than_the_radius(
+    size_m: float,
+) -> None:
     spacing, radius = 0.02, 0.7
     start, point = random_poses(1000, 2, size_m), random_poses(1000, 3, size_m)[:, :2]
     length = dubins_length_to_point(start, point, radius)
     curvature, lengths = dubins_segments_to_point(start, point, tensor(radius))
     torch.testing.assert_close(lengths.sum(-1), length)
-    path = sample_segments(start, curvature, lengths, spacing, math.ceil(float(length.max()) / spacing) + 1)
+    path = sample_segments(
+        start, curvature, lengths, spacing, math.ceil(float(length.max()) / spacing) + 1
+    )
     torch.testing.assert_close(path[:, 0], start)
     torch.testing.assert_close(path[:, -1, :2], point)
     moved = path[:, 1:] - path[:, :-1]
@@ -109,7 +135,9 @@ def test_path_reaches_the_point_at_its_length_forward_and_no_tighter_than_the_ra
     ahead = moved[..., 0] * middle.cos() + moved[..., 1] * middle.sin()
     aside = moved[..., 1] * middle.cos() - moved[..., 0] * middle.sin()
     assert ahead.min() >= 0
-    assert aside.abs().max() < spacing**2 / (2 * radius)  # where one segment gives way to the next
+    assert aside.abs().max() < spacing**2 / (
+        2 * radius
+    )  # where one segment gives way to the next
 
 
 def test_points_past_the_end_repeat_it() -> None:
@@ -136,10 +164,14 @@ def test_length_is_the_same_anywhere_in_the_plane(
 
 @settings(max_examples=200, deadline=None)
 @given(POSE, POINT, st.floats(0.2, 5))
-def test_length_mirrors_and_scales(start: tuple[float, ...], point: tuple[float, ...], scale: float) -> None:
+def test_length_mirrors_and_scales(
+    start: tuple[float, ...], point: tuple[float, ...], scale: float
+) -> None:
     begin, end = tensor(*start), tensor(*point)
     expected = dubins_length_to_point(begin, end, 1.0)
-    mirrored = dubins_length_to_point(begin * tensor(1, -1, -1), end * tensor(1, -1), 1.0)
+    mirrored = dubins_length_to_point(
+        begin * tensor(1, -1, -1), end * tensor(1, -1), 1.0
+    )
     assert_same_length(mirrored, expected, begin, end)
     large = dubins_length_to_point(begin * tensor(scale, scale, 1), end * scale, scale)
     assert_same_length(large / scale, expected, begin, end)
@@ -163,7 +195,9 @@ def test_nearly_straight_ahead_is_nearly_straight_in_single_precision() -> None:
     sign = torch.randint(0, 2, (count,), generator=generator) * 2.0 - 1
     aside = sign * 10 ** (torch.rand(count, generator=generator) * 6 - 9)
     x = torch.rand(count, generator=generator) * 26 + 4
-    length = dubins_length_to_point(torch.zeros(count, 3), torch.stack((x, aside), dim=1), 1.0)
+    length = dubins_length_to_point(
+        torch.zeros(count, 3), torch.stack((x, aside), dim=1), 1.0
+    )
     torch.testing.assert_close(length, x, rtol=0, atol=0.01)
 
 
@@ -172,7 +206,16 @@ def test_leading_dimensions_and_radii_broadcast() -> None:
     radius = tensor(0.5, 1.0, 1.5, 2.0)
     lengths = dubins_length_to_point(start[:, None], point[None], radius[:, None])
     assert lengths.shape == (4, 5)
-    torch.testing.assert_close(lengths[2, 3], dubins_length_to_point(start[2], point[3], 1.5))
-    curvature, parts = dubins_segments_to_point(start[:, None], point[None], radius[:, None])
+    torch.testing.assert_close(
+        lengths[2, 3], dubins_length_to_point(start[2], point[3], 1.5)
+    )
+    curvature, parts = dubins_segments_to_point(
+        start[:, None], point[None], radius[:, None]
+    )
     torch.testing.assert_close(parts.sum(-1), lengths)
-    assert sample_segments(start[:, None], curvature, parts, 0.1, 7).shape == (4, 5, 7, 3)
+    assert sample_segments(start[:, None], curvature, parts, 0.1, 7).shape == (
+        4,
+        5,
+        7,
+        3,
+    )

@@ -14,7 +14,11 @@ from benchnav.planning.planners.cost_risk import framed_fields
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
 from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank
 from benchnav.planning.planners.straight import Straight
-from benchnav.planning.planners.turns import follow_dubins, is_steered, turning_primitives
+from benchnav.planning.planners.turns import (
+    follow_dubins,
+    is_steered,
+    turning_primitives,
+)
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import Outcome
@@ -48,7 +52,9 @@ def test_rollout_cost_equals_a_loop_over_samples() -> None:
                 row, column = int(y // 0.5), int(x // 0.5)
                 inside = 0 <= row < 16 and 0 <= column < 12 and x >= 0 and y >= 0
                 free = inside and bool(problem.free[b, row, column])
-                lam = max(problem.risk_map[b, row, column].item(), 0.3) if inside else 0.0
+                lam = (
+                    max(problem.risk_map[b, row, column].item(), 0.3) if inside else 0.0
+                )
                 gx, gy = target[b].tolist()
                 expected += math.hypot(x - gx, y - gy) + (0 if free else 1e4)
                 if t < 13:
@@ -69,7 +75,11 @@ def test_the_mean_is_moved_by_the_softmax_average_of_the_noise(
 ) -> None:
     share = 0.3 if temperature is None else MPPIConfig.temperature_share
     config = replace(
-        SMALL, control_cost=control_cost, noise=(0.3, 0.6), temperature=temperature, temperature_share=share
+        SMALL,
+        control_cost=control_cost,
+        noise=(0.3, 0.6),
+        temperature=temperature,
+        temperature_share=share,
     )
     problem = factories.problem(torch.full((1, 16, 16), 0.8))
     planner = MPPI(config)
@@ -77,18 +87,28 @@ def test_the_mean_is_moved_by_the_softmax_average_of_the_noise(
     state = replace(state, mean=torch.rand(state.mean.shape, generator=generator(4)))
     action, following, _ = planner.plan(first(problem), state)
     noise = state.noise.at(state.step)
-    cost = rollout_cost(problem, problem.start, state.mean, noise, problem.goal_m)[0].double()
+    cost = rollout_cost(problem, problem.start, state.mean, noise, problem.goal_m)[
+        0
+    ].double()
     for step in range(20):
         for axis, scale in enumerate(config.noise):
-            cost += control_cost * state.mean[0, step, axis] * noise[step, axis] / scale**2
-    weights = torch.exp(-(cost - cost.min()) / (temperature or 0.3 * (cost - cost.min()).mean()))
+            cost += (
+                control_cost * state.mean[0, step, axis] * noise[step, axis] / scale**2
+            )
+    weights = torch.exp(
+        -(cost - cost.min()) / (temperature or 0.3 * (cost - cost.min()).mean())
+    )
     low, high = torch.tensor([0.0, -1.0]), torch.tensor([1.0, 1.0])
     moved = state.mean[0] + (noise * (weights / weights.sum())).sum(-1)
     mean = moved.clamp(low, high)
     assert bool((mean != moved).any())
     torch.testing.assert_close(action[0].double(), mean[0], atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(following.mean[0, :-1].double(), mean[1:], atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(following.mean[0, -1].double(), mean[-1], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(
+        following.mean[0, :-1].double(), mean[1:], atol=1e-5, rtol=1e-4
+    )
+    torch.testing.assert_close(
+        following.mean[0, -1].double(), mean[-1], atol=1e-5, rtol=1e-4
+    )
 
 
 def test_where_costs_are_flat_the_mean_stays_at_its_bound() -> None:
@@ -105,15 +125,26 @@ def test_where_costs_are_flat_the_mean_stays_at_its_bound() -> None:
 
 
 def test_the_average_reaches_the_bounds_and_no_further() -> None:
-    mean, noise = torch.tensor([[[3.0, 0.0]]]), torch.tensor([[[-1.0, 1.0], [0.5, 1.5]]])
-    weights, low, high = torch.full((1, 2), 0.5), torch.tensor([0.0, -1.0]), torch.tensor([3.0, 1.0])
+    mean, noise = (
+        torch.tensor([[[3.0, 0.0]]]),
+        torch.tensor([[[-1.0, 1.0], [0.5, 1.5]]]),
+    )
+    weights, low, high = (
+        torch.full((1, 2), 0.5),
+        torch.tensor([0.0, -1.0]),
+        torch.tensor([3.0, 1.0]),
+    )
     assert mppi.average(mean, noise, weights, low, high)[0, 0].tolist() == [3.0, 1.0]
     first_only = torch.tensor([[1.0, 0.0]])
     assert mppi.average(mean, noise, first_only, low, high)[0, 0].tolist() == [2.0, 0.5]
 
 
-def test_the_spread_is_the_mean_excess_of_samples_that_pay_no_more_steps_off_free_ground() -> None:
-    cost = torch.tensor([[3.0, 1.0, 2.0, 1e4 + 2.0], [2e4 + 5.0, 3e4, 2e4 + 6.0, 2e4 + 7.0], [4.0] * 4])
+def test_the_spread_is_the_mean_excess_of_samples_that_pay_no_more_steps_off_free_ground() -> (
+    None
+):
+    cost = torch.tensor(
+        [[3.0, 1.0, 2.0, 1e4 + 2.0], [2e4 + 5.0, 3e4, 2e4 + 6.0, 2e4 + 7.0], [4.0] * 4]
+    )
     assert mppi.cost_spread(cost)[:2, 0].tolist() == pytest.approx([1.0, 1.0])
     assert 0 < mppi.cost_spread(cost)[2, 0] < 1e-20
 
@@ -129,19 +160,28 @@ class Scaled(GoalDistance):
 
 
 @pytest.mark.parametrize(("temperature", "same"), [(None, True), (0.5, False)])
-def test_by_default_the_unit_of_the_objective_changes_nothing(temperature: float | None, same: bool) -> None:
+def test_by_default_the_unit_of_the_objective_changes_nothing(
+    temperature: float | None, same: bool
+) -> None:
     actions = []
     for objective in (GoalDistance(), Scaled()):
-        # A short horizon: 1000 times what it costs stays below the penalty of ground that is not free.
-        problem = factories.problem(torch.full((1, 16, 16), 0.8), (5.75, 5.75), objective=objective)
+        # A short horizon: 1000 times what it costs stays below the penalty of ground
+        # that is not free.
+        problem = factories.problem(
+            torch.full((1, 16, 16), 0.8), (5.75, 5.75), objective=objective
+        )
         planner = MPPI(replace(SMALL, horizon_s=0.5, temperature=temperature))
-        actions.append(planner.plan(first(problem), planner.init(problem, generator()))[0])
+        actions.append(
+            planner.plan(first(problem), planner.init(problem, generator()))[0]
+        )
     assert torch.allclose(*actions, atol=1e-3) is same
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pushed(Unicycle):
-    """Driven by a force along its heading, in newtons, and a turn rate; drag holds it at 1 m/s."""
+    """Driven by a force along its heading, in newtons, and a turn rate; drag holds it
+    at 1 m/s.
+    """
 
     mass_kg: float = 1.0
 
@@ -163,16 +203,23 @@ class Pushed(Unicycle):
     def __call__(
         self, state: torch.Tensor, action: torch.Tensor, traversability: torch.Tensor
     ) -> torch.Tensor:
-        speed = (state[..., 3] + self.dt_s * (action[..., 0] / self.mass_kg)).clamp(-1.0, 1.0)
+        speed = (state[..., 3] + self.dt_s * (action[..., 0] / self.mass_kg)).clamp(
+            -1.0, 1.0
+        )
         moved = torch.stack((speed, action[..., 1]), dim=-1)
-        return torch.cat((super().__call__(state[..., :3], moved, traversability), speed[..., None]), dim=-1)
+        return torch.cat(
+            (super().__call__(state[..., :3], moved, traversability), speed[..., None]),
+            dim=-1,
+        )
 
 
 def test_a_robot_driven_by_newtons_does_as_one_driven_by_accelerations() -> None:
     ground = torch.full((1, 16, 16), 0.9)
     steps = []
     for mass_kg in (1.0, 150.0):
-        problem = factories.problem(ground, goal=(5.25, 4.25), robot=Pushed(mass_kg=mass_kg))
+        problem = factories.problem(
+            ground, goal=(5.25, 4.25), robot=Pushed(mass_kg=mass_kg)
+        )
         driven = drive(MPPI(replace(SMALL, horizon_s=3.0)), problem, time_budget_s=40)
         assert driven.outcome.tolist() == [Outcome.SUCCESS]
         steps.append(driven.steps[0].item())
@@ -181,7 +228,9 @@ def test_a_robot_driven_by_newtons_does_as_one_driven_by_accelerations() -> None
 
 
 @pytest.mark.parametrize("name", registry.names("objective"))
-def test_on_open_ground_the_defaults_take_hardly_longer_than_a_straight_line(name: str) -> None:
+def test_on_open_ground_the_defaults_take_hardly_longer_than_a_straight_line(
+    name: str,
+) -> None:
     robot = Unicycle()
     objective = registry.make("objective", name, robot=robot, goal_radius_m=1.0)
     ground = torch.full((1, 32, 32), 0.9)
@@ -194,15 +243,22 @@ def test_on_open_ground_the_defaults_take_hardly_longer_than_a_straight_line(nam
 
 
 def test_noise_is_a_share_of_the_range_of_each_action_unless_it_is_given() -> None:
-    problem = factories.problem(torch.full((1, 16, 16), 0.8), robot=Pushed(mass_kg=150.0))
-    scale = MPPI(replace(SMALL, noise_share=0.25)).init(problem, generator()).noise.scale
+    problem = factories.problem(
+        torch.full((1, 16, 16), 0.8), robot=Pushed(mass_kg=150.0)
+    )
+    scale = (
+        MPPI(replace(SMALL, noise_share=0.25)).init(problem, generator()).noise.scale
+    )
     assert scale.tolist() == pytest.approx([75.0, 0.5])
     given = replace(SMALL, noise=(3.0, 0.2))
-    assert MPPI(given).init(problem, generator()).noise.scale.tolist() == pytest.approx([3.0, 0.2])
+    assert MPPI(given).init(problem, generator()).noise.scale.tolist() == pytest.approx(
+        [3.0, 0.2]
+    )
 
 
 @pytest.mark.parametrize(
-    ("horizon_s", "dt_s", "steps"), [(5.0, 0.1, 50), (1.0, 0.3, 3), (2.0, 0.3, 7), (0.1, 1.0, 1)]
+    ("horizon_s", "dt_s", "steps"),
+    [(5.0, 0.1, 50), (1.0, 0.3, 3), (2.0, 0.3, 7), (0.1, 1.0, 1)],
 )
 def test_the_horizon_is_in_seconds(horizon_s: float, dt_s: float, steps: int) -> None:
     problem = factories.problem(torch.full((1, 16, 16), 0.8), robot=Unicycle(dt_s=dt_s))
@@ -221,22 +277,30 @@ class Free(Objective):
 
 
 def test_the_whole_control_cost_takes_actions_back_to_rest() -> None:
-    # γ = temperature weighs samples about the mean u as if they were drawn about 0, whatever u is; half of
-    # it as if about u/2.
+    # γ = temperature weighs samples about the mean u as if they were drawn about 0,
+    # whatever u is; half of it as if about u/2.
     robot = Unicycle(speed_mps=(-9, 9), turn_rate_radps=(-9, 9))
     ground = torch.full((1, 99, 99), 0.5)
     problem = factories.problem(ground, (24, 24), (30, 30), robot, Free())
-    config = MPPIConfig(horizon_s=0.2, samples=200_000, noise=(0.5, 0.5), temperature=0.7)
+    config = MPPIConfig(
+        horizon_s=0.2, samples=200_000, noise=(0.5, 0.5), temperature=0.7
+    )
     mean = torch.tensor([[[0.4, -0.3], [-0.2, 0.5]]])
     for share in (1.0, 0.5):
         planner = MPPI(replace(config, control_cost=share * 0.7))
         state = replace(planner.init(problem, generator()), mean=mean)
-        weighed = rollout_cost(problem, problem.start, mean, state.noise.at(0), problem.goal_m)
+        weighed = rollout_cost(
+            problem, problem.start, mean, state.noise.at(0), problem.goal_m
+        )
         assert (weighed == 0).all()
         planner._advance.compiled = planner._weigh.compiled = False
         action, following, _ = planner.plan(first(problem), state)
-        torch.testing.assert_close(action[0], (1 - share) * mean[0, 0], atol=0.02, rtol=0)
-        torch.testing.assert_close(following.mean[0, 0], (1 - share) * mean[0, 1], atol=0.02, rtol=0)
+        torch.testing.assert_close(
+            action[0], (1 - share) * mean[0, 0], atol=0.02, rtol=0
+        )
+        torch.testing.assert_close(
+            following.mean[0, 0], (1 - share) * mean[0, 1], atol=0.02, rtol=0
+        )
 
 
 def test_noise_has_the_scale_that_is_set_and_is_another_for_each_seed() -> None:
@@ -245,7 +309,9 @@ def test_noise_has_the_scale_that_is_set_and_is_another_for_each_seed() -> None:
     state = planner.init(problem, generator())
     noise = state.noise.at(0)
     assert noise.shape == (30, 2, 5000)
-    torch.testing.assert_close(noise.std(dim=(0, 2)), torch.tensor([0.2, 0.7]), atol=0.01, rtol=0)
+    torch.testing.assert_close(
+        noise.std(dim=(0, 2)), torch.tensor([0.2, 0.7]), atol=0.01, rtol=0
+    )
     other = planner.init(problem, generator(1))
     assert (noise * other.noise.at(0)).mean().abs() < 0.005
 
@@ -273,14 +339,20 @@ def test_an_episode_alone_does_as_it_does_in_a_batch() -> None:
     states = [planner.init(given, generator()) for given in (problem, alone)]
     position = problem.start
     for _ in range(4):
-        action, states[0], _ = planner.plan(replace(first(problem), state=position), states[0])
-        same, states[1], _ = planner.plan(replace(first(alone), state=position[1:2]), states[1])
+        action, states[0], _ = planner.plan(
+            replace(first(problem), state=position), states[0]
+        )
+        same, states[1], _ = planner.plan(
+            replace(first(alone), state=position[1:2]), states[1]
+        )
         torch.testing.assert_close(action[1], same[0], atol=1e-4, rtol=1e-4)
         position = problem.robot(position, action, problem.traversability_at(position))
 
 
 def test_it_drives_at_the_target_that_it_is_given() -> None:
-    problem = factories.problem(torch.full((1, 16, 16), 0.8), start=(4.0, 4.0), goal=(7.0, 4.0))
+    problem = factories.problem(
+        torch.full((1, 16, 16), 0.8), start=(4.0, 4.0), goal=(7.0, 4.0)
+    )
     planner = MPPI(replace(SMALL, samples=1900, horizon_s=4, temperature=0.1))
     state = planner.init(problem, generator())
     aside = torch.tensor([[4.0, 7.0]])
@@ -289,7 +361,9 @@ def test_it_drives_at_the_target_that_it_is_given() -> None:
         for target in (problem.goal_m, aside)
     ]
     assert turns[1] - turns[0] > 0.03
-    assert torch.equal(planner.plan(first(problem), state)[1].mean[0, :, 1].mean(), turns[0])
+    assert torch.equal(
+        planner.plan(first(problem), state)[1].mean[0, :, 1].mean(), turns[0]
+    )
     assert planner.commit_action(state, aside) is state
 
 
@@ -307,7 +381,9 @@ def test_noise_for_another_number_of_actions_is_asked_for_by_name() -> None:
             return ("speed_mps", "turn_rate_radps", "crab_mps")
 
     problem = factories.problem(torch.full((1, 16, 16), 0.85), robot=Three())
-    with pytest.raises(ConfigError, match=r"`noise` of MPPI with 3 values, for .*crab_mps"):
+    with pytest.raises(
+        ConfigError, match=r"`noise` of MPPI with 3 values, for .*crab_mps"
+    ):
         MPPI(replace(SMALL, noise=(0.5, 0.5))).init(problem, generator())
     MPPI(replace(SMALL, noise=(0.5, 0.5, 0.2))).init(problem, generator())
 
@@ -339,7 +415,9 @@ def test_a_low_temperature_takes_the_best_sample() -> None:
     action, _, _ = planner.plan(first(problem), state)
     noise = state.noise.at(state.step)
     cost = rollout_cost(problem, problem.start, state.mean, noise, problem.goal_m)
-    best = noise[0, :, cost.argmin()].clamp(torch.tensor([0.0, -1.0]), torch.tensor([1.0, 1.0]))
+    best = noise[0, :, cost.argmin()].clamp(
+        torch.tensor([0.0, -1.0]), torch.tensor([1.0, 1.0])
+    )
     torch.testing.assert_close(action[0], best, atol=1e-3, rtol=0)
 
 
@@ -353,7 +431,9 @@ def test_drawing_changes_no_action() -> None:
     assert plan.samples.numel() == plan.path.numel() == 0
     assert drawn.samples.shape == (2, 40, 21, 2)
     assert drawn.path.shape == (2, 21, 2)
-    moved = problem.robot(problem.start, again, problem.traversability_at(problem.start))
+    moved = problem.robot(
+        problem.start, again, problem.traversability_at(problem.start)
+    )
     moved = problem.robot(moved, following.mean[:, 0], problem.traversability_at(moved))
     torch.testing.assert_close(drawn.path[:, 2], moved[:, :2])
     # The best samples end nearer to the goal than a standing robot.
@@ -366,13 +446,17 @@ def problem_on(robot) -> Problem:  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.parametrize("robot", [Unicycle(), DifferentialDrive(), Bicycle()])
-def test_no_tensor_is_made_on_another_device(robot, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
+def test_no_tensor_is_made_on_another_device(
+    robot, monkeypatch: pytest.MonkeyPatch
+) -> None:  # type: ignore[no-untyped-def]
     monkeypatch.setattr(mppi, "Fused", lambda function, *_, **__: function)
     with fake_cuda(problem_on(robot)) as problem:
         mean, scale = problem.start.new_zeros(2, 20, 2), problem.start.new_ones(2)
         values = mean.new_zeros(2, 20, 4 * 256)
         places = torch.zeros(20, 2, dtype=torch.int64, device=mean.device)
-        bank = NoiseBank(scale=scale, values=values, place=places, stride=places, samples=256)
+        bank = NoiseBank(
+            scale=scale, values=values, place=places, stride=places, samples=256
+        )
         state = MPPIState(
             problem,
             mean,
@@ -387,7 +471,9 @@ def test_no_tensor_is_made_on_another_device(robot, monkeypatch: pytest.MonkeyPa
         planner = MPPI(replace(SMALL, control_cost=0.1))
         action, state, plan = planner.plan(first(problem, draw=True), state)
         assert on_cuda(action, state.mean, plan.path, plan.samples, plan.status)
-        cost = rollout_cost(problem, problem.start, state.mean, bank.at(1), problem.goal_m)
+        cost = rollout_cost(
+            problem, problem.start, state.mean, bank.at(1), problem.goal_m
+        )
         assert on_cuda(cost)
 
 
@@ -403,7 +489,8 @@ def test_each_action_has_its_own_scale_and_shape() -> None:
     assert noise.shape == (12, 2, 4000)
     torch.testing.assert_close(noise.std(dim=(0, 2)), SCALE, atol=0.01, rtol=0)
     assert noise.mean(dim=(0, 2)).abs().max() < 0.01
-    # Normal: a twentieth lies beyond 1.96 standard deviations, and three in a thousand beyond 3.
+    # Normal: a twentieth lies beyond 1.96 standard deviations, and three in a thousand
+    # beyond 3.
     far = (noise / SCALE[:, None]).abs()
     assert (far > 1.96).double().mean().item() == pytest.approx(0.05, abs=0.004)
     assert (far > 3).double().mean().item() == pytest.approx(0.0027, abs=0.001)
@@ -422,7 +509,8 @@ def test_steps_and_seeds_have_noise_of_their_own() -> None:
     for place in range(1, 4):
         assert (steps[0] * steps[place]).mean().abs() < 0.01
         assert not torch.equal(steps[0], steps[place])
-    # Seeds in a row, and such as are alike in 32 bits, which is all that PyTorch's generator looks at.
+    # Seeds in a row, and such as are alike in 32 bits, which is all that PyTorch's
+    # generator looks at.
     for seed in (6, 5 + 2**32):
         assert not torch.equal(bank(seed).at(0), one.at(0))
         assert not torch.equal(bank(seed).at(0), one.at(1))
@@ -439,12 +527,18 @@ def test_noise_is_a_function_of_seed_and_step_alone() -> None:
 def marked(horizon: int, samples: int) -> NoiseBank:
     """A bank whose numbers tell their places."""
     one = bank(horizon=horizon, samples=samples)
-    places = torch.arange(one.values.numel(), dtype=torch.float32).view(one.values.shape)
-    return NoiseBank(scale=SCALE, values=places, place=one.place, stride=one.stride, samples=samples)
+    places = torch.arange(one.values.numel(), dtype=torch.float32).view(
+        one.values.shape
+    )
+    return NoiseBank(
+        scale=SCALE, values=places, place=one.place, stride=one.stride, samples=samples
+    )
 
 
 @pytest.mark.parametrize(("horizon", "samples"), [(2, 50), (50, 40), (7, 1)])
-def test_runs_keep_to_their_parts_and_no_number_serves_a_sample_twice(horizon: int, samples: int) -> None:
+def test_runs_keep_to_their_parts_and_no_number_serves_a_sample_twice(
+    horizon: int, samples: int
+) -> None:
     one = marked(horizon, samples)
     part = 4 * samples
     for step in range(300):
@@ -477,11 +571,13 @@ BEHIND, WITHIN = (
 @pytest.mark.parametrize(
     ("objective", "least_mps", "traversability", "wheelbase_m", "goal", "within_s"),
     [
-        # Half a turn of radius 0.73 m and 5 m back take 8.5 s at 0.85 m/s, 5 m in reverse 5.9 s.
+        # Half a turn of radius 0.73 m and 5 m back take 8.5 s at 0.85 m/s, 5 m in
+        # reverse 5.9 s.
         ("travel_time", 0.0, 0.85, 0.5, BEHIND, 12.0),
         ("goal_distance", 0.0, 0.85, 0.5, BEHIND, 12.0),
         ("goal_distance", -1.0, 0.85, 0.5, BEHIND, 8.0),
-        # Half a turn takes 7 s and 13 s, and the horizon is 5 s: Dubins paths of 8.5 m and 11.3 m.
+        # Half a turn takes 7 s and 13 s, and the horizon is 5 s: Dubins paths of 8.5 m
+        # and 11.3 m.
         ("goal_distance", 0.0, 0.35, 0.5, BEHIND, 26.0),
         ("travel_time", 0.0, 0.35, 1.0, BEHIND, 32.0),
         # A Dubins path of 8.3 m, away from the goal and back.
@@ -501,15 +597,21 @@ def test_a_bicycle_turns_to_any_goal(
     radius_m = 1.0 if goal == BEHIND else 0.5
     cost = registry.make("objective", objective, robot=robot, goal_radius_m=radius_m)
     ground = torch.full((2, 40, 40), traversability)
-    problem = factories.problem(ground, (13.0, 10.0), goal, robot, cost, Rules(goal_radius_m=radius_m))
+    problem = factories.problem(
+        ground, (13.0, 10.0), goal, robot, cost, Rules(goal_radius_m=radius_m)
+    )
     problem = with_start(problem, 13.0, 10.0, 0.0)
-    driven = drive(MPPI(replace(SMALL, samples=128, horizon_s=5.0)), problem, None, within_s)
+    driven = drive(
+        MPPI(replace(SMALL, samples=128, horizon_s=5.0)), problem, None, within_s
+    )
     assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
 
 
 def test_turns_are_full_steering_for_some_of_the_time_and_then_straight() -> None:
     like = torch.zeros(1)
-    assert [is_steered(robot) for robot in (Bicycle(), Unicycle(), DifferentialDrive())] == [
+    assert [
+        is_steered(robot) for robot in (Bicycle(), Unicycle(), DifferentialDrive())
+    ] == [
         True,
         False,
         False,
@@ -536,7 +638,9 @@ class Asked:
 
     cells: torch.Tensor | None = None
 
-    def sample(self, count: int, key: int, cells: torch.Tensor | None = None) -> torch.Tensor:
+    def sample(
+        self, count: int, key: int, cells: torch.Tensor | None = None
+    ) -> torch.Tensor:
         assert cells is not None
         self.cells = cells
         return torch.full((len(cells), count, *cells.shape[1:]), 0.5)
@@ -547,7 +651,9 @@ class Asked:
 
 def test_fields_are_drawn_as_far_as_what_is_rolled_out() -> None:
     fields = Asked()
-    problem = factories.problem(torch.full((1, 40, 40), 0.8), (1.25, 10.25), (13.0, 10.25))
+    problem = factories.problem(
+        torch.full((1, 40, 40), 0.8), (1.25, 10.25), (13.0, 10.25)
+    )
     problem = replace(problem, fields=fields)
     planner = MPPI(replace(SMALL, risk_on="cost", fields=10))
     planner.plan(first(problem), planner.init(problem, generator()))
@@ -556,18 +662,29 @@ def test_fields_are_drawn_as_far_as_what_is_rolled_out() -> None:
 
 
 def test_a_turn_replaces_only_a_mean_that_is_no_better_than_standing() -> None:
-    """Goals behind, ahead of a robot at rest, ahead of one with a good mean, and behind on slow ground."""
+    """Goals behind, ahead of a robot at rest, ahead of one with a good mean, and behind
+    on slow ground.
+    """
     ground = torch.full((4, 40, 40), 0.85)
     ground[3] = 0.35  # half a turn takes 6.6 s, so that none pays within 5 s
     problem = factories.problem(ground, (13.0, 10.0), (7.0, 10.0), Bicycle())
-    start = torch.tensor([[13.0, 10.0, 0.0], [13.0, 10.0, math.pi], [13.0, 10.0, math.pi], [13.0, 10.0, 0.0]])
+    start = torch.tensor(
+        [
+            [13.0, 10.0, 0.0],
+            [13.0, 10.0, math.pi],
+            [13.0, 10.0, math.pi],
+            [13.0, 10.0, 0.0],
+        ]
+    )
     problem = replace(problem, start=start)
     planner = MPPI(replace(SMALL, horizon_s=5.0))
     state = planner.init(problem, generator())
     mean = state.mean.clone()
     mean[2, :, 0] = 0.5
     state = replace(state, mean=mean)
-    turned, follows = planner._turned(first(problem), state, problem.goal_m, problem.padded_ground, None)
+    turned, follows = planner._turned(
+        first(problem), state, problem.goal_m, problem.padded_ground, None
+    )
     assert follows.tolist() == [False, False, False, True]
     assert bool((turned[[0, 3], :, 0] == 1).all())
     # Half a turn takes π·0.73 m / 0.85 m/s = 2.7 s, and all of 5 s where λ̂ is 0.35.
@@ -577,16 +694,24 @@ def test_a_turn_replaces_only_a_mean_that_is_no_better_than_standing() -> None:
     for member, chosen in enumerate(turned):
         alone = problem.select(torch.tensor([member]))
         kept = planner.select(state, torch.tensor([member]))
-        single, _ = planner._turned(first(alone), kept, alone.goal_m, alone.padded_ground, None)
+        single, _ = planner._turned(
+            first(alone), kept, alone.goal_m, alone.padded_ground, None
+        )
         torch.testing.assert_close(single[0], chosen)
 
 
 @pytest.mark.parametrize("goal", [BEHIND, WITHIN])
-def test_actions_along_a_dubins_path_reach_the_goal_without_feedback(goal: tuple[float, float]) -> None:
+def test_actions_along_a_dubins_path_reach_the_goal_without_feedback(
+    goal: tuple[float, float],
+) -> None:
     robot = Bicycle(wheelbase_m=1.0)
-    problem = factories.problem(torch.full((1, 40, 40), 0.35), (13.0, 10.0), goal, robot)
+    problem = factories.problem(
+        torch.full((1, 40, 40), 0.35), (13.0, 10.0), goal, robot
+    )
     problem = with_start(problem, 13.0, 10.0, 0.0)
-    actions, turns = follow_dubins(problem, problem.start, problem.goal_m, problem.padded_ground, 400)
+    actions, turns = follow_dubins(
+        problem, problem.start, problem.goal_m, problem.padded_ground, 400
+    )
     state, nearest = problem.start, math.inf
     for action in actions.unbind(1):
         state = robot(state, action, torch.tensor([0.35]))
@@ -597,15 +722,23 @@ def test_actions_along_a_dubins_path_reach_the_goal_without_feedback(goal: tuple
 
 def test_a_dubins_path_is_driven_as_it_is_until_the_robot_faces_the_goal() -> None:
     """Neither samples change it nor a mean that pays ends it."""
-    problem = factories.problem(torch.full((1, 40, 40), 0.35), (13.0, 10.0), BEHIND, Bicycle())
-    problem, ahead = (with_start(problem, 13.0, 10.0, heading) for heading in (0.0, math.pi))
-    actions, _ = follow_dubins(problem, problem.start, problem.goal_m, problem.padded_ground, 50)
+    problem = factories.problem(
+        torch.full((1, 40, 40), 0.35), (13.0, 10.0), BEHIND, Bicycle()
+    )
+    problem, ahead = (
+        with_start(problem, 13.0, 10.0, heading) for heading in (0.0, math.pi)
+    )
+    actions, _ = follow_dubins(
+        problem, problem.start, problem.goal_m, problem.padded_ground, 50
+    )
     planner = MPPI(replace(SMALL, horizon_s=5.0))
     chosen, after, _ = planner.plan(first(problem), planner.init(problem, generator()))
     torch.testing.assert_close(chosen, actions[:, 0])
     straight = replace(after, mean=after.mean * torch.tensor([1.0, 0.0]))
     assert bool(planner.plan(first(problem), straight)[1].follows)
-    assert not bool(planner.plan(first(ahead), replace(straight, problem=ahead))[1].follows)
+    assert not bool(
+        planner.plan(first(ahead), replace(straight, problem=ahead))[1].follows
+    )
 
 
 LEFT, RIGHT = (slice(21, None), slice(26, 28)), (slice(None, 19), slice(26, 28))
@@ -623,14 +756,19 @@ LEFT, RIGHT = (slice(21, None), slice(26, 28)), (slice(None, 19), slice(26, 28))
     ],
 )
 def test_a_dubins_path_keeps_to_ground_that_holds_the_robot(
-    sides: tuple[Any, ...], immobile: Immobile | None, kept: tuple[int, int], side: int | None
+    sides: tuple[Any, ...],
+    immobile: Immobile | None,
+    kept: tuple[int, int],
+    side: int | None,
 ) -> None:
     rules = Rules(min_traversability=0.05, free_space=FreeSpace(above=0.0))
     fields = torch.full((2, 40, 40), 0.5)
     for place in sides:
         for field, soft in zip(fields, kept, strict=True):
             field[place] = 0.05 if soft else 0.5
-    problem = factories.problem(fields[:1], (13.0, 10.0), (7.0, 10.5), Bicycle(), rules=rules)
+    problem = factories.problem(
+        fields[:1], (13.0, 10.0), (7.0, 10.5), Bicycle(), rules=rules
+    )
     problem = replace(with_start(problem, 13.0, 10.0, 0.0), immobile=immobile)
     ground = framed_fields(problem, fields[None])
     actions, turns = follow_dubins(problem, problem.start, problem.goal_m, ground, 50)

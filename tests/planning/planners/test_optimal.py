@@ -25,12 +25,24 @@ from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
-from tests.planning.planners.driving import drive, first, generator, known_world, step_at, with_start
+from tests.planning.planners.driving import (
+    drive,
+    first,
+    generator,
+    known_world,
+    step_at,
+    with_start,
+)
 
 RULES = Rules(min_traversability=0.01, free_space=FreeSpace(above=0.0))
 
 
-def problem(ground: Tensor, start: tuple[float, float], goal: tuple[float, float], **changes: Any) -> Problem:
+def problem(
+    ground: Tensor,
+    start: tuple[float, float],
+    goal: tuple[float, float],
+    **changes: Any,
+) -> Problem:
     return factories.problem(ground, start, goal, rules=RULES, **changes)
 
 
@@ -41,18 +53,23 @@ def time_to_go(planner: Any, posed: Problem) -> Tensor:
 
 
 def curve(x: float, y: float, heading: float, radius_m: float = 1.0) -> float:
-    """Least time to a disc around 0 along a circle of radius 1 and straight on; infinite within that circle."""
+    """Least time to a disc around 0 along a circle of radius 1 and straight on;
+    infinite within that circle.
+    """
     found = math.inf
     for side in (1, -1):
         centre_x, centre_y = x - side * math.sin(heading), y + side * math.cos(heading)
         away = math.hypot(centre_x, centre_y)
         if away < 1:
             continue
-        # From the centre: where the robot is, and where the straight begins, which ends at 0.
+        # From the centre: where the robot is, and where the straight begins, which ends
+        # at 0.
         begin = math.atan2(y - centre_y, x - centre_x)
         ends = math.atan2(-centre_y, -centre_x) - side * math.acos(1 / away)
         arc = (side * (ends - begin)) % (2 * math.pi)
-        found = min(found, arc * (arc < 2 * math.pi - 1e-6) + math.sqrt(away**2 - 1) - radius_m)
+        found = min(
+            found, arc * (arc < 2 * math.pi - 1e-6) + math.sqrt(away**2 - 1) - radius_m
+        )
     return found
 
 
@@ -70,13 +87,17 @@ def test_on_free_ground_the_cost_to_go_is_the_least_time() -> None:
     value = Optimal().init(posed, generator()).to_go.value[0, 0]
     drawn, far, near = torch.Generator().manual_seed(0), [], []
     while len(far) < 200 or len(near) < 40:
-        heading, row, column = (int(torch.randint(most, (), generator=drawn)) for most in (32, 64, 64))
+        heading, row, column = (
+            int(torch.randint(most, (), generator=drawn)) for most in (32, 64, 64)
+        )
         x, y = (column + 0.5) / 2 - goal[0], (row + 0.5) / 2 - goal[1]
         if math.hypot(x, y) < 2:
             continue
         wanted = least_time(x, y, heading * math.pi / 16)
         more = float(value[heading, row, column]) - wanted
-        far, near = ([*far, more / wanted], near) if wanted > 10 else (far, [*near, more])
+        far, near = (
+            ([*far, more / wanted], near) if wanted > 10 else (far, [*near, more])
+        )
     # It is never less than what can be done.
     assert min(*far, *near) > -0.001
     assert max(far) < 0.02
@@ -95,7 +116,9 @@ def test_on_free_ground_it_drives_in_the_least_time(turned: float) -> None:
     assert float(time_to_go(Optimal(), posed)) == pytest.approx(wanted, rel=0.02)
 
 
-def test_through_strips_the_time_adds_up_and_slow_ground_is_gone_around_where_that_is_quicker() -> None:
+def test_through_strips_the_time_adds_up_and_slow_ground_is_gone_around_where_that_is_quicker() -> (
+    None
+):
     ground = torch.full((2, 40, 40), 0.8)
     ground[0, :, 15:25] = 0.2
     ground[1, 15:25, 15:25] = 0.1
@@ -114,7 +137,9 @@ def test_through_strips_the_time_adds_up_and_slow_ground_is_gone_around_where_th
 def test_half_the_traversability_takes_twice_the_time() -> None:
     drawn = 0.3 + 0.7 * torch.rand(1, 24, 24, generator=generator())
     both = torch.cat((drawn, drawn / 2))
-    whole, half = time_to_go(Optimal(), problem(both, (2.25, 2.25), (9.25, 8.25))).tolist()
+    whole, half = time_to_go(
+        Optimal(), problem(both, (2.25, 2.25), (9.25, 8.25))
+    ).tolist()
     assert half == pytest.approx(2 * whole, rel=1e-4)
 
 
@@ -153,7 +178,9 @@ def test_the_time_held_is_counted_while_it_drives() -> None:
         assert state.held.tolist() == pytest.approx([wanted])
 
 
-def test_ground_that_is_not_free_is_gone_around_and_crossed_where_there_is_no_other_way() -> None:
+def test_ground_that_is_not_free_is_gone_around_and_crossed_where_there_is_no_other_way() -> (
+    None
+):
     ground = torch.full((2, 24, 24), 0.9)
     wall = torch.zeros(24, 24, dtype=torch.bool)
     wall[:, 11] = True
@@ -177,14 +204,20 @@ def test_moves_end_where_the_robot_does() -> None:
     moves = Moves.of(Unicycle(), 0.5, 32)
     angles = headings_of(32)
     offsets = moves.offsets(angles, torch.ones(1, dtype=torch.float64))[:, :, 0]
-    for place, (action, seconds) in enumerate(zip(moves.actions, moves.seconds.tolist(), strict=True)):
+    for place, (action, seconds) in enumerate(
+        zip(moves.actions, moves.seconds.tolist(), strict=True)
+    ):
         state = torch.cat((torch.zeros(32, 2, dtype=torch.float64), angles[:, None]), 1)
         robot = Unicycle(dt_s=seconds / 2000)
         for _ in range(2000):
-            state = robot(state, action.expand(32, 2), torch.ones(32, dtype=torch.float64))
+            state = robot(
+                state, action.expand(32, 2), torch.ones(32, dtype=torch.float64)
+            )
         torch.testing.assert_close(offsets[:, place], state[:, :2], atol=1e-3, rtol=0)
         turned = (state[:, 2] - angles) / (math.pi / 16)
-        torch.testing.assert_close(turned, torch.full_like(turned, moves.turns[place]), atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            turned, torch.full_like(turned, moves.turns[place]), atol=1e-6, rtol=0
+        )
         assert float(offsets[:, place].norm(dim=1).max()) <= 0.5 + 1e-9
 
 
@@ -193,7 +226,11 @@ def held_ground(below: float, for_s: float) -> Problem:
     ground = torch.full((1, 40, 24), 0.9)
     ground[:, :36, 11] = below
     posed = problem(ground, (2.25, 2.25), (9.25, 2.25))
-    return replace(posed, immobile=Immobile(below=0.1, for_s=for_s), distribution=factories.certain(ground))
+    return replace(
+        posed,
+        immobile=Immobile(below=0.1, for_s=for_s),
+        distribution=factories.certain(ground),
+    )
 
 
 def test_the_reference_crosses_what_does_not_hold_for_long_enough() -> None:
@@ -243,15 +280,23 @@ def wide_bar(for_s: float) -> Problem:
     ground = torch.full((1, 24, 40), 0.9)
     ground[:, :, 12:15] = 0.095
     posed = problem(ground, (2.25, 6.25), (17.25, 6.25), time_budget_s=90.0)
-    return replace(posed, immobile=Immobile(below=0.1, for_s=for_s), distribution=factories.certain(ground))
+    return replace(
+        posed,
+        immobile=Immobile(below=0.1, for_s=for_s),
+        distribution=factories.certain(ground),
+    )
 
 
-@pytest.mark.parametrize(("for_s", "crosses"), [(12.0, False), (15.0, False), (16.5, True), (20.0, True)])
+@pytest.mark.parametrize(
+    ("for_s", "crosses"), [(12.0, False), (15.0, False), (16.5, True), (20.0, True)]
+)
 def test_over_several_cells_dwell_time_adds_up(for_s: float, crosses: bool) -> None:
     posed, planner = wide_bar(for_s), NearOptimal()
     found = float(time_to_go(planner, posed))
     done = drive(planner, posed, world=known_world(posed))
-    assert done.outcome.tolist() == [Outcome.SUCCESS if crosses else Outcome.IMMOBILISED]
+    assert done.outcome.tolist() == [
+        Outcome.SUCCESS if crosses else Outcome.IMMOBILISED
+    ]
     if crosses:
         assert found == pytest.approx((14 - 1.5) / 0.9 + 1.5 / 0.095, rel=0.02)
         assert 0.1 * int(done.steps[0]) == pytest.approx(found, rel=0.02)
@@ -260,7 +305,9 @@ def test_over_several_cells_dwell_time_adds_up(for_s: float, crosses: bool) -> N
 
 
 def test_dwell_time_that_is_left_is_exact_along_a_bar() -> None:
-    """A robot that faces the far side may have spent all but what the rest of the bar takes."""
+    """A robot that faces the far side may have spent all but what the rest of the bar
+    takes.
+    """
     posed = wide_bar(18.0)
     for levels in (1, 3):
         planner = NearOptimal(NearOptimalConfig(levels=levels))
@@ -268,7 +315,9 @@ def test_dwell_time_that_is_left_is_exact_along_a_bar() -> None:
         assert to_go.max_dwell_s is not None
         for column in range(12, 15):
             left_s = (14.5 - column) * 0.5 / 0.095
-            assert float(to_go.max_dwell_s[0, 0, 0, 12, column]) == pytest.approx(18 - left_s, abs=0.35)
+            assert float(to_go.max_dwell_s[0, 0, 0, 12, column]) == pytest.approx(
+                18 - left_s, abs=0.35
+            )
         # Of other terrain, all of it.
         assert float(to_go.max_dwell_s[0, 0, 0, 12, 8]) == 18
 
@@ -296,7 +345,8 @@ def test_a_wall_that_straight_crosses_is_crossed_as_soon(
     immobile = Immobile(below=below, for_s=cells * 0.5 / crossing / share)
     posed = replace(posed, immobile=immobile, distribution=factories.certain(ground))
     straight, reference = (
-        drive(planner, posed, world=known_world(posed)) for planner in (Straight(), NearOptimal())
+        drive(planner, posed, world=known_world(posed))
+        for planner in (Straight(), NearOptimal())
     )
     assert straight.outcome.tolist() == reference.outcome.tolist() == [Outcome.SUCCESS]
     assert int(reference.steps[0]) <= int(straight.steps[0])
@@ -308,19 +358,31 @@ def test_a_wall_that_straight_crosses_is_crossed_as_soon(
 def small_worlds(seed: int, for_s: float) -> Problem:
     """Rough fields with a closed wall right across, thin enough in places."""
     drawn = torch.rand(4, 1, 18, 26, generator=generator(seed))
-    ground = torch.nn.functional.avg_pool2d(drawn, 3, 1)[:, 0].sub(0.2).mul(2.0).clamp(0.02, 1)
+    ground = (
+        torch.nn.functional.avg_pool2d(drawn, 3, 1)[:, 0]
+        .sub(0.2)
+        .mul(2.0)
+        .clamp(0.02, 1)
+    )
     where = torch.rand(4, generator=generator(seed + 1)).mul(8).long() + 8
     for member, column in enumerate(where.tolist()):
         ground[member, :, column : column + 1 + member % 3] = 0.3
     posed = problem(ground, (2.25, 4.25), (10.25, 4.25), time_budget_s=25.0)
-    return replace(posed, immobile=Immobile(below=0.35, for_s=for_s), distribution=factories.certain(ground))
+    return replace(
+        posed,
+        immobile=Immobile(below=0.35, for_s=for_s),
+        distribution=factories.certain(ground),
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_it_succeeds_wherever_a_star_with_dwa_or_straight_do_and_no_later(seed: int) -> None:
+def test_it_succeeds_wherever_a_star_with_dwa_or_straight_do_and_no_later(
+    seed: int,
+) -> None:
     posed = small_worlds(10 * seed, 3.0 + seed)
     reference, *others = (
-        drive(planner, posed, world=known_world(posed)) for planner in (NearOptimal(), AStarDWA(), Straight())
+        drive(planner, posed, world=known_world(posed))
+        for planner in (NearOptimal(), AStarDWA(), Straight())
     )
     for other in others:
         succeeds = other.outcome == Outcome.SUCCESS
@@ -339,16 +401,24 @@ def test_where_value_iteration_fails_it_follows_the_earlier_of_the_others(
     # On the first map the wall is quick, but not free.
     free = torch.ones_like(ground).bool()
     free[:, :12, 11] = False
-    posed = replace(posed, immobile=Immobile(), distribution=factories.certain(ground), free=free)
+    posed = replace(
+        posed, immobile=Immobile(), distribution=factories.certain(ground), free=free
+    )
     world = known_world(posed)
-    guided, straight = (drive(planner, posed, world=world) for planner in (AStarDWA(), Straight()))
+    guided, straight = (
+        drive(planner, posed, world=world) for planner in (AStarDWA(), Straight())
+    )
     assert straight.outcome.tolist() == [Outcome.SUCCESS, Outcome.IMMOBILISED]
     assert guided.outcome.tolist() == [Outcome.SUCCESS] * 2
     assert int(straight.steps[0]) < int(guided.steps[0])
 
     def stand(self: Optimal, step: Any, plan_state: Any) -> Any:
         observed = self.observe(step, plan_state)
-        return torch.zeros_like(step.state[:, :2]), observed, Plan.empty(len(step.state))
+        return (
+            torch.zeros_like(step.state[:, :2]),
+            observed,
+            Plan.empty(len(step.state)),
+        )
 
     monkeypatch.setattr(Optimal, "plan", stand)
     done = drive(NearOptimal(), posed, world=world)
@@ -373,7 +443,9 @@ def test_a_robot_that_is_off_its_drive_goes_on_by_value_iteration() -> None:
 
 
 @pytest.mark.parametrize(("held", "crosses"), [(3.0, True), (13.0, False)])
-def test_who_has_no_time_left_to_leave_such_ground_is_lost_by_every_way(held: float, crosses: bool) -> None:
+def test_who_has_no_time_left_to_leave_such_ground_is_lost_by_every_way(
+    held: float, crosses: bool
+) -> None:
     """It takes 3.7 s to the last cell of the bar, and 2.6 s to leave that."""
     posed = with_start(wide_bar(18.0), 6.9, 6.25, 0.0)
     state = Optimal.init(NearOptimal(), posed, generator())
@@ -385,11 +457,15 @@ def test_who_has_no_time_left_to_leave_such_ground_is_lost_by_every_way(held: fl
 @pytest.mark.parametrize("levels", [1, 2, 3, 4, 5])
 def test_there_are_as_many_levels_as_are_asked_for(levels: int) -> None:
     planner = NearOptimal(NearOptimalConfig(levels=levels))
-    assert Optimal.init(planner, wide_bar(4.0), generator()).to_go.value.shape[1] == levels
+    assert (
+        Optimal.init(planner, wide_bar(4.0), generator()).to_go.value.shape[1] == levels
+    )
 
 
 def test_deep_in_a_bar_a_robot_with_little_time_left_takes_the_dearer_side() -> None:
-    """Ahead is the near side, behind it the goal: to leave takes 7 s of 20, to turn and cross twice that."""
+    """Ahead is the near side, behind it the goal: to leave takes 7 s of 20, to turn and
+    cross twice that.
+    """
     ground = torch.full((1, 40, 34), 0.9)
     ground[:, :36, 10:22] = 0.4
     posed = replace(
@@ -400,7 +476,8 @@ def test_deep_in_a_bar_a_robot_with_little_time_left_takes_the_dearer_side() -> 
     state = Optimal.init(NearOptimal(), posed, generator())
     pose = torch.tensor([[7.75, 5.25, math.pi]])
     some, more, most = (
-        float(ways_from(pose, torch.tensor([held]), state).cost.min()) for held in (0.0, 8.0, 15.0)
+        float(ways_from(pose, torch.tensor([held]), state).cost.min())
+        for held in (0.0, 8.0, 15.0)
     )
     across = 3.25 / 0.4 + 2.25 / 0.9
     assert across < some < 1.02 * (across + math.pi / 0.4)
@@ -412,14 +489,22 @@ def test_a_robot_that_was_held_has_less_time_left() -> None:
     posed = held_ground(0.08, 7.0)
     state = Optimal.init(NearOptimal(), with_start(posed, 5.3, 2.25, 0.0), generator())
     pose = torch.tensor([[5.6, 2.25, 0.0]])
-    some, more = (float(ways_from(pose, torch.tensor([held]), state).cost.min()) for held in (0.0, 6.5))
+    some, more = (
+        float(ways_from(pose, torch.tensor([held]), state).cost.min())
+        for held in (0.0, 6.5)
+    )
     assert some == pytest.approx(0.4 / 0.08 + 2.25 / 0.9, rel=0.1)
     assert more > 3 * some or more >= UNREACHED / 2
 
 
 def test_levels_of_a_world_that_holds_at_once_are_entry_as_loss() -> None:
     drawn = torch.rand(2, 1, 36, 36, generator=generator(4))
-    ground = torch.nn.functional.avg_pool2d(drawn, 5, 1)[:, 0].sub(0.35).mul(3).clamp(0.02, 1)
+    ground = (
+        torch.nn.functional.avg_pool2d(drawn, 5, 1)[:, 0]
+        .sub(0.35)
+        .mul(3)
+        .clamp(0.02, 1)
+    )
     assert 0.02 < float((ground < 0.1).float().mean()) < 0.3
     posed = replace(
         problem(ground, (2.25, 2.25), (13.25, 12.25)),
@@ -433,7 +518,9 @@ def test_levels_of_a_world_that_holds_at_once_are_entry_as_loss() -> None:
 
 
 def test_the_hazard_of_a_metre_is_that_of_its_cells() -> None:
-    """Along a corridor of the same hazard V = (T + 1/h) (1 − exp(−h x)), which solves V' = 1 + h (T − V)."""
+    """Along a corridor of the same hazard V = (T + 1/h) (1 − exp(−h x)), which solves
+    V' = 1 + h (T − V).
+    """
     lost, budget_s = 0.01, 200.0
     ground = torch.ones(1, 64, 64)
     posed = problem(ground, (3.25, 16.0), (28.25, 16.0), time_budget_s=budget_s)
@@ -446,7 +533,9 @@ def test_the_hazard_of_a_metre_is_that_of_its_cells() -> None:
     )
     found = float(time_to_go(Optimal(OptimalConfig(hazard=True)), posed))
     hazard = -math.log(1 - lost) / 0.5
-    assert found == pytest.approx((budget_s + 1 / hazard) * (1 - math.exp(-hazard * 24)), rel=0.02)
+    assert found == pytest.approx(
+        (budget_s + 1 / hazard) * (1 - math.exp(-hazard * 24)), rel=0.02
+    )
     sure = float(time_to_go(Optimal(), posed))
     assert sure == pytest.approx(24, rel=0.02)
 
@@ -483,7 +572,9 @@ def test_where_it_has_arrived_nothing_holds_it(hazard: bool) -> None:
     away = torch.hypot(0.5 * column + 0.25 - 9.25, 0.5 * row + 0.25 - 4.25)
     ground[1, (away > 0.1) & (away <= 1.0)] = 0.05
     posed = replace(posed, immobile=Immobile(below=0.1, for_s=0.3))
-    predicted = factories.normal(ground, torch.full_like(ground, 0.2 if hazard else 0.0))
+    predicted = factories.normal(
+        ground, torch.full_like(ground, 0.2 if hazard else 0.0)
+    )
     planner = Optimal(OptimalConfig(hazard=True)) if hazard else NearOptimal()
     found = time_to_go(planner, replace(posed, distribution=predicted, risk_map=ground))
     assert float(found[1]) == pytest.approx(float(found[0]), rel=0.03)
@@ -540,7 +631,11 @@ def test_where_there_is_no_way_the_world_ends_the_episode() -> None:
     for turned in (0.0, 0.1):
         step = step_at(posed.start + torch.tensor([0.0, 0.0, turned]))
         action, _, plan = planner.plan(step, planner.init(posed, generator()))
-        assert plan.status.tolist() == [PlanStatus.PARTIAL, PlanStatus.OK, PlanStatus.PARTIAL]
+        assert plan.status.tolist() == [
+            PlanStatus.PARTIAL,
+            PlanStatus.OK,
+            PlanStatus.PARTIAL,
+        ]
         assert torch.equal(action[[0, 2]], Straight().plan(step, posed)[0][[0, 2]])
     done = drive(planner, posed, world=known_world(posed))
     assert done.outcome[1:].tolist() == [Outcome.SUCCESS, Outcome.IMMOBILISED]
@@ -553,17 +648,26 @@ def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> N
     ground = torch.full((1, 16, 16), 0.9)
     for robot in (Bicycle(), DifferentialDrive()):
         with pytest.raises(
-            ConfigError, match=f"Unicycle for planner '{kind.name}', got {type(robot).__name__}"
+            ConfigError,
+            match=f"Unicycle for planner '{kind.name}', got {type(robot).__name__}",
         ):
             kind().init(factories.problem(ground, robot=robot), generator())
     uneven = Unicycle(turn_rate_radps=(-1.0, 0.5))
-    with pytest.raises(ConfigError, match=f"alike to both sides for planner '{kind.name}'"):
+    with pytest.raises(
+        ConfigError, match=f"alike to both sides for planner '{kind.name}'"
+    ):
         kind().init(factories.problem(ground, robot=uneven), generator())
     backward = Unicycle(speed_mps=(-1.0, 1.0))
-    with pytest.raises(ConfigError, match=f"`speed_mps` from 0 on for planner '{kind.name}', got from -1 on"):
+    with pytest.raises(
+        ConfigError,
+        match=f"`speed_mps` from 0 on for planner '{kind.name}', got from -1 on",
+    ):
         kind().init(factories.problem(ground, robot=backward), generator())
     posed = factories.problem(ground, rules=replace(RULES, goal_radius_m=0.35))
-    with pytest.raises(ConfigError, match=r"`goal_radius_m` of at least 0\.35, half of a cell's diagonal"):
+    with pytest.raises(
+        ConfigError,
+        match=r"`goal_radius_m` of at least 0\.35, half of a cell's diagonal",
+    ):
         kind().init(posed, generator())
     posed = factories.problem(ground)
     with pytest.raises(ConfigError, match="which plans once"):
@@ -573,8 +677,12 @@ def test_other_robots_and_maps_that_change_are_refused(kind: type[Optimal]) -> N
 def test_what_cannot_be_known_is_refused() -> None:
     ground = torch.full((1, 16, 16), 0.9)
     posed = factories.problem(ground)
-    unsure = replace(posed, distribution=factories.normal(ground, torch.full_like(ground, 0.1)))
-    with pytest.raises(ConfigError, match="model 'clairvoyant' for planner 'near_optimal'"):
+    unsure = replace(
+        posed, distribution=factories.normal(ground, torch.full_like(ground, 0.1))
+    )
+    with pytest.raises(
+        ConfigError, match="model 'clairvoyant' for planner 'near_optimal'"
+    ):
         NearOptimal().init(unsure, generator())
     with pytest.raises(ConfigError, match="immobilises robots for `hazard`"):
         Optimal(OptimalConfig(hazard=True)).init(posed, generator())
@@ -586,9 +694,15 @@ def test_what_cannot_be_known_is_refused() -> None:
         (OptimalConfig, {"headings": 4}, "`headings` from 8 to 256 for optimal"),
         (OptimalConfig, {"refine": 0}, "`refine` from 1 to 4 for optimal"),
         (NearOptimalConfig, {"levels": 6}, "`levels` from 0 to 5 for near_optimal"),
-        (NearOptimalConfig, {"headings": 300}, "`headings` from 8 to 256 for near_optimal"),
+        (
+            NearOptimalConfig,
+            {"headings": 300},
+            "`headings` from 8 to 256 for near_optimal",
+        ),
     ],
 )
-def test_settings_that_are_none_are_refused(kind: Any, changes: dict[str, int], words: str) -> None:
+def test_settings_that_are_none_are_refused(
+    kind: Any, changes: dict[str, int], words: str
+) -> None:
     with pytest.raises(ConfigError, match=words):
         kind(**changes)

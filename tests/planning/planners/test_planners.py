@@ -1,4 +1,6 @@
-"""What every registered planner does in a closed loop with the simulation, with every robot that it steers."""
+"""What every registered planner does in a closed loop with the simulation, with every
+robot that it steers.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -17,16 +19,23 @@ from tests import factories
 from tests.planning.planners.driving import Drive, drive
 
 FEW = {"samples": 256}
-OPTIONS: dict[str, dict[str, Any]] = {"mppi": FEW, "astar_mppi": {"mppi": FEW}, "cl_rrt": {"expansions": 200}}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "mppi": FEW,
+    "astar_mppi": {"mppi": FEW},
+    "cl_rrt": {"expansions": 200},
+}
 # What is given λ itself has tests of its own.
 NAMES = [name for name in registry.names("planner") if name != "near_optimal"]
-# MPPI looks as far as its horizon alone and `straight` not at all; the others have a path over the whole map.
+# MPPI looks as far as its horizon alone and `straight` not at all; the others have a
+# path over the whole map.
 GLOBAL = sorted(set(NAMES) - {"mppi", "straight"})
 ROBOTS = registry.names("robot")
 
 
 def make(planner: str) -> Any:
-    return registry.make("planner", {"part": planner, "options": OPTIONS.get(planner, {})})
+    return registry.make(
+        "planner", {"part": planner, "options": OPTIONS.get(planner, {})}
+    )
 
 
 def steers(planner: str, robot: str) -> bool:
@@ -37,15 +46,24 @@ def steers(planner: str, robot: str) -> bool:
     return True
 
 
-STEERED = [(planner, robot) for planner in NAMES for robot in ROBOTS if steers(planner, robot)]
+STEERED = [
+    (planner, robot) for planner in NAMES for robot in ROBOTS if steers(planner, robot)
+]
 EACH = pytest.mark.parametrize(("planner", "robot"), STEERED)
-# Of tests that drive far: each planner with the robot that is hardest to turn, and one with each.
+# Of tests that drive far: each planner with the robot that is hardest to turn, and one
+# with each.
 FEW = pytest.mark.parametrize(
     ("planner", "robot"),
     [("astar_mppi", robot) for robot in ROBOTS if ("astar_mppi", robot) in STEERED]
-    + [next(pair for pair in STEERED if pair[0] == name) for name in NAMES if name != "astar_mppi"],
+    + [
+        next(pair for pair in STEERED if pair[0] == name)
+        for name in NAMES
+        if name != "astar_mppi"
+    ],
 )
-EACH_GLOBAL = pytest.mark.parametrize(("planner", "robot"), [pair for pair in STEERED if pair[0] in GLOBAL])
+EACH_GLOBAL = pytest.mark.parametrize(
+    ("planner", "robot"), [pair for pair in STEERED if pair[0] in GLOBAL]
+)
 
 
 class Watched(Planner[Any]):
@@ -72,7 +90,9 @@ def run(
     **places: Any,
 ) -> Drive:
     """Drives, and asserts that the planner never gave up."""
-    problem = factories.problem(predicted, robot=registry.make("robot", robot), **places)
+    problem = factories.problem(
+        predicted, robot=registry.make("robot", robot), **places
+    )
     watched = Watched(make(planner))
     driven = drive(watched, problem, truth, time_budget_s)
     assert PlanStatus.FAILED not in watched.statuses
@@ -101,7 +121,8 @@ def crossed(driven: Drive, predicted: Tensor) -> float:
 def test_it_drives_to_the_goal_over_free_ground(planner: str, robot: str) -> None:
     driven = run(planner, robot, torch.full((2, 16, 20), 0.85), goal=(8.25, 6.25))
     assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
-    # The way is 8.6 m less 1 m of goal radius, at 0.85 m/s; no planner takes the double of it.
+    # The way is 8.6 m less 1 m of goal radius, at 0.85 m/s; no planner takes the double
+    # of it.
     assert (driven.steps < 180).all()
 
 
@@ -119,7 +140,9 @@ def test_a_planner_with_a_global_path_finds_the_gap(planner: str, robot: str) ->
 
 
 @FEW
-def test_from_ground_that_is_predicted_to_hold_it_it_gets_out(planner: str, robot: str) -> None:
+def test_from_ground_that_is_predicted_to_hold_it_it_gets_out(
+    planner: str, robot: str
+) -> None:
     predicted = torch.full((2, 16, 16), 0.85)
     predicted[:, 1:4, 1:4] = 0.0
     driven = run(planner, robot, predicted, torch.full_like(predicted, 0.6))
@@ -127,14 +150,18 @@ def test_from_ground_that_is_predicted_to_hold_it_it_gets_out(planner: str, robo
 
 
 @FEW
-def test_a_closed_wall_that_can_be_passed_in_truth_is_crossed(planner: str, robot: str) -> None:
+def test_a_closed_wall_that_can_be_passed_in_truth_is_crossed(
+    planner: str, robot: str
+) -> None:
     predicted = torch.full((2, 20, 17), 0.85)
     predicted[:, 9:12] = 0.0  # 1.5 m
     truth = torch.full_like(predicted, 0.7)
-    # Head on: a bicycle, which needs room to turn, may leave the map where it comes upon a wall aslant.
+    # Head on: a bicycle, which needs room to turn, may leave the map where it comes
+    # upon a wall aslant.
     places = {"start": (4.1, 1.25), "goal": (4.1, 8.75)}
     if planner == "mppi":
-        # The penalty of crossing lies within its horizon and what is won by it beyond: it waits before the wall.
+        # The penalty of crossing lies within its horizon and what is won by it beyond:
+        # it waits before the wall.
         driven = run(planner, robot, predicted, truth, time_budget_s=12.0, **places)
         assert driven.outcome.tolist() == [Outcome.TIMEOUT] * 2
     else:
@@ -143,10 +170,14 @@ def test_a_closed_wall_that_can_be_passed_in_truth_is_crossed(planner: str, robo
 
 
 @pytest.mark.parametrize("planner", registry.names("planner"))
-def test_on_ground_that_carries_no_robot_all_are_immobilised_alike(planner: str) -> None:
+def test_on_ground_that_carries_no_robot_all_are_immobilised_alike(
+    planner: str,
+) -> None:
     ground, immobile = torch.zeros(2, 16, 16), Immobile(below=0.3, for_s=1.5)
     problem = factories.problem(ground, start=(1.75, 3.75), goal=(6.25, 3.75))
-    problem = replace(problem, distribution=factories.certain(ground), immobile=immobile)
+    problem = replace(
+        problem, distribution=factories.certain(ground), immobile=immobile
+    )
     watched = Watched(make(planner))
     driven = drive(watched, problem, time_budget_s=20.0, immobile=immobile)
     assert driven.outcome.tolist() == [Outcome.IMMOBILISED] * 2
@@ -162,13 +193,21 @@ def test_the_same_seed_gives_the_same_episode(planner: str, robot: str) -> None:
     assert torch.equal(first.actions, second.actions)
 
 
-def test_every_planner_steers_the_papers_robot_and_refuses_what_it_does_not_steer() -> None:
+def test_every_planner_steers_the_papers_robot_and_refuses_what_it_does_not_steer() -> (
+    None
+):
     for planner in NAMES:
         assert (planner, "unicycle") in STEERED
         for robot in ROBOTS:
             if (planner, robot) not in STEERED:
-                steered = "turns only while it drives" if (planner, robot) == ("cl_rrt", "bicycle") else ""
-                with pytest.raises(ConfigError, match=f"for planner '{planner}'.*{steered}"):
+                steered = (
+                    "turns only while it drives"
+                    if (planner, robot) == ("cl_rrt", "bicycle")
+                    else ""
+                )
+                with pytest.raises(
+                    ConfigError, match=f"for planner '{planner}'.*{steered}"
+                ):
                     check_steers(make(planner), registry.make("robot", robot), planner)
             else:
                 check_steers(make(planner), registry.make("robot", robot), planner)

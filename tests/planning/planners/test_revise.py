@@ -33,7 +33,9 @@ def ground() -> Tensor:
 
 
 def wall() -> Tensor:
-    """A wall across the straight way, which has its gap far from it; on the first of two maps alone."""
+    """A wall across the straight way, which has its gap far from it; on the first of
+    two maps alone.
+    """
     changed = ground()
     changed[0, :20, 14:16] = 0.1
     return changed
@@ -60,19 +62,27 @@ def test_the_same_map_changes_no_action(name: str) -> None:
     _, plan_state, _ = planner.plan(state, plan_state)
     again = planner.revise(plan_state, problem(ground()))
     for one, other in zip(
-        taken(planner, plan_state, posed.start, 3), taken(planner, again, posed.start, 3), strict=True
+        taken(planner, plan_state, posed.start, 3),
+        taken(planner, again, posed.start, 3),
+        strict=True,
     ):
         assert torch.equal(one, other)
 
 
-def drive(planner: Any, first: Problem, then: Problem, steps: int, at: int = 5) -> Tensor:
-    """Where robots are under the true ground of the second problem, which they learn of after some steps."""
+def drive(
+    planner: Any, first: Problem, then: Problem, steps: int, at: int = 5
+) -> Tensor:
+    """Where robots are under the true ground of the second problem, which they learn of
+    after some steps.
+    """
     state, observed = first.start, torch.full_like(first.start[:, 0], torch.nan)
     plan_state, draws = boundary.begin(planner, first, generator()), generator(1)
     track = [state]
     for count in range(steps):
         if count == at:
-            plan_state = boundary.revise(planner, plan_state, replace(then, start=state), draws)
+            plan_state = boundary.revise(
+                planner, plan_state, replace(then, start=state), draws
+            )
         step = replace(step_at(state), traversability=observed, time_s=0.1 * count)
         answer = boundary.act(planner, step, plan_state, first)
         plan_state = answer.plan_state
@@ -119,13 +129,20 @@ def test_a_revised_search_is_the_whole_search_of_the_new_map(name: str) -> None:
     revised, anew = planner.revise(plan_state, then), astar.search(then)
     assert torch.equal(revised.field.cost, anew.cost)
     assert torch.equal(revised.field.following, anew.following)
-    assert torch.equal(revised.ground.penalty_per_m, planner.init(then, generator()).ground.penalty_per_m)
+    assert torch.equal(
+        revised.ground.penalty_per_m,
+        planner.init(then, generator()).ground.penalty_per_m,
+    )
     assert revised.local.problem.risk_map is not plan_state.local.problem.risk_map
     assert torch.equal(revised.local.problem.risk_map, then.risk_map)
     # Now a hill is seen on the second map.
-    heights = torch.zeros(2, 24, 30).index_put((torch.tensor(1), torch.tensor(12)), torch.tensor(4.0))
+    heights = torch.zeros(2, 24, 30).index_put(
+        (torch.tensor(1), torch.tensor(12)), torch.tensor(4.0)
+    )
     hill = replace(then, observation=replace(then.observation, elevation_m=heights))
-    assert torch.equal(planner.revise(revised, hill).field.cost, astar.search(hill).cost)
+    assert torch.equal(
+        planner.revise(revised, hill).field.cost, astar.search(hill).cost
+    )
     assert not torch.equal(astar.search(hill).cost, anew.cost)
 
 
@@ -137,7 +154,9 @@ def test_local_planners_keep_their_motion() -> None:
         for _ in range(3):
             _, plan_state, _ = planner.plan(first(posed), plan_state)
         revised = planner.revise(plan_state, then)
-        assert torch.equal(getattr(revised.local, kept), getattr(plan_state.local, kept))
+        assert torch.equal(
+            getattr(revised.local, kept), getattr(plan_state.local, kept)
+        )
         assert float(getattr(revised.local, kept).abs().max()) > 0
     planner, posed = make("mppi"), problem(ground())
     plan_state = planner.plan(first(posed), planner.init(posed, generator()))[1]
@@ -150,24 +169,35 @@ def test_cl_rrt_keeps_a_path_that_is_free_and_leaves_one_that_is_no_longer() -> 
     planner, posed = make("cl_rrt"), problem(ground())
     _, plan_state, _ = planner.plan(first(posed), planner.init(posed, generator()))
     revised = planner.revise(plan_state, problem(wall()))
-    assert revised.edge.tolist() == [int(plan_state.route.depth[0]), int(plan_state.edge[1])]
+    assert revised.edge.tolist() == [
+        int(plan_state.route.depth[0]),
+        int(plan_state.edge[1]),
+    ]
     slow = ground()
     slow[:, :, 14:16] = 0.5
     assert torch.equal(planner.revise(plan_state, problem(slow)).edge, plan_state.edge)
     _, after, _ = planner.plan(step_at(posed.start), revised)
-    assert not torch.equal(after.route.path[0].nan_to_num(), plan_state.route.path[0].nan_to_num())
-    assert torch.equal(after.route.path[1].nan_to_num(), plan_state.route.path[1].nan_to_num())
+    assert not torch.equal(
+        after.route.path[0].nan_to_num(), plan_state.route.path[0].nan_to_num()
+    )
+    assert torch.equal(
+        after.route.path[1].nan_to_num(), plan_state.route.path[1].nan_to_num()
+    )
 
 
 def slow(traversability: float, rows: slice = slice(8, 16)) -> Tensor:
-    """Free ground of little λ̂ across the straight path, 3 m thick, on the first of two maps only."""
+    """Free ground of little λ̂ across the straight path, 3 m thick, on the first of two
+    maps only.
+    """
     changed = ground()
     changed[0, rows, 13:19] = traversability
     return changed
 
 
 def cl_rrt_on_its_path(monkeypatch: pytest.MonkeyPatch) -> tuple[CLRRT, Any, list[int]]:
-    """CL-RRT with a path to the goal, and a list to which each search adds its number of episodes."""
+    """CL-RRT with a path to the goal, and a list to which each search adds its number
+    of episodes.
+    """
     planner, posed, searched = make("cl_rrt"), problem(ground()), []
     _, plan_state, _ = planner.plan(first(posed), planner.init(posed, generator()))
     assert plan_state.route.status.tolist() == [PlanStatus.OK] * 2
@@ -190,7 +220,9 @@ def test_cl_rrt_drives_around_ground_that_turns_slow_and_stays_free() -> None:
     assert torch.equal(track[1], unchanged[1])
 
 
-@pytest.mark.parametrize(("traversability", "searches"), [(0.85, []), (0.68, []), (0.6, [1]), (0.95, [])])
+@pytest.mark.parametrize(
+    ("traversability", "searches"), [(0.85, []), (0.68, []), (0.6, [1]), (0.95, [])]
+)
 def test_cl_rrt_searches_where_its_path_costs_a_tenth_more(
     traversability: float, searches: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,21 +236,30 @@ def test_cl_rrt_searches_where_its_path_costs_a_tenth_more(
     assert searched == searches
 
 
-def test_cl_rrt_keeps_a_dearer_path_that_no_new_one_undercuts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cl_rrt_keeps_a_dearer_path_that_no_new_one_undercuts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     planner, before, _ = cl_rrt_on_its_path(monkeypatch)
     # Slow ground from edge to edge, and a new path 3 m beside the old one.
     monkeypatch.setattr(cl_rrt, "search", lambda loop, root, *rest: detour)
     detour = before.route.select(torch.tensor([0]))
     detour = replace(detour, path=detour.path + torch.tensor([0.0, 3.0]))
-    detour = replace(detour, path=torch.cat((before.problem.start[:1, None, :2], detour.path[:, :-1]), 1))
+    detour = replace(
+        detour,
+        path=torch.cat((before.problem.start[:1, None, :2], detour.path[:, :-1]), 1),
+    )
     then = problem(slow(0.4, slice(None)))
     _, after, _ = planner.plan(step_at(then.start), planner.revise(before, then))
     assert torch.equal(after.route.path.nan_to_num(), before.route.path.nan_to_num())
     assert after.doubted.tolist() == [False, False]
     # Over quick ground the same path is taken.
-    _, after, _ = planner.plan(step_at(then.start), planner.revise(before, problem(slow(0.4, slice(8, 14)))))
+    _, after, _ = planner.plan(
+        step_at(then.start), planner.revise(before, problem(slow(0.4, slice(8, 14))))
+    )
     assert torch.equal(after.route.path[0].nan_to_num(), detour.path[0].nan_to_num())
-    assert torch.equal(after.route.path[1].nan_to_num(), before.route.path[1].nan_to_num())
+    assert torch.equal(
+        after.route.path[1].nan_to_num(), before.route.path[1].nan_to_num()
+    )
 
 
 def test_cl_rrt_tries_a_few_times_for_a_path_in_place_of_a_dearer_one(
@@ -246,15 +287,22 @@ def test_cl_rrt_tries_a_few_times_for_a_path_in_place_of_a_dearer_one(
     # What is behind the robot is driven already.
     passed = replace(then, start=then.start + torch.tensor([8.0, 0.0, 0.0]))
     fresh = replace(alone, doubted=torch.tensor([False]))
-    assert planner.revise(fresh, passed.select(torch.tensor([0]))).doubted.tolist() == [False]
+    assert planner.revise(fresh, passed.select(torch.tensor([0]))).doubted.tolist() == [
+        False
+    ]
 
 
-def test_cl_rrt_leaves_a_partial_path_that_costs_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cl_rrt_leaves_a_partial_path_that_costs_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     planner, plan_state, _ = cl_rrt_on_its_path(monkeypatch)
     partial = torch.full_like(plan_state.route.status, int(PlanStatus.PARTIAL))
     plan_state = replace(plan_state, route=replace(plan_state.route, status=partial))
     revised = planner.revise(plan_state, problem(slow(0.4)))
-    assert revised.edge.tolist() == [int(plan_state.route.depth[0]), int(plan_state.edge[1])]
+    assert revised.edge.tolist() == [
+        int(plan_state.route.depth[0]),
+        int(plan_state.edge[1]),
+    ]
     assert revised.doubted.tolist() == [False, False]
 
 
@@ -297,7 +345,9 @@ def test_a_planner_that_cannot_revise_begins_anew_where_the_robots_are() -> None
     again = boundary.revise(planner, plan_state, moved, generator())
     assert planner.begun == 2
     assert torch.equal(planner.start, posed.start + 1)
-    assert torch.equal(moved.start, posed.start + 1), "it wrote into what is not its own"
+    assert torch.equal(moved.start, posed.start + 1), (
+        "it wrote into what is not its own"
+    )
     assert torch.equal(again.risk_map, wall())
 
 
@@ -312,4 +362,6 @@ def test_of_a_batch_the_map_that_has_changed_is_searched_anew_and_no_other() -> 
     wanted = planner.init(after, generator())
     assert torch.equal(found.field.cost, wanted.field.cost)
     assert torch.equal(found.field.following, wanted.field.following)
-    assert not torch.equal(found.field.cost, planner.init(before, generator()).field.cost)
+    assert not torch.equal(
+        found.field.cost, planner.init(before, generator()).field.cost
+    )

@@ -21,13 +21,17 @@ angles = st.floats(-10, 10)
 
 
 def steered(heading: float, x: float, y: float, robot=UNICYCLE) -> list[float]:  # type: ignore[no-untyped-def]
-    return steer_toward(torch.tensor([[1.0, 2.0, heading]]), torch.tensor([[x, y]]), robot)[0].tolist()
+    return steer_toward(
+        torch.tensor([[1.0, 2.0, heading]]), torch.tensor([[x, y]]), robot
+    )[0].tolist()
 
 
 def test_it_drives_at_full_speed_at_what_it_looks_at() -> None:
     assert steered(0.0, 5.0, 2.0) == pytest.approx([1.0, 0.0])
     assert steered(math.pi / 2, 1.0, 5.0) == pytest.approx([1.0, 0.0], abs=1e-6)
-    assert steered(0.0, 5.0, 2.0, Unicycle(speed_mps=(0, 2))) == pytest.approx([2.0, 0.0])
+    assert steered(0.0, 5.0, 2.0, Unicycle(speed_mps=(0, 2))) == pytest.approx(
+        [2.0, 0.0]
+    )
 
 
 def test_it_turns_to_the_nearer_side_and_slows() -> None:
@@ -67,18 +71,24 @@ def test_a_robot_that_steers_drives_while_it_turns() -> None:
 
 @given(heading=angles, x=angles, y=angles)
 @settings(max_examples=60, deadline=None)
-def test_actions_keep_the_bounds_and_a_whole_turn_changes_nothing(heading: float, x: float, y: float) -> None:
+def test_actions_keep_the_bounds_and_a_whole_turn_changes_nothing(
+    heading: float, x: float, y: float
+) -> None:
     for robot in (UNICYCLE, BICYCLE):
         speed, turn = steered(heading, x, y, robot)
         assert robot.action_low[0] <= speed <= robot.action_high[0]
         assert robot.action_low[1] - 1e-6 <= turn <= robot.action_high[1] + 1e-6
         if abs(math.hypot(x - 1, y - 2)) > 0.1 and abs(turn) < 0.5:
-            assert steered(heading + 2 * math.pi, x, y, robot)[1] == pytest.approx(turn, abs=1e-3)
+            assert steered(heading + 2 * math.pi, x, y, robot)[1] == pytest.approx(
+                turn, abs=1e-3
+            )
 
 
 @pytest.mark.parametrize("robot", [UNICYCLE, DifferentialDrive(), BICYCLE])
 def test_it_arrives_however_it_looked_at_first(robot) -> None:  # type: ignore[no-untyped-def]
-    problem = factories.problem(torch.full((4, 24, 30), 0.8), (6.0, 6.0), (11.0, 9.0), robot)
+    problem = factories.problem(
+        torch.full((4, 24, 30), 0.8), (6.0, 6.0), (11.0, 9.0), robot
+    )
     start = problem.start.clone()
     start[:, 2] = torch.tensor([0.0, 2.0, 3.7, -2.0])
     driven = drive(Straight(), replace(problem, start=start), time_budget_s=40)
@@ -129,7 +139,11 @@ def test_what_a_planner_does_not_say_has_a_default() -> None:
             return torch.zeros(len(step.state), 2), None, Plan.empty(len(step.state))
 
     planner, task = Least(), factories.task()
-    assert (planner.follows(task), planner.remarks(task), planner.compiled) == ("", (), None)
+    assert (planner.follows(task), planner.remarks(task), planner.compiled) == (
+        "",
+        (),
+        None,
+    )
     assert (planner.steers, planner.blind) == (None, False)
     assert planner.select(None, torch.tensor([0])) is NotImplemented
     check_steers(planner, BICYCLE, "least")

@@ -12,7 +12,9 @@ from benchnav.core.terrain import Terrain
 from benchnav.planning.sensing.belief import Law
 
 
-def mixture(batch: int, height: int, width: int, seed: int = 0, atoms: bool = True) -> TraversabilityMixture:
+def mixture(
+    batch: int, height: int, width: int, seed: int = 0, atoms: bool = True
+) -> TraversabilityMixture:
     """Two components a cell, of which the lower reaches under 0 and the upper over 1."""
     generator = torch.Generator().manual_seed(seed)
     shape = (batch, 1, height, width)
@@ -20,14 +22,20 @@ def mixture(batch: int, height: int, width: int, seed: int = 0, atoms: bool = Tr
     low = 0.05 + 0.1 * torch.rand(shape, generator=generator, dtype=torch.float64)
     high = 0.6 + 0.3 * torch.rand(shape, generator=generator, dtype=torch.float64)
     stds = torch.full_like(torch.cat((low, high), 1), 0.1 if atoms else 0.005)
-    return TraversabilityMixture(torch.cat((share, 1 - share), 1), torch.cat((low, high), 1), stds)
+    return TraversabilityMixture(
+        torch.cat((share, 1 - share), 1), torch.cat((low, high), 1), stds
+    )
 
 
-def law(height: int, width: int, correlation_m: float = 1.0, resolution_m: float = 0.5) -> Law:
+def law(
+    height: int, width: int, correlation_m: float = 1.0, resolution_m: float = 0.5
+) -> Law:
     return Law(grid=Grid(height, width, resolution_m), correlation_m=correlation_m)
 
 
-def terrain(truth: TraversabilityMixture, field: Tensor, resolution_m: float = 0.5) -> Terrain:
+def terrain(
+    truth: TraversabilityMixture, field: Tensor, resolution_m: float = 0.5
+) -> Terrain:
     batch, height, width = truth.shape
     maps = torch.zeros(batch, height, width)
     return Terrain(
@@ -39,5 +47,7 @@ def terrain(truth: TraversabilityMixture, field: Tensor, resolution_m: float = 0
 def scores(law: Law, count: int, seed: int = 0) -> Tensor:
     """Normal scores as the world draws them, shape [count, H, W]."""
     key = rng.stream_key(seed, "scores")
-    drawn = correlated_normal(key, np.arange(count), law.grid.shape, law.correlation_cells)
+    drawn = correlated_normal(
+        key, np.arange(count), law.grid.shape, law.correlation_cells
+    )
     return torch.from_numpy(drawn)

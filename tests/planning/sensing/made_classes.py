@@ -1,4 +1,6 @@
-"""Predictions of look-alike classes, and looks at them, for tests of the belief that learns which ground is of."""
+"""Predictions of look-alike classes, and looks at them, for tests of the belief that
+learns which ground is of.
+"""
 
 import torch
 from torch import Tensor
@@ -23,16 +25,27 @@ def law_of(
     pairs: tuple[tuple[str, str], ...] = PAIRS,
 ) -> Law:
     statistics = GroundStatistics(
-        weights=(1.0,), means=(0.5,), stds=(0.2,), layer_means={}, look_alikes=pairs, potts_strength=strength
+        weights=(1.0,),
+        means=(0.5,),
+        stds=(0.2,),
+        layer_means={},
+        look_alikes=pairs,
+        potts_strength=strength,
     )
     return Law(
-        grid=Grid(height, width, 0.5), correlation_m=correlation_m, statistics=statistics, class_names=NAMES
+        grid=Grid(height, width, 0.5),
+        correlation_m=correlation_m,
+        statistics=statistics,
+        class_names=NAMES,
     )
 
 
 def prediction(weights: Tensor) -> TraversabilityMixture:
     """A component a class, from weights of shape [B, 5, H, W]."""
-    means, stds = (torch.tensor(own).double()[:, None, None].expand_as(weights) for own in (MEANS, STDS))
+    means, stds = (
+        torch.tensor(own).double()[:, None, None].expand_as(weights)
+        for own in (MEANS, STDS)
+    )
     return TraversabilityMixture(weights, means, stds, (0, 1, 2, 3, 4))
 
 
@@ -44,23 +57,31 @@ def even(batch: int, height: int, width: int) -> TraversabilityMixture:
 
 
 def mixed(batch: int, height: int, width: int, seed: int = 0) -> TraversabilityMixture:
-    """All classes with some weight: left of the first pair, right of the second, rock below."""
+    """All classes with some weight: left of the first pair, right of the second, rock
+    below.
+    """
     generator = torch.Generator().manual_seed(seed)
-    weights = 0.005 + 0.02 * torch.rand(batch, 5, height, width, generator=generator, dtype=torch.float64)
+    weights = 0.005 + 0.02 * torch.rand(
+        batch, 5, height, width, generator=generator, dtype=torch.float64
+    )
     weights[:, :2, :-2, : width // 2] += 0.4
     weights[:, 3:, :-2, width // 2 :] += 0.4
     weights[:, 2, -2:] += 0.9
     return prediction(weights / weights.sum(1, keepdim=True))
 
 
-def looked(shape: tuple[int, ...], values: dict[tuple[int, int], float], std: float = 0.1) -> Sensed:
+def looked(
+    shape: tuple[int, ...], values: dict[tuple[int, int], float], std: float = 0.1
+) -> Sensed:
     found = torch.full(shape, torch.nan, dtype=torch.float64)
     for (row, column), value in values.items():
         found[:, row, column] = value
     return Sensed(traversability=found, std=torch.full_like(found, std))
 
 
-def after(belief: Classes, prior: TraversabilityMixture, law: Law, *looks: Sensed) -> ClassesState:
+def after(
+    belief: Classes, prior: TraversabilityMixture, law: Law, *looks: Sensed
+) -> ClassesState:
     state = belief.init(prior, law)
     for sensed in looks:
         state = belief.update(state, sensed)

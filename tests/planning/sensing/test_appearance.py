@@ -17,7 +17,12 @@ from benchnav.planning.sensing.appearance import Memory, masked, remember
 from benchnav.planning.sensing.near import Near
 from benchnav.planning.sensing.sensor import Appearance, Full, Moment
 
-MEANS = {"rgb": (10.4, 99.6, 200.5), "elevation_m": (1.75,), "slope_deg": (12.5,), "vegetation_m": (0.3,)}
+MEANS = {
+    "rgb": (10.4, 99.6, 200.5),
+    "elevation_m": (1.75,),
+    "slope_deg": (12.5,),
+    "vegetation_m": (0.3,),
+}
 
 
 def terrain_from(recipe_id: str, maps: int = 3) -> Terrain:
@@ -26,13 +31,17 @@ def terrain_from(recipe_id: str, maps: int = 3) -> Terrain:
     return terrain_of(generate(recipe, split, np.arange(maps)), recipe)
 
 
-def appearance_of(terrain: Terrain, seen: Tensor, doubt: float | Tensor = 0.0) -> Appearance:
+def appearance_of(
+    terrain: Terrain, seen: Tensor, doubt: float | Tensor = 0.0
+) -> Appearance:
     doubts = torch.full(seen.shape, doubt) if isinstance(doubt, float) else doubt
     return Appearance(seen=seen, observation=terrain.observe(), doubt=doubts)
 
 
 @pytest.mark.parametrize("recipe_id", ["tiny-v1", "stakes-v1", "vegetation-v1"])
-def test_what_was_all_seen_without_noise_is_the_observation_bit_for_bit(recipe_id: str) -> None:
+def test_what_was_all_seen_without_noise_is_the_observation_bit_for_bit(
+    recipe_id: str,
+) -> None:
     terrain = terrain_from(recipe_id)
     states = torch.zeros(3, 3)
     sensed = Full().sense(terrain, terrain.traversability, states, Moment((1, 2, 3), 0))
@@ -64,7 +73,9 @@ def test_a_clear_look_near_the_robot_is_the_observation_there() -> None:
     assert torch.equal(known.layers["seen"], seen.float())
     assert torch.equal(known.rgb.movedim(1, -1)[seen], truth.rgb.movedim(1, -1)[seen])
     assert torch.equal(known.elevation_m[seen], truth.elevation_m[seen])
-    assert torch.equal(known.layers["vegetation_m"][seen], truth.layers["vegetation_m"][seen])
+    assert torch.equal(
+        known.layers["vegetation_m"][seen], truth.layers["vegetation_m"][seen]
+    )
     inner = known.slope_deg != 12.5
     assert inner.double().mean() > 0.01
     assert torch.equal(known.slope_deg[inner], truth.slope_deg[inner])
@@ -87,7 +98,9 @@ def test_where_nothing_was_seen_are_the_training_means(seed: int, share: float) 
         grid=grid,
     )
     known = masked(memory, MEANS)
-    expected = torch.tensor([10, 100, 200], dtype=torch.uint8)  # halves go to the even number
+    expected = torch.tensor(
+        [10, 100, 200], dtype=torch.uint8
+    )  # halves go to the even number
     assert (known.rgb.movedim(1, -1)[~seen] == expected).all()
     assert (known.rgb.movedim(1, -1)[seen] == 7).all()
     assert (known.elevation_m[~seen] == 1.75).all()
@@ -100,12 +113,18 @@ def test_where_nothing_was_seen_are_the_training_means(seed: int, share: float) 
     for own in range(2):
         for row in range(height):
             for column in range(width):
-                around = seen[own, max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+                around = seen[
+                    own, max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2
+                ]
                 right = slopes[own, row, column] if bool(around.all()) else 12.5
-                assert float(known.slope_deg[own, row, column]) == pytest.approx(right, abs=1e-3)
+                assert float(known.slope_deg[own, row, column]) == pytest.approx(
+                    right, abs=1e-3
+                )
 
 
-def test_of_two_looks_the_one_with_less_doubt_is_kept_and_of_equal_ones_the_earlier() -> None:
+def test_of_two_looks_the_one_with_less_doubt_is_kept_and_of_equal_ones_the_earlier() -> (
+    None
+):
     terrain = terrain_from("vegetation-v1", 1)
     shape = terrain.elevation_m.shape
 
@@ -119,7 +138,9 @@ def test_of_two_looks_the_one_with_less_doubt_is_kept_and_of_equal_ones_the_earl
         )
         seen = torch.zeros(shape, dtype=torch.bool)
         seen[:, :, cells] = True
-        return Appearance(seen=seen, observation=observation, doubt=torch.full(shape, doubt))
+        return Appearance(
+            seen=seen, observation=observation, doubt=torch.full(shape, doubt)
+        )
 
     memory = before = Memory.none(terrain)
     for value, cells, doubt in (
@@ -148,7 +169,8 @@ def test_memories_are_of_their_own_episodes() -> None:
     memory = remember(Memory.none(terrain), appearance_of(terrain, seen, 1.0))
     order = torch.tensor([2, 0])
     alone = remember(
-        Memory.none(terrain.select(order)), appearance_of(terrain.select(order), seen[order], 1.0)
+        Memory.none(terrain.select(order)),
+        appearance_of(terrain.select(order), seen[order], 1.0),
     )
     some, same = masked(memory.select(order), MEANS), masked(alone, MEANS)
     for name in ("rgb", "elevation_m", "slope_deg"):

@@ -9,7 +9,13 @@ from benchnav.core.chosen import ChosenDistribution, choose
 from benchnav.core.copula import correlations
 from benchnav.core.errors import ConfigError
 from benchnav.core.pooled import pool
-from benchnav.planning.sensing.belief import Law, Predicted, Static, draw_scores, fields_of
+from benchnav.planning.sensing.belief import (
+    Law,
+    Predicted,
+    Static,
+    draw_scores,
+    fields_of,
+)
 from benchnav.planning.sensing.score_table import VALUES, value_at
 from benchnav.planning.sensing.sensor import Sensed
 from tests.planning.sensing import made
@@ -35,9 +41,15 @@ def test_static_believes_something_else_where_the_prediction_is_another() -> Non
     state = belief.init(prior, LAW)
     cells = torch.zeros(2, 10, 12, dtype=torch.bool)
     cells[1, 3, 4:7] = True
-    other = replace(prior, means=torch.where(cells[:, None], 1 - prior.means, prior.means))
-    nothing = Sensed(traversability=torch.full((2, 10, 12), torch.nan), std=torch.ones(2, 10, 12))
-    assert torch.equal(belief.changed(state, belief.update(state, nothing, other)), cells)
+    other = replace(
+        prior, means=torch.where(cells[:, None], 1 - prior.means, prior.means)
+    )
+    nothing = Sensed(
+        traversability=torch.full((2, 10, 12), torch.nan), std=torch.ones(2, 10, 12)
+    )
+    assert torch.equal(
+        belief.changed(state, belief.update(state, nothing, other)), cells
+    )
     assert not belief.changed(state, belief.update(state, nothing)).any()
 
 
@@ -63,7 +75,8 @@ def test_fields_have_the_marginals_and_the_laws_correlation(correlated: bool) ->
             expected = float(prior.cdf(level)[own, row, column])
             assert (drawn <= level).mean() == pytest.approx(expected, abs=0.07)
     rank = stats.spearmanr(fields[0, :, 4, 5], fields[0, :, 4, 6])[0]
-    # Spearman's ρ of normal numbers of correlation r is 6/π asin(r/2); atoms make it a little less.
+    # Spearman's ρ of normal numbers of correlation r is 6/π asin(r/2); atoms make it a
+    # little less.
     expected = 6 / np.pi * np.arcsin(np.exp(-1 / 18) / 2) if correlated else 0
     assert rank == pytest.approx(expected, abs=0.1)
 
@@ -72,7 +85,9 @@ def test_an_episodes_fields_are_its_own_keys() -> None:
     prior = made.mixture(2, 10, 12)
     belief = Static()
     both = belief.sample_fields(belief.init(prior, LAW), 4, KEYS)
-    one = belief.sample_fields(belief.init(prior.select(torch.tensor([1])), LAW), 4, KEYS[1:])
+    one = belief.sample_fields(
+        belief.init(prior.select(torch.tensor([1])), LAW), 4, KEYS[1:]
+    )
     assert torch.equal(both[1:], one)
     more = belief.sample_fields(belief.init(prior, LAW), 6, KEYS)
     assert torch.equal(more[:, :4], both)
@@ -92,10 +107,14 @@ def test_fields_that_are_drawn_have_the_laws_nugget() -> None:
 
 
 @pytest.mark.parametrize("correlation_m", [0.4, 1.5])
-def test_scores_are_correlated_as_those_of_the_world_along_both_axes(correlation_m: float) -> None:
+def test_scores_are_correlated_as_those_of_the_world_along_both_axes(
+    correlation_m: float,
+) -> None:
     law = made.law(5, 7, correlation_m)
     drawn = draw_scores(law, 20000, (7,))[0].flatten(1).double()
-    down, across = (correlations(size, law.correlation_cells) for size in law.grid.shape)
+    down, across = (
+        correlations(size, law.correlation_cells) for size in law.grid.shape
+    )
     row, column = np.divmod(np.arange(35), 7)
     wanted = down[abs(row[:, None] - row)] * across[abs(column[:, None] - column)]
     np.testing.assert_allclose(drawn.T @ drawn / 20000, wanted, atol=0.035)
@@ -106,13 +125,20 @@ def test_fields_that_are_told_from_a_table_have_the_ranks_of_their_scores() -> N
     prior, law = made.mixture(3, 10, 12), made.law(10, 12)
     scores = draw_scores(law, 200, (1, 2, 3)).double()
     assert prior.searched
-    found, wanted = Predicted(prior=prior, law=law).fields(scores), fields_of(prior, scores)
+    found, wanted = (
+        Predicted(prior=prior, law=law).fields(scores),
+        fields_of(prior, scores),
+    )
     assert float((found - wanted).abs().max()) < 0.01
     assert float((found - wanted).abs().mean()) < 0.0005
     for end in (0.0, 1.0):  # atoms are whole
         assert torch.equal(found == end, wanted == end)
         assert float((wanted == end).double().mean()) > 0.02
-    known = Predicted(prior=prior, law=law).select(torch.tensor([2, 0])).fields(scores[[2, 0]])
+    known = (
+        Predicted(prior=prior, law=law)
+        .select(torch.tensor([2, 0]))
+        .fields(scores[[2, 0]])
+    )
     assert torch.equal(known, found[[2, 0]])
 
 

@@ -1,4 +1,6 @@
-"""Probabilities of classes against all labellings of small patches, and on simulated maps."""
+"""Probabilities of classes against all labellings of small patches, and on simulated
+maps.
+"""
 
 import itertools
 from dataclasses import replace
@@ -37,7 +39,9 @@ def islands() -> TraversabilityMixture:
     return prediction(weights)
 
 
-def enumerated(values: dict[tuple[int, int], float], law: Law, std: float) -> np.ndarray:
+def enumerated(
+    values: dict[tuple[int, int], float], law: Law, std: float
+) -> np.ndarray:
     """Probability of the first class, over all labellings; at most one value is 0 or 1."""
     places, seen = list(values), np.array(list(values.values()))
     at = np.array(places)
@@ -47,7 +51,10 @@ def enumerated(values: dict[tuple[int, int], float], law: Law, std: float) -> np
     inside = (seen > 0) & (seen < 1)
 
     def shares(label: int, value: float, name: str) -> float:
-        own, rock = getattr(stats.norm(MEANS[label], STDS[label]), name), getattr(stats.norm(0.3, 0.2), name)
+        own, rock = (
+            getattr(stats.norm(MEANS[label], STDS[label]), name),
+            getattr(stats.norm(0.3, 0.2), name),
+        )
         return float(0.9 * own(value) + 0.1 * rock(value))
 
     def likelihood(labels: tuple[int, ...]) -> float:
@@ -56,24 +63,41 @@ def enumerated(values: dict[tuple[int, int], float], law: Law, std: float) -> np
             for own, value in zip(labels, seen, strict=True)
         ])  # fmt: skip
         known, inner = scores[inside], covariance[np.ix_(inside, inside)]
-        found = stats.multivariate_normal(np.zeros(len(known)), inner).pdf(known) if len(known) else 1.0
-        for own, value, score in zip(np.array(labels)[inside], seen[inside], known, strict=True):
+        found = (
+            stats.multivariate_normal(np.zeros(len(known)), inner).pdf(known)
+            if len(known)
+            else 1.0
+        )
+        for own, value, score in zip(
+            np.array(labels)[inside], seen[inside], known, strict=True
+        ):
             found *= shares(own, value, "pdf") / stats.norm.pdf(score)
         for place in np.flatnonzero(~inside):
-            pull = np.linalg.solve(inner, covariance[inside, place]) if len(known) else np.zeros(0)
-            mean, spread = pull @ known, covariance[place, place] - pull @ covariance[inside, place]
+            pull = (
+                np.linalg.solve(inner, covariance[inside, place])
+                if len(known)
+                else np.zeros(0)
+            )
+            mean, spread = (
+                pull @ known,
+                covariance[place, place] - pull @ covariance[inside, place],
+            )
             off = (scores[place] - mean) / np.sqrt(spread)
             found *= stats.norm.cdf(off) if seen[place] <= 0 else stats.norm.sf(off)
         return float(found)
 
-    known = {labels: likelihood(labels) for labels in itertools.product((0, 1), repeat=len(places))}
+    known = {
+        labels: likelihood(labels)
+        for labels in itertools.product((0, 1), repeat=len(places))
+    }
     total, first = 0.0, np.zeros((3, 3))
     assert law.statistics is not None
     for bits in itertools.product((0, 1), repeat=9):
         field = np.array(bits).reshape(3, 3)
         alike = (field[1:] == field[:-1]).sum() + (field[:, 1:] == field[:, :-1]).sum()
         weight = (
-            np.exp(law.statistics.potts_strength * alike) * known[tuple(field[place] for place in places)]
+            np.exp(law.statistics.potts_strength * alike)
+            * known[tuple(field[place] for place in places)]
         )
         total, first = total + weight, first + weight * (field == 0)
     return first / total
@@ -94,32 +118,52 @@ def test_probabilities_are_those_of_all_labellings(
     law, prior = law_of(12, 12), islands()
     state = Classes().init(prior, law)
     # Random numbers of its own for each patch.
-    labels = torch.randint(-(2**62), 2**62, state.labels.shape, generator=torch.Generator().manual_seed(2))
-    state = replace(state, sweeps=6 * torch.arange(len(PLACES)), labels=2 * labels + (labels & 1))
+    labels = torch.randint(
+        -(2**62), 2**62, state.labels.shape, generator=torch.Generator().manual_seed(2)
+    )
+    state = replace(
+        state, sweeps=6 * torch.arange(len(PLACES)), labels=2 * labels + (labels & 1)
+    )
     for values in looks:
         found = torch.full(prior.shape, torch.nan, dtype=torch.float64)
         for own, (top, left) in enumerate(PLACES):
             for (row, column), value in values.items():
                 found[own, top + row, left + column] = value
-        state = Classes().update(state, Sensed(traversability=found, std=torch.full_like(found, std)))
+        state = Classes().update(
+            state, Sensed(traversability=found, std=torch.full_like(found, std))
+        )
     chance = state.probability()
-    patches = [chance[own, row : row + 3, column : column + 3] for own, (row, column) in enumerate(PLACES)]
+    patches = [
+        chance[own, row : row + 3, column : column + 3]
+        for own, (row, column) in enumerate(PLACES)
+    ]
     values = {place: value for each in looks for place, value in each.items()}
     # Each patch has 64 chains of its own.
-    np.testing.assert_allclose(torch.stack(patches).mean(0), enumerated(values, law, std), atol=0.025)
+    np.testing.assert_allclose(
+        torch.stack(patches).mean(0), enumerated(values, law, std), atol=0.025
+    )
     assert float(torch.stack(patches).std(0).max()) < 0.1
 
 
 def potts(count: int, size: int, strength: float, seed: int) -> Tensor:
-    """Labels of maps after long heat-bath sweeps from even, and from all-alike, ones; bool, [count, size, size]."""
+    """Labels of maps after long heat-bath sweeps from even, and from all-alike, ones;
+    bool, [count, size, size].
+    """
     generator = np.random.default_rng(seed)
     labels = generator.choice([-1, 1], (count, size, size))
     labels[count // 2 :] = generator.choice([-1, 1], (count - count // 2, 1, 1))
     even = np.add.outer(np.arange(size), np.arange(size)) % 2
     for step in range(800):
         ring = np.pad(labels, ((0, 0), (1, 1), (1, 1)))
-        around = ring[:, :-2, 1:-1] + ring[:, 2:, 1:-1] + ring[:, 1:-1, :-2] + ring[:, 1:-1, 2:]
-        drawn = np.where(generator.random(labels.shape) < 1 / (1 + np.exp(-strength * around)), 1, -1)
+        around = (
+            ring[:, :-2, 1:-1]
+            + ring[:, 2:, 1:-1]
+            + ring[:, 1:-1, :-2]
+            + ring[:, 1:-1, 2:]
+        )
+        drawn = np.where(
+            generator.random(labels.shape) < 1 / (1 + np.exp(-strength * around)), 1, -1
+        )
         labels = np.where(even == step % 2, drawn, labels)
     return torch.from_numpy(labels > 0)
 
@@ -129,14 +173,22 @@ def test_probabilities_of_classes_are_calibrated_on_simulated_maps(count: int) -
     size, std, strength = 24, 0.1, 0.85
     law, prior = law_of(size, size, 1.5, strength), even(count, size, size)
     first, scores = potts(count, size, strength, 1), made.scores(law, count, 3)
-    mean, deviation = (torch.where(first, own[0], own[1]).double() for own in (MEANS, STDS))
+    mean, deviation = (
+        torch.where(first, own[0], own[1]).double() for own in (MEANS, STDS)
+    )
     generator, line = np.random.default_rng(5), torch.arange(size)
     state = Classes().init(prior, law)
     for step in range(12):
-        near = ((line[:, None] - 5 - step) ** 2 + (line - 5 - 0.5 * step) ** 2 <= 4).expand(count, size, size)
+        near = (
+            (line[:, None] - 5 - step) ** 2 + (line - 5 - 0.5 * step) ** 2 <= 4
+        ).expand(count, size, size)
         noise = torch.from_numpy(generator.normal(size=first.shape)) * std
-        found = torch.where(near, (mean + deviation * (scores + noise)).clamp(0, 1), torch.nan)
-        state = Classes().update(state, Sensed(traversability=found, std=torch.full_like(found, std)))
+        found = torch.where(
+            near, (mean + deviation * (scores + noise)).clamp(0, 1), torch.nan
+        )
+        state = Classes().update(
+            state, Sensed(traversability=found, std=torch.full_like(found, std))
+        )
     chance, seen = state.probability(), state.copula.observed
     reach = torch.nn.functional.max_pool2d(seen[:, None].double(), 9, 1, 4)[:, 0] > 0
     own = (first & seen).flatten(1).sum(1) / seen.flatten(1).sum(1)
@@ -149,12 +201,18 @@ def test_probabilities_of_classes_are_calibrated_on_simulated_maps(count: int) -
         member = torch.arange(count)[:, None, None].expand_as(cells)[cells]
         for low, high in ((0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0)):
             within = (told >= low) & (told <= high)
-            off = torch.zeros(count, dtype=torch.float64).index_add(0, member[within], (truth - told)[within])
+            off = torch.zeros(count, dtype=torch.float64).index_add(
+                0, member[within], (truth - told)[within]
+            )
             # By chance, and by what 64 chains, some of them alike, leave.
             allowed = 3.5 * off.square().sum().sqrt() + 0.03 * within.sum() + 1
             assert float(off.sum().abs()) < float(allowed)
     # λ itself, by the rank that it has in what is believed.
-    lower, upper = Classes().distribution(state).cdf_limits((mean + deviation * scores).clamp(0, 1))
+    lower, upper = (
+        Classes()
+        .distribution(state)
+        .cdf_limits((mean + deviation * scores).clamp(0, 1))
+    )
     rank = lower + (upper - lower) * torch.from_numpy(generator.random(lower.shape))
     inner = ((rank > 0.05) & (rank < 0.95))[reach & ~seen].double().mean()
     assert float(inner) == pytest.approx(0.9, abs=0.03)
@@ -166,8 +224,12 @@ def test_where_a_label_is_settled_all_chains_hold_it() -> None:
     generator, state = torch.Generator().manual_seed(0), Classes().init(prior, law)
     for step in range(4):
         found = torch.full(prior.shape, torch.nan, dtype=torch.float64)
-        found[:, 2:4, 2 * step : 2 * step + 2] = torch.rand(40, 2, 2, generator=generator).double()
-        state = Classes().update(state, Sensed(traversability=found, std=torch.full_like(found, 0.1)))
+        found[:, 2:4, 2 * step : 2 * step + 2] = torch.rand(
+            40, 2, 2, generator=generator
+        ).double()
+        state = Classes().update(
+            state, Sensed(traversability=found, std=torch.full_like(found, 0.1))
+        )
         share = unpacked(state.labels).double().mean(-1)
         settled = state.copula.observed & ((state.chance - 0.5).abs() > 0.4999)
         assert settled.any()

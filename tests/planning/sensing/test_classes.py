@@ -14,7 +14,16 @@ from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.labels import unpacked
 from benchnav.planning.sensing.sensor import Sensed
 from tests.planning.sensing import made
-from tests.planning.sensing.made_classes import MEANS, STDS, after, even, law_of, looked, mixed, prediction
+from tests.planning.sensing.made_classes import (
+    MEANS,
+    STDS,
+    after,
+    even,
+    law_of,
+    looked,
+    mixed,
+    prediction,
+)
 
 LOOKS = (
     looked((2, 12, 14), {(3, 3): 0.62, (3, 4): 0.6, (4, 10): 1.0}),
@@ -30,7 +39,10 @@ def test_without_look_alikes_it_is_the_copula_belief() -> None:
     state, wanted = mine.init(prior, law), plain.init(prior, law)
     for sensed, new in zip(LOOKS, (None, other, None), strict=True):
         before, was = state, wanted
-        state, wanted = mine.update(state, sensed, new), plain.update(wanted, sensed, new)
+        state, wanted = (
+            mine.update(state, sensed, new),
+            plain.update(wanted, sensed, new),
+        )
         torch.testing.assert_close(state.copula.mean, wanted.mean, rtol=0, atol=1e-9)
         torch.testing.assert_close(state.copula.std, wanted.std, rtol=0, atol=1e-9)
         assert torch.equal(mine.changed(before, state), plain.changed(was, wanted))
@@ -38,7 +50,9 @@ def test_without_look_alikes_it_is_the_copula_belief() -> None:
     assert torch.equal(mine.at(state, some).below, plain.at(wanted, some).below)
     found, expected = mine.distribution(state), plain.distribution(wanted)
     torch.testing.assert_close(found.cdf(0.4), expected.cdf(0.4), rtol=0, atol=1e-9)
-    torch.testing.assert_close(mine.sample_fields(state, 2, (1, 2)), plain.sample_fields(wanted, 2, (1, 2)))
+    torch.testing.assert_close(
+        mine.sample_fields(state, 2, (1, 2)), plain.sample_fields(wanted, 2, (1, 2))
+    )
 
 
 def test_cells_that_cannot_be_of_a_pair_are_as_under_the_copula_belief() -> None:
@@ -58,7 +72,9 @@ def test_before_anything_is_sensed_it_is_the_prediction() -> None:
     state = Classes().init(prior, law_of(12, 14))
     found = Classes().distribution(state)
     for value in (0.1, 0.5, 0.9, 1.0):
-        torch.testing.assert_close(found.cdf(value), prior.cdf(value), rtol=0, atol=1e-9)
+        torch.testing.assert_close(
+            found.cdf(value), prior.cdf(value), rtol=0, atol=1e-9
+        )
     assert (state.pair[:, :-2, :7] == 1).all()
     assert (state.pair[:, :-2, 7:] == 2).all()
     assert (state.pair[:, -2:] == 0).all()
@@ -90,40 +106,55 @@ def test_cells_for_themselves_follow_bayes_rule() -> None:
 def test_further_looks_at_a_cell_count_with_their_own_noise() -> None:
     prior, law = mixed(1, 12, 14), law_of(12, 14, 0.0, 0.0)
     values, stds = (0.62, 0.5, 0.7), (0.5, 0.3, 0.4)
-    looks = [looked((1, 12, 14), {(3, 3): value}, std) for value, std in zip(values, stds, strict=True)]
+    looks = [
+        looked((1, 12, 14), {(3, 3): value}, std)
+        for value, std in zip(values, stds, strict=True)
+    ]
     state = after(Classes(), prior, law, *looks)
     log_odds = float(state.odds[0, 3, 3])
     for sign, look in zip((1, -1), state.looks, strict=True):
         own = [torch.full(prior.shape, value).double() for value in values]
-        scores = np.array([float(look.prior.to_normal(value)[0][0, 3, 3]) for value in own])
+        scores = np.array(
+            [float(look.prior.to_normal(value)[0][0, 3, 3]) for value in own]
+        )
         density = (
-            sum(float(look.prior.log_prob(value)[0, 3, 3]) for value in own) - stats.norm.logpdf(scores).sum()
+            sum(float(look.prior.log_prob(value)[0, 3, 3]) for value in own)
+            - stats.norm.logpdf(scores).sum()
         )
         noisy = stats.multivariate_normal(np.zeros(3), 1 + np.diag(np.square(stds)))
         log_odds += sign * (density + noisy.logpdf(scores))
-    assert float(torch.logit(state.probability()[0, 3, 3])) == pytest.approx(log_odds, abs=1e-3)
+    assert float(torch.logit(state.probability()[0, 3, 3])) == pytest.approx(
+        log_odds, abs=1e-3
+    )
 
 
 def test_strength_and_length_of_ones_own_go_before_those_of_the_law() -> None:
     prior, law, sensed = even(2, 12, 14), law_of(12, 14, 1.5, 0.3), LOOKS[0]
     plain = after(Classes(), prior, law, sensed)
     strong = after(Classes(strength=0.8), prior, law, sensed)
-    assert torch.equal(strong.chance, after(Classes(), prior, law_of(12, 14, 1.5, 0.8), sensed).chance)
+    assert torch.equal(
+        strong.chance, after(Classes(), prior, law_of(12, 14, 1.5, 0.8), sensed).chance
+    )
     beside = (strong.chance - 0.5).abs()[:, 2, 3] - (plain.chance - 0.5).abs()[:, 2, 3]
     assert bool((beside > 0.05).all())
     short = after(Classes(0.6), prior, law, sensed)
     assert torch.equal(
-        short.copula.mean, after(Classes(), prior, law_of(12, 14, 0.6, 0.3), sensed).copula.mean
+        short.copula.mean,
+        after(Classes(), prior, law_of(12, 14, 0.6, 0.3), sensed).copula.mean,
     )
     narrow = after(Classes(window=1), prior, law, *LOOKS)
-    assert not torch.equal(narrow.copula.mean, after(Classes(), prior, law, *LOOKS).copula.mean)
+    assert not torch.equal(
+        narrow.copula.mean, after(Classes(), prior, law, *LOOKS).copula.mean
+    )
 
 
 def test_a_fitted_strength_counts_up_to_the_critical_one() -> None:
     prior, law, sensed = even(2, 12, 14), law_of(12, 14, strength=2.26), LOOKS[0]
     found = after(Classes(), prior, law, sensed).chance
     assert torch.equal(found, after(Classes(strength=0.88), prior, law, sensed).chance)
-    assert not torch.equal(found, after(Classes(strength=2.26), prior, law, sensed).chance)
+    assert not torch.equal(
+        found, after(Classes(strength=2.26), prior, law, sensed).chance
+    )
 
 
 def test_what_is_known_is_an_episodes_own() -> None:
@@ -136,17 +167,28 @@ def test_what_is_known_is_an_episodes_own() -> None:
             # Of other sizes in other episodes, and nothing new in some.
             if (own + step) % 3:
                 row, column = 3 + 7 * own + step, 2 + 11 * own + step
-                block = torch.rand(2 + own, 3, generator=generator, dtype=torch.float64).mul(1.3).clamp(max=1)
+                block = (
+                    torch.rand(2 + own, 3, generator=generator, dtype=torch.float64)
+                    .mul(1.3)
+                    .clamp(max=1)
+                )
                 found[own, row : row + 2 + own, column : column + 3] = block
         looks.append(Sensed(traversability=found, std=torch.full_like(found, 0.1)))
     state = after(Classes(window=12), prior, law, *looks)
     for own in range(3):
         kept = torch.tensor([own])
-        alone = after(Classes(window=12), prior.select(kept), law, *(each.select(kept) for each in looks))
+        alone = after(
+            Classes(window=12),
+            prior.select(kept),
+            law,
+            *(each.select(kept) for each in looks),
+        )
         chosen = Classes().select(state, kept)
         assert torch.equal(alone.labels, chosen.labels)
         torch.testing.assert_close(alone.chance, chosen.chance, rtol=0, atol=1e-9)
-        torch.testing.assert_close(alone.copula.mean, chosen.copula.mean, rtol=0, atol=1e-9)
+        torch.testing.assert_close(
+            alone.copula.mean, chosen.copula.mean, rtol=0, atol=1e-9
+        )
 
 
 def test_an_update_changes_nothing_that_it_was_given() -> None:
@@ -166,7 +208,9 @@ def test_observed_cells_keep_their_traversability_whatever_their_class() -> None
     found = Classes().distribution(state)
     for place, value in values.items():
         for level in (0.1, 0.5, 0.9):
-            assert float(found.quantile(level)[0][place]) == pytest.approx(value, abs=0.01)
+            assert float(found.quantile(level)[0][place]) == pytest.approx(
+                value, abs=0.01
+            )
 
 
 def test_quantiles_of_some_cells_are_those_of_the_distribution() -> None:
@@ -189,7 +233,11 @@ def test_only_cells_of_which_something_is_learnt_change() -> None:
     assert not bool(changed[0, :, 20:].any())
     assert float(state.probability()[0, 5, 7]) > 0.6
     assert not bool(Classes().changed(state, state).any())
-    assert bool(Classes().changed(state, Classes().update(state, LOOKS_NOTHING, mixed(1, 40, 40))).all())
+    assert bool(
+        Classes()
+        .changed(state, Classes().update(state, LOOKS_NOTHING, mixed(1, 40, 40)))
+        .all()
+    )
 
 
 LOOKS_NOTHING = looked((1, 40, 40), {})
@@ -200,14 +248,22 @@ def test_sensed_traversability_is_kept_under_a_new_prediction() -> None:
     new = mixed(2, 12, 14)
     values = {(3, 3): 0.95, (3, 4): 0.93, (4, 3): 0.9, (5, 10): 0.3, (5, 11): 1.0}
     sensed = looked((2, 12, 14), values)
-    changed = Classes().update(after(Classes(), prior, law, sensed), looked((2, 12, 14), {}), new)
+    changed = Classes().update(
+        after(Classes(), prior, law, sensed), looked((2, 12, 14), {}), new
+    )
     wanted = after(Classes(), new, law, sensed)
     for one, other in zip(changed.looks, wanted.looks, strict=True):
-        torch.testing.assert_close(one.lower, other.lower, rtol=0, atol=1e-3, equal_nan=True)
+        torch.testing.assert_close(
+            one.lower, other.lower, rtol=0, atol=1e-3, equal_nan=True
+        )
     torch.testing.assert_close(changed.density, wanted.density, rtol=0, atol=1e-2)
-    torch.testing.assert_close(changed.probability(), wanted.probability(), rtol=0, atol=0.25)
+    torch.testing.assert_close(
+        changed.probability(), wanted.probability(), rtol=0, atol=0.25
+    )
     assert (changed.probability() - wanted.probability()).abs().mean() < 0.03
-    torch.testing.assert_close(changed.copula.mean, wanted.copula.mean, rtol=0, atol=0.1)
+    torch.testing.assert_close(
+        changed.copula.mean, wanted.copula.mean, rtol=0, atol=0.1
+    )
 
 
 def test_of_a_new_prediction_the_cells_count_that_are_others() -> None:
@@ -215,67 +271,104 @@ def test_of_a_new_prediction_the_cells_count_that_are_others() -> None:
     anew = torch.zeros(2, 12, 14, dtype=torch.bool)
     anew[0, :, 7:] = True
     first = after(Classes(), prior, law, LOOKS[0])
-    state = Classes().update(first, looked((2, 12, 14), {}), prior.replaced(anew, even(2, 12, 14)))
+    state = Classes().update(
+        first, looked((2, 12, 14), {}), prior.replaced(anew, even(2, 12, 14))
+    )
     assert torch.equal(state.pair, torch.where(anew, 1, first.pair))
     assert torch.equal(state.odds, torch.where(anew, 0.0, first.odds))
-    # In the other episode, and of seen ground far from λ that was scored anew, all is as it was.
+    # In the other episode, and of seen ground far from λ that was scored anew, all is
+    # as it was.
     for name in ("labels", "chance", "density"):
         assert torch.equal(getattr(state, name)[1], getattr(first, name)[1])
     assert torch.equal(state.sweeps[1], first.sweeps[1])
     assert torch.equal(state.copula.mean[1], first.copula.mean[1])
-    assert torch.equal(Classes().changed(first, state) | anew, Classes().changed(first, state))
+    assert torch.equal(
+        Classes().changed(first, state) | anew, Classes().changed(first, state)
+    )
 
 
 def test_ground_that_is_seen_later_has_patches_of_either_class() -> None:
-    law, unseen = law_of(12, 14), prediction(torch.eye(5).double()[2].view(1, 5, 1, 1).expand(1, 5, 12, 14))
+    law, unseen = (
+        law_of(12, 14),
+        prediction(torch.eye(5).double()[2].view(1, 5, 1, 1).expand(1, 5, 12, 14)),
+    )
     before = Classes().init(unseen, law)
     # Whatever the labels were of ground that could be of no pair.
     for labels in (before.labels, torch.full_like(before.labels, -1)):
-        state = Classes().update(replace(before, labels=labels), looked((1, 12, 14), {}), even(1, 12, 14))
+        state = Classes().update(
+            replace(before, labels=labels), looked((1, 12, 14), {}), even(1, 12, 14)
+        )
         bits = unpacked(state.labels)
-        assert 0.6 < float((bits[..., 1:, :] == bits[..., :-1, :]).double().mean()) < 0.9
+        assert (
+            0.6 < float((bits[..., 1:, :] == bits[..., :-1, :]).double().mean()) < 0.9
+        )
         assert float(bits.double().mean()) == pytest.approx(0.5, abs=0.1)
 
 
 def test_cells_of_no_class_are_as_under_the_copula_belief() -> None:
     law, chosen = law_of(12, 14), torch.zeros(2, 12, 14, dtype=torch.bool)
     chosen[:, :, :5] = True
-    unseen = TraversabilityMixture(*(torch.full((2, 1, 12, 14), own).double() for own in (1.0, 0.6, 0.2)))
+    unseen = TraversabilityMixture(
+        *(torch.full((2, 1, 12, 14), own).double() for own in (1.0, 0.6, 0.2))
+    )
     prior = choose(chosen, mixed(2, 12, 14), unseen)
     assert isinstance(prior, TraversabilityMixture)
     assert prior.group == (0, 1, 2, 3, 4, -1)
     sensed = looked((2, 12, 14), {(3, 10): 0.9, (4, 10): 1.0})
-    state, plain = after(Classes(), prior, law, sensed), Copula().update(Copula().init(prior, law), sensed)
+    state, plain = (
+        after(Classes(), prior, law, sensed),
+        Copula().update(Copula().init(prior, law), sensed),
+    )
     assert torch.equal(state.pair > 0, (mixed(2, 12, 14).weights[:, 2] < 0.5) & chosen)
     assert torch.equal(state.copula.mean, plain.mean)
     found, wanted = Classes().distribution(state), Copula().distribution(plain)
-    torch.testing.assert_close(found.cdf(0.6)[~chosen], wanted.cdf(0.6)[~chosen], rtol=0, atol=1e-9)
-    assert torch.equal(Classes().at(state, ~chosen).below, Copula().at(plain, ~chosen).below)
+    torch.testing.assert_close(
+        found.cdf(0.6)[~chosen], wanted.cdf(0.6)[~chosen], rtol=0, atol=1e-9
+    )
+    assert torch.equal(
+        Classes().at(state, ~chosen).below, Copula().at(plain, ~chosen).below
+    )
 
 
 def test_episodes_that_take_the_places_of_others_are_what_they_were_alone() -> None:
-    belief, law, more = Classes(), law_of(12, 14), LOOKS[2].select(torch.tensor([0, 0, 0]))
+    belief, law, more = (
+        Classes(),
+        law_of(12, 14),
+        LOOKS[2].select(torch.tensor([0, 0, 0])),
+    )
     one = after(belief, mixed(3, 12, 14), law, LOOKS[0].select(torch.tensor([0, 0, 0])))
     two = after(Classes(0.8), mixed(2, 12, 14, seed=1), law, LOOKS[1])
-    whole, cells = belief.put(one, torch.tensor([2, 0]), two), torch.ones(3, 12, 14, dtype=torch.bool)
+    whole, cells = (
+        belief.put(one, torch.tensor([2, 0]), two),
+        torch.ones(3, 12, 14, dtype=torch.bool),
+    )
     for told in (
         lambda state: state,
-        lambda state: belief.update(state, more.select(torch.arange(len(state.sweeps)))),
+        lambda state: belief.update(
+            state, more.select(torch.arange(len(state.sweeps)))
+        ),
     ):
         found = belief.at(told(whole), cells).mean().view(3, 12, 14)
         first, second = (
-            belief.at(told(state), cells[: len(state.sweeps)]).mean().view(-1, 12, 14) for state in (one, two)
+            belief.at(told(state), cells[: len(state.sweeps)]).mean().view(-1, 12, 14)
+            for state in (one, two)
         )
-        torch.testing.assert_close(found, torch.stack((second[1], first[1], second[0])), atol=1e-9, rtol=0)
+        torch.testing.assert_close(
+            found, torch.stack((second[1], first[1], second[0])), atol=1e-9, rtol=0
+        )
 
 
 def test_a_length_can_be_estimated() -> None:
     prior, law = even(1, 24, 24), law_of(24, 24, 1.5)
     scores = made.scores(law_of(24, 24, 0.5), 1)
     field = torch.full((1, 24, 24), torch.nan, dtype=torch.float64)
-    field[:, 10:14, 4:20] = (MEANS[0] + STDS[0] * scores)[:, 10:14, 4:20].clamp(0.01, 0.99)
+    field[:, 10:14, 4:20] = (MEANS[0] + STDS[0] * scores)[:, 10:14, 4:20].clamp(
+        0.01, 0.99
+    )
     sensed = Sensed(traversability=field, std=torch.full_like(field, 0.1))
-    short, fixed = (after(Classes(length), prior, law, sensed) for length in ("estimated", "world"))
+    short, fixed = (
+        after(Classes(length), prior, law, sensed) for length in ("estimated", "world")
+    )
     assert float(short.copula.field.length) < 2.0
     assert float(fixed.copula.field.length) == 3.0
 
@@ -284,7 +377,12 @@ def test_fields_that_are_drawn_have_the_distribution_and_patches() -> None:
     weights = torch.zeros(1, 5, 12, 14, dtype=torch.float64)
     weights[:, 0], weights[:, 1] = 0.7, 0.3
     prior, law = prediction(weights), law_of(12, 14)
-    state = after(Classes(), prior, law, looked((1, 12, 14), {(3, 3): 0.95, (3, 4): 0.9, (4, 3): 0.93}))
+    state = after(
+        Classes(),
+        prior,
+        law,
+        looked((1, 12, 14), {(3, 3): 0.95, (3, 4): 0.9, (4, 3): 0.93}),
+    )
     fields = Classes().sample_fields(state, 250, (7,))
     found = Classes().distribution(state)
     for place in ((3, 3), (3, 5), (8, 9), (11, 13)):
@@ -292,6 +390,8 @@ def test_fields_that_are_drawn_have_the_distribution_and_patches() -> None:
             share = float((fields[0][:, place[0], place[1]] <= level).double().mean())
             assert share == pytest.approx(float(found.cdf(level)[0][place]), abs=0.07)
     one = Classes().sample_fields(state, 3, (7,))
-    both = Classes().sample_fields(Classes().select(state, torch.tensor([0, 0])), 3, (8, 7))
+    both = Classes().sample_fields(
+        Classes().select(state, torch.tensor([0, 0])), 3, (8, 7)
+    )
     torch.testing.assert_close(both[1:], one)
     assert not torch.equal(both[:1], one)

@@ -30,21 +30,27 @@ INF = float("inf")
 FILE = "benchnav.planning.sensing.copula:Copula"
 
 
-def looked(values: dict[tuple[int, int], float], std: float = LEAST_STD, batch: int = 1) -> Sensed:
+def looked(
+    values: dict[tuple[int, int], float], std: float = LEAST_STD, batch: int = 1
+) -> Sensed:
     found = torch.full((batch, HEIGHT, WIDTH), torch.nan, dtype=torch.float64)
     for (row, column), value in values.items():
         found[:, row, column] = value
     return Sensed(traversability=found, std=torch.full_like(found, std))
 
 
-def after(belief: Copula, prior: TraversabilityDistribution, *looks: Sensed, law: Law = LAW) -> CopulaState:
+def after(
+    belief: Copula, prior: TraversabilityDistribution, *looks: Sensed, law: Law = LAW
+) -> CopulaState:
     state = belief.init(prior, law)
     for sensed in looks:
         state = belief.update(state, sensed)
     return state
 
 
-def covariance(one: list[tuple[int, int]], other: list[tuple[int, int]], length: float = 3.0) -> np.ndarray:
+def covariance(
+    one: list[tuple[int, int]], other: list[tuple[int, int]], length: float = 3.0
+) -> np.ndarray:
     away = ((np.array(one)[:, None] - np.array(other)[None]) ** 2).sum(-1)
     return np.exp(-away / (2 * length**2))
 
@@ -56,7 +62,9 @@ def test_before_anything_is_sensed_it_is_the_prediction() -> None:
     prior = made.mixture(2, HEIGHT, WIDTH)
     found = Copula().distribution(Copula().init(prior, LAW))
     for level in (0.1, 0.5, 0.9):
-        torch.testing.assert_close(found.quantile(level), prior.quantile(level), atol=1e-9, rtol=0)
+        torch.testing.assert_close(
+            found.quantile(level), prior.quantile(level), atol=1e-9, rtol=0
+        )
 
 
 def test_scores_that_are_observed_condition_the_field_as_linear_algebra_says() -> None:
@@ -72,7 +80,9 @@ def test_scores_that_are_observed_condition_the_field_as_linear_algebra_says() -
     inner = covariance(where, where) + 0.04 * np.eye(3)
     across = covariance(where, EVERY)
     mean = (across.T @ np.linalg.solve(inner, score)).reshape(HEIGHT, WIDTH)
-    variance = 1 - (across * np.linalg.solve(inner, across)).sum(0).reshape(HEIGHT, WIDTH)
+    variance = 1 - (across * np.linalg.solve(inner, across)).sum(0).reshape(
+        HEIGHT, WIDTH
+    )
     np.testing.assert_allclose(state.mean[0], mean, atol=6e-3)
     np.testing.assert_allclose(state.std[0], np.sqrt(variance), atol=6e-3)
     found = Copula().distribution(state)
@@ -81,11 +91,15 @@ def test_scores_that_are_observed_condition_the_field_as_linear_algebra_says() -
 
 
 @pytest.mark.parametrize("by_law", [True, False])
-def test_of_a_nugget_neighbours_know_nothing_and_a_cell_that_was_sensed_all(by_law: bool) -> None:
+def test_of_a_nugget_neighbours_know_nothing_and_a_cell_that_was_sensed_all(
+    by_law: bool,
+) -> None:
     prior = made.mixture(1, HEIGHT, WIDTH)
     places = {(4, 4): 0.55, (4, 5): 0.3}
     told = looked(places, std=0.01)
-    belief, law = (Copula(), replace(LAW, nugget=0.4)) if by_law else (Copula(nugget=0.4), LAW)
+    belief, law = (
+        (Copula(), replace(LAW, nugget=0.4)) if by_law else (Copula(nugget=0.4), LAW)
+    )
     state = after(belief, prior, told, law=law)
     where = list(places)
     mask = told.mask
@@ -94,7 +108,9 @@ def test_of_a_nugget_neighbours_know_nothing_and_a_cell_that_was_sensed_all(by_l
     inner = 0.6 * covariance(where, where) + (0.4 + 1e-4) * np.eye(2)
     across = 0.6 * covariance(where, EVERY) + 0.4 * same
     mean = (across.T @ np.linalg.solve(inner, score)).reshape(HEIGHT, WIDTH)
-    variance = 1 - (across * np.linalg.solve(inner, across)).sum(0).reshape(HEIGHT, WIDTH)
+    variance = 1 - (across * np.linalg.solve(inner, across)).sum(0).reshape(
+        HEIGHT, WIDTH
+    )
     np.testing.assert_allclose(state.mean[0], mean, atol=6e-3)
     np.testing.assert_allclose(state.std[0], np.sqrt(variance.clip(0)), atol=6e-3)
     assert state.std[0, 4, 4] < 0.011 < 0.5 < state.std[0, 4, 6]
@@ -118,7 +134,14 @@ def test_ground_at_zero_is_an_interval_up_to_the_atoms_end() -> None:
     state = after(Copula(), prior, looked({(6, 6): 0.0}))
     assert float(state.lower[0, 6, 6]) == -INF
     end = float(state.upper[0, 6, 6])
-    assert float(prior.from_normal(torch.full(prior.shape, end - 0.01, dtype=torch.float64))[0, 6, 6]) == 0
+    assert (
+        float(
+            prior.from_normal(torch.full(prior.shape, end - 0.01, dtype=torch.float64))[
+                0, 6, 6
+            ]
+        )
+        == 0
+    )
     found = Copula().distribution(state)
     assert float(found.cdf(0.1)[0, 6, 6]) > 0.99
     assert float(found.mean()[0, 6, 6]) < 0.005
@@ -135,23 +158,40 @@ def test_λ_that_the_prediction_holds_impossible_is_at_its_end() -> None:
         assert side * float(state.mean[0, 6, 8]) > 1
 
 
-def test_two_looks_with_noise_are_averaged_and_an_interval_is_told_by_the_sharpest() -> None:
+def test_two_looks_with_noise_are_averaged_and_an_interval_is_told_by_the_sharpest() -> (
+    None
+):
     prior = made.mixture(1, HEIGHT, WIDTH)
-    once, twice = (after(Copula(), prior, *[looked({(6, 6): 0.5}, 0.4)] * n) for n in (1, 2))
+    once, twice = (
+        after(Copula(), prior, *[looked({(6, 6): 0.5}, 0.4)] * n) for n in (1, 2)
+    )
     assert float(twice.noise_std[0, 6, 6]) == pytest.approx(0.4 / np.sqrt(2))
     assert float(twice.std[0, 6, 6]) < float(once.std[0, 6, 6])
-    apart = after(Copula(), prior, looked({(6, 6): 0.4}, 0.4), looked({(6, 6): 0.6}, 0.2))
-    scores = [float(after(Copula(), prior, looked({(6, 6): v})).lower[0, 6, 6]) for v in (0.4, 0.6)]
-    assert float(apart.lower[0, 6, 6]) == pytest.approx(0.2 * scores[0] + 0.8 * scores[1])
-    held, again = (after(Copula(), prior, *[looked({(6, 6): 0.0}, 0.4)] * n) for n in (1, 2))
+    apart = after(
+        Copula(), prior, looked({(6, 6): 0.4}, 0.4), looked({(6, 6): 0.6}, 0.2)
+    )
+    scores = [
+        float(after(Copula(), prior, looked({(6, 6): v})).lower[0, 6, 6])
+        for v in (0.4, 0.6)
+    ]
+    assert float(apart.lower[0, 6, 6]) == pytest.approx(
+        0.2 * scores[0] + 0.8 * scores[1]
+    )
+    held, again = (
+        after(Copula(), prior, *[looked({(6, 6): 0.0}, 0.4)] * n) for n in (1, 2)
+    )
     assert torch.equal(held.mean, again.mean)
     sharp, noisy = looked({(6, 6): 0.0}, 0.01), looked({(6, 6): 0.0}, 0.8)
     for looks in ((sharp, noisy), (noisy, sharp)):
         wanted = after(Copula(), prior, sharp).mean
-        torch.testing.assert_close(after(Copula(), prior, *looks).mean, wanted, atol=0.006, rtol=0)
+        torch.testing.assert_close(
+            after(Copula(), prior, *looks).mean, wanted, atol=0.006, rtol=0
+        )
     # A number says more than an interval, whichever comes first.
     for looks in ((0.0, 0.3), (0.3, 0.0)):
-        state = after(Copula(), prior, *(looked({(6, 6): value}, 0.4) for value in looks))
+        state = after(
+            Copula(), prior, *(looked({(6, 6): value}, 0.4) for value in looks)
+        )
         wanted = after(Copula(), prior, looked({(6, 6): 0.3}, 0.4)).mean
         torch.testing.assert_close(state.mean, wanted, atol=0.006, rtol=0)
 
@@ -166,9 +206,16 @@ def test_the_same_look_without_noise_changes_nothing() -> None:
 
 def test_the_order_of_looks_and_the_other_episodes_do_not_matter() -> None:
     prior = made.mixture(2, HEIGHT, WIDTH)
-    looks = [looked({(4, 4): 0.55, (4, 5): 0.0}, 0.1), looked({(6, 6): 0.3}, 0.1), looked({(5, 9): 1.0}, 0.1)]
+    looks = [
+        looked({(4, 4): 0.55, (4, 5): 0.0}, 0.1),
+        looked({(6, 6): 0.3}, 0.1),
+        looked({(5, 9): 1.0}, 0.1),
+    ]
     first = prior.select(torch.tensor([0]))
-    forward, backward = after(Copula(), first, *looks), after(Copula(), first, *looks[::-1])
+    forward, backward = (
+        after(Copula(), first, *looks),
+        after(Copula(), first, *looks[::-1]),
+    )
     torch.testing.assert_close(forward.mean, backward.mean, atol=0.012, rtol=0)
     torch.testing.assert_close(forward.std, backward.std, atol=0.012, rtol=0)
     state = Copula().init(prior, LAW)
@@ -176,7 +223,9 @@ def test_the_order_of_looks_and_the_other_episodes_do_not_matter() -> None:
         both = sensed.traversability.repeat(2, 1, 1)
         both[1] = torch.nan
         both[1, 2 : 4 + 4 * place, 2 + 3 * place] = 0.4
-        state = Copula().update(state, Sensed(traversability=both, std=torch.full_like(both, 0.1)))
+        state = Copula().update(
+            state, Sensed(traversability=both, std=torch.full_like(both, 0.1))
+        )
     assert torch.equal(state.mean[:1], forward.mean)
     assert torch.equal(state.std[:1], forward.std)
     kept = Copula().select(state, torch.tensor([1]))
@@ -188,12 +237,19 @@ def test_nothing_is_told_beyond_four_lengths() -> None:
     prior = made.mixture(1, 40, 40)
     found = torch.full((1, 40, 40), torch.nan, dtype=torch.float64)
     found[0, 20, 20] = 0.2
-    state = after(Copula(), prior, Sensed(traversability=found, std=torch.full_like(found, 0.01)), law=law)
+    state = after(
+        Copula(),
+        prior,
+        Sensed(traversability=found, std=torch.full_like(found, 0.01)),
+        law=law,
+    )
     told = (state.mean != 0).nonzero()[:, 1:] - 20
     assert 5 <= int(told.abs().max()) <= 8
     # Nor is anything noted that is under the least change: a correlation of 0.004 here.
     score = float(state.lower[0, 20, 20])
-    assert float(state.mean[0, 20, 26]) == pytest.approx(score * np.exp(-36 / 8), abs=0.006)
+    assert float(state.mean[0, 20, 26]) == pytest.approx(
+        score * np.exp(-36 / 8), abs=0.006
+    )
 
 
 def test_the_reach_is_of_an_episodes_own_cells_whatever_others_sense() -> None:
@@ -207,14 +263,20 @@ def test_the_reach_is_of_an_episodes_own_cells_whatever_others_sense() -> None:
     assert torch.equal(both.std[:1] != 1, alone.std != 1)
 
 
-def simulated(length: float, batch: int = 15, size: int = 24) -> tuple[TraversabilityMixture, Tensor, Sensed]:
-    """Ground of some ℓ in metres, of which the cells along a winding way are observed with noise."""
+def simulated(
+    length: float, batch: int = 15, size: int = 24
+) -> tuple[TraversabilityMixture, Tensor, Sensed]:
+    """Ground of some ℓ in metres, of which the cells along a winding way are observed
+    with noise.
+    """
     law = made.law(size, size, length)
     prior, score = made.mixture(batch, size, size), made.scores(law, batch)
     noise = torch.from_numpy(np.random.default_rng(0).normal(0, 0.1, score.shape))
     row = np.arange(size)
     way = abs(row[:, None] - size / 2 - 6 * np.sin(row / 4)) <= 3.0
-    field = prior.from_normal(score + noise).masked_fill(~torch.from_numpy(way), torch.nan)
+    field = prior.from_normal(score + noise).masked_fill(
+        ~torch.from_numpy(way), torch.nan
+    )
     assert 140 <= way.sum() <= 170
     return prior, field, Sensed(traversability=field, std=torch.full_like(field, 0.1))
 
@@ -230,7 +292,9 @@ def test_the_length_that_is_estimated_is_that_of_the_ground(length: float) -> No
 
 
 def test_an_estimate_is_the_mode_of_the_posterior_by_brute_force() -> None:
-    """Against the likelihood of numbers and intervals by SciPy, with the prior of the logarithm."""
+    """Against the likelihood of numbers and intervals by SciPy, with the prior of the
+    logarithm.
+    """
     prior = made.mixture(1, HEIGHT, WIDTH)
     said = {
         (2, 2): 0.5,
@@ -247,7 +311,8 @@ def test_an_estimate_is_the_mode_of_the_posterior_by_brute_force() -> None:
         state = after(Copula("estimated"), prior, looked(places, 0.1))
         where = list(places)
         low, high = (
-            np.array([float(side[0][place]) for place in where]) for side in (state.lower, state.upper)
+            np.array([float(side[0][place]) for place in where])
+            for side in (state.lower, state.upper)
         )
         held = high > low
         modes = []
@@ -255,16 +320,24 @@ def test_an_estimate_is_the_mode_of_the_posterior_by_brute_force() -> None:
         for length in grid / LAW.grid.resolution_m:
             along = correlations(WIDTH, length)
             away = abs(np.array(where)[:, None] - np.array(where)[None])
-            inner = along[away[..., 0]] * along[away[..., 1]] + 0.01 * np.eye(len(where))
-            numbers = stats.multivariate_normal(cov=inner[np.ix_(~held, ~held)]).logpdf(low[~held])
-            gain = inner[np.ix_(held, ~held)] @ np.linalg.inv(inner[np.ix_(~held, ~held)])
+            inner = along[away[..., 0]] * along[away[..., 1]] + 0.01 * np.eye(
+                len(where)
+            )
+            numbers = stats.multivariate_normal(cov=inner[np.ix_(~held, ~held)]).logpdf(
+                low[~held]
+            )
+            gain = inner[np.ix_(held, ~held)] @ np.linalg.inv(
+                inner[np.ix_(~held, ~held)]
+            )
             spread = inner[np.ix_(held, held)] - gain @ inner[np.ix_(~held, held)]
             end = (high[held] - gain @ low[~held]) / np.sqrt(np.diag(spread))
             assert len(end) == 1
             away_from_median = np.log(length * LAW.grid.resolution_m / 1.5) / np.log(2)
             modes.append(numbers + stats.norm.logcdf(end)[0] - away_from_median**2 / 2)
         expected = grid[int(np.argmax(modes))]
-        assert float(state.field.length) * LAW.grid.resolution_m == pytest.approx(expected)
+        assert float(state.field.length) * LAW.grid.resolution_m == pytest.approx(
+            expected
+        )
         assert expected != 1.5
 
 
@@ -277,7 +350,9 @@ def test_a_length_is_estimated_each_time_that_observations_have_doubled() -> Non
     for row, column in places[:100]:
         value = torch.full_like(field, torch.nan)
         value[0, row, column] = field[0, row, column]
-        state = belief.update(state, Sensed(traversability=value, std=torch.full_like(value, 0.1)))
+        state = belief.update(
+            state, Sensed(traversability=value, std=torch.full_like(value, 0.1))
+        )
         found.append(int(state.estimated_from[0]))
     assert sorted(set(found)) == [0, 8, 16, 32, 64]
     assert state.estimated_from[1] == 0
@@ -286,9 +361,13 @@ def test_a_length_is_estimated_each_time_that_observations_have_doubled() -> Non
     # All cells are then as if that length had been believed from the beginning.
     short, _, sensed = simulated(0.6)
     state = after(belief, short, sensed, law=law)
-    for own, length in enumerate((state.field.length * law.grid.resolution_m).tolist()[:3]):
+    for own, length in enumerate(
+        (state.field.length * law.grid.resolution_m).tolist()[:3]
+    ):
         own_ = torch.tensor([own])
-        one = after(Copula(length, window=40), short.select(own_), sensed.select(own_), law=law)
+        one = after(
+            Copula(length, window=40), short.select(own_), sensed.select(own_), law=law
+        )
         torch.testing.assert_close(state.mean[own_], one.mean, atol=1e-6, rtol=0)
         alone = after(belief, short.select(own_), sensed.select(own_), law=law)
         assert torch.equal(alone.mean, state.mean[own_])
@@ -297,19 +376,32 @@ def test_a_length_is_estimated_each_time_that_observations_have_doubled() -> Non
 
 
 @pytest.mark.parametrize("correlation_m", [0.0, 0.5])
-def test_the_length_that_is_believed_takes_the_worlds_place(correlation_m: float) -> None:
+def test_the_length_that_is_believed_takes_the_worlds_place(
+    correlation_m: float,
+) -> None:
     prior = made.mixture(1, HEIGHT, WIDTH)
     state = after(Copula(correlation_m), prior, looked({(6, 6): 0.2}))
-    other = after(Copula(), prior, looked({(6, 6): 0.2}), law=made.law(HEIGHT, WIDTH, correlation_m))
+    other = after(
+        Copula(),
+        prior,
+        looked({(6, 6): 0.2}),
+        law=made.law(HEIGHT, WIDTH, correlation_m),
+    )
     assert torch.equal(state.mean, other.mean)
     if correlation_m == 0:
         assert (state.mean != 0).nonzero().tolist() == [[0, 6, 6]]
 
 
-def test_many_observations_of_a_smooth_field_are_taken_by_a_lattice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_observations_of_a_smooth_field_are_taken_by_a_lattice(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     used = []
     around = Lattice.around
-    monkeypatch.setattr(Lattice, "around", lambda *given: used.append(len(given[2][0])) or around(*given))
+    monkeypatch.setattr(
+        Lattice,
+        "around",
+        lambda *given: used.append(len(given[2][0])) or around(*given),
+    )
     for length_m, window in ((1.5, 8), (2.5, 64), (2.5, 8)):
         law = made.law(HEIGHT, WIDTH, length_m)
         after(
@@ -349,7 +441,9 @@ def test_an_approximation_that_errs_makes_no_cell_less_sure(
 def test_numbers_make_no_cell_less_sure_and_tell_the_same_one_by_one(
     seed: int, count: int, parts: int, length_m: float, window: int
 ) -> None:
-    """With the dense equations, and where the window is small and ℓ long with the lattice."""
+    """With the dense equations, and where the window is small and ℓ long with the
+    lattice.
+    """
     generator, law = np.random.default_rng(seed), made.law(HEIGHT, WIDTH, length_m)
     prior = TraversabilityMixture(
         *(torch.full((1, 1, HEIGHT, WIDTH), one).double() for one in (1.0, 0.5, 0.1))
@@ -366,10 +460,13 @@ def test_numbers_make_no_cell_less_sure_and_tell_the_same_one_by_one(
         before, state = state, belief.update(state, sensed)
         assert float((state.std - before.std).max()) <= 0
     once = belief.update(
-        belief.init(prior, law), looked({tuple(p): float(field[tuple(p)]) for p in places}, 0.2)
+        belief.init(prior, law),
+        looked({tuple(p): float(field[tuple(p)]) for p in places}, 0.2),
     )
     for name in ("mean", "std"):
-        torch.testing.assert_close(getattr(state, name), getattr(once, name), atol=0.02, rtol=0)
+        torch.testing.assert_close(
+            getattr(state, name), getattr(once, name), atol=0.02, rtol=0
+        )
     exact = looked({tuple(places[0]): float(field[tuple(places[0])])})
     sure = belief.update(state, exact)
     again = belief.update(sure, exact)
@@ -377,7 +474,9 @@ def test_numbers_make_no_cell_less_sure_and_tell_the_same_one_by_one(
 
 
 def way(turns: bool, steps: int = 121) -> Tensor:
-    """12 m of driving in steps of 0.1 m, straight or turning until it crosses itself, shape [N, 3]."""
+    """12 m of driving in steps of 0.1 m, straight or turning until it crosses itself,
+    shape [N, 3].
+    """
     turn = torch.zeros(steps)
     if turns:
         turn[40:] = 0.1 * 2 * math.pi / 7.0  # a circle of 7 m
@@ -389,21 +488,32 @@ def way(turns: bool, steps: int = 121) -> Tensor:
 
 @pytest.mark.parametrize(("resolution_m", "radius_m"), [(0.25, 2.0), (0.5, 4.0)])
 @pytest.mark.parametrize("turns", [False, True])
-def test_what_was_learnt_is_never_forgotten(resolution_m: float, radius_m: float, turns: bool) -> None:
+def test_what_was_learnt_is_never_forgotten(
+    resolution_m: float, radius_m: float, turns: bool
+) -> None:
     """Against all observations at once, in the cells within ℓ of what was sensed."""
     height, width = round(10 / resolution_m), round(16 / resolution_m)
     law = made.law(height, width, 1.5, resolution_m)
     shape = (1, 2, height, width)
     weights, means, stds = (
-        torch.tensor(pair).view(1, 2, 1, 1).expand(shape) for pair in ((0.1, 0.9), (0.05, 0.66), (0.05, 0.1))
+        torch.tensor(pair).view(1, 2, 1, 1).expand(shape)
+        for pair in ((0.1, 0.9), (0.05, 0.66), (0.05, 0.1))
     )
-    prior = TraversabilityMixture(weights.contiguous(), means.contiguous(), stds.contiguous())
+    prior = TraversabilityMixture(
+        weights.contiguous(), means.contiguous(), stds.contiguous()
+    )
     field = prior.from_normal(made.scores(law, 1, 7).float())
-    terrain, sensor, belief = made.terrain(prior, field, resolution_m), Probe(radius_m), Copula()
+    terrain, sensor, belief = (
+        made.terrain(prior, field, resolution_m),
+        Probe(radius_m),
+        Copula(),
+    )
     state = belief.init(prior, law)
     for step, pose in enumerate(way(turns)):
         if step % 5 == 0:
-            state = belief.update(state, sensor.sense(terrain, field, pose[None], Moment((1,), step)))
+            state = belief.update(
+                state, sensor.sense(terrain, field, pose[None], Moment((1,), step))
+            )
     cells = state.observed[0].nonzero(as_tuple=True)
     known = Observed(
         *(
@@ -416,7 +526,9 @@ def test_what_was_learnt_is_never_forgotten(resolution_m: float, radius_m: float
     away = torch.hypot(lines[0] - row, lines[1] - column).amin(-1) * resolution_m
     wanted = (~state.observed[0] & (away < radius_m + 1.5)).nonzero(as_tuple=True)
     among, across = (
-        state.field.covariance(0, cells[0][:, None] - other[0], cells[1][:, None] - other[1]).numpy()
+        state.field.covariance(
+            0, cells[0][:, None] - other[0], cells[1][:, None] - other[1]
+        ).numpy()
         for other in (cells, wanted)
     )
     mean, variance, skew = predict(condition(among, known), among, known, across)
@@ -427,12 +539,15 @@ def test_what_was_learnt_is_never_forgotten(resolution_m: float, radius_m: float
     place = torch.zeros(1, height, width, dtype=torch.bool)
     place[0][wanted] = True
     found = belief.distribution(state).at(place)
-    moments = (torch.from_numpy(values)[None, :, None].float() for values in (mean, std, skew))
+    moments = (
+        torch.from_numpy(values)[None, :, None].float() for values in (mean, std, skew)
+    )
     whole = ConditionedDistribution(
         prior.at(place), *(values.view(prior.at(place).shape) for values in moments)
     )
     scores = [
-        one.log_prob(field[place].view(prior.at(place).shape)).clamp(min=-10).mean() for one in (found, whole)
+        one.log_prob(field[place].view(prior.at(place).shape)).clamp(min=-10).mean()
+        for one in (found, whole)
     ]
     assert abs(float(scores[0] - scores[1])) < 0.05
 
@@ -442,12 +557,18 @@ def test_what_was_observed_at_a_cell_is_kept_where_there_is_no_room_for_it(
 ) -> None:
     prior = made.mixture(1, HEIGHT, WIDTH)
     field = prior.from_normal(made.scores(LAW, 1))
-    told = {place: 0.0 if place % 3 == 1 else max(float(field[0, 6, place]), 0.2) for place in range(2, 12)}
+    told = {
+        place: 0.0 if place % 3 == 1 else max(float(field[0, 6, place]), 0.2)
+        for place in range(2, 12)
+    }
     for room in (1, 2, 256):
         monkeypatch.setattr("benchnav.planning.sensing.copula._MOST_AT_ONCE", room)
         state = Copula().init(prior, LAW)
         for place, value in told.items():
-            before, state = state, Copula().update(state, looked({(6, place): value}, 0.05))
+            before, state = (
+                state,
+                Copula().update(state, looked({(6, place): value}, 0.05)),
+            )
             # An interval may widen when its neighbours are told.
             number = before.lower == before.upper
             assert float((state.std - before.std)[number].clamp(min=0).sum()) < 0.02
@@ -464,14 +585,25 @@ def test_a_look_at_more_cells_than_the_window_tells_of_all() -> None:
 
 
 @pytest.mark.parametrize("part", [1.0, 0.4, 0.0])
-def test_another_prediction_of_some_cells_is_conditioned_on_the_same_λ(part: float) -> None:
-    prior, other = made.mixture(2, HEIGHT, WIDTH), made.mixture(2, HEIGHT, WIDTH, seed=3)
+def test_another_prediction_of_some_cells_is_conditioned_on_the_same_λ(
+    part: float,
+) -> None:
+    prior, other = (
+        made.mixture(2, HEIGHT, WIDTH),
+        made.mixture(2, HEIGHT, WIDTH, seed=3),
+    )
     anew = torch.arange(WIDTH).expand(2, HEIGHT, WIDTH) < part * WIDTH
     other = prior.replaced(anew, other)
-    looks = [looked({(4, 4): 0.5, (6, 6): 0.0}, 0.1, 2), looked({(10, 12): 0.4, (4, 4): 0.45}, 0.1, 2)]
+    looks = [
+        looked({(4, 4): 0.5, (6, 6): 0.0}, 0.1, 2),
+        looked({(10, 12): 0.4, (4, 4): 0.45}, 0.1, 2),
+    ]
     state = after(Copula(), prior, *looks)
     state = replace(state, table=state.table.having(prior, torch.ones_like(anew)))
-    found, wanted = Copula().update(state, looked({}, batch=2), other), after(Copula(), other, *looks)
+    found, wanted = (
+        Copula().update(state, looked({}, batch=2), other),
+        after(Copula(), other, *looks),
+    )
     # λ̂ is another everywhere there, also where the score stayed.
     changed = Copula().changed(state, found)
     assert (changed | ~anew).all()
@@ -480,9 +612,15 @@ def test_another_prediction_of_some_cells_is_conditioned_on_the_same_λ(part: fl
     torch.testing.assert_close(found.std, wanted.std, atol=0.02, rtol=0)
     every = torch.ones_like(anew)
     torch.testing.assert_close(
-        Copula().at(found, every).mean(), Copula().at(wanted, every).mean(), atol=0.01, rtol=0
+        Copula().at(found, every).mean(),
+        Copula().at(wanted, every).mean(),
+        atol=0.01,
+        rtol=0,
     )
-    assert torch.equal(Copula().distribution(found).at(every).mean() > 0, wanted.prior.at(every).mean() > 0)
+    assert torch.equal(
+        Copula().distribution(found).at(every).mean() > 0,
+        wanted.prior.at(every).mean() > 0,
+    )
     if part == 0:
         assert found.mean is state.mean or torch.equal(found.mean, state.mean)
         assert found.prior is state.prior
@@ -490,11 +628,15 @@ def test_another_prediction_of_some_cells_is_conditioned_on_the_same_λ(part: fl
 
 def test_λ_that_one_prediction_holds_impossible_is_remembered_for_the_next() -> None:
     sure = torch.ones(1, 1, HEIGHT, WIDTH, dtype=torch.float64)
-    wrong, right = (TraversabilityMixture(sure, mean * sure, 0.05 * sure) for mean in (0.8, 0.2))
+    wrong, right = (
+        TraversabilityMixture(sure, mean * sure, 0.05 * sure) for mean in (0.8, 0.2)
+    )
     state = after(Copula(), wrong, looked({(6, 6): 0.15}))
     found = Copula().update(state, looked({}), right)
     assert float(found.lower[0, 6, 6]) == pytest.approx(-1.0)
-    assert float(Copula().distribution(found).mean()[0, 6, 6]) == pytest.approx(0.15, abs=0.01)
+    assert float(Copula().distribution(found).mean()[0, 6, 6]) == pytest.approx(
+        0.15, abs=0.01
+    )
 
 
 def test_a_prediction_that_drifts_is_taken_when_it_has_moved() -> None:
@@ -509,21 +651,30 @@ def test_a_prediction_that_drifts_is_taken_when_it_has_moved() -> None:
 
 def test_fields_that_are_drawn_have_what_is_believed_and_what_was_observed() -> None:
     prior = made.mixture(1, HEIGHT, WIDTH)
-    state = after(Copula(), prior, looked({(4, 4): 0.5, (4, 7): 0.0, (9, 9): 0.85}, 0.05))
+    state = after(
+        Copula(), prior, looked({(4, 4): 0.5, (4, 7): 0.0, (9, 9): 0.85}, 0.05)
+    )
     fields = Copula().sample_fields(state, 800, (9,))[0]
     found = Copula().distribution(state)
     for place in ((4, 4), (4, 5), (6, 7), (9, 9), (13, 0)):
         drawn = fields[:, *place].numpy()
         for level in (0.1, 0.3, 0.6, 0.9):
-            assert (drawn <= level).mean() == pytest.approx(float(found.cdf(level)[0][place]), abs=0.07)
+            assert (drawn <= level).mean() == pytest.approx(
+                float(found.cdf(level)[0][place]), abs=0.07
+            )
     # Cells between are drawn together: their scores keep the correlation that is left.
     left = covariance([(6, 7)], [(6, 8)]) - (
         covariance([(6, 7)], [(4, 4), (9, 9)])
-        @ np.linalg.inv(covariance([(4, 4), (9, 9)], [(4, 4), (9, 9)]) + 0.0025 * np.eye(2))
+        @ np.linalg.inv(
+            covariance([(4, 4), (9, 9)], [(4, 4), (9, 9)]) + 0.0025 * np.eye(2)
+        )
         @ covariance([(4, 4), (9, 9)], [(6, 8)])
     )
     assert left > 0.3
-    ranks = fields[:, 6, 7].argsort().argsort().double(), fields[:, 6, 8].argsort().argsort().double()
+    ranks = (
+        fields[:, 6, 7].argsort().argsort().double(),
+        fields[:, 6, 8].argsort().argsort().double(),
+    )
     assert float(torch.corrcoef(torch.stack(ranks))[0, 1]) > 0.5
     # Two batches of one key are the same fields.
     again = Copula().sample_fields(state, 40, (9,))[0]
@@ -531,8 +682,12 @@ def test_fields_that_are_drawn_have_what_is_believed_and_what_was_observed() -> 
 
 
 @pytest.mark.parametrize("sensor", [Contact(), Probe(1.0, 0.1)])
-def test_nine_of_ten_cells_near_the_robot_lie_in_the_90_percent_interval(sensor: Contact | Probe) -> None:
-    """Randomised PIT of cells not yet observed, within 2ℓ of a robot on a straight way, by maps."""
+def test_nine_of_ten_cells_near_the_robot_lie_in_the_90_percent_interval(
+    sensor: Contact | Probe,
+) -> None:
+    """Randomised PIT of cells not yet observed, within 2ℓ of a robot on a straight way,
+    by maps.
+    """
     batch, steps = 150, 10
     law = made.law(20, 20, 1.5)
     prior = made.mixture(batch, 20, 20)
@@ -541,8 +696,12 @@ def test_nine_of_ten_cells_near_the_robot_lie_in_the_90_percent_interval(sensor:
     belief = Copula()
     state = belief.init(prior, law)
     for step in range(steps):
-        where = torch.tensor([[1.25 + 0.6 * step, 5.1, 0.0]], dtype=torch.float64).repeat(batch, 1)
-        state = belief.update(state, sensor.sense(terrain, field, where, Moment(keys, step)))
+        where = torch.tensor(
+            [[1.25 + 0.6 * step, 5.1, 0.0]], dtype=torch.float64
+        ).repeat(batch, 1)
+        state = belief.update(
+            state, sensor.sense(terrain, field, where, Moment(keys, step))
+        )
     row, column = torch.arange(20)[:, None] * 0.5 + 0.25, torch.arange(20) * 0.5 + 0.25
     near = torch.hypot(row - 5.1, column - float(where[0, 0])) <= 3.0
     asked = near[None] & ~state.observed
@@ -551,11 +710,17 @@ def test_nine_of_ten_cells_near_the_robot_lie_in_the_90_percent_interval(sensor:
     pit = torch.lerp(low, high, draw)
     inside = ((pit > 0.05) & (pit < 0.95)) & asked
     by_map = inside.flatten(1).sum(1) / asked.flatten(1).sum(1)
-    share, error = float(inside.sum() / asked.sum()), float(by_map.std() / np.sqrt(batch))
+    share, error = (
+        float(inside.sum() / asked.sum()),
+        float(by_map.std() / np.sqrt(batch)),
+    )
     assert abs(share - 0.9) < 2.5 * error
     assert error < 0.012
     # And the belief is narrower than the prediction.
-    gain = prior.log_prob(field)[asked].mean() - belief.distribution(state).log_prob(field)[asked].mean()
+    gain = (
+        prior.log_prob(field)[asked].mean()
+        - belief.distribution(state).log_prob(field)[asked].mean()
+    )
     assert float(gain) < -0.05
 
 
@@ -566,7 +731,10 @@ def test_of_some_cells_it_is_told_quickly_what_is_believed(base: str) -> None:
         values = torch.stack([prior.quantile(level) for level in LEVELS], 1)
         prior = QuantileDistribution(values)
     state = Copula().init(prior, LAW)
-    for sensed in (looked({(4, 4): 0.5, (4, 7): 0.0}, 0.05, 2), looked({(9, 9): 1.0}, 0.2, 2)):
+    for sensed in (
+        looked({(4, 4): 0.5, (4, 7): 0.0}, 0.05, 2),
+        looked({(9, 9): 1.0}, 0.2, 2),
+    ):
         state = Copula().update(state, sensed)
     cells = torch.zeros(2, HEIGHT, WIDTH, dtype=torch.bool)
     cells[0, 3:10, 3:10] = cells[1, 8:, 5] = True
@@ -577,7 +745,10 @@ def test_of_some_cells_it_is_told_quickly_what_is_believed(base: str) -> None:
         lambda one: 1 / one.expected_time(0.05), lambda one: one.chance(0.1),
     ):  # fmt: skip
         torch.testing.assert_close(
-            measure(found), measure(exact), atol=0.005 if base == "mixture" else 0.01, rtol=0
+            measure(found),
+            measure(exact),
+            atol=0.005 if base == "mixture" else 0.01,
+            rtol=0,
         )
 
 
@@ -591,12 +762,20 @@ def test_cells_are_told_that_have_changed() -> None:
     assert not changed[1].any()
     assert torch.equal(changed[0], (after.mean[0] != 0) | (after.std[0] != 1))
     assert changed[0, 6, 6]
-    assert not Copula().changed(after, Copula().update(after, sensed.select(torch.tensor([1, 1])))).any()
+    assert (
+        not Copula()
+        .changed(after, Copula().update(after, sensed.select(torch.tensor([1, 1]))))
+        .any()
+    )
 
 
 @pytest.mark.parametrize("noise_std", [LEAST_STD, 0.1])
-def test_beside_ground_at_zero_risk_is_that_of_all_fields_that_match(noise_std: float) -> None:
-    """Against a million pairs of scores; a Gaussian posterior of the score would be off by 0.02 right beside it."""
+def test_beside_ground_at_zero_risk_is_that_of_all_fields_that_match(
+    noise_std: float,
+) -> None:
+    """Against a million pairs of scores; a Gaussian posterior of the score would be off
+    by 0.02 right beside it.
+    """
     prior = made.mixture(1, HEIGHT, WIDTH)
     state = after(Copula(), prior, looked({(6, 6): 0.0}, noise_std))
     found, end = Copula().distribution(state), float(state.upper[0, 6, 6])
@@ -616,14 +795,20 @@ def test_beside_ground_at_zero_risk_is_that_of_all_fields_that_match(noise_std: 
         assert len(matching) == 40_000
         believed = found.at(place)
         worst = matching.sort()[0][:8000].mean()
-        assert float(believed.mean()) == pytest.approx(float(matching.mean()), abs=0.004)
+        assert float(believed.mean()) == pytest.approx(
+            float(matching.mean()), abs=0.004
+        )
         assert float(believed.cvar(0.8)) == pytest.approx(float(worst), abs=0.003)
-        assert float(believed.cdf(0.1)) == pytest.approx(float((matching <= 0.1).double().mean()), abs=0.007)
+        assert float(believed.cdf(0.1)) == pytest.approx(
+            float((matching <= 0.1).double().mean()), abs=0.007
+        )
 
 
 def test_the_length_is_a_number_or_a_word_in_a_suite() -> None:
     def of(value: Any) -> Copula:
-        return registry.make("belief", {"part": FILE, "options": {"correlation_m": value}})
+        return registry.make(
+            "belief", {"part": FILE, "options": {"correlation_m": value}}
+        )
 
     assert [of(value).correlation_m for value in (0.75, 2, "world", "estimated")] == [
         0.75,
@@ -633,12 +818,15 @@ def test_the_length_is_a_number_or_a_word_in_a_suite() -> None:
     ]
     for value in ("guessed", None):
         with pytest.raises(
-            ConfigError, match=r"`correlation_m` of belief .* as a number or 'world' or 'estimated'"
+            ConfigError,
+            match=r"`correlation_m` of belief .* as a number or 'world' or 'estimated'",
         ):
             of(value)
 
 
-@pytest.mark.parametrize("wrong", [{"correlation_m": -1.0}, {"correlation_m": "guessed"}, {"window": 0}])
+@pytest.mark.parametrize(
+    "wrong", [{"correlation_m": -1.0}, {"correlation_m": "guessed"}, {"window": 0}]
+)
 def test_what_cannot_be_believed_is_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         Copula(**wrong)
@@ -651,12 +839,20 @@ def test_a_state_is_not_changed_by_an_update() -> None:
     Copula().update(state, looked({(6, 6): 0.0}))
     for name in ("lower", "upper", "noise_std", "precision", "shift", "mean", "std"):
         one: Tensor = getattr(state, name)
-        torch.testing.assert_close(one, getattr(before, name), rtol=0, atol=0, equal_nan=True)
+        torch.testing.assert_close(
+            one, getattr(before, name), rtol=0, atol=0, equal_nan=True
+        )
 
 
 def test_episodes_that_take_the_places_of_others_are_what_they_were_alone() -> None:
-    belief, looks = Copula(), (looked({(4, 4): 0.5, (9, 2): 0.0}, batch=3), looked({(6, 6): 0.3}, batch=2))
-    prior, other = made.mixture(3, HEIGHT, WIDTH), made.mixture(2, HEIGHT, WIDTH, seed=1)
+    belief, looks = (
+        Copula(),
+        (looked({(4, 4): 0.5, (9, 2): 0.0}, batch=3), looked({(6, 6): 0.3}, batch=2)),
+    )
+    prior, other = (
+        made.mixture(3, HEIGHT, WIDTH),
+        made.mixture(2, HEIGHT, WIDTH, seed=1),
+    )
     one, two = after(belief, prior, looks[0]), after(belief, other, looks[1])
     whole = belief.put(one, torch.tensor([2, 0]), two)
     more = looked({(7, 5): 0.6}, batch=3)
@@ -664,14 +860,20 @@ def test_episodes_that_take_the_places_of_others_are_what_they_were_alone() -> N
         (whole, (one, two), whole),
         (
             belief.update(whole, more),
-            tuple(belief.update(each, more.select(torch.arange(len(each.mean)))) for each in (one, two)),
+            tuple(
+                belief.update(each, more.select(torch.arange(len(each.mean))))
+                for each in (one, two)
+            ),
             whole,
         ),
     ):
         cells = torch.ones(3, HEIGHT, WIDTH, dtype=torch.bool)
         found = belief.at(state, cells).mean().view(3, HEIGHT, WIDTH)
         first, second = (
-            belief.at(each, cells[: len(each.mean)]).mean().view(-1, HEIGHT, WIDTH) for each in alone
+            belief.at(each, cells[: len(each.mean)]).mean().view(-1, HEIGHT, WIDTH)
+            for each in alone
         )
-        torch.testing.assert_close(found, torch.stack((second[1], first[1], second[0])), atol=1e-9, rtol=0)
+        torch.testing.assert_close(
+            found, torch.stack((second[1], first[1], second[0])), atol=1e-9, rtol=0
+        )
         assert belief.changed(now, state).any() == (state is not now)

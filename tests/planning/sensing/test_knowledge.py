@@ -1,4 +1,6 @@
-"""What robots know: what they are shown, what their model is given of it, and what is believed of the rest."""
+"""What robots know: what they are shown, what their model is given of it, and what is
+believed of the rest.
+"""
 
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -25,7 +27,14 @@ from benchnav.planning.sensing.knowledge import (
     unseen_ground,
 )
 from benchnav.planning.sensing.near import Near
-from benchnav.planning.sensing.sensor import Contact, Full, Moment, Probe, Sensed, Sensor
+from benchnav.planning.sensing.sensor import (
+    Contact,
+    Full,
+    Moment,
+    Probe,
+    Sensed,
+    Sensor,
+)
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
 from tests.planning.sensing import made
@@ -43,7 +52,9 @@ SEES = Near(range_m=2.0, colour_noise=0.0, elevation_noise=0.0)
 def terrain() -> Terrain:
     generator = torch.Generator().manual_seed(3)
     mean = torch.rand(BATCH, SIZE, SIZE, generator=generator)
-    rgb = torch.randint(256, (BATCH, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8)
+    rgb = torch.randint(
+        256, (BATCH, 3, SIZE, SIZE), generator=generator, dtype=torch.uint8
+    )
     return replace(factories.terrain(mean, 0.05), rgb=rgb)
 
 
@@ -57,10 +68,14 @@ class Model:
 
     seen: list[Observation] = field(default_factory=list)
 
-    def __call__(self, terrain: Terrain, observation: Observation) -> TraversabilityDistribution:
+    def __call__(
+        self, terrain: Terrain, observation: Observation
+    ) -> TraversabilityDistribution:
         self.seen.append(observation)
         means = observation.rgb[:, :1].float() / 255
-        return TraversabilityMixture(torch.ones_like(means), means, torch.full_like(means, 0.1), (0,))
+        return TraversabilityMixture(
+            torch.ones_like(means), means, torch.full_like(means, 0.1), (0,)
+        )
 
 
 def learner(model: Any = None, **changes: Any) -> Learner:
@@ -76,13 +91,19 @@ def begin(how: Learner) -> Knowledge:
     return how.begin(TRUTH, START, None)
 
 
-def moved(how: Learner, known: Knowledge, robot_state: Tensor, step: int = 5) -> tuple[Knowledge, Tensor]:
+def moved(
+    how: Learner, known: Knowledge, robot_state: Tensor, step: int = 5
+) -> tuple[Knowledge, Tensor]:
     looks = torch.ones(BATCH, dtype=torch.bool)
-    return how.update(how.sense(known, TRUTH, robot_state, step, looks, torch.ones_like(looks)), TRUTH)
+    return how.update(
+        how.sense(known, TRUTH, robot_state, step, looks, torch.ones_like(looks)), TRUTH
+    )
 
 
 def near(robot_state: Tensor = START) -> Tensor:
-    appearance = SEES.sense(TRUTH.terrain, TRUTH.field, robot_state, Moment(KEYS, 0)).appearance
+    appearance = SEES.sense(
+        TRUTH.terrain, TRUTH.field, robot_state, Moment(KEYS, 0)
+    ).appearance
     assert appearance is not None
     return appearance.seen
 
@@ -113,7 +134,9 @@ def test_a_model_is_given_what_was_seen_and_training_means_elsewhere() -> None:
     assert len(model.seen) == 2
 
 
-def test_what_is_believed_is_the_prediction_where_ground_was_seen_and_the_prior_elsewhere() -> None:
+def test_what_is_believed_is_the_prediction_where_ground_was_seen_and_the_prior_elsewhere() -> (
+    None
+):
     known, seen = begin(how := learner()), near()
     believed = how.distribution(known)
     red = TRUTH.terrain.rgb[:, 0].float() / 255
@@ -122,27 +145,42 @@ def test_what_is_believed_is_the_prediction_where_ground_was_seen_and_the_prior_
     )
     prior = STATISTICS.mixture((BATCH, SIZE, SIZE), red)
     for ask in (lambda d: d.mean(), lambda d: d.cdf(0.4), lambda d: d.cvar(0.5)):
-        torch.testing.assert_close(ask(believed), torch.where(seen, ask(own), ask(prior)), atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            ask(believed), torch.where(seen, ask(own), ask(prior)), atol=1e-4, rtol=0
+        )
     torch.testing.assert_close(
-        known.risk_map, torch.where(seen, own.cvar(0.5), prior.cvar(0.5)), atol=0.01, rtol=0
+        known.risk_map,
+        torch.where(seen, own.cvar(0.5), prior.cvar(0.5)),
+        atol=0.01,
+        rtol=0,
     )
-    assert torch.equal(known.free, torch.where(seen, own.mean() > 0.3, prior.mean() > 0.3))
+    assert torch.equal(
+        known.free, torch.where(seen, own.mean() > 0.3, prior.mean() > 0.3)
+    )
 
 
 def test_a_model_of_another_kind_than_mixtures_is_taken_too() -> None:
-    def quantiles(terrain: Terrain, observation: Observation) -> TraversabilityDistribution:
+    def quantiles(
+        terrain: Terrain, observation: Observation
+    ) -> TraversabilityDistribution:
         red = observation.rgb[:, 0].float() / 255
-        return QuantileDistribution(torch.stack([(red + 0.2 * (own - 0.5)).clamp(0, 1) for own in LEVELS], 1))
+        return QuantileDistribution(
+            torch.stack([(red + 0.2 * (own - 0.5)).clamp(0, 1) for own in LEVELS], 1)
+        )
 
     known = begin(how := learner(quantiles))
     believed, seen = how.distribution(known).mean(), near()
     red = TRUTH.terrain.rgb[:, 0].float() / 255
     assert (believed - red)[seen].abs().max() < 0.06
-    torch.testing.assert_close(believed[~seen], STATISTICS.mixture((BATCH, SIZE, SIZE), red).mean()[~seen])
+    torch.testing.assert_close(
+        believed[~seen], STATISTICS.mixture((BATCH, SIZE, SIZE), red).mean()[~seen]
+    )
 
 
 def test_privileged_models_tell_of_seen_ground_alone() -> None:
-    def oracle(terrain: Terrain, observation: Observation) -> TraversabilityDistribution:
+    def oracle(
+        terrain: Terrain, observation: Observation
+    ) -> TraversabilityDistribution:
         return terrain.truth
 
     known = begin(how := learner(oracle))
@@ -152,12 +190,16 @@ def test_privileged_models_tell_of_seen_ground_alone() -> None:
     torch.testing.assert_close(believed[~seen], prior.mean()[~seen])
 
     # One that knows λ itself knows it as it is now.
-    def clairvoyant(terrain: Terrain, observation: Observation) -> TraversabilityDistribution:
+    def clairvoyant(
+        terrain: Terrain, observation: Observation
+    ) -> TraversabilityDistribution:
         return factories.certain(terrain.traversability)
 
     later = learner(clairvoyant)
     now = later.begin(replace(TRUTH, field=1 - TRUTH.field), START, None)
-    torch.testing.assert_close(later.distribution(now).mean()[seen], 1 - TRUTH.field[seen])
+    torch.testing.assert_close(
+        later.distribution(now).mean()[seen], 1 - TRUTH.field[seen]
+    )
 
 
 @pytest.mark.parametrize("unseen", ["prior", "optimistic", "pessimistic"])
@@ -167,26 +209,43 @@ def test_unseen_ground_is_believed_to_be_what_the_rules_say(unseen: str) -> None
     assert found.shape == (2, 4, 5)
     assert found.dtype == like.dtype
     prior = STATISTICS.mixture(like.shape, like)
-    # CVaR at 0.8 of 0.7 N(0.8, 0.1²) + 0.3 N(0.1, 0.05²), clipped, from its worst fifth.
+    # CVaR at 0.8 of 0.7 N(0.8, 0.1²) + 0.3 N(0.1, 0.05²), clipped, from its worst
+    # fifth.
     grid = torch.linspace(0.0005, 0.1995, 200, dtype=torch.float64)
-    worst = torch.stack([STATISTICS.mixture((1, 1, 1), grid).quantile(float(share)) for share in grid]).mean()
-    wanted = {"prior": float(prior.mean()[0, 0, 0]), "optimistic": 1.0, "pessimistic": float(worst)}[unseen]
-    torch.testing.assert_close(found.mean(), torch.full_like(like, wanted), atol=2e-3, rtol=0)
+    worst = torch.stack(
+        [STATISTICS.mixture((1, 1, 1), grid).quantile(float(share)) for share in grid]
+    ).mean()
+    wanted = {
+        "prior": float(prior.mean()[0, 0, 0]),
+        "optimistic": 1.0,
+        "pessimistic": float(worst),
+    }[unseen]
+    torch.testing.assert_close(
+        found.mean(), torch.full_like(like, wanted), atol=2e-3, rtol=0
+    )
     if unseen != "prior":  # without doubt
         torch.testing.assert_close(found.cvar(0.9), found.mean(), atol=1e-6, rtol=0)
     assert 0.05 < float(worst) < 0.1
 
 
 @pytest.mark.parametrize("unseen", ["prior", "optimistic", "pessimistic"])
-def test_pessimism_lowers_what_unseen_ground_is_worth_and_closes_none(unseen: str) -> None:
+def test_pessimism_lowers_what_unseen_ground_is_worth_and_closes_none(
+    unseen: str,
+) -> None:
     known, seen = begin(learner(rules=replace(RULES, unseen=unseen))), near()
     usual = begin(learner())
     assert torch.equal(known.risk_map[seen], usual.risk_map[seen])
     assert torch.equal(known.free[seen], usual.free[seen])
     assert not usual.free[seen].all(), "all of it is free"
     assert known.free[~seen].all()
-    lower, higher = (known.risk_map < usual.risk_map)[~seen], (known.risk_map > usual.risk_map)[~seen]
-    assert (bool(lower.all()), bool(higher.all())) == (unseen == "pessimistic", unseen == "optimistic")
+    lower, higher = (
+        (known.risk_map < usual.risk_map)[~seen],
+        (known.risk_map > usual.risk_map)[~seen],
+    )
+    assert (bool(lower.all()), bool(higher.all())) == (
+        unseen == "pessimistic",
+        unseen == "optimistic",
+    )
 
 
 def test_pessimism_closes_no_unseen_ground_either_when_more_is_known_of_it() -> None:
@@ -198,11 +257,18 @@ def test_pessimism_closes_no_unseen_ground_either_when_more_is_known_of_it() -> 
     assert not known.free[known.seen].all()
 
 
-def test_a_sensor_that_looks_and_senses_at_once_does_both_in_the_same_episodes() -> None:
+def test_a_sensor_that_looks_and_senses_at_once_does_both_in_the_same_episodes() -> (
+    None
+):
     class Both(Sensor):
-        def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
+        def sense(
+            self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
+        ) -> Sensed:
             sensed = Contact().sense(terrain, field, robot_state, moment)
-            return replace(sensed, appearance=SEES.sense(terrain, field, robot_state, moment).appearance)
+            return replace(
+                sensed,
+                appearance=SEES.sense(terrain, field, robot_state, moment).appearance,
+            )
 
     how = learner(sensor=Both(), belief=Static())
     two = torch.tensor([True, False, True])
@@ -233,7 +299,9 @@ def test_sensors_are_asked_when_it_is_due_and_where_robots_are(belief: Any) -> N
         def __init__(self, inner: Sensor) -> None:
             self.inner = inner
 
-        def sense(self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment) -> Sensed:
+        def sense(
+            self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
+        ) -> Sensed:
             asked.append(type(self.inner).__name__)
             return self.inner.sense(terrain, field, robot_state, moment)
 
@@ -265,7 +333,9 @@ def test_all_looks_between_two_updates_count_and_of_one_cell_the_later() -> None
     one = how.sense(known, TRUTH, START, 1, every, torch.ones_like(every))
     both = how.sense(one, TRUTH, START + 0.5, 2, every, torch.ones_like(every))
     first = Probe(0.8, 0.3).sense(TRUTH.terrain, TRUTH.field, START, Moment(KEYS, 1))
-    second = Probe(0.8, 0.3).sense(TRUTH.terrain, TRUTH.field, START + 0.5, Moment(KEYS, 2))
+    second = Probe(0.8, 0.3).sense(
+        TRUTH.terrain, TRUTH.field, START + 0.5, Moment(KEYS, 2)
+    )
     assert torch.equal(both.ever_sensed, first.mask | second.mask)
     assert torch.equal(both.reached, second.mask)
     wanted = torch.where(second.mask, second.traversability, first.traversability)
@@ -277,7 +347,9 @@ def test_all_looks_between_two_updates_count_and_of_one_cell_the_later() -> None
     assert torch.equal(after.ever_sensed, both.ever_sensed)
     assert changed[both.ever_sensed].any()
     at_once = Copula().update(Copula().init(TRUTH.terrain.truth, how.law), both.sensed)
-    torch.testing.assert_close(how.distribution(after).mean(), Copula().distribution(at_once).mean())
+    torch.testing.assert_close(
+        how.distribution(after).mean(), Copula().distribution(at_once).mean()
+    )
     assert torch.equal(after.risk_map[~changed], known.risk_map[~changed])
 
 
@@ -288,10 +360,14 @@ def test_episodes_are_kept_and_take_the_places_of_others() -> None:
     kept = how.select(known, last)
     assert torch.equal(kept.risk_map, known.risk_map[last])
     assert torch.equal(kept.seen, known.seen[last])
-    torch.testing.assert_close(how.distribution(kept).mean(), how.distribution(known).mean()[last])
+    torch.testing.assert_close(
+        how.distribution(kept).mean(), how.distribution(known).mean()[last]
+    )
     turned = how.put(known, torch.tensor([0, 2]), kept)
     order = torch.tensor([2, 1, 0])
-    torch.testing.assert_close(how.distribution(turned).mean(), how.distribution(known).mean()[order])
+    torch.testing.assert_close(
+        how.distribution(turned).mean(), how.distribution(known).mean()[order]
+    )
     assert torch.equal(turned.observation.rgb, known.observation.rgb[order])
     truth = TRUTH.put(torch.tensor([0, 2]), TRUTH.select(last))
     assert truth.keys == (13, 12, 11)
@@ -299,7 +375,10 @@ def test_episodes_are_kept_and_take_the_places_of_others() -> None:
 
 
 def test_without_statistics_nothing_is_known_of_unseen_ground() -> None:
-    with pytest.raises(ConfigError, match=r"`Law\.statistics` for a robot that does not see all, got None"):
+    with pytest.raises(
+        ConfigError,
+        match=r"`Law\.statistics` for a robot that does not see all, got None",
+    ):
         begin(learner(law=made.law(SIZE, SIZE)))
 
 
@@ -332,11 +411,16 @@ def fails(*given: Any, **named: Any) -> Any:
     [
         ({"sensor": type("Blind", (Near,), {"sense": fails})()}, Outcome.SENSOR_ERROR),
         ({"model": fails}, Outcome.MODEL_ERROR),
-        ({"belief": type("Broken", (Copula,), {"init": fails})()}, Outcome.BELIEF_ERROR),
+        (
+            {"belief": type("Broken", (Copula,), {"init": fails})()},
+            Outcome.BELIEF_ERROR,
+        ),
         ({"measure": fails}, Outcome.MODEL_ERROR),
     ],
 )
-def test_who_fails_at_the_start_is_named(changes: dict[str, Any], outcome: Outcome) -> None:
+def test_who_fails_at_the_start_is_named(
+    changes: dict[str, Any], outcome: Outcome
+) -> None:
     with pytest.raises(KnowledgeError, match="no") as error:
         begin(learner(**changes))
     assert error.value.outcome == outcome

@@ -38,23 +38,38 @@ def enumerated() -> np.ndarray:
     for bits in itertools.product((0, 1), repeat=9):
         labels = np.array(bits).reshape(PAIR.shape)
         alike = (labels[1:] == labels[:-1]) & (PAIR[1:] == PAIR[:-1]) & (PAIR[1:] > 0)
-        beside = (labels[:, 1:] == labels[:, :-1]) & (PAIR[:, 1:] == PAIR[:, :-1]) & (PAIR[:, 1:] > 0)
+        beside = (
+            (labels[:, 1:] == labels[:, :-1])
+            & (PAIR[:, 1:] == PAIR[:, :-1])
+            & (PAIR[:, 1:] > 0)
+        )
         weight = labels[0, 0] * np.exp(STRENGTH * (alike.sum() + beside.sum()))
         total, first = total + weight, first + weight * labels
     return np.asarray(first / total)
 
 
 def sampled(members: Tensor, sweeps: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Share of bits, and what clusters tell, over chains at many places of the torus; and the labels."""
+    """Share of bits, and what clusters tell, over chains at many places of the torus;
+    and the labels.
+    """
     row, column = (members // 12 * 4)[:, None, None], (members % 12 * 4)[:, None, None]
-    row, column = torch.broadcast_tensors(row + torch.arange(3)[:, None], column + torch.arange(3) + 0 * row)
+    row, column = torch.broadcast_tensors(
+        row + torch.arange(3)[:, None], column + torch.arange(3) + 0 * row
+    )
     lattice = Lattice.of(torch.from_numpy(PAIR).expand(len(members), 3, 3), STRENGTH)
     known = torch.zeros(len(members), 3, 3, dtype=torch.int64)
     known[:, 0, 0] = -1
     labels, even = fair(SIZE, SIZE)[row, column] | known, -((row + column) % 2)
     shares = clusters = torch.zeros(3, 3, dtype=torch.float64)
     for sweep in range(sweeps):
-        drawn = noise(torch.full_like(members, sweep), row, column, lattice.degree(), STRENGTH, SIZE)
+        drawn = noise(
+            torch.full_like(members, sweep),
+            row,
+            column,
+            lattice.degree(),
+            STRENGTH,
+            SIZE,
+        )
         labels = swept(labels, lattice, ~known, even, drawn)
         if sweep >= 10:
             tied = joined(labels, lattice, known, drawn)

@@ -35,9 +35,16 @@ def ground(elevation_m: Tensor, resolution_m: float = 0.5) -> Terrain:
     )
 
 
-def look(near: Near, terrain: Terrain, *states: tuple[float, ...], step: int = 3) -> Appearance:
+def look(
+    near: Near, terrain: Terrain, *states: tuple[float, ...], step: int = 3
+) -> Appearance:
     moment = Moment(KEYS[: len(states)], step)
-    sensed = near.sense(terrain, terrain.traversability, torch.tensor(states, dtype=torch.float64), moment)
+    sensed = near.sense(
+        terrain,
+        terrain.traversability,
+        torch.tensor(states, dtype=torch.float64),
+        moment,
+    )
     assert sensed.appearance is not None
     assert not sensed.mask.any()
     return sensed.appearance
@@ -60,7 +67,9 @@ def beside(shape: torch.Size, x: float, y: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("range_m", [0.2, 1.4, 3.0, 40.0])
-def test_on_flat_ground_a_disc_is_seen_and_what_is_beside_the_robot(range_m: float) -> None:
+def test_on_flat_ground_a_disc_is_seen_and_what_is_beside_the_robot(
+    range_m: float,
+) -> None:
     terrain = ground(torch.zeros(2, 14, 18))
     places = ((2.45, 3.2, 0.4), (8.9, 0.1, -2.0))
     seen = look(replace(CLEAR, range_m=range_m), terrain, *places).seen
@@ -71,16 +80,27 @@ def test_on_flat_ground_a_disc_is_seen_and_what_is_beside_the_robot(range_m: flo
 
 @pytest.mark.parametrize("fov_deg", [20.0, 90.0, 200.0, 359.0, 360.0])
 @pytest.mark.parametrize("heading", [0.3, 3.0, -9.0])
-def test_the_field_of_view_is_centred_on_the_heading(fov_deg: float, heading: float) -> None:
+def test_the_field_of_view_is_centred_on_the_heading(
+    fov_deg: float, heading: float
+) -> None:
     terrain, x, y = ground(torch.zeros(1, 20, 18)), 4.4, 4.7
-    seen = look(replace(CLEAR, range_m=3.0, fov_deg=fov_deg), terrain, (x, y, heading)).seen[0]
+    seen = look(
+        replace(CLEAR, range_m=3.0, fov_deg=fov_deg), terrain, (x, y, heading)
+    ).seen[0]
     to_x, to_y = offsets(seen.shape, x, y)
     away = np.hypot(to_x, to_y)
-    within = to_x * np.cos(heading) + to_y * np.sin(heading) >= away * np.cos(np.radians(fov_deg / 2)) - 1e-12
-    np.testing.assert_array_equal(seen, (within & (away <= 3.0)) | beside(seen.shape, x, y))
+    within = (
+        to_x * np.cos(heading) + to_y * np.sin(heading)
+        >= away * np.cos(np.radians(fov_deg / 2)) - 1e-12
+    )
+    np.testing.assert_array_equal(
+        seen, (within & (away <= 3.0)) | beside(seen.shape, x, y)
+    )
 
 
-@pytest.mark.parametrize(("wall_m", "height_m"), [(0.3, 1.0), (0.61, 1.0), (1.2, 1.0), (0.61, 30.0)])
+@pytest.mark.parametrize(
+    ("wall_m", "height_m"), [(0.3, 1.0), (0.61, 1.0), (1.2, 1.0), (0.61, 30.0)]
+)
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_wall_hides_what_is_under_the_line_from_the_mast_over_it(
     wall_m: float, height_m: float, turned: bool
@@ -98,14 +118,22 @@ def test_a_wall_hides_what_is_under_the_line_from_the_mast_over_it(
     assert torch.equal(seen, ((rows <= ahead) | over).expand_as(seen))
 
 
-@given(st.floats(-1, 1), st.floats(-1, 1), st.floats(0.05, 5), st.integers(0, 15), st.integers(0, 17))
+@given(
+    st.floats(-1, 1),
+    st.floats(-1, 1),
+    st.floats(0.05, 5),
+    st.integers(0, 15),
+    st.integers(0, 17),
+)
 @settings(deadline=None, max_examples=30)
 def test_a_plane_hides_nothing(
     along_x: float, along_y: float, height_m: float, row: int, column: int
 ) -> None:
     to_x, to_y = offsets(torch.Size((1, 16, 18)), 0.0, 0.0)
     plane = ground(torch.from_numpy(along_x * to_x + along_y * to_y)[None])
-    assert look(replace(CLEAR, range_m=50.0, height_m=height_m), plane, centred(row, column)).seen.all()
+    assert look(
+        replace(CLEAR, range_m=50.0, height_m=height_m), plane, centred(row, column)
+    ).seen.all()
 
 
 def hills(batch: int, size: int, relief_m: float) -> Tensor:
@@ -113,11 +141,15 @@ def hills(batch: int, size: int, relief_m: float) -> Tensor:
     return torch.from_numpy(relief_m * surface)
 
 
-def test_line_of_sight_is_nearly_that_of_rays_over_ground_between_the_centres_of_cells() -> None:
+def test_line_of_sight_is_nearly_that_of_rays_over_ground_between_the_centres_of_cells() -> (
+    None
+):
     size, height_m, places = 40, 1.0, [(20, 20), (4, 33), (30, 2)]
     elevation = hills(3, size, 4.0)
     states = [centred(*place) for place in places]
-    seen = look(replace(CLEAR, range_m=50.0, height_m=height_m), ground(elevation), *states).seen
+    seen = look(
+        replace(CLEAR, range_m=50.0, height_m=height_m), ground(elevation), *states
+    ).seen
     agrees, shares = [], []
     for own, (row, column) in enumerate(places):
         z = elevation[own].float().double()
@@ -125,10 +157,15 @@ def test_line_of_sight_is_nearly_that_of_rays_over_ground_between_the_centres_of
         for i in range(size):
             for j in range(size):
                 steps = max(abs(i - row), abs(j - column))
-                part = torch.arange(1, max(steps, 1), dtype=torch.float64) / max(steps, 1)
+                part = torch.arange(1, max(steps, 1), dtype=torch.float64) / max(
+                    steps, 1
+                )
                 at_row, at_column = row + part * (i - row), column + part * (j - column)
                 least, left = at_row.floor().long(), at_column.floor().long()
-                below, right = (at_row - 1e-9).ceil().long(), (at_column - 1e-9).ceil().long()
+                below, right = (
+                    (at_row - 1e-9).ceil().long(),
+                    (at_column - 1e-9).ceil().long(),
+                )
                 up = torch.lerp(z[least, left], z[least, right], at_column - left)
                 down = torch.lerp(z[below, left], z[below, right], at_column - left)
                 between = torch.lerp(up, down, at_row - least)
@@ -148,13 +185,18 @@ def test_what_is_seen_hangs_on_nothing_but_the_ground_that_is_seen(
     generator = torch.Generator().manual_seed(seed)
     elevation = hills(1, 24, 5.0) + 0.3 * torch.rand(1, 24, 24, generator=generator)
     near = Near(range_m=range_m, height_m=height_m, fov_deg=fov_deg)
-    x, y, heading = (torch.rand(3, generator=generator) * torch.tensor([12.0, 12.0, 6.0])).tolist()
+    x, y, heading = (
+        torch.rand(3, generator=generator) * torch.tensor([12.0, 12.0, 6.0])
+    ).tolist()
     first = look(near, ground(elevation), (x, y, heading))
-    sunk = elevation - torch.where(first.seen, 0, 4 * torch.rand(1, 24, 24, generator=generator))
+    sunk = elevation - torch.where(
+        first.seen, 0, 4 * torch.rand(1, 24, 24, generator=generator)
+    )
     again = look(near, ground(sunk), (x, y, heading))
     assert torch.equal(first.seen, again.seen)
     assert torch.equal(
-        first.observation.elevation_m.nan_to_num(-99), again.observation.elevation_m.nan_to_num(-99)
+        first.observation.elevation_m.nan_to_num(-99),
+        again.observation.elevation_m.nan_to_num(-99),
     )
 
 
@@ -183,8 +225,13 @@ def test_noise_is_normal_and_grows_with_distance() -> None:
     away = torch.from_numpy(np.hypot(*offsets(seen.shape, x, y)))[seen]
     torch.testing.assert_close(looks[0].doubt[0][seen], away.float())
     assert (looks[0].doubt[0][~seen] == math.inf).all()
-    heights = torch.stack([each.observation.elevation_m[0][seen] for each in looks]).double() - 7
-    colours = torch.stack([each.observation.rgb[0][:, seen] for each in looks]).double() - 120
+    heights = (
+        torch.stack([each.observation.elevation_m[0][seen] for each in looks]).double()
+        - 7
+    )
+    colours = (
+        torch.stack([each.observation.rgb[0][:, seen] for each in looks]).double() - 120
+    )
     for low, high in ((0.4, 2.0), (2.0, 4.0), (4.0, 6.0)):
         far = (away > low) & (away <= high)
         noise = heights[:, far] / away[far]
@@ -192,8 +239,14 @@ def test_noise_is_normal_and_grows_with_distance() -> None:
         assert abs(float(noise.mean())) < 0.02 * 4 / math.sqrt(noise.numel())
         for channel in colours.unbind(1):
             expected = (9 * away[far] ** 2 + 1 / 12).mean().sqrt()  # and of rounding
-            assert float(channel[:, far].square().mean().sqrt()) == pytest.approx(float(expected), rel=0.02)
-    together = torch.cat((colours, heights[:, None]), 1)[..., away > 2].movedim(1, 0).flatten(1)
+            assert float(channel[:, far].square().mean().sqrt()) == pytest.approx(
+                float(expected), rel=0.02
+            )
+    together = (
+        torch.cat((colours, heights[:, None]), 1)[..., away > 2]
+        .movedim(1, 0)
+        .flatten(1)
+    )
     assert (torch.corrcoef(together) - torch.eye(4)).abs().max() < 0.02
     # Nor are cells alike, nor steps.
     scores = heights[:, away > 0] / away[away > 0]
@@ -232,7 +285,9 @@ def test_noise_is_of_the_episode_the_cell_and_the_step_alone() -> None:
     terrain = ground(hills(3, 20, 1.0))
     states = (centred(3, 4), centred(10, 9), centred(18, 2))
 
-    def elevations(near: Near, members: list[int], step: int = 3, keys: tuple[int, ...] = KEYS) -> Tensor:
+    def elevations(
+        near: Near, members: list[int], step: int = 3, keys: tuple[int, ...] = KEYS
+    ) -> Tensor:
         some = terrain.select(torch.tensor(members))
         state = torch.tensor([states[own] for own in members])
         moment = Moment([keys[own] for own in members], step)
@@ -246,7 +301,9 @@ def test_noise_is_of_the_episode_the_cell_and_the_step_alone() -> None:
     order = elevations(Near(range_m=3.0), [2, 0])
     assert torch.equal(order.nan_to_num(-9), every[[2, 0]].nan_to_num(-9))
     away = known & (every != terrain.elevation_m)
-    assert (elevations(Near(range_m=3.0), [0, 1, 2], step=4)[away] != every[away]).double().mean() > 0.99
+    assert (
+        elevations(Near(range_m=3.0), [0, 1, 2], step=4)[away] != every[away]
+    ).double().mean() > 0.99
     other = elevations(Near(range_m=3.0), [0, 1, 2], keys=(21, 5, 23))
     changed = (other.nan_to_num(-9) != every.nan_to_num(-9)).flatten(1).any(1)
     assert changed.tolist() == [False, True, False]

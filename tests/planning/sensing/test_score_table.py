@@ -1,11 +1,17 @@
-"""Distributions by a table of their CDF: their functions agree with each other, with integrals of it and with draws."""
+"""Distributions by a table of their CDF: their functions agree with each other, with
+integrals of it and with draws.
+"""
 
 import pytest
 import torch
 
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.planning.sensing import score_table
-from benchnav.planning.sensing.score_table import VALUES, TabulatedDistribution, scores_of
+from benchnav.planning.sensing.score_table import (
+    VALUES,
+    TabulatedDistribution,
+    scores_of,
+)
 from benchnav.testing.breaches import Breaches
 from benchnav.testing.distribution import check_functions
 from tests.core.distributions import Hidden, mixture, quantiles
@@ -19,10 +25,14 @@ def table() -> TabulatedDistribution:
     even = values.clone()
     sure = torch.ones_like(values)
     never = torch.zeros_like(values)
-    return TabulatedDistribution(torch.stack((smooth, steep, even, sure, never), -1)[None, :, None])
+    return TabulatedDistribution(
+        torch.stack((smooth, steep, even, sure, never), -1)[None, :, None]
+    )
 
 
-def test_functions_are_those_of_a_distribution_and_agree_with_integrals_of_its_cdf() -> None:
+def test_functions_are_those_of_a_distribution_and_agree_with_integrals_of_its_cdf() -> (
+    None
+):
     breaches = Breaches("distribution", "table")
     check_functions(table(), 1e-6, breaches)
     breaches.refuse()
@@ -40,8 +50,12 @@ def test_means_of_all_kinds_are_those_of_draws(floor: float) -> None:
     assert torch.allclose(law.expected_time(floor)[0, 0], times, rtol=2e-3, atol=0)
     for level in (0.5, 0.8):
         least = drawn[: round(len(drawn) * (1 - level))].clamp(min=floor)
-        assert torch.allclose(law.time_cvar(level, floor)[0, 0], (1 / least).mean(0), rtol=2e-3, atol=0)
-    assert torch.allclose(law.time_cvar(0.0, floor), law.expected_time(floor), rtol=1e-9, atol=0)
+        assert torch.allclose(
+            law.time_cvar(level, floor)[0, 0], (1 / least).mean(0), rtol=2e-3, atol=0
+        )
+    assert torch.allclose(
+        law.time_cvar(0.0, floor), law.expected_time(floor), rtol=1e-9, atol=0
+    )
 
 
 @pytest.mark.parametrize("level", [0.0, 0.3, 0.5, 0.8, 0.9, 0.95])
@@ -77,4 +91,7 @@ def test_a_row_has_the_scores_of_its_own_cell(
         low, high = row.to_normal(value)
         wanted = (high if value < 1 else low)[0].float().clamp(-9, 9)
         torch.testing.assert_close(found[:, place], wanted, rtol=0, atol=1e-5)
-    assert scores_of(prior.at(torch.zeros(prior.shape, dtype=torch.bool))).shape == (0, len(VALUES))
+    assert scores_of(prior.at(torch.zeros(prior.shape, dtype=torch.bool))).shape == (
+        0,
+        len(VALUES),
+    )

@@ -21,16 +21,26 @@ PLACES = factories.places(torch.tensor([[6.0, 6.0]]))
 MIDDLE = torch.tensor([[4.0, 4.0, 0.0]])
 
 
-def realisation(mean: torch.Tensor, std: float = 0.1, noise: str = "resampled", steps: int = 200, **given):  # type: ignore[no-untyped-def]
+def realisation(
+    mean: torch.Tensor,
+    std: float = 0.1,
+    noise: str = "resampled",
+    steps: int = 200,
+    **given,
+):  # type: ignore[no-untyped-def]
     settings = {"key": KEY, "maps": range(len(mean)), **given}
     places = factories.places(torch.full((len(mean), 2), 6.0))
-    return Realisation(factories.terrain(mean, std), World(noise=noise), places, steps, **settings)
+    return Realisation(
+        factories.terrain(mean, std), World(noise=noise), places, steps, **settings
+    )
 
 
 def met(one: Realisation, batch: int, steps: int) -> torch.Tensor:
     """λ of robots that stand in the middle, shape [steps, B]."""
     state = MIDDLE.repeat(batch, 1)
-    return torch.stack([one.at(state, torch.full((batch,), step)) for step in range(steps)])
+    return torch.stack(
+        [one.at(state, torch.full((batch,), step)) for step in range(steps)]
+    )
 
 
 def even(batch: int, value: float = 0.5) -> torch.Tensor:
@@ -54,17 +64,24 @@ def test_noise_is_keyed_by_map_and_step_whatever_the_batch() -> None:
 
 
 def test_another_root_is_another_noise() -> None:
-    first, second = (met(realisation(even(3), key=rng.stream_key(seed, "noise")), 3, 4) for seed in (0, 1))
+    first, second = (
+        met(realisation(even(3), key=rng.stream_key(seed, "noise")), 3, 4)
+        for seed in (0, 1)
+    )
     assert not (first == second).any()
 
 
 def test_another_time_budget_leaves_the_noise_as_it_is() -> None:
-    short, long = (met(realisation(even(2), steps=steps), 2, 10) for steps in (10, 1000))
+    short, long = (
+        met(realisation(even(2), steps=steps), 2, 10) for steps in (10, 1000)
+    )
     assert torch.equal(short, long)
 
 
 def test_noise_scales_with_each_cells_standard_deviation_and_mean() -> None:
-    narrow, wide = (met(realisation(even(2, 0.5), std), 2, 20) - 0.5 for std in (0.01, 0.1))
+    narrow, wide = (
+        met(realisation(even(2, 0.5), std), 2, 20) - 0.5 for std in (0.01, 0.1)
+    )
     torch.testing.assert_close(10 * narrow, wide, atol=1e-5, rtol=0)
     lower = met(realisation(even(2, 0.4), 0.01), 2, 20)
     torch.testing.assert_close(lower - 0.4, narrow, atol=1e-6, rtol=0)
@@ -81,7 +98,10 @@ def test_lambda_is_read_in_the_cell_where_the_robot_stands() -> None:
     mean = torch.rand(2, 12, 20)
     one = realisation(mean, 0.0)
     state = torch.tensor([[7.3, 1.2, 0.0], [0.1, 5.9, 0.0]])
-    assert one.at(state, torch.zeros(2, dtype=torch.int64)).tolist() == [mean[0, 2, 14], mean[1, 11, 0]]
+    assert one.at(state, torch.zeros(2, dtype=torch.int64)).tolist() == [
+        mean[0, 2, 14],
+        mean[1, 11, 0],
+    ]
     off = torch.tensor([[-0.1, 1.2, 0.0], [3.0, 6.1, 0.0]])
     assert one.at(off, torch.zeros(2, dtype=torch.int64)).tolist() == [0, 0]
 
@@ -129,7 +149,9 @@ def two_modes(batch: int, size: int = 16) -> TraversabilityMixture:
     def pair(first: float, second: float) -> torch.Tensor:
         return torch.tensor([first, second]).view(1, 2, 1, 1).expand(shape).clone()
 
-    return TraversabilityMixture(pair(0.9, 0.1), pair(0.8, 0.05), pair(0.1, 0.05), (0, 0))
+    return TraversabilityMixture(
+        pair(0.9, 0.1), pair(0.8, 0.05), pair(0.1, 0.05), (0, 0)
+    )
 
 
 def test_resampled_noise_has_a_second_mode_where_the_truth_has_one() -> None:
@@ -140,7 +162,9 @@ def test_resampled_noise_has_a_second_mode_where_the_truth_has_one() -> None:
     for value in (0.0, 0.03, 0.1, 0.5, 0.8, 0.95):
         expected = float(two_modes(1).cdf(value)[0, 0, 0])
         assert (drawn <= value).mean() == pytest.approx(expected, abs=0.01)
-    off = one.at(torch.tensor([[-1.0, 4.0, 0.0]] * 200), torch.zeros(200, dtype=torch.int64))
+    off = one.at(
+        torch.tensor([[-1.0, 4.0, 0.0]] * 200), torch.zeros(200, dtype=torch.int64)
+    )
     assert off.max() < 1e-8
 
 
@@ -151,7 +175,12 @@ def test_frozen_noise_stays_what_it_is_at_a_place() -> None:
     assert len(drawn[0].unique()) == 5
     assert one.field is not None
     assert torch.equal(drawn[0], one.field[:, 8, 8])
-    assert one.at(torch.tensor([[-0.1, 4.0, 0.0]] * 5), torch.zeros(5, dtype=torch.int64)).tolist() == [0] * 5
+    assert (
+        one.at(
+            torch.tensor([[-0.1, 4.0, 0.0]] * 5), torch.zeros(5, dtype=torch.int64)
+        ).tolist()
+        == [0] * 5
+    )
 
 
 def test_only_resampled_noise_has_no_field() -> None:
@@ -180,17 +209,24 @@ FREE = World(noise="frozen")
 IMMOBILISING = World(noise="frozen", immobile=Immobile(below=0.1))
 
 
-def ground(batch: int, *components: tuple[float, float, float], size: int = 16) -> Terrain:
+def ground(
+    batch: int, *components: tuple[float, float, float], size: int = 16
+) -> Terrain:
     """Flat ground with the same mixture of (weight, mean, std) in each cell."""
     columns = torch.tensor(components).T[:, None, :, None, None]
     weights, means, stds = (c.expand(batch, -1, size, size).clone() for c in columns)
     made = factories.terrain(torch.full((batch, size, size), 0.5))
-    return replace(made, truth=TraversabilityMixture(weights, means, stds, (0,) * len(components)))
+    return replace(
+        made, truth=TraversabilityMixture(weights, means, stds, (0,) * len(components))
+    )
 
 
 def across(batch: int, size: int = 16) -> Places:
     """From one corner to the other."""
-    start, goal = torch.full((batch, 2), 1.25), torch.full((batch, 2), 0.5 * size - 1.25)
+    start, goal = (
+        torch.full((batch, 2), 1.25),
+        torch.full((batch, 2), 0.5 * size - 1.25),
+    )
     return factories.places(goal, start)
 
 
@@ -198,24 +234,35 @@ SOFT = ((0.9, 0.8, 0.1), (0.1, 0.05, 0.05))
 
 
 def test_marginals_are_each_cells_own_distribution() -> None:
-    """Before any field is rejected, pooled over realisations, in two cells of different ground."""
+    """Before any field is rejected, pooled over realisations, in two cells of different
+    ground.
+    """
     terrain = ground(1, *SOFT)
     terrain.truth.means[:, 0, 8:] = 0.5
     draws = [draw_frozen(terrain, FREE, across(1), KEY, [i])[0][0] for i in range(2000)]
     field = torch.stack(draws).double().numpy()
     for row in (3, 12):
         truth = terrain.truth
-        cell = (t[:, :, row : row + 1, :1].double() for t in (truth.weights, truth.means, truth.stds))
+        cell = (
+            t[:, :, row : row + 1, :1].double()
+            for t in (truth.weights, truth.means, truth.stds)
+        )
         mixture = TraversabilityMixture(*cell)
         drawn = field[:, row, 5]
         assert (drawn == 0).mean() == pytest.approx(float(mixture.cdf(0.0)), abs=0.01)
         inside = drawn[(drawn > 0) & (drawn < 1)]
         low, high = float(mixture.cdf(0.0)), 1 - float(mixture.chance(1.0))
 
-        def share(value: np.ndarray, mixture: TraversabilityMixture = mixture) -> np.ndarray:
-            return np.array([float(mixture.cdf(float(v))) for v in np.atleast_1d(value)])
+        def share(
+            value: np.ndarray, mixture: TraversabilityMixture = mixture
+        ) -> np.ndarray:
+            return np.array(
+                [float(mixture.cdf(float(v))) for v in np.atleast_1d(value)]
+            )
 
-        found = stats.kstest(inside, lambda v, low=low, high=high: (share(v) - low) / (high - low))
+        found = stats.kstest(
+            inside, lambda v, low=low, high=high: (share(v) - low) / (high - low)
+        )
         assert found.pvalue > 1e-3
 
 
@@ -225,14 +272,23 @@ def test_the_kernel_of_the_gaussian_field_is_that_of_the_world() -> None:
         world = replace(FREE, correlation_m=1.5, kernel=kernel)
         drawn = draw_frozen(terrain, world, across(1), KEY, [3])[0][0]
         key = rng.stream_key(KEY, 3, "field", 0)
-        normal = correlated_normal(key, np.arange(1), terrain.grid.shape, 3.0, kernel)[0]
+        normal = correlated_normal(key, np.arange(1), terrain.grid.shape, 3.0, kernel)[
+            0
+        ]
         np.testing.assert_allclose((drawn.double() - 0.5) / 0.05, normal, atol=1e-5)
 
 
 @pytest.mark.parametrize("correlation_m", [0.5, 1.5])
-def test_the_correlation_of_the_gaussian_field_is_that_of_the_world(correlation_m: float) -> None:
-    terrain, world = ground(1, (1.0, 0.5, 0.05)), replace(FREE, correlation_m=correlation_m)
-    draws = [draw_frozen(terrain, world, across(1), KEY, [i])[0][0] for i in range(1500)]
+def test_the_correlation_of_the_gaussian_field_is_that_of_the_world(
+    correlation_m: float,
+) -> None:
+    terrain, world = (
+        ground(1, (1.0, 0.5, 0.05)),
+        replace(FREE, correlation_m=correlation_m),
+    )
+    draws = [
+        draw_frozen(terrain, world, across(1), KEY, [i])[0][0] for i in range(1500)
+    ]
     normal = (torch.stack(draws).double() - 0.5) / 0.05
     for rows, columns in ((1, 0), (0, 2), (3, 0), (2, 2), (0, 8)):
         other = normal[:, rows:, columns:]
@@ -245,10 +301,14 @@ def test_the_correlation_of_the_gaussian_field_is_that_of_the_world(correlation_
 def test_a_field_is_keyed_by_root_and_map_whatever_the_batch() -> None:
     terrain = ground(4, *SOFT)
     together, _ = draw_frozen(terrain, IMMOBILISING, across(4), KEY, [3, 5, 7, 9])
-    alone, _ = draw_frozen(terrain.select(torch.tensor([2])), IMMOBILISING, across(1), KEY, [7])
+    alone, _ = draw_frozen(
+        terrain.select(torch.tensor([2])), IMMOBILISING, across(1), KEY, [7]
+    )
     assert torch.equal(alone[0], together[2])
     assert len({float(values.sum()) for values in together}) == 4
-    other, _ = draw_frozen(terrain, IMMOBILISING, across(4), rng.stream_key(1, "noise"), [3, 5, 7, 9])
+    other, _ = draw_frozen(
+        terrain, IMMOBILISING, across(4), rng.stream_key(1, "noise"), [3, 5, 7, 9]
+    )
     assert not (other == together).flatten(1).all(dim=1).any()
 
 
@@ -280,14 +340,17 @@ def test_ground_that_immobilises_the_robot_on_every_way_is_drawn_again() -> None
     # Those whose first draw had a way keep it; the others' first draw had none.
     kept = attempts == 1
     assert torch.equal(field[kept], first[kept])
-    assert not joined(first[~kept] >= 0.1, terrain.grid, places.select(torch.nonzero(~kept)[:, 0])).any()
+    assert not joined(
+        first[~kept] >= 0.1, terrain.grid, places.select(torch.nonzero(~kept)[:, 0])
+    ).any()
 
 
 def test_what_immobilises_the_robot_counts_in_drawing_again() -> None:
     terrain, places = wall_with_noise(100), across(100)
     hard = replace(IMMOBILISING, immobile=Immobile(below=0.3))
     easier, harder = (
-        draw_frozen(terrain, world, places, KEY, range(100))[1] for world in (IMMOBILISING, hard)
+        draw_frozen(terrain, world, places, KEY, range(100))[1]
+        for world in (IMMOBILISING, hard)
     )
     assert harder.double().mean() > easier.double().mean()
 
@@ -301,12 +364,18 @@ def test_ground_without_any_way_is_refused_with_the_map() -> None:
 
 def test_ground_is_joined_over_edges_and_not_corners() -> None:
     grid = Grid(4, 4, 1.0)
-    staircase = torch.tensor([[1, 0, 0, 0], [1, 1, 0, 0], [0, 1, 1, 0], [0, 0, 1, 1]]).bool()
+    staircase = torch.tensor(
+        [[1, 0, 0, 0], [1, 1, 0, 0], [0, 1, 1, 0], [0, 0, 1, 1]]
+    ).bool()
     diagonal = torch.eye(4).bool()
     closed_goal, closed_start = staircase.clone(), staircase.clone()
     closed_goal[3, 3], closed_start[0, 0] = False, False
-    maps = torch.stack((staircase, diagonal, closed_goal, closed_start, torch.ones(4, 4).bool()))
-    places = factories.places(torch.tensor([[3.5, 3.5]] * 5), torch.tensor([[0.5, 0.5]] * 5))
+    maps = torch.stack(
+        (staircase, diagonal, closed_goal, closed_start, torch.ones(4, 4).bool())
+    )
+    places = factories.places(
+        torch.tensor([[3.5, 3.5]] * 5), torch.tensor([[0.5, 0.5]] * 5)
+    )
     assert joined(maps, grid, places).tolist() == [True, False, False, False, True]
 
 
@@ -320,5 +389,9 @@ def test_start_is_x_and_y_and_not_row_and_column() -> None:
 
 def test_a_correlation_longer_than_a_quarter_of_the_map_is_refused_in_metres() -> None:
     draw_frozen(ground(1, *SOFT), replace(FREE, correlation_m=2.0), across(1), KEY, [0])
-    with pytest.raises(ConfigError, match=r"`world.correlation_m` of at most 2 m, .* got 2.1 m"):
-        draw_frozen(ground(1, *SOFT), replace(FREE, correlation_m=2.1), across(1), KEY, [0])
+    with pytest.raises(
+        ConfigError, match=r"`world.correlation_m` of at most 2 m, .* got 2.1 m"
+    ):
+        draw_frozen(
+            ground(1, *SOFT), replace(FREE, correlation_m=2.1), across(1), KEY, [0]
+        )

@@ -13,7 +13,9 @@ def test_the_papers_world() -> None:
     paper = PRESETS["paper"]
     assert paper.world == World(noise="resampled", time_budget_s=100.0)
     assert paper.rules == Rules(
-        free_space=FreeSpace(by="risk", above=0.3), min_traversability=0.3, goal_radius_m=1.0
+        free_space=FreeSpace(by="risk", above=0.3),
+        min_traversability=0.3,
+        goal_radius_m=1.0,
     )
 
 
@@ -24,7 +26,9 @@ def test_the_world_with_stakes() -> None:
         time_budget_ratio=3.0,
     )  # fmt: skip
     assert stakes.rules == Rules(
-        free_space=FreeSpace(by="mean", above=0.1), min_traversability=0.05, goal_radius_m=1.0
+        free_space=FreeSpace(by="mean", above=0.1),
+        min_traversability=0.05,
+        goal_radius_m=1.0,
     )
 
 
@@ -38,14 +42,21 @@ def test_a_time_budget_is_in_seconds_or_in_reference_times_at_top_speed() -> Non
         ratio.budget_s(torch.tensor([20.0, torch.nan]), 1.0)
     for both in ({}, {"time_budget_s": None}):
         world = {"time_budget_ratio": 3.0 if not both else None, **both}
-        with pytest.raises(ConfigError, match="either `time_budget_s` or `time_budget_ratio`"):
+        with pytest.raises(
+            ConfigError, match="either `time_budget_s` or `time_budget_ratio`"
+        ):
             World(**world)
 
 
 @pytest.mark.parametrize("world", [preset.world for preset in PRESETS.values()])
 def test_a_world_is_plain_data_and_back(world: World) -> None:
     assert (
-        read(World, {"time_budget_s": None} | json.loads(json.dumps(world.to_dict())), of("world")) == world
+        read(
+            World,
+            {"time_budget_s": None} | json.loads(json.dumps(world.to_dict())),
+            of("world"),
+        )
+        == world
     )
 
 
@@ -53,11 +64,17 @@ def test_what_the_noise_does_not_use_is_not_in_the_plain_data() -> None:
     assert World().to_dict() == {"noise": "resampled", "time_budget_s": 100.0}
     assert World(correlation_m=2.0).to_dict() == World().to_dict()
     frozen = World(noise="frozen", correlation_m=2.0)
-    assert frozen.to_dict() == {"noise": "frozen", "correlation_m": 2.0, "time_budget_s": 100.0}
+    assert frozen.to_dict() == {
+        "noise": "frozen",
+        "correlation_m": 2.0,
+        "time_budget_s": 100.0,
+    }
     assert World(kernel="matern32").to_dict() == World().to_dict()
 
 
-def test_a_kernel_is_in_the_plain_data_where_it_is_not_that_of_all_worlds_before() -> None:
+def test_a_kernel_is_in_the_plain_data_where_it_is_not_that_of_all_worlds_before() -> (
+    None
+):
     rough = World(noise="frozen", kernel="matern32")
     assert rough.to_dict()["kernel"] == "matern32"
     assert read(World, rough.to_dict(), of("world")) == rough
@@ -69,14 +86,19 @@ def test_a_kernel_is_in_the_plain_data_where_it_is_not_that_of_all_worlds_before
     assert made.kernel == "matern32"
     assert label == "stakes kernel=matern32"
     with pytest.raises(
-        ConfigError, match=r"`world.kernel` with `world.noise` frozen, got it with 'resampled'"
+        ConfigError,
+        match=r"`world.kernel` with `world.noise` frozen, got it with 'resampled'",
     ):
         read_world({"kernel": "matern32"})
-    with pytest.raises(ConfigError, match="`kernel` 'gaussian' or 'matern32', got 'cubic'"):
+    with pytest.raises(
+        ConfigError, match="`kernel` 'gaussian' or 'matern32', got 'cubic'"
+    ):
         World(kernel="cubic")
 
 
-@pytest.mark.parametrize(("budget", "dt", "steps"), [(100.0, 0.1, 1000), (0.3, 0.1, 3), (1.0, 0.3, 3)])
+@pytest.mark.parametrize(
+    ("budget", "dt", "steps"), [(100.0, 0.1, 1000), (0.3, 0.1, 3), (1.0, 0.3, 3)]
+)
 def test_the_time_budget_in_steps(budget: float, dt: float, steps: int) -> None:
     assert World().steps(torch.tensor([budget, 2 * budget]), dt)[0] == steps
 
@@ -95,10 +117,17 @@ def test_a_time_budget_without_a_step_is_refused() -> None:
 
 
 def test_noise_of_another_name_and_numbers_out_of_range_are_refused() -> None:
-    with pytest.raises(ConfigError, match="'resampled', 'stored' or 'frozen', got 'loud'"):
+    with pytest.raises(
+        ConfigError, match="'resampled', 'stored' or 'frozen', got 'loud'"
+    ):
         World(noise="loud")
     with pytest.raises(ConfigError, match="correlation_m"):
         World(correlation_m=-1.0)
-    for wrong in ({"below": 0.0}, {"below": 1.1}, {"for_s": 0.0}, {"for_s": float("inf")}):
+    for wrong in (
+        {"below": 0.0},
+        {"below": 1.1},
+        {"for_s": 0.0},
+        {"for_s": float("inf")},
+    ):
         with pytest.raises(ConfigError, match=f"immobile.{next(iter(wrong))}"):
             Immobile(**wrong)

@@ -37,20 +37,29 @@ def test_published_pairs_agree_with_published_successes() -> None:
 
 
 def test_interval_of_a_difference_is_that_of_its_source() -> None:
-    assert show_difference(56, 70, 48, 80) == "+20.0 [5.2, 33.4]"  # Newcombe's first example, table II
+    assert (
+        show_difference(56, 70, 48, 80) == "+20.0 [5.2, 33.4]"
+    )  # Newcombe's first example, table II
 
 
 def test_success_stands_beside_the_published() -> None:
-    table = tabulate_success(rows(0.4, mean=[True, False, True, False], cvar_7=[True, True, True, False]))
+    table = tabulate_success(
+        rows(0.4, mean=[True, False, True, False], cvar_7=[True, True, True, False])
+    )
     header, _, mean, cvar = table.splitlines()
-    assert mean.startswith("| 40 % | `mean` | 50.0 [15, 85] | 10.0 | 69.0 [62, 75] | 9.1 | ")
+    assert mean.startswith(
+        "| 40 % | `mean` | 50.0 [15, 85] | 10.0 | 69.0 [62, 75] | 9.1 | "
+    )
     assert cvar == "| 40 % | `cvar:0.7` | 75.0 [30, 95] | 10.0 | – | – | – | – |"
     assert header.count("|") == mean.count("|") == cvar.count("|")
 
 
 def test_p_is_corrected_over_all_lines_that_are_compared() -> None:
     arrived = {"mean": 100, "cvar_8": 170}
-    trials = {name: [True] * count + [False] * (200 - count) for name, count in arrived.items()}
+    trials = {
+        name: [True] * count + [False] * (200 - count)
+        for name, count in arrived.items()
+    }
     table = tabulate_success(rows(0.4, **trials)).splitlines()[2:]
     raw = []
     for name, count in (("mean", 100), ("cvar:0.8", 170)):
@@ -58,7 +67,9 @@ def test_p_is_corrected_over_all_lines_that_are_compared() -> None:
         raw.append(fisher_exact([[count, 200 - count], [theirs, 200 - theirs]]).pvalue)
     first, second = sorted(raw)
     expected = {first: 2 * first, second: max(2 * first, second)}
-    assert [line.split("|")[-2].strip() for line in table] == [show_p(expected[p]) for p in raw]
+    assert [line.split("|")[-2].strip() for line in table] == [
+        show_p(expected[p]) for p in raw
+    ]
 
 
 def test_pairs_are_those_of_one_trial() -> None:
@@ -73,9 +84,16 @@ def test_pairs_are_those_of_one_trial() -> None:
 
 def test_a_run_stands_beside_the_first_trial_by_trial() -> None:
     first = rows(1.0, mean=[True] * 10 + [False] * 2, cvar_8=[True] * 12)
-    other = rows(1.0, mean=[False] * 9 + [True] * 3, cvar_8=[True] * 12).sample(frac=1, random_state=0)
-    whole, change = tabulate_runs({"a": first, "b": other.assign(time_s=20.0)}).split("\n\n")
-    assert whole.split("\n")[2] == "| 100 % | `mean` | 83.3, 10.0 s | 25.0, 20.0 s | 20.0, 11.6 s |"
+    other = rows(1.0, mean=[False] * 9 + [True] * 3, cvar_8=[True] * 12).sample(
+        frac=1, random_state=0
+    )
+    whole, change = tabulate_runs({"a": first, "b": other.assign(time_s=20.0)}).split(
+        "\n\n"
+    )
+    assert (
+        whole.split("\n")[2]
+        == "| 100 % | `mean` | 83.3, 10.0 s | 25.0, 20.0 s | 20.0, 11.6 s |"
+    )
     header, _, mean, cautious = change.split("\n")
     assert "won with b alone, with a alone" in header
     # Two won and nine lost of twelve; p of the binomial tail, twice over two lines.

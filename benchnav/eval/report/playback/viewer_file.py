@@ -1,9 +1,11 @@
 """Files for the Rerun viewer: one episode, or several on one map.
 
-A file holds the terrain as a mesh, its colours and layers, the true mean of λ, the λ field, the λ̂ that each
-planner was given, each robot with its heading at every step, the path driven so far, what the planner was thinking,
-how it ended, and time series; and a blueprint that arranges them. Of a robot that learns on its way, λ̂, mean and spread
-of its belief, what it saw and sensed, and how far its sensors reached change over time.
+A file holds the terrain as a mesh, its colours and layers, the true mean of λ, the λ
+field, the λ̂ that each planner was given, each robot with its heading at every step,
+the path driven so far, what the planner was thinking, how it ended, and time series;
+and a blueprint that arranges them. Of a robot that learns on its way, λ̂, mean and
+spread of its belief, what it saw and sensed, and how far its sensors reached change
+over time.
 """
 
 from collections.abc import Sequence
@@ -20,7 +22,14 @@ from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.checksums import is_as_noted, note_checksums
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.playback.scene import TIMELINE, Driver, Stage, layer_entity, log_driver, log_terrain
+from benchnav.eval.report.playback.scene import (
+    TIMELINE,
+    Driver,
+    Stage,
+    layer_entity,
+    log_driver,
+    log_terrain,
+)
 from benchnav.eval.words import NAMING, contender_names, reading_name
 from benchnav.viz.maps import MAX_SPREAD, layer_scale
 from benchnav.viz.style import bytes_of, condition_colours
@@ -38,12 +47,15 @@ _ALL, _PLACES = "/map/overlay/**", "/map/places/**"
 
 
 def write_viewer_files(folder: Path) -> None:
-    """Write the viewer's file of each recording in a run folder that has none, or a damaged one.
+    """Write the viewer's file of each recording in a run folder that has none, or a
+    damaged one.
 
     Args:
         folder: the run folder.
     """
-    files = [path.with_suffix(".rrd") for path in sorted((folder / "playback").glob("*.npz"))]
+    files = [
+        path.with_suffix(".rrd") for path in sorted((folder / "playback").glob("*.npz"))
+    ]
     for file in files:
         if not file.exists() or not is_as_noted(folder, file):
             write_rerun([Recording.load(file.with_suffix(".npz"))], file)
@@ -58,14 +70,21 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
         path: file to write; its name is what the viewer calls it.
     """
     drivers = drivers_of(recordings)
-    # One chunk an entity, however slow the machine is: each has a header of more than a kilobyte.
+    # One chunk an entity, however slow the machine is: each has a header of more than a
+    # kilobyte.
     batches = rr.ChunkBatcherConfig.NEVER()
-    stream = rr.RecordingStream(APPLICATION, recording_id=path.stem, batcher_config=batches)
+    stream = rr.RecordingStream(
+        APPLICATION, recording_id=path.stem, batcher_config=batches
+    )
     with replacing(path) as partial:
         stream.save(partial, default_blueprint=arrange(drivers))
         try:
             stream.send_recording_name(_title(drivers))
-            stream.log("about", rr.TextDocument(describe(drivers), media_type="text/markdown"), static=True)
+            stream.log(
+                "about",
+                rr.TextDocument(describe(drivers), media_type="text/markdown"),
+                static=True,
+            )
             log_terrain(Stage(stream=stream, recording=recordings[0]))
             for driver in drivers:
                 log_driver(stream, driver)
@@ -82,7 +101,9 @@ def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
     colours = condition_colours([about["planner"] for about in abouts])
     return [
         Driver(recording=recording, name=name, colour=bytes_of(colour))
-        for recording, name, colour in zip(recordings, contender_names(abouts), colours, strict=True)
+        for recording, name, colour in zip(
+            recordings, contender_names(abouts), colours, strict=True
+        )
     ]
 
 
@@ -90,14 +111,19 @@ def _title(drivers: Sequence[Driver]) -> str:
     if len(drivers) == 1:
         return drivers[0].recording.title
     about = drivers[0].recording.about
-    return f"{about['scenario']} {about['map']}: {', '.join(driver.name for driver in drivers)}"
+    return (
+        f"{about['scenario']} {about['map']}: "
+        f"{', '.join(driver.name for driver in drivers)}"
+    )
 
 
 def arrange(drivers: Sequence[Driver]) -> Any:
     """Arranges the views: the terrain and time series to the left, maps to the right."""
     series = [
         rrb.TimeSeriesView(
-            name="Observed λ", origin="/series/traversability", axis_y=rrb.ScalarAxis(range=(0, 1))
+            name="Observed λ",
+            origin="/series/traversability",
+            axis_y=rrb.ScalarAxis(range=(0, 1)),
         ),
         rrb.TimeSeriesView(name="Distance to the goal [m]", origin="/series/goal"),
     ]
@@ -113,7 +139,9 @@ def arrange(drivers: Sequence[Driver]) -> Any:
         rrb.Horizontal(
             rrb.Vertical(
                 rrb.Spatial3DView(name=title, origin="/world"),
-                rrb.Horizontal(*series, rrb.TextDocumentView(name="About", origin="/about")),
+                rrb.Horizontal(
+                    *series, rrb.TextDocumentView(name="About", origin="/about")
+                ),
                 row_shares=[3, 1],
             ),
             rrb.Grid(*flat, grid_columns=2),
@@ -139,17 +167,33 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
         "True mean of λ": ["/map/true_mean", *own, _ALL, _PLACES],
     }
     if recording.field is not None:
-        views["λ field of the episode; dark red immobilises a robot"] = ["/map/field", *own, _ALL, _PLACES]
+        views["λ field of the episode; dark red immobilises a robot"] = [
+            "/map/field",
+            *own,
+            _ALL,
+            _PLACES,
+        ]
     for driver in drivers:
-        name = f"λ̂ given to {driver.name or 'the planner'}, free: {free_rule(driver.recording)}"
-        views[name] = [driver.entity("/map/risk"), driver.entity("/map/overlay", "**"), _PLACES]
+        name = (
+            f"λ̂ given to {driver.name or 'the planner'}, free: "
+            f"{free_rule(driver.recording)}"
+        )
+        views[name] = [
+            driver.entity("/map/risk"),
+            driver.entity("/map/overlay", "**"),
+            _PLACES,
+        ]
     if len(drivers) == 1 and recording.known:
-        views |= {title: [f"/map/{name}", _ALL, _PLACES] for name, title in _LEARNT.items()}
+        views |= {
+            title: [f"/map/{name}", _ALL, _PLACES] for name, title in _LEARNT.items()
+        }
     return views
 
 
 def layer_title(name: str, layer: np.ndarray) -> str:
-    """What the view of a layer is called: its name, and the values of its lightest and its darkest colour."""
+    """What the view of a layer is called: its name, and the values of its lightest and
+    its darkest colour.
+    """
     if is_azimuth(name):
         return f"{name}, directions"
     scale = layer_scale(name, layer)
@@ -157,15 +201,21 @@ def layer_title(name: str, layer: np.ndarray) -> str:
 
 
 def describe(drivers: Sequence[Driver]) -> str:
-    """Says in Markdown what is shown, how each episode ended, and which ground was free."""
+    """Says in Markdown what is shown, how each episode ended, and which ground was
+    free.
+    """
     about, driven = drivers[0].recording.about, [driver.recording for driver in drivers]
-    labels = {name: [reading_name(name, own.about.get(name, NOT_USED)) for own in driven] for name in NAMING}
+    labels = {
+        name: [reading_name(name, own.about.get(name, NOT_USED)) for own in driven]
+        for name in NAMING
+    }
     rows: dict[str, Sequence[str]] = {
         **{name: cells for name, cells in labels.items() if set(cells) != {NOT_USED}},
         "outcome": [Bold(own.outcome) for own in driven],
         "time": [f"{own.end_s:.1f} s of {own.time_budget_s:g} s" for own in driven],
         "observed λ": [
-            f"{own.traversability.mean():.2f}" if len(own.traversability) else NOT_USED for own in driven
+            f"{own.traversability.mean():.2f}" if len(own.traversability) else NOT_USED
+            for own in driven
         ],
         "free": [free_rule(own) for own in driven],
     }

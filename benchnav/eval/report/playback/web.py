@@ -20,7 +20,8 @@ _START_S = 60.0
 
 
 def serve(path: Path) -> None:
-    """Serves the viewer with a recording, and prints its address, until it is interrupted or told to end.
+    """Serves the viewer with a recording, and prints its address, until it is
+    interrupted or told to end.
 
     Args:
         path: an `.rrd` file.
@@ -29,12 +30,26 @@ def serve(path: Path) -> None:
         BenchnavError: the viewer did not start.
     """
     page, data = _free_port(_PAGE_PORT), _free_port(_DATA_PORT)
-    command = [sys.executable, "-m", "rerun_cli", str(path), "--serve-web", "--bind", HOST]
+    command = [
+        sys.executable,
+        "-m",
+        "rerun_cli",
+        str(path),
+        "--serve-web",
+        "--bind",
+        HOST,
+    ]
     command += ["--web-viewer-port", str(page), "--port", str(data)]
     # It has a child of its own, so that both are ended as a group.
-    viewer = subprocess.Popen(command, env={**os.environ, "RUST_LOG": "error"}, start_new_session=True)
-    # Also where Ctrl-C was ignored, as in a process that a script started in the background.
-    before = {one: signal.signal(one, signal.default_int_handler) for one in (signal.SIGINT, signal.SIGTERM)}
+    viewer = subprocess.Popen(
+        command, env={**os.environ, "RUST_LOG": "error"}, start_new_session=True
+    )
+    # Also where Ctrl-C was ignored, as in a process that a script started in the
+    # background.
+    before = {
+        one: signal.signal(one, signal.default_int_handler)
+        for one in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         _wait_for(page, viewer)
         _wait_for(data, viewer)
@@ -71,4 +86,6 @@ def _wait_for(port: int, viewer: subprocess.Popen[bytes]) -> None:
             if probe.connect_ex((HOST, port)) == 0:
                 return
         time.sleep(0.05)
-    raise BenchnavError("The viewer did not start. Open the recording with `rerun` to see why.")
+    raise BenchnavError(
+        "The viewer did not start. Open the recording with `rerun` to see why."
+    )

@@ -1,4 +1,6 @@
-"""A comparison of models in numbers and words: a table for each kind of file, and what columns and figures mean."""
+"""A comparison of models in numbers and words: a table for each kind of file, and what
+columns and figures mean.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,15 +17,31 @@ from benchnav.models.quality.scores_of_maps import COMPARED, SCORES, TAIL_RATES
 from benchnav.stats.bootstrap import LEAST_MAPS
 from benchnav.stats.holm import ALPHA
 from benchnav.stats.scores import against_best, compare_pairs, summarise
-from benchnav.stats.tables import Column, Row, cell_of, labels_of, p_value, signed, signed_interval, table_of
+from benchnav.stats.tables import (
+    Column,
+    Row,
+    cell_of,
+    labels_of,
+    p_value,
+    signed,
+    signed_interval,
+    table_of,
+)
 
 # What a model costs, which stands in the table next to its scores: heading and meaning.
 COSTS = {
-    "prediction_ms": ("ms a\nmap", "median time of predicting one map, in milliseconds."),
+    "prediction_ms": (
+        "ms a\nmap",
+        "median time of predicting one map, in milliseconds.",
+    ),
     "parameters": ("parameters\n", "number of weights of all networks of the model."),
 }
 PRIVILEGED_MARK = " †"
-_UNITS = ((1e6, 2, "M"), (1e3, 1, "k"), (1, 0, ""))  # size, decimal places and letter of a number of weights
+_UNITS = (
+    (1e6, 2, "M"),
+    (1e3, 1, "k"),
+    (1, 0, ""),
+)  # size, decimal places and letter of a number of weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,9 +49,10 @@ class Comparison:
     """What was measured of several models.
 
     Args:
-        models: by label what is said of it, such as `source`, `privileged`, `parameters`, `prediction_ms`; those that
-            compete first.
-        summary: a row a split and model, `split`, `model` and the columns of `scores.summarise`.
+        models: by label what is said of it, such as `source`, `privileged`,
+            `parameters`, `prediction_ms`; those that compete first.
+        summary: a row a split and model, `split`, `model` and the columns of
+            `scores.summarise`.
         pairs: of each split, `split` and the columns of `scores.compare_pairs`.
         best: of each split, `split`, `model` and the columns of `scores.against_best`.
         tallies: by split and model.
@@ -93,34 +112,51 @@ def comparison_table(title: str, comparison: Comparison, whole: bool = False) ->
     Args:
         title: over the table.
         comparison: what was measured.
-        whole: with both errors of E[λ]; else that to observed λ only if the other is unknown.
+        whole: with both errors of E[λ]; else that to observed λ only if the other is
+            unknown.
     """
     numbers = comparison.numbers
-    known = [name for name in (*SCORES, *COSTS) if name in numbers and numbers[name].notna().any()]
+    known = [
+        name
+        for name in (*SCORES, *COSTS)
+        if name in numbers and numbers[name].notna().any()
+    ]
     hidden = {score.name for score in TAIL_RATES}
     if not whole and numbers.get("rmse_expected", pd.Series([math.nan])).notna().all():
         hidden.add("rmse_observed")
     best = comparison.best[comparison.best["marked"]]
-    marked = {(row["split"], row["model"], row["measure"]) for row in best.to_dict("records")}
+    marked = {
+        (row["split"], row["model"], row["measure"]) for row in best.to_dict("records")
+    }
     columns = [
         Column("split\n", cell_of("split"), "split of the dataset."),
         Column(
             "model\n",
             lambda row: row["model"] + PRIVILEGED_MARK * row["privileged"],
-            "† marks privileged models: references that are given part of the truth and do not compete.",
+            "† marks privileged models: references that are given part of the truth "
+            "and do not compete.",
         ),
     ]
     for name in known:
         if name not in hidden:
-            heading, meaning = COSTS.get(name) or (SCORES[name].heading, SCORES[name].meaning)
+            heading, meaning = COSTS.get(name) or (
+                SCORES[name].heading,
+                SCORES[name].meaning,
+            )
             columns.append(Column(heading, partial(_cell, name, marked), meaning))
     note = (
-        "best of its split by this measure, and all without a significant difference from it (permutation test by map, "
+        "best of its split by this measure, and all without a significant difference "
+        "from it (permutation test by map, "
         f"Holm, p ≥ {ALPHA}). Privileged models (†) do not compete."
     )
     return table_of(
-        numbers.to_dict("records"), columns, title=title, labels=2, numbers=True, bold_note=note if marked else ""
-    )  # fmt: skip
+        numbers.to_dict("records"),
+        columns,
+        title=title,
+        labels=2,
+        numbers=True,
+        bold_note=note if marked else "",
+    )
 
 
 def _cell(name: str, marked: set[tuple[str, str, str]], row: Row) -> str:
@@ -130,14 +166,18 @@ def _cell(name: str, marked: set[tuple[str, str, str]], row: Row) -> str:
     if name == "prediction_ms":
         return f"{value:.3g}"
     if name == "parameters":
-        size, digits, unit = next((known for known in _UNITS if value >= known[0]), _UNITS[-1])
+        size, digits, unit = next(
+            (known for known in _UNITS if value >= known[0]), _UNITS[-1]
+        )
         return f"{value / size:.{digits}f}{unit}"
     text = f"{value:.4f}"
     return Bold(text) if (row["split"], row["model"], name) in marked else text
 
 
 def difference_table(comparison: Comparison) -> Table:
-    """Write the differences to the best, a row a split, measure and other model that competes."""
+    """Write the differences to the best, a row a split, measure and other model that
+    competes.
+    """
     rows = comparison.best[comparison.best["difference"].notna()]
     columns = [
         *labels_of("split"),
@@ -146,7 +186,8 @@ def difference_table(comparison: Comparison) -> Table:
         Column(
             "difference",
             lambda row: signed(row["difference"], 4),
-            "the model less the best, by this measure; of “in 90 %” the difference of the distance to 0.9.",
+            "the model less the best, by this measure; of “in 90 %” the difference of "
+            "the distance to 0.9.",
         ),
         Column(
             "95 % interval",
@@ -155,14 +196,21 @@ def difference_table(comparison: Comparison) -> Table:
         ),
         Column(
             "p (Holm)",
-            lambda row: p_value(row["p_holm"]) if row["alike"] else Bold(p_value(row["p_holm"])),
-            "permutation test by map, which exchanges the two models; corrected over all pairs of models that compete, "
+            lambda row: (
+                p_value(row["p_holm"]) if row["alike"] else Bold(p_value(row["p_holm"]))
+            ),
+            "permutation test by map, which exchanges the two models; corrected over "
+            "all pairs of models that compete, "
             "within measure and split (Holm).",
         ),
     ]
     note = "" if rows["alike"].all() else f"p under {ALPHA}."
     return table_of(
-        rows.to_dict("records"), columns, title="Differences to the best", labels=4, bold_note=note
+        rows.to_dict("records"),
+        columns,
+        title="Differences to the best",
+        labels=4,
+        bold_note=note,
     )
 
 
@@ -177,7 +225,11 @@ def comparison_json(about: Mapping[str, Any], comparison: Comparison) -> str:
             **row,
             "pit": list(tally.pit),
             "sparsification": dict(
-                zip(("left_out", "by_width", "by_error"), tally.curves().tolist(), strict=True)
+                zip(
+                    ("left_out", "by_width", "by_error"),
+                    tally.curves().tolist(),
+                    strict=True,
+                )
             ),
         }
     for row in comparison.pairs.to_dict("records"):
@@ -186,9 +238,23 @@ def comparison_json(about: Mapping[str, Any], comparison: Comparison) -> str:
 
 
 def comparison_csv(comparison: Comparison) -> str:
-    """Write the numbers as CSV, a row a split and model, with the ends of their intervals."""
+    """Write the numbers as CSV, a row a split and model, with the ends of their
+    intervals.
+    """
     numbers = comparison.numbers
-    names = [own for score in COMPARED for own in (score.name, f"{score.name}_low", f"{score.name}_high")]
-    columns = ["split", "model", "privileged", "units", *names, *COSTS, *(score.name for score in TAIL_RATES)]
+    names = [
+        own
+        for score in COMPARED
+        for own in (score.name, f"{score.name}_low", f"{score.name}_high")
+    ]
+    columns = [
+        "split",
+        "model",
+        "privileged",
+        "units",
+        *names,
+        *COSTS,
+        *(score.name for score in TAIL_RATES),
+    ]
     known = [name for name in columns if name in numbers]
     return numbers.to_csv(columns=known, index=False, float_format="%.6g")

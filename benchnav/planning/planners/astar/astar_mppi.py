@@ -1,6 +1,8 @@
-"""A* + MPPI: a global path over the map's cells, followed by model predictive path integral control.
+"""A* + MPPI: a global path over the map's cells, followed by model predictive path
+integral control.
 
-Beyond the paper, which runs MPPI without a global path and combines global and local planners.
+Beyond the paper, which runs MPPI without a global path and combines global and local
+planners.
 """
 
 from dataclasses import dataclass, field
@@ -26,7 +28,8 @@ class AStarMPPIConfig(GuideConfig):
         super().__post_init__()
         expect(
             self.explore == 0 or self.mppi.cost_to_go == "objective",
-            f"`explore` = 0 for A*+MPPI with `cost_to_go` {self.mppi.cost_to_go!r}, whose costs run to the goal "
+            f"`explore` = 0 for A*+MPPI with `cost_to_go` {self.mppi.cost_to_go!r}, "
+            "whose costs run to the goal "
             f"and not to waypoints of A*, got {self.explore}.",
         )
 
@@ -34,7 +37,8 @@ class AStarMPPIConfig(GuideConfig):
 class AStarMPPI(Guided[MPPIState]):
     """A* gives way-points to model predictive path integral control.
 
-    With a cost to go, which is A*'s, MPPI minimises a cost that runs to the goal; A*'s path then serves recovery.
+    With a cost to go, which is A*'s, MPPI minimises a cost that runs to the goal; A*'s
+    path then serves recovery.
 
     Args:
         config: settings.

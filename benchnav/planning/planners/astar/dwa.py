@@ -1,12 +1,15 @@
-"""The dynamic window approach (DWA): the best constant (v, ω) within reach of the accelerations.
+"""The dynamic window approach (DWA): the best constant (v, ω) within reach of the
+accelerations.
 
-From Fox, Burgard and Thrun (1997), "The dynamic window approach to collision avoidance", come the window,
-the velocity pairs that the robot can reach within one step, and the search for the one whose arc is best.
-A robot without limits reaches all that its bounds allow. How arcs are judged is not theirs: each pair is held
-for the whole horizon, rolled out through F under λ̂, and judged by J toward a way-point and by the heading that
-it ends with. There are no admissible velocities by braking distance, no terms for clearance and speed; a pair
-that leaves free ground before it arrives pays the penalty of each step off it, which is why DWA creeps in narrow
-places and needs a recovery where it stands.
+From Fox, Burgard and Thrun (1997), "The dynamic window approach to collision
+avoidance", come the window, the velocity pairs that the robot can reach within one
+step, and the search for the one whose arc is best. A robot without limits reaches all
+that its bounds allow. How arcs are judged is not theirs: each pair is held for the
+whole horizon, rolled out through F under λ̂, and judged by J toward a way-point and by
+the heading that it ends with. There are no admissible velocities by braking distance,
+no terms for clearance and speed; a pair that leaves free ground before it arrives pays
+the penalty of each step off it, which is why DWA creeps in narrow places and needs a
+recovery where it stands.
 Letters in shapes: B episodes, M velocity pairs, T horizon steps, S state dimensions.
 """
 
@@ -20,7 +23,12 @@ from torch import Tensor
 
 from benchnav.core.batch import Batch
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
+from benchnav.planning.planners.planner import (
+    LocalPlanner,
+    Plan,
+    check_finite,
+    rollout_path,
+)
 from benchnav.planning.planners.straight import turn_toward
 from benchnav.planning.problem import (
     Dynamics,
@@ -46,13 +54,15 @@ class DWAConfig:
 
     Args:
         speeds: linear velocities in the window.
-        turn_rates: angular velocities in the window; an odd number has that of straight driving among them.
-        horizon_s: how long a pair is held; to the nearest number of steps T, one at least.
-        heading_weight: cost of a radian between the last heading and the direction of the way-point, as a
-            share of what J costs a robot that stands for the horizon; it lets a robot turn on the spot,
-            which changes no distance.
-        arrival_m: a trajectory this near to the way-point has arrived and costs no more, so that a
-            near way-point does not slow the robot.
+        turn_rates: angular velocities in the window; an odd number has that of straight
+            driving among them.
+        horizon_s: how long a pair is held; to the nearest number of steps T, one at
+            least.
+        heading_weight: cost of a radian between the last heading and the direction of
+            the way-point, as a share of what J costs a robot that stands for the
+            horizon; it lets a robot turn on the spot, which changes no distance.
+        arrival_m: a trajectory this near to the way-point has arrived and costs no
+            more, so that a near way-point does not slow the robot.
     """
 
     speeds: int = 10
@@ -63,7 +73,12 @@ class DWAConfig:
 
     def __post_init__(self) -> None:
         """Refuses an empty window, and weights that mean nothing."""
-        check_finite("DWA", self, ("speeds", "turn_rates", "horizon_s"), ("heading_weight", "arrival_m"))
+        check_finite(
+            "DWA",
+            self,
+            ("speeds", "turn_rates", "horizon_s"),
+            ("heading_weight", "arrival_m"),
+        )
 
 
 @dataclass(frozen=True)
@@ -93,7 +108,9 @@ class DWA(LocalPlanner[DWAState]):
         self.config = config or DWAConfig()
         pairs = self.config.speeds * self.config.turn_rates
         # Of the episodes are: states, cost, under_way, pairs, padded_ground, target.
-        self._rollout = Fused(rollout, pairs, _WORTH_COMPILING, batched=(0, 1, 2, 3, 4, 5))
+        self._rollout = Fused(
+            rollout, pairs, _WORTH_COMPILING, batched=(0, 1, 2, 3, 4, 5)
+        )
 
     @property
     def compiled(self) -> bool | None:
@@ -118,7 +135,9 @@ class DWA(LocalPlanner[DWAState]):
         best = cost.argmin(dim=1)[:, None, None]
         layers = {}
         if step.draw:
-            held = window.mT[:, None].expand(-1, steps_in(self.config.horizon_s, problem.dt_s), -1, -1)
+            held = window.mT[:, None].expand(
+                -1, steps_in(self.config.horizon_s, problem.dt_s), -1, -1
+            )
             drawn = rollout_path(problem, step.state, held)
             path = drawn.take_along_dim(best[..., None], 1)[:, 0]
             layers = {"path": path, "samples": drawn[:, :, ::_DRAW_EVERY]}
@@ -132,10 +151,15 @@ class DWA(LocalPlanner[DWAState]):
 
 
 def reachable(problem: Problem, velocity: Tensor) -> tuple[Tensor, Tensor]:
-    """Least and greatest velocities within one step's reach, from (v, ω) now, each of shape [B, 2]."""
+    """Least and greatest velocities within one step's reach, from (v, ω) now, each of
+    shape [B, 2].
+    """
     speed, turn_rate = velocity.unbind(1)
     # Numbers, for a tensor made of them would be sent to the device at every step.
-    reach, turn_reach = (rate * problem.dt_s for rate in problem.robot.action_rates or (math.inf, math.inf))
+    reach, turn_reach = (
+        rate * problem.dt_s
+        for rate in problem.robot.action_rates or (math.inf, math.inf)
+    )
     least = torch.stack((speed - reach, turn_rate - turn_reach), dim=1)
     most = torch.stack((speed + reach, turn_rate + turn_reach), dim=1)
     return least.clamp(*problem.action_bounds), most.clamp(*problem.action_bounds)
@@ -183,7 +207,9 @@ def rollout(
     arrival_m: float,
     steps: int,
 ) -> Arcs:
-    """Hold each pair for some steps, and add up costs of those under way; takes a problem in its parts."""
+    """Hold each pair for some steps, and add up costs of those under way; takes a
+    problem in its parts.
+    """
     states, cost, under_way = arcs
     grid, robot, objective, min_traversability = dynamics
     for _ in range(steps):
@@ -224,16 +250,34 @@ def score(
     steps = steps_in(config.horizon_s, problem.dt_s)
     for first in range(0, steps, _CHUNK_STEPS):
         count = min(_CHUNK_STEPS, steps - first)
-        arcs = advance(arcs, pairs, problem.padded_ground, target, problem.dynamics, config.arrival_m, count)
+        arcs = advance(
+            arcs,
+            pairs,
+            problem.padded_ground,
+            target,
+            problem.dynamics,
+            config.arrival_m,
+            count,
+        )
     states, cost, under_way = arcs
-    # The unit of the heading's weight: the size of what J, without penalties, costs robots that stand for the horizon.
+    # The unit of the heading's weight: the size of what J, without penalties, costs
+    # robots that stand for the horizon.
     standing = problem.start.new_zeros(len(problem), 2).clamp(*problem.action_bounds)
     traversability = predicted_traversability(problem.ground_at(state))
     stage = problem.objective.stage(state, standing, traversability, target_m)
-    unit = (steps * stage + problem.objective.terminal(state, traversability, target_m)).abs()
-    # From the last heading to the way-point as seen from where the robot is now. It is not wrapped: a turn past the
-    # way-point counts as such, else a robot that spins would find another round as good as stopping.
+    unit = (
+        steps * stage + problem.objective.terminal(state, traversability, target_m)
+    ).abs()
+    # From the last heading to the way-point as seen from where the robot is now. It is
+    # not wrapped: a turn past the way-point counts as such, else a robot that spins
+    # would find another round as good as stopping.
     state = state[:, None]
-    heading_error = (turn_toward(state, target) - (states[..., 2] - state[..., 2])).abs()
+    heading_error = (
+        turn_toward(state, target) - (states[..., 2] - state[..., 2])
+    ).abs()
     weight = config.heading_weight * unit
-    return cost + (problem.terminal_cost(states, target) + weight[:, None] * heading_error) * under_way
+    return (
+        cost
+        + (problem.terminal_cost(states, target) + weight[:, None] * heading_error)
+        * under_way
+    )

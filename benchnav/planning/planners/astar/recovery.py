@@ -1,7 +1,8 @@
 """Recovery: what becomes of a robot that its local planner holds in place.
 
-Where a local planner has held a robot in place for a second, the robot is steered along the path, cell by
-cell, until it has left the place; one that drives and is held by the ground is left to its planner. Not of
+Where a local planner has held a robot in place for a second, the robot is steered along
+the path, cell by cell, until it has left the place; one that drives and is held by the
+ground is left to its planner. Not of
 the paper. Letters in shapes: B episodes, S state and A action dimensions.
 """
 
@@ -12,7 +13,13 @@ from torch import Tensor
 
 from benchnav.core.batch import Batch
 from benchnav.planning.objective import distance
-from benchnav.planning.planners.astar.astar import CostToGo, cell_at, cell_centres, cell_points, path_cells
+from benchnav.planning.planners.astar.astar import (
+    CostToGo,
+    cell_at,
+    cell_centres,
+    cell_points,
+    path_cells,
+)
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Robot
 
@@ -67,16 +74,21 @@ def watch(recovery: Recovery, state: Tensor, action: Tensor, robot: Robot) -> Re
         action: what the local planner would do next, the speed first, shape [B, A].
         robot: for its time step and top speed.
     """
-    left = distance(state, recovery.place_m) >= torch.where(recovery.active, _LEFT_M, _STANDING_M)
+    left = distance(state, recovery.place_m) >= torch.where(
+        recovery.active, _LEFT_M, _STANDING_M
+    )
     time_s = (recovery.steps + 1) * robot.dt_s
     given_up = recovery.active & (time_s >= _PATIENCE_S + _RECOVERY_S)
     anew = left | given_up
-    held = (time_s >= _PATIENCE_S) & (recovery.driven_m < _IDLE * robot.top_speed_mps * time_s)
+    held = (time_s >= _PATIENCE_S) & (
+        recovery.driven_m < _IDLE * robot.top_speed_mps * time_s
+    )
     return replace(
         recovery,
         place_m=torch.where(anew[:, None], state[:, :2], recovery.place_m),
         steps=torch.where(anew, 0, recovery.steps + 1),
-        driven_m=torch.where(anew, 0, recovery.driven_m) + action[:, 0].abs() * robot.dt_s,
+        driven_m=torch.where(anew, 0, recovery.driven_m)
+        + action[:, 0].abs() * robot.dt_s,
         active=~anew & (recovery.active | held),
     )
 
@@ -89,10 +101,12 @@ def aim(
     state: Tensor,
     straight: Tensor,
 ) -> Recovery:
-    """Says where robots are steered: along the path, from the centre of one cell to that of the next.
+    """Says where robots are steered: along the path, from the centre of one cell to
+    that of the next.
 
-    Where dearer ground lies on the line to the next cell, it is reached by way of the corner that the two
-    cells share, which no other cell has a part in. A robot keeps to a target until it is there.
+    Where dearer ground lies on the line to the next cell, it is reached by way of the
+    corner that the two cells share, which no other cell has a part in. A robot keeps to
+    a target until it is there.
 
     Args:
         recovery: now, from `watch`, with the targets of the last step.
@@ -111,11 +125,17 @@ def aim(
     points = cell_points(problem, field, ahead)
     on = (arrived & (recovery.target_m == points[:, 0]).all(dim=1)).long()[:, None]
     cell = ahead.gather(1, on)[:, 0]
-    target = torch.where(arrived[:, None], points.take_along_dim(on[..., None], 1)[:, 0], recovery.target_m)
+    target = torch.where(
+        arrived[:, None],
+        points.take_along_dim(on[..., None], 1)[:, 0],
+        recovery.target_m,
+    )
 
     ahead = path_cells(field, cell_at(grid, state), 2)
     gate = 0.5 * cell_centres(grid, ahead).to(state).sum(dim=1)
-    first_m = torch.where(straight[:, None], cell_points(problem, field, ahead)[:, 1], gate)
+    first_m = torch.where(
+        straight[:, None], cell_points(problem, field, ahead)[:, 1], gate
+    )
     return replace(
         recovery,
         target_m=torch.where(begun[:, None], target, first_m),

@@ -1,19 +1,23 @@
 """Edges of the tree: references are drawn, simulated in closed loop, and judged.
 
-An edge is what becomes of the robot when its controller follows a reference from a node: it is driven
-through F with predicted traversability, step by step, and ends where its reference ends, at the goal, after
-its time, or where it collides.
+An edge is what becomes of the robot when its controller follows a reference from a
+node: it is driven through F with predicted traversability, step by step, and ends where
+its reference ends, at the goal, after its time, or where it collides.
 
-- An edge collides where it leaves the map, *enters* ground that is not free, or passes in one time step between
-  two such cells that touch at a corner (`gridgraph.squeezes`). One that begins on ground that is not free, because
-  the truth differs from the prediction, may leave it, and goes on.
-- A loop that may cross does not collide with ground that is not free. How far an edge drives on such
-  ground, or between such cells, is counted, since a metre of it has a penalty.
-- Of an edge that collides the nearer half of its free part stays, as the source keeps feasible nodes along
+- An edge collides where it leaves the map, *enters* ground that is not free, or passes
+  in one time step between two such cells that touch at a corner (`gridgraph.squeezes`).
+  One that begins on ground that is not free, because the truth differs from the
+  prediction, may leave it, and goes on.
+- A loop that may cross does not collide with ground that is not free. How far an edge
+  drives on such ground, or between such cells, is counted, since a metre of it has a
+  penalty.
+- Of an edge that collides the nearer half of its free part stays, as the source keeps
+  feasible nodes along
   the way: in tight places no edge of full length is free.
 
-Source: Kuwata et al. (2009), algorithm 1, lines 4–10. Letters in shapes: B episodes, R edges driven at once,
-T time steps, N points of a reference, P drawn points of an edge, S state dimensions.
+Source: Kuwata et al. (2009), algorithm 1, lines 4–10. Letters in shapes: B episodes, R
+edges driven at once, T time steps, N points of a reference, P drawn points of an edge,
+S state dimensions.
 """
 
 import math
@@ -27,7 +31,12 @@ from benchnav.core.batch import Batch
 from benchnav.core.gridgraph import squeezes
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.astar.astar import cell_at
-from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, PathFollower, Reference, Tracking
+from benchnav.planning.planners.cl_rrt.pursuit import (
+    SPACING_M,
+    PathFollower,
+    Reference,
+    Tracking,
+)
 from benchnav.planning.planners.dubins import dubins_segments_to_point, sample_segments
 from benchnav.planning.problem import Problem, motion_traversability
 from benchnav.planning.robots import steps_in
@@ -100,7 +109,9 @@ class Edges:
     drawn: Tensor
 
 
-def draw_references(loop: ClosedLoop, pose: Tensor, target_m: Tensor) -> tuple[Reference, Tensor]:
+def draw_references(
+    loop: ClosedLoop, pose: Tensor, target_m: Tensor
+) -> tuple[Reference, Tensor]:
     """Draws the shortest paths to points at which any heading will do.
 
     Args:
@@ -109,9 +120,12 @@ def draw_references(loop: ClosedLoop, pose: Tensor, target_m: Tensor) -> tuple[R
         target_m: points to reach, shape [B, R, 2].
 
     Returns:
-        The references, and the length of each path, shape [B, R]; references run straight on past it.
+        The references, and the length of each path, shape [B, R]; references run
+        straight on past it.
     """
-    curvature, lengths_m = dubins_segments_to_point(pose, target_m, loop.radius_m[:, None])
+    curvature, lengths_m = dubins_segments_to_point(
+        pose, target_m, loop.radius_m[:, None]
+    )
     # As far as the controller looks ahead from an edge's end.
     count = 2 + math.ceil((loop.step_m + loop.follower.lookahead_m) / SPACING_M)
     poses = sample_segments(pose, curvature, lengths_m, SPACING_M, count)
@@ -119,7 +133,9 @@ def draw_references(loop: ClosedLoop, pose: Tensor, target_m: Tensor) -> tuple[R
     return Reference.along(poses, length_m), length_m
 
 
-def drive(loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Tensor) -> Edges:
+def drive(
+    loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Tensor
+) -> Edges:
     """Drives along references and keeps what is free of collision.
 
     Args:
@@ -132,7 +148,9 @@ def drive(loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Te
         The edges.
     """
     problem, end_m = loop.problem, length_m.clamp(max=loop.step_m)
-    path, progress, free, collided, integral, error = _simulate(loop, begin, reference, end_m)
+    path, progress, free, collided, integral, error = _simulate(
+        loop, begin, reference, end_m
+    )
     squeezed = _squeezed(problem, path, free)
     collided = collided | (squeezed & ~loop.crossing[:, None]).cummax(dim=0).values
     at_goal = distance(path, problem.goal_m[:, None]) < problem.goal_radius_m
@@ -142,7 +160,9 @@ def drive(loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Te
     half = (_first(collided) - 1).clamp(min=0) // 2
     last = torch.where(_at(collided, last), half, last)
     before = (last - 1).clamp(min=0)
-    tracking = Tracking(_at(path, before)[..., :2], _at(integral, last), _at(error, last))
+    tracking = Tracking(
+        _at(path, before)[..., :2], _at(integral, last), _at(error, last)
+    )
     return Edges(
         kept=last > 0,
         at=LoopState(state=_at(path, last), tracking=tracking, free=_at(free, last)),
@@ -154,12 +174,15 @@ def drive(loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Te
     )
 
 
-def _simulate(loop: ClosedLoop, begin: LoopState, reference: Reference, end_m: Tensor) -> list[Tensor]:
+def _simulate(
+    loop: ClosedLoop, begin: LoopState, reference: Reference, end_m: Tensor
+) -> list[Tensor]:
     """Drives until all edges have ended or collided.
 
     Returns:
-        At each of T steps: states, shape [T, B, R, S]; progress; whether the robot is on free ground;
-        whether it has collided by then; integral and error of the controller; each of shape [T, B, R].
+        At each of T steps: states, shape [T, B, R, S]; progress; whether the robot is
+        on free ground; whether it has collided by then; integral and error of the
+        controller; each of shape [T, B, R].
     """
     problem, follower, barred = loop.problem, loop.follower, ~loop.crossing[:, None]
     state, tracking, progress = begin.state, begin.tracking, torch.zeros_like(end_m)
@@ -171,18 +194,23 @@ def _simulate(loop: ClosedLoop, begin: LoopState, reference: Reference, end_m: T
         free = ground > 0
         collided = collided | (was_free & barred & ~free) | (ground == 0)
         was_free = was_free | free
-        log.append((state, progress, free, collided, tracking.integral, tracking.error_mps))
+        log.append(
+            (state, progress, free, collided, tracking.integral, tracking.error_mps)
+        )
         if step % _CHECK_STEPS == 0 and bool(((progress >= end_m) | collided).all()):
             break
         action, tracking = follower.act(reference, state, tracking, progress)
         state = problem.robot(
-            state, action, motion_traversability(ground, problem.task.rules.min_traversability)
+            state,
+            action,
+            motion_traversability(ground, problem.task.rules.min_traversability),
         )
     return [torch.stack(values) for values in zip(*log, strict=True)]
 
 
 def _squeezed(problem: Problem, path: Tensor, free: Tensor) -> Tensor:
-    """Tell at which steps a robot has just passed between two cells that are not free, bool, shape [T, B, R].
+    """Tell at which steps a robot has just passed between two cells that are not free,
+    bool, shape [T, B, R].
 
     Args:
         problem: B problems.
@@ -192,26 +220,38 @@ def _squeezed(problem: Problem, path: Tensor, free: Tensor) -> Tensor:
     cells = cell_at(problem.grid, path).movedim(0, -1)
     source, target = (part.flatten(1) for part in (cells[..., :-1], cells[..., 1:]))
     free_cells = problem.free.flatten(1)
-    passed = squeezes(partial(torch.gather, free_cells, 1), source, target, problem.grid.width)
+    passed = squeezes(
+        partial(torch.gather, free_cells, 1), source, target, problem.grid.width
+    )
     # A robot off the map is read in the nearest cell.
-    passed = passed.unflatten(1, (path.shape[2], -1)).movedim(-1, 0) & free[:-1] & free[1:]
+    passed = (
+        passed.unflatten(1, (path.shape[2], -1)).movedim(-1, 0) & free[:-1] & free[1:]
+    )
     return torch.nn.functional.pad(passed, (0, 0, 0, 0, 1, 0))
 
 
 def _blocked_m(path: Tensor, free: Tensor, squeezed: Tensor) -> Tensor:
-    """Metres driven on ground that is not free, or between such cells, up to each step, shape [T, B, R]."""
+    """Metres driven on ground that is not free, or between such cells, up to each step,
+    shape [T, B, R].
+    """
     moved = torch.where(free[:-1] & ~squeezed[1:], 0, distance(path[1:], path[:-1]))
     return torch.nn.functional.pad(moved.cumsum(dim=0), (0, 0, 0, 0, 1, 0))
 
 
 def _first(condition: Tensor) -> Tensor:
-    """First step at which a condition [T, B, R] holds, int64, shape [B, R]; 0 where it never does."""
+    """First step at which a condition [T, B, R] holds, int64, shape [B, R]; 0 where it
+    never does.
+    """
     return condition.to(torch.uint8).argmax(dim=0)
 
 
 def _at(log: Tensor, step: Tensor) -> Tensor:
-    """Picks from the first dimension: a log [T, B, R, *F] at steps [B, R] gives [B, R, *F]."""
-    return log.take_along_dim(step.reshape(1, *step.shape, *[1] * (log.dim() - 3)), 0)[0]
+    """Picks from the first dimension: a log [T, B, R, *F] at steps [B, R] gives [B, R,
+    *F].
+    """
+    return log.take_along_dim(step.reshape(1, *step.shape, *[1] * (log.dim() - 3)), 0)[
+        0
+    ]
 
 
 def _thin(path: Tensor, progress: Tensor, last: Tensor, count: int) -> Tensor:

@@ -1,17 +1,20 @@
 """Path following: pure pursuit steers, a PID holds the speed.
 
-Pure pursuit drives the arc that is tangent to the robot and meets the path one look-ahead distance
-on. The PID compares the speed over ground with the wanted one, so it makes up for ground that slows
-the robot, as far as the bounds allow; where an arc asks for a turn rate out of bounds, the speed gives
-way and the arc is kept. Traversability that scales both velocities alike thus bears on when the robot
-is somewhere, hardly on where. The robot is driven by (v, ω), as a unicycle is. One whose turn rate changes
-within a limit would weave about a path that it looks too short a way ahead on: the look-ahead distance is at
-least what it drives while its turn rate builds up.
+Pure pursuit drives the arc that is tangent to the robot and meets the path one
+look-ahead distance on. The PID compares the speed over ground with the wanted one, so
+it makes up for ground that slows the robot, as far as the bounds allow; where an arc
+asks for a turn rate out of bounds, the speed gives way and the arc is kept.
+Traversability that scales both velocities alike thus bears on when the robot is
+somewhere, hardly on where. The robot is driven by (v, ω), as a unicycle is. One whose
+turn rate changes within a limit would weave about a path that it looks too short a way
+ahead on: the look-ahead distance is at least what it drives while its turn rate builds
+    up.
 
-Where the robot is along the path is itself a state, its progress: an arc length that each step
-moves forward to the robot's projection on the path's tangent. It never goes back, so paths may cross
-themselves. Sources: Coulter (1992), "Implementation of the pure pursuit path tracking algorithm"; paper
-IV-A2. Letters in shapes: N points, S state and A action dimensions.
+Where the robot is along the path is itself a state, its progress: an arc length that
+each step moves forward to the robot's projection on the path's tangent. It never goes
+back, so paths may cross
+themselves. Sources: Coulter (1992), "Implementation of the pure pursuit path tracking
+algorithm"; paper IV-A2. Letters in shapes: N points, S state and A action dimensions.
 """
 
 import math
@@ -35,9 +38,12 @@ class FollowerConfig:
     """Settings of a path follower.
 
     Args:
-        lookahead_m: distance along the path from the robot to the point that it steers for, at least.
-        lookahead_s: the same as what the robot drives in so many seconds at the wanted speed, where that is more.
-        speed_mps: speed over ground that is wanted; without it the robot's top speed forward.
+        lookahead_m: distance along the path from the robot to the point that it steers
+            for, at least.
+        lookahead_s: the same as what the robot drives in so many seconds at the wanted
+            speed, where that is more.
+        speed_mps: speed over ground that is wanted; without it the robot's top speed
+            forward.
         speed_kp: proportional gain of the speed, on top of the wanted speed itself.
         speed_ki: integral gain in 1/s.
         speed_kd: derivative gain in s.
@@ -75,19 +81,26 @@ class Reference:
         """Makes references that run straight on past the ends of their paths.
 
         Args:
-            poses: (x, y, θ) each `SPACING_M` on, past the end the end pose, shape [*B, N, 3].
+            poses: (x, y, θ) each `SPACING_M` on, past the end the end pose, shape [*B,
+                N, 3].
             length_m: length of each path, shape [*B].
         """
         *batch, count, _ = poses.shape
         arc = torch.arange(count, dtype=poses.dtype, device=poses.device) * SPACING_M
         beyond = (arc - length_m[..., None]).clamp(min=0)
         cos, sin = poses[..., 2].cos(), poses[..., 2].sin()
-        rows = torch.stack((poses[..., 0] + beyond * cos, poses[..., 1] + beyond * sin, cos, sin), dim=-1)
-        first = torch.arange(math.prod(batch), device=poses.device).reshape(batch) * count
+        rows = torch.stack(
+            (poses[..., 0] + beyond * cos, poses[..., 1] + beyond * sin, cos, sin),
+            dim=-1,
+        )
+        first = (
+            torch.arange(math.prod(batch), device=poses.device).reshape(batch) * count
+        )
         return cls(rows.reshape(-1, 4), first, count)
 
     def at(self, arc_m: Tensor) -> Tensor:
-        """Looks up the last point at or before an arc length, which must lie on the path.
+        """Looks up the last point at or before an arc length, which must lie on the
+        path.
 
         Returns:
             (x, y, cos θ, sin θ), shape [*B, 4].
@@ -112,7 +125,9 @@ class Tracking(Batch):
 
     @classmethod
     def standing(cls, state: Tensor) -> "Tracking":
-        """Tracking of robots that stand at the beginning of their references, states [*B, S]."""
+        """Tracking of robots that stand at the beginning of their references, states
+        [*B, S].
+        """
         zero = torch.zeros_like(state[..., 0])
         return cls(state[..., :2], zero, zero)
 
@@ -122,32 +137,46 @@ class PathFollower:
 
     Args:
         config: settings.
-        robot: gives the time step and the bounds of (v, ω), and of their changes where it has some.
+        robot: gives the time step and the bounds of (v, ω), and of their changes where
+            it has some.
 
     Raises:
-        ConfigError: the robot has other actions, cannot drive forward, or turns one way alone.
+        ConfigError: the robot has other actions, cannot drive forward, or turns one way
+            alone.
     """
 
     def __init__(self, config: FollowerConfig, robot: Robot) -> None:
         """Reads the bounds."""
-        names, low, high = tuple(robot.action_names), robot.action_low, robot.action_high
+        names, low, high = (
+            tuple(robot.action_names),
+            robot.action_low,
+            robot.action_high,
+        )
         expect(
             names == (SPEED, TURN_RATE) and high[0] > 0 and low[1] < 0 < high[1],
-            f"a robot with actions ({SPEED}, {TURN_RATE}), the first up to more than 0 and the second to both sides, "
-            f"got ({', '.join(names)}) from {tuple(low)} to {tuple(high)}. Take a planner that samples actions, such "
+            f"a robot with actions ({SPEED}, {TURN_RATE}), the first up to more than "
+            "0 and the second to both sides, "
+            f"got ({', '.join(names)}) from {tuple(low)} to {tuple(high)}. Take a "
+            "planner that samples actions, such "
             "as mppi.",
         )
         self.config = config
         self.dt_s = robot.dt_s
         self.speed_mps = low[0], high[0]
-        self.wanted_mps = high[0] if config.speed_mps is None else min(config.speed_mps, high[0])
+        self.wanted_mps = (
+            high[0] if config.speed_mps is None else min(config.speed_mps, high[0])
+        )
         self.turn_rate_radps = min(-low[1], high[1])
         self.tightest_m = low[0] / self.turn_rate_radps  # radius of the tightest turn
         rates = robot.action_rates
         build_up_s = self.turn_rate_radps / rates[1] if rates else 0.0
-        self.lookahead_m = max(config.lookahead_m, max(config.lookahead_s, build_up_s) * self.wanted_mps)
+        self.lookahead_m = max(
+            config.lookahead_m, max(config.lookahead_s, build_up_s) * self.wanted_mps
+        )
 
-    def advance(self, reference: Reference, state: Tensor, progress_m: Tensor) -> Tensor:
+    def advance(
+        self, reference: Reference, state: Tensor, progress_m: Tensor
+    ) -> Tensor:
         """Moves the progress forward to where the robot is now.
 
         Args:
@@ -156,7 +185,8 @@ class PathFollower:
             progress_m: shape [*B].
 
         Returns:
-            The new progress, no further than leaves the look-ahead point on the reference.
+            The new progress, no further than leaves the look-ahead point on the
+            reference.
         """
         near_x, near_y, cos, sin = reference.at(progress_m).unbind(-1)
         at = (progress_m * (1 / SPACING_M)).floor() * SPACING_M
@@ -165,7 +195,11 @@ class PathFollower:
         return torch.maximum(progress_m, projected).clamp(max=last)
 
     def act(
-        self, reference: Reference, state: Tensor, tracking: Tracking, progress_m: Tensor
+        self,
+        reference: Reference,
+        state: Tensor,
+        tracking: Tracking,
+        progress_m: Tensor,
     ) -> tuple[Tensor, Tracking]:
         """Chooses an action.
 
@@ -188,15 +222,23 @@ class PathFollower:
 
         # PID: the wanted speed, corrected by the error of the speed over ground.
         moved = state[..., :2] - tracking.position_m
-        error = self.wanted_mps - torch.hypot(moved[..., 0], moved[..., 1]) * (1 / self.dt_s)
+        error = self.wanted_mps - torch.hypot(moved[..., 0], moved[..., 1]) * (
+            1 / self.dt_s
+        )
         low, high = self.speed_mps
         reach = high - low
-        integral = (tracking.integral + error * (config.speed_ki * self.dt_s)).clamp(-reach, reach)
+        integral = (tracking.integral + error * (config.speed_ki * self.dt_s)).clamp(
+            -reach, reach
+        )
         speed = self.wanted_mps + config.speed_kp * error + integral
         if config.speed_kd:
             speed = speed + (error - tracking.error_mps) * (config.speed_kd / self.dt_s)
-        speed = torch.minimum(speed, self.turn_rate_radps / curvature.abs().clamp(min=_LEAST_CURVATURE))
+        speed = torch.minimum(
+            speed, self.turn_rate_radps / curvature.abs().clamp(min=_LEAST_CURVATURE)
+        )
         speed = speed.clamp(low, high)
-        turn_rate = (speed * curvature).clamp(-self.turn_rate_radps, self.turn_rate_radps)
+        turn_rate = (speed * curvature).clamp(
+            -self.turn_rate_radps, self.turn_rate_radps
+        )
         action = torch.stack((speed, turn_rate), dim=-1)
         return action, Tracking(state[..., :2], integral, error)

@@ -1,20 +1,23 @@
 """The tree of CL-RRT and the search that grows it.
 
-`search` is the whole of a plan and reads top-down: plant a root; in each round choose nodes and where to go
-from them, draw references, drive along them (`edges`), and add their ends as nodes; at last take the best
+`search` is the whole of a plan and reads top-down: plant a root; in each round choose
+nodes and where to go from them, draw references, drive along them (`edges`), and add
+their ends as nodes; at last take the best
 route. A tree is a value: a table of nodes, of which every round makes a longer one.
 
-- Nodes are chosen by Kuwata's mix of two heuristics: the nearest in Dubins length (explore), or the one
-  through which the point is reached soonest (optimise). Before a way to the goal is known 70 % of the
-  choices explore, afterwards 30 %, and nodes that cannot improve on the best way are left out.
-- The goal's share of the edges goes to nodes that have not tried it yet, the most promising first: an attempt
-  is deterministic, so a second one from the same node would be a copy. The source tries the goal from every new
-  node.
-- A way costs its simulated time, and `PENALTY` for each metre of it on ground that is not free.
+- Nodes are chosen by Kuwata's mix of two heuristics: the nearest in Dubins length
+  (explore), or the one through which the point is reached soonest (optimise). Before a
+  way to the goal is known 70 % of the choices explore, afterwards 30 %, and nodes that
+  cannot improve on the best way are left out.
+- The goal's share of the edges goes to nodes that have not tried it yet, the most
+  promising first: an attempt is deterministic, so a second one from the same node would
+  be a copy. The source tries the goal from every new node.
+- A way costs its simulated time, and `PENALTY` for each metre of it on ground that is
+  not free.
 
-Source: Kuwata et al. (2009), section IV and algorithm 1. Letters in shapes: B episodes, R edges of a round,
-V nodes, E edges of a finished tree, D edges of a path, N points of a reference, of which Q are drawn, P drawn
-points of an edge.
+Source: Kuwata et al. (2009), section IV and algorithm 1. Letters in shapes: B episodes,
+R edges of a round, V nodes, E edges of a finished tree, D edges of a path, N points of
+a reference, of which Q are drawn, P drawn points of an edge.
 """
 
 import math
@@ -39,9 +42,15 @@ from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, Tracking
 from benchnav.planning.planners.dubins import dubins_length_to_point
 from benchnav.planning.planners.planner import PlanStatus
 
-_EXPLORE = (0.7, 0.3)  # share of choices that explore, before and after a way to the goal is known
-_PARTIAL_GAIN_M = 0.5  # a partial path that leads no further than this toward the goal is none
-_MARGIN_M = 0.3  # a partial path is left so far before its end, which may lie close to what is not free
+_EXPLORE = (
+    0.7,
+    0.3,
+)  # share of choices that explore, before and after a way to the goal is known
+_PARTIAL_GAIN_M = (
+    0.5  # a partial path that leads no further than this toward the goal is none
+)
+# a partial path is left so far before its end, which may lie close to what is not free
+_MARGIN_M = 0.3
 _FAR_M = 1e4  # longer than any way on a map
 
 
@@ -62,13 +71,15 @@ class Choice:
 
 @dataclass(frozen=True, kw_only=True)
 class Tree(Choice, Edges):
-    """Trees of B episodes. Node 0 is the root; every other is the end of the edge that leads to it.
+    """Trees of B episodes. Node 0 is the root; every other is the end of the edge that
+    leads to it.
 
-    Edges are as they were chosen and driven, V in place of R, but that their times, inf where nothing is left of one,
-    and metres that are not free count from the root.
+    Edges are as they were chosen and driven, V in place of R, but that their times, inf
+    where nothing is left of one, and metres that are not free count from the root.
 
     Args:
-        to_goal_m: Dubins length on to the goal, inf where nothing is left of the edge, shape [B, V].
+        to_goal_m: Dubins length on to the goal, inf where nothing is left of the edge,
+            shape [B, V].
     """
 
     to_goal_m: Tensor
@@ -80,7 +91,9 @@ class Tree(Choice, Edges):
 
     @property
     def best(self) -> tuple[Tensor, Tensor]:
-        """What the best way to the goal costs, inf where none is known, and its node, each of shape [B]."""
+        """What the best way to the goal costs, inf where none is known, and its node,
+        each of shape [B].
+        """
         return torch.where(self.arrived, self.cost, math.inf).min(dim=1)
 
 
@@ -89,7 +102,8 @@ class Route(Batch):
     """What was planned for each episode.
 
     Args:
-        status: `PlanStatus`: OK where the path leads to the goal and enters free ground alone, else PARTIAL.
+        status: `PlanStatus`: OK where the path leads to the goal and enters free ground
+            alone, else PARTIAL.
         depth: edges of the path, 0 where there is none, int64, shape [B].
         rows: references of the edges, as `Reference` keeps them, shape [B, D, N, 4].
         end_m: arc length at which each reference is left for the next, shape [B, D].
@@ -108,30 +122,47 @@ class Route(Batch):
         """Split paths into short straight pieces.
 
         Args:
-            most_m: maximum length of a piece, where the drawn points are `DRAWN_M` apart.
+            most_m: maximum length of a piece, where the drawn points are `DRAWN_M`
+                apart.
 
         Returns:
-            Midpoints (x, y), shape [B, K, 2], and lengths, shape [B, K]; 0 m at (0, 0) past the end of a path.
+            Midpoints (x, y), shape [B, K, 2], and lengths, shape [B, K]; 0 m at (0, 0)
+            past the end of a path.
         """
         count = math.ceil(DRAWN_M / most_m)
         offset = self.path.diff(dim=1)[:, :, None]
         at = (torch.arange(count, device=offset.device) + 0.5) / count
-        points = (self.path[:, :-1, None] + at[:, None] * offset).flatten(1, 2).nan_to_num(nan=0.0)
-        length_m = torch.linalg.vector_norm(offset, dim=-1).expand(-1, -1, count) / count
+        points = (
+            (self.path[:, :-1, None] + at[:, None] * offset)
+            .flatten(1, 2)
+            .nan_to_num(nan=0.0)
+        )
+        length_m = (
+            torch.linalg.vector_norm(offset, dim=-1).expand(-1, -1, count) / count
+        )
         return points, length_m.flatten(1, 2).nan_to_num(nan=0.0)
 
     @property
     def line(self) -> Tensor:
-        """Points of the references as far as they are driven, NaN where unused, shape [B, D·Q, 2]."""
+        """Points of the references as far as they are driven, NaN where unused, shape
+        [B, D·Q, 2].
+        """
         points = self.rows[:, :, :: round(DRAWN_M / SPACING_M), :2]
         arc_m = torch.arange(points.shape[2], device=points.device) * DRAWN_M
-        used = torch.arange(self.rows.shape[1], device=points.device) < self.depth[:, None]
+        used = (
+            torch.arange(self.rows.shape[1], device=points.device) < self.depth[:, None]
+        )
         driven = used[..., None] & (arc_m <= self.end_m[..., None])
         return _pack(torch.where(driven[..., None], points, math.nan).flatten(1, 2))
 
 
 def search(
-    loop: ClosedLoop, root: Tensor, tracking: Tracking, sample_m: Tensor, chance: Tensor, goal_edges: int
+    loop: ClosedLoop,
+    root: Tensor,
+    tracking: Tracking,
+    sample_m: Tensor,
+    chance: Tensor,
+    goal_edges: int,
 ) -> Route:
     """Grows a tree for each episode and takes the best route of each.
 
@@ -140,14 +171,17 @@ def search(
         root: states to plan from, shape [B, S].
         tracking: of the controllers there, shape [B].
         sample_m: points to reach, D rounds of them, shape [D, R, 2].
-        chance: uniform in [0, 1), decides by which heuristic each node is chosen, shape [D, R].
+        chance: uniform in [0, 1), decides by which heuristic each node is chosen, shape
+            [D, R].
         goal_edges: edges of a round that aim at the goal.
     """
     tree = plant(loop, root, tracking)
     for points_m, chances in zip(sample_m, chance, strict=True):
         choice = choose(loop, tree, points_m, chances, goal_edges)
         begin = stand(tree, choice.parent)
-        reference, length_m = draw_references(loop, begin.state[..., :3], choice.target_m)
+        reference, length_m = draw_references(
+            loop, begin.state[..., :3], choice.target_m
+        )
         tree = add(loop, tree, choice, drive(loop, begin, reference, length_m))
     return best_route(loop, tree, len(sample_m))
 
@@ -173,7 +207,9 @@ def plant(loop: ClosedLoop, root: Tensor, tracking: Tracking) -> Tree:
     )
 
 
-def choose(loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_edges: int) -> Choice:
+def choose(
+    loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_edges: int
+) -> Choice:
     """Chooses nodes, and where to go from them.
 
     Args:
@@ -181,19 +217,24 @@ def choose(loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_
         tree: so far.
         sample_m: points to reach, shape [R, 2].
         chance: uniform in [0, 1), shape [R].
-        goal_edges: how many of the R edges go to the goal instead, while there are nodes that have not.
+        goal_edges: how many of the R edges go to the goal instead, while there are
+            nodes that have not.
     """
     best = tree.best[0][:, None]
     found = best < math.inf
-    straight_m = (distance(tree.at.state, loop.problem.goal_m[:, None]) - loop.problem.goal_radius_m).clamp(
-        min=0
-    )
-    closed = tree.cost + straight_m / loop.follower.speed_mps[1] >= best  # cannot improve on the best way
+    straight_m = (
+        distance(tree.at.state, loop.problem.goal_m[:, None])
+        - loop.problem.goal_radius_m
+    ).clamp(min=0)
+    closed = (
+        tree.cost + straight_m / loop.follower.speed_mps[1] >= best
+    )  # cannot improve on the best way
     closed_m = torch.where(closed, math.inf, 0.0)
     # The time of the way to each node, as the length driven in it at the wanted speed.
     spent_m = torch.where(closed, 0, loop.follower.wanted_mps * tree.time_s)
 
-    # Line 2 of algorithm 1: the first node by length alone (explore), or by the whole way (optimise).
+    # Line 2 of algorithm 1: the first node by length alone (explore), or by the whole
+    # way (optimise).
     explore = chance < torch.where(found, _EXPLORE[1], _EXPLORE[0])  # [B, R]
     length_m = dubins_length_to_point(
         tree.at.state[:, None, :, :3], sample_m[:, None], loop.radius_m[:, None, None]
@@ -204,9 +245,16 @@ def choose(loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_
 
     # Lines 13–20: the goal.
     lanes = min(goal_edges, tree.parent.shape[1])
-    tried = torch.zeros_like(tree.time_s).scatter_add(1, tree.parent, tree.aimed.to(tree.time_s)) > 0
+    tried = (
+        torch.zeros_like(tree.time_s).scatter_add(
+            1, tree.parent, tree.aimed.to(tree.time_s)
+        )
+        > 0
+    )
     promise_m = tree.to_goal_m + closed_m + torch.where(found, spent_m, 0)
-    promise_m, promising = torch.where(tried, math.inf, promise_m).topk(lanes, dim=1, largest=False)
+    promise_m, promising = torch.where(tried, math.inf, promise_m).topk(
+        lanes, dim=1, largest=False
+    )
     others = (0, node.shape[1] - lanes)
     aimed, promising = pad(promise_m < math.inf, others), pad(promising, others)
     return Choice(
@@ -222,11 +270,15 @@ def stand(tree: Tree, node: Tensor) -> LoopState:
 
 
 def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
-    """The tree with the ends of edges as its next nodes, rejected ones too, so that tables stay of a size."""
+    """The tree with the ends of edges as its next nodes, rejected ones too, so that
+    tables stay of a size.
+    """
     kept, parent = edges.kept, choice.parent
     edges = replace(
         edges,
-        time_s=torch.where(kept, tree.time_s.gather(1, parent) + edges.time_s, math.inf),
+        time_s=torch.where(
+            kept, tree.time_s.gather(1, parent) + edges.time_s, math.inf
+        ),
         blocked_m=tree.blocked_m.gather(1, parent) + edges.blocked_m,
         arrived=edges.arrived & kept,
     )
@@ -236,7 +288,8 @@ def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
 
 
 def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
-    """Takes the cheapest path to the goal or, where there is none, the best partial one.
+    """Takes the cheapest path to the goal or, where there is none, the best partial
+    one.
 
     Args:
         loop: robots, controller and ground.
@@ -264,20 +317,26 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
         depth=depth,
         rows=reference.rows.reshape(*nodes.shape, -1, 4),
         end_m=torch.where(early, end_m - _MARGIN_M, end_m),
-        path=_pack(torch.where((nodes > 0)[..., None, None], drawn, math.nan).flatten(1, 2)),
+        path=_pack(
+            torch.where((nodes > 0)[..., None, None], drawn, math.nan).flatten(1, 2)
+        ),
         tree=torch.where(tree.kept[:, 1:, None, None], tree.drawn[:, 1:], math.nan),
     )
 
 
 def no_route(loop: ClosedLoop, rounds: int, edges: int) -> Route:
-    """Routes without a path, of the shapes that searched ones have: of trees with nothing but roots."""
+    """Routes without a path, of the shapes that searched ones have: of trees with
+    nothing but roots.
+    """
     root = plant(loop, loop.problem.start, Tracking.standing(loop.problem.start))
     tree = map_tensors(root, lambda values: values.repeat_interleave(1 + edges, dim=1))
     return best_route(loop, tree, rounds)
 
 
 def _best_partial(tree: Tree) -> Tensor:
-    """Nodes nearest to the goal, those on free ground first; the root unless that gains enough."""
+    """Nodes nearest to the goal, those on free ground first; the root unless that gains
+    enough.
+    """
     remaining_m = tree.to_goal_m + torch.where(tree.at.free, 0.0, _FAR_M)
     least_m, node = remaining_m.min(dim=1)
     return torch.where(remaining_m[:, 0] - least_m > _PARTIAL_GAIN_M, node, 0)
@@ -285,11 +344,15 @@ def _best_partial(tree: Tree) -> Tensor:
 
 def _to_goal_m(loop: ClosedLoop, state: Tensor) -> Tensor:
     """Dubins lengths from states [B, V, S] to the goals, shape [B, V]."""
-    return dubins_length_to_point(state[..., :3], loop.problem.goal_m[:, None], loop.radius_m[:, None])
+    return dubins_length_to_point(
+        state[..., :3], loop.problem.goal_m[:, None], loop.radius_m[:, None]
+    )
 
 
 def _take(values: Tensor, index: Tensor) -> Tensor:
-    """Picks from the second dimension: values [B, V, *F] at indices [B, R] give [B, R, *F]."""
+    """Picks from the second dimension: values [B, V, *F] at indices [B, R] give [B, R,
+    *F].
+    """
     return values.take_along_dim(index if values.dim() == 2 else index[..., None], 1)
 
 

@@ -1,7 +1,8 @@
 """Closed loops of planners on a λ field that is known, simulated as the world does it.
 
-λ is read where a robot stands at the start of a step, and so is whether that immobilises it. Nothing is drawn, so a
-robot that repeats the actions in the same world repeats the drive.
+λ is read where a robot stands at the start of a step, and so is whether that
+immobilises it. Nothing is drawn, so a robot that repeats the actions in the same world
+repeats the drive.
 Letters in shapes: B episodes, T steps, S state and A action dimensions.
 """
 
@@ -51,7 +52,8 @@ def simulate(
         plan_state: from `init`.
         problem: B problems.
         field: λ, shape [B, H, W].
-        rival: the simulation ends where this drive has reached the goal by then; None for no such drive.
+        rival: the simulation ends where this drive has reached the goal by then; None
+            for no such drive.
     """
     grid, robot, immobile = problem.grid, problem.robot, problem.immobile
     low, high = problem.action_bounds
@@ -60,7 +62,9 @@ def simulate(
     longest = int(limit.max())
     if rival is not None:
         limit = torch.minimum(limit, rival.steps)
-    states = problem.start.new_full((len(problem), longest + 1, problem.start.shape[1]), torch.nan)
+    states = problem.start.new_full(
+        (len(problem), longest + 1, problem.start.shape[1]), torch.nan
+    )
     actions = problem.start.new_full((len(problem), longest, len(low)), torch.nan)
     arrival = torch.full_like(problem.time_budget_s, torch.inf)
     states[:, 0] = problem.start
@@ -75,7 +79,11 @@ def simulate(
         states[running, count + 1], actions[running, count] = state, action
         arrived = distance(state, problem.goal_m[running]) < problem.goal_radius_m
         arrival[running[arrived]] = count + 1.0
-        ended = arrived | ~grid.contains(state[:, 0], state[:, 1]) | (count + 1 >= limit[running])
+        ended = (
+            arrived
+            | ~grid.contains(state[:, 0], state[:, 1])
+            | (count + 1 >= limit[running])
+        )
         if immobile is not None:
             dwell = torch.where(observed < immobile.below, dwell + 1, 0)
             ended = ended | (dwell >= steps_in(immobile.for_s, problem.dt_s))
@@ -84,12 +92,19 @@ def simulate(
             if len(kept) == 0:
                 break
             plan_state = select(plan_state, kept)
-            running, state, dwell, observed = running[kept], state[kept], dwell[kept], observed[kept]
+            running, state, dwell, observed = (
+                running[kept],
+                state[kept],
+                dwell[kept],
+                observed[kept],
+            )
     return Drive(states=states, actions=actions, steps=arrival)
 
 
 def earlier(first: Drive, second: Drive) -> Drive:
-    """Return of each episode the drive that reaches the goal earlier; the first where both are as early."""
+    """Return of each episode the drive that reaches the goal earlier; the first where
+    both are as early.
+    """
     takes = (second.steps < first.steps)[:, None, None]
     return Drive(
         states=torch.where(takes, second.states, first.states),

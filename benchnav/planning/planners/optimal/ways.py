@@ -1,9 +1,11 @@
 """Motion primitives to nearby cell centres, by which a robot goes down the cost to go.
 
-Between cells' centres the interpolated cost to go is too low before slow ground and too high in it, so that a robot
-that looks at its next moves alone may turn to and fro. Ways therefore end at centres, up to some cells away: a turn on
-the spot, along a circle at full speed, and straight on.
-Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L levels of dwell time.
+Between cells' centres the interpolated cost to go is too low before slow ground and too
+high in it, so that a robot that looks at its next moves alone may turn to and fro. Ways
+therefore end at centres, up to some cells away: a turn on the spot, along a circle at
+full speed, and straight on.
+Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L levels of
+    dwell time.
 """
 
 import math
@@ -20,7 +22,10 @@ from benchnav.planning.problem import Problem
 
 _NEAR_CELLS = 4  # how far ways lead
 _POINTS = 16  # N, along a way
-_BESIDE = (math.pi / 4, math.pi / 2)  # how far beside a robot's heading a cell may lie for a circle
+_BESIDE = (
+    math.pi / 4,
+    math.pi / 2,
+)  # how far beside a robot's heading a cell may lie for a circle
 _EVEN = 1e-4  # an arc of a whole circle but for rounding is none
 _DRAWN_WAYS = 100  # of the path that is drawn
 
@@ -36,7 +41,8 @@ class OptimalState(Batch):
         to_go: cost to go of every state.
         held: dwell time of the robots in seconds, shape [B].
         taken: steps taken, int64, shape [B].
-        drive: simulated to its end; a robot follows it as long as it is on it; None for none.
+        drive: simulated to its end; a robot follows it as long as it is on it; None for
+            none.
     """
 
     problem: Problem
@@ -81,10 +87,15 @@ def ways_from(pose: Tensor, held: Tensor, plan_state: OptimalState) -> Ways:
     away = torch.stack(grid.centre_of(row, column), -1) - pose[:, None, :2]
     ahead, left = _seen_from(pose[:, 2:], away)
     bearing = torch.atan2(left, ahead)
-    # A turn until the robot looks at the cell, or as far beside it as it drives along a circle for.
-    off = torch.cat([(bearing.abs() - most).clamp(min=0) for most in (0.0, *_BESIDE)], 1)
+    # A turn until the robot looks at the cell, or as far beside it as it drives along a
+    # circle for.
+    off = torch.cat(
+        [(bearing.abs() - most).clamp(min=0) for most in (0.0, *_BESIDE)], 1
+    )
     count = len(_BESIDE) + 1
-    away, bearing, inside = (own.repeat(1, count, *[1] * (own.dim() - 2)) for own in (away, bearing, inside))
+    away, bearing, inside = (
+        own.repeat(1, count, *[1] * (own.dim() - 2)) for own in (away, bearing, inside)
+    )
     side = torch.where(bearing < 0, -1.0, 1.0).to(pose)
     first = pose[:, 2:] + side * off
     ahead, left = _seen_from(first, away)
@@ -94,7 +105,11 @@ def ways_from(pose: Tensor, held: Tensor, plan_state: OptimalState) -> Ways:
     square = ahead.square() + past.square() - radius.square()
     straight = square.clamp(min=0).sqrt()
     arc = (
-        torch.remainder(torch.atan2(past, ahead) + torch.atan2(radius, straight) + _EVEN, 2 * math.pi) - _EVEN
+        torch.remainder(
+            torch.atan2(past, ahead) + torch.atan2(radius, straight) + _EVEN,
+            2 * math.pi,
+        )
+        - _EVEN
     )
     possible = inside & (square >= 0) & (arc <= math.pi)
 
@@ -124,17 +139,24 @@ def ways_from(pose: Tensor, held: Tensor, plan_state: OptimalState) -> Ways:
 
 
 def _seen_from(heading: Tensor, away: Tensor) -> tuple[Tensor, Tensor]:
-    """How far ahead and to the left offsets [B, K, 2] are for a robot of headings [B, 1] or [B, K]."""
+    """How far ahead and to the left offsets [B, K, 2] are for a robot of headings [B,
+    1] or [B, K].
+    """
     x, y, cosine, sine = away[..., 0], away[..., 1], heading.cos(), heading.sin()
     return x * cosine + y * sine, y * cosine - x * sine
 
 
 def path_of(plan_state: OptimalState, pose: Tensor, held: Tensor) -> Tensor:
-    """Positions along the best ways, one after another, until the goal, shape [B, N, 2]; NaN behind it."""
+    """Positions along the best ways, one after another, until the goal, shape [B, N,
+    2]; NaN behind it.
+    """
     problem, found = plan_state.problem, [pose[:, None, :2]]
     own = torch.arange(len(pose), device=pose.device)
     for _ in range(_DRAWN_WAYS):
-        left = torch.linalg.vector_norm(pose[:, :2] - problem.goal_m, dim=1) >= problem.goal_radius_m
+        left = (
+            torch.linalg.vector_norm(pose[:, :2] - problem.goal_m, dim=1)
+            >= problem.goal_radius_m
+        )
         if not bool(left.any()):
             break
         ways = ways_from(pose, held, plan_state)
@@ -147,7 +169,9 @@ def path_of(plan_state: OptimalState, pose: Tensor, held: Tensor) -> Tensor:
 
 
 def _near(pose: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows and columns of the cells around robots, and which lie on the map, each of shape [B, K]."""
+    """Rows and columns of the cells around robots, and which lie on the map, each of
+    shape [B, K].
+    """
     around = torch.arange(-_NEAR_CELLS, _NEAR_CELLS + 1, device=pose.device)
     near = torch.cartesian_prod(around, around)
     near = near[(near.square().sum(1) <= _NEAR_CELLS**2) & near.any(1)]
@@ -158,9 +182,15 @@ def _near(pose: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _cost(
-    pose: Tensor, held: Tensor, points: Tensor, spot_s: Tensor, drive_s: Tensor, heading: Tensor,
-    cells: tuple[Tensor, ...], plan_state: OptimalState,
-) -> Tensor:  # fmt: skip
+    pose: Tensor,
+    held: Tensor,
+    points: Tensor,
+    spot_s: Tensor,
+    drive_s: Tensor,
+    heading: Tensor,
+    cells: tuple[Tensor, ...],
+    plan_state: OptimalState,
+) -> Tensor:
     """Cost of ways and from their ends on, shape [B, K].
 
     Args:
@@ -198,21 +228,32 @@ def _cost(
     return torch.where(most < costs.lost_after_s, cost + to_go, UNREACHED)
 
 
-def _value_at(to_go: CostToGo, dwell_s: Tensor, heading: Tensor, cells: tuple[Tensor, ...]) -> Tensor:
-    """The cost to go of poses at cells' centres, between headings, shape [B, K]; cells off the map mean nothing."""
+def _value_at(
+    to_go: CostToGo, dwell_s: Tensor, heading: Tensor, cells: tuple[Tensor, ...]
+) -> Tensor:
+    """The cost to go of poses at cells' centres, between headings, shape [B, K]; cells
+    off the map mean nothing.
+    """
     _, levels, headings, height, width = to_go.value.shape
     row, column = cells[0].clamp(0, height - 1), cells[1].clamp(0, width - 1)
     place = heading / (2 * math.pi / headings)
     first = place.floor()
-    index = [(first.long() + more) % headings * height * width + row * width + column for more in (0, 1)]
+    index = [
+        (first.long() + more) % headings * height * width + row * width + column
+        for more in (0, 1)
+    ]
 
     def read(values: Tensor) -> Tensor:
         """Values of all levels, shape [B, L, K]."""
         flat = values.flatten(2)
-        before, behind = (flat.gather(2, each[:, None].expand(-1, levels, -1)) for each in index)
+        before, behind = (
+            flat.gather(2, each[:, None].expand(-1, levels, -1)) for each in index
+        )
         return torch.lerp(before, behind, (place - first)[:, None])
 
     value = read(to_go.value)
     if to_go.max_dwell_s is not None:
-        value = torch.where(read(to_go.max_dwell_s) > dwell_s[:, None], value, UNREACHED)
+        value = torch.where(
+            read(to_go.max_dwell_s) > dwell_s[:, None], value, UNREACHED
+        )
     return value.amin(1)

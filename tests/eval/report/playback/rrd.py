@@ -14,7 +14,9 @@ def verify(path: Path) -> None:
     """Lets the viewer's own program check a file."""
     programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     command = ["rerun", "rrd", "verify", str(path)]
-    subprocess.run(command, check=True, capture_output=True, env={**os.environ, "PATH": programs})
+    subprocess.run(
+        command, check=True, capture_output=True, env={**os.environ, "PATH": programs}
+    )
 
 
 def chunks(path: Path) -> dict[str, list[pa.RecordBatch]]:
@@ -31,8 +33,15 @@ def column(path: Path, entity: str, name: str) -> tuple[np.ndarray, list[object]
     for batch in chunks(path).get(entity, []):
         if "time" not in batch.schema.names:
             continue
-        times = batch.column("time").to_numpy(zero_copy_only=False).astype("timedelta64[ns]").astype(np.int64)
-        values = batch.column(next(n for n in batch.schema.names if n.endswith(name))).to_pylist()
+        times = (
+            batch.column("time")
+            .to_numpy(zero_copy_only=False)
+            .astype("timedelta64[ns]")
+            .astype(np.int64)
+        )
+        values = batch.column(
+            next(n for n in batch.schema.names if n.endswith(name))
+        ).to_pylist()
         found += list(zip(times * 1e-9, values, strict=True))
     found.sort(key=lambda pair: pair[0])
     return np.array([time for time, _ in found]), [value for _, value in found]
@@ -53,7 +62,11 @@ def image(path: Path, entity: str, shape: tuple[int, int] = (40, 60)) -> np.ndar
     return static(path, entity, "buffer").astype(np.uint8).reshape(*shape, 3)[::-1]
 
 
-def read_path(path: Path, entity: str = "/world/robot") -> tuple[np.ndarray, np.ndarray]:
-    """A robot's path: times in seconds, [N + 1], and positions (x, y, z) in metres, [N + 1, 3]."""
+def read_path(
+    path: Path, entity: str = "/world/robot"
+) -> tuple[np.ndarray, np.ndarray]:
+    """A robot's path: times in seconds, [N + 1], and positions (x, y, z) in metres, [N
+    + 1, 3].
+    """
     times, positions = column(path, entity, "positions")
     return times, np.array([place for (place,) in positions], np.float32)  # type: ignore[misc]

@@ -31,14 +31,20 @@ from tests.eval.report import made
 def flat(steps: int, **changes: object) -> Recording:
     """An episode on λ̂ of one colour, so that what is drawn stands out."""
     recording = made.recording(steps, plans=(), **changes)
-    return replace(recording, predicted=np.full((40, 60), 0.5, np.float32), free=np.ones((40, 60), bool))
+    return replace(
+        recording,
+        predicted=np.full((40, 60), 0.5, np.float32),
+        free=np.ones((40, 60), bool),
+    )
 
 
 def test_a_moment_lasts_a_frame_and_the_end_a_while() -> None:
     times = frame_times(12.0)
     held = round(HOLD_S * FRAMES_A_SECOND)
     assert len(times) == 12 / SPEED * FRAMES_A_SECOND + held
-    np.testing.assert_allclose(times[:3], [0, SPEED / FRAMES_A_SECOND, 2 * SPEED / FRAMES_A_SECOND])
+    np.testing.assert_allclose(
+        times[:3], [0, SPEED / FRAMES_A_SECOND, 2 * SPEED / FRAMES_A_SECOND]
+    )
     assert (times[-held:] == 12.0).all()
     assert times[-held - 1] < 12.0
     assert set(frame_times(0.0)) == {0.0}
@@ -50,7 +56,9 @@ def orange(frame: np.ndarray) -> np.ndarray:
 
 
 def robot_at(frame: np.ndarray, panel: Axes) -> np.ndarray:
-    """Where the robot's mark is on a panel: x and y of its middle, in pixels from below."""
+    """Where the robot's mark is on a panel: x and y of its middle, in pixels from
+    below.
+    """
     box = panel.get_window_extent()
     rows, columns = np.nonzero(orange(frame))
     y = SIZE[1] - 1 - rows
@@ -58,9 +66,13 @@ def robot_at(frame: np.ndarray, panel: Axes) -> np.ndarray:
     return np.array([columns[inside].mean(), y[inside].mean()])
 
 
-def test_a_video_has_its_size_and_duration_and_the_robots_where_their_paths_say(tmp_path: Path) -> None:
+def test_a_video_has_its_size_and_duration_and_the_robots_where_their_paths_say(
+    tmp_path: Path,
+) -> None:
     first, second = flat(40), flat(24, labels=made.condition(risk="mean"))
-    second = replace(second, states=second.states * np.array([1, 0.5, 1, 1, 1], np.float32))
+    second = replace(
+        second, states=second.states * np.array([1, 0.5, 1, 1, 1], np.float32)
+    )
     path = tmp_path / "there" / "a.mp4"
     steps = list(write_video([first, second], path))
     times = frame_times(4.0)
@@ -71,8 +83,12 @@ def test_a_video_has_its_size_and_duration_and_the_robots_where_their_paths_say(
         assert (stream.width, stream.height) == SIZE
         assert SIZE[0] * 9 == SIZE[1] * 16
         assert stream.average_rate == FRAMES_A_SECOND
-        decoded = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
-        assert container.duration / 1e6 == pytest.approx(len(times) / FRAMES_A_SECOND, abs=0.06)
+        decoded = [
+            frame.to_ndarray(format="rgb24") for frame in container.decode(stream)
+        ]
+        assert container.duration / 1e6 == pytest.approx(
+            len(times) / FRAMES_A_SECOND, abs=0.06
+        )
     assert len(decoded) == len(times)
     frames = Frames([first, second])
     for number in (0, 5, 11):
@@ -90,7 +106,9 @@ def test_the_robot_points_where_it_heads() -> None:
         states[:, 2] = heading_rad
         frames = Frames([replace(turned, states=states)])
         box = frames.given[0].get_window_extent()
-        rows, columns = np.nonzero(orange(frames.draw(0.1))[: -int(box.y0), : int(box.x1)])
+        rows, columns = np.nonzero(
+            orange(frames.draw(0.1))[: -int(box.y0), : int(box.x1)]
+        )
         size[name] = (np.ptp(columns), np.ptp(rows))
     assert size["east"][0] > size["east"][1]
     assert size["north"][1] > size["north"][0]
@@ -100,17 +118,25 @@ def labelled(panel: Axes) -> dict[str, Any]:
     return {str(artist.get_label()): artist for artist in panel.get_children()}
 
 
-def test_a_frame_shows_what_was_planned_and_driven_by_then_and_at_the_end_how_it_ended() -> None:
+def test_a_frame_shows_what_was_planned_and_driven_by_then_and_at_the_end_how_it_ended() -> (
+    None
+):
     recording = made.held_recording(80)
     frames = Frames([recording])
     (given,), (truth,) = frames.given, frames.truths
     frames.draw(2.0)
     assert frames.time.get_text() == "t =   2.0 s"
-    assert given.texts[-1].get_text() == f"observed λ = {recording.traversability[20]:.2f}"
+    assert (
+        given.texts[-1].get_text() == f"observed λ = {recording.traversability[20]:.2f}"
+    )
     for panel in (given, truth):
         drawn = labelled(panel)
-        np.testing.assert_array_equal(np.transpose(drawn["driven"].get_data()), recording.track[:21])
-        np.testing.assert_array_equal(np.ravel(drawn["robot"].get_data()), recording.track[20])
+        np.testing.assert_array_equal(
+            np.transpose(drawn["driven"].get_data()), recording.track[:21]
+        )
+        np.testing.assert_array_equal(
+            np.ravel(drawn["robot"].get_data()), recording.track[20]
+        )
         assert "immobilised" not in drawn
     plan = recording.plan_at(2.0).lines["path"][0]
     np.testing.assert_array_equal(labelled(given)["planned"].get_segments()[0], plan)
@@ -119,7 +145,9 @@ def test_a_frame_shows_what_was_planned_and_driven_by_then_and_at_the_end_how_it
     for panel in (given, truth):
         drawn = labelled(panel)
         assert not {"planned", "robot"} & drawn.keys()
-        np.testing.assert_array_equal(np.ravel(drawn["immobilised"].get_data()), recording.track[-1])
+        np.testing.assert_array_equal(
+            np.ravel(drawn["immobilised"].get_data()), recording.track[-1]
+        )
 
 
 def shown_in(panel: Axes) -> np.ndarray:
@@ -141,7 +169,10 @@ def test_λ_hat_stands_beside_λ_as_it_was_which_episodes_share() -> None:
     widths = [panel.get_window_extent().width for panel in panels]
     assert np.ptp(widths) < 1e-6
     assert sum(widths) > 0.8 * SIZE[0]
-    paths = [[line for line in panel.lines if "driven" in str(line.get_label())] for panel in panels]
+    paths = [
+        [line for line in panel.lines if "driven" in str(line.get_label())]
+        for panel in panels
+    ]
     assert list(map(len, paths)) == [1, 1, 2]
     assert one.field is not None
     turned = made.held_recording(20, field=one.field[::-1])
@@ -153,7 +184,9 @@ def test_λ_hat_stands_beside_λ_as_it_was_which_episodes_share() -> None:
 def test_where_λ_is_resampled_its_mean_stands_beside() -> None:
     recording = made.recording(20, plans=())
     frames = Frames([recording])
-    np.testing.assert_array_equal(shown_in(frames.truths[0]), shades(recording.true_mean))
+    np.testing.assert_array_equal(
+        shown_in(frames.truths[0]), shades(recording.true_mean)
+    )
     assert "resampled at each step" in words_of(frames.truths[0])
 
 
@@ -161,14 +194,24 @@ def words_of(panel: Axes) -> str:
     return panel.get_title().replace("\n", " ")
 
 
-def test_each_episode_has_the_name_of_its_planner_and_risk_setting_and_of_what_else_differs() -> None:
-    labels = [made.condition("astar_dwa", "mean"), made.condition("astar_dwa", "mean", robot="bicycle")]
+def test_each_episode_has_the_name_of_its_planner_and_risk_setting_and_of_what_else_differs() -> (
+    None
+):
+    labels = [
+        made.condition("astar_dwa", "mean"),
+        made.condition("astar_dwa", "mean", robot="bicycle"),
+    ]
     frames = Frames([made.recording(3, labels=own) for own in labels])
     for panel, own in zip(frames.given, labels, strict=True):
-        assert words_of(panel) == f"{condition_name(own)}, {own['robot']} λ̂ given to the planner"
+        assert (
+            words_of(panel)
+            == f"{condition_name(own)}, {own['robot']} λ̂ given to the planner"
+        )
     (alone,) = Frames([made.recording(3, labels=labels[0])]).given
     assert words_of(alone).startswith(f"{condition_name(labels[0])} λ̂")
-    (blind,) = Frames([made.recording(3, labels=made.condition("straight", "–", model="–"))]).given
+    (blind,) = Frames(
+        [made.recording(3, labels=made.condition("straight", "–", model="–"))]
+    ).given
     assert words_of(blind).startswith("straight true E[λ]")
 
 
@@ -184,15 +227,25 @@ def test_the_legend_names_what_is_there() -> None:
     terrain = {"not free", "immobilises a robot"}
     assert named(taken) == places | plan | terrain
     everywhere = np.ones_like(taken.free)
-    assert named(replace(taken, free=everywhere, immobilising=~everywhere, plans=())) == places
-    other = replace(taken, about=taken.about | {"outcome": "success", "planner": "other"})
-    assert {"immobilised", "success", "driven, in the colour of its title"} < named(taken, other)
+    assert (
+        named(replace(taken, free=everywhere, immobilising=~everywhere, plans=()))
+        == places
+    )
+    other = replace(
+        taken, about=taken.about | {"outcome": "success", "planner": "other"}
+    )
+    assert {"immobilised", "success", "driven, in the colour of its title"} < named(
+        taken, other
+    )
 
 
 def inside(frame: np.ndarray, panel: Axes) -> np.ndarray:
     """The pixels of a panel."""
     box = panel.get_window_extent()
-    return frame[SIZE[1] - int(box.y1) + 2 : SIZE[1] - int(box.y0) - 2, int(box.x0) + 2 : int(box.x1) - 2]
+    return frame[
+        SIZE[1] - int(box.y1) + 2 : SIZE[1] - int(box.y0) - 2,
+        int(box.x0) + 2 : int(box.x1) - 2,
+    ]
 
 
 def test_the_map_changes_when_more_is_known_and_only_then() -> None:
@@ -208,7 +261,9 @@ def test_the_map_changes_when_more_is_known_and_only_then() -> None:
     known = still.known_at(40)
     assert known is not None
     np.testing.assert_array_equal(shown_in(panel), known_colours(still, 40)["risk"])
-    np.testing.assert_array_equal(panel.collections[0].get_segments(), hatching(~known.seen, 0.5))
+    np.testing.assert_array_equal(
+        panel.collections[0].get_segments(), hatching(~known.seen, 0.5)
+    )
     reach = labelled(panel)["reach of the sensors"]
     np.testing.assert_array_equal(np.transpose(reach.get_data()), known.outline)
     assert "λ̂ known by then" in words_of(panel)
@@ -225,7 +280,10 @@ def test_ground_that_was_not_seen_lies_under_a_veil() -> None:
         assert (colours[known.seen] == bare[name][known.seen]).all(), name
         hidden = ~known.seen & ~known.sensed
         grey = bytes_of(UNSEEN)[0]
-        assert (np.abs(colours[hidden] - 1.0 * grey) <= np.abs(bare[name][hidden] - 1.0 * grey)).all()
+        assert (
+            np.abs(colours[hidden] - 1.0 * grey)
+            <= np.abs(bare[name][hidden] - 1.0 * grey)
+        ).all()
     np.testing.assert_array_equal(bare["mean"], shades(known.mean))
     assert len(np.unique(veiled["seen"].reshape(-1, 3), axis=0)) == 3
 
@@ -233,7 +291,9 @@ def test_ground_that_was_not_seen_lies_under_a_veil() -> None:
 def test_the_legend_names_what_learning_shows() -> None:
     learning, words = made.learning_recording(20), {"not seen", "reach of the sensors"}
     assert words < named(learning)
-    seen = replace(learning.known[0], seen=np.ones((40, 60), bool), outline=np.empty((0, 2)))
+    seen = replace(
+        learning.known[0], seen=np.ones((40, 60), bool), outline=np.empty((0, 2))
+    )
     known: tuple[KnownMap, ...]
     for known in ((seen,), ()):
         assert not words & named(replace(learning, known=known))

@@ -31,5 +31,9 @@ def test_a_recording_gets_the_viewers_file_beside_it_once(tmp_path: Path) -> Non
 def test_names_of_recordings_are_such_that_the_viewer_takes_them() -> None:
     suite = Suite(model="oracle", planners=("mppi",), risks=("cvar:0.5",))
     (condition,) = conditions_of(suite, lambda data: ["std"])
-    path = Unit(condition=condition, seed=0, realisation=0, maps=(3, 4)).recording_path(1, ".rrd")
-    assert re.fullmatch(r"playback/mppi-cvar-0-5-std-[0-9a-f]{8}-0-0-00004\.rrd", str(path))
+    path = Unit(condition=condition, seed=0, realisation=0, maps=(3, 4)).recording_path(
+        1, ".rrd"
+    )
+    assert re.fullmatch(
+        r"playback/mppi-cvar-0-5-std-[0-9a-f]{8}-0-0-00004\.rrd", str(path)
+    )

@@ -19,7 +19,9 @@ from tests.eval.report import made
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_the_viewer_is_served_here_alone_until_it_is_told_to_end(tmp_path: Path, end: signal.Signals) -> None:
+def test_the_viewer_is_served_here_alone_until_it_is_told_to_end(
+    tmp_path: Path, end: signal.Signals
+) -> None:
     path = tmp_path / "one.rrd"
     write_rerun([made.recording(5)], path)
     code = (
@@ -27,7 +29,9 @@ def test_the_viewer_is_served_here_alone_until_it_is_told_to_end(tmp_path: Path,
         "serve(Path(sys.argv[1]))"
     )
     family: list[psutil.Process] = []
-    process = subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True
+    )
     try:
         assert process.stdout is not None
         found = re.search(r"http://\S+", process.stdout.readline())
@@ -40,10 +44,18 @@ def test_the_viewer_is_served_here_alone_until_it_is_told_to_end(tmp_path: Path,
         assert data.startswith(f"rerun+http://{HOST}:")
         (viewer,) = psutil.Process(process.pid).children()
         family = [viewer, *viewer.children(recursive=True)]
-        connections = [connection for member in family for connection in member.net_connections()]
-        held = {connection.laddr for connection in connections if connection.status == psutil.CONN_LISTEN}
+        connections = [
+            connection for member in family for connection in member.net_connections()
+        ]
+        held = {
+            connection.laddr
+            for connection in connections
+            if connection.status == psutil.CONN_LISTEN
+        }
         assert {place.ip for place in held} == {HOST}
-        assert {address.port, urlsplit(data.removeprefix("rerun+")).port} <= {place.port for place in held}
+        assert {address.port, urlsplit(data.removeprefix("rerun+")).port} <= {
+            place.port for place in held
+        }
         process.send_signal(end)
         assert process.wait(60) == 0
         assert not psutil.wait_procs(family, timeout=30)[1]

@@ -10,7 +10,11 @@ from benchnav.core.errors import ConfigError
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.trainable import Ensemble
 from benchnav.models.predictor import Clairvoyant
-from benchnav.models.quality.compare.candidates import count_parameters, find_candidates, prediction_ms
+from benchnav.models.quality.compare.candidates import (
+    count_parameters,
+    find_candidates,
+    prediction_ms,
+)
 from tests.models.stub import ColourModel
 from tests.models.support import linear_table, make_terrain
 
@@ -51,16 +55,23 @@ def test_one_model_under_two_names_is_refused(
     ]  # one name for both says nothing
 
 
-def test_models_of_files_are_called_by_their_class_or_checkpoint(tmp_path: Path) -> None:
+def test_models_of_files_are_called_by_their_class_or_checkpoint(
+    tmp_path: Path,
+) -> None:
     file = tmp_path / "mine.py"
-    file.write_text("from tests.models.stub import ColourModel\n\nclass Own(ColourModel):\n    pass\n")
+    file.write_text(
+        "from tests.models.stub import ColourModel\n\nclass Own(ColourModel):\n    pass\n"
+    )
     assert find_candidates([f"{file}:Own", "colours"])[0].label == "Own"
 
 
 def test_weights_of_all_networks_are_counted_once() -> None:
     network = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 1), torch.nn.BatchNorm2d(4))
     assert count_parameters(FusedModel([network], linear_table(), ("a",))) == 16 + 8
-    assert count_parameters(FusedModel([network, network], linear_table(), ("a",))) == 16 + 8
+    assert (
+        count_parameters(FusedModel([network, network], linear_table(), ("a",)))
+        == 16 + 8
+    )
     other = torch.nn.Conv2d(3, 4, 1)
     both = FusedModel([network, other], linear_table(), ("a",))
     assert count_parameters(both) == 16 + 8 + 16
@@ -85,4 +96,6 @@ def test_the_time_is_the_median_of_repeated_predictions_after_a_first(
     assert len(asked) == 2  # the first took all the time that there is
     assert taken == pytest.approx(2.0)
     asked.append(1)
-    assert prediction_ms(Counted(), make_terrain(batch=1)) == pytest.approx(4 + 1 + (15 + 1) / 2 - 1, abs=1.5)
+    assert prediction_ms(Counted(), make_terrain(batch=1)) == pytest.approx(
+        4 + 1 + (15 + 1) / 2 - 1, abs=1.5
+    )

@@ -32,7 +32,9 @@ class Quantiles(TraversabilityModel):
 
     def predict(self, observation: Observation) -> QuantileDistribution:
         shape = (len(observation.rgb), 1, *observation.grid.shape)
-        return QuantileDistribution(torch.tensor(LEVELS).view(-1, 1, 1) * torch.ones(shape))
+        return QuantileDistribution(
+            torch.tensor(LEVELS).view(-1, 1, 1) * torch.ones(shape)
+        )
 
 
 class Foreign(ColourModel):
@@ -69,7 +71,11 @@ def test_a_table_is_printed_and_nothing_written(
     assert [row[2] for row in rows[2:4]] == ["†", "†"]
     for model, row in ((ColourModel(), rows[4]), (Vague(), rows[5])):
         quality = dict(evaluate(model, dataset))["test/hs"]
-        for value in (quality.classes[0].miou, quality.traversability.crps, quality.traversability.nll):
+        for value in (
+            quality.classes[0].miou,
+            quality.traversability.crps,
+            quality.traversability.nll,
+        ):
             assert f"{value:.4f}" in [cell.rstrip("*") for cell in row]
     assert err.splitlines()[-1] == "models and splits: 8/8"
     assert "no difference can be significant with so few maps: test/std, test/hs" in out
@@ -84,7 +90,17 @@ def test_a_folder_holds_numbers_differences_page_and_figures(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "new" / "comparison"
-    asked = ["vague", "colours", "quantiles", "--data", dataset.path, "--splits", "[train]", "--out", out]
+    asked = [
+        "vague",
+        "colours",
+        "quantiles",
+        "--data",
+        dataset.path,
+        "--splits",
+        "[train]",
+        "--out",
+        out,
+    ]
     assert call("train", "compare", *asked, "--seed", 3) == 0
     assert {path.name for path in out.iterdir()} == FILES
     names = ("measures", "calibration", "sparsification")
@@ -107,7 +123,10 @@ def test_a_folder_holds_numbers_differences_page_and_figures(
     assert own["accuracy"] == pytest.approx(quality.classes[0].accuracy)
     assert own["crps_low"] < own["crps"] < own["crps_high"]
     assert split["models"]["quantiles"]["nll"] is None
-    assert "accuracy" not in split["models"]["quantiles"] or split["models"]["quantiles"]["accuracy"] is None
+    assert (
+        "accuracy" not in split["models"]["quantiles"]
+        or split["models"]["quantiles"]["accuracy"] is None
+    )
     assert split["models"]["oracle"]["rmse_expected"] == 0
     assert len(own["sparsification"]["by_width"]) == 50
 
@@ -115,11 +134,15 @@ def test_a_folder_holds_numbers_differences_page_and_figures(
     assert [row["model"] for row in rows] == list(found["models"])
     assert [row["privileged"] for row in rows] == ["False"] * 3 + ["True"] * 2
     assert float(rows[1]["pinball"]) == pytest.approx(own["pinball"], rel=1e-5)
-    assert float(rows[1]["tail_rate_95"]) == pytest.approx(own["tail_rate_95"], rel=1e-5)
+    assert float(rows[1]["tail_rate_95"]) == pytest.approx(
+        own["tail_rate_95"], rel=1e-5
+    )
     assert rows[2]["nll"] == rows[2]["accuracy"] == rows[3]["prediction_ms"] == ""
     pairs = list(csv.DictReader((out / "differences.csv").open()))
     both = [
-        row for row in pairs if (row["one"], row["other"], row["measure"]) == ("vague", "colours", "crps")
+        row
+        for row in pairs
+        if (row["one"], row["other"], row["measure"]) == ("vague", "colours", "crps")
     ]
     assert float(both[0]["difference"]) > 0
     assert float(both[0]["p_holm"]) < 0.05
@@ -127,19 +150,45 @@ def test_a_folder_holds_numbers_differences_page_and_figures(
     page = (out / "compare.md").read_text()
     assert all(f"(figures/{name}.png)" in page for name in names)
     headings = [cell.strip() for cell in page.splitlines()[2].strip("|").split("|")]
-    explained = [line[4:].partition("**: ")[0] for line in page.splitlines() if line.startswith("- **")]
+    explained = [
+        line[4:].partition("**: ")[0]
+        for line in page.splitlines()
+        if line.startswith("- **")
+    ]
     assert headings == explained[: len(headings)]
     assert "## Differences to the best" in page
-    (row,) = [line for line in page.splitlines() if line.startswith("| train | colours")]
+    (row,) = [
+        line for line in page.splitlines() if line.startswith("| train | colours")
+    ]
     assert f"**{own['crps']:.4f}**" in row
     (row,) = [line for line in page.splitlines() if line.startswith("| train | vague")]
-    assert "**" not in row.partition("0.9")[0] or f"**{split['models']['vague']['crps']:.4f}**" not in row
+    assert (
+        "**" not in row.partition("0.9")[0]
+        or f"**{split['models']['vague']['crps']:.4f}**" not in row
+    )
 
     # Another comparison takes its place only when asked to.
-    assert call("train", "compare", "colours", "--data", dataset.path, "--out", out) == 2
+    assert (
+        call("train", "compare", "colours", "--data", dataset.path, "--out", out) == 2
+    )
     assert "--overwrite" in capfd.readouterr().err
-    assert call("train", "compare", "colours", "--data", dataset.path, "--out", out, "--overwrite") == 0
-    assert list(json.loads((out / "compare.json").read_text())["splits"]) == ["test/std", "test/hs"]
+    assert (
+        call(
+            "train",
+            "compare",
+            "colours",
+            "--data",
+            dataset.path,
+            "--out",
+            out,
+            "--overwrite",
+        )
+        == 0
+    )
+    assert list(json.loads((out / "compare.json").read_text())["splits"]) == [
+        "test/std",
+        "test/hs",
+    ]
     assert "Differences" not in (out / "compare.md").read_text()
 
 
@@ -149,11 +198,25 @@ def test_seed_and_device_reach_the_measurement(
     pits = {}
     for seed in (0, 7):
         out = tmp_path / str(seed)
-        asked = ("colours", "--data", dataset.path, "--splits", "[valid]", "--out", out, "--device", "cpu")
+        asked = (
+            "colours",
+            "--data",
+            dataset.path,
+            "--splits",
+            "[valid]",
+            "--out",
+            out,
+            "--device",
+            "cpu",
+        )
         assert call("train", "compare", *asked, "--seed", seed) == 0
-        models = json.loads((out / "compare.json").read_text())["splits"]["valid"]["models"]
+        models = json.loads((out / "compare.json").read_text())["splits"]["valid"][
+            "models"
+        ]
         pits[seed] = models["colours"]["pit"]
-        assert pits[seed] == list(measure_split(ColourModel(), dataset, "valid", seed).traversability.pit)
+        assert pits[seed] == list(
+            measure_split(ColourModel(), dataset, "valid", seed).traversability.pit
+        )
     assert pits[0] != pits[7]
     asked_for: list[torch.device] = []
     measured = measure_split
@@ -171,7 +234,12 @@ def test_seed_and_device_reach_the_measurement(
         return measured(model, data, split, seed, torch.device("cpu"), **how)
 
     monkeypatch.setattr("benchnav.models.quality.measurement.measure_split", spy)
-    assert call("train", "compare", "colours", "--data", dataset.path, "--splits", "[valid]") == 0
+    assert (
+        call(
+            "train", "compare", "colours", "--data", dataset.path, "--splits", "[valid]"
+        )
+        == 0
+    )
     assert asked_for == [torch.device("cpu", 0)] * 3
 
 
@@ -189,34 +257,69 @@ def test_groups_of_maps_are_the_units(
         return read(self, split, indices, fields)
 
     monkeypatch.setattr(TerrainDataset, "read", with_groups)
-    monkeypatch.setattr(TerrainDataset, "field_names", property(lambda self: (*names, "group")))
+    monkeypatch.setattr(
+        TerrainDataset, "field_names", property(lambda self: (*names, "group"))
+    )
     out = tmp_path / "out"
     assert (
-        call("train", "compare", "colours", "--data", dataset.path, "--splits", "[train]", "--out", out) == 0
+        call(
+            "train",
+            "compare",
+            "colours",
+            "--data",
+            dataset.path,
+            "--splits",
+            "[train]",
+            "--out",
+            out,
+        )
+        == 0
     )
-    assert json.loads((out / "compare.json").read_text())["splits"]["train"]["units"] == 5
+    assert (
+        json.loads((out / "compare.json").read_text())["splits"]["train"]["units"] == 5
+    )
     assert "train 10 maps in 5 groups" in capfd.readouterr().out
 
 
 def test_a_model_of_other_classes_is_compared_by_traversability_and_said_to_be(
     dataset: TerrainDataset, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    assert call("train", "compare", "colours", "foreign", "--data", dataset.path, "--splits", "[valid]") == 0
+    assert (
+        call(
+            "train",
+            "compare",
+            "colours",
+            "foreign",
+            "--data",
+            dataset.path,
+            "--splits",
+            "[valid]",
+        )
+        == 0
+    )
     out = capfd.readouterr().out
-    assert "foreign is compared by λ alone: its classes are not those of these maps" in out
+    assert (
+        "foreign is compared by λ alone: its classes are not those of these maps" in out
+    )
     first, second = (
-        line.split() for line in out.splitlines() if line.startswith("valid ") and "†" not in line
+        line.split()
+        for line in out.splitlines()
+        if line.startswith("valid ") and "†" not in line
     )
     assert second[2:4] == ["–", "–"]
     assert first[4:10] == second[4:10]  # the same λ
 
 
 def test_where_the_truth_is_unknown_no_model_is_given_the_class_table_for_it(
-    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    dataset: TerrainDataset,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     truth = TerrainDataset.truth_of
     monkeypatch.setattr(
-        TerrainDataset, "truth_of", lambda self, split: "unknown" if split == "valid" else truth(self, split)
+        TerrainDataset,
+        "truth_of",
+        lambda self, split: "unknown" if split == "valid" else truth(self, split),
     )
     asked = ("colours", "--data", dataset.path, "--splits", "[valid,test/std]")
     assert call("train", "compare", *asked) == 0
@@ -226,27 +329,50 @@ def test_where_the_truth_is_unknown_no_model_is_given_the_class_table_for_it(
         for line in out.splitlines()
         if line.startswith(("valid ", "test/std ")) and "0." in line
     ]
-    assert rows == [["valid", "colours"], *(["test/std", name] for name in ("colours", "oracle", "ideal"))]
+    assert rows == [
+        ["valid", "colours"],
+        *(["test/std", name] for name in ("colours", "oracle", "ideal")),
+    ]
     assert "oracle and ideal are left out on valid: the truth is unknown there" in out
-    assert "RMSE λ" in " ".join(out.split()) or "unknown on valid: RMSE E[λ] is a dash" in out
+    assert (
+        "RMSE λ" in " ".join(out.split())
+        or "unknown on valid: RMSE E[λ] is a dash" in out
+    )
 
 
 def test_a_model_that_is_worse_than_none_is_told_so(
-    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    dataset: TerrainDataset,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(baselines, "nearest_colour_accuracy", lambda _, split: 0.999)
     monkeypatch.setattr(baselines, "climatology_crps", lambda _, split: 0.15)
     assert (
-        call("train", "compare", "colours", "quantiles", "--data", dataset.path, "--splits", "[valid]") == 0
+        call(
+            "train",
+            "compare",
+            "colours",
+            "quantiles",
+            "--data",
+            dataset.path,
+            "--splits",
+            "[valid]",
+        )
+        == 0
     )
     out = capfd.readouterr().out.splitlines()
-    assert "colours: warning: the model's accuracy is below that of the nearest colour on valid" in out
+    assert (
+        "colours: warning: the model's accuracy is below that of the nearest colour on valid"
+        in out
+    )
     worse = "warning: the model's CRPS is worse than that of one distribution for all cells on valid"
     crps = {
         name: measure_split(model, dataset, "valid").traversability.crps
         for name, model in (("colours", ColourModel()), ("quantiles", Quantiles()))
     }
-    assert [f"{name}: {worse}" in out for name in crps] == [score > 0.15 for score in crps.values()]
+    assert [f"{name}: {worse}" in out for name in crps] == [
+        score > 0.15 for score in crps.values()
+    ]
     assert crps["colours"] < 0.15 < crps["quantiles"]
     assert not any(line.startswith("oracle: ") for line in out)
 

@@ -35,7 +35,10 @@ def tallies(dataset: TerrainDataset) -> Tallies:
 def summary_of(tallies: Tallies) -> pd.DataFrame:
     splits = dict.fromkeys(split for split, _ in tallies)
     tables = {
-        split: summarise(COMPARED, {name: own.sums() for (of, name), own in tallies.items() if of == split})
+        split: summarise(
+            COMPARED,
+            {name: own.sums() for (of, name), own in tallies.items() if of == split},
+        )
         for split in splits
     }
     return pd.concat(tables, names=["split", "model"]).reset_index()
@@ -43,7 +46,13 @@ def summary_of(tallies: Tallies) -> pd.DataFrame:
 
 def draw(name: str, summary: pd.DataFrame | None = None, **data: Any) -> Figure:
     """Draw the figure of a name from what it needs of `Comparison`."""
-    given = {"summary": summary, "models": MODELS, "privileged": ["oracle"], "splits": SPLITS, **data}
+    given = {
+        "summary": summary,
+        "models": MODELS,
+        "privileged": ["oracle"],
+        "splits": SPLITS,
+        **data,
+    }
     comparison: Any = SimpleNamespace(**given)
     (figure,) = [own for own in comparison_figures(comparison) if own.name == name]
     return figure.draw(comparison)
@@ -57,7 +66,10 @@ def test_models_differ_in_look_and_privileged_ones_are_grey() -> None:
     names = [f"m{number}" for number in range(16)]
     looks = model_looks([*names, "oracle", "ideal"], ["oracle", "ideal"])
     assert list(looks) == [*names, "oracle", "ideal"]
-    assert len({(look["color"], look["marker"], look["ls"]) for look in looks.values()}) == 18
+    assert (
+        len({(look["color"], look["marker"], look["ls"]) for look in looks.values()})
+        == 18
+    )
     assert looks["oracle"]["color"].startswith("0.")
 
 
@@ -66,15 +78,28 @@ def test_marks_and_lines_are_the_measures_and_their_intervals(tallies: Tallies) 
     figure = draw("measures", summary)
     axes = panel(figure, f"{HEADINGS['crps']} ↓")
     titles = [axes.get_title() for axes in figure.axes]
-    assert {f"{HEADINGS['accuracy']} ↑", f"{HEADINGS['ause']} ↓", HEADINGS["width"]} < set(titles)
+    assert {
+        f"{HEADINGS['accuracy']} ↑",
+        f"{HEADINGS['ause']} ↓",
+        HEADINGS["width"],
+    } < set(titles)
     marks = {line.get_label(): line.get_xdata() for line in axes.lines}
     for split in SPLITS:
-        wanted = summary[summary["split"] == split].set_index("model")["crps"].reindex(MODELS)
+        wanted = (
+            summary[summary["split"] == split]
+            .set_index("model")["crps"]
+            .reindex(MODELS)
+        )
         np.testing.assert_allclose(np.asarray(marks[split], dtype=float), wanted)
     train = summary[summary["split"] == "train"].set_index("model")
     ends = [segment[:, 0] for segment in axes.collections[0].get_segments()]
-    np.testing.assert_allclose(ends[0], train.loc["colours", ["crps_low", "crps_high"]].astype(float))
-    labels = {label.get_text(): label.get_color() for label in figure.axes[0].get_yticklabels()}
+    np.testing.assert_allclose(
+        ends[0], train.loc["colours", ["crps_low", "crps_high"]].astype(float)
+    )
+    labels = {
+        label.get_text(): label.get_color()
+        for label in figure.axes[0].get_yticklabels()
+    }
     assert labels == {"colours": "black", "oracle": "0.5"}
     assert panel(figure, HEADINGS["coverage"]).lines[-1].get_xdata()[0] == 0.9  # type: ignore[index]
 
@@ -104,15 +129,25 @@ def test_sparsification_shows_both_rankings_of_every_split(tallies: Tallies) -> 
         assert high > max(float(np.max(line.get_ydata())) for line in axes.lines)  # type: ignore[arg-type]
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == [*MODELS, "largest errors first, the best order"]
-    assert axes.lines[1].get_linestyle() == figure.legends[0].get_lines()[-1].get_linestyle() == ":"
+    assert (
+        axes.lines[1].get_linestyle()
+        == figure.legends[0].get_lines()[-1].get_linestyle()
+        == ":"
+    )
 
 
-def test_severity_has_a_line_a_model_and_leaves_out_what_was_not_measured(tallies: Tallies) -> None:
-    summary = summary_of({key: own for key, own in tallies.items() if key != ("train", "oracle")})
+def test_severity_has_a_line_a_model_and_leaves_out_what_was_not_measured(
+    tallies: Tallies,
+) -> None:
+    summary = summary_of(
+        {key: own for key, own in tallies.items() if key != ("train", "oracle")}
+    )
     summary["split"] = summary["split"].replace({"train": "test/hg-050"})
     figure = draw("severity", summary, splits=["test/std", "test/hg-050"])
     for axes, name in zip(figure.axes[:2], ("crps", "pinball"), strict=True):
         lines = {line.get_label(): line.get_data() for line in axes.lines}
         own = summary[summary["model"] == "colours"].set_index("split")[name]
-        np.testing.assert_allclose(lines["colours"], [[0, 0.5], [own["test/std"], own["test/hg-050"]]])
+        np.testing.assert_allclose(
+            lines["colours"], [[0, 0.5], [own["test/std"], own["test/hg-050"]]]
+        )
         assert len(lines["oracle"][0]) == 1

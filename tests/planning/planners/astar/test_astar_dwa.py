@@ -36,7 +36,10 @@ def longest_stand_s(driven: Drive) -> float:
 
 @pytest.mark.parametrize(
     ("robot", "objective"),
-    [(Unicycle(), GoalDistance()), (DifferentialDrive(), TravelTime(DifferentialDrive(), 1.0))],
+    [
+        (Unicycle(), GoalDistance()),
+        (DifferentialDrive(), TravelTime(DifferentialDrive(), 1.0)),
+    ],
 )
 def test_it_finds_the_gap_in_a_wall(robot: Unicycle, objective: Objective) -> None:
     ground = torch.full((2, 24, 30), 0.85)
@@ -49,7 +52,9 @@ def test_it_finds_the_gap_in_a_wall(robot: Unicycle, objective: Objective) -> No
 
 
 def cornered(objective: Objective) -> Problem:
-    """Four corners of ground that is not free, to be passed closely on either side and both axes."""
+    """Four corners of ground that is not free, to be passed closely on either side and
+    both axes.
+    """
     ground = torch.full((4, 20, 26), 0.8)
     ground[0, 6:, 8:12] = 0.0
     ground[1, :12, 8:12] = 0.0
@@ -57,7 +62,9 @@ def cornered(objective: Objective) -> Problem:
     # A way that leads through corners alone.
     ground[3, :, 12] = 0.0
     ground[3, 8, 12], ground[3, 7:10, 11], ground[3, 8, 11] = 0.8, 0.0, 0.8
-    return factories.problem(ground, start=(2.0, 4.0), goal=(11.5, 4.2), objective=objective)
+    return factories.problem(
+        ground, start=(2.0, 4.0), goal=(11.5, 4.2), objective=objective
+    )
 
 
 @pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Unicycle(), 1.0)])
@@ -70,7 +77,9 @@ def test_it_does_not_stand_beside_a_corner(objective: Objective) -> None:
 def test_it_sets_off_however_near_to_a_corner_it_stands() -> None:
     # Beside it, at its tip, and in the cell before it; looking along each axis.
     places = ((3.98, 3.6), (3.99, 2.99), (3.7, 2.6))
-    starts = torch.tensor([[*place, heading] for place in places for heading in (0.0, 1.5, 3.1, -2.0)])
+    starts = torch.tensor(
+        [[*place, heading] for place in places for heading in (0.0, 1.5, 3.1, -2.0)]
+    )
     ground = torch.full((len(starts), 16, 20), 0.8)
     ground[:, 6:, 8:12] = 0.0
     problem = replace(factories.problem(ground, goal=(8.5, 6.5)), start=starts)
@@ -104,7 +113,9 @@ def test_it_drives_across_where_no_way_is_free(objective: Objective) -> None:
 
 
 def test_a_robot_turned_away_turns_round() -> None:
-    problem = factories.problem(torch.full((3, 16, 20), 0.6), start=(4.0, 4.0), goal=(8.0, 4.0))
+    problem = factories.problem(
+        torch.full((3, 16, 20), 0.6), start=(4.0, 4.0), goal=(8.0, 4.0)
+    )
     starts = torch.tensor([[4.0, 4.0, math.pi], [4.0, 4.0, 2.0], [4.0, 4.0, -2.0]])
     driven = drive(AStarDWA(), replace(problem, start=starts))
     assert driven.outcome.tolist() == [SUCCESS] * 3
@@ -113,7 +124,9 @@ def test_a_robot_turned_away_turns_round() -> None:
 
 @pytest.mark.parametrize("rate", [-1.0, 1.0])
 def test_a_robot_that_spins_stops_it(rate: float) -> None:
-    problem = factories.problem(torch.full((1, 16, 20), 0.6), start=(4.0, 4.0), goal=(8.0, 4.0))
+    problem = factories.problem(
+        torch.full((1, 16, 20), 0.6), start=(4.0, 4.0), goal=(8.0, 4.0)
+    )
     planner = AStarDWA()
     state = planner.init(problem, generator())
     spinning = torch.tensor([[0.0, rate]])
@@ -122,7 +135,9 @@ def test_a_robot_that_spins_stops_it(rate: float) -> None:
     for _ in range(150):
         step = replace(first(problem), state=robot_state)
         action, state, _ = planner.plan(step, state)
-        robot_state = problem.robot(robot_state, action, problem.traversability_at(robot_state))
+        robot_state = problem.robot(
+            robot_state, action, problem.traversability_at(robot_state)
+        )
         rates.append(action[0, 1].item())
         if (robot_state[0, :2] - problem.goal_m[0]).norm() < 1:
             break
@@ -137,7 +152,9 @@ def test_its_settings_are_its_own_and_those_of_dwa() -> None:
     assert made.config == AStarDWAConfig(lookahead_m=3.0, dwa=DWAConfig(horizon_s=4.0))
     assert made.local.config == DWAConfig(horizon_s=4.0)
     with pytest.raises(ConfigError, match="dwa"):
-        registry.make("planner", {"part": "astar_dwa", "options": {"dwa": {"horizons": 40}}})
+        registry.make(
+            "planner", {"part": "astar_dwa", "options": {"dwa": {"horizons": 40}}}
+        )
 
 
 @pytest.mark.parametrize(
@@ -164,7 +181,9 @@ class Own(GoalDistance):
     def __init__(self, power: float) -> None:
         self.power = power
 
-    def path_cost(self, traversability: torch.Tensor, grade: torch.Tensor) -> torch.Tensor:
+    def path_cost(
+        self, traversability: torch.Tensor, grade: torch.Tensor
+    ) -> torch.Tensor:
         return 2 * traversability**-self.power
 
 
@@ -189,7 +208,9 @@ def test_it_tells_where_no_risk_setting_moves_its_path(by: str) -> None:
             assert "moves DWA alone" in remark
 
 
-def test_it_tells_that_it_takes_the_shortest_path_of_an_objective_without_its_own_cost() -> None:
+def test_it_tells_that_it_takes_the_shortest_path_of_an_objective_without_its_own_cost() -> (
+    None
+):
     (remark,) = AStarDWA().remarks(factories.task(objective=Bare()))
     assert "shortest" in remark
     assert "Bare" in remark

@@ -18,7 +18,9 @@ SMALL = MPPIConfig(samples=256, horizon_s=3)
 
 
 def trap(robot: Unicycle | Bicycle) -> Problem:
-    """A pocket of ground that is not free, open toward the start, between it and the goal."""
+    """A pocket of ground that is not free, open toward the start, between it and the
+    goal.
+    """
     ground = torch.full((2, 24, 24), 0.85)
     ground[:, 8:16, 14:16] = 0.1
     ground[:, 8:10, 8:16] = ground[:, 14:16, 8:16] = 0.1
@@ -35,12 +37,15 @@ def test_the_global_path_leads_it_round_a_pocket(robot: Unicycle | Bicycle) -> N
 
 @pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Unicycle(), 1.0)])
 def test_it_drives_across_a_wall_that_closes_the_map(objective: Objective) -> None:
-    # Ground 1.5 m thick that is not free, from one edge of the map to the other; it carries the robot slowly.
+    # Ground 1.5 m thick that is not free, from one edge of the map to the other; it
+    # carries the robot slowly.
     ground = torch.full((2, 20, 20), 0.85)
     ground[0, :, 9:12] = 0.1
     ground[1, 9:12] = 0.1
     problem = factories.problem(ground, (2.75, 3.0), (8.5, 8.0), objective=objective)
-    driven = drive(AStarMPPI(AStarMPPIConfig(mppi=SMALL)), problem, ground.clamp(min=0.4), 60)
+    driven = drive(
+        AStarMPPI(AStarMPPIConfig(mppi=SMALL)), problem, ground.clamp(min=0.4), 60
+    )
     assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
 
 
@@ -49,7 +54,9 @@ def test_mppi_alone_stays_in_the_pocket() -> None:
     assert Outcome.SUCCESS not in driven.outcome.tolist()
 
 
-def test_it_is_given_the_way_points_that_dwa_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_given_the_way_points_that_dwa_is_given(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     problem = trap(Unicycle())
     told: list[torch.Tensor] = []
     for planner in (AStarMPPI(AStarMPPIConfig(mppi=SMALL)), AStarDWA()):
@@ -72,10 +79,14 @@ def test_its_settings_are_its_own_and_those_of_mppi() -> None:
         "options": {"lookahead_m": 3, "mppi": {"samples": 300, "noise": [0.4, 0.3]}},
     }
     made = registry.make("planner", part)
-    assert made.config == AStarMPPIConfig(lookahead_m=3.0, mppi=MPPIConfig(samples=300, noise=(0.4, 0.3)))
+    assert made.config == AStarMPPIConfig(
+        lookahead_m=3.0, mppi=MPPIConfig(samples=300, noise=(0.4, 0.3))
+    )
     assert made.local.config.samples == 300
     with pytest.raises(ConfigError, match="lookahead_m"):
-        registry.make("planner", {"part": "astar_mppi", "options": {"lookahead_m": 0.0}})
+        registry.make(
+            "planner", {"part": "astar_mppi", "options": {"lookahead_m": 0.0}}
+        )
 
 
 def test_it_says_whether_it_runs_compiled() -> None:

@@ -1,4 +1,6 @@
-"""Optimism about ground that is not known: where the path leads, and what stays as it was."""
+"""Optimism about ground that is not known: where the path leads, and what stays as it
+was.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -31,7 +33,9 @@ NAMES = ("astar_dwa", "astar_mppi")
 
 
 def two_routes(std: float = 0.2) -> Problem:
-    """A block between two ways of one mean λ: the upper is known and a little shorter, of the lower little is known."""
+    """A block between two ways of one mean λ: the upper is known and a little shorter,
+    of the lower little is known.
+    """
     mean, spread = torch.full((1, 24, 30), 0.5), torch.zeros(1, 24, 30)
     mean[:, 6:18, 8:22] = 0.05
     spread[:, :6] = std
@@ -68,10 +72,14 @@ def test_the_robot_drives_the_way_that_is_explored() -> None:
         assert side * float(away[away.abs().argmax()]) > 3.0
 
 
-def test_the_search_is_dijkstras_under_the_raised_map_and_free_ground_stays_what_it_is() -> None:
+def test_the_search_is_dijkstras_under_the_raised_map_and_free_ground_stays_what_it_is() -> (
+    None
+):
     generator_ = torch.Generator().manual_seed(3)
     mean, std = (torch.rand(2, 16, 12, generator=generator_) for _ in range(2))
-    posed = factories.problem(mean, (1.25, 1.25), (4.25, 6.75), objective=TravelTime(Unicycle(), 1.0))
+    posed = factories.problem(
+        mean, (1.25, 1.25), (4.25, 6.75), objective=TravelTime(Unicycle(), 1.0)
+    )
     posed = replace(posed, distribution=factories.normal(mean, 0.3 * std))
     assert not posed.free.all()
     explore, ranks = 0.7, norm.ppf([0.16, 0.84])
@@ -81,11 +89,18 @@ def test_the_search_is_dijkstras_under_the_raised_map_and_free_ground_stays_what
     raised = replace(posed, risk_map=expected.float())
     field = planner("astar_dwa", explore).init(posed, generator()).field
     goals = {
-        (i, j) for i in range(16) for j in range(12) if np.hypot(j / 2 + 0.25 - 4.25, i / 2 + 0.25 - 6.75) < 1
+        (i, j)
+        for i in range(16)
+        for j in range(12)
+        if np.hypot(j / 2 + 0.25 - 4.25, i / 2 + 0.25 - 6.75) < 1
     }
     for b in range(2):
-        costs = networkx.multi_source_dijkstra_path_length(networkx_graph(raised, b, True), goals)
-        found = {(i, j): field.cost[b, i, j].item() for i in range(16) for j in range(12)}
+        costs = networkx.multi_source_dijkstra_path_length(
+            networkx_graph(raised, b, True), goals
+        )
+        found = {
+            (i, j): field.cost[b, i, j].item() for i in range(16) for j in range(12)
+        }
         assert found == pytest.approx(costs, rel=1e-4)
 
 
@@ -97,7 +112,10 @@ def test_the_way_point_rule_has_the_costs_of_the_path_and_the_local_planner_thos
     begun = planner(name, 0.5).init(posed, generator())
     raised = optimistic(posed, 0.5)
     assert torch.equal(begun.ground.traversability, ground_costs(raised).traversability)
-    for own in (begun.local.problem, planner(name, 0.5).revise(begun, posed).local.problem):
+    for own in (
+        begun.local.problem,
+        planner(name, 0.5).revise(begun, posed).local.problem,
+    ):
         assert torch.equal(own.risk_map, posed.risk_map)
         assert torch.equal(own.free, posed.free)
 
@@ -107,7 +125,10 @@ def test_without_it_all_is_as_it_was(name: str) -> None:
     posed = two_routes()
     assert optimistic(posed, 0.0) is posed
     plain, given = registry.make("planner", name), planner(name, 0.0)
-    one, other = (each.plan(first(posed), each.init(posed, generator())) for each in (plain, given))
+    one, other = (
+        each.plan(first(posed), each.init(posed, generator()))
+        for each in (plain, given)
+    )
     assert torch.equal(one[0], other[0])
     assert torch.equal(one[1].field.cost, astar.search(posed).cost)
 
@@ -136,7 +157,8 @@ def test_it_searches_anew_where_what_is_unknown_has_changed_and_nowhere_else(
     assert torch.equal(revised.field.following, anew.field.following)
     assert not torch.equal(revised.field.cost[0], begun.field.cost[0])
     assert torch.equal(revised.ground.traversability, anew.ground.traversability)
-    # Under the next revision the bonus is added to the map itself, not to what had it already.
+    # Under the next revision the bonus is added to the map itself, not to what had it
+    # already.
     again = own.revise(revised, known)
     assert searched == [1, 2]
     assert torch.equal(again.field.cost, anew.field.cost)
@@ -153,7 +175,10 @@ def test_its_default_moves_no_id() -> None:
         return condition.id
 
     # Of version 0.10.0, which had no such option.
-    for name, known in (("astar_dwa", "ba1ffcce827de18a"), ("astar_mppi", "df0e23bf97f58f6e")):
+    for name, known in (
+        ("astar_dwa", "ba1ffcce827de18a"),
+        ("astar_mppi", "df0e23bf97f58f6e"),
+    ):
         assert id_of(name) == known
         assert id_of({"part": name, "options": {"explore": 0}}) == known
         assert id_of({"part": name, "options": {"explore": 0.5}}) != known

@@ -19,7 +19,15 @@ from benchnav.planning.robots import Bicycle, Unicycle
 from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
-from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda, step_at, with_start
+from tests.planning.planners.driving import (
+    drive,
+    fake_cuda,
+    first,
+    generator,
+    on_cuda,
+    step_at,
+    with_start,
+)
 
 
 @dataclass
@@ -40,25 +48,37 @@ class Constant(LocalPlanner[tuple[Tensor, ...]]):
         action = step.state.new_tensor(self.action).expand(len(step.state), 2)
         return action, plan_state, Plan.empty(len(action), action.device)
 
-    def commit_action(self, plan_state: tuple[Tensor, ...], action: Tensor) -> tuple[Tensor, ...]:
+    def commit_action(
+        self, plan_state: tuple[Tensor, ...], action: Tensor
+    ) -> tuple[Tensor, ...]:
         return (*plan_state, action)
 
-    def select(self, plan_state: tuple[Tensor, ...], members: Tensor) -> tuple[Tensor, ...]:
+    def select(
+        self, plan_state: tuple[Tensor, ...], members: Tensor
+    ) -> tuple[Tensor, ...]:
         raise AssertionError("nobody leaves")
 
 
-def test_under_travel_time_a_way_point_within_the_goals_radius_still_draws_the_local_planner() -> None:
+def test_under_travel_time_a_way_point_within_the_goals_radius_still_draws_the_local_planner() -> (
+    None
+):
     seen: list[Problem] = []
 
     class Noting(Constant):
-        def init(self, problem: Problem, generator: torch.Generator) -> tuple[Tensor, ...]:
+        def init(
+            self, problem: Problem, generator: torch.Generator
+        ) -> tuple[Tensor, ...]:
             seen.append(problem)
             return ()
 
-    problem = factories.problem(torch.full((1, 16, 16), 0.8), objective=TravelTime(Unicycle(), 1.0))
+    problem = factories.problem(
+        torch.full((1, 16, 16), 0.8), objective=TravelTime(Unicycle(), 1.0)
+    )
     Guided(GuideConfig(), Noting((0.0, 0.0))).init(problem, generator())
     near = torch.tensor([[2.0, 2.0, 0.0]])
-    cost = seen[0].objective.stage(near, torch.zeros(1, 2), torch.ones(1), torch.tensor([[2.5, 2.0]]))
+    cost = seen[0].objective.stage(
+        near, torch.zeros(1, 2), torch.ones(1), torch.tensor([[2.5, 2.0]])
+    )
     assert cost.item() == pytest.approx(0.1)
 
 
@@ -68,7 +88,9 @@ class Standing(Constant):
     def __init__(self) -> None:
         super().__init__((0.0, 0.0))
 
-    def select(self, plan_state: tuple[Tensor, ...], members: Tensor) -> tuple[Tensor, ...]:
+    def select(
+        self, plan_state: tuple[Tensor, ...], members: Tensor
+    ) -> tuple[Tensor, ...]:
         return tuple(action[members] for action in plan_state)
 
 
@@ -79,7 +101,9 @@ def test_a_local_planner_that_does_nothing_arrives_by_recovery_alone() -> None:
     walled = torch.full((2, 16, 24), 0.85)
     walled[1, 7:9, :12] = 0.1
     problem = factories.problem(walled, start=(2.0, 2.0), goal=(4.0, 6.5))
-    driven = drive(Guided(GuideConfig(), Constant((0.0, 0.0))), problem, time_budget_s=100)
+    driven = drive(
+        Guided(GuideConfig(), Constant((0.0, 0.0))), problem, time_budget_s=100
+    )
     assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
     assert problem.free_at(driven.states).float().mean() > 0.98
 
@@ -102,10 +126,14 @@ def test_a_recovery_leads_through_the_corner_that_two_cells_share() -> None:
     ground[0, 4:9, 5] = 0.0
     problem = with_start(factories.problem(ground, goal=(8.25, 1.75)), 2.45, 2.4, 0.0)
     # From cell (4, 4) to (3, 5): a line to its centre would cut cell (4, 5).
-    assert astar.path_cells(astar.search(problem), torch.tensor([84]), 2).tolist() == [[84, 65]]
+    assert astar.path_cells(astar.search(problem), torch.tensor([84]), 2).tolist() == [
+        [84, 65]
+    ]
     assert recovered(problem, 45) == [[2.5, 2.0], [2.75, 1.75]]
     free = factories.problem(torch.full((1, 16, 20), 0.8), goal=(8.25, 1.75))
-    (first,) = astar.path_cells(astar.search(free), torch.tensor([84]), 2)[:, 1].tolist()
+    (first,) = astar.path_cells(astar.search(free), torch.tensor([84]), 2)[
+        :, 1
+    ].tolist()
     assert recovered(with_start(free, 2.45, 2.4, 0.0), 12) == [
         [first % 20 / 2 + 0.25, first // 20 / 2 + 0.25]
     ]
@@ -113,7 +141,9 @@ def test_a_recovery_leads_through_the_corner_that_two_cells_share() -> None:
 
 def test_one_that_drives_is_left_alone_on_ground_that_holds_it() -> None:
     problem = factories.problem(torch.full((1, 16, 16), 0.85))
-    driven = drive(Guided(GuideConfig(), Constant((0.9, 0.1))), problem, 0 * problem.risk_map, 5.0)
+    driven = drive(
+        Guided(GuideConfig(), Constant((0.9, 0.1))), problem, 0 * problem.risk_map, 5.0
+    )
     assert (driven.actions == torch.tensor([0.9, 0.1])).all()
 
 
@@ -131,17 +161,23 @@ def test_the_local_planner_is_told_what_was_taken_instead() -> None:
 
 
 def test_the_recovery_of_an_episode_stays_its_own_when_others_leave_the_batch() -> None:
-    """Of four robots two are being led away, to two places; those that stay are led as they were among all."""
+    """Of four robots two are being led away, to two places; those that stay are led as
+    they were among all.
+    """
     ground = torch.full((4, 16, 20), 0.8)
     problem = factories.problem(ground, goal=(8.25, 6.75))
-    starts = torch.tensor([[1.6, 1.2, 0.0], [6.1, 2.3, 1.0], [2.2, 6.4, -1.0], [4.1, 4.4, 0.5]])
+    starts = torch.tensor(
+        [[1.6, 1.2, 0.0], [6.1, 2.3, 1.0], [2.2, 6.4, -1.0], [4.1, 4.4, 0.5]]
+    )
     problem = replace(problem, start=starts)
     planner = Guided(GuideConfig(), Standing())
     plan_state, state = planner.init(problem, generator()), problem.start
     for _ in range(14):
         action, plan_state, _ = planner.plan(step_at(state), plan_state)
         # The first and third are carried on by the ground, so that they are not held.
-        state = problem.robot(state, action, torch.full((4,), 0.5)) + 0.1 * torch.tensor(
+        state = problem.robot(
+            state, action, torch.full((4,), 0.5)
+        ) + 0.1 * torch.tensor(
             [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.0]]
         )
     assert plan_state.recovery.active.tolist() == [False, True, False, True]
@@ -151,10 +187,15 @@ def test_the_recovery_of_an_episode_stays_its_own_when_others_leave_the_batch() 
         some = planner.select(plan_state, members)
         action, following, _ = planner.plan(step_at(state[members]), some)
         torch.testing.assert_close(action, whole[members], rtol=0, atol=1e-6)
-        assert following.recovery.active.tolist() == plan_state.recovery.active[members].tolist()
+        assert (
+            following.recovery.active.tolist()
+            == plan_state.recovery.active[members].tolist()
+        )
         for name in ("place_m", "steps", "driven_m", "target_m", "cell"):
             expected = getattr(plan_state.recovery, name)[members]
-            torch.testing.assert_close(getattr(some.recovery, name), expected, rtol=0, atol=0)
+            torch.testing.assert_close(
+                getattr(some.recovery, name), expected, rtol=0, atol=0
+            )
 
 
 # --- The guide.
@@ -190,7 +231,9 @@ def test_it_gives_the_way_points_of_the_rule_under_its_settings() -> None:
         (GuideConfig(lookahead_m=2.0), GoalDistance()),
         (GuideConfig(), TravelTime(Unicycle(), 1.0)),
     ):
-        problem = factories.problem(slow, (1.75, 3.25), (10.25, 3.25), objective=objective)
+        problem = factories.problem(
+            slow, (1.75, 3.25), (10.25, 3.25), objective=objective
+        )
         local = Constant((0.5, 0.0))
         planner = Guided(config, local)
         planner.plan(first(problem), planner.init(problem, generator()))
@@ -202,7 +245,9 @@ def test_it_gives_the_way_points_of_the_rule_under_its_settings() -> None:
 
 
 def test_the_whole_reference_is_drawn_only_when_asked_for() -> None:
-    problem = factories.problem(torch.full((2, 16, 24), 0.9), start=(1.1, 6.6), goal=(10.3, 2.2))
+    problem = factories.problem(
+        torch.full((2, 16, 24), 0.9), start=(1.1, 6.6), goal=(10.3, 2.2)
+    )
     planner = Guided(GuideConfig(lookahead_m=1.0), Constant((0.5, 0.0)))
     state = planner.init(problem, generator())
     action, _, plan = planner.plan(first(problem), state)
@@ -213,7 +258,9 @@ def test_the_whole_reference_is_drawn_only_when_asked_for() -> None:
     torch.testing.assert_close(plan.reference[:, -1], problem.goal_m)
 
 
-def test_it_says_where_the_path_is_the_shortest_and_not_the_cheapest_by_the_objective() -> None:
+def test_it_says_where_the_path_is_the_shortest_and_not_the_cheapest_by_the_objective() -> (
+    None
+):
     class Own(Objective):
         """A J that says nothing of paths."""
 
@@ -240,7 +287,9 @@ def test_a_look_ahead_that_looks_nowhere_is_refused() -> None:
 def test_no_tensor_is_made_on_another_device_but_by_the_search(
     monkeypatch: pytest.MonkeyPatch, objective: Objective
 ) -> None:
-    real = factories.problem(torch.full((2, 16, 24), 0.9), robot=Bicycle(), objective=objective)
+    real = factories.problem(
+        torch.full((2, 16, 24), 0.9), robot=Bicycle(), objective=objective
+    )
     searched, costs = astar.search(real), astar.edge_costs(real)
     with fake_cuda(real) as problem:
         costs = costs.to("cuda")
@@ -252,4 +301,6 @@ def test_no_tensor_is_made_on_another_device_but_by_the_search(
         action, following, plan = planner.plan(first(problem, draw=True), state)
         recovery = following.recovery
         assert on_cuda(action, plan.reference, planner.local.targets[0])
-        assert on_cuda(recovery.place_m, recovery.steps, recovery.driven_m, recovery.active)
+        assert on_cuda(
+            recovery.place_m, recovery.steps, recovery.driven_m, recovery.active
+        )

@@ -8,7 +8,9 @@ ROBOT = Unicycle()
 STAND, DRIVE = torch.tensor([[0.0, 0.5]]), torch.tensor([[1.0, 0.0]])
 
 
-def watched(moves_m: list[float], action: Tensor, robot: Unicycle = ROBOT) -> list[bool]:
+def watched(
+    moves_m: list[float], action: Tensor, robot: Unicycle = ROBOT
+) -> list[bool]:
     """Whether a robot that moves so far along x in each step is being steered away."""
     state = torch.zeros(1, 3)
     recovery = Recovery.none(state)

@@ -1,4 +1,6 @@
-"""Maps of 16 m × 16 m with start (3, 8) and goal (13, 8), and the closed loop on them, for tests."""
+"""Maps of 16 m × 16 m with start (3, 8) and goal (13, 8), and the closed loop on them,
+for tests.
+"""
 
 from typing import Any
 
@@ -20,7 +22,9 @@ def open_map(batch: int = 1) -> Tensor:
 
 
 def walled_map(gap: slice | None = None) -> Tensor:
-    """A wall 1 m thick at x = 8 m, between start and goal, with or without a gap along y."""
+    """A wall 1 m thick at x = 8 m, between start and goal, with or without a gap along
+    y.
+    """
     maps = open_map()
     maps[:, :, 16:18] = 0.1
     if gap is not None:
@@ -33,7 +37,11 @@ def make_problem(maps: Tensor, robot: Robot | None = None) -> Problem:
 
 
 def make_loop(
-    maps: Tensor, crossing: bool = False, radius_m: float = 1.0, robot: Robot | None = None, **changes: Any
+    maps: Tensor,
+    crossing: bool = False,
+    radius_m: float = 1.0,
+    robot: Robot | None = None,
+    **changes: Any,
 ) -> ClosedLoop:
     problem = make_problem(maps, robot)
     values = {"step_m": 5.0, "edge_time_s": 10.0} | changes

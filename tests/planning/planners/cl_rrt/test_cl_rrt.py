@@ -1,4 +1,6 @@
-"""CL-RRT on small maps, driven through the same F that it predicts with unless said otherwise."""
+"""CL-RRT on small maps, driven through the same F that it predicts with unless said
+otherwise.
+"""
 
 import math
 from dataclasses import replace
@@ -27,7 +29,13 @@ from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import World
 from tests import factories
-from tests.planning.planners.cl_rrt.maps import GRID, known, make_problem, open_map, walled_map
+from tests.planning.planners.cl_rrt.maps import (
+    GRID,
+    known,
+    make_problem,
+    open_map,
+    walled_map,
+)
 from tests.planning.planners.driving import drive as closed_loop
 
 SMALL = CLRRTConfig(expansions=200)
@@ -35,10 +43,17 @@ GAP = slice(20, 28)  # from y = 10 m to 14 m, wide enough to be found by every s
 
 
 def at(state: Tensor, draw: bool = True) -> Step:
-    return Step(state=state, traversability=torch.full_like(state[:, 0], math.nan), time_s=0.0, draw=draw)
+    return Step(
+        state=state,
+        traversability=torch.full_like(state[:, 0], math.nan),
+        time_s=0.0,
+        draw=draw,
+    )
 
 
-def begin(problem: Problem, config: CLRRTConfig = SMALL, seed: int = 0) -> tuple[CLRRT, CLRRTState]:
+def begin(
+    problem: Problem, config: CLRRTConfig = SMALL, seed: int = 0
+) -> tuple[CLRRT, CLRRTState]:
     planner = CLRRT(config)
     return planner, planner.init(problem, torch.Generator().manual_seed(seed))
 
@@ -49,18 +64,26 @@ def first_plan(problem: Problem, config: CLRRTConfig = SMALL, seed: int = 0) -> 
 
 
 def drive(
-    problem: Problem, steps: int, config: CLRRTConfig = SMALL, seed: int = 0, truth: Tensor | None = None
+    problem: Problem,
+    steps: int,
+    config: CLRRTConfig = SMALL,
+    seed: int = 0,
+    truth: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, list[Plan]]:
     """States [N + 1, B, S], actions [N, B, A] and plans, until all have arrived."""
     planner, plan_state = begin(problem, config, seed)
-    ground = problem.grid.pad(problem.traversability if truth is None else truth, outside=0.0)
+    ground = problem.grid.pad(
+        problem.traversability if truth is None else truth, outside=0.0
+    )
     state = problem.start
     states, actions, plans = [state], [], []
     for _ in range(steps):
         action, plan_state, plan = planner.plan(at(state), plan_state)
         actions.append(action)
         plans.append(plan)
-        state = problem.robot(state, action, problem.grid.lookup(ground, state[:, 0], state[:, 1]))
+        state = problem.robot(
+            state, action, problem.grid.lookup(ground, state[:, 0], state[:, 1])
+        )
         states.append(state)
         if bool(arrived(problem, state).all()):
             break
@@ -74,7 +97,9 @@ def arrived(problem: Problem, state: Tensor) -> Tensor:
 def off_polyline(points: Tensor, polyline: Tensor) -> Tensor:
     """Distances of points [N, 2] to a polyline [M, 2]."""
     begin, along = polyline[:-1], polyline[1:] - polyline[:-1]
-    share = ((points[:, None] - begin) * along).sum(-1) / (along * along).sum(-1).clamp(min=1e-9)
+    share = ((points[:, None] - begin) * along).sum(-1) / (along * along).sum(-1).clamp(
+        min=1e-9
+    )
     nearest = begin + share.clamp(0, 1)[..., None] * along
     return torch.linalg.vector_norm(points[:, None] - nearest, dim=-1).amin(dim=1)
 
@@ -93,7 +118,9 @@ def test_open_map_is_crossed_as_predicted() -> None:
     torch.testing.assert_close(path[0], problem.start[0, :2])
     assert arrived(problem, path[-1:]).all()
     assert arrived(problem, states[-1]).all()
-    assert all(plan.path is first.path for plan in plans)  # followed to the end, without another plan
+    assert all(
+        plan.path is first.path for plan in plans
+    )  # followed to the end, without another plan
     assert off_polyline(states[:, 0, :2], path).max() < 0.05
     assert off_polyline(path, states[:, 0, :2]).max() < 0.05
     low, high = problem.action_bounds
@@ -121,7 +148,9 @@ def test_wall_is_passed_through_its_gap() -> None:
 
 def test_quicker_way_is_preferred_to_the_shorter_one() -> None:
     maps = open_map()
-    maps[:, 8:24, 12:20] = 0.32  # free, but slow: 4 m at 0.32 take as long as 10 m around
+    maps[:, 8:24, 12:20] = (
+        0.32  # free, but slow: 4 m at 0.32 take as long as 10 m around
+    )
     states, _, _ = drive(make_problem(maps), 600, CLRRTConfig())
     straight_s = 5 / 0.8 + 4 / 0.32
     assert (len(states) - 1) * 0.1 < straight_s
@@ -134,15 +163,20 @@ def test_closed_wall_is_tried_in_vain_and_then_crossed() -> None:
     assert status[0] == PlanStatus.PARTIAL
     assert PlanStatus.FAILED not in status
     assert arrived(problem, states[-1]).all()
-    # Tried again at once, the first path kept; at its end tried as often before it crosses.
-    assert all(torch.equal(plan.path.nan_to_num(), plans[0].path.nan_to_num()) for plan in plans[1:10])
+    # Tried again at once, the first path kept; at its end tried as often before it
+    # crosses.
+    assert all(
+        torch.equal(plan.path.nan_to_num(), plans[0].path.nan_to_num())
+        for plan in plans[1:10]
+    )
     without = torch.tensor([bool(plan.path.isnan().all()) for plan in plans])
     assert without.sum() == SMALL.most_failures
     last = int(without.nonzero()[-1])
     assert without[last - SMALL.most_failures + 1 : last + 1].all()
     assert states[last, 0, 0] > 5  # it went as far as it could before
     assert all_free(problem, states[: last + 1, 0])
-    # Across by the cheapest way, which is the shortest; then a free way is looked for, and found.
+    # Across by the cheapest way, which is the shortest; then a free way is looked for,
+    # and found.
     blocked = ~problem.free_at(states[:, 0][None])[0]
     metres = distance(states[1:, 0], states[:-1, 0])[blocked[:-1]].sum()
     assert metres < 1.3
@@ -157,7 +191,9 @@ def test_plans_in_vain_before_a_wall_is_crossed_and_tries_at_a_free_way_afterwar
     blocked = torch.full((1, *GRID.shape), 0.1)
     blocked[:, 15:17, 5:7] = 0.8  # too small for a partial path
     problem = make_problem(blocked)
-    config = replace(SMALL, expansions=100, most_failures=most_failures, turning_radius_m=0.2)
+    config = replace(
+        SMALL, expansions=100, most_failures=most_failures, turning_radius_m=0.2
+    )
     planner, plan_state = begin(problem, config)
     without, failures = [], []
     for _ in range(10):
@@ -187,12 +223,18 @@ def test_goal_on_ground_that_is_not_free_is_reached() -> None:
     assert arrived(problem, states[-1]).all()
 
 
-def test_closed_wall_is_not_entered_by_chance_where_the_ground_is_other_than_predicted() -> None:
+def test_closed_wall_is_not_entered_by_chance_where_the_ground_is_other_than_predicted() -> (
+    None
+):
     problem = make_problem(walled_map().repeat(8, 1, 1))
-    noise = torch.rand(problem.traversability.shape, generator=torch.Generator().manual_seed(0))
+    noise = torch.rand(
+        problem.traversability.shape, generator=torch.Generator().manual_seed(0)
+    )
     truth = (problem.risk_map + 0.4 * (noise - 0.5)).clamp(0.1, 1)
     states, _, plans = drive(problem, 100, truth=truth)
-    without = torch.stack([plan.path[..., 0].isnan().all(dim=1) for plan in plans])  # [N, B]
+    without = torch.stack(
+        [plan.path[..., 0].isnan().all(dim=1) for plan in plans]
+    )  # [N, B]
     assert without.any(dim=0).all()
     for member in range(8):
         before = states[: int(without[:, member].to(torch.uint8).argmax()) + 1, member]
@@ -208,7 +250,9 @@ def test_way_to_the_goal_takes_the_place_of_a_partial_path_at_once() -> None:
         status = [int(plan.status[0]) for plan in plans]
         if status[0] == PlanStatus.PARTIAL and PlanStatus.OK in status:
             assert len(known(plans[0].path[0])) > 2
-            assert not torch.equal(plans[-1].path.nan_to_num(), plans[0].path.nan_to_num())
+            assert not torch.equal(
+                plans[-1].path.nan_to_num(), plans[0].path.nan_to_num()
+            )
             assert off_polyline(states[:, 0, :2], known(plans[0].path[0])).max() < 0.5
             return
     pytest.fail("Expected a seed at which a later plan finds what the first did not.")
@@ -242,7 +286,9 @@ def test_goal_as_far_as_the_rounds_reach_is_planned_to_at_once() -> None:
     assert first_plan(problem, CLRRTConfig()).status.tolist() == [PlanStatus.OK]
 
 
-def test_partial_path_is_not_changed_while_the_robot_stands_on_ground_that_is_not_free() -> None:
+def test_partial_path_is_not_changed_while_the_robot_stands_on_ground_that_is_not_free() -> (
+    None
+):
     # From there a way out may lead through the very wall that the path stops at.
     maps = open_map(8)
     maps[:, 15, 6:10] = 0.1  # from y = 7.5 m, beside the start
@@ -255,7 +301,9 @@ def test_partial_path_is_not_changed_while_the_robot_stands_on_ground_that_is_no
     for _ in range(SMALL.most_failures - 2):
         _, plan_state, plan = planner.plan(at(beside), plan_state)
         assert plan.path is first.path
-    assert (plan_state.failures == 0).all()  # once it is back on free ground it looks for a way again
+    assert (
+        plan_state.failures == 0
+    ).all()  # once it is back on free ground it looks for a way again
     _, later, plan = planner.plan(at(problem.start), plan_state)
     assert ((later.failures == 1) | (plan.status == PlanStatus.OK)).all()
 
@@ -280,7 +328,9 @@ def test_robot_that_leaves_ground_that_is_not_free_stays_on_the_map() -> None:
     maps[:, :, :6] = 0.1
     problem = make_problem(maps)
     planner, plan_state = begin(problem)
-    facing = torch.stack((off_border_m, torch.full((7,), 8.0), torch.full((7,), math.pi)), dim=1)
+    facing = torch.stack(
+        (off_border_m, torch.full((7,), 8.0), torch.full((7,), math.pi)), dim=1
+    )
     _, _, plan = planner.plan(at(facing), plan_state)
     points = known(plan.tree.flatten(0, 2))
     assert len(points) > 0
@@ -312,8 +362,12 @@ def test_robot_that_faces_a_wall_turns_tighter() -> None:
 
 def test_ground_other_than_predicted_changes_the_time_but_not_the_way() -> None:
     problem = make_problem(walled_map(gap=GAP))
-    noise = torch.rand(problem.traversability.shape, generator=torch.Generator().manual_seed(0))
-    states, _, plans = drive(problem, 900, truth=(problem.risk_map + noise - 0.5).clamp(0.1, 1))
+    noise = torch.rand(
+        problem.traversability.shape, generator=torch.Generator().manual_seed(0)
+    )
+    states, _, plans = drive(
+        problem, 900, truth=(problem.risk_map + noise - 0.5).clamp(0.1, 1)
+    )
     assert arrived(problem, states[-1]).all()
     assert off_polyline(states[:, 0, :2], known(plans[0].path[0])).max() < 0.3
 
@@ -322,10 +376,13 @@ def test_displaced_robots_plan_anew_and_only_they() -> None:
     problem = make_problem(open_map(3))
     planner, plan_state = begin(problem)
     _, plan_state, before = planner.plan(at(problem.start), plan_state)
-    moved = problem.start + torch.tensor([[0.0, 0.6, 0.0], [0.0, 1.4, 0.0], [0.0, 0.0, 0.0]])
+    moved = problem.start + torch.tensor(
+        [[0.0, 0.6, 0.0], [0.0, 1.4, 0.0], [0.0, 0.0, 0.0]]
+    )
     _, _, after = planner.plan(at(moved), plan_state)
     changed = [
-        not torch.equal(a, b) for a, b in zip(before.tree.nan_to_num(), after.tree.nan_to_num(), strict=True)
+        not torch.equal(a, b)
+        for a, b in zip(before.tree.nan_to_num(), after.tree.nan_to_num(), strict=True)
     ]
     assert changed == [False, True, False]
     torch.testing.assert_close(after.path[1, 0], moved[1, :2])
@@ -380,11 +437,14 @@ def test_episode_alone_is_what_it_is_in_a_batch() -> None:
         assert arrived(alone, states[-1]).all()
         # Rounding may put the step at which it goes on to the next edge off by one.
         assert off_polyline(states[:, 0, :2], together[:, member, :2]).max() < 0.05
-        assert arrived(alone, together[min(len(states) + 3, len(together) - 1), member][None]).all()
+        assert arrived(
+            alone, together[min(len(states) + 3, len(together) - 1), member][None]
+        ).all()
 
 
 def test_samples_are_keyed_by_seed_and_step_whatever_is_in_the_batch() -> None:
-    # The robots of one batch start at other steps than that of the other, but plan at the same one.
+    # The robots of one batch start at other steps than that of the other, but plan at
+    # the same one.
     maps = torch.cat((open_map(), walled_map(gap=GAP)))
     together, alone = make_problem(maps), make_problem(maps[1:])
     plans = []
@@ -407,7 +467,9 @@ def test_layers_are_drawn_when_asked_for_whenever_that_is() -> None:
     assert plan.path.numel() == plan.reference.numel() == plan.tree.numel() == 0
     drawn, _, later = planner.plan(at(problem.start), begin(problem)[1])
     assert torch.equal(drawn, action)
-    _, _, shown = planner.plan(at(problem.start), plan_state)  # of a route planned when none was asked for
+    _, _, shown = planner.plan(
+        at(problem.start), plan_state
+    )  # of a route planned when none was asked for
     torch.testing.assert_close(shown.tree, later.tree, equal_nan=True)
 
 
@@ -422,8 +484,13 @@ def test_drawn_tree_is_one_of_edges_no_longer_than_the_step() -> None:
     assert len(edges) > SMALL.expansions / 2
     ends = torch.stack([edge[-1] for edge in edges] + [problem.start[0, :2]])
     for edge in edges:
-        assert torch.linalg.vector_norm(edge[1:] - edge[:-1], dim=1).sum() < SMALL.step_m + 0.2
-        assert torch.linalg.vector_norm(ends - edge[0], dim=1).min() < 1e-6  # begins where another ends
+        assert (
+            torch.linalg.vector_norm(edge[1:] - edge[:-1], dim=1).sum()
+            < SMALL.step_m + 0.2
+        )
+        assert (
+            torch.linalg.vector_norm(ends - edge[0], dim=1).min() < 1e-6
+        )  # begins where another ends
     assert known(plan.reference[0]).shape[0] > 10
     assert off_polyline(known(plan.path[0]), known(plan.reference[0])).max() < 0.5
 
@@ -437,9 +504,12 @@ def test_drawn_tree_is_one_of_edges_no_longer_than_the_step() -> None:
     ],
 )
 def test_prediction_is_what_the_controller_then_does(robot: Robot) -> None:
-    # With F as predicted the robot comes through each predicted state, over all edges of the path.
+    # With F as predicted the robot comes through each predicted state, over all edges
+    # of the path.
     problem = make_problem(walled_map(gap=GAP), robot)
-    config = CLRRTConfig(edge_time_s=18.0, follower=FollowerConfig(speed_mps=0.3, speed_kd=0.02))
+    config = CLRRTConfig(
+        edge_time_s=18.0, follower=FollowerConfig(speed_mps=0.3, speed_kd=0.02)
+    )
     states, _, plans = drive(problem, 900, config)
     path = known(plans[0].path[0])
     assert plans[0].status.tolist() == [PlanStatus.OK]
@@ -470,25 +540,35 @@ def test_robot_at_its_goal_stands() -> None:
     ],
 )
 def test_settings_are_checked(options: dict[str, object]) -> None:
-    with pytest.raises(ConfigError, match="lookahead_m" if "follower" in options else next(iter(options))):
+    with pytest.raises(
+        ConfigError,
+        match="lookahead_m" if "follower" in options else next(iter(options)),
+    ):
         registry.make("planner", {"part": "cl_rrt", "options": options})
 
 
 def test_settings_of_the_follower_are_given_beside_the_others() -> None:
     options = {"expansions": 75, "follower": {"lookahead_m": 0.9}}
     made = registry.make("planner", {"part": "cl_rrt", "options": options})
-    assert made.config == CLRRTConfig(expansions=75, follower=FollowerConfig(lookahead_m=0.9))
+    assert made.config == CLRRTConfig(
+        expansions=75, follower=FollowerConfig(lookahead_m=0.9)
+    )
 
 
 @pytest.mark.parametrize(
     ("robot", "match"),
     [
-        (Unicycle(speed_mps=(0.8, 1.0), turn_rate_radps=(-0.5, 0.5)), "turning_radius_m"),
+        (
+            Unicycle(speed_mps=(0.8, 1.0), turn_rate_radps=(-0.5, 0.5)),
+            "turning_radius_m",
+        ),
         (Unicycle(turn_rate_radps=(0.0, 1.0)), "both sides"),
         (Bicycle(), "steering_rad"),
     ],
 )
-def test_robots_that_it_cannot_steer_are_refused_before_anything_runs(robot: Robot, match: str) -> None:
+def test_robots_that_it_cannot_steer_are_refused_before_anything_runs(
+    robot: Robot, match: str
+) -> None:
     with pytest.raises(ConfigError, match=match):
         begin(make_problem(open_map(), robot))
 
@@ -507,7 +587,10 @@ def test_what_tables_say_of_it() -> None:
     assert slow.remarks(factories.task(Unicycle(speed_mps=(0.0, 3.0)))) == said
     assert slow.remarks(factories.task(Unicycle())) == ()
     # Backward it would be faster, but it is driven forward alone.
-    assert "at 2 m/s at most" in planner.remarks(factories.task(Unicycle(speed_mps=(-3.0, 2.0))))[0]
+    assert (
+        "at 2 m/s at most"
+        in planner.remarks(factories.task(Unicycle(speed_mps=(-3.0, 2.0))))[0]
+    )
 
 
 @pytest.mark.parametrize("top_mps", [0.5, 3.0])
@@ -541,7 +624,9 @@ def test_those_that_are_kept_go_on_as_they_would_in_the_batch() -> None:
         state = problem.robot(state, action, problem.traversability_at(state))
     few = planner.select(plan_state, members)
     for count in range(4):
-        state = state + torch.tensor([0.0, 1.5, 0.0]) * (count == 2)  # aside, so that it plans anew
+        state = state + torch.tensor([0.0, 1.5, 0.0]) * (
+            count == 2
+        )  # aside, so that it plans anew
         action, plan_state, plan = planner.plan(at(state), plan_state)
         few_action, few, few_plan = planner.plan(at(state[members]), few)
         torch.testing.assert_close(few_action, action[members])
@@ -550,7 +635,9 @@ def test_those_that_are_kept_go_on_as_they_would_in_the_batch() -> None:
         state = problem.robot(state, action, problem.traversability_at(state))
 
 
-def test_trees_are_grown_for_running_robots_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trees_are_grown_for_running_robots_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     grown: list[int] = []
 
     def counted(loop: ClosedLoop, root: Tensor, *rest: Any) -> Route:
@@ -559,7 +646,8 @@ def test_trees_are_grown_for_running_robots_alone(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(cl_rrt, "search", counted)
     problem = make_problem(open_map(3))
-    # In truth two of three are held where they begin, which ends their episodes after a second.
+    # In truth two of three are held where they begin, which ends their episodes after a
+    # second.
     truth = torch.cat((torch.zeros(2, *GRID.shape), open_map()))
     world = World(immobile=Immobile(below=0.1, for_s=1.0))
     places = factories.places(problem.goal_m, problem.start[:, :2])
@@ -583,19 +671,29 @@ def test_number_of_expansions_and_rounds(expansions: int, per_round: int) -> Non
     assert tried.sum() > 0.8 * expansions
     assert plan_state.route.rows.shape[1] == expansions // per_round
     # A round's edges all begin where earlier rounds' end.
-    begins, ends = plan.tree[0, :, 0], torch.stack([edge[-1] for edge in map(known, plan.tree[0][tried])])
+    begins, ends = (
+        plan.tree[0, :, 0],
+        torch.stack([edge[-1] for edge in map(known, plan.tree[0][tried])]),
+    )
     first_round = tried.nonzero()[:, 0] < per_round
-    from_root = torch.linalg.vector_norm(begins[tried] - plan_state.problem.start[0, :2], dim=1) < 1e-4
+    from_root = (
+        torch.linalg.vector_norm(begins[tried] - plan_state.problem.start[0, :2], dim=1)
+        < 1e-4
+    )
     assert from_root[first_round].all()
     assert not from_root.all()
     assert len(ends) == len(from_root)
 
 
-@pytest.mark.parametrize(("goal_bias", "edges"), [(0.0, 0), (0.04, 1), (0.25, 7), (1.0, 25)])
+@pytest.mark.parametrize(
+    ("goal_bias", "edges"), [(0.0, 0), (0.04, 1), (0.25, 7), (1.0, 25)]
+)
 def test_share_of_the_edges_that_aim_at_the_goal(goal_bias: float, edges: int) -> None:
-    # In the second round there are nodes enough. On open ground an edge that aims at the goal ends on a line
-    # that leads there.
-    config = CLRRTConfig(expansions=50, goal_bias=goal_bias, step_m=3.0, turning_radius_m=0.5)
+    # In the second round there are nodes enough. On open ground an edge that aims at
+    # the goal ends on a line that leads there.
+    config = CLRRTConfig(
+        expansions=50, goal_bias=goal_bias, step_m=3.0, turning_radius_m=0.5
+    )
     problem = make_problem(open_map())
     straight = 0
     for points in map(known, first_plan(problem, config).tree[0, 25:]):
@@ -609,7 +707,9 @@ def test_share_of_the_edges_that_aim_at_the_goal(goal_bias: float, edges: int) -
 def test_references_turn_no_tighter_than_the_radius(turning_radius_m: float) -> None:
     problem = make_problem(open_map())
     away = problem.start + torch.tensor([0.0, 0.0, math.pi / 2])
-    planner, plan_state = begin(problem, CLRRTConfig(turning_radius_m=turning_radius_m, goal_bias=1.0))
+    planner, plan_state = begin(
+        problem, CLRRTConfig(turning_radius_m=turning_radius_m, goal_bias=1.0)
+    )
     _, plan_state, plan = planner.plan(at(away), plan_state)
     assert plan.status.tolist() == [PlanStatus.OK]
     rows = plan_state.route.rows[0, 0]
@@ -620,27 +720,41 @@ def test_references_turn_no_tighter_than_the_radius(turning_radius_m: float) -> 
 
 @pytest.mark.parametrize("step_m", [1.0, 3.0])
 def test_longest_edge(step_m: float) -> None:
-    plan = first_plan(make_problem(open_map()), CLRRTConfig(expansions=100, step_m=step_m))
-    lengths = [distance(points[1:], points[:-1]).sum() for points in map(known, plan.tree[0])]
+    plan = first_plan(
+        make_problem(open_map()), CLRRTConfig(expansions=100, step_m=step_m)
+    )
+    lengths = [
+        distance(points[1:], points[:-1]).sum() for points in map(known, plan.tree[0])
+    ]
     assert max(lengths).item() == pytest.approx(step_m, abs=0.2)
 
 
 @pytest.mark.parametrize("edge_time_s", [2.0, 5.0])
 def test_longest_edge_in_time(edge_time_s: float) -> None:
-    plan = first_plan(make_problem(open_map() * 0.5), CLRRTConfig(expansions=100, edge_time_s=edge_time_s))
-    lengths = [distance(points[1:], points[:-1]).sum() for points in map(known, plan.tree[0])]
+    plan = first_plan(
+        make_problem(open_map() * 0.5),
+        CLRRTConfig(expansions=100, edge_time_s=edge_time_s),
+    )
+    lengths = [
+        distance(points[1:], points[:-1]).sum() for points in map(known, plan.tree[0])
+    ]
     assert max(lengths).item() == pytest.approx(0.4 * edge_time_s, abs=0.2)
 
 
 @pytest.mark.parametrize("replan_distance_m", [0.5, 2.0])
-def test_distance_from_the_path_at_which_it_plans_anew(replan_distance_m: float) -> None:
+def test_distance_from_the_path_at_which_it_plans_anew(
+    replan_distance_m: float,
+) -> None:
     problem = make_problem(open_map(2))
-    planner, plan_state = begin(problem, replace(SMALL, replan_distance_m=replan_distance_m))
+    planner, plan_state = begin(
+        problem, replace(SMALL, replan_distance_m=replan_distance_m)
+    )
     _, plan_state, before = planner.plan(at(problem.start), plan_state)
     off = torch.tensor([[0.0, -0.9, 0.0], [0.0, -1.1, 0.0]]) * replan_distance_m
     _, _, after = planner.plan(at(problem.start + off), plan_state)
     changed = [
-        not torch.equal(*pair) for pair in zip(before.tree.nan_to_num(), after.tree.nan_to_num(), strict=True)
+        not torch.equal(*pair)
+        for pair in zip(before.tree.nan_to_num(), after.tree.nan_to_num(), strict=True)
     ]
     assert changed == [False, True]
 
@@ -658,18 +772,25 @@ def test_distance_from_the_path_at_which_it_plans_anew(replan_distance_m: float)
     ],
 )
 def test_follower_drives_as_it_is_set(follower: FollowerConfig) -> None:
-    # Ground that slows the robot, so that each gain tells; away from the goal, so that it has to turn.
+    # Ground that slows the robot, so that each gain tells; away from the goal, so that
+    # it has to turn.
     maps = open_map() * 0.6
-    problem = make_problem(maps, Unicycle(speed_mps=(0.0, 2.0), turn_rate_radps=(-2.0, 2.0)))
+    problem = make_problem(
+        maps, Unicycle(speed_mps=(0.0, 2.0), turn_rate_radps=(-2.0, 2.0))
+    )
     turned = replace(problem, start=problem.start + torch.tensor([0.0, 0.0, 1.0]))
-    _, usual, _ = drive(turned, 20, replace(SMALL, follower=FollowerConfig(speed_mps=1.0)))
+    _, usual, _ = drive(
+        turned, 20, replace(SMALL, follower=FollowerConfig(speed_mps=1.0))
+    )
     _, actions, _ = drive(turned, 20, replace(SMALL, follower=follower))
     assert (usual - actions).abs().max() > 0.02
 
 
 def test_wanted_speed_is_the_speed_over_ground() -> None:
     problem = make_problem(open_map(), Unicycle(speed_mps=(0.0, 2.0)))
-    states, _, _ = drive(problem, 400, replace(SMALL, follower=FollowerConfig(speed_mps=0.6)))
+    states, _, _ = drive(
+        problem, 400, replace(SMALL, follower=FollowerConfig(speed_mps=0.6))
+    )
     moved = distance(states[1:, 0], states[:-1, 0]) / 0.1
     assert moved[30:].median().item() == pytest.approx(0.6, abs=0.03)
 

@@ -28,7 +28,9 @@ def circle(radius_m: float, turns: float) -> Reference:
     """To the left about (0, radius), from the origin."""
     arc = torch.arange(round(turns * math.tau * radius_m / SPACING_M) + 1) * SPACING_M
     angle = arc / radius_m
-    poses = torch.stack((radius_m * angle.sin(), radius_m * (1 - angle.cos()), angle), dim=-1)
+    poses = torch.stack(
+        (radius_m * angle.sin(), radius_m * (1 - angle.cos()), angle), dim=-1
+    )
     return Reference.along(poses[None], arc[-1:])
 
 
@@ -59,7 +61,9 @@ def drive(
 
 @pytest.mark.parametrize("traversability", [1.0, 0.5])
 def test_line_is_joined_and_kept(traversability: float) -> None:
-    states, actions, progress = drive(line(12), (0, 0.5, 0.3), traversability, round(100 / traversability))
+    states, actions, progress = drive(
+        line(12), (0, 0.5, 0.3), traversability, round(100 / traversability)
+    )
     driven = states[:-1]
     assert driven[-1, 0] > 9
     assert driven[driven[:, 0] > 3, 1].abs().max() < 0.02
@@ -72,15 +76,21 @@ def test_line_is_joined_and_kept(traversability: float) -> None:
 @pytest.mark.parametrize("traversability", [1.0, 0.5])
 @pytest.mark.parametrize("radius_m", [1.0, 3.0])
 def test_circle_is_kept(radius_m: float, traversability: float) -> None:
-    states, _, progress = drive(circle(radius_m, 2), (0, 0, 0), traversability, round(100 / traversability))
+    states, _, progress = drive(
+        circle(radius_m, 2), (0, 0, 0), traversability, round(100 / traversability)
+    )
     radii = torch.hypot(states[:, 0], states[:, 1] - radius_m)
     assert (radii - radius_m).abs().max() < 0.05
     assert progress[-1] > 8
-    assert (progress[1:] >= progress[:-1]).all()  # though the circle passes its beginning again
+    assert (
+        progress[1:] >= progress[:-1]
+    ).all()  # though the circle passes its beginning again
 
 
 def test_circle_tighter_than_the_bounds_at_full_speed_is_kept_by_slowing_down() -> None:
-    states, actions, _ = drive(circle(0.5, 2), (0, 0, 0), 1.0, 100, FollowerConfig(lookahead_m=0.3))
+    states, actions, _ = drive(
+        circle(0.5, 2), (0, 0, 0), 1.0, 100, FollowerConfig(lookahead_m=0.3)
+    )
     radii = torch.hypot(states[:, 0], states[:, 1] - 0.5)
     assert (radii - 0.5).abs().max() < 0.05
     assert actions[:, 1].abs().max() <= 1
@@ -90,7 +100,9 @@ def test_circle_tighter_than_the_bounds_at_full_speed_is_kept_by_slowing_down() 
 def test_ground_changes_when_the_robot_is_somewhere_but_hardly_where() -> None:
     slow, _, _ = drive(circle(2, 1), (0, 0.4, 0), 0.4, 200)
     fast, _, _ = drive(circle(2, 1), (0, 0.4, 0), 1.0, 80)
-    apart = torch.linalg.vector_norm(slow[:180, None, :2] - fast[:, :2], dim=-1).amin(dim=1)
+    apart = torch.linalg.vector_norm(slow[:180, None, :2] - fast[:, :2], dim=-1).amin(
+        dim=1
+    )
     assert apart.max() < 0.1
 
 
@@ -108,25 +120,38 @@ def test_derivative_damps_a_change_of_speed() -> None:
     tracking = Tracking(torch.zeros(1, 2), torch.zeros(1), error)
     speeds = []
     for gain in (0.0, 0.1):
-        config = FollowerConfig(speed_mps=0.6, speed_kp=0.0, speed_ki=0.0, speed_kd=gain)
-        action, _ = PathFollower(config, Unicycle()).act(line(5), state, tracking, torch.zeros(1))
+        config = FollowerConfig(
+            speed_mps=0.6, speed_kp=0.0, speed_ki=0.0, speed_kd=gain
+        )
+        action, _ = PathFollower(config, Unicycle()).act(
+            line(5), state, tracking, torch.zeros(1)
+        )
         speeds.append(action[0, 0].item())
-    # Moved 0.05 m in 0.1 s: the error fell from 0.5 to 0.1 m/s, so the command falls by 0.1·0.4/0.1.
+    # Moved 0.05 m in 0.1 s: the error fell from 0.5 to 0.1 m/s, so the command falls by
+    # 0.1·0.4/0.1.
     assert speeds[0] - speeds[1] == pytest.approx(0.4, abs=1e-5)
 
 
 def test_reference_runs_straight_on_past_its_end() -> None:
-    poses = torch.tensor([[[0.0, 0.0, 0.0], [0.1, 0.0, math.pi / 6], [0.1, 0.0, math.pi / 6]]])
+    poses = torch.tensor(
+        [[[0.0, 0.0, 0.0], [0.1, 0.0, math.pi / 6], [0.1, 0.0, math.pi / 6]]]
+    )
     reference = Reference.along(poses, torch.tensor([0.1]))
-    expected = torch.tensor([0.1 + 0.1 * math.cos(math.pi / 6), 0.1 * math.sin(math.pi / 6)])
+    expected = torch.tensor(
+        [0.1 + 0.1 * math.cos(math.pi / 6), 0.1 * math.sin(math.pi / 6)]
+    )
     torch.testing.assert_close(reference.at(torch.tensor([0.2]))[0, :2], expected)
 
 
 def test_robot_with_acceleration_limits_joins_and_keeps_a_line() -> None:
-    states, actions, _ = drive(line(12), (0, 0.5, 0.3), 1.0, 120, robot=DifferentialDrive())
+    states, actions, _ = drive(
+        line(12), (0, 0.5, 0.3), 1.0, 120, robot=DifferentialDrive()
+    )
     assert states[-1, 0] > 9
     assert states[states[:, 0] > 4, 1].abs().max() < 0.02
-    assert (actions[0, 0] - states[1, 3]).abs() > 0.5  # it cannot do what it is told at first
+    assert (
+        actions[0, 0] - states[1, 3]
+    ).abs() > 0.5  # it cannot do what it is told at first
 
 
 def test_a_fast_robot_looks_as_far_ahead_as_keeps_it_on_a_line() -> None:
@@ -135,7 +160,9 @@ def test_a_fast_robot_looks_as_far_ahead_as_keeps_it_on_a_line() -> None:
     assert actions[20:, 0].min().item() == pytest.approx(6.0)
     assert states[30:, 1].abs().max() < 0.01
     # Of what it would drive in a tenth of that time it weaves.
-    weaving, _, _ = drive(line(40), (0, 0.5, 0.1), 1.0, 60, FollowerConfig(lookahead_s=0.06), robot)
+    weaving, _, _ = drive(
+        line(40), (0, 0.5, 0.1), 1.0, 60, FollowerConfig(lookahead_s=0.06), robot
+    )
     assert weaving[30:, 1].abs().max() > 0.05
 
 
@@ -143,7 +170,12 @@ def test_a_fast_robot_looks_as_far_ahead_as_keeps_it_on_a_line() -> None:
     ("config", "robot", "wanted_mps", "lookahead_m"),
     [
         (FollowerConfig(), Unicycle(speed_mps=(-4.0, 3.0)), 3.0, 1.8),
-        (FollowerConfig(speed_mps=2.0, lookahead_s=0.5), Unicycle(speed_mps=(0.0, 3.0)), 2.0, 1.0),
+        (
+            FollowerConfig(speed_mps=2.0, lookahead_s=0.5),
+            Unicycle(speed_mps=(0.0, 3.0)),
+            2.0,
+            1.0,
+        ),
         (FollowerConfig(speed_mps=9.0), Unicycle(), 1.0, 0.6),
         (FollowerConfig(lookahead_m=0.7), Unicycle(speed_mps=(0.0, 0.3)), 0.3, 0.7),
     ],
@@ -171,7 +203,8 @@ def test_robots_that_cannot_follow_a_path_are_refused(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize(
-    "field", ["lookahead_m", "lookahead_s", "speed_mps", "speed_kp", "speed_ki", "speed_kd"]
+    "field",
+    ["lookahead_m", "lookahead_s", "speed_mps", "speed_kp", "speed_ki", "speed_kd"],
 )
 def test_settings_are_checked(field: str) -> None:
     with pytest.raises(ConfigError, match=field):

@@ -1,4 +1,6 @@
-"""The search: which nodes are chosen, what a way costs, which route is taken; and that a tree is a value."""
+"""The search: which nodes are chosen, what a way costs, which route is taken; and that
+a tree is a value.
+"""
 
 from dataclasses import FrozenInstanceError, fields, replace
 
@@ -32,17 +34,23 @@ def planted(loop: ClosedLoop) -> Tree:
     return plant(loop, loop.problem.start, Tracking.standing(loop.problem.start))
 
 
-def extended(loop: ClosedLoop, tree: Tree, nodes: list[int], targets: list[tuple[float, float]]) -> Tree:
+def extended(
+    loop: ClosedLoop, tree: Tree, nodes: list[int], targets: list[tuple[float, float]]
+) -> Tree:
     """The tree with an edge from each node to each target."""
     batch = len(loop.problem)
     node, target_m = torch.tensor([nodes] * batch), torch.tensor([targets] * batch)
     begin = stand(tree, node)
     reference, length_m = draw_references(loop, begin.state, target_m)
-    choice = Choice(parent=node, target_m=target_m, aimed=torch.zeros_like(node, dtype=torch.bool))
+    choice = Choice(
+        parent=node, target_m=target_m, aimed=torch.zeros_like(node, dtype=torch.bool)
+    )
     return add(loop, tree, choice, drive(loop, begin, reference, length_m))
 
 
-def searched(loop: ClosedLoop, rounds: int, count: int, seed: int = 0, goal_edges: int = 4):  # type: ignore[no-untyped-def]
+def searched(
+    loop: ClosedLoop, rounds: int, count: int, seed: int = 0, goal_edges: int = 4
+):  # type: ignore[no-untyped-def]
     generator = torch.Generator().manual_seed(seed)
     sample_m = torch.rand(rounds, count, 2, generator=generator) * 16
     chance = torch.rand(rounds, count, generator=generator)
@@ -62,7 +70,9 @@ def tensors(value: object) -> list[Tensor]:
 
 
 def two_nodes(loop: ClosedLoop) -> Tree:
-    """Root at (3, 8), and a node near (7, 8) to which the way was slow: 60 s for what takes 5."""
+    """Root at (3, 8), and a node near (7, 8) to which the way was slow: 60 s for what
+    takes 5.
+    """
     tree = extended(loop, planted(loop), [0], [(7.0, 8.0)])
     return replace(tree, time_s=torch.tensor([[0.0, 60.0]]))
 
@@ -74,7 +84,10 @@ def test_share_of_choices_that_explore(known_way: bool) -> None:
     tree = two_nodes(loop)
     if known_way:  # as an edge elsewhere that takes long
         way = extended(loop, tree, [0], [(3.0, 12.0)])
-        arrived, time_s = torch.tensor([[False, False, True]]), torch.tensor([[0.0, 60.0, 500.0]])
+        arrived, time_s = (
+            torch.tensor([[False, False, True]]),
+            torch.tensor([[0.0, 60.0, 500.0]]),
+        )
         tree = replace(way, arrived=arrived, time_s=time_s)
     chance = (torch.arange(1000) + 0.5) / 1000
     choice = choose(loop, tree, torch.tensor([8.0, 8.0]).expand(1000, 2), chance, 0)
@@ -84,7 +97,8 @@ def test_share_of_choices_that_explore(known_way: bool) -> None:
 
 
 def test_nearest_is_by_dubins_length() -> None:
-    # (2.5, 8) is half a metre behind the root, which would have to turn about, and 3.2 m before the other.
+    # (2.5, 8) is half a metre behind the root, which would have to turn about, and 3.2
+    # m before the other.
     loop = make_loop(open_map())
     tree = extended(loop, planted(loop), [0], [(5.5, 8.0)])
     back = tree.at.state.clone()
@@ -99,19 +113,39 @@ def test_nearest_is_by_dubins_length() -> None:
 def test_nodes_that_cannot_improve_on_the_best_way_are_left_out() -> None:
     loop = make_loop(open_map())
     tree = extended(loop, planted(loop), [0, 0], [(7.0, 8.0), (3.0, 12.0)])
-    arrived, time_s = torch.tensor([[False, False, True]]), torch.tensor([[0.0, 18.0, 20.0]])
-    tree = replace(tree, arrived=arrived, time_s=time_s)  # 5 m to the goal's rim: 18 s + 5 s > 20 s
+    arrived, time_s = (
+        torch.tensor([[False, False, True]]),
+        torch.tensor([[0.0, 18.0, 20.0]]),
+    )
+    tree = replace(
+        tree, arrived=arrived, time_s=time_s
+    )  # 5 m to the goal's rim: 18 s + 5 s > 20 s
     chance = torch.linspace(0, 0.99, 20)
-    assert (choose(loop, tree, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 3).parent == 0).all()
+    assert (
+        choose(loop, tree, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 3).parent
+        == 0
+    ).all()
     soon = replace(tree, time_s=torch.tensor([[0.0, 14.0, 20.0]]))
-    assert (choose(loop, soon, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 0).parent == 1).any()
-    dear = replace(soon, blocked_m=torch.tensor([[0.0, 0.1, 0.0]]))  # and the penalty counts
-    assert (choose(loop, dear, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 0).parent == 0).all()
+    assert (
+        choose(loop, soon, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 0).parent
+        == 1
+    ).any()
+    dear = replace(
+        soon, blocked_m=torch.tensor([[0.0, 0.1, 0.0]])
+    )  # and the penalty counts
+    assert (
+        choose(loop, dear, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 0).parent
+        == 0
+    ).all()
 
 
-def test_the_goals_share_goes_to_nodes_that_have_not_tried_it_the_nearest_first() -> None:
+def test_the_goals_share_goes_to_nodes_that_have_not_tried_it_the_nearest_first() -> (
+    None
+):
     loop = make_loop(open_map())
-    tree = extended(loop, planted(loop), [0, 0, 0], [(5.0, 8.0), (4.0, 8.0), (6.0, 8.0)])
+    tree = extended(
+        loop, planted(loop), [0, 0, 0], [(5.0, 8.0), (4.0, 8.0), (6.0, 8.0)]
+    )
     sample_m, chance = torch.tensor([[15.0, 1.0]]).expand(5, 2), torch.zeros(5)
     first = choose(loop, tree, sample_m, chance, 2)
     assert first.parent[0, :2].tolist() == [3, 1]
@@ -124,7 +158,10 @@ def test_the_goals_share_goes_to_nodes_that_have_not_tried_it_the_nearest_first(
     again = choose(loop, larger, sample_m[:1].expand(9, 2), torch.zeros(9), 9)
     left = larger.to_goal_m[0].isfinite()
     left[[1, 3]] = False
-    assert sorted(again.parent[0][again.aimed[0]].tolist()) == left.nonzero()[:, 0].tolist()
+    assert (
+        sorted(again.parent[0][again.aimed[0]].tolist())
+        == left.nonzero()[:, 0].tolist()
+    )
     lengths = larger.to_goal_m[0][again.parent[0][again.aimed[0]]]
     assert (lengths.diff() >= 0).all()
 
@@ -134,8 +171,12 @@ def test_no_more_edges_aim_at_the_goal_than_are_asked_for_or_there_are_nodes(
     goal_edges: int, aimed: int
 ) -> None:
     loop = make_loop(open_map())
-    tree = extended(loop, planted(loop), [0, 0, 0], [(5.0, 8.0), (4.0, 8.0), (6.0, 8.0)])
-    choice = choose(loop, tree, torch.tensor([[15.0, 1.0]]).expand(8, 2), torch.zeros(8), goal_edges)
+    tree = extended(
+        loop, planted(loop), [0, 0, 0], [(5.0, 8.0), (4.0, 8.0), (6.0, 8.0)]
+    )
+    choice = choose(
+        loop, tree, torch.tensor([[15.0, 1.0]]).expand(8, 2), torch.zeros(8), goal_edges
+    )
     assert choice.aimed.sum() == aimed
     assert (choice.target_m == loop.problem.goal_m).all(dim=-1).sum() == aimed
 
@@ -146,9 +187,14 @@ def test_a_way_costs_its_time_and_the_penalty_of_metres_that_are_not_free() -> N
     tree = extended(loop, tree, [1], [(11.0, 8.0)])
     tree = extended(loop, tree, [2], [(13.0, 8.0)])
     torch.testing.assert_close(
-        tree.time_s[0], torch.tensor([0, 5, 5 + 3.75 + 3.33, 12.08 + 1.25]), rtol=0, atol=0.6
+        tree.time_s[0],
+        torch.tensor([0, 5, 5 + 3.75 + 3.33, 12.08 + 1.25]),
+        rtol=0,
+        atol=0.6,
     )
-    torch.testing.assert_close(tree.blocked_m[0], torch.tensor([0.0, 0.0, 1.0, 1.0]), rtol=0, atol=0.1)
+    torch.testing.assert_close(
+        tree.blocked_m[0], torch.tensor([0.0, 0.0, 1.0, 1.0]), rtol=0, atol=0.1
+    )
     torch.testing.assert_close(tree.cost, tree.time_s + PENALTY * tree.blocked_m)
     torch.testing.assert_close(tree.best[0], tree.cost[:, 3])
 
@@ -156,13 +202,20 @@ def test_a_way_costs_its_time_and_the_penalty_of_metres_that_are_not_free() -> N
 def test_cheapest_way_is_taken_and_one_that_crosses_is_partial() -> None:
     loop = make_loop(walled_map(gap=GAP), crossing=True)
     across = extended(loop, planted(loop), [0], [(7.0, 8.0)])
-    across = extended(loop, extended(loop, across, [1], [(11.0, 8.0)]), [2], [(13.0, 8.0)])
+    across = extended(
+        loop, extended(loop, across, [1], [(11.0, 8.0)]), [2], [(13.0, 8.0)]
+    )
     route = best_route(loop, across, 5)
     assert route.status.tolist() == [PlanStatus.PARTIAL]
     assert route.depth.tolist() == [3]
     assert known(route.path[0])[-1, 0] > 11.9
     around = across
-    for node, target in ((0, (6.0, 11.5)), (4, (8.5, 13.0)), (5, (11.0, 11.0)), (6, (13.0, 8.0))):
+    for node, target in (
+        (0, (6.0, 11.5)),
+        (4, (8.5, 13.0)),
+        (5, (11.0, 11.0)),
+        (6, (13.0, 8.0)),
+    ):
         around = extended(loop, around, [node], [target])
     assert around.arrived[0].nonzero()[:, 0].tolist() == [3, 7]
     assert around.time_s[0, 7] > around.time_s[0, 3]
@@ -179,8 +232,12 @@ def test_partial_route_leads_nearest_to_the_goal_and_is_left_before_its_end() ->
     assert route.status.tolist() == [PlanStatus.PARTIAL]
     assert route.depth.tolist() == [1]
     assert known(route.path[0])[-1, 0] == pytest.approx(5.0, abs=0.1)
-    assert route.end_m[0, 0].item() == pytest.approx(tree.end_m[0, 1].item() - 0.3, abs=1e-5)
-    assert best_route(loop, extended(loop, planted(loop), [0], [(3.4, 8.0)]), 4).depth.tolist() == [0]
+    assert route.end_m[0, 0].item() == pytest.approx(
+        tree.end_m[0, 1].item() - 0.3, abs=1e-5
+    )
+    assert best_route(
+        loop, extended(loop, planted(loop), [0], [(3.4, 8.0)]), 4
+    ).depth.tolist() == [0]
 
 
 def test_partial_route_rather_leads_to_free_ground_than_nearer_to_the_goal() -> None:
