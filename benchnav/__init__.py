@@ -32,7 +32,7 @@ __getattr__, __dir__, __all__ = face(
     },
 )
 
-__version__ = "1.3.0"
+__version__ = "2.0.0.dev0"
 
 # Gymnasium takes 0.05 s beside NumPy and loads no PyTorch.
 gymnasium.register(

@@ -107,6 +107,13 @@ class Results:
         """
         return self._report.summary.copy()
 
+    @property
+    def hypotheses(self) -> pd.DataFrame:
+        """One row per hypothesis: its claim, the difference with its interval, p, and
+        whether it is supported. Empty if the run has none.
+        """
+        return self._report.tests.copy()
+
     def best(self) -> pd.DataFrame:
         """Return the conditions of each block that are not significantly worse than its
         best, best first.

@@ -8,6 +8,8 @@ kind; for those of runs it is `benchnav.eval.figures.RunData`.
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import copy
+from functools import partial
+from io import BytesIO
 from typing import TYPE_CHECKING, Any, Self
 
 from benchnav.core.specified import Specified
@@ -73,7 +75,16 @@ class Figure(Specified, ABC):
         from benchnav.viz.style import styled
 
         with styled():
-            return self.draw(data)
+            drawing = self.draw(data)
+        # Notebooks show an object by this method, whatever backend is active.
+        vars(drawing)["_repr_png_"] = partial(_png, drawing)
+        return drawing
+
+
+def _png(drawing: "matplotlib.figure.Figure") -> bytes:
+    image = BytesIO()
+    drawing.savefig(image, format="png", dpi=150, bbox_inches="tight")
+    return image.getvalue()
 
 
 def applicable(figures: Sequence[Figure], data: Any) -> list[Figure]:

@@ -53,6 +53,13 @@ def run(dataset_path: Path) -> Results:
         world=World.stakes(time_budget_s=20.0),
         rules=Rules(free_space=FreeSpace(by="mean", above=0.2)),
         scenarios=["std"],
+        hypotheses=[
+            {
+                "one": {"risk": "cvar:0.8"},
+                "other": {"risk": "mean"},
+                "metric": "success",
+            }
+        ],
         maps=2,
         verbose=False,
     )
@@ -109,6 +116,9 @@ def test_results_hold_what_the_folder_holds(run: Results, tmp_path: Path) -> Non
     page = saved.report(tmp_path / "page")
     assert page.is_file()
     assert not (tmp_path / "kept" / "report.html").exists()
+    tests = pd.read_csv(page.parent / "hypotheses.csv")
+    assert list(tests["claim"]) == list(run.hypotheses["claim"])
+    assert len(tests) == 1
 
 
 def test_results_compare_as_the_command_does(run: Results, tmp_path: Path) -> None:
@@ -147,6 +157,7 @@ def test_results_compare_as_the_command_does(run: Results, tmp_path: Path) -> No
 def test_figures_are_methods(run: Results) -> None:
     figure = run.plot.success()
     assert figure.axes
+    assert figure._repr_png_().startswith(b"\x89PNG")  # which notebooks show
     with pytest.raises(ConfigError, match="Did you mean 'success'"):
         run.plot.sucess()
 
