@@ -27,7 +27,7 @@ from benchnav.models.nets.calibration import (
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.mdn import MixtureDensityModel
 from benchnav.models.predictor import Ideal, Oracle
-from benchnav.models.quality import measure as measure_module
+from benchnav.models.quality import measurement as measurement_module
 from benchnav.models.quality.measure import evaluate
 from benchnav.models.training import fit as fit_module
 from benchnav.models.training import networks
@@ -162,7 +162,7 @@ def test_each_command_uses_the_device_that_it_is_given(
         raise Enough
 
     def measure(
-        model: Any, dataset: Any, splits: Any, seed: int, device: torch.device
+        model: Any, dataset: Any, split: str, seed: int, device: torch.device, **_: Any
     ) -> Any:
         asked.append(device)
         raise Enough
@@ -173,7 +173,7 @@ def test_each_command_uses_the_device_that_it_is_given(
     )
     for name in ("networks.fit_network", "gaussian_processes.fit_gps"):
         monkeypatch.setattr(f"benchnav.models.training.{name}", begin)
-    monkeypatch.setattr(measure_module, "evaluate", measure)
+    monkeypatch.setattr(measurement_module, "measure_split", measure)
     (tmp_path / "logs.csv").write_text(
         "class,slope_deg,traversability\n" + "a,5,0.5\n" * 20
     )
