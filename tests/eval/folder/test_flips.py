@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from benchnav.core.errors import ConfigError
@@ -21,6 +22,7 @@ from benchnav.eval.folder.run_folder import (
     read_table,
     unit_rows,
 )
+from benchnav.eval.folder.sealed import metadata, read_sealed, with_metadata
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.folder.verify import verify_run
 from benchnav.eval.recording import GROUND, Ground, Recording
@@ -166,6 +168,17 @@ def test_missing_files_and_units_of_another_run_are_told(
     assert damage == []  # its key is another's, so that the unit lacks its steps
     unit.unlink()
     assert "1 of 2 units are not finished" in verify_run(copy)[1]
+
+
+def test_steps_that_are_sealed_again_are_not_those_of_the_unit(
+    run: Path, tmp_path: Path
+) -> None:
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    path = sorted(copy.glob("steps/*/*.parquet"))[0]
+    changed = with_metadata(read_sealed(path).slice(1), {"key": metadata(path)["key"]})
+    pq.write_table(changed, path)
+    damage, _ = verify_run(copy)
+    assert damage == [f"{path.relative_to(copy)}: it holds the steps of another run"]
 
 
 def test_a_damaged_viewer_file_is_written_again(run: Path, tmp_path: Path) -> None:
