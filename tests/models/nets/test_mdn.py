@@ -469,7 +469,7 @@ def test_maps_are_jittered_and_slopes_scaled_by_the_training_maps(
     class Watched(MapData):
         def __init__(self, *arguments: Any, **named: Any) -> None:
             super().__init__(*arguments, **named)
-            jitters.append(self.jitter)
+            jitters.append(self.augmentation.jitter)
 
     monkeypatch.setattr(networks, "MapData", Watched)
     network, _ = fit_network(
