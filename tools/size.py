@@ -26,6 +26,39 @@ _LAYOUT = {
     tokenize.ENCODING,
     tokenize.ENDMARKER,
 }
+# Names that do not say what a value is.
+EVERYDAY = frozenset(
+    [
+        "found",
+        "own",
+        "place",
+        "known",
+        "told",
+        "made",
+        "whole",
+        "both",
+        "here",
+        "there",
+        "left",
+        "every",
+        "asked",
+        "given",
+        "each",
+        "one",
+        "other",
+        "way",
+        "said",
+        "kept",
+        "wanted",
+        "met",
+        "about",
+        "share",
+        "held",
+        "most",
+        "least",
+    ]
+)
+MAX_LINES = 450  # of a file
 # What is counted: of a checkout or a revision, by the first folders of a path.
 _COUNTED = ("benchnav", "benchmarks", "studies", "tools", "tests")
 
@@ -56,6 +89,45 @@ def _docstring_lines(module: ast.Module) -> set[int]:
             if is_text and isinstance(statement.value.value, str):
                 lines.add(statement.lineno)
     return lines
+
+
+def style(text: str) -> Counter[str]:
+    """Count tokens, logical lines, assigned names and parameters, and everyday names."""
+    tree = ast.parse(text)
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    logical_lines = sum(token.type == tokenize.NEWLINE for token in tokens)
+    names = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.append(node.id)
+        elif isinstance(node, ast.arg) and node.arg not in ("self", "cls"):
+            names.append(node.arg)
+    return Counter(
+        tokens=count(text),
+        lines=logical_lines - len(_docstring_lines(tree)),
+        names=len(names),
+        everyday=sum(name in EVERYDAY for name in names),
+    )
+
+
+def print_style() -> None:
+    """Print the density of lines and the fraction of everyday names of each package."""
+    totals: dict[str, Counter[str]] = {}
+    for path in sorted(sizes()):
+        if path.startswith("benchnav/"):
+            text = (ROOT / path).read_text()
+            package = "/".join(path.split("/")[:-1][:2])
+            for name in (package, "all"):
+                totals[name] = totals.get(name, Counter()) + style(text)
+            if (length := len(text.splitlines())) > MAX_LINES:
+                print(f"{path}: {length} lines, expected at most {MAX_LINES}")
+    for name, total in totals.items():
+        tokens_a_line = total["tokens"] / total["lines"]
+        everyday = 1000 * total["everyday"] / max(total["names"], 1)
+        print(
+            f"{name:25} {tokens_a_line:5.2f} tokens a logical line, "
+            f"{everyday:5.1f} everyday names of 1 000"
+        )
 
 
 def sizes(revision: str = "") -> dict[str, int]:
@@ -113,7 +185,13 @@ def main() -> None:
     )
     parser.add_argument("--against", default="", help="a revision to compare with")
     parser.add_argument("--files", action="store_true", help="each file")
+    parser.add_argument(
+        "--style", action="store_true", help="density of lines, and names"
+    )
     given = parser.parse_args()
+    if given.style:
+        print_style()
+        return
     if sys.version_info[:2] != (3, 11):
         print(
             f"warning: Python {sys.version_info[0]}.{sys.version_info[1]} may split "
