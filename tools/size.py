@@ -27,37 +27,11 @@ _LAYOUT = {
     tokenize.ENDMARKER,
 }
 # Names that do not say what a value is.
-EVERYDAY = frozenset(
-    [
-        "found",
-        "own",
-        "place",
-        "known",
-        "told",
-        "made",
-        "whole",
-        "both",
-        "here",
-        "there",
-        "left",
-        "every",
-        "asked",
-        "given",
-        "each",
-        "one",
-        "other",
-        "way",
-        "said",
-        "kept",
-        "wanted",
-        "met",
-        "about",
-        "share",
-        "held",
-        "most",
-        "least",
-    ]
-)
+_EVERYDAY_WORDS = """
+found own place known told made whole both here there left every asked given each one
+other way said kept wanted met about share held most least
+"""
+EVERYDAY = frozenset(_EVERYDAY_WORDS.split())
 MAX_LINES = 450  # of a file
 # What is counted: of a checkout or a revision, by the first folders of a path.
 _COUNTED = ("benchnav", "benchmarks", "studies", "tools", "tests")
