@@ -74,6 +74,7 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python -m tests.prose
 
 # The wheel is built from the source archive. What *.egg-info lists of an earlier build would go into the archive.
 wheel: $(STAMP)
