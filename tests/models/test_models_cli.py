@@ -21,7 +21,7 @@ from benchnav.models.nets.calibration import (
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
-from benchnav.models.training.data import MapDataset
+from benchnav.models.training.data import Loading, MapDataset
 from benchnav.models.training.fit import STATE, FitOptions
 from tests.commands import call
 from tests.models.support import make_dataset, names
@@ -560,8 +560,9 @@ def test_how_maps_are_read_reaches_the_training(
 ) -> None:
     seen = []
 
-    def opened(*_: object, in_memory: bool, workers: int, **others: object) -> None:
-        seen.append((in_memory, workers))
+    def opened(*given: object) -> None:
+        (loading,) = (value for value in given if isinstance(value, Loading))
+        seen.append((loading.in_memory, loading.workers))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(networks, "MapData", opened)

@@ -51,7 +51,7 @@ def open_maps(
         refuse_taken(
             Path(out), overwrite, partial(_foreign, files={*files, FIGURES}, what=what)
         )
-        check_writable(Path(out, FIGURES))
+        check_writable(Path(out, next(iter(files))))
     dataset = TerrainDataset(find_dataset(data))
     expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
     return dataset
