@@ -157,24 +157,6 @@ def test_its_settings_are_its_own_and_those_of_dwa() -> None:
         )
 
 
-@pytest.mark.parametrize(
-    ("options", "remedy"),
-    [
-        ({"by_time": True}, "travel_time"),
-        ({"by_time": False}, "travel_time"),
-        ({"dwa": {"horizon": 50}}, "horizon_s"),
-        ({"dwa": {"acceleration": 0.5}}, "limits of a robot"),
-        ({"dwa": {"turn_acceleration": 0.5}}, "limits of a robot"),
-    ],
-)
-def test_options_that_are_gone_are_refused_with_what_does_their_work(
-    options: dict[str, object], remedy: str
-) -> None:
-    with pytest.raises(ConfigError, match=remedy) as refused:
-        registry.make("planner", {"part": "astar_dwa", "options": options})
-    assert "\n" not in str(refused.value)
-
-
 class Own(GoalDistance):
     """An objective whose path cost is its own."""
 
