@@ -15,7 +15,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.viz import style as figures
+from benchnav.models.quality import output
 from tests.commands import call
 from tests.datagen.dem.rasters import SOUTH, WEST, centres, rough, write
 
@@ -153,7 +153,7 @@ def test_nothing_is_scored_against_a_truth_that_is_unknown(
         texts = [text.get_text() for text in figure.findobj(Text)]
         drawn[path.stem] = [texts, [panel.get_label() for panel in figure.axes]]
 
-    monkeypatch.setattr(figures, "save_twice", save)
+    monkeypatch.setattr(output, "save_twice", save)
     for model in ("mine", "oracle"):
         out = ("--out", tmp_path / model, "--maps", 1)
         assert call("train", "evaluate", model, "--data", "real.h5", *out) == 0
