@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager
 from functools import cache
 from itertools import islice
 from multiprocessing import resource_tracker
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 from urllib.parse import urlparse
 
@@ -105,7 +105,7 @@ def _run_in_processes(
         while pending := pending | _submit(
             executor, islice(waiting, jobs + 1 - len(pending)), done.put
         ):
-            future = done.get()
+            future = _wait_for_one(executor, done)
             pending.remove(future)
             yield future.result()
     except BrokenProcessPool as error:
@@ -121,6 +121,27 @@ def _run_in_processes(
             for process in list(executor._processes.values()):
                 kill_process_tree(process)
             executor.shutdown()
+
+
+def _wait_for_one(executor: Any, done: SimpleQueue[Future[Result]]) -> Future[Result]:
+    """Return the next future that is done.
+
+    The executor usually notices that a worker was killed. On a loaded machine it was
+    seen to wait for results after its last worker had gone, which this notices.
+
+    Raises:
+        BrokenProcessPool: If no worker is alive.
+    """
+    while True:
+        try:
+            return done.get(timeout=_WORKERS_S)
+        except Empty:
+            workers = list(executor._processes.values())
+            if any(worker.is_alive() for worker in workers):
+                continue
+        # A result may have come between the two looks.
+        if done.empty():
+            raise BrokenProcessPool("no worker is alive")
 
 
 def _submit(

@@ -3,8 +3,11 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
+from types import SimpleNamespace
 
 import pytest
 
@@ -20,6 +23,7 @@ LIVES = (
 # Prints the numbers of its processes, then waits to be interrupted or killed.
 WAITS = """
 import os, signal, sys, time
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background jobs do not have
 from benchnav.core.workers import run_calls
@@ -76,6 +80,16 @@ def test_the_error_of_a_call_is_raised_and_ends_the_others(tmp_path: Path) -> No
         list(run_calls([partial(write, number) for number in range(8)], jobs=2))
     time.sleep(0.5)
     assert len(list(tmp_path.iterdir())) < 4
+
+
+def test_results_are_not_awaited_from_workers_that_are_gone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(workers, "_WORKERS_S", 0.01)
+    gone = SimpleNamespace(is_alive=lambda: False)
+    executor = SimpleNamespace(_processes={1: gone})
+    with pytest.raises(BrokenProcessPool):
+        workers._wait_for_one(executor, SimpleQueue())
 
 
 def test_a_worker_that_is_killed_is_one_line_and_the_next_calls_have_others() -> None:
