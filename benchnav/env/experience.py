@@ -19,7 +19,7 @@ from benchnav.core.batch import Batch, map_tensors
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.env.view import Known
 from benchnav.planning.sensing.knowledge import Knowledge, Learner, Truth
-from benchnav.planning.sensing.sensor import Sensed
+from benchnav.planning.sensing.sensor import Measurement
 
 _MOST_KEPT = 256  # maps, of up to a megabyte each
 
@@ -162,7 +162,7 @@ class Experience:
         return self._knowledge
 
 
-def _only(sensed: Sensed, which: Tensor) -> Sensed:
+def _only(sensed: Measurement, which: Tensor) -> Measurement:
     """What was sensed in some episodes, bool, shape [B, 1, 1], and nothing in the
     others.
     """

@@ -27,7 +27,7 @@ from benchnav.planning.robots import (
     Robot,
     Unicycle,
 )
-from benchnav.planning.sensing.belief import Belief, Law, Static
+from benchnav.planning.sensing.belief import Belief, CovarianceModel, Static
 from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.near import Near
@@ -35,14 +35,14 @@ from benchnav.planning.sensing.sensor import (
     Appearance,
     Contact,
     Full,
-    Moment,
+    Measurement,
+    NoiseKey,
     Probe,
-    Sensed,
     Sensor,
     Step,
 )
 from benchnav.planning.world.simulation import Simulation
-from benchnav.planning.world.world import Places, World
+from benchnav.planning.world.world import Endpoints, World
 
 __all__ = [
     "CLRRT",
@@ -60,21 +60,22 @@ __all__ = [
     "Classes",
     "Contact",
     "Copula",
+    "CovarianceModel",
     "DifferentialDrive",
+    "Endpoints",
     "ExpectedTime",
     "FreeSpace",
     "Full",
     "GoalDistance",
-    "Law",
     "LocalPlanner",
     "MPPIConfig",
     "Mean",
-    "Moment",
+    "Measurement",
     "Near",
     "NearOptimal",
+    "NoiseKey",
     "Objective",
     "Optimal",
-    "Places",
     "Plan",
     "PlanStatus",
     "Planner",
@@ -84,7 +85,6 @@ __all__ = [
     "RiskMeasure",
     "Robot",
     "Rules",
-    "Sensed",
     "Sensor",
     "Simulation",
     "SingleClass",

@@ -37,7 +37,7 @@ class Memory(Batch):
     rgb: Tensor
     elevation_m: Tensor
     layers: Mapping[str, Tensor]
-    doubt: Tensor
+    noise_level: Tensor
     grid: Grid
 
     @classmethod
@@ -56,7 +56,7 @@ class Memory(Batch):
                 name: torch.full_like(layer, torch.nan)
                 for name, layer in terrain.layers.items()
             },
-            doubt=torch.full_like(unknown, torch.inf),
+            noise_level=torch.full_like(unknown, torch.inf),
             grid=terrain.grid,
         )
 
@@ -70,8 +70,8 @@ def remember(memory: Memory, appearance: Appearance) -> Memory:
         appearance: what the same episodes see now, with all layers that the memory has.
     """
     seen, look = appearance.seen, appearance.observation
-    doubt = appearance.doubt.to(memory.doubt)
-    better = seen & (~memory.seen | (doubt < memory.doubt))
+    noise_level = appearance.noise_level.to(memory.noise_level)
+    better = seen & (~memory.seen | (noise_level < memory.noise_level))
     return Memory(
         seen=memory.seen | seen,
         rgb=torch.where(better[:, None], look.rgb, memory.rgb),
@@ -80,7 +80,7 @@ def remember(memory: Memory, appearance: Appearance) -> Memory:
             name: torch.where(better, look.layers[name], kept)
             for name, kept in memory.layers.items()
         },
-        doubt=torch.where(better, doubt, memory.doubt),
+        noise_level=torch.where(better, noise_level, memory.noise_level),
         grid=memory.grid,
     )
 

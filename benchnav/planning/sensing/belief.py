@@ -27,13 +27,13 @@ from benchnav.core.grid import Grid
 from benchnav.core.ground import GroundStatistics
 from benchnav.core.specified import Specified
 from benchnav.planning.sensing.score_table import scores_of, value_at
-from benchnav.planning.sensing.sensor import Sensed
+from benchnav.planning.sensing.sensor import Measurement
 
 State = TypeVar("State", bound=Batch)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Law:
+class CovarianceModel:
     """Covariance model of the λ field.
 
     Args:
@@ -75,14 +75,16 @@ class Belief(Specified, ABC, Generic[State]):
     Attributes:
         learns: whether what is sensed of λ changes what is believed; one that does not
             is told new predictions alone.
-        needs_statistics: whether `Law.statistics` have to be there.
+        needs_statistics: whether `CovarianceModel.statistics` have to be there.
     """
 
     learns: ClassVar[bool] = True
     needs_statistics: ClassVar[bool] = False
 
     @abstractmethod
-    def init(self, prior: TraversabilityDistribution, law: Law) -> State:
+    def init(
+        self, prior: TraversabilityDistribution, covariance: CovarianceModel
+    ) -> State:
         """Return the initial belief state.
 
         Args:
@@ -94,7 +96,7 @@ class Belief(Specified, ABC, Generic[State]):
     def update(
         self,
         state: State,
-        sensed: Sensed,
+        sensed: Measurement,
         prior: TraversabilityDistribution | None = None,
     ) -> State:
         """What is known when more was sensed.
@@ -207,7 +209,7 @@ class Predicted(Batch):
     """
 
     prior: TraversabilityDistribution
-    law: Law
+    covariance: CovarianceModel
 
     def fields(self, scores: Tensor, cells: Tensor | None = None) -> Tensor:
         """λ of the ranks that normal scores have in the prediction, shape [B, M, H, W]
@@ -251,18 +253,24 @@ class Static(Belief[Predicted]):
 
     correlated: bool = True
 
-    def init(self, prior: TraversabilityDistribution, law: Law) -> Predicted:
+    def init(
+        self, prior: TraversabilityDistribution, covariance: CovarianceModel
+    ) -> Predicted:
         """Keeps the prediction."""
-        return Predicted(prior=prior, law=law)
+        return Predicted(prior=prior, covariance=covariance)
 
     def update(
         self,
         state: Predicted,
-        sensed: Sensed,
+        sensed: Measurement,
         prior: TraversabilityDistribution | None = None,
     ) -> Predicted:
         """Takes a new prediction where there is one."""
-        return state if prior is None else Predicted(prior=prior, law=state.law)
+        return (
+            state
+            if prior is None
+            else Predicted(prior=prior, covariance=state.covariance)
+        )
 
     def distribution(self, state: Predicted) -> TraversabilityDistribution:
         """The prediction."""
@@ -285,11 +293,15 @@ class Static(Belief[Predicted]):
         return state.fields(self._scores(state, count, keys), cells)
 
     def _scores(self, state: Predicted, count: int, keys: Sequence[int]) -> Tensor:
-        law = state.law if self.correlated else replace(state.law, correlation_m=0.0)
-        return draw_scores(law, count, keys)
+        covariance = (
+            state.covariance
+            if self.correlated
+            else replace(state.covariance, correlation_m=0.0)
+        )
+        return draw_scores(covariance, count, keys)
 
 
-def draw_scores(law: Law, count: int, keys: Sequence[int]) -> Tensor:
+def draw_scores(covariance: CovarianceModel, count: int, keys: Sequence[int]) -> Tensor:
     """Draws normal scores that hang together as those of the world do, float32, shape
     [B, M, H, W].
 
@@ -302,18 +314,23 @@ def draw_scores(law: Law, count: int, keys: Sequence[int]) -> Tensor:
         keys: a stream key of each episode, B of them.
     """
     # An episode at a time: the last bits of a product depend on how many are in it.
-    return torch.stack([_scores_of_one(law, count, key) for key in keys])
+    return torch.stack([_scores_of_one(covariance, count, key) for key in keys])
 
 
-def _scores_of_one(law: Law, count: int, key: int) -> Tensor:
+def _scores_of_one(covariance: CovarianceModel, count: int, key: int) -> Tensor:
     """Those of an episode, shape [M, H, W]."""
-    drawn = _white(key, count, law.grid.shape)
-    if law.correlation_m:
-        down, across = (_root(size, law.correlation_cells) for size in law.grid.shape)
+    drawn = _white(key, count, covariance.grid.shape)
+    if covariance.correlation_m:
+        down, across = (
+            _root(size, covariance.correlation_cells) for size in covariance.grid.shape
+        )
         drawn = down @ drawn @ across
-    if law.nugget:
-        own = _white(rng.stream_key(key, "nugget"), count, law.grid.shape)
-        drawn = math.sqrt(1 - law.nugget) * drawn + math.sqrt(law.nugget) * own
+    if covariance.nugget:
+        own = _white(rng.stream_key(key, "nugget"), count, covariance.grid.shape)
+        drawn = (
+            math.sqrt(1 - covariance.nugget) * drawn
+            + math.sqrt(covariance.nugget) * own
+        )
     return drawn
 
 

@@ -43,14 +43,14 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.pooled import PooledDistribution
 from benchnav.planning.sensing import copula as within
-from benchnav.planning.sensing.belief import Belief, Law
+from benchnav.planning.sensing.belief import Belief, CovarianceModel
 from benchnav.planning.sensing.chains import draw_labels
 from benchnav.planning.sensing.copula import Copula, CopulaState
 from benchnav.planning.sensing.gaussian import interval_moments
 from benchnav.planning.sensing.labels import CHAINS, Lattice, fair, noise, swept, tally
 from benchnav.planning.sensing.pairs import split, statistics_of
 from benchnav.planning.sensing.score_table import TabulatedDistribution
-from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
+from benchnav.planning.sensing.sensor import LEAST_STD, Measurement
 from benchnav.planning.sensing.sites import Evidence
 
 _MOST_STRENGTH = 0.88  # ln(1 + √2) is critical
@@ -141,19 +141,21 @@ class Classes(Belief[ClassesState]):
             f"`strength` ≥ 0 and finite, got {self.strength}.",
         )
 
-    def init(self, prior: TraversabilityDistribution, law: Law) -> ClassesState:
+    def init(
+        self, prior: TraversabilityDistribution, covariance: CovarianceModel
+    ) -> ClassesState:
         """Knows the prediction alone.
 
         Raises:
             ConfigError: the prediction tells no classes, or the law does not say which
                 look alike.
         """
-        first, second, pair, odds = split(prior, law)
-        copula = self._copula.init(first, law)
+        first, second, pair, odds = split(prior, covariance)
+        copula = self._copula.init(first, covariance)
         none = torch.zeros_like(copula.mean)
         state = ClassesState(
             copula=copula,
-            looks=(copula, self._copula.init(second, law)),
+            looks=(copula, self._copula.init(second, covariance)),
             density=torch.stack((none, none), 1),
             pair=pair,
             odds=odds,
@@ -166,7 +168,7 @@ class Classes(Belief[ClassesState]):
     def update(
         self,
         state: ClassesState,
-        sensed: Sensed,
+        sensed: Measurement,
         prior: TraversabilityDistribution | None = None,
     ) -> ClassesState:
         """Draws labels near what is new, and conditions cells on what is observed
@@ -185,7 +187,7 @@ class Classes(Belief[ClassesState]):
             some = draw_labels(
                 _evidence(told).select(members),
                 news[members],
-                self._strength(told.copula.law),
+                self._strength(told.copula.covariance),
                 self.window,
             )
             names = ("chance", "labels", "sweeps")
@@ -218,7 +220,7 @@ class Classes(Belief[ClassesState]):
 
     def distribution(self, state: ClassesState) -> TraversabilityDistribution:
         """The average over the classes of a cell, each given what was observed."""
-        if not statistics_of(state.copula.law).look_alikes:
+        if not statistics_of(state.copula.covariance).look_alikes:
             return self._copula.distribution(state.copula)
         dtype, first = state.copula.prior.dtype, state.probability()
         moments = [values.to(dtype) for values in _moments(state)]
@@ -316,9 +318,9 @@ class Classes(Belief[ClassesState]):
             fields.append(torch.where(first, parts[0], parts[1]))
         return torch.stack(fields, 1)
 
-    def _strength(self, law: Law) -> float:
+    def _strength(self, covariance: CovarianceModel) -> float:
         return (
-            min(statistics_of(law).potts_strength, _MOST_STRENGTH)
+            min(statistics_of(covariance).potts_strength, _MOST_STRENGTH)
             if self.strength is None
             else self.strength
         )
@@ -335,7 +337,9 @@ class Classes(Belief[ClassesState]):
             state.labels[members],
             state.sweeps[members],
         )
-        lattice = Lattice.of(state.pair[members], self._strength(state.copula.law))
+        lattice = Lattice.of(
+            state.pair[members], self._strength(state.copula.covariance)
+        )
         row, column = (
             torch.arange(size, device=fresh.device) for size in fresh.shape[1:]
         )
@@ -358,7 +362,7 @@ class Classes(Belief[ClassesState]):
         """Takes the prediction of cells where it differs, bool [B, H, W], and scores
         the λ observed there under it.
         """
-        first, second, pair, odds = split(prior, state.copula.law)
+        first, second, pair, odds = split(prior, state.copula.covariance)
         (one, differs), (other, also) = (
             within.with_prior(look, own)
             for look, own in zip(state.looks, (first, second), strict=True)
@@ -399,7 +403,7 @@ def _density(look: CopulaState, cells: Tensor, value: Tensor) -> Tensor:
     )
 
 
-def _noted(state: ClassesState, sensed: Sensed) -> tuple[ClassesState, Tensor]:
+def _noted(state: ClassesState, sensed: Measurement) -> tuple[ClassesState, Tensor]:
     """Notes what was sensed under either class, and tells of which cells something new
     is known.
     """

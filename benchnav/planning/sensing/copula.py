@@ -32,7 +32,12 @@ from benchnav.core import rng
 from benchnav.core.conditioned import ConditionedDistribution, skewed
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
-from benchnav.planning.sensing.belief import Belief, Law, Predicted, draw_scores
+from benchnav.planning.sensing.belief import (
+    Belief,
+    CovarianceModel,
+    Predicted,
+    draw_scores,
+)
 from benchnav.planning.sensing.gaussian import (
     Field,
     Observed,
@@ -42,7 +47,7 @@ from benchnav.planning.sensing.gaussian import (
 )
 from benchnav.planning.sensing.lattice import Lattice, condition_and_predict, spacing_of
 from benchnav.planning.sensing.score_table import ScoreTable, TabulatedDistribution
-from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
+from benchnav.planning.sensing.sensor import LEAST_STD, Measurement
 
 _REACH = 4.0  # ℓ; the correlation is 3e-4 there
 # ℓ; what is observed farther off changes no cell within `_REACH` by `_LEAST_CHANGE`
@@ -153,23 +158,31 @@ class Copula(Belief[CopulaState]):
             f"`nugget` in [0, 1), got {self.nugget}.",
         )
 
-    def init(self, prior: TraversabilityDistribution, law: Law) -> CopulaState:
+    def init(
+        self, prior: TraversabilityDistribution, covariance: CovarianceModel
+    ) -> CopulaState:
         """Knows the prediction alone."""
-        named = {"world": law.correlation_m, "estimated": _MEDIAN_M}
+        named = {"world": covariance.correlation_m, "estimated": _MEDIAN_M}
         length_m = (
             named[self.correlation_m]
             if isinstance(self.correlation_m, str)
             else self.correlation_m
         )
-        law = law if self.nugget is None else replace(law, nugget=self.nugget)
-        lengths = [length_m / law.grid.resolution_m] * prior.shape[0]
+        covariance = (
+            covariance
+            if self.nugget is None
+            else replace(covariance, nugget=self.nugget)
+        )
+        lengths = [length_m / covariance.grid.resolution_m] * prior.shape[0]
         zeros = torch.zeros(prior.shape, dtype=torch.float64, device=prior.device)
         none = torch.full_like(zeros, torch.nan)
         return CopulaState(
             prior=prior,
             table=ScoreTable.empty(prior),
-            law=law,
-            field=Field.of(law.grid.shape, lengths, prior.device, law.nugget),
+            covariance=covariance,
+            field=Field.of(
+                covariance.grid.shape, lengths, prior.device, covariance.nugget
+            ),
             estimated_from=zeros[:, 0, 0].long(),
             value=none,
             lower=none,
@@ -185,7 +198,7 @@ class Copula(Belief[CopulaState]):
     def update(
         self,
         state: CopulaState,
-        sensed: Sensed,
+        sensed: Measurement,
         prior: TraversabilityDistribution | None = None,
     ) -> CopulaState:
         """Conditions cells near what is new on what is observed there.
@@ -246,7 +259,12 @@ class Copula(Belief[CopulaState]):
             if length != float(state.field.length[own]):
                 state.field.write(
                     own,
-                    Field.of(state.law.grid.shape, [length], "cpu", state.law.nugget),
+                    Field.of(
+                        state.covariance.grid.shape,
+                        [length],
+                        "cpu",
+                        state.covariance.nugget,
+                    ),
                 )
                 maps["mean"][:], maps["std"][:], maps["skew"][:] = 0, 1, 0
                 new = observed
@@ -300,15 +318,22 @@ class Copula(Belief[CopulaState]):
         self, state: CopulaState, count: int, keys: Sequence[int]
     ) -> Tensor:
         """Normal scores of the fields that `sample_fields` draws, shape [B, M, H, W]."""
-        (height, width), device = state.law.grid.shape, state.mean.device
+        (height, width), device = state.covariance.grid.shape, state.mean.device
         lines = (
             torch.arange(height, device=device)[:, None],
             torch.arange(width, device=device),
         )
         scores = []
         for own, length in enumerate(state.field.length.tolist()):
-            law = replace(state.law, correlation_m=length * state.law.grid.resolution_m)
-            drawn = draw_scores(law, count, keys[own : own + 1])[0].to(device).double()
+            covariance = replace(
+                state.covariance,
+                correlation_m=length * state.covariance.grid.resolution_m,
+            )
+            drawn = (
+                draw_scores(covariance, count, keys[own : own + 1])[0]
+                .to(device)
+                .double()
+            )
             scores.append(drawn)
             row, column = (state.precision[own] > _NO_TERM).nonzero(as_tuple=True)
             if len(row) == 0:
@@ -319,7 +344,7 @@ class Copula(Belief[CopulaState]):
             )
             noise_keys = [rng.stream_key(keys[own], "observations")]
             noise = draw_scores(
-                replace(law, correlation_m=0.0, nugget=0.0), count, noise_keys
+                replace(covariance, correlation_m=0.0, nugget=0.0), count, noise_keys
             )
             noise = noise[0].to(drawn)[:, row, column] / precision.sqrt()
             inner = state.field.covariance(
@@ -402,7 +427,7 @@ def scores_at(
     return torch.where(number, middle, low), torch.where(number, middle, high)
 
 
-def note(state: CopulaState, sensed: Sensed) -> tuple[CopulaState, Tensor]:
+def note(state: CopulaState, sensed: Measurement) -> tuple[CopulaState, Tensor]:
     """Notes what was sensed, and tells of which cells something new is known, bool of
     shape [B, H, W].
     """
@@ -533,8 +558,8 @@ def _estimate(
     state: CopulaState, maps: dict[str, ndarray], row: ndarray, column: ndarray
 ) -> float:
     """ℓ of one episode, in cells: the mode of its posterior among `_LENGTHS_M`."""
-    grid, observed = state.law.grid, _observed(maps, row, column)
-    field = _candidates(grid.shape, grid.resolution_m, state.law.nugget)
+    grid, observed = state.covariance.grid, _observed(maps, row, column)
+    field = _candidates(grid.shape, grid.resolution_m, state.covariance.nugget)
     apart = [torch.from_numpy(places[:, None] - places) for places in (row, column)]
     likely = []
     for own, length_m in enumerate(_LENGTHS_M):

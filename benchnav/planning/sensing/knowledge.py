@@ -28,8 +28,8 @@ from benchnav.core.terrain import Observation, Terrain
 from benchnav.planning import risk
 from benchnav.planning.free_space import Rules
 from benchnav.planning.sensing.appearance import Memory, masked, remember
-from benchnav.planning.sensing.belief import Belief, Law
-from benchnav.planning.sensing.sensor import Moment, Sensed, Sensor
+from benchnav.planning.sensing.belief import Belief, CovarianceModel
+from benchnav.planning.sensing.sensor import Measurement, NoiseKey, Sensor
 from benchnav.planning.world.outcome import Outcome
 
 _PESSIMISTIC = 0.8  # level of the CVaR that is believed of unseen ground
@@ -103,7 +103,7 @@ class Knowledge(Batch):
 
     memory: Memory | None
     news: Tensor
-    sensed: Sensed
+    sensed: Measurement
     ever_sensed: Tensor
     reached: Tensor
     observation: Observation
@@ -136,7 +136,7 @@ class Learner:
     sensor: Sensor
     ground: Sensor
     belief: Belief[Any]
-    law: Law
+    covariance: CovarianceModel
     measure: risk.RiskFunction
     rules: Rules
     predict: Predict
@@ -150,11 +150,11 @@ class Learner:
             ConfigError: there are none.
         """
         expect(
-            self.law.statistics is not None,
-            "`Law.statistics` for a robot that does not see all, got None.",
+            self.covariance.statistics is not None,
+            "`CovarianceModel.statistics` for a robot that does not see all, got None.",
         )
-        assert self.law.statistics is not None
-        return self.law.statistics
+        assert self.covariance.statistics is not None
+        return self.covariance.statistics
 
     def begin(
         self,
@@ -176,7 +176,7 @@ class Learner:
         """
         memory, observation = None, truth.terrain.observe()
         if not self.sensor.sees_all:
-            first = self._look(self.sensor, truth, robot_state, Moment(truth.keys, 0))
+            first = self._look(self.sensor, truth, robot_state, NoiseKey(truth.keys, 0))
             assert first.appearance is not None
             memory = remember(Memory.none(observation), first.appearance)
             observation, prediction = self._predict(memory, truth)
@@ -207,7 +207,8 @@ class Learner:
             KnowledgeError: the belief raised.
         """
         return call(
-            Outcome.BELIEF_ERROR, lambda: self.belief.init(prediction.clone(), self.law)
+            Outcome.BELIEF_ERROR,
+            lambda: self.belief.init(prediction.clone(), self.covariance),
         )
 
     def sense(
@@ -238,7 +239,7 @@ class Learner:
         Raises:
             KnowledgeError: a sensor raised, or gave what is none.
         """
-        moment = Moment(truth.keys, step)
+        noise_key = NoiseKey(truth.keys, step)
         known = replace(known, reached=torch.zeros_like(known.reached))
         for sensor, asked in (
             (self.sensor, looks),
@@ -247,13 +248,13 @@ class Learner:
             if sensor.sees_all or not bool(asked.any()):
                 continue
             new, told = (
-                self._look(sensor, truth, robot_state, moment),
+                self._look(sensor, truth, robot_state, noise_key),
                 asked[:, None, None],
             )
             mask, before = new.mask & told, known.sensed
             known = replace(
                 known,
-                sensed=Sensed(
+                sensed=Measurement(
                     traversability=torch.where(
                         mask, new.traversability, before.traversability
                     ),
@@ -266,7 +267,9 @@ class Learner:
                 appearance = replace(new.appearance, seen=new.appearance.seen & told)
                 memory = remember(known.memory, appearance)
                 # A cell that is seen for the first time, or better than before.
-                more = (memory.doubt != known.memory.doubt).flatten(1).any(1)
+                more = (
+                    (memory.noise_level != known.memory.noise_level).flatten(1).any(1)
+                )
                 reached = known.reached | appearance.seen
                 known = replace(
                     known, memory=memory, news=known.news | more, reached=reached
@@ -436,39 +439,44 @@ class Learner:
         return observation, choose(memory.seen, predicted, unseen)
 
     def _look(
-        self, sensor: Sensor, truth: Truth, robot_state: Tensor, moment: Moment
-    ) -> Sensed:
-        def look() -> Sensed:
+        self, sensor: Sensor, truth: Truth, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
+        def look() -> Measurement:
             given = truth.terrain, truth.field, robot_state
             # Our own change nothing that they are given.
             if not type(sensor).__module__.startswith("benchnav."):
                 given = truth.terrain.clone(), truth.field.clone(), robot_state.clone()
-            found = self._checked(sensor.sense(*given, moment), truth.field)
+            found = self._checked(sensor.sense(*given, noise_key), truth.field)
             expect(
                 sensor is not self.sensor or found.appearance is not None,
-                "`Sensed.appearance` from a sensor of appearance, got none. List λ "
+                "`Measurement.appearance` from a sensor of appearance, got none. List λ "
                 "sensors under `grounds`.",
             )
             return found
 
         return call(Outcome.SENSOR_ERROR, look)
 
-    def _checked(self, sensed: Any, like: Tensor) -> Sensed:
+    def _checked(self, sensed: Any, like: Tensor) -> Measurement:
         """What a sensor said, where it is what a sensor may say."""
         expect(
-            isinstance(sensed, Sensed),
-            f"a Sensed from `sense`, got {type(sensed).__name__}.",
+            isinstance(sensed, Measurement),
+            f"a Measurement from `sense`, got {type(sensed).__name__}.",
         )
         for name in ("traversability", "std"):
-            check_map(f"`Sensed.{name}`", getattr(sensed, name), like.dtype, like)
+            check_map(f"`Measurement.{name}`", getattr(sensed, name), like.dtype, like)
         found = sensed.traversability[sensed.mask]
         expect(
             bool(((found >= 0) & (found <= 1)).all()),
-            "`Sensed.traversability` in [0, 1], or NaN.",
+            "`Measurement.traversability` in [0, 1], or NaN.",
         )
         if sensed.appearance is not None:
             check_map("`Appearance.seen`", sensed.appearance.seen, torch.bool, like)
-            check_map("`Appearance.doubt`", sensed.appearance.doubt, like.dtype, like)
+            check_map(
+                "`Appearance.noise_level`",
+                sensed.appearance.noise_level,
+                like.dtype,
+                like,
+            )
         return sensed
 
     def _checked_cells(self, cells: Any, known: Knowledge) -> Tensor:
@@ -497,10 +505,10 @@ def unseen_ground(
     return TraversabilityMixture(torch.ones_like(means), means, torch.zeros_like(means))
 
 
-def nothing_sensed(like: Tensor) -> Sensed:
+def nothing_sensed(like: Tensor) -> Measurement:
     """No λ of any cell of maps, shape [B, H, W]."""
     nothing = torch.full_like(like, torch.nan)
-    return Sensed(traversability=nothing, std=torch.ones_like(nothing))
+    return Measurement(traversability=nothing, std=torch.ones_like(nothing))
 
 
 def sensor_keys(noise_key: int, maps: Any) -> tuple[int, ...]:

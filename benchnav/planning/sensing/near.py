@@ -25,7 +25,7 @@ from torch import Tensor
 from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
 from benchnav.core.terrain import Observation, Terrain
-from benchnav.planning.sensing.sensor import Appearance, Moment, Sensed, Sensor
+from benchnav.planning.sensing.sensor import Appearance, Measurement, NoiseKey, Sensor
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,12 @@ class Near(Sensor):
             )
 
     def sense(
-        self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-    ) -> Sensed:
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
         """Looks around once; robots off the map see nothing."""
         distance = self._distances(terrain, robot_state.double())
         seen = distance.isfinite()
-        noise = moment.normal("look", seen, (4,)) * distance[seen][:, None]
+        noise = noise_key.normal("look", seen, (4,)) * distance[seen][:, None]
         colour = terrain.rgb.movedim(1, -1)[seen] + self.colour_noise * noise[:, :3]
         rgb = torch.zeros_like(terrain.rgb)
         rgb.movedim(1, -1)[seen] = colour.round().clamp(0, 255).to(rgb.dtype)
@@ -101,9 +101,9 @@ class Near(Sensor):
                 for name, layer in terrain.layers.items()
             },
         )
-        return Sensed.looks(
+        return Measurement.of_appearance(
             Appearance(
-                seen=seen, observation=observation, doubt=distance.to(field.dtype)
+                seen=seen, observation=observation, noise_level=distance.to(field.dtype)
             )
         )
 

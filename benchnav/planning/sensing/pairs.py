@@ -14,7 +14,7 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.planning.sensing.belief import Law
+from benchnav.planning.sensing.belief import CovarianceModel
 
 _LEAST_MASS, _LEAST_CLASS = (
     0.05,
@@ -22,23 +22,23 @@ _LEAST_MASS, _LEAST_CLASS = (
 )  # of a cell's weight: the pair's, and each of its classes'
 
 
-def statistics_of(law: Law) -> GroundStatistics:
+def statistics_of(covariance: CovarianceModel) -> GroundStatistics:
     """The statistics of the ground, which say what looks alike.
 
     Raises:
         ConfigError: there are none.
     """
     expect(
-        law.statistics is not None,
+        covariance.statistics is not None,
         "statistics of the ground, which say which classes look alike, got none. Take "
         "a model that has them, or the "
         "belief copula.",
     )
-    return cast(GroundStatistics, law.statistics)
+    return cast(GroundStatistics, covariance.statistics)
 
 
 def split(
-    prior: TraversabilityDistribution, law: Law
+    prior: TraversabilityDistribution, covariance: CovarianceModel
 ) -> tuple[TraversabilityMixture, TraversabilityMixture, Tensor, Tensor]:
     """Splits a prediction by the label of cells.
 
@@ -56,7 +56,7 @@ def split(
         ConfigError: the prediction tells no classes, or the law does not say which look
             alike.
     """
-    names, pairs = law.class_names, statistics_of(law).look_alikes
+    names, pairs = covariance.class_names, statistics_of(covariance).look_alikes
     if not isinstance(prior, TraversabilityMixture) or prior.group is None:
         raise ConfigError(
             "Expected a mixture whose components belong to classes for the belief "

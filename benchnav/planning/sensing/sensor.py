@@ -59,11 +59,11 @@ class Appearance(Batch):
 
     seen: Tensor
     observation: Observation
-    doubt: Tensor
+    noise_level: Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sensed(Batch):
+class Measurement(Batch):
     """What is learnt in a step.
 
     Args:
@@ -79,9 +79,9 @@ class Sensed(Batch):
     appearance: Appearance | None = None
 
     @classmethod
-    def looks(cls, appearance: Appearance) -> "Sensed":
+    def of_appearance(cls, appearance: Appearance) -> "Measurement":
         """What a sensor learns that looks at the ground and senses no λ."""
-        nothing = torch.full_like(appearance.doubt, torch.nan)
+        nothing = torch.full_like(appearance.noise_level, torch.nan)
         return cls(
             traversability=nothing, std=torch.ones_like(nothing), appearance=appearance
         )
@@ -93,7 +93,7 @@ class Sensed(Batch):
 
 
 @dataclass(frozen=True)
-class Moment:
+class NoiseKey:
     """Which noise a sensor meets.
 
     Args:
@@ -140,8 +140,8 @@ class Sensor(Specified, ABC):
 
     @abstractmethod
     def sense(
-        self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-    ) -> Sensed:
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
         """Senses once.
 
         Args:
@@ -163,13 +163,15 @@ class Full(Sensor):
     sees_all: ClassVar[bool] = True
 
     def sense(
-        self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-    ) -> Sensed:
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
         """Sees all."""
         seen = torch.ones_like(field, dtype=torch.bool)
-        return Sensed.looks(
+        return Measurement.of_appearance(
             Appearance(
-                seen=seen, observation=terrain.observe(), doubt=torch.zeros_like(field)
+                seen=seen,
+                observation=terrain.observe(),
+                noise_level=torch.zeros_like(field),
             )
         )
 
@@ -179,8 +181,8 @@ class Contact(Sensor):
     """The λ of the cell under the robot, without noise: what every robot has."""
 
     def sense(
-        self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-    ) -> Sensed:
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
         """Senses the robot's own cell."""
         x, y = robot_state[:, 0], robot_state[:, 1]
         row, column = terrain.grid.cell_of(x, y)
@@ -190,7 +192,7 @@ class Contact(Sensor):
         ]
         row, column = row[member], column[member]
         found[member, row, column] = field[member, row, column]
-        return Sensed(traversability=found, std=torch.full_like(field, LEAST_STD))
+        return Measurement(traversability=found, std=torch.full_like(field, LEAST_STD))
 
 
 @dataclass(frozen=True)
@@ -224,8 +226,8 @@ class Probe(Sensor):
         )
 
     def sense(
-        self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-    ) -> Sensed:
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
         """Senses the cells near the robot."""
         near = self._near(terrain, robot_state)
         wanted = near.nonzero(as_tuple=True)
@@ -233,13 +235,15 @@ class Probe(Sensor):
         lower, upper = (ends[0].double() for ends in truth.to_normal(value[None]))
         # An atom has no score that noise could move.
         atom = upper > lower
-        score = lower.masked_fill(atom, 0.0) + self.noise_std * moment.normal(
+        score = lower.masked_fill(atom, 0.0) + self.noise_std * noise_key.normal(
             "noise", near
         )
         read = truth.from_normal(score[None].to(value.dtype))[0].to(field.dtype)
         found = torch.full_like(field, torch.nan)
         found[wanted] = torch.where(atom, value, read)
-        return Sensed(traversability=found, std=torch.full_like(field, self.noise_std))
+        return Measurement(
+            traversability=found, std=torch.full_like(field, self.noise_std)
+        )
 
     def _near(self, terrain: Terrain, robot_state: Tensor) -> Tensor:
         """Cells whose centres are within the radius, bool, shape [B, H, W]."""

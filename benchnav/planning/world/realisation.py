@@ -25,7 +25,7 @@ from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
-from benchnav.planning.world.world import Places, World
+from benchnav.planning.world.world import Endpoints, World
 
 MOST_ATTEMPTS = 100
 
@@ -55,7 +55,7 @@ class Realisation:
         self,
         terrain: Terrain,
         world: World,
-        places: Places,
+        places: Endpoints,
         steps: int,
         key: int,
         maps: Sequence[int],
@@ -171,7 +171,7 @@ def check_known(terrain: Terrain, world: World) -> None:
 
 
 def draw_frozen(
-    terrain: Terrain, world: World, places: Places, key: int, maps: Sequence[int]
+    terrain: Terrain, world: World, places: Endpoints, key: int, maps: Sequence[int]
 ) -> tuple[Tensor, Tensor]:
     """Draws the λ of B episodes.
 
@@ -231,7 +231,7 @@ def draw_frozen(
     )
 
 
-def joined(ground: Tensor, grid: Grid, places: Places) -> Tensor:
+def joined(ground: Tensor, grid: Grid, places: Endpoints) -> Tensor:
     """Tells in which episodes ground joins start and goal, from cell to cell over
     shared edges.
 

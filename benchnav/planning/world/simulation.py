@@ -16,7 +16,7 @@ from benchnav.planning.problem import Task
 from benchnav.planning.robots import steps_in
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.realisation import Realisation
-from benchnav.planning.world.world import Places, World
+from benchnav.planning.world.world import Endpoints, World
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Simulation:
         terrain: Terrain,
         task: Task,
         world: World,
-        places: Places,
+        places: Endpoints,
         noise_key: int,
         maps: Sequence[int],
     ) -> None:

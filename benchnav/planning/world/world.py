@@ -25,7 +25,7 @@ _BUDGETS = ("time_budget_s", "time_budget_ratio")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Places(Batch):
+class Endpoints(Batch):
     """Where episodes begin and end.
 
     Args:
