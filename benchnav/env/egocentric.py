@@ -35,7 +35,8 @@ from benchnav.models.predictor import (
 )
 from benchnav.planning.robots import steps_in
 from benchnav.planning.sensing.belief import Belief, CovarianceModel
-from benchnav.planning.sensing.knowledge import Learner, Truth, sensor_keys
+from benchnav.planning.sensing.knowledge import Truth, sensor_keys
+from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.sensor import Sensor
 from benchnav.planning.world.outcome import Outcome
 

@@ -18,7 +18,7 @@ from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.quantiles import LEVELS, quantiles_at
 from benchnav.planning.sensing.belief import Belief, CovarianceModel, draw_scores
-from benchnav.planning.sensing.sensor import LEAST_STD, Measurement
+from benchnav.planning.sensing.sensor import MIN_STD, Measurement
 from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
 from benchnav.testing.distribution import check_functions
 
@@ -265,7 +265,7 @@ class _Trial:
         """
         exact = Measurement(
             traversability=sensed.traversability,
-            std=torch.full_like(sensed.traversability, LEAST_STD),
+            std=torch.full_like(sensed.traversability, MIN_STD),
         )
         once = self.update(last, exact)
         twice = NOTHING if once is NOTHING else self.update(once, exact)

@@ -17,7 +17,7 @@ from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.planning.sensing.sensor import (
-    LEAST_STD,
+    MIN_STD,
     Appearance,
     Measurement,
     NoiseKey,
@@ -43,7 +43,7 @@ def check_sensor(
     The robots: one in the middle of the map, two at its borders, one off it.
     The contract: some cell is sensed or seen; a `Measurement` of the field's shape, dtype
     and device; λ in [0, 1], NaN where it is not sensed, with a standard deviation of at
-    least `LEAST_STD`; of an `Appearance` the terrain's own layers, with elevation and a
+    least `MIN_STD`; of an `Appearance` the terrain's own layers, with elevation and a
     doubt ≥ 0 in every cell that is seen; the arguments left as they were, and with them
     the global generators of Python, NumPy and PyTorch; the same answer when asked
     again, and for some episodes alone and in another order what it is in the batch;
@@ -213,9 +213,9 @@ def _faults(sensed: Any, truth: _Truth) -> Iterator[str]:
     found, std = sensed.traversability[sensed.mask], sensed.std[sensed.mask]
     if not bool(((found >= 0) & (found <= 1)).all()):
         yield "Expected λ in [0, 1], or NaN where it is not sensed, got other numbers."
-    if not bool(((std >= LEAST_STD) & std.isfinite()).all()):
+    if not bool(((std >= MIN_STD) & std.isfinite()).all()):
         yield (
-            f"Expected `Measurement.std` of at least {LEAST_STD:g}, and finite, where λ "
+            f"Expected `Measurement.std` of at least {MIN_STD:g}, and finite, where λ "
             "is sensed, got others."
         )
     if sensed.appearance is not None:

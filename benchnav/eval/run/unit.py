@@ -45,13 +45,8 @@ from benchnav.models.predictor import Clairvoyant, loaded, nugget_of
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Prediction, Problem, heading_to, pose_problem
 from benchnav.planning.sensing.belief import CovarianceModel, Fields
-from benchnav.planning.sensing.knowledge import (
-    KnowledgeError,
-    Learner,
-    Truth,
-    call,
-    sensor_keys,
-)
+from benchnav.planning.sensing.knowledge import KnowledgeError, Truth, call, sensor_keys
+from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.lower_bound import BOUNDED_ROBOTS, Motion, lower_bound_s
 from benchnav.planning.world.outcome import Outcome
@@ -254,7 +249,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
             heading_to(block.places.start_m, block.places.goal_m)
         )
         known = learner.begin(truth, start, predicted)
-        fields = Fields(learner.belief, known.believed, tuple(unit.maps))
+        fields = Fields(learner.belief, known.belief_state, tuple(unit.maps))
         prediction = Prediction(
             known.observation,
             learner.distribution(known),

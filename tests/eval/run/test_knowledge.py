@@ -31,7 +31,8 @@ from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.belief import Belief, Predicted, Static
 from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.copula import Copula
-from benchnav.planning.sensing.knowledge import KnowledgeError, Learner, Truth
+from benchnav.planning.sensing.knowledge import KnowledgeError, Truth
+from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.near import Near
 from benchnav.planning.sensing.score_table import TabulatedDistribution
 from benchnav.planning.sensing.sensor import (

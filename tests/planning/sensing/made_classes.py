@@ -9,7 +9,8 @@ from benchnav.core.grid import Grid
 from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning.sensing.belief import CovarianceModel
-from benchnav.planning.sensing.classes import Classes, ClassesState
+from benchnav.planning.sensing.class_state import ClassesState
+from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.sensor import Measurement
 
 NAMES = ("packed", "crusted", "rock", "firm", "drift")

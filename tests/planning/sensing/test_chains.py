@@ -47,7 +47,7 @@ def enumerated(
     at = np.array(places)
     across = correlations(12, covariance.correlation_cells)
     away = np.abs(at[:, None] - at[None])
-    covariance = across[away[..., 0]] * across[away[..., 1]] + std**2 * np.eye(len(at))
+    matrix = across[away[..., 0]] * across[away[..., 1]] + std**2 * np.eye(len(at))
     inside = (seen > 0) & (seen < 1)
 
     def shares(label: int, value: float, name: str) -> float:
@@ -74,13 +74,13 @@ def enumerated(
             found *= shares(own, value, "pdf") / stats.norm.pdf(score)
         for place in np.flatnonzero(~inside):
             pull = (
-                np.linalg.solve(inner, covariance[inside, place])
+                np.linalg.solve(inner, matrix[inside, place])
                 if len(known)
                 else np.zeros(0)
             )
             mean, spread = (
                 pull @ known,
-                covariance[place, place] - pull @ covariance[inside, place],
+                matrix[place, place] - pull @ covariance[inside, place],
             )
             off = (scores[place] - mean) / np.sqrt(spread)
             found *= stats.norm.cdf(off) if seen[place] <= 0 else stats.norm.sf(off)
@@ -132,9 +132,9 @@ def test_probabilities_are_those_of_all_labellings(
         state = Classes().update(
             state, Measurement(traversability=found, std=torch.full_like(found, std))
         )
-    chance = state.probability()
+    p_first = state.probability()
     patches = [
-        chance[own, row : row + 3, column : column + 3]
+        p_first[own, row : row + 3, column : column + 3]
         for own, (row, column) in enumerate(PLACES)
     ]
     values = {place: value for each in looks for place, value in each.items()}
@@ -192,12 +192,12 @@ def test_probabilities_of_classes_are_calibrated_on_simulated_maps(count: int) -
         state = Classes().update(
             state, Measurement(traversability=found, std=torch.full_like(found, std))
         )
-    chance, seen = state.probability(), state.copula.observed
+    p_first, seen = state.probability(), state.copula.observed
     reach = torch.nn.functional.max_pool2d(seen[:, None].double(), 9, 1, 4)[:, 0] > 0
     own = (first & seen).flatten(1).sum(1) / seen.flatten(1).sum(1)
     touching = ((own > 0.1) & (own < 0.9))[:, None, None].expand_as(seen)
     for cells in (seen, reach & ~seen, reach & ~seen & touching):
-        told, truth = chance[cells], first[cells].double()
+        told, truth = p_first[cells], first[cells].double()
         score = -torch.where(first[cells], told, 1 - told).log().mean()
         assert float(score) < np.log(2) - 0.05
         # The map is the unit: cells of one hang together.
@@ -237,6 +237,6 @@ def test_where_a_label_is_settled_all_chains_hold_it() -> None:
             state, Measurement(traversability=found, std=torch.full_like(found, 0.1))
         )
         share = unpacked(state.labels).double().mean(-1)
-        settled = state.copula.observed & ((state.chance - 0.5).abs() > 0.4999)
+        settled = state.copula.observed & ((state.p_first - 0.5).abs() > 0.4999)
         assert settled.any()
-        assert float((share - state.chance)[settled].abs().max()) < 0.1
+        assert float((share - state.p_first)[settled].abs().max()) < 0.1

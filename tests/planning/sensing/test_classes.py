@@ -91,7 +91,7 @@ def test_cells_for_themselves_follow_bayes_rule() -> None:
     for (row, column), value in values.items():
         likely = [
             look.prior.log_prob(torch.full(prior.shape, value).double())[:, row, column]
-            for look in state.looks
+            for look in state.per_class
         ]
         wanted[:, row, column] += likely[0] - likely[1]
     own = state.pair > 0
@@ -112,7 +112,7 @@ def test_further_looks_at_a_cell_count_with_their_own_noise() -> None:
     ]
     state = after(Classes(), prior, covariance, *looks)
     log_odds = float(state.odds[0, 3, 3])
-    for sign, look in zip((1, -1), state.looks, strict=True):
+    for sign, look in zip((1, -1), state.per_class, strict=True):
         own = [torch.full(prior.shape, value).double() for value in values]
         scores = np.array(
             [float(look.prior.to_normal(value)[0][0, 3, 3]) for value in own]
@@ -137,10 +137,12 @@ def test_strength_and_length_of_ones_own_go_before_those_of_the_law() -> None:
     plain = after(Classes(), prior, covariance, sensed)
     strong = after(Classes(strength=0.8), prior, covariance, sensed)
     assert torch.equal(
-        strong.chance,
-        after(Classes(), prior, covariance_of(12, 14, 1.5, 0.8), sensed).chance,
+        strong.p_first,
+        after(Classes(), prior, covariance_of(12, 14, 1.5, 0.8), sensed).p_first,
     )
-    beside = (strong.chance - 0.5).abs()[:, 2, 3] - (plain.chance - 0.5).abs()[:, 2, 3]
+    beside = (strong.p_first - 0.5).abs()[:, 2, 3] - (plain.p_first - 0.5).abs()[
+        :, 2, 3
+    ]
     assert bool((beside > 0.05).all())
     short = after(Classes(0.6), prior, covariance, sensed)
     assert torch.equal(
@@ -159,12 +161,12 @@ def test_a_fitted_strength_counts_up_to_the_critical_one() -> None:
         covariance_of(12, 14, strength=2.26),
         LOOKS[0],
     )
-    found = after(Classes(), prior, covariance, sensed).chance
+    found = after(Classes(), prior, covariance, sensed).p_first
     assert torch.equal(
-        found, after(Classes(strength=0.88), prior, covariance, sensed).chance
+        found, after(Classes(strength=0.88), prior, covariance, sensed).p_first
     )
     assert not torch.equal(
-        found, after(Classes(strength=2.26), prior, covariance, sensed).chance
+        found, after(Classes(strength=2.26), prior, covariance, sensed).p_first
     )
 
 
@@ -196,7 +198,7 @@ def test_what_is_known_is_an_episodes_own() -> None:
         )
         chosen = Classes().select(state, kept)
         assert torch.equal(alone.labels, chosen.labels)
-        torch.testing.assert_close(alone.chance, chosen.chance, rtol=0, atol=1e-9)
+        torch.testing.assert_close(alone.p_first, chosen.p_first, rtol=0, atol=1e-9)
         torch.testing.assert_close(
             alone.copula.mean, chosen.copula.mean, rtol=0, atol=1e-9
         )
@@ -206,7 +208,7 @@ def test_an_update_changes_nothing_that_it_was_given() -> None:
     state = after(Classes(), mixed(2, 12, 14), covariance_of(12, 14), LOOKS[0])
     kept = state.clone()
     Classes().update(state, LOOKS[1], mixed(2, 12, 14, seed=2))
-    for name in ("chance", "labels", "density", "sweeps", "odds"):
+    for name in ("p_first", "labels", "density", "sweeps", "odds"):
         assert torch.equal(getattr(state, name), getattr(kept, name))
     assert torch.equal(state.copula.mean, kept.copula.mean)
 
@@ -263,7 +265,7 @@ def test_sensed_traversability_is_kept_under_a_new_prediction() -> None:
         after(Classes(), prior, covariance, sensed), looked((2, 12, 14), {}), new
     )
     wanted = after(Classes(), new, covariance, sensed)
-    for one, other in zip(changed.looks, wanted.looks, strict=True):
+    for one, other in zip(changed.per_class, wanted.per_class, strict=True):
         torch.testing.assert_close(
             one.lower, other.lower, rtol=0, atol=1e-3, equal_nan=True
         )
@@ -289,7 +291,7 @@ def test_of_a_new_prediction_the_cells_count_that_are_others() -> None:
     assert torch.equal(state.odds, torch.where(anew, 0.0, first.odds))
     # In the other episode, and of seen ground far from λ that was scored anew, all is
     # as it was.
-    for name in ("labels", "chance", "density"):
+    for name in ("labels", "p_first", "density"):
         assert torch.equal(getattr(state, name)[1], getattr(first, name)[1])
     assert torch.equal(state.sweeps[1], first.sweeps[1])
     assert torch.equal(state.copula.mean[1], first.copula.mean[1])

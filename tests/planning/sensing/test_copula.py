@@ -22,7 +22,7 @@ from benchnav.planning.sensing.copula import Copula, CopulaState
 from benchnav.planning.sensing.gaussian import Observed, condition, predict
 from benchnav.planning.sensing.lattice import Lattice
 from benchnav.planning.sensing.sensor import (
-    LEAST_STD,
+    MIN_STD,
     Contact,
     Measurement,
     NoiseKey,
@@ -37,7 +37,7 @@ FILE = "benchnav.planning.sensing.copula:Copula"
 
 
 def looked(
-    values: dict[tuple[int, int], float], std: float = LEAST_STD, batch: int = 1
+    values: dict[tuple[int, int], float], std: float = MIN_STD, batch: int = 1
 ) -> Measurement:
     found = torch.full((batch, HEIGHT, WIDTH), torch.nan, dtype=torch.float64)
     for (row, column), value in values.items():
@@ -57,7 +57,7 @@ def after(
     return state
 
 
-def covariance(
+def cov_between(
     one: list[tuple[int, int]], other: list[tuple[int, int]], length: float = 3.0
 ) -> np.ndarray:
     away = ((np.array(one)[:, None] - np.array(other)[None]) ** 2).sum(-1)
@@ -86,8 +86,8 @@ def test_scores_that_are_observed_condition_the_field_as_linear_algebra_says() -
     for place in where:
         mask[0][place] = True
     score = prior.at(mask).to_normal(values[None])[0].numpy().ravel()
-    inner = covariance(where, where) + 0.04 * np.eye(3)
-    across = covariance(where, EVERY)
+    inner = cov_between(where, where) + 0.04 * np.eye(3)
+    across = cov_between(where, EVERY)
     mean = (across.T @ np.linalg.solve(inner, score)).reshape(HEIGHT, WIDTH)
     variance = 1 - (across * np.linalg.solve(inner, across)).sum(0).reshape(
         HEIGHT, WIDTH
@@ -116,8 +116,8 @@ def test_of_a_nugget_neighbours_know_nothing_and_a_cell_that_was_sensed_all(
     mask = told.mask
     score = prior.at(mask).to_normal(told.traversability[mask][None])[0].numpy().ravel()
     same = np.eye(HEIGHT * WIDTH)[[EVERY.index(place) for place in where]]
-    inner = 0.6 * covariance(where, where) + (0.4 + 1e-4) * np.eye(2)
-    across = 0.6 * covariance(where, EVERY) + 0.4 * same
+    inner = 0.6 * cov_between(where, where) + (0.4 + 1e-4) * np.eye(2)
+    across = 0.6 * cov_between(where, EVERY) + 0.4 * same
     mean = (across.T @ np.linalg.solve(inner, score)).reshape(HEIGHT, WIDTH)
     variance = 1 - (across * np.linalg.solve(inner, across)).sum(0).reshape(
         HEIGHT, WIDTH
@@ -212,7 +212,7 @@ def test_the_same_look_without_noise_changes_nothing() -> None:
     state = after(Copula(), prior, looked({(6, 6): 0.5}))
     again = Copula().update(state, looked({(6, 6): 0.5}))
     assert again.mean is state.mean or torch.equal(again.mean, state.mean)
-    assert float(again.noise_std[0, 6, 6]) == LEAST_STD
+    assert float(again.noise_std[0, 6, 6]) == MIN_STD
 
 
 def test_the_order_of_looks_and_the_other_episodes_do_not_matter() -> None:
@@ -450,7 +450,7 @@ def test_an_approximation_that_errs_makes_no_cell_less_sure(
         mean, variance, skew = predict(*given)
         return mean + 0.1, wider * variance, skew
 
-    monkeypatch.setattr("benchnav.planning.sensing.copula.predict", errs)
+    monkeypatch.setattr("benchnav.planning.sensing.conditioning.predict", errs)
     found = Copula().update(before, looked({(4, 5): 0.5}, 0.1))
     assert float((found.std - before.std).max()) <= 0
     # A variance that is off by little takes the new mean along.
@@ -592,7 +592,7 @@ def test_what_was_observed_at_a_cell_is_kept_where_there_is_no_room_for_it(
         for place in range(2, 12)
     }
     for room in (1, 2, 256):
-        monkeypatch.setattr("benchnav.planning.sensing.copula._MOST_AT_ONCE", room)
+        monkeypatch.setattr("benchnav.planning.sensing.conditioning._MAX_EXACT", room)
         state = Copula().init(prior, COVARIANCE)
         for place, value in told.items():
             before, state = (
@@ -693,12 +693,12 @@ def test_fields_that_are_drawn_have_what_is_believed_and_what_was_observed() -> 
                 float(found.cdf(level)[0][place]), abs=0.07
             )
     # Cells between are drawn together: their scores keep the correlation that is left.
-    left = covariance([(6, 7)], [(6, 8)]) - (
-        covariance([(6, 7)], [(4, 4), (9, 9)])
+    left = cov_between([(6, 7)], [(6, 8)]) - (
+        cov_between([(6, 7)], [(4, 4), (9, 9)])
         @ np.linalg.inv(
-            covariance([(4, 4), (9, 9)], [(4, 4), (9, 9)]) + 0.0025 * np.eye(2)
+            cov_between([(4, 4), (9, 9)], [(4, 4), (9, 9)]) + 0.0025 * np.eye(2)
         )
-        @ covariance([(4, 4), (9, 9)], [(6, 8)])
+        @ cov_between([(4, 4), (9, 9)], [(6, 8)])
     )
     assert left > 0.3
     ranks = (
@@ -799,7 +799,7 @@ def test_cells_are_told_that_have_changed() -> None:
     )
 
 
-@pytest.mark.parametrize("noise_std", [LEAST_STD, 0.1])
+@pytest.mark.parametrize("noise_std", [MIN_STD, 0.1])
 def test_beside_ground_at_zero_risk_is_that_of_all_fields_that_match(
     noise_std: float,
 ) -> None:

@@ -21,11 +21,11 @@ from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.knowledge import (
     Knowledge,
     KnowledgeError,
-    Learner,
     Truth,
     nothing_sensed,
     unseen_ground,
 )
+from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.near import Near
 from benchnav.planning.sensing.sensor import (
     Contact,
@@ -280,7 +280,7 @@ def test_a_sensor_that_looks_and_senses_at_once_does_both_in_the_same_episodes()
     two = torch.tensor([True, False, True])
     known = how.sense(begin(how), TRUTH, START, 1, two, torch.ones_like(two))
     assert known.ever_sensed.flatten(1).sum(1).tolist() == [1, 0, 1]
-    assert known.reached.flatten(1).any(1).tolist() == [True, False, True]
+    assert known.footprint.flatten(1).any(1).tolist() == [True, False, True]
 
 
 def test_ground_that_turns_out_bad_is_closed_once_it_is_seen() -> None:
@@ -327,7 +327,7 @@ def test_sensors_are_asked_when_it_is_due_and_where_robots_are(belief: Any) -> N
     looked = how.sense(known, TRUTH, START + 2, 1, two, torch.ones_like(two))
     assert asked == ["Near", *ground, "Near", *ground]
     more = (looked.seen & ~known.seen).flatten(1).any(1)
-    assert more.tolist() == two.tolist() == looked.news.tolist()
+    assert more.tolist() == two.tolist() == looked.has_news.tolist()
     wanted = known.seen | near(START + 2) & two[:, None, None]
     assert torch.equal(looked.seen, wanted)
     # In a later step that tells nothing new, all is as it was.
@@ -347,7 +347,7 @@ def test_all_looks_between_two_updates_count_and_of_one_cell_the_later() -> None
         TRUTH.terrain, TRUTH.field, START + 0.5, NoiseKey(KEYS, 2)
     )
     assert torch.equal(both.ever_sensed, first.mask | second.mask)
-    assert torch.equal(both.reached, second.mask)
+    assert torch.equal(both.footprint, second.mask)
     wanted = torch.where(second.mask, second.traversability, first.traversability)
     assert torch.equal(both.sensed.traversability.nan_to_num(-1), wanted.nan_to_num(-1))
     assert (both.sensed.std[both.sensed.mask] == 0.3).all()

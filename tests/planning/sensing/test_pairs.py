@@ -26,7 +26,7 @@ def test_a_cell_is_of_the_heavier_pair_and_of_none_that_has_little() -> None:
     state = Classes().init(prediction(weights), covariance_of(3, 5))
     assert state.pair[0, 0].tolist() == [1, 2, 0, 0, 1]
     # What the other classes have stays theirs under either.
-    first, second = (look.prior for look in state.looks)
+    first, second = (look.prior for look in state.per_class)
     assert isinstance(first, TraversabilityMixture)
     assert isinstance(second, TraversabilityMixture)
     wanted = torch.tensor([0.6, 0.0, 0.0, 0.2, 0.2]).double()

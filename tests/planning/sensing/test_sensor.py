@@ -10,7 +10,7 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.sensor import (
-    LEAST_STD,
+    MIN_STD,
     Contact,
     Measurement,
     NoiseKey,
@@ -45,7 +45,7 @@ def test_contact_is_the_λ_of_the_robots_cell_as_it_is(
     sensed = sense(Contact(), ground)
     assert sensed.mask.nonzero().tolist() == [[0, 2, 4], [1, 11, 0], [2, 0, 13]]
     assert torch.equal(sensed.traversability[sensed.mask], ground[1][sensed.mask])
-    assert (sensed.std[sensed.mask] == LEAST_STD).all()
+    assert (sensed.std[sensed.mask] == MIN_STD).all()
 
 
 def test_a_robot_off_the_map_senses_nothing_by_contact(
