@@ -70,8 +70,8 @@ def revise(
     Returns:
         The next plan state.
     """
-    given = problem.clone()
-    revised = planner.revise(plan_state, given)
+    copy = problem.clone()
+    revised = planner.revise(plan_state, copy)
     return begin(planner, problem, generator) if revised is NotImplemented else revised
 
 
@@ -88,15 +88,15 @@ def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) ->
         The answer. A wrong type, shape, dtype or device makes every episode faulty, an
         action that is not finite its own alone.
     """
-    said = planner.plan(step.clone(), plan_state)
+    output = planner.plan(step.clone(), plan_state)
     standing, nothing = (
         standing_actions(problem),
         Plan.empty(len(problem), step.state.device),
     )
-    if fault := find_fault(said, problem):
+    if fault := find_fault(output, problem):
         everyone = torch.ones_like(step.traversability, dtype=torch.bool)
         return Answer(standing, plan_state, nothing, everyone, fault)
-    action, following, plan = said
+    action, following, plan = output
     faulty = ~action.detach().isfinite().all(dim=1)
     if find_layer_faults(plan, problem):
         plan = replace(nothing, status=plan.status)
@@ -120,17 +120,21 @@ def standing_actions(problem: Problem) -> Tensor:
     )
 
 
-def find_fault(said: Any, problem: Problem) -> str:
+def find_fault(output: Any, problem: Problem) -> str:
     """Tells what makes a whole answer useless, in one line; empty where nothing does.
 
     Args:
         said: whatever `plan` returned.
         problem: B problems, for the shape, dtype and device that actions need.
     """
-    if not isinstance(said, tuple) or len(said) != 3:
-        got = f"{len(said)} values" if isinstance(said, tuple) else type(said).__name__
+    if not isinstance(output, tuple) or len(output) != 3:
+        got = (
+            f"{len(output)} values"
+            if isinstance(output, tuple)
+            else type(output).__name__
+        )
         return f"Expected (action, plan_state, Plan) from `plan`, got {got}."
-    action, _, plan = said
+    action, _, plan = output
     batch, like = len(problem), problem.start
     if fault := find_tensor_fault(
         "actions",

@@ -41,9 +41,9 @@ def _is_switched_off() -> bool:
     return os.environ.get("TORCH_COMPILE_DISABLE") == "1"
 
 
-def worth_compiling(rollouts: int, least: int, device: torch.device) -> bool:
+def worth_compiling(rollouts: int, min_rollouts: int, device: torch.device) -> bool:
     """Tells whether so many rollouts an episode are to be compiled."""
-    return device.type == "cuda" or rollouts >= least
+    return device.type == "cuda" or rollouts >= min_rollouts
 
 
 class Fused(Generic[R]):
@@ -68,14 +68,14 @@ class Fused(Generic[R]):
         self,
         function: Callable[..., R],
         rollouts: int,
-        least: int,
+        min_rollouts: int,
         batched: tuple[int, ...] = (),
     ) -> None:
         """Keeps the function; nothing is compiled yet."""
         self._function, self._rollouts, self._least, self._batched = (
             function,
             rollouts,
-            least,
+            min_rollouts,
             batched,
         )
         self._fused: Callable[..., R] | None = None
@@ -140,7 +140,7 @@ class Fused(Generic[R]):
         """What a call is compiled for: shapes, dtypes and devices of tensors, the other
         arguments, PyTorch's modes.
         """
-        found: list[object] = [
+        parts: list[object] = [
             torch.is_inference_mode_enabled(),
             torch.is_grad_enabled(),
             torch.get_num_threads(),
@@ -152,10 +152,10 @@ class Fused(Generic[R]):
                     if index in self._batched
                     else item.shape
                 )
-                found.append((shape, item.dtype, item.device))
+                parts.append((shape, item.dtype, item.device))
             else:
-                found.append(_key(item))
-        return tuple(found)
+                parts.append(_key(item))
+        return tuple(parts)
 
 
 def _of_items(function: Callable[..., R], kinds: list[type]) -> Callable[..., R]:

@@ -79,8 +79,10 @@ def tail_cost(cost: Tensor, level: float) -> Tensor:
         return cost.mean(1)
     worst = (1 - level) * cost.shape[1]
     count = math.ceil(worst - 1e-9)
-    most = cost.topk(count, dim=1).values
-    return (most[:, :-1].sum(1) + (worst - count + 1) * most[:, -1]) / worst
+    worst_costs = cost.topk(count, dim=1).values
+    return (
+        worst_costs[:, :-1].sum(1) + (worst - count + 1) * worst_costs[:, -1]
+    ) / worst
 
 
 class Entrapment(NamedTuple):
@@ -105,7 +107,7 @@ class Entrapment(NamedTuple):
 def advance_entrapped(
     states: Tensor,
     cost: Tensor,
-    held: Tensor,
+    dwell_steps: Tensor,
     sampled: Sampled,
     padded_ground: Tensor,
     target: Tensor,
@@ -132,26 +134,31 @@ def advance_entrapped(
         dynamics: of the problem.
 
     Returns:
-        States, cost and `held` after these steps.
+        States, cost and `dwell_steps` after these steps.
     """
-    goal, steps_left, goal_radius_m, below, most = entrapment
+    goal, steps_left, goal_radius_m, below, max_steps = entrapment
     grid, robot, objective, min_traversability = dynamics
     for step in range(sampled.mean.shape[1]):
         action = sampled_actions(sampled, step)
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
-        traversability, going = predicted_traversability(ground), held < most
+        traversability, going = (
+            predicted_traversability(ground),
+            dwell_steps < max_steps,
+        )
         away = torch.hypot(states[..., 0] - goal[..., 0], states[..., 1] - goal[..., 1])
-        longer = torch.where(traversability < below, held + 1, 0)
-        longer = torch.where((held < 0) | (away < goal_radius_m), -1, longer)
-        stops = going & (longer >= most)
+        longer_dwell = torch.where(traversability < below, dwell_steps + 1, 0)
+        longer_dwell = torch.where(
+            (dwell_steps < 0) | (away < goal_radius_m), -1, longer_dwell
+        )
+        stops = going & (longer_dwell >= max_steps)
         paid = stage_cost(objective, states, action, ground, target)
         standing = stage_cost(
             objective, states, torch.zeros_like(action), ground, target
         )
-        rest = (steps_left - (step + 1)).clamp(min=0) * standing
-        cost = cost + torch.where(going, paid + torch.where(stops, rest, 0), 0)
+        remaining = (steps_left - (step + 1)).clamp(min=0) * standing
+        cost = cost + torch.where(going, paid + torch.where(stops, remaining, 0), 0)
         states = robot(
             states, action, motion_traversability(ground, min_traversability)
         )
-        held = torch.where(going, longer, held)
-    return component_wise(states), cost, held
+        dwell_steps = torch.where(going, longer_dwell, dwell_steps)
+    return component_wise(states), cost, dwell_steps

@@ -184,15 +184,15 @@ class MPPIConfig:
             "`risk_on: cost` for `level`, `fields` and `once` of MPPI, got 'map', "
             "whose risk is the risk setting's.",
         )
-        known = "objective", "map", "expected-time"
+        choices = "objective", "map", "expected-time"
         expect(
-            self.cost_to_go in known,
-            f"`cost_to_go` among {', '.join(known)} for MPPI, got {self.cost_to_go!r}.",
+            self.cost_to_go in choices,
+            f"`cost_to_go` among {', '.join(choices)} for MPPI, got {self.cost_to_go!r}.",
         )
-        least = math.ceil(_LEAST_TAIL / (1 - self.level) - 1e-9)
+        min_fields = math.ceil(_LEAST_TAIL / (1 - self.level) - 1e-9)
         expect(
-            self.level == 0 or self.fields >= least,
-            f"`fields` of at least {_LEAST_TAIL} / (1 − `level`) = {least} for MPPI, "
+            self.level == 0 or self.fields >= min_fields,
+            f"`fields` of at least {_LEAST_TAIL} / (1 − `level`) = {min_fields} for MPPI, "
             f"got {self.fields}.",
         )
 
@@ -218,7 +218,7 @@ class MPPIState(Batch):
 
     problem: Problem
     mean: Tensor
-    held: Tensor
+    dwell_steps: Tensor
     follows: Tensor
     ground: Tensor | None
     to_go: Tensor | None
@@ -242,13 +242,18 @@ class MPPI(LocalPlanner[MPPIState]):
     def __init__(self, config: MPPIConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or MPPIConfig()
-        rollouts, least = self.config.samples * self._fields, self.worth_compiling
-        self._advance = Fused(advance_chunk, rollouts, least, batched=OF_EPISODES)
+        rollouts, min_rollouts = (
+            self.config.samples * self._fields,
+            self.worth_compiling,
+        )
+        self._advance = Fused(
+            advance_chunk, rollouts, min_rollouts, batched=OF_EPISODES
+        )
         self._advance_entrapped = Fused(
-            advance_entrapped, rollouts, least, batched=ENTRAPPED_OF_EPISODES
+            advance_entrapped, rollouts, min_rollouts, batched=ENTRAPPED_OF_EPISODES
         )
         self._weigh = Fused(
-            weigh, rollouts, least, batched=(*OF_EPISODES, 12, 13)
+            weigh, rollouts, min_rollouts, batched=(*OF_EPISODES, 12, 13)
         )  # going, to_go
 
     @property
@@ -287,17 +292,17 @@ class MPPI(LocalPlanner[MPPIState]):
 
     def follows(self, task: Task) -> str:
         """What it minimises where that is not J alone; see `Planner`."""
-        config, found = self.config, []
+        config, parts = self.config, []
         if config.risk_on == "cost":
             tail = f"CVaR {config.level:g} of J" if config.level else "mean of J"
-            found.append(f"{tail} over {config.fields} fields of λ")
+            parts.append(f"{tail} over {config.fields} fields of λ")
         if config.entrapment:
-            found.append("immobilised rollouts pay the rest of the time")
+            parts.append("immobilised rollouts pay the rest of the time")
         if config.cost_to_go != "objective":
-            known = "λ̂" if config.cost_to_go == "map" else "expected-time"
-            found.append(f"the last state pays A*'s cost to go under {known}")
+            to_go_map = "λ̂" if config.cost_to_go == "map" else "expected-time"
+            parts.append(f"the last state pays A*'s cost to go under {to_go_map}")
         return ", ".join(
-            found if config.risk_on == "cost" or not found else ["J", *found]
+            parts if config.risk_on == "cost" or not parts else ["J", *parts]
         )
 
     def init(self, problem: Problem, generator: torch.Generator) -> MPPIState:
@@ -325,12 +330,20 @@ class MPPI(LocalPlanner[MPPIState]):
         )
         bank = draw_bank(seed, horizon, config.samples, scale)
         key = rng.stream_key(seed, "fields")
-        held, ground = (
+        no_dwell, ground = (
             problem.start.new_zeros(len(problem)),
             self._drawn_once(problem, key),
         )
         return MPPIState(
-            problem, mean, held, held.bool(), ground, self._to_go(problem), bank, key, 0
+            problem,
+            mean,
+            no_dwell,
+            no_dwell.bool(),
+            ground,
+            self._to_go(problem),
+            bank,
+            key,
+            0,
         )
 
     def revise(self, plan_state: MPPIState, problem: Problem) -> MPPIState:
@@ -341,8 +354,8 @@ class MPPI(LocalPlanner[MPPIState]):
         )
 
     def _to_go(self, problem: Problem) -> Tensor | None:
-        wanted = self.config.cost_to_go
-        if wanted == "objective":
+        option = self.config.cost_to_go
+        if option == "objective":
             return None
         name = type(problem.objective).__name__
         expect(
@@ -350,7 +363,7 @@ class MPPI(LocalPlanner[MPPIState]):
             "an objective with `path_cost` for option `cost_to_go` of MPPI, got "
             f"{name}.",
         )
-        if wanted == "expected-time":
+        if option == "expected-time":
             risk_map = risk.ExpectedTime()(problem.distribution).to(problem.risk_map)
             problem = replace(problem, risk_map=risk_map)
         return astar.framed(problem, astar.search(problem))
@@ -377,8 +390,10 @@ class MPPI(LocalPlanner[MPPIState]):
             problem, step.state, mean, noise, target_m, advance, ground, dwell
         )
         if config.control_cost:
-            own = control_cost(mean, noise, plan_state.noise.scale)
-            cost = cost + config.control_cost * own.repeat_interleave(self._fields, 0)
+            control = control_cost(mean, noise, plan_state.noise.scale)
+            cost = cost + config.control_cost * control.repeat_interleave(
+                self._fields, 0
+            )
         weights, updated = self._weigh(
             states,
             cost,
@@ -401,7 +416,7 @@ class MPPI(LocalPlanner[MPPIState]):
         )
         return (
             updated[:, 0],
-            after if dwell is None else replace(after, held=dwell.held),
+            after if dwell is None else replace(after, dwell_steps=dwell.dwell_steps),
             plan,
         )
 
@@ -469,8 +484,10 @@ class MPPI(LocalPlanner[MPPIState]):
         immobile = plan_state.problem.immobile
         if not self.config.entrapment or immobile is None:
             return None
-        held = torch.where(step.traversability < immobile.below, plan_state.held + 1, 0)
-        return Dwell(held, step.time_s)
+        dwell_steps = torch.where(
+            step.traversability < immobile.below, plan_state.dwell_steps + 1, 0
+        )
+        return Dwell(dwell_steps, step.time_s)
 
 
 def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
@@ -495,7 +512,7 @@ class Dwell(NamedTuple):
         time_s: since the start.
     """
 
-    held: Tensor
+    dwell_steps: Tensor
     time_s: float
 
 
@@ -577,28 +594,30 @@ def roll_out(
         for sampled in parts:
             states, cost = advance(states, cost, sampled, ground, target, dynamics)
         return states, cost, None
-    most = steps_in(problem.immobile.for_s, problem.dt_s)
-    held = (
-        dwell.held.repeat_interleave(count, 0)[:, None]
+    max_steps = steps_in(problem.immobile.for_s, problem.dt_s)
+    dwell_steps = (
+        dwell.dwell_steps.repeat_interleave(count, 0)[:, None]
         .expand_as(cost)
-        .clamp(max=most - 1)
+        .clamp(max=max_steps - 1)
         .contiguous()
     )
-    left = ((problem.time_budget_s - dwell.time_s) / problem.dt_s).round().to(state)
-    left = left.repeat_interleave(count, 0)[:, None]
+    steps_left = (
+        ((problem.time_budget_s - dwell.time_s) / problem.dt_s).round().to(state)
+    )
+    steps_left = steps_left.repeat_interleave(count, 0)[:, None]
     goal = problem.goal_m.repeat_interleave(count, 0)[:, None].contiguous()
     for chunk, sampled in zip(chunks, parts, strict=True):
         rules = Entrapment(
             goal,
-            left - chunk.start,
+            steps_left - chunk.start,
             problem.goal_radius_m,
             problem.immobile.below,
-            most,
+            max_steps,
         )
-        states, cost, held = advance(
-            states, cost, held, sampled, ground, target, rules, dynamics
+        states, cost, dwell_steps = advance(
+            states, cost, dwell_steps, sampled, ground, target, rules, dynamics
         )
-    return states, cost, held < most
+    return states, cost, dwell_steps < max_steps
 
 
 def advance_chunk(
@@ -638,7 +657,7 @@ def weigh(
         Weights of the samples, shape [B, K], and the mean action sequences, shape [B,
         T, A].
     """
-    cost, each = total_cost(states, cost, ends)
+    cost, cost_per_field = total_cost(states, cost, ends)
     scale: Tensor | float | None = temperature
     if scale is None:
         stopped = (
@@ -646,7 +665,7 @@ def weigh(
             if ends.going is None
             else (~ends.going).unflatten(0, (-1, ends.fields)).sum(1)
         )
-        scale = temperature_share * cost_spread(cost, each, stopped)
+        scale = temperature_share * cost_spread(cost, cost_per_field, stopped)
     weights = torch.softmax((cost.amin(dim=1, keepdim=True) - cost) / scale, dim=1)
     return weights, average(
         sampled.mean, sampled.noise, weights, sampled.low, sampled.high
@@ -668,16 +687,16 @@ def total_cost(states: Tensor, cost: Tensor, ends: Ends) -> tuple[Tensor, Tensor
         last = terminal_cost(objective, states, ground, target)
     else:
         # All fields of an episode have one map of costs.
-        together = states.unflatten(0, (-1, fields)).flatten(1, 2)
-        paths = astar.cost_at(grid, to_go, together[..., 0], together[..., 1])
+        of_episode = states.unflatten(0, (-1, fields)).flatten(1, 2)
+        paths = astar.cost_at(grid, to_go, of_episode[..., 0], of_episode[..., 1])
         last = paths.view_as(cost) + PENALTY * (ground <= 0)
     cost = cost + (last if going is None else torch.where(going, last, 0))
-    each = cost.unflatten(0, (-1, fields))
-    return tail_cost(each, level) if fields > 1 else cost, each
+    cost_per_field = cost.unflatten(0, (-1, fields))
+    return tail_cost(cost_per_field, level) if fields > 1 else cost, cost_per_field
 
 
 def cost_spread(
-    cost: Tensor, each: Tensor | None = None, stopped: Tensor | None = None
+    cost: Tensor, cost_per_field: Tensor | None = None, stopped: Tensor | None = None
 ) -> Tensor:
     """How far the costs of samples lie above the least, on average: the unit of the
     relative temperature.
@@ -698,12 +717,14 @@ def cost_spread(
     Returns:
         More than 0, shape [B, 1].
     """
-    each, best = (
-        cost[:, None] if each is None else each,
+    cost_per_field, best = (
+        cost[:, None] if cost_per_field is None else cost_per_field,
         cost.argmin(dim=1, keepdim=True),
     )
-    more = each - each.gather(2, best[:, None].expand(-1, each.shape[1], -1))
-    counted = (more / PENALTY + 0.5).floor().sum(1) <= 0
+    excess_per_field = cost_per_field - cost_per_field.gather(
+        2, best[:, None].expand(-1, cost_per_field.shape[1], -1)
+    )
+    counted = (excess_per_field / PENALTY + 0.5).floor().sum(1) <= 0
     if stopped is not None:
         counted = counted & (stopped <= stopped.gather(1, best))
     excess = cost - cost.amin(dim=1, keepdim=True)

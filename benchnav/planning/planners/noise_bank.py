@@ -38,14 +38,14 @@ class NoiseBank:
 
     scale: Tensor
     values: Tensor
-    place: Tensor
+    offset: Tensor
     stride: Tensor
     samples: int
 
     def at(self, step: int) -> Tensor:
         """The noise of a step, shape [T, A, K]."""
         actions, horizon, numbers = self.values.shape
-        within = (self.place + step * self.stride) % (numbers - self.samples + 1)
+        within = (self.offset + step * self.stride) % (numbers - self.samples + 1)
         # Parts move backward: forward, with the plan, a moment of it would meet the
         # same part at every step.
         part = (torch.arange(horizon, device=within.device) - step) % horizon
@@ -106,9 +106,9 @@ def draw_bank(seed: int, horizon: int, samples: int, scale: Tensor) -> NoiseBank
     values = torch.randn(
         (actions, horizon, numbers), generator=generator, dtype=scale.dtype
     ).to(scale.device)
-    places, shape = numbers - samples + 1, (horizon, actions)
-    place, stride = (
-        torch.randint(places, shape, generator=generator).to(scale.device)
+    n_offsets, shape = numbers - samples + 1, (horizon, actions)
+    offset, stride = (
+        torch.randint(n_offsets, shape, generator=generator).to(scale.device)
         for _ in range(2)
     )
-    return NoiseBank(scale, values * scale[:, None, None], place, stride, samples)
+    return NoiseBank(scale, values * scale[:, None, None], offset, stride, samples)

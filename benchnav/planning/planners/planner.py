@@ -72,7 +72,7 @@ class Plan:
 
     @classmethod
     def empty(
-        cls, batch: int, device: torch.device | str = "cpu", **known: Tensor
+        cls, batch: int, device: torch.device | str = "cpu", **layers: Tensor
     ) -> "Plan":
         """Makes a plan with status OK and nothing to draw but what is given."""
         blank = {
@@ -80,7 +80,7 @@ class Plan:
             for name, inner in LAYERS.items()
         }
         status = torch.zeros(batch, dtype=torch.int64, device=device)
-        return cls(**{"status": status, **blank, **known})
+        return cls(**{"status": status, **blank, **layers})
 
     def lines(self, member: int) -> dict[str, Tensor]:
         """What is drawn of one episode, by layer: polylines, shape [lines, N, 2]."""
@@ -250,7 +250,10 @@ class LocalPlanner(Planner[State]):
 
 
 def check_finite(
-    owner: str, settings: Any, above: tuple[str, ...], least: tuple[str, ...] = ()
+    owner: str,
+    settings: Any,
+    above: tuple[str, ...],
+    at_least_zero: tuple[str, ...] = (),
 ) -> None:
     """Refuses settings that are not finite, or under 0; None stands for a setting that
     is not given.
@@ -264,7 +267,7 @@ def check_finite(
     Raises:
         ConfigError: there are such.
     """
-    for name in (*above, *least):
+    for name in (*above, *at_least_zero):
         value, sign = getattr(settings, name), ">" if name in above else "≥"
         fits = value is None or (0 <= value < math.inf and (value or sign == "≥"))
         expect(fits, f"`{name}` {sign} 0 and finite for {owner}, got {value}.")
@@ -288,11 +291,11 @@ def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:
             f"Expected robot {kinds} for planner {name!r}, got {type(robot).__name__}."
         )
     names = tuple(robot.action_names)
-    known = (names,) if planner.steers is None else planner.steers
-    actions = " or ".join(f"({', '.join(each)})" for each in known)
-    steered = STEERING in names and not any(STEERING in each for each in known)
+    steered_names = (names,) if planner.steers is None else planner.steers
+    actions = " or ".join(f"({', '.join(each)})" for each in steered_names)
+    steered = STEERING in names and not any(STEERING in each for each in steered_names)
     expect(
-        names in known,
+        names in steered_names,
         f"a robot with actions {actions} for planner {name!r}, got "
         f"{type(robot).__name__} with "
         f"({', '.join(names)}). {_STEERED if steered else _SAMPLED}",

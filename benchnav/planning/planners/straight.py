@@ -52,14 +52,15 @@ def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
     low, high, rates = robot.action_low, robot.action_high, robot.action_rates
     # A robot of limited acceleration has to be able to end its turn in time.
     gain = _TURN_GAIN if rates is None else min(_TURN_GAIN, 2 * rates[1] / high[1])
-    least = 0.0 if TURN_RATE in robot.action_names else _CREEP
-    aligned = high[0] * (1 - missing.abs() / _AWAY_RAD).clamp(min=least)
+    min_fraction = 0.0 if TURN_RATE in robot.action_names else _CREEP
+    aligned = high[0] * (1 - missing.abs() / _AWAY_RAD).clamp(min=min_fraction)
     speed = torch.minimum(
         aligned, _APPROACH * torch.linalg.vector_norm(target_m - state[:, :2], dim=1)
     )
     actions = zip((speed, gain * missing), low, high, strict=True)
     return torch.stack(
-        [action.clamp(least, most) for action, least, most in actions], dim=1
+        [action.clamp(min_fraction, most) for action, min_fraction, most in actions],
+        dim=1,
     )
 
 

@@ -69,8 +69,8 @@ def choose(
     """
     robot = problem.robot
     primitives = turning_primitives(robot, mean.shape[1], mean)
-    rest = torch.zeros_like(primitives[..., :1])
-    mean_cost, standing = cost_of(mean, rest), cost_of(0 * mean, rest)
+    no_offset = torch.zeros_like(primitives[..., :1])
+    mean_cost, standing = cost_of(mean, no_offset), cost_of(0 * mean, no_offset)
     stands = (mean_cost >= standing)[:, 0]
     if mean.device.type == "cpu" and not bool(
         (stands | following).any()
@@ -109,19 +109,21 @@ def follow_dubins(
     robot = problem.robot
     low, high = problem.action_bounds
     speed, steering = (robot.action_names.index(name) for name in (SPEED, STEERING))
-    most = torch.zeros_like(torch.stack((low, high)))
-    most[:, speed], most[:, steering] = (
+    extremes = torch.zeros_like(torch.stack((low, high)))
+    extremes[:, speed], extremes[:, steering] = (
         high[speed],
         torch.stack((low[steering], high[steering])),
     )
     before = state[:, None].expand(-1, 2, -1)
-    moved = (
-        robot(before, most.expand(len(state), -1, -1), torch.ones_like(before[..., 0]))
+    motion = (
+        robot(
+            before, extremes.expand(len(state), -1, -1), torch.ones_like(before[..., 0])
+        )
         - before
     )
     step_m, turned = (
-        torch.hypot(moved[..., 0], moved[..., 1]).amin(dim=1),
-        moved[..., 2].abs().amin(dim=1),
+        torch.hypot(motion[..., 0], motion[..., 1]).amin(dim=1),
+        motion[..., 2].abs().amin(dim=1),
     )
     can_turn = (step_m > 0) & (turned > 0)
     radius = torch.where(can_turn, step_m / turned, 1.0)
@@ -137,21 +139,27 @@ def follow_dubins(
         for one, other in zip(near, far, strict=True)
     )
 
-    here = problem.grid.lookup(
+    own_ground = problem.grid.lookup(
         ground, *state[:, :2].repeat_interleave(len(ground) // len(state), 0).unbind(-1)
     )
-    traversability = motion_traversability(here, problem.task.rules.min_traversability)
+    traversability = motion_traversability(
+        own_ground, problem.task.rules.min_traversability
+    )
     step_m = step_m * traversability.unflatten(0, (len(state), -1)).mean(dim=1)
     along = torch.arange(horizon + 1, device=state.device) * step_m[:, None]
     first, second = length[:, :1], length[:, 1:]
     heading = curvature[:, :1] * along.minimum(first) + curvature[:, 1:] * (
         along - first
     ).clamp(min=0).minimum(second)
-    share = heading.diff(dim=1) * radius[:, None] / step_m[:, None].clamp(min=1e-9)
+    turn_fraction = (
+        heading.diff(dim=1) * radius[:, None] / step_m[:, None].clamp(min=1e-9)
+    )
     actions = state.new_zeros(len(state), horizon, len(low))
     actions[..., speed] = high[speed]
     actions[..., steering] = torch.where(
-        share < 0, -share * low[steering], share * high[steering]
+        turn_fraction < 0,
+        -turn_fraction * low[steering],
+        turn_fraction * high[steering],
     )
     ahead = (curvature * length).abs().sum(dim=1) <= turned
     return actions, can_turn & ~ahead & (is_clear[0] | is_clear[1])
@@ -173,13 +181,13 @@ def _is_clear(
         state[:, :3], *segments, spacing_m, 1 + math.ceil(reach_m / spacing_m)
     )
     points = points.repeat_interleave(len(ground) // len(state), 0)
-    found = grid.lookup(ground, points[..., 0], points[..., 1])
-    least = 0.0 if problem.immobile is None else problem.immobile.below
+    values = grid.lookup(ground, points[..., 0], points[..., 1])
+    min_traversability = 0.0 if problem.immobile is None else problem.immobile.below
     firm = (
-        predicted_traversability(found).unflatten(0, (len(state), -1)).mean(dim=1)
-        >= least
+        predicted_traversability(values).unflatten(0, (len(state), -1)).mean(dim=1)
+        >= min_traversability
     )
-    return firm.all(dim=1) & (found > 0).unflatten(0, (len(state), -1)).flatten(1).all(
+    return firm.all(dim=1) & (values > 0).unflatten(0, (len(state), -1)).flatten(1).all(
         dim=1
     )
 
@@ -206,14 +214,14 @@ def turning_primitives(robot: Robot, horizon: int, like: Tensor) -> Tensor:
     step = torch.arange(horizon, device=like.device)[:, None]
     part = torch.arange(_DURATIONS + 1, device=like.device)
     turns = step * _DURATIONS < part * horizon  # [T, durations]
-    rest = torch.zeros(
+    straight = torch.zeros(
         horizon, len(names), _DURATIONS + 1, dtype=like.dtype, device=like.device
     )
-    found = []
-    for first, then in gears:
+    primitives = []
+    for first_speed, second_speed in gears:
         for angle in (low[steering], high[steering]):
-            actions = rest.clone()
-            actions[:, speed] = torch.where(turns, first, then)
+            actions = straight.clone()
+            actions[:, speed] = torch.where(turns, first_speed, second_speed)
             actions[:, steering] = torch.where(turns, angle, 0.0)
-            found.append(actions)
-    return torch.cat(found, dim=2)
+            primitives.append(actions)
+    return torch.cat(primitives, dim=2)

@@ -116,21 +116,23 @@ def lower_bound_s(
         .astype(int)
         .clip(0, np.array(squares.shape) - 1)
     )
-    kept = np.ones_like(ends)
+    is_reachable = np.ones_like(ends)
     if motion.immobile is not None:
         # In single precision, as the world compares.
         exits = (fine >= np.float32(motion.immobile.below)) | ends
         exits[begin] = True
-        kept = _near(exits, squares, _deepest_m(motion, motion.immobile) + 2 * error_m)
-    parts, _ = label(kept, generate_binary_structure(2, 2))
-    kept = parts == parts[begin]
-    if not (kept & ends).any():
+        is_reachable = _near(
+            exits, squares, _deepest_m(motion, motion.immobile) + 2 * error_m
+        )
+    parts, _ = label(is_reachable, generate_binary_structure(2, 2))
+    is_reachable = parts == parts[begin]
+    if not (is_reachable & ends).any():
         return math.inf
     reach = (
         _reached(fine, squares, motion.step_m, 2 * error_m) + error_m / motion.step_m
     )
     slowness = 1 / (motion.robot.top_speed_mps * reach.clip(_LEAST_TRAVERSABILITY))
-    mesh = Mesh(squares, slowness, kept, ends & kept)
+    mesh = Mesh(squares, slowness, is_reachable, ends & is_reachable)
     return mesh.value_at(largest(mesh, motion.goal_radius_m), start_m)
 
 
@@ -165,13 +167,13 @@ def _around(squares: Grid, reach_m: float) -> list[tuple[int, int, float]]:
     """Offsets of squares at most so far away, and how far: the least distance of the
     closed squares.
     """
-    most = math.floor(reach_m / squares.resolution_m) + 1
+    max_offset = math.floor(reach_m / squares.resolution_m) + 1
     offsets = [
         (row, column)
-        for row in range(-most, most + 1)
-        for column in range(-most, most + 1)
+        for row in range(-max_offset, max_offset + 1)
+        for column in range(-max_offset, max_offset + 1)
     ]
-    found = [
+    squares_around = [
         (
             *offset,
             squares.resolution_m
@@ -179,7 +181,7 @@ def _around(squares: Grid, reach_m: float) -> list[tuple[int, int, float]]:
         )
         for offset in offsets
     ]
-    return [each for each in found if each[2] <= reach_m]
+    return [entry for entry in squares_around if entry[2] <= reach_m]
 
 
 def _shifted(values: ndarray, row: int, column: int) -> ndarray:
@@ -192,23 +194,25 @@ def _shifted(values: ndarray, row: int, column: int) -> ndarray:
 
 def _near(exits: ndarray, squares: Grid, reach_m: float) -> ndarray:
     """Tell which squares have a point at most so far from an exit, bool."""
-    found = exits.copy()
+    is_near = exits.copy()
     for row, column, _ in _around(squares, reach_m):
-        found |= _shifted(exits, row, column)
-    return found
+        is_near |= _shifted(exits, row, column)
+    return is_near
 
 
 def _reached(fine: ndarray, squares: Grid, step_m: float, error_m: float) -> ndarray:
     """λ⁺: the greatest λ from which one step leads into each square, of the shape of
     the squares.
     """
-    found = fine.copy()
+    fastest = fine.copy()
     for row, column, away_m in _around(squares, step_m + error_m):
-        there = _shifted(fine, row, column)
-        found = np.where(
-            (there * step_m + error_m >= away_m) & (there > found), there, found
+        shifted = _shifted(fine, row, column)
+        fastest = np.where(
+            (shifted * step_m + error_m >= away_m) & (shifted > fastest),
+            shifted,
+            fastest,
         )
-    return found
+    return fastest
 
 
 class Mesh:
@@ -228,7 +232,7 @@ class Mesh:
     """
 
     def __init__(
-        self, squares: Grid, slowness: ndarray, kept: ndarray, ends: ndarray
+        self, squares: Grid, slowness: ndarray, is_kept: ndarray, ends: ndarray
     ) -> None:
         """Lay triangles out."""
         self.squares = squares
@@ -236,8 +240,8 @@ class Mesh:
             squares.height + 1, -1
         )
         corners = node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]
-        low, right, up, far = (corner[kept] for corner in corners)
-        even = np.add.outer(*map(np.arange, squares.shape))[kept] % 2 == 0
+        low, right, up, far = (corner[is_kept] for corner in corners)
+        even = np.add.outer(*map(np.arange, squares.shape))[is_kept] % 2 == 0
         # Right angles at the lower left and the upper right corner, or at the other
         # two.
         self.right = np.concatenate(
@@ -246,7 +250,7 @@ class Mesh:
         across = np.concatenate((np.where(even, right, low), np.where(even, up, far)))
         upward = np.concatenate((np.where(even, up, far), np.where(even, right, low)))
         self.along = np.stack((across, upward))
-        self.rise = np.tile(slowness[kept] * squares.resolution_m, 2)
+        self.rise = np.tile(slowness[is_kept] * squares.resolution_m, 2)
         self.free = np.zeros(node.size, dtype=bool)
         self.free[self.right] = self.free[self.along] = True
         for corner in corners:
@@ -257,8 +261,8 @@ class Mesh:
         """From W at the free nodes to its rise over both legs of all triangles, shape
         [2·T, free nodes].
         """
-        count, each = len(self.right), np.arange(len(self.right))
-        values, rows = np.repeat([1.0, -1.0], count), np.tile(each, 2)
+        count, triangles = len(self.right), np.arange(len(self.right))
+        values, rows = np.repeat([1.0, -1.0], count), np.tile(triangles, 2)
         shape = count, len(self.free)
         legs = [
             csr_array((values, (rows, np.concatenate((end, self.right)))), shape)
@@ -275,11 +279,13 @@ class Mesh:
         """W at a point, from W at all nodes, shape [N]; of a removed square it means
         nothing.
         """
-        place = point_m / self.squares.resolution_m
+        position = point_m / self.squares.resolution_m
         column, row = (
-            np.floor(place).astype(int).clip(0, np.array(self.squares.shape)[::-1] - 1)
+            np.floor(position)
+            .astype(int)
+            .clip(0, np.array(self.squares.shape)[::-1] - 1)
         )
-        x, y = place - (column, row)
+        x, y = position - (column, row)
         nodes = value.reshape(self.squares.height + 1, -1)[
             row : row + 2, column : column + 2
         ]
@@ -319,9 +325,9 @@ def largest(mesh: Mesh, goal_radius_m: float) -> ndarray:
     for step in range(1, _MOST_STEPS + 1):
         free = solve(source + back @ (allowed - multiplier))
         over = _RELAXATION * (rises @ free) + (1 - _RELAXATION) * allowed
-        wanted = over + multiplier
-        length = np.hypot(wanted[:count], wanted[count:])
-        allowed = wanted * np.tile(mesh.rise / np.maximum(length, mesh.rise), 2)
+        target = over + multiplier
+        length = np.hypot(target[:count], target[count:])
+        allowed = target * np.tile(mesh.rise / np.maximum(length, mesh.rise), 2)
         multiplier = multiplier + over - allowed
         if step % _CHECK_EVERY == 0:
             value = np.zeros(len(mesh.free))

@@ -64,14 +64,16 @@ def tell_standstill(
         return outcome
     window = steps_in(STUCK_WINDOW_S, dt_s)
     back = torch.arange(-window, 1, device=steps.device)
-    place = (steps[:, None] + back).clamp(min=0)
-    recent = positions_m.gather(1, place[..., None].expand(-1, -1, 2))
-    moved = torch.linalg.vector_norm(recent - recent[:, :1], dim=2).amax(dim=1)
-    taken = steps[:, None] + back[:-1]
-    drove = torch.where(taken >= 0, driven_m.gather(1, taken.clamp(min=0)), 0.0).sum(
-        dim=1
+    index = (steps[:, None] + back).clamp(min=0)
+    recent = positions_m.gather(1, index[..., None].expand(-1, -1, 2))
+    moved_m = torch.linalg.vector_norm(recent - recent[:, :1], dim=2).amax(dim=1)
+    step_indices = steps[:, None] + back[:-1]
+    driven_total_m = torch.where(
+        step_indices >= 0, driven_m.gather(1, step_indices.clamp(min=0)), 0.0
+    ).sum(dim=1)
+    standing = torch.where(
+        driven_total_m >= STUCK_DISTANCE_M, Outcome.STUCK, Outcome.STALLED
     )
-    standing = torch.where(drove >= STUCK_DISTANCE_M, Outcome.STUCK, Outcome.STALLED)
     return torch.where(
-        (outcome == Outcome.TIMEOUT) & (moved < STUCK_DISTANCE_M), standing, outcome
+        (outcome == Outcome.TIMEOUT) & (moved_m < STUCK_DISTANCE_M), standing, outcome
     )

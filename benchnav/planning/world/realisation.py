@@ -106,14 +106,16 @@ class Realisation:
             1, step.clamp(max=self._noise.shape[1] - 1)[:, None]
         )[:, :, None]
         count = self._ground.shape[1]
-        found = self._grid.lookup(
+        values = self._grid.lookup(
             self._ground.flatten(0, 1),
             x.repeat_interleave(count),
             y.repeat_interleave(count),
         )
-        weights, means, stds = found.view(len(x), 3, count // 3, 1, 1).unbind(1)
-        met = TraversabilityMixture(weights, means, stds).from_normal(noise)[:, 0, 0]
-        return torch.where(self._grid.contains(x, y), met, 0.0)
+        weights, means, stds = values.view(len(x), 3, count // 3, 1, 1).unbind(1)
+        traversability = TraversabilityMixture(weights, means, stds).from_normal(noise)[
+            :, 0, 0
+        ]
+        return torch.where(self._grid.contains(x, y), traversability, 0.0)
 
     def field_at(self, step: int) -> Tensor:
         """λ of every cell at a step where it is resampled, shape [B, H, W]: one noise a
@@ -135,19 +137,19 @@ class Realisation:
         """
         self._ground.index_copy_(0, members, others._ground)
         self._truth = map_tensors(
-            self._truth, lambda own, new: own.index_copy(0, members, new), others._truth
+            self._truth, lambda old, new: old.index_copy(0, members, new), others._truth
         )
         self.attempts.index_copy_(0, members, others.attempts)
         if self.field is not None and others.field is not None:
             self.field.index_copy_(0, members, others.field)
             return
         # Time budgets may differ; what is beyond an episode's own is never met.
-        most = max(self._noise.shape[1], others._noise.shape[1])
-        own, new = (
-            torch.nn.functional.pad(n, (0, most - n.shape[1]))
+        n_steps = max(self._noise.shape[1], others._noise.shape[1])
+        old, new = (
+            torch.nn.functional.pad(n, (0, n_steps - n.shape[1]))
             for n in (self._noise, others._noise)
         )
-        self._noise = own.index_copy(0, members, new)
+        self._noise = old.index_copy(0, members, new)
 
 
 def check_known(terrain: Terrain, world: World) -> None:
@@ -245,12 +247,12 @@ def joined(ground: Tensor, grid: Grid, places: Endpoints) -> Tensor:
     Returns:
         bool, shape [B].
     """
-    within = np.zeros((3, 3, 3))  # a map's cells are joined to its own alone
-    within[1] = generate_binary_structure(2, 1)
-    parts = torch.from_numpy(label(ground.cpu().numpy(), within)[0])
+    connectivity = np.zeros((3, 3, 3))  # a map's cells are joined to its own alone
+    connectivity[1] = generate_binary_structure(2, 1)
+    parts = torch.from_numpy(label(ground.cpu().numpy(), connectivity)[0])
     member = torch.arange(len(parts))
     start, goal = (
-        parts[member, *grid.cell_of(*place.cpu().T)]
-        for place in (places.start_m, places.goal_m)
+        parts[member, *grid.cell_of(*position.cpu().T)]
+        for position in (places.start_m, places.goal_m)
     )
     return ((start > 0) & (start == goal)).to(ground.device)

@@ -34,7 +34,7 @@ class SimulationState:
     state: Tensor
     outcome: Tensor
     step: Tensor
-    held: Tensor
+    dwell_steps: Tensor
 
     @property
     def running(self) -> Tensor:
@@ -134,15 +134,19 @@ class Simulation:
         arrived = distance(state, self._goal_m) < self._goal_radius_m
         inside = self._grid.contains(state[:, 0], state[:, 1])
         outcome = torch.where(step >= self.steps, Outcome.TIMEOUT, Outcome.RUNNING)
-        held = now.held
+        dwell_steps = now.dwell_steps
         if self._immobile is not None:
-            held = torch.where(traversability < self._immobile.below, held + 1, 0)
-            most = steps_in(self._immobile.for_s, self.robot.dt_s)
-            outcome = torch.where(held >= most, Outcome.IMMOBILISED, outcome)
+            dwell_steps = torch.where(
+                traversability < self._immobile.below, dwell_steps + 1, 0
+            )
+            max_steps = steps_in(self._immobile.for_s, self.robot.dt_s)
+            outcome = torch.where(
+                dwell_steps >= max_steps, Outcome.IMMOBILISED, outcome
+            )
         outcome = torch.where(inside, outcome, Outcome.OUT_OF_BOUNDS)
         outcome = torch.where(arrived, Outcome.SUCCESS, outcome)
         outcome = torch.where(now.running, outcome, now.outcome)
-        return SimulationState(state, outcome, step, held), traversability
+        return SimulationState(state, outcome, step, dwell_steps), traversability
 
     def unhindered(self, now: SimulationState, action: Tensor) -> Tensor:
         """Where an action would take the robots on ground of λ = 1, shape [B, S]; what

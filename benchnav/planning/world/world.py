@@ -237,8 +237,8 @@ PRESETS: Mapping[str, Preset] = {
 
 def _changed_preset(name: str, changes: Mapping[str, Any]) -> World:
     # One of the two ways to give a time budget replaces the other.
-    other = dict.fromkeys(_BUDGETS) if changes.keys() & set(_BUDGETS) else {}
-    return replace(PRESETS[name].world, **{**other, **changes})
+    no_budget = dict.fromkeys(_BUDGETS) if changes.keys() & set(_BUDGETS) else {}
+    return replace(PRESETS[name].world, **{**no_budget, **changes})
 
 
 def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
@@ -261,19 +261,19 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
         isinstance(world, Mapping | str),
         f"`world` as a mapping of settings, got {world!r}.",
     )
-    given = {"preset": world} if isinstance(world, str) else dict(world)
-    name = given.pop("preset", "paper")
+    changes_given = {"preset": world} if isinstance(world, str) else dict(world)
+    name = changes_given.pop("preset", "paper")
     check_known("a world", name, PRESETS)
     preset = PRESETS[name]
-    budgets = [key for key in _BUDGETS if given.get(key) is not None]
+    budgets = [key for key in _BUDGETS if changes_given.get(key) is not None]
     if (
         len(budgets) == 1
     ):  # of the two ways to give a time budget one takes the other's place
-        given |= dict.fromkeys(set(_BUDGETS) - set(budgets))
-    changed_world = read(World, given, "`{}`".format, "world", preset.world)
+        changes_given |= dict.fromkeys(set(_BUDGETS) - set(budgets))
+    changed_world = read(World, changes_given, "`{}`".format, "world", preset.world)
     for key in ("correlation_m", "kernel"):
         expect(
-            key not in given or changed_world.noise == "frozen",
+            key not in changes_given or changed_world.noise == "frozen",
             f"`world.{key}` with `world.noise` frozen, got it with "
             f"{changed_world.noise!r}.",
         )
@@ -286,11 +286,11 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
     return changed_world, rules, " ".join([name, *changes])
 
 
-def _differences(preset: Any, made: Any) -> list[str]:
+def _differences(preset: Any, value: Any) -> list[str]:
     """What tables call the fields in which a value differs from its preset."""
     changed = []
     for f in fields(preset):
-        before, after = getattr(preset, f.name), getattr(made, f.name)
+        before, after = getattr(preset, f.name), getattr(value, f.name)
         if before == after or (after is None and f.name != "immobile"):
             continue
         if isinstance(after, FreeSpace):

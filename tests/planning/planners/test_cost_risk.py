@@ -635,7 +635,7 @@ def test_a_robot_remembers_for_how_long_it_was_held() -> None:
     for observed, wanted in ((math.nan, 0), (0.05, 1), (0.02, 2), (0.3, 0), (0.05, 1)):
         step = replace(first(problem), traversability=torch.tensor([observed]))
         _, plan_state, _ = planner.plan(step, plan_state)
-        assert plan_state.held.tolist() == [wanted]
+        assert plan_state.dwell_steps.tolist() == [wanted]
     # In a world that holds nobody there is nothing to plan for.
     free = replace(problem, immobile=None)
     wanted, _ = drives(MPPI(SMALL), free)

@@ -531,7 +531,11 @@ def marked(horizon: int, samples: int) -> NoiseBank:
         one.values.shape
     )
     return NoiseBank(
-        scale=SCALE, values=places, place=one.place, stride=one.stride, samples=samples
+        scale=SCALE,
+        values=places,
+        offset=one.offset,
+        stride=one.stride,
+        samples=samples,
     )
 
 

@@ -86,7 +86,8 @@ def revised_edge_costs(problem: Problem, before: Tensor, changed: Tensor) -> Ten
     member, edge = _of_cells(near.flatten(1), source).nonzero(as_tuple=True)
     of_map, edges = member * near[0].numel(), edge.cpu().numpy()
     begin, end = (
-        torch.from_numpy(own[edges]).to(edge.device) for own in (source, target)
+        torch.from_numpy(cells_of_edges[edges]).to(edge.device)
+        for cells_of_edges in (source, target)
     )
     length_m = (
         torch.from_numpy(cells[edges]).to(edge.device) * problem.grid.resolution_m
@@ -117,7 +118,7 @@ def _costs(
     shape that these return.
     """
     traversability, elevation_m, free = (
-        [of(own) for own in (source, target)]
+        [of(ends) for ends in (source, target)]
         for of in (traversability_of, elevation_of, free_of)
     )
     grade = (elevation_m[1].double() - elevation_m[0].double()) / length_m
@@ -125,17 +126,19 @@ def _costs(
     name = f"`path_cost` of {type(objective).__name__}"
     per_m = [objective.path_cost(values.double(), grade) for values in traversability]
     for cost in per_m:
-        got = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
+        shape = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
         expect(
-            got == list(grade.shape),
-            f"{name} of the shape of λ̂ and grade, {list(grade.shape)}, got {got}. "
+            shape == list(grade.shape),
+            f"{name} of the shape of λ̂ and grade, {list(grade.shape)}, got {shape}. "
             "Give a cost for each piece of a "
             "path.",
         )
-    least, most = torch.stack([torch.stack(cost.aminmax()) for cost in per_m]).aminmax()
-    if not 0 < least <= most < torch.inf:
+    min_cost, max_cost = torch.stack(
+        [torch.stack(cost.aminmax()) for cost in per_m]
+    ).aminmax()
+    if not 0 < min_cost <= max_cost < torch.inf:
         raise ConfigError(
-            f"Expected {name} as finite numbers > 0, got {least:g} to {most:g}. "
+            f"Expected {name} as finite numbers > 0, got {min_cost:g} to {max_cost:g}. "
             "Return a cost > 0 per metre."
         )
     squeezed = gridgraph.squeezes(free_of, source, target, problem.grid.width)
@@ -235,7 +238,7 @@ def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
     size = grid.resolution_m
     to_go, per_m = costs.unbind(1)
     column, row = (x_m / size).floor(), (y_m / size).floor()
-    own, ended = grid.lookup(per_m, x_m, y_m), grid.lookup(to_go, x_m, y_m) == 0
+    own_cost, ended = grid.lookup(per_m, x_m, y_m), grid.lookup(to_go, x_m, y_m) == 0
     sides, best = (-0.5, 0.5, 1.5), torch.full_like(x_m, torch.inf)
     centres = {
         (up, right): ((column + right) * size, (row + up) * size)
@@ -244,14 +247,14 @@ def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
     }
     metre = {side: grid.lookup(per_m, *centre) for side, centre in centres.items()}
     for (up, right), (centre_x, centre_y) in centres.items():
-        there = metre[up, right]
+        other_cost = metre[up, right]
         # Cells that touch at a corner and are not free leave no way between them, see
         # `edge_costs`; where they are the cell itself and its neighbour across an edge,
         # one of the ends is not free.
         closed = torch.minimum(metre[up, 0.5], metre[0.5, right]) >= PENALTY
-        squeezed = closed & (torch.maximum(own, there) < PENALTY)
+        squeezed = closed & (torch.maximum(own_cost, other_cost) < PENALTY)
         length = torch.sqrt((x_m - centre_x) ** 2 + (y_m - centre_y) ** 2)
-        line = length * (0.5 * (own + there) + PENALTY * squeezed)
+        line = length * (0.5 * (own_cost + other_cost) + PENALTY * squeezed)
         best = torch.minimum(best, grid.lookup(to_go, centre_x, centre_y) + line)
     return torch.where(ended, 0, best)
 

@@ -135,10 +135,10 @@ class DWA(LocalPlanner[DWAState]):
         best = cost.argmin(dim=1)[:, None, None]
         layers = {}
         if step.draw:
-            held = window.mT[:, None].expand(
+            actions = window.mT[:, None].expand(
                 -1, steps_in(self.config.horizon_s, problem.dt_s), -1, -1
             )
-            drawn = rollout_path(problem, step.state, held)
+            drawn = rollout_path(problem, step.state, actions)
             path = drawn.take_along_dim(best[..., None], 1)[:, 0]
             layers = {"path": path, "samples": drawn[:, :, ::_DRAW_EVERY]}
         plan = Plan.empty(len(problem), step.state.device, **layers)
@@ -160,9 +160,9 @@ def reachable(problem: Problem, velocity: Tensor) -> tuple[Tensor, Tensor]:
         rate * problem.dt_s
         for rate in problem.robot.action_rates or (math.inf, math.inf)
     )
-    least = torch.stack((speed - reach, turn_rate - turn_reach), dim=1)
-    most = torch.stack((speed + reach, turn_rate + turn_reach), dim=1)
-    return least.clamp(*problem.action_bounds), most.clamp(*problem.action_bounds)
+    low = torch.stack((speed - reach, turn_rate - turn_reach), dim=1)
+    high = torch.stack((speed + reach, turn_rate + turn_reach), dim=1)
+    return low.clamp(*problem.action_bounds), high.clamp(*problem.action_bounds)
 
 
 def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Tensor:
@@ -176,12 +176,12 @@ def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Te
     Returns:
         Pairs (v, ω) within the bounds, shape [B, M, 2].
     """
-    least, most = (bound[:, None] for bound in reachable(problem, velocity))
-    shares = [
+    low, high = (bound[:, None] for bound in reachable(problem, velocity))
+    fractions = [
         torch.linspace(0, 1, count, device=velocity.device, dtype=velocity.dtype)
         for count in (config.speeds, config.turn_rates)
     ]
-    return least + (most - least) * torch.cartesian_prod(*shares)
+    return low + (high - low) * torch.cartesian_prod(*fractions)
 
 
 class Arcs(NamedTuple):

@@ -113,31 +113,31 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         """What A* and the local planner minimise where that is not J alone; see
         `Planner`.
         """
-        own = self.local.follows(task)
+        local_aim = self.local.follows(task)
         if isinstance(task.objective, GoalDistance) or not has_path_cost(
             task.objective
         ):
-            return f"3D path length (A*), {own or 'J'} ({self.local.name})"
-        return own and f"J (A*), {own} ({self.local.name})"
+            return f"3D path length (A*), {local_aim or 'J'} ({self.local.name})"
+        return local_aim and f"J (A*), {local_aim} ({self.local.name})"
 
     def remarks(self, task: Task) -> tuple[str, ...]:
         """Says what a path costs where J does not, and where no risk setting moves the
         path; see `Planner`.
         """
-        found, objective = [], task.objective
+        remarks, objective = [], task.objective
         if not has_path_cost(objective):
-            found.append(
+            remarks.append(
                 f"A* takes the shortest path: {type(objective).__name__} has no "
                 "`path_cost`"
             )
         if not self._cost_uses_map(task) and task.rules.free_space.by == "mean":
-            found.append(
+            remarks.append(
                 "A* finds the same path under every risk setting, since its cost does "
                 "not use λ̂ and free ground is "
                 f"set by the mean; risk moves {self.local.name} alone (objective "
                 "travel_time moves the path)"
             )
-        return tuple(found)
+        return tuple(remarks)
 
     def init(self, problem: Problem, generator: torch.Generator) -> GuidedState[Local]:
         """Searches the maps; see `Planner`."""
@@ -173,13 +173,13 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         recovery = aim(
             recovery, plan_state.recovery.active, problem, field, state, straight
         )
-        away = steer_toward(state, recovery.target_m, problem.robot)
-        action = torch.where(recovery.active[:, None], away, action)
+        steered = steer_toward(state, recovery.target_m, problem.robot)
+        action = torch.where(recovery.active[:, None], steered, action)
         if step.draw:
             # Long enough for a path that crosses the map twice; longer ones are cut.
-            whole = 2 * (problem.grid.height + problem.grid.width)
+            max_points = 2 * (problem.grid.height + problem.grid.width)
             plan = replace(
-                plan, reference=astar.path_points(problem, field, state, whole)
+                plan, reference=astar.path_points(problem, field, state, max_points)
             )
         local = self.local.commit_action(local, action)
         return action, replace(plan_state, local=local, recovery=recovery), plan
@@ -204,10 +204,10 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         members = changed.flatten(1).any(1).nonzero()[:, 0]
         if len(members):
             costs = astar.revised_edge_costs(problem, costs, changed)
-            found = astar.search(
-                problem.select(members), (costs[own] for own in members.tolist())
+            searched = astar.search(
+                problem.select(members), (costs[member] for member in members.tolist())
             )
-            field = field.put(members, found)
+            field = field.put(members, searched)
         ground = ground_costs(problem)
         return replace(
             plan_state,

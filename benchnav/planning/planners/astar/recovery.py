@@ -50,7 +50,7 @@ class Recovery(Batch):
         cell: flat index of the path's cell at or behind that, int64, shape [B].
     """
 
-    place_m: Tensor
+    anchor_m: Tensor
     steps: Tensor
     driven_m: Tensor
     active: Tensor
@@ -61,8 +61,8 @@ class Recovery(Batch):
     def none(cls, state: Tensor) -> "Recovery":
         """That of robots, shape [B, S], which have not been anywhere yet."""
         zero = torch.zeros_like(state[:, 0])
-        place = torch.full_like(state[:, :2], torch.inf)
-        return cls(place, zero.long(), zero, zero.bool(), place, zero.long())
+        nowhere = torch.full_like(state[:, :2], torch.inf)
+        return cls(nowhere, zero.long(), zero, zero.bool(), nowhere, zero.long())
 
 
 def watch(recovery: Recovery, state: Tensor, action: Tensor, robot: Robot) -> Recovery:
@@ -74,22 +74,22 @@ def watch(recovery: Recovery, state: Tensor, action: Tensor, robot: Robot) -> Re
         action: what the local planner would do next, the speed first, shape [B, A].
         robot: for its time step and top speed.
     """
-    left = distance(state, recovery.place_m) >= torch.where(
+    has_left = distance(state, recovery.anchor_m) >= torch.where(
         recovery.active, _LEFT_M, _STANDING_M
     )
     time_s = (recovery.steps + 1) * robot.dt_s
-    given_up = recovery.active & (time_s >= _PATIENCE_S + _RECOVERY_S)
-    anew = left | given_up
-    held = (time_s >= _PATIENCE_S) & (
+    timed_out = recovery.active & (time_s >= _PATIENCE_S + _RECOVERY_S)
+    restarts = has_left | timed_out
+    is_standing = (time_s >= _PATIENCE_S) & (
         recovery.driven_m < _IDLE * robot.top_speed_mps * time_s
     )
     return replace(
         recovery,
-        place_m=torch.where(anew[:, None], state[:, :2], recovery.place_m),
-        steps=torch.where(anew, 0, recovery.steps + 1),
-        driven_m=torch.where(anew, 0, recovery.driven_m)
+        anchor_m=torch.where(restarts[:, None], state[:, :2], recovery.anchor_m),
+        steps=torch.where(restarts, 0, recovery.steps + 1),
+        driven_m=torch.where(restarts, 0, recovery.driven_m)
         + action[:, 0].abs() * robot.dt_s,
-        active=~anew & (recovery.active | held),
+        active=~restarts & (recovery.active | is_standing),
     )
 
 

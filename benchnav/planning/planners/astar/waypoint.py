@@ -81,7 +81,7 @@ def line_costs(
     """
     offset = end_m - start_m
     cuts = _grid_cuts(start_m, offset, ground.grid.resolution_m, crossings)
-    share = cuts.diff(dim=-1)
+    fraction = cuts.diff(dim=-1)
     middle = (
         start_m[:, :, None]
         + (0.5 * (cuts[..., 1:] + cuts[..., :-1]))[..., None] * offset[:, :, None]
@@ -98,7 +98,7 @@ def line_costs(
     # Of a line without length any grade will do: it costs nothing.
     grade = rise / length.clamp(min=1e-9)
     per_m = ground.path_cost(at_pieces(ground.traversability), grade)
-    return ((per_m + at_pieces(ground.penalty_per_m)) * share * length).sum(dim=-1)
+    return ((per_m + at_pieces(ground.penalty_per_m)) * fraction * length).sum(dim=-1)
 
 
 def choose_waypoint(
@@ -136,14 +136,14 @@ def choose_waypoint(
     # touch.
     first = torch.minimum(lines[:, :1], by_gate.sum(dim=1, keepdim=True))
     path = torch.cat((first, legs), dim=1).cumsum(dim=1)
-    near = (
+    in_range = (
         torch.linalg.vector_norm(points_m.diff(dim=1), dim=2).cumsum(dim=1)
         <= lookahead_m
     )
     rank = torch.arange(count, device=ahead.device)
-    worth = lines <= _SHORT_CUT * path
-    farthest = torch.where(worth & near, rank, 0).amax(dim=1)
-    return ahead.take_along_dim(farthest[:, None, None], 1)[:, 0], worth[:, 0]
+    is_worth = lines <= _SHORT_CUT * path
+    farthest = torch.where(is_worth & in_range, rank, 0).amax(dim=1)
+    return ahead.take_along_dim(farthest[:, None, None], 1)[:, 0], is_worth[:, 0]
 
 
 def _grid_cuts(

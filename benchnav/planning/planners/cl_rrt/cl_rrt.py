@@ -317,7 +317,7 @@ class CLRRT(Planner[CLRRTState]):
         """
         route, before = plan_state.route, plan_state.problem
         points, length_m = self._ahead(route, problem, problem.start)
-        was, now = (own.ground_at(points) for own in (before, problem))
+        was, now = (problem_of.ground_at(points) for problem_of in (before, problem))
         closed = ((was > 0) & (now < 0) & (length_m > 0)).any(dim=1)
         judged = problem.grid.lookup(plan_state.ground, points[..., 0], points[..., 1])
         cost, judged_cost = (
@@ -416,26 +416,26 @@ class CLRRT(Planner[CLRRTState]):
         used_up = lost & (now.route.depth[due] > 0)
         failures = torch.where(used_up, 0, now.failures[due])
         route = self._search(state[due], now, due, failures)
-        found = route.status == PlanStatus.OK
+        reaches_goal = route.status == PlanStatus.OK
         crosses = (failures >= self.config.most_failures) & (route.depth > 0)
-        failures = torch.where(found | crosses, 0, failures + 1)
+        failures = torch.where(reaches_goal | crosses, 0, failures + 1)
         compared = now.doubted[due] & ~lost
         better = ~compared
-        if bool((compared & found).any()):
+        if bool((compared & reaches_goal).any()):
             costs = [
-                self._cost_ahead(now, each, state)[due]
-                for each in (now.route.put(due, route), now.route)
+                self._cost_ahead(now, candidate, state)[due]
+                for candidate in (now.route.put(due, route), now.route)
             ]
             better = better | (costs[0] < costs[1])
-        taken = (lost | (found & better)).nonzero()[:, 0]
+        taken = (lost | (reaches_goal & better)).nonzero()[:, 0]
         members = due[taken]
         # A path that nothing better is found for is kept as it is.
-        kept = compared & (failures >= self.config.most_failures)
-        failures = torch.where(kept, 0, failures)
+        stays = compared & (failures >= self.config.most_failures)
+        failures = torch.where(stays, 0, failures)
         return replace(
             now,
             ground=now.ground.index_copy(0, due, now.problem.padded_ground[due]),
-            doubted=now.doubted.index_copy(0, due, compared & ~found & ~kept),
+            doubted=now.doubted.index_copy(0, due, compared & ~reaches_goal & ~stays),
             route=now.route.put(members, route.select(taken)),
             edge=now.edge.index_fill(0, members, 0),
             progress_m=now.progress_m.index_fill(0, members, 0),

@@ -101,7 +101,7 @@ class Edges:
     """
 
     at: LoopState
-    kept: Tensor
+    exists: Tensor
     time_s: Tensor
     blocked_m: Tensor
     arrived: Tensor
@@ -164,7 +164,7 @@ def drive(
         _at(path, before)[..., :2], _at(integral, last), _at(error, last)
     )
     return Edges(
-        kept=last > 0,
+        exists=last > 0,
         at=LoopState(state=_at(path, last), tracking=tracking, free=_at(free, last)),
         time_s=last.to(path) * problem.dt_s,
         blocked_m=_at(_blocked_m(path, free, squeezed), last),

@@ -58,8 +58,10 @@ class FollowerConfig:
 
     def __post_init__(self) -> None:
         """Refuses settings that lead nowhere."""
-        least = "lookahead_s", "speed_kp", "speed_ki", "speed_kd"
-        check_finite("a path follower", self, ("lookahead_m", "speed_mps"), least)
+        at_least_zero = "lookahead_s", "speed_kp", "speed_ki", "speed_kd"
+        check_finite(
+            "a path follower", self, ("lookahead_m", "speed_mps"), at_least_zero
+        )
 
 
 @dataclass(frozen=True)

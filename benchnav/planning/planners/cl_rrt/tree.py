@@ -197,7 +197,7 @@ def plant(loop: ClosedLoop, root: Tensor, tracking: Tracking) -> Tree:
         target_m=at.state[..., :2],
         aimed=false,
         at=at,
-        kept=~false,
+        exists=~false,
         time_s=zero,
         blocked_m=zero,
         arrived=false,
@@ -221,7 +221,7 @@ def choose(
             nodes that have not.
     """
     best = tree.best[0][:, None]
-    found = best < math.inf
+    is_reached = best < math.inf
     straight_m = (
         distance(tree.at.state, loop.problem.goal_m[:, None])
         - loop.problem.goal_radius_m
@@ -235,7 +235,7 @@ def choose(
 
     # Line 2 of algorithm 1: the first node by length alone (explore), or by the whole
     # way (optimise).
-    explore = chance < torch.where(found, _EXPLORE[1], _EXPLORE[0])  # [B, R]
+    explore = chance < torch.where(is_reached, _EXPLORE[1], _EXPLORE[0])  # [B, R]
     length_m = dubins_length_to_point(
         tree.at.state[:, None, :, :3], sample_m[:, None], loop.radius_m[:, None, None]
     )
@@ -251,7 +251,7 @@ def choose(
         )
         > 0
     )
-    promise_m = tree.to_goal_m + closed_m + torch.where(found, spent_m, 0)
+    promise_m = tree.to_goal_m + closed_m + torch.where(is_reached, spent_m, 0)
     promise_m, promising = torch.where(tried, math.inf, promise_m).topk(
         lanes, dim=1, largest=False
     )
@@ -273,16 +273,16 @@ def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
     """The tree with the ends of edges as its next nodes, rejected ones too, so that
     tables stay of a size.
     """
-    kept, parent = edges.kept, choice.parent
+    exists, parent = edges.exists, choice.parent
     edges = replace(
         edges,
         time_s=torch.where(
-            kept, tree.time_s.gather(1, parent) + edges.time_s, math.inf
+            exists, tree.time_s.gather(1, parent) + edges.time_s, math.inf
         ),
         blocked_m=tree.blocked_m.gather(1, parent) + edges.blocked_m,
-        arrived=edges.arrived & kept,
+        arrived=edges.arrived & exists,
     )
-    to_goal_m = torch.where(kept, _to_goal_m(loop, edges.at.state), math.inf)
+    to_goal_m = torch.where(exists, _to_goal_m(loop, edges.at.state), math.inf)
     new = Tree(**vars(choice), **vars(edges), to_goal_m=to_goal_m)
     return map_tensors(tree, lambda old, added: torch.cat((old, added), dim=1), new)
 
@@ -297,8 +297,8 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
         rounds: in which it was grown, so that no path has more edges: D.
     """
     cost, cheapest = tree.best
-    found = cost < math.inf
-    chain = [torch.where(found, cheapest, _best_partial(tree))[:, None]]
+    is_reached = cost < math.inf
+    chain = [torch.where(is_reached, cheapest, _best_partial(tree))[:, None]]
     for _ in range(rounds):
         chain.append(tree.parent.gather(1, chain[-1]))
     backward = torch.cat(chain, dim=1)  # ends in zeros
@@ -306,21 +306,21 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
     order = depth[:, None] - 1 - torch.arange(rounds, device=depth.device)
     nodes = torch.where(order >= 0, backward.gather(1, order.clamp(min=0)), 0)
     end_m = tree.end_m.gather(1, nodes)
-    early = (order == 0) & ~found[:, None]
+    early = (order == 0) & ~is_reached[:, None]
     crossed = loop.crossing & (tree.blocked_m.gather(1, chain[0])[:, 0] > 0)
 
     pose = stand(tree, tree.parent.gather(1, nodes)).state[..., :3]
     reference, _ = draw_references(loop, pose, _take(tree.target_m, nodes))
     drawn = _take(tree.drawn.flatten(2), nodes).unflatten(-1, (-1, 2))
     return Route(
-        status=torch.where(found & ~crossed, PlanStatus.OK, PlanStatus.PARTIAL),
+        status=torch.where(is_reached & ~crossed, PlanStatus.OK, PlanStatus.PARTIAL),
         depth=depth,
         rows=reference.rows.reshape(*nodes.shape, -1, 4),
         end_m=torch.where(early, end_m - _MARGIN_M, end_m),
         path=_pack(
             torch.where((nodes > 0)[..., None, None], drawn, math.nan).flatten(1, 2)
         ),
-        tree=torch.where(tree.kept[:, 1:, None, None], tree.drawn[:, 1:], math.nan),
+        tree=torch.where(tree.exists[:, 1:, None, None], tree.drawn[:, 1:], math.nan),
     )
 
 

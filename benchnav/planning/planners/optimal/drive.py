@@ -88,15 +88,15 @@ def simulate(
             dwell = torch.where(observed < immobile.below, dwell + 1, 0)
             ended = ended | (dwell >= steps_in(immobile.for_s, problem.dt_s))
         if bool(ended.any()):
-            kept = (~ended).nonzero()[:, 0]
-            if len(kept) == 0:
+            running_on = (~ended).nonzero()[:, 0]
+            if len(running_on) == 0:
                 break
-            plan_state = select(plan_state, kept)
+            plan_state = select(plan_state, running_on)
             running, state, dwell, observed = (
-                running[kept],
-                state[kept],
-                dwell[kept],
-                observed[kept],
+                running[running_on],
+                state[running_on],
+                dwell[running_on],
+                observed[running_on],
             )
     return Drive(states=states, actions=actions, steps=arrival)
 

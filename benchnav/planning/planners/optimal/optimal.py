@@ -139,33 +139,33 @@ class Optimal(Planner[OptimalState]):
             f"`turn_rate_radps` alike to both sides for planner {self.name!r}, got "
             f"{low:g} to {high:g}.",
         )
-        least_speed = robot.action_low[0]
+        min_speed = robot.action_low[0]
         expect(
-            least_speed == 0,
+            min_speed == 0,
             f"`speed_mps` from 0 on for planner {self.name!r}, got from "
-            f"{least_speed:g} on.",
+            f"{min_speed:g} on.",
         )
         assert isinstance(robot, Unicycle)
         grid = problem.grid
         grid = Grid(grid.height * times, grid.width * times, grid.resolution_m / times)
-        least, radius = grid.resolution_m / math.sqrt(2), problem.goal_radius_m
+        min_radius, radius = grid.resolution_m / math.sqrt(2), problem.goal_radius_m
         expect(
-            radius >= least,
-            f"`goal_radius_m` of at least {least:.2f}, half of a cell's diagonal, for "
+            radius >= min_radius,
+            f"`goal_radius_m` of at least {min_radius:.2f}, half of a cell's diagonal, for "
             f"planner {self.name!r}, got "
             f"{radius:g}.",
         )
         costs = self.costs_of(problem, grid)
         moves = Moves.of(robot, grid.resolution_m, self.config.headings)
         to_go = value_iteration(costs, moves, grid, self.config.headings)
-        held = problem.start.new_zeros(len(problem))
+        no_dwell = problem.start.new_zeros(len(problem))
         return OptimalState(
             problem=problem,
             grid=grid,
             costs=costs,
             to_go=to_go,
-            held=held,
-            taken=torch.zeros_like(held).long(),
+            dwell_s=no_dwell,
+            taken=torch.zeros_like(no_dwell).long(),
         )
 
     def plan(
@@ -173,16 +173,19 @@ class Optimal(Planner[OptimalState]):
     ) -> tuple[Tensor, OptimalState, Plan]:
         """Begins the way that leads to the least cost; see `Planner`."""
         plan_state = self.observe(step, plan_state)
-        problem, held = plan_state.problem, plan_state.held
-        pose, own = step.state[:, :3], torch.arange(len(held), device=held.device)
-        ways = ways_from(pose, held, plan_state)
+        problem, dwell_s = plan_state.problem, plan_state.dwell_s
+        pose, member = (
+            step.state[:, :3],
+            torch.arange(len(dwell_s), device=dwell_s.device),
+        )
+        ways = ways_from(pose, dwell_s, plan_state)
         cost, best = ways.cost.min(1)
         # What a turn takes to be over after this step.
-        rate = ways.turn[own, best] / (
+        rate = ways.turn[member, best] / (
             self.turning_at(pose, plan_state).clamp(min=_LEAST_KNOWN) * problem.dt_s
         )
         low, high = problem.action_bounds
-        drives = ways.rolls[own, best] | (rate.abs() <= high[1])
+        drives = ways.rolls[member, best] | (rate.abs() <= high[1])
         action = torch.stack(
             (torch.where(drives, high[0], 0.0), rate.clamp(low[1], high[1])), 1
         )
@@ -195,19 +198,19 @@ class Optimal(Planner[OptimalState]):
             action,
         )
         status = PlanStatus.PARTIAL * stranded.long()
-        drawn = {"path": path_of(plan_state, pose, held)} if step.draw else {}
-        plan = replace(Plan.empty(len(held), held.device, **drawn), status=status)
+        drawn = {"path": path_of(plan_state, pose, dwell_s)} if step.draw else {}
+        plan = replace(Plan.empty(len(dwell_s), dwell_s.device, **drawn), status=status)
         return action, plan_state, plan
 
     def observe(self, step: Step, plan_state: OptimalState) -> OptimalState:
         """Count the step, and the dwell time by the λ that the robots met in the last
         one.
         """
-        immobile, held = plan_state.problem.immobile, plan_state.held
+        immobile, dwell_s = plan_state.problem.immobile, plan_state.dwell_s
         if immobile is not None:
-            holds = step.traversability < immobile.below
-            held = torch.where(holds, held + plan_state.problem.dt_s, 0.0)
-        return replace(plan_state, held=held, taken=plan_state.taken + 1)
+            immobilises = step.traversability < immobile.below
+            dwell_s = torch.where(immobilises, dwell_s + plan_state.problem.dt_s, 0.0)
+        return replace(plan_state, dwell_s=dwell_s, taken=plan_state.taken + 1)
 
     def select(self, plan_state: OptimalState, members: Tensor) -> OptimalState:
         """Keeps some episodes; see `Planner`."""
@@ -254,8 +257,8 @@ class Optimal(Planner[OptimalState]):
             )
         lost = problem.distribution.cdf_limits(immobile.below)[0].clamp(max=1 - 1e-6)
         # Of ground that does not hold the robot.
-        whole = problem.distribution.expected_time(immobile.below)
-        rate = ((whole - lost / immobile.below) / (1 - lost)).clamp(min=1)
+        total_time = problem.distribution.expected_time(immobile.below)
+        rate = ((total_time - lost / immobile.below) / (1 - lost)).clamp(min=1)
         hazard = -torch.log1p(-lost) / problem.grid.resolution_m
         return _on_grid(
             problem, grid, rate, torch.ones_like(problem.free), hazard=hazard
@@ -301,11 +304,14 @@ class NearOptimal(Optimal):
         plan_state = super().init(problem, generator)
         field = problem.distribution.mean()
         drive = simulate(super().plan, OptimalState.select, plan_state, problem, field)
-        others: tuple[Planner[Any], ...] = (AStarDWA(), Straight())
-        for other in others:
-            begun = other.init(problem, generator)
+        planners: tuple[Planner[Any], ...] = (AStarDWA(), Straight())
+        for planner in planners:
+            planner_state = planner.init(problem, generator)
             drive = earlier(
-                drive, simulate(other.plan, other.select, begun, problem, field, drive)
+                drive,
+                simulate(
+                    planner.plan, planner.select, planner_state, problem, field, drive
+                ),
             )
         return replace(plan_state, drive=drive)
 
@@ -349,26 +355,33 @@ class NearOptimal(Optimal):
 
     def costs_of(self, problem: Problem, grid: Grid) -> Costs:
         """What driving costs; see `Optimal`."""
-        known, immobile = problem.distribution, problem.immobile
+        distribution, immobile = problem.distribution, problem.immobile
         if not (
-            isinstance(known, TraversabilityMixture) and bool((known.stds == 0).all())
+            isinstance(distribution, TraversabilityMixture)
+            and bool((distribution.stds == 0).all())
         ):
             raise ConfigError(
                 f"Expected model 'clairvoyant' for planner {self.name!r}, which is "
                 "given λ itself, got a prediction "
                 "that is not certain."
             )
-        field = known.mean()
+        field = distribution.mean()
         rate = 1 / field.clamp(min=_LEAST_KNOWN)
-        holds = (
+        immobilises = (
             torch.zeros_like(problem.free)
             if immobile is None
             else field < immobile.below
         )
         if immobile is None or self.config.levels == 0:
-            return _on_grid(problem, grid, torch.where(holds, UNREACHED, rate), ~holds)
+            return _on_grid(
+                problem, grid, torch.where(immobilises, UNREACHED, rate), ~immobilises
+            )
         costs = _on_grid(
-            problem, grid, rate, ~holds, immobile_s=torch.where(holds, rate, 0.0)
+            problem,
+            grid,
+            rate,
+            ~immobilises,
+            immobile_s=torch.where(immobilises, rate, 0.0),
         )
         return replace(costs, lost_after_s=immobile.for_s, levels=self.config.levels)
 
@@ -407,17 +420,19 @@ def _on_grid(
     row, column = (torch.arange(size, device=rate.device) for size in grid.shape)
     x, y = grid.centre_of(row[:, None], column)
     goal_x, goal_y = problem.goal_m.T[:, :, None, None]
-    away = torch.hypot(x - goal_x, y - goal_y)
+    distance_m = torch.hypot(x - goal_x, y - goal_y)
     # One rate in all of them: what a way costs within the disc is taken off again;
     # nothing immobilises a robot there.
-    ends = away <= problem.goal_radius_m
-    within = torch.where(ends, rate, UNREACHED).amin((1, 2), keepdim=True)
-    rate = torch.where(ends, within, rate)
-    left = (away - problem.goal_radius_m) / problem.robot.top_speed_mps * rate
+    ends = distance_m <= problem.goal_radius_m
+    goal_rate = torch.where(ends, rate, UNREACHED).amin((1, 2), keepdim=True)
+    rate = torch.where(ends, goal_rate, rate)
+    remaining_s = (
+        (distance_m - problem.goal_radius_m) / problem.robot.top_speed_mps * rate
+    )
     return Costs(
         rate=rate,
         open=fine(open_) | ends,
-        final=torch.where(ends, left, torch.nan).to(dtype),
+        final=torch.where(ends, remaining_s, torch.nan).to(dtype),
         loss=problem.time_budget_s.to(dtype),
         hazard=None if hazard is None else fine(hazard).to(dtype).masked_fill(ends, 0),
         immobile_s=None

@@ -61,26 +61,26 @@ class Moves:
         """Those of a unicycle: as far as turns come to whole headings, but at least
         one, and at most a cell else.
         """
-        (top, most), bin_rad = robot.action_high, 2 * math.pi / headings
-        found = [((top, 0.0), cell_m / top, 0)]
-        for speed, rate in ((top, most / 2), (top, most), (0.0, most)):
+        (top, max_rate), bin_rad = robot.action_high, 2 * math.pi / headings
+        moves = [((top, 0.0), cell_m / top, 0)]
+        for speed, rate in ((top, max_rate / 2), (top, max_rate), (0.0, max_rate)):
             bins = (
                 max(1, math.floor(cell_m * rate / speed / bin_rad + 1e-9))
                 if speed
                 else 1
             )
-            found += [
+            moves += [
                 ((speed, side * rate), bins * bin_rad / rate, side * bins)
                 for side in (1, -1)
             ]
-        actions, seconds, turns = zip(*found, strict=True)
+        actions, seconds, turns = zip(*moves, strict=True)
         return cls(
             torch.tensor(actions, dtype=torch.float64),
             torch.tensor(seconds, dtype=torch.float64),
             turns,
         )
 
-    def offsets(self, heading: Tensor, share: Tensor) -> Tensor:
+    def offsets(self, heading: Tensor, fraction: Tensor) -> Tensor:
         """How far a robot is from where it was, after some share of each action.
 
         Args:
@@ -91,7 +91,7 @@ class Moves:
             (x, y) in metres, shape [*K, A, N, 2].
         """
         speed, rate = self.actions.T.to(heading)[..., None]
-        time = self.seconds.to(heading)[:, None] * share
+        time = self.seconds.to(heading)[:, None] * fraction
         angle = heading[..., None, None]
         # sin(ωt/2) / (ωt/2) of the chord, along the mean heading.
         chord = speed * time * torch.sinc(rate * time / (2 * math.pi))
@@ -160,9 +160,9 @@ def value_iteration(costs: Costs, moves: Moves, grid: Grid, headings: int) -> Co
     arcs = _arcs(moves, grid, headings, costs.rate)
     maps = torch.arange(len(costs.rate), device=costs.rate.device).split(_MAPS_AT_ONCE)
     solved = [_solve(costs.select(chunk), arcs, grid) for chunk in maps]
-    dwell = [each.max_dwell_s for each in solved if each.max_dwell_s is not None]
+    dwell = [part.max_dwell_s for part in solved if part.max_dwell_s is not None]
     return CostToGo(
-        value=torch.cat([each.value for each in solved]),
+        value=torch.cat([part.value for part in solved]),
         max_dwell_s=torch.cat(dwell) if dwell else None,
     )
 
@@ -202,19 +202,19 @@ def _arcs(moves: Moves, grid: Grid, headings: int, like: Tensor) -> list[_Arc]:
         moves.offsets(headings_of(headings), shares) / grid.resolution_m
     )  # [Q, A, N + 1, 2]
     reach = max(1, math.ceil(float(offsets.abs().max()) - 1e-9))
-    found = []
-    for place, (seconds, turn) in enumerate(
+    arcs = []
+    for index, (seconds, turn) in enumerate(
         zip(moves.seconds.tolist(), moves.turns, strict=True)
     ):
         passed, ends = (
             torch.zeros(headings, 2 * reach + 1, 2 * reach + 1) for _ in range(2)
         )
-        own = offsets[:, place].flip(-1) + reach  # rows and columns
-        cells = (own[:, :-1] + 0.5).floor().long()
+        cells_at = offsets[:, index].flip(-1) + reach  # rows and columns
+        cells = (cells_at[:, :-1] + 0.5).floor().long()
         for heading in range(headings):
             for row, column in cells[heading].tolist():
                 passed[heading, row, column] += 1 / _POINTS
-            end = own[heading, -1].tolist()
+            end = cells_at[heading, -1].tolist()
             row, column = (min(math.floor(part + 1e-9), 2 * reach - 1) for part in end)
             for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
                 beside = (
@@ -222,12 +222,12 @@ def _arcs(moves: Moves, grid: Grid, headings: int, like: Tensor) -> list[_Arc]:
                     abs(1 - across - (end[1] - column)),
                 )
                 ends[heading, row + down, column + across] += beside[0] * beside[1]
-        metres = float(moves.actions[place, 0].abs()) * seconds
+        metres = float(moves.actions[index, 0].abs()) * seconds
         points = tuple(
             (cells[:, number, 0].tolist(), cells[:, number, 1].tolist())
             for number in range(_POINTS)
         )
-        found.append(
+        arcs.append(
             _Arc(
                 seconds,
                 metres,
@@ -237,15 +237,15 @@ def _arcs(moves: Moves, grid: Grid, headings: int, like: Tensor) -> list[_Arc]:
                 points,
             )
         )
-    return found
+    return arcs
 
 
 def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> CostToGo:
     headings, levels = len(arcs[0].ends), costs.levels
     frame = (arcs[0].reach,) * 4
     weights = torch.where(costs.open, 1.0, _BARRED)[:, None]
-    spent, share, dwells = [], [], []
-    kept: list[Tensor | None] = []
+    spent, scales, dwells = [], [], []
+    survivals: list[Tensor | None] = []
     # Off the map a second costs as much as no way at all, and a cell beyond is as the
     # one at the border.
     rate, framed = (
@@ -254,25 +254,25 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> CostToGo:
     )
     for arc in arcs:
         cost = arc.seconds * conv2d(rate, arc.passed)
-        share.append(1 / conv2d(framed, arc.ends))
-        keep = None
+        scales.append(1 / conv2d(framed, arc.ends))
+        survival = None
         if costs.hazard is not None:
-            keep = torch.exp(
+            survival = torch.exp(
                 -arc.metres * conv2d(pad(costs.hazard[:, None], frame), arc.passed)
             )
-            cost = cost + (1 - keep) * costs.loss[:, None, None, None]
+            cost = cost + (1 - survival) * costs.loss[:, None, None, None]
         spent.append(cost)
-        kept.append(keep)
+        survivals.append(survival)
         dwells.append(None if costs.immobile_s is None else _dwell_along(costs, arc))
 
-    def at_end(arc: _Arc, share: Tensor, values: Tensor) -> Tensor:
+    def at_end(arc: _Arc, scales: Tensor, values: Tensor) -> Tensor:
         """Values between the cells and headings where an arc ends."""
         turned = values.roll(-arc.turn, 2)
         if not arc.metres:
             return turned
         inside = pad((turned * weights[:, None]).flatten(0, 1), frame, mode="replicate")
         return (
-            conv2d(inside, arc.ends, groups=headings).view_as(values) * share[:, None]
+            conv2d(inside, arc.ends, groups=headings).view_as(values) * scales[:, None]
         )
 
     final = costs.final[:, None, None]
@@ -287,20 +287,20 @@ def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> CostToGo:
     settled = torch.zeros_like(final, dtype=torch.bool)[..., :1, :1]
     for sweep in range(1, _MOST_SWEEPS * max(grid.shape)):
         before, dwell_before = value, dwell
-        for number, arc in enumerate(arcs):
-            ended, along = at_end(arc, share[number], value), dwells[number]
+        for index, arc in enumerate(arcs):
+            ended, along = at_end(arc, scales[index], value), dwells[index]
             ended_dwell = None
             if along is not None:
                 assert dwell is not None
                 ended, ended_dwell = along.before(
-                    ended, at_end(arc, share[number], dwell), costs.lost_after_s
+                    ended, at_end(arc, scales[index], dwell), costs.lost_after_s
                 )
-            keep = kept[number]
-            found = (ended if keep is None else ended * keep[:, None]) + spent[number][
-                :, None
-            ]
-            better = final.isnan() & (found < value)
-            value = torch.where(better, found, value)
+            survival = survivals[index]
+            candidate = (
+                ended if survival is None else ended * survival[:, None]
+            ) + spent[index][:, None]
+            better = final.isnan() & (candidate < value)
+            value = torch.where(better, candidate, value)
             if ended_dwell is not None:
                 assert dwell is not None
                 dwell = torch.where(better, ended_dwell, dwell)
@@ -352,15 +352,15 @@ class _Dwell:
         dwell = torch.where(is_lost, 0.0, dwell)
         # The more dwell time a drive leaves, the more it costs: the first that leaves
         # enough is the cheapest.
-        least_s = [
+        min_dwell_s = [
             max(level * lost_after_s / levels, _LEAST_DWELL_S)
             for level in range(levels)
         ]
-        index = torch.stack([(dwell < least).sum(1) for least in least_s], 1)
-        none = torch.full_like(value[:, :1], UNREACHED)
-        unlimited = torch.full_like(none, lost_after_s)
+        index = torch.stack([(dwell < min_s).sum(1) for min_s in min_dwell_s], 1)
+        unreached = torch.full_like(value[:, :1], UNREACHED)
+        unlimited = torch.full_like(unreached, lost_after_s)
         return (
-            torch.cat((value, none), 1).gather(1, index),
+            torch.cat((value, unreached), 1).gather(1, index),
             torch.cat((dwell, unlimited), 1).gather(1, index),
         )
 

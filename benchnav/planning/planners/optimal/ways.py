@@ -49,7 +49,7 @@ class OptimalState(Batch):
     grid: Grid
     costs: Costs
     to_go: CostToGo
-    held: Tensor
+    dwell_s: Tensor
     taken: Tensor
     drive: Drive | None = None
 
@@ -73,7 +73,7 @@ class Ways:
     heading: Tensor
 
 
-def ways_from(pose: Tensor, held: Tensor, plan_state: OptimalState) -> Ways:
+def ways_from(pose: Tensor, dwell_s: Tensor, plan_state: OptimalState) -> Ways:
     """Finds ways to near cells, and what they cost.
 
     Args:
@@ -84,24 +84,26 @@ def ways_from(pose: Tensor, held: Tensor, plan_state: OptimalState) -> Ways:
     grid, robot = plan_state.grid, plan_state.problem.robot
     top, rate = robot.action_high
     row, column, inside = _near(pose, grid)
-    away = torch.stack(grid.centre_of(row, column), -1) - pose[:, None, :2]
-    ahead, left = _seen_from(pose[:, 2:], away)
-    bearing = torch.atan2(left, ahead)
+    offset = torch.stack(grid.centre_of(row, column), -1) - pose[:, None, :2]
+    ahead, leftward = _seen_from(pose[:, 2:], offset)
+    bearing = torch.atan2(leftward, ahead)
     # A turn until the robot looks at the cell, or as far beside it as it drives along a
     # circle for.
-    off = torch.cat(
-        [(bearing.abs() - most).clamp(min=0) for most in (0.0, *_BESIDE)], 1
+    turn_first = torch.cat(
+        [(bearing.abs() - max_bearing).clamp(min=0) for max_bearing in (0.0, *_BESIDE)],
+        1,
     )
     count = len(_BESIDE) + 1
-    away, bearing, inside = (
-        own.repeat(1, count, *[1] * (own.dim() - 2)) for own in (away, bearing, inside)
+    offset, bearing, inside = (
+        own.repeat(1, count, *[1] * (own.dim() - 2))
+        for own in (offset, bearing, inside)
     )
     side = torch.where(bearing < 0, -1.0, 1.0).to(pose)
-    first = pose[:, 2:] + side * off
-    ahead, left = _seen_from(first, away)
+    first = pose[:, 2:] + side * turn_first
+    ahead, leftward = _seen_from(first, offset)
     # The circle until the robot looks at the cell, where the cell is not within it.
     radius = torch.as_tensor(top / rate).to(pose)
-    past = side * left - radius
+    past = side * leftward - radius
     square = ahead.square() + past.square() - radius.square()
     straight = square.clamp(min=0).sqrt()
     arc = (
@@ -113,9 +115,9 @@ def ways_from(pose: Tensor, held: Tensor, plan_state: OptimalState) -> Ways:
     )
     possible = inside & (square >= 0) & (arc <= math.pi)
 
-    share = (torch.arange(_POINTS, device=pose.device) + 0.5) / _POINTS
+    fractions = (torch.arange(_POINTS, device=pose.device) + 0.5) / _POINTS
     drive_s = arc / rate + straight / top
-    time = share * drive_s[..., None]
+    time = fractions * drive_s[..., None]
     turning = torch.minimum(time, arc[..., None] / rate)
     chord = 2 * radius * (turning * rate / 2).sin()
     mean = first[..., None] + side[..., None] * turning * rate / 2
@@ -128,44 +130,49 @@ def ways_from(pose: Tensor, held: Tensor, plan_state: OptimalState) -> Ways:
         -1,
     )
     cells = row.repeat(1, count), column.repeat(1, count)
-    cost = _cost(pose, held, points, off / rate, drive_s, heading, cells, plan_state)
+    cost = _cost(
+        pose, dwell_s, points, turn_first / rate, drive_s, heading, cells, plan_state
+    )
     return Ways(
         cost=torch.where(possible, cost, UNREACHED),
-        turn=side * (off + arc),
-        rolls=off == 0,
-        points=torch.cat((points, (pose[:, None, :2] + away)[:, :, None]), 2),
+        turn=side * (turn_first + arc),
+        rolls=turn_first == 0,
+        points=torch.cat((points, (pose[:, None, :2] + offset)[:, :, None]), 2),
         heading=heading,
     )
 
 
-def _seen_from(heading: Tensor, away: Tensor) -> tuple[Tensor, Tensor]:
+def _seen_from(heading: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
     """How far ahead and to the left offsets [B, K, 2] are for a robot of headings [B,
     1] or [B, K].
     """
-    x, y, cosine, sine = away[..., 0], away[..., 1], heading.cos(), heading.sin()
+    x, y, cosine, sine = offset[..., 0], offset[..., 1], heading.cos(), heading.sin()
     return x * cosine + y * sine, y * cosine - x * sine
 
 
-def path_of(plan_state: OptimalState, pose: Tensor, held: Tensor) -> Tensor:
+def path_of(plan_state: OptimalState, pose: Tensor, dwell_s: Tensor) -> Tensor:
     """Positions along the best ways, one after another, until the goal, shape [B, N,
     2]; NaN behind it.
     """
-    problem, found = plan_state.problem, [pose[:, None, :2]]
-    own = torch.arange(len(pose), device=pose.device)
+    problem, points_of_path = plan_state.problem, [pose[:, None, :2]]
+    member = torch.arange(len(pose), device=pose.device)
     for _ in range(_DRAWN_WAYS):
-        left = (
+        is_away = (
             torch.linalg.vector_norm(pose[:, :2] - problem.goal_m, dim=1)
             >= problem.goal_radius_m
         )
-        if not bool(left.any()):
+        if not bool(is_away.any()):
             break
-        ways = ways_from(pose, held, plan_state)
+        ways = ways_from(pose, dwell_s, plan_state)
         best = ways.cost.argmin(1)
-        points = ways.points[own, best]
-        found.append(torch.where(left[:, None, None], points, torch.nan))
-        ended = torch.cat((points[:, -1], ways.heading[own, best, None]), 1)
-        pose, held = torch.where(left[:, None], ended, pose), torch.zeros_like(held)
-    return torch.cat(found, 1)
+        points = ways.points[member, best]
+        points_of_path.append(torch.where(is_away[:, None, None], points, torch.nan))
+        ended = torch.cat((points[:, -1], ways.heading[member, best, None]), 1)
+        pose, dwell_s = (
+            torch.where(is_away[:, None], ended, pose),
+            torch.zeros_like(dwell_s),
+        )
+    return torch.cat(points_of_path, 1)
 
 
 def _near(pose: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
@@ -173,17 +180,17 @@ def _near(pose: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
     shape [B, K].
     """
     around = torch.arange(-_NEAR_CELLS, _NEAR_CELLS + 1, device=pose.device)
-    near = torch.cartesian_prod(around, around)
-    near = near[(near.square().sum(1) <= _NEAR_CELLS**2) & near.any(1)]
-    row, column = (own[:, None] for own in grid.cell_of(pose[:, 0], pose[:, 1]))
-    row, column = row + near[:, 0], column + near[:, 1]
+    offsets = torch.cartesian_prod(around, around)
+    offsets = offsets[(offsets.square().sum(1) <= _NEAR_CELLS**2) & offsets.any(1)]
+    row, column = (index[:, None] for index in grid.cell_of(pose[:, 0], pose[:, 1]))
+    row, column = row + offsets[:, 0], column + offsets[:, 1]
     inside = (row >= 0) & (row < grid.height) & (column >= 0) & (column < grid.width)
     return row, column, inside
 
 
 def _cost(
     pose: Tensor,
-    held: Tensor,
+    dwell_s: Tensor,
     points: Tensor,
     spot_s: Tensor,
     drive_s: Tensor,
@@ -208,24 +215,26 @@ def _cost(
     def read(values: Tensor, outside: float) -> tuple[Tensor, Tensor]:
         """What a map holds where the robots are, [B, 1], and along the ways, [B, K, N]."""
         padded = grid.pad(values, outside)
-        here = grid.lookup(padded, pose[:, :1], pose[:, 1:2])
-        return here, grid.lookup(padded, points[..., 0], points[..., 1])
+        at_robot = grid.lookup(padded, pose[:, :1], pose[:, 1:2])
+        return at_robot, grid.lookup(padded, points[..., 0], points[..., 1])
 
-    here, along = read(costs.rate, UNREACHED)
-    cost = spot_s * here + drive_s * along.mean(2)
-    most = now = torch.zeros_like(cost)
+    at_robot, along = read(costs.rate, UNREACHED)
+    cost = spot_s * at_robot + drive_s * along.mean(2)
+    max_dwell = current_dwell = torch.zeros_like(cost)
     if costs.immobile_s is not None:
-        here, along = read(costs.immobile_s, 0.0)
-        most = now = torch.where(here > 0, held[:, None] + spot_s * here, 0.0)
+        at_robot, along = read(costs.immobile_s, 0.0)
+        max_dwell = current_dwell = torch.where(
+            at_robot > 0, dwell_s[:, None] + spot_s * at_robot, 0.0
+        )
         for seconds in (along * drive_s[..., None] / _POINTS).unbind(2):
-            now = torch.where(seconds > 0, now + seconds, 0.0)
-            most = torch.maximum(most, now)
-    to_go = _value_at(plan_state.to_go, now, heading, cells)
+            current_dwell = torch.where(seconds > 0, current_dwell + seconds, 0.0)
+            max_dwell = torch.maximum(max_dwell, current_dwell)
+    to_go = _value_at(plan_state.to_go, current_dwell, heading, cells)
     if costs.hazard is not None:
         _, along = read(costs.hazard, 0.0)
-        kept = torch.exp(-along.mean(2) * drive_s * problem.robot.top_speed_mps)
-        to_go = kept * to_go + (1 - kept) * costs.loss[:, None]
-    return torch.where(most < costs.lost_after_s, cost + to_go, UNREACHED)
+        survival = torch.exp(-along.mean(2) * drive_s * problem.robot.top_speed_mps)
+        to_go = survival * to_go + (1 - survival) * costs.loss[:, None]
+    return torch.where(max_dwell < costs.lost_after_s, cost + to_go, UNREACHED)
 
 
 def _value_at(
@@ -236,20 +245,20 @@ def _value_at(
     """
     _, levels, headings, height, width = to_go.value.shape
     row, column = cells[0].clamp(0, height - 1), cells[1].clamp(0, width - 1)
-    place = heading / (2 * math.pi / headings)
-    first = place.floor()
+    bin = heading / (2 * math.pi / headings)
+    first = bin.floor()
     index = [
-        (first.long() + more) % headings * height * width + row * width + column
-        for more in (0, 1)
+        (first.long() + step) % headings * height * width + row * width + column
+        for step in (0, 1)
     ]
 
     def read(values: Tensor) -> Tensor:
         """Values of all levels, shape [B, L, K]."""
         flat = values.flatten(2)
         before, behind = (
-            flat.gather(2, each[:, None].expand(-1, levels, -1)) for each in index
+            flat.gather(2, indices[:, None].expand(-1, levels, -1)) for indices in index
         )
-        return torch.lerp(before, behind, (place - first)[:, None])
+        return torch.lerp(before, behind, (bin - first)[:, None])
 
     value = read(to_go.value)
     if to_go.max_dwell_s is not None:
