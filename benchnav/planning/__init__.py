@@ -17,7 +17,8 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.planning.planners.astar.astar_dwa": ("AStarDWA",),
         "benchnav.planning.planners.astar.astar_mppi": ("AStarMPPI",),
         "benchnav.planning.planners.cl_rrt.cl_rrt": ("CLRRT",),
-        "benchnav.planning.planners.mppi": ("MPPI", "MPPIConfig"),
+        "benchnav.planning.planners.mppi": ("MPPI",),
+        "benchnav.planning.planners.mppi_config": ("MPPIConfig",),
         "benchnav.planning.planners.optimal.optimal": ("NearOptimal", "Optimal"),
         "benchnav.planning.planners.planner": (
             "LocalPlanner",

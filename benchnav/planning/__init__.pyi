@@ -3,7 +3,8 @@ from benchnav.planning.objective import GoalDistance, Objective, TravelTime, dis
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI
 from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig
+from benchnav.planning.planners.mppi import MPPI
+from benchnav.planning.planners.mppi_config import MPPIConfig
 from benchnav.planning.planners.optimal.optimal import NearOptimal, Optimal
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, PlanStatus
 from benchnav.planning.planners.straight import Straight

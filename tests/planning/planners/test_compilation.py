@@ -16,7 +16,8 @@ from benchnav.planning.planners import compilation
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig
 from benchnav.planning.planners.astar.dwa import DWAConfig
 from benchnav.planning.planners.compilation import Fused, worth_compiling
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig
+from benchnav.planning.planners.mppi import MPPI
+from benchnav.planning.planners.mppi_config import MPPIConfig
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.belief import CovarianceModel, Fields, Static
 from tests import factories

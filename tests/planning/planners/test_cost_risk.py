@@ -25,12 +25,11 @@ from benchnav.planning.planners.cost_risk import (
     tail_cost,
     within_reach,
 )
-from benchnav.planning.planners.mppi import (
-    MPPI,
+from benchnav.planning.planners.mppi import MPPI, MPPIState
+from benchnav.planning.planners.mppi_config import MPPIConfig
+from benchnav.planning.planners.mppi_rollouts import (
     Dwell,
     Ends,
-    MPPIConfig,
-    MPPIState,
     advance_chunk,
     cost_spread,
     roll_out,

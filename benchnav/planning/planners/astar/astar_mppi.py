@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 
 from benchnav.core.errors import expect
 from benchnav.planning.planners.astar.guided import GuideConfig, Guided
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
+from benchnav.planning.planners.mppi import MPPI, MPPIState
+from benchnav.planning.planners.mppi_config import MPPIConfig
 from benchnav.planning.planners.straight import STEERS
 
 
