@@ -1,11 +1,11 @@
-"""Motion primitives to nearby cell centres, by which a robot goes down the cost to go.
+"""Motion primitives to nearby cell centres, by which a robot descends the cost to go.
 
-Between cells' centres the interpolated cost to go is too low before slow ground and too
-high in it, so that a robot that looks at its next moves alone may turn to and fro. Ways
-therefore end at centres, up to some cells away: a turn on the spot, along a circle at
-full speed, and straight on.
-Letters in shapes: B episodes, H×W cells, Q headings, K ways, N points, L levels of
-    dwell time.
+Between cell centres the interpolated cost to go is too low in front of slow terrain and
+too high in it. A robot that only compares its next actions may therefore oscillate.
+Hence motion primitives end at centres, up to some cells away. They turn in place,
+follow a circle at full speed, and then drive straight.
+Letters in shapes: B episodes, H×W cells, Q headings, K primitives, N points, L levels
+of dwell time.
 """
 
 import math
@@ -20,28 +20,26 @@ from benchnav.planning.planners.optimal.drive import Drive
 from benchnav.planning.planners.optimal.value import UNREACHED, Costs, CostToGo
 from benchnav.planning.problem import Problem
 
-_NEAR_CELLS = 4  # how far ways lead
-_POINTS = 16  # N, along a way
-_BESIDE = (
-    math.pi / 4,
-    math.pi / 2,
-)  # how far beside a robot's heading a cell may lie for a circle
-_EVEN = 1e-4  # an arc of a whole circle but for rounding is none
-_DRAWN_WAYS = 100  # of the path that is drawn
+_NEAR_CELLS = 4  # maximum distance of ends
+_POINTS = 16  # N, along a primitive
+# Maximum bearings of a cell at which a primitive begins on a circle.
+_BESIDE = (math.pi / 4, math.pi / 2)
+_EVEN = 1e-4  # an arc this close to a whole circle counts as none
+_DRAWN_WAYS = 100  # primitives of the path that is drawn
 
 
 @dataclass(frozen=True, kw_only=True)
 class OptimalState(Batch):
-    """What the optimal planner knows.
+    """Plan state of the optimal planner.
 
     Args:
-        problem: what is being solved.
+        problem: the problem.
         grid: cells of value iteration, H×W.
-        costs: of driving on them.
+        costs: costs of driving on them.
         to_go: cost to go of every state.
-        held: dwell time of the robots in seconds, shape [B].
-        taken: steps taken, int64, shape [B].
-        drive: simulated to its end; a robot follows it as long as it is on it; None for
+        dwell_s: dwell times of the robots in seconds, shape [B].
+        taken: number of steps taken, int64, shape [B].
+        drive: simulated drive, which a robot follows as long as it is on it; None for
             none.
     """
 
@@ -56,13 +54,13 @@ class OptimalState(Batch):
 
 @dataclass(frozen=True)
 class Ways:
-    """Ways from where robots are, K of them in each episode.
+    """Motion primitives from the robots' poses, K of them in each episode.
 
     Args:
-        cost: of the way and from its end to the goal, shape [B, K].
-        turn: angle by which the robot turns first, shape [B, K].
-        rolls: whether it drives while it turns, bool, shape [B, K].
-        points: (x, y) along the way, the last at its end, shape [B, K, N + 1, 2].
+        cost: cost of the primitive and from its end to the goal, shape [B, K].
+        turn: angle by which the robot turns first, in radians, shape [B, K].
+        rolls: mask of primitives that drive while turning, bool, shape [B, K].
+        points: (x, y) along the primitive, the last at its end, shape [B, K, N + 1, 2].
         heading: θ at its end, shape [B, K].
     """
 
@@ -74,11 +72,11 @@ class Ways:
 
 
 def ways_from(pose: Tensor, dwell_s: Tensor, plan_state: OptimalState) -> Ways:
-    """Finds ways to near cells, and what they cost.
+    """Return motion primitives to nearby cells, and their costs.
 
     Args:
         pose: (x, y, θ), shape [B, 3].
-        held: dwell time of the robots in seconds, shape [B].
+        dwell_s: dwell times of the robots in seconds, shape [B].
         plan_state: costs and values.
     """
     grid, robot = plan_state.grid, plan_state.problem.robot
@@ -87,8 +85,8 @@ def ways_from(pose: Tensor, dwell_s: Tensor, plan_state: OptimalState) -> Ways:
     offset = torch.stack(grid.centre_of(row, column), -1) - pose[:, None, :2]
     ahead, leftward = _seen_from(pose[:, 2:], offset)
     bearing = torch.atan2(leftward, ahead)
-    # A turn until the robot looks at the cell, or as far beside it as it drives along a
-    # circle for.
+    # A turn in place until the robot faces the cell, or has it at a bearing of
+    # `_BESIDE`.
     turn_first = torch.cat(
         [(bearing.abs() - max_bearing).clamp(min=0) for max_bearing in (0.0, *_BESIDE)],
         1,
@@ -101,18 +99,13 @@ def ways_from(pose: Tensor, dwell_s: Tensor, plan_state: OptimalState) -> Ways:
     side = torch.where(bearing < 0, -1.0, 1.0).to(pose)
     first = pose[:, 2:] + side * turn_first
     ahead, leftward = _seen_from(first, offset)
-    # The circle until the robot looks at the cell, where the cell is not within it.
+    # The arc until the robot faces the cell, if the cell is outside the circle.
     radius = torch.as_tensor(top / rate).to(pose)
     past = side * leftward - radius
     square = ahead.square() + past.square() - radius.square()
     straight = square.clamp(min=0).sqrt()
-    arc = (
-        torch.remainder(
-            torch.atan2(past, ahead) + torch.atan2(radius, straight) + _EVEN,
-            2 * math.pi,
-        )
-        - _EVEN
-    )
+    angle = torch.atan2(past, ahead) + torch.atan2(radius, straight) + _EVEN
+    arc = torch.remainder(angle, 2 * math.pi) - _EVEN
     possible = inside & (square >= 0) & (arc <= math.pi)
 
     fractions = (torch.arange(_POINTS, device=pose.device) + 0.5) / _POINTS
@@ -121,46 +114,49 @@ def ways_from(pose: Tensor, dwell_s: Tensor, plan_state: OptimalState) -> Ways:
     turning = torch.minimum(time, arc[..., None] / rate)
     chord = 2 * radius * (turning * rate / 2).sin()
     mean = first[..., None] + side[..., None] * turning * rate / 2
-    heading, on = first + side * arc, top * (time - turning)
-    points = pose[:, None, None, :2] + torch.stack(
-        (
-            chord * mean.cos() + on * heading[..., None].cos(),
-            chord * mean.sin() + on * heading[..., None].sin(),
-        ),
-        -1,
-    )
+    heading = first + side * arc
+    straight_m = top * (time - turning)
+    x = chord * mean.cos() + straight_m * heading[..., None].cos()
+    y = chord * mean.sin() + straight_m * heading[..., None].sin()
+    points = pose[:, None, None, :2] + torch.stack((x, y), -1)
     cells = row.repeat(1, count), column.repeat(1, count)
     cost = _cost(
         pose, dwell_s, points, turn_first / rate, drive_s, heading, cells, plan_state
     )
+    ends = (pose[:, None, :2] + offset)[:, :, None]
     return Ways(
         cost=torch.where(possible, cost, UNREACHED),
         turn=side * (turn_first + arc),
         rolls=turn_first == 0,
-        points=torch.cat((points, (pose[:, None, :2] + offset)[:, :, None]), 2),
+        points=torch.cat((points, ends), 2),
         heading=heading,
     )
 
 
 def _seen_from(heading: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """How far ahead and to the left offsets [B, K, 2] are for a robot of headings [B,
-    1] or [B, K].
+    """Return how far ahead and to the left offsets are.
+
+    Args:
+        heading: headings of the robots, [B, 1] or [B, K].
+        offset: (x, y) in metres, [B, K, 2].
     """
-    x, y, cosine, sine = offset[..., 0], offset[..., 1], heading.cos(), heading.sin()
+    x = offset[..., 0]
+    y = offset[..., 1]
+    cosine = heading.cos()
+    sine = heading.sin()
     return x * cosine + y * sine, y * cosine - x * sine
 
 
 def path_of(plan_state: OptimalState, pose: Tensor, dwell_s: Tensor) -> Tensor:
-    """Positions along the best ways, one after another, until the goal, shape [B, N,
-    2]; NaN behind it.
+    """Return positions along the best primitives to the goal, shape [B, N, 2].
+
+    NaN behind the goal.
     """
     problem, points_of_path = plan_state.problem, [pose[:, None, :2]]
     member = torch.arange(len(pose), device=pose.device)
     for _ in range(_DRAWN_WAYS):
-        is_away = (
-            torch.linalg.vector_norm(pose[:, :2] - problem.goal_m, dim=1)
-            >= problem.goal_radius_m
-        )
+        distance_m = torch.linalg.vector_norm(pose[:, :2] - problem.goal_m, dim=1)
+        is_away = distance_m >= problem.goal_radius_m
         if not bool(is_away.any()):
             break
         ways = ways_from(pose, dwell_s, plan_state)
@@ -176,8 +172,9 @@ def path_of(plan_state: OptimalState, pose: Tensor, dwell_s: Tensor) -> Tensor:
 
 
 def _near(pose: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows and columns of the cells around robots, and which lie on the map, each of
-    shape [B, K].
+    """Return rows and columns of cells around robots, and a mask of those on the map.
+
+    Each has the shape [B, K].
     """
     around = torch.arange(-_NEAR_CELLS, _NEAR_CELLS + 1, device=pose.device)
     offsets = torch.cartesian_prod(around, around)
@@ -198,22 +195,24 @@ def _cost(
     cells: tuple[Tensor, ...],
     plan_state: OptimalState,
 ) -> Tensor:
-    """Cost of ways and from their ends on, shape [B, K].
+    """Return costs of primitives and from their ends on, shape [B, K].
 
     Args:
         pose: (x, y, θ), shape [B, 3].
-        held: dwell time of the robots in seconds, shape [B].
-        points: (x, y) along the ways, shape [B, K, N, 2].
-        spot_s: for how long they turn on the spot, with λ = 1, shape [B, K].
-        drive_s: for how long they drive, with λ = 1, shape [B, K].
+        dwell_s: dwell times of the robots in seconds, shape [B].
+        points: (x, y) along the primitives, shape [B, K, N, 2].
+        spot_s: duration of the turn in place at λ = 1, shape [B, K].
+        drive_s: duration of the drive at λ = 1, shape [B, K].
         heading: θ at the ends, shape [B, K].
         cells: rows and columns of the ends, each of shape [B, K].
         plan_state: costs and values.
     """
-    grid, costs, problem = plan_state.grid, plan_state.costs, plan_state.problem
+    grid = plan_state.grid
+    costs = plan_state.costs
+    problem = plan_state.problem
 
     def read(values: Tensor, outside: float) -> tuple[Tensor, Tensor]:
-        """What a map holds where the robots are, [B, 1], and along the ways, [B, K, N]."""
+        """Return map values at the robots, [B, 1], and along primitives, [B, K, N]."""
         padded = grid.pad(values, outside)
         at_robot = grid.lookup(padded, pose[:, :1], pose[:, 1:2])
         return at_robot, grid.lookup(padded, points[..., 0], points[..., 1])
@@ -240,8 +239,9 @@ def _cost(
 def _value_at(
     to_go: CostToGo, dwell_s: Tensor, heading: Tensor, cells: tuple[Tensor, ...]
 ) -> Tensor:
-    """The cost to go of poses at cells' centres, between headings, shape [B, K]; cells
-    off the map mean nothing.
+    """Return the cost to go of poses at cell centres, between headings, shape [B, K].
+
+    It is undefined for cells off the map.
     """
     _, levels, headings, height, width = to_go.value.shape
     row, column = cells[0].clamp(0, height - 1), cells[1].clamp(0, width - 1)
@@ -253,7 +253,7 @@ def _value_at(
     ]
 
     def read(values: Tensor) -> Tensor:
-        """Values of all levels, shape [B, L, K]."""
+        """Return values of all levels, shape [B, L, K]."""
         flat = values.flatten(2)
         before, behind = (
             flat.gather(2, indices[:, None].expand(-1, levels, -1)) for indices in index
@@ -262,7 +262,6 @@ def _value_at(
 
     value = read(to_go.value)
     if to_go.max_dwell_s is not None:
-        value = torch.where(
-            read(to_go.max_dwell_s) > dwell_s[:, None], value, UNREACHED
-        )
+        is_possible = read(to_go.max_dwell_s) > dwell_s[:, None]
+        value = torch.where(is_possible, value, UNREACHED)
     return value.amin(1)
