@@ -59,24 +59,24 @@ from benchnav.planning.robots import (
 
 BOUNDED_ROBOTS = (Unicycle, DifferentialDrive, Bicycle)
 
-_MOST_SQUARES = 300_000  # of a map; the equations' factors stay under a gigabyte
-_LEAST_TRAVERSABILITY = 1e-3
+_MAX_SQUARES = 300_000  # of a map; the equations' factors stay under a gigabyte
+_MIN_TRAVERSABILITY = 1e-3
 _ULPS = 4 * 2.0**-24  # of a position, as a share of the map's extent
 _RELAXATION = 1.6
 # of what the gradient misses, in units of the flux at the goal over the slowness
 _WEIGHT = 5.0
 _EXCESS = 1.004  # of slopes, at which to stop
 _CHECK_EVERY = 25  # steps
-_MOST_STEPS = 300
+_MAX_STEPS = 300
 
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """What bounds the motion of robots in an episode.
+    """Bounds of the motion of robots in an episode.
 
     Args:
         robot: one of the shipped robots, whose λ scales its speed.
-        goal_radius_m: a robot this near to the goal has arrived.
+        goal_radius_m: distance to the goal below which a robot has reached it.
         immobile: what immobilises a robot; None for nothing.
     """
 
@@ -93,17 +93,17 @@ class Motion:
 def lower_bound_s(
     field: ndarray, grid: Grid, motion: Motion, start_m: ndarray, goal_m: ndarray
 ) -> float:
-    """Bound the time to the goal from below, for all trajectories.
+    """Return a lower bound of the time to the goal, for all trajectories.
 
     Args:
         field: λ of each cell during the whole episode, in [0, 1], shape [H, W].
-        grid: of the map.
-        motion: of the robot.
-        start_m: (x, y), shape [2].
-        goal_m: (x, y), shape [2].
+        grid: grid of the map.
+        motion: bounds of the robot's motion.
+        start_m: start (x, y) in metres, shape [2].
+        goal_m: goal (x, y) in metres, shape [2].
 
     Returns:
-        Seconds; 0 at the goal, infinite where no trajectory arrives.
+        Seconds; 0 at the goal, infinite if no trajectory reaches it.
     """
     start_m, goal_m = np.asarray(start_m, np.float64), np.asarray(goal_m, np.float64)
     error_m = _ULPS * max(grid.extent_m)
@@ -131,17 +131,18 @@ def lower_bound_s(
     reach = (
         _reached(fine, squares, motion.step_m, 2 * error_m) + error_m / motion.step_m
     )
-    slowness = 1 / (motion.robot.top_speed_mps * reach.clip(_LEAST_TRAVERSABILITY))
+    slowness = 1 / (motion.robot.top_speed_mps * reach.clip(_MIN_TRAVERSABILITY))
     mesh = Mesh(squares, slowness, is_reachable, ends & is_reachable)
     return mesh.value_at(largest(mesh, motion.goal_radius_m), start_m)
 
 
 def _refined(grid: Grid, step_m: float) -> Grid:
-    """Squares about as wide as a step, a whole number of them along each side of a
-    cell.
+    """Return a grid of squares about as wide as a step.
+
+    A whole number of them covers each side of a cell.
     """
     times = max(1, math.ceil(grid.resolution_m / step_m - 1e-6))
-    times = max(1, min(times, math.isqrt(_MOST_SQUARES // (grid.height * grid.width))))
+    times = max(1, min(times, math.isqrt(_MAX_SQUARES // (grid.height * grid.width))))
     return Grid(grid.height * times, grid.width * times, grid.resolution_m / times)
 
 
@@ -151,9 +152,7 @@ def _deepest_m(motion: Motion, immobile: Immobile) -> float:
 
 
 def _squares_within(squares: Grid, point_m: ndarray, radius_m: float) -> ndarray:
-    """Tell which closed squares come as near to a point as a radius, bool, of the shape
-    of the squares.
-    """
+    """Return a mask of closed squares within a radius of a point, bool."""
     gaps_m = []
     for size, at_m in zip(squares.shape, point_m[::-1], strict=True):
         low_m = np.arange(size) * squares.resolution_m
@@ -164,9 +163,7 @@ def _squares_within(squares: Grid, point_m: ndarray, radius_m: float) -> ndarray
 
 
 def _around(squares: Grid, reach_m: float) -> list[tuple[int, int, float]]:
-    """Offsets of squares at most so far away, and how far: the least distance of the
-    closed squares.
-    """
+    """Return offsets of squares within a distance, and the minimum distance of each."""
     max_offset = math.floor(reach_m / squares.resolution_m) + 1
     offsets = [
         (row, column)
@@ -185,7 +182,7 @@ def _around(squares: Grid, reach_m: float) -> list[tuple[int, int, float]]:
 
 
 def _shifted(values: ndarray, row: int, column: int) -> ndarray:
-    """Values some rows and columns on, 0 beyond the edge."""
+    """Return values shifted by some rows and columns, 0 beyond the edge."""
     height, width = values.shape
     margin = max(abs(row), abs(column))
     framed = np.pad(values, margin)
@@ -193,7 +190,7 @@ def _shifted(values: ndarray, row: int, column: int) -> ndarray:
 
 
 def _near(exits: ndarray, squares: Grid, reach_m: float) -> ndarray:
-    """Tell which squares have a point at most so far from an exit, bool."""
+    """Return a mask of squares with a point within a distance of an exit, bool."""
     is_near = exits.copy()
     for row, column, _ in _around(squares, reach_m):
         is_near |= _shifted(exits, row, column)
@@ -201,9 +198,7 @@ def _near(exits: ndarray, squares: Grid, reach_m: float) -> ndarray:
 
 
 def _reached(fine: ndarray, squares: Grid, step_m: float, error_m: float) -> ndarray:
-    """λ⁺: the greatest λ from which one step leads into each square, of the shape of
-    the squares.
-    """
+    """Return λ⁺, the maximum λ from which one step leads into each square."""
     fastest = fine.copy()
     for row, column, away_m in _around(squares, step_m + error_m):
         shifted = _shifted(fine, row, column)
@@ -258,8 +253,9 @@ class Mesh:
 
     @cached_property
     def rises(self) -> csr_array:
-        """From W at the free nodes to its rise over both legs of all triangles, shape
-        [2·T, free nodes].
+        """Matrix from W at the free nodes to its rise over both legs of all triangles.
+
+        Its shape is [2·T, free nodes].
         """
         count, triangles = len(self.right), np.arange(len(self.right))
         values, rows = np.repeat([1.0, -1.0], count), np.tile(triangles, 2)
@@ -271,13 +267,14 @@ class Mesh:
         return csr_array(vstack(legs).tocsc()[:, self.free])
 
     def excess(self, value: ndarray) -> float:
-        """Greatest slope of W over what is allowed, from W at all nodes, shape [N]."""
+        """Return the maximum slope of W relative to its bound, from W at all N nodes."""
         over = np.hypot(*(value[end] - value[self.right] for end in self.along))
         return float((over / self.rise).max())
 
     def value_at(self, value: ndarray, point_m: ndarray) -> float:
-        """W at a point, from W at all nodes, shape [N]; of a removed square it means
-        nothing.
+        """Return W at a point, from W at all nodes, shape [N].
+
+        It is undefined in a removed square.
         """
         position = point_m / self.squares.resolution_m
         column, row = (
@@ -301,11 +298,11 @@ class Mesh:
 
 
 def largest(mesh: Mesh, goal_radius_m: float) -> ndarray:
-    """Find nearly the largest W whose slopes are allowed, at all nodes, shape [N].
+    """Return nearly the largest W of bounded slope, at all nodes, shape [N].
 
     Args:
-        mesh: its triangles.
-        goal_radius_m: a length of the disc in which W ends, by which steps are scaled.
+        mesh: triangles.
+        goal_radius_m: radius of the disc on which W is 0, a length that scales steps.
     """
     rises, size = mesh.rises, mesh.squares.resolution_m
     value, count = np.zeros(len(mesh.free)), len(mesh.right)
@@ -322,7 +319,7 @@ def largest(mesh: Mesh, goal_radius_m: float) -> ndarray:
     source = size**2 / weight
     allowed = multiplier = np.zeros(2 * count)
     best = value
-    for step in range(1, _MOST_STEPS + 1):
+    for step in range(1, _MAX_STEPS + 1):
         free = solve(source + back @ (allowed - multiplier))
         over = _RELAXATION * (rises @ free) + (1 - _RELAXATION) * allowed
         target = over + multiplier

@@ -83,7 +83,7 @@ from benchnav.planning.problem import Problem, Task, motion_traversability
 from benchnav.planning.robots import SPEED, TURN_RATE
 from benchnav.planning.sensing.sensor import Step
 
-_STALL_M = 0.25  # progress less than this in `stall_s` is none
+_STALL_M = 0.25  # minimum progress within `stall_s`
 # fraction by which the cost of the path ahead rises before it is compared with a new
 # one
 _RISE = 0.1
@@ -121,7 +121,7 @@ class CLRRTConfig:
     follower: FollowerConfig = field(default_factory=FollowerConfig)
 
     def __post_init__(self) -> None:
-        """Refuses settings that grow no tree."""
+        """Validate the settings."""
         above = (
             "expansions",
             "expansions_per_round",
@@ -145,29 +145,29 @@ class CLRRTConfig:
 
     @property
     def rounds(self) -> int:
-        """Rounds of a plan, which is also the most edges that a path can have: D."""
+        """Rounds of a plan, also the maximum number of edges of a path: D."""
         return self.expansions // self.expansions_per_round
 
 
 @dataclass(frozen=True, kw_only=True)
 class CLRRTState(Batch):
-    """What CL-RRT carries from step to step.
+    """Plan state of CL-RRT.
 
     Args:
-        problem: what is being solved.
-        route: what is being followed.
-        edge: which edge of the path, int64, shape [B].
-        tracking: of the controller.
-        progress_m: arc length along the reference of that edge, shape [B].
-        failures: plans in a row without a way to the goal, int64, shape [B].
-        mark_m: progress along the path when last some was seen, shape [B].
-        mark_step: the step of it, int64, shape [B].
+        problem: the problem.
+        route: route that is followed.
+        edge: index of the current edge of the path, int64, shape [B].
+        tracking: state of the controller.
+        progress_m: arc length along the reference of that edge in metres, shape [B].
+        failures: consecutive plans without a path to the goal, int64, shape [B].
+        mark_m: progress along the path at the last mark, shape [B].
+        mark_step: step of that mark, int64, shape [B].
         ground: `Problem.padded_ground` on which the path was chosen, shape [B, N].
-        doubted: the path has become dearer since, and is to be compared with a new one,
-            bool, shape [B].
+        doubted: mask of paths that have become more expensive, and are to be compared
+            with new ones, bool, shape [B].
         follower: the controller.
         seed: root of the samples.
-        step: steps planned so far.
+        step: number of steps planned so far.
     """
 
     problem: Problem
@@ -186,7 +186,7 @@ class CLRRTState(Batch):
 
 
 class CLRRT(Planner[CLRRTState]):
-    """A tree of closed-loop simulations, and the controller on its quickest branch.
+    """Planner that grows a tree of closed-loop simulations and follows its best branch.
 
     Args:
         config: settings.
@@ -195,23 +195,21 @@ class CLRRT(Planner[CLRRTState]):
     steers = ((SPEED, TURN_RATE),)
 
     def __init__(self, config: CLRRTConfig | None = None) -> None:
-        """Keeps the settings; all else is in the plan state."""
+        """Store the settings."""
         self.config = config or CLRRTConfig()
 
     def uses(self, task: Task) -> frozenset[str]:
-        """λ̂ and free space; see `Planner`."""
+        """Return λ̂ and the input of free space; see `Planner`."""
         return frozenset({"risk_map", task.rules.free_space.source})
 
     def follows(self, task: Task) -> str:
-        """What the tree minimises where that is not J; see `Planner`."""
-        return (
-            ""
-            if isinstance(task.objective, TravelTime)
-            else "simulated time to the goal"
-        )
+        """Return what the tree minimises instead of J; see `Planner`."""
+        if isinstance(task.objective, TravelTime):
+            return ""
+        return "simulated time to the goal"
 
     def remarks(self, task: Task) -> tuple[str, ...]:
-        """Notes for tables; see `Planner`."""
+        """Return notes for tables; see `Planner`."""
         config, robot = self.config.follower, task.robot
         follower = PathFollower(config, robot)
         remarks = []
@@ -231,10 +229,10 @@ class CLRRT(Planner[CLRRTState]):
         return tuple(remarks)
 
     def init(self, problem: Problem, generator: torch.Generator) -> CLRRTState:
-        """Starts with no path, so that the first step plans; see `Planner`.
+        """Return a plan state without a path, so that the first step plans.
 
         Raises:
-            ConfigError: the robot cannot follow references, or none of the turning
+            ConfigError: If the robot cannot follow references, or not of the turning
                 radius.
         """
         config = self.config
@@ -271,7 +269,7 @@ class CLRRT(Planner[CLRRTState]):
     def plan(
         self, step: Step, plan_state: CLRRTState
     ) -> tuple[Tensor, CLRRTState, Plan]:
-        """Follows the path, planning anew where that is due; see `Planner`."""
+        """Return actions along the path, after a new plan if one is due; see `Planner`."""
         config, problem, state = self.config, plan_state.problem, step.state
         now = self._follow(state, plan_state)
         ground = problem.ground_at(state)
@@ -308,12 +306,14 @@ class CLRRT(Planner[CLRRTState]):
         )
 
     def select(self, plan_state: CLRRTState, members: Tensor) -> CLRRTState:
-        """Keeps some episodes, so that trees are grown for them alone; see `Planner`."""
+        """Return the plan state of some episodes; see `Planner`."""
         return plan_state.select(members)
 
     def revise(self, plan_state: CLRRTState, problem: Problem) -> CLRRTState:
-        """Keep paths that cost what they did, doubt dearer ones, leave those that are
-        free no more; see `Planner`.
+        """Return the plan state under another λ̂; see `Planner`.
+
+        Paths of unchanged cost are kept, more expensive ones are doubted, and those
+        that are no longer free are left.
         """
         route, before = plan_state.route, plan_state.problem
         points, length_m = self._ahead(route, problem, problem.start)
@@ -337,7 +337,7 @@ class CLRRT(Planner[CLRRTState]):
     def _ahead(
         self, route: Route, problem: Problem, state: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Pieces of the paths as `Route.pieces`, those behind the robots of length 0."""
+        """Return pieces of paths as `Route.pieces`; those behind robots have length 0."""
         points, length_m = route.pieces(0.5 * problem.grid.resolution_m)
         away = distance(points, state[:, None, :2]).masked_fill(length_m == 0, math.inf)
         ahead = (
@@ -347,8 +347,9 @@ class CLRRT(Planner[CLRRTState]):
         return points, torch.where(ahead, length_m, 0)
 
     def _cost(self, now: CLRRTState, ground: Tensor, length_m: Tensor) -> Tensor:
-        """Cost of pieces in seconds, [B], from values of `padded_ground` and lengths
-        [B, K], as of a tree's edges.
+        """Return costs of pieces in seconds, [B], as those of a tree's edges.
+
+        Pieces are given by values of `padded_ground` and lengths, [B, K].
         """
         robot, rules = now.problem.robot, now.problem.task.rules
         reach_mps = (
@@ -393,8 +394,9 @@ class CLRRT(Planner[CLRRTState]):
         )
 
     def _off_route(self, state: Tensor, now: CLRRTState) -> Tensor:
-        """Tells who needs a plan: at the end of the path, too far from it, or stalled;
-        bool [B].
+        """Return a mask of robots that need a plan, bool, [B].
+
+        They are at the end of the path, too far from it, or stalled.
         """
         offset = now.route.path - state[:, None, :2]
         square = (offset * offset).sum(dim=-1).nan_to_num(nan=math.inf).amin(dim=1)
@@ -447,9 +449,7 @@ class CLRRT(Planner[CLRRTState]):
     def _search(
         self, root: Tensor, now: CLRRTState, members: Tensor, failures: Tensor
     ) -> Route:
-        """Grows trees from root states [M, S] of some episodes and takes the best path
-        of each.
-        """
+        """Return the best paths of trees grown from root states [M, S]."""
         config, problem = self.config, now.problem
         if len(members) < len(problem):
             problem = problem.select(members)
@@ -475,7 +475,7 @@ class CLRRT(Planner[CLRRTState]):
     def _closed_loop(
         self, problem: Problem, follower: PathFollower, failures: Tensor
     ) -> ClosedLoop:
-        """What trees are grown with after so many failed plans, int64 [B]."""
+        """Return the closed loop of trees after a number of failed plans, int64 [B]."""
         config = self.config
         least_m = max(follower.tightest_m, min(config.turning_radius_m, SPACING_M))
         tries = failures % config.most_failures
@@ -492,7 +492,7 @@ class CLRRT(Planner[CLRRTState]):
 
 
 def _reference(route: Route, edge: Tensor) -> Reference:
-    """References of one edge [B] of each path."""
+    """Return the references of one edge [B] of each path."""
     batch, depth, count, _ = route.rows.shape
     path = torch.arange(batch, device=edge.device) * depth + edge.clamp(max=depth - 1)
     return Reference(route.rows.reshape(-1, 4), path * count, count)

@@ -56,12 +56,12 @@ _FAR_M = 1e4  # longer than any way on a map
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """Which edges a round tries.
+    """Edges that a round tries.
 
     Args:
         parent: node at which each begins, int64, shape [B, R].
-        target_m: point that its reference leads to, shape [B, R, 2].
-        aimed: that point is the goal, bool, shape [B, R].
+        target_m: end point (x, y) of its reference in metres, shape [B, R, 2].
+        aimed: mask of edges to the goal, bool, shape [B, R].
     """
 
     parent: Tensor
@@ -86,20 +86,18 @@ class Tree(Choice, Edges):
 
     @property
     def cost(self) -> Tensor:
-        """What the way to each node costs, shape [B, V]."""
+        """Cost of the path to each node, shape [B, V]."""
         return self.time_s + PENALTY * self.blocked_m
 
     @property
     def best(self) -> tuple[Tensor, Tensor]:
-        """What the best way to the goal costs, inf where none is known, and its node,
-        each of shape [B].
-        """
+        """Cost of the best path to the goal, inf without one, and its node, each [B]."""
         return torch.where(self.arrived, self.cost, math.inf).min(dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Route(Batch):
-    """What was planned for each episode.
+    """Plan of each episode.
 
     Args:
         status: `PlanStatus`: OK where the path leads to the goal and enters free ground
@@ -144,8 +142,9 @@ class Route(Batch):
 
     @property
     def line(self) -> Tensor:
-        """Points of the references as far as they are driven, NaN where unused, shape
-        [B, D·Q, 2].
+        """Points of the references as far as they are driven, shape [B, D·Q, 2].
+
+        Unused points are NaN.
         """
         points = self.rows[:, :, :: round(DRAWN_M / SPACING_M), :2]
         arc_m = torch.arange(points.shape[2], device=points.device) * DRAWN_M
@@ -164,7 +163,7 @@ def search(
     chance: Tensor,
     goal_edges: int,
 ) -> Route:
-    """Grows a tree for each episode and takes the best route of each.
+    """Return the best route of a tree grown for each episode.
 
     Args:
         loop: robots, controller and ground.
@@ -187,7 +186,7 @@ def search(
 
 
 def plant(loop: ClosedLoop, root: Tensor, tracking: Tracking) -> Tree:
-    """A tree of the root alone; arguments as for `search`."""
+    """Return a tree of only the root; arguments as for `search`."""
     begin = LoopState(state=root, tracking=tracking, free=loop.problem.free_at(root))
     at = map_tensors(begin, lambda values: values[:, None])
     zero = torch.zeros_like(root[:, :1])
@@ -210,7 +209,7 @@ def plant(loop: ClosedLoop, root: Tensor, tracking: Tracking) -> Tree:
 def choose(
     loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_edges: int
 ) -> Choice:
-    """Chooses nodes, and where to go from them.
+    """Choose nodes, and targets of edges from them.
 
     Args:
         loop: robots, controller and ground.
@@ -265,13 +264,14 @@ def choose(
 
 
 def stand(tree: Tree, node: Tensor) -> LoopState:
-    """Where the closed loop stands at nodes, int64 [B, R]."""
+    """Return the closed-loop state at nodes, int64 [B, R]."""
     return map_tensors(tree.at, lambda values: _take(values, node))
 
 
 def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
-    """The tree with the ends of edges as its next nodes, rejected ones too, so that
-    tables stay of a size.
+    """Return the tree with the ends of edges as its next nodes.
+
+    Rejected edges are added too, so that the size of tables is constant.
     """
     exists, parent = edges.exists, choice.parent
     edges = replace(
@@ -288,8 +288,7 @@ def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
 
 
 def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
-    """Takes the cheapest path to the goal or, where there is none, the best partial
-    one.
+    """Return the cheapest path to the goal or, without one, the best partial path.
 
     Args:
         loop: robots, controller and ground.
@@ -325,17 +324,16 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
 
 
 def no_route(loop: ClosedLoop, rounds: int, edges: int) -> Route:
-    """Routes without a path, of the shapes that searched ones have: of trees with
-    nothing but roots.
-    """
+    """Return routes without a path, of the shapes of searched ones."""
     root = plant(loop, loop.problem.start, Tracking.standing(loop.problem.start))
     tree = map_tensors(root, lambda values: values.repeat_interleave(1 + edges, dim=1))
     return best_route(loop, tree, rounds)
 
 
 def _best_partial(tree: Tree) -> Tensor:
-    """Nodes nearest to the goal, those on free ground first; the root unless that gains
-    enough.
+    """Return nodes nearest to the goal, those in free cells first.
+
+    It is the root unless the gain is sufficient.
     """
     remaining_m = tree.to_goal_m + torch.where(tree.at.free, 0.0, _FAR_M)
     least_m, node = remaining_m.min(dim=1)
@@ -343,20 +341,18 @@ def _best_partial(tree: Tree) -> Tensor:
 
 
 def _to_goal_m(loop: ClosedLoop, state: Tensor) -> Tensor:
-    """Dubins lengths from states [B, V, S] to the goals, shape [B, V]."""
+    """Return Dubins lengths from states [B, V, S] to the goals, shape [B, V]."""
     return dubins_length_to_point(
         state[..., :3], loop.problem.goal_m[:, None], loop.radius_m[:, None]
     )
 
 
 def _take(values: Tensor, index: Tensor) -> Tensor:
-    """Picks from the second dimension: values [B, V, *F] at indices [B, R] give [B, R,
-    *F].
-    """
+    """Return values [B, V, *F] at indices [B, R] of the second dimension, [B, R, *F]."""
     return values.take_along_dim(index if values.dim() == 2 else index[..., None], 1)
 
 
 def _pack(points: Tensor) -> Tensor:
-    """Moves points that are not NaN to the front, in their order, shape [B, N, 2]."""
+    """Return points [B, N, 2] with those that are not NaN first, in their order."""
     order = points[..., 0].isnan().to(torch.uint8).argsort(dim=1, stable=True)
     return _take(points, order)
