@@ -112,7 +112,7 @@ def standing_actions(problem: Problem) -> Tensor:
 
 
 def find_fault(output: Any, problem: Problem) -> str:
-    """Return the fault of a planner's output, in one line; empty if there is none.
+    """Return the fault of a planner's output, in one line; empty without a fault.
 
     Args:
         output: return value of `plan`.

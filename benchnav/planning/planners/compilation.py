@@ -214,7 +214,7 @@ def _compiling(checked: bool) -> Iterator[None]:
 
 
 def _key(arg: object) -> object:
-    """Return an argument if it has a hash; else its id, as of a frozen robot with a list."""
+    """Return an argument if it has a hash; else its id, as for a frozen robot with a list."""
     try:
         hash(arg)
     except TypeError:

@@ -84,7 +84,7 @@ def tail_cost(cost: Tensor, level: float) -> Tensor:
 
 
 class Entrapment(NamedTuple):
-    """What immobilises a robot for good, and what that costs.
+    """Permanent immobilisation of a robot, and its cost.
 
     Args:
         goal: (x, y) of the goal, shape [B, 1, 2].

@@ -68,7 +68,7 @@ class Learner:
         """Statistics of the training maps, used for unobserved terrain.
 
         Raises:
-            ConfigError: If there are none.
+            ConfigError: If the covariance model has no statistics.
         """
         expect(
             self.covariance.statistics is not None,

@@ -1,4 +1,4 @@
-"""How episodes end.
+"""Outcomes of episodes.
 
 Letters in shapes: B episodes, N steps.
 """

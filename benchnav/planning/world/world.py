@@ -276,7 +276,7 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
 
 
 def _differences(preset: Any, value: Any) -> list[str]:
-    """What tables call the fields in which a value differs from its preset."""
+    """Return the names in tables of fields that differ from the preset."""
     changed = []
     for f in fields(preset):
         before, after = getattr(preset, f.name), getattr(value, f.name)

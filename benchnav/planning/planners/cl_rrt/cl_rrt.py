@@ -1,58 +1,54 @@
 """Closed-loop rapidly-exploring random trees (CL-RRT).
 
-A tree is grown not by steering states but by simulating the robot with its controller:
-a node is chosen for a sampled point, a Dubins reference is drawn from the node to the
-point, and the closed loop of pure pursuit and a PID on speed (`pursuit`) drives along
-it through F with predicted traversability. The edge stays as far as it is free of
-collision; what the robot then executes is the same controller on the same references.
-The best path is the one of least simulated time; J is not read. Source: Kuwata et al.
-(2009), "Real-time motion planning with applications to autonomous urban driving"; paper
-IV-A2.
+A tree is not grown by steering states but by simulating the robot with its controller.
+A node is chosen for a sampled point, and a Dubins reference is drawn from the node to
+the point. The closed loop of pure pursuit and a PID on speed (`pursuit`) drives along
+it through F with predicted traversability. An edge is kept as far as it is free of
+collision. The robot then executes the same controller on the same references. The best
+path is that of minimum simulated time; J is not used. Source: Kuwata et al. (2009),
+"Real-time motion planning with applications to autonomous urban driving"; paper IV-A2.
 
-Read on in `tree`, whose `search` is one plan, and in `edges`, which simulates and
-judges. This module is what the source calls the execution loop, algorithm 2: when to
-plan, and from what.
+See also `tree`, whose `search` is one plan, and `edges`, which simulates. This module
+is the execution loop of the source, algorithm 2: when to plan, and from which state.
 
-- The source grows one tree all the time, propagates its best path again from the latest
-  state, and stops where there is none that is safe. Here a tree is grown where a plan
-  is due, at the path's end or when the robot has strayed or stalled (paper IV-A2), and
-  not kept. Nodes need not be safe to stop at.
-- References are Dubins paths; the source draws straight lines and takes Dubins lengths
+- The source grows one tree all the time, simulates its best path again from the latest
+  state, and stops if no path is safe. Here a tree is grown only when a plan is due, at
+  the path's end or when the robot has strayed or stalled (paper IV-A2), and is not
+  kept. Nodes need not be safe to stop at.
+- References are Dubins paths; the source draws straight lines and uses Dubins lengths
   for its heuristics.
-- Where λ̂ falls along a path to the goal, so that what is ahead costs over a tenth more
-  than by the map that it was chosen on, a new tree is grown and the cheaper of both
-  paths is driven. Both costs are times along the predicted positions under the new λ̂.
-  Without a new path the next steps try again, up to `most_failures` times. A partial
-  path is left at once. So a map that stays as it is costs no tree, and one that changes
-  little by little only a few.
-- Sampled points carry no heading, so references are the shortest paths to a point with
-  free heading: the least over all end headings of the Dubins length, and no random
-      heading makes a detour.
-- A plan without a way to the goal leads along the best partial path, and is tried anew
-  at the next steps with references of half the radius each time, down to the robot's
-  own tightest turn or the spacing of their
-  points: at full radius a robot that faces ground that is not free has no way at all,
-  and one that can slow down can turn tighter. After `most_failures` such plans a
-  partial path is driven to its end. It is left a little before its end, and not tried
-  anew from ground that is not free: a robot that slid into a wall could leave it on the
-      other side.
-- Where `most_failures` plans in a row found no partial path either, the next ones may
-  cross: their edges go on over ground that is not free, at its penalty a metre, and the
-  cheapest path is driven as a partial one. Before that the tree stays on free ground,
-  so that a free way is taken wherever one is found; and once the robot is across, it
-  looks for one again. The planner never gives up.
-- Expansions go in rounds: all samples of a round, of all episodes, are simulated at
+- If λ̂ decreases along a path to the goal, so that the remaining path costs over a tenth
+  more than on the map on which it was chosen, a new tree is grown and the cheaper of
+  both paths is driven. Both costs are times along the predicted positions under the new
+  λ̂. Without a new path the next steps try again, up to `most_failures` times. A partial
+  path is left at once. Hence a constant map costs no tree, and one that changes slowly
+  only a few.
+- Sampled points have no heading, so references are the shortest paths to a point with
+  free heading: the minimum over all end headings of the Dubins length. No random
+  heading causes a detour.
+- A plan without a path to the goal follows the best partial path. The next steps plan
+  again, each time with references of half the radius, down to the robot's own tightest
+  turn or the spacing of their points: at full radius a robot that faces non-free cells
+  may have no path, and one that can slow down can turn tighter. After `most_failures`
+  such plans a partial path is driven to its end. It is left slightly before its end,
+  and there is no further plan from non-free cells: a robot that slid into a wall could
+  leave it on the other side.
+- If `most_failures` consecutive plans found no partial path either, the next ones may
+  cross: their edges continue over non-free cells, at their penalty per metre, and the
+  cheapest path is driven as a partial one. Before that the tree stays in free cells, so
+  that a free path is used wherever one is found; once the robot is across, it looks for
+  one again. The planner never gives up.
+- Expansions are in rounds: all samples of a round, of all episodes, are simulated at
   once. Samples are a pure function of the plan state's seed and step, the same for each
   episode of a batch.
-- A path has at most one edge a round, so that a plan reaches as far as `rounds` edges
-  do (100 m by default); a goal farther off is approached along partial paths.
+- A path has at most one edge per round, so that a plan reaches as far as `rounds` edges
+  do (100 m by default); a goal farther away is approached along partial paths.
 
-Letters in shapes: B episodes, M of which plan anew, D edges of a path, R edges of a
-    round.
+Letters in shapes: B episodes, M of which plan, D edges of a path, R edges of a round.
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -63,10 +59,10 @@ from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import TravelTime, distance
+from benchnav.planning.planners.cl_rrt.config import CLRRTConfig
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import (
     SPACING_M,
-    FollowerConfig,
     PathFollower,
     Reference,
     Tracking,
@@ -76,7 +72,6 @@ from benchnav.planning.planners.planner import (
     Plan,
     Planner,
     PlanStatus,
-    check_finite,
     check_steers,
 )
 from benchnav.planning.problem import Problem, Task, motion_traversability
@@ -84,69 +79,9 @@ from benchnav.planning.robots import SPEED, TURN_RATE
 from benchnav.planning.sensing.sensor import Step
 
 _STALL_M = 0.25  # minimum progress within `stall_s`
-# fraction by which the cost of the path ahead rises before it is compared with a new
-# one
+# Fraction by which the cost of the remaining path rises before it is compared with a
+# new one.
 _RISE = 0.1
-
-
-@dataclass(frozen=True, kw_only=True)
-class CLRRTConfig:
-    """Settings of CL-RRT. The paper gives none of these numbers; the defaults are ours.
-
-    Args:
-        expansions: edges tried in a plan.
-        expansions_per_round: edges simulated at once; divides `expansions`.
-        step_m: greatest length of an edge along its reference.
-        edge_time_s: greatest duration of an edge; one that takes longer ends there.
-        goal_bias: share of the expansions that aim at the goal.
-        turning_radius_m: of the references, as long as they lead to the goal.
-        replan_distance_m: a robot farther than this from the nearest predicted position
-            plans anew.
-        stall_s: so does one that makes no progress for so long.
-        most_failures: plans in a row without a way to the goal after which a partial
-            path is driven to its end and, without one, edges may cross ground that is
-            not free.
-        follower: of the controller, in simulation and on the way.
-    """
-
-    expansions: int = 500
-    expansions_per_round: int = 25
-    step_m: float = 5.0
-    edge_time_s: float = 10.0
-    goal_bias: float = 0.25
-    turning_radius_m: float = 1.0
-    replan_distance_m: float = 1.0
-    stall_s: float = 5.0
-    most_failures: int = 5
-    follower: FollowerConfig = field(default_factory=FollowerConfig)
-
-    def __post_init__(self) -> None:
-        """Validate the settings."""
-        above = (
-            "expansions",
-            "expansions_per_round",
-            "step_m",
-            "edge_time_s",
-            "turning_radius_m",
-        )
-        check_finite(
-            "CL-RRT", self, (*above, "replan_distance_m", "stall_s", "most_failures")
-        )
-        expect(
-            self.expansions % self.expansions_per_round == 0,
-            "`expansions` as a multiple of `expansions_per_round` = "
-            f"{self.expansions_per_round} for CL-RRT, got "
-            f"{self.expansions}.",
-        )
-        expect(
-            0 <= self.goal_bias <= 1,
-            f"`goal_bias` in 0–1 for CL-RRT, got {self.goal_bias}.",
-        )
-
-    @property
-    def rounds(self) -> int:
-        """Rounds of a plan, also the maximum number of edges of a path: D."""
-        return self.expansions // self.expansions_per_round
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -40,7 +40,7 @@ class FollowerConfig:
     Args:
         lookahead_m: distance along the path from the robot to the point that it steers
             for, at least.
-        lookahead_s: the same as what the robot drives in so many seconds at the wanted
+        lookahead_s: the same as the time in seconds to drive it at the wanted
             speed, where that is more.
         speed_mps: speed over ground that is wanted; without it the robot's top speed
             forward.

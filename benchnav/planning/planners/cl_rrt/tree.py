@@ -42,16 +42,13 @@ from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, Tracking
 from benchnav.planning.planners.dubins import dubins_length_to_point
 from benchnav.planning.planners.planner import PlanStatus
 
-_EXPLORE = (
-    0.7,
-    0.3,
-)  # share of choices that explore, before and after a way to the goal is known
-_PARTIAL_GAIN_M = (
-    0.5  # a partial path that leads no further than this toward the goal is none
-)
-# a partial path is left so far before its end, which may lie close to what is not free
+# Fraction of choices that explore, before and after a path to the goal is known.
+_EXPLORE = (0.7, 0.3)
+_PARTIAL_GAIN_M = 0.5  # minimum gain toward the goal of a partial path
+# Distance before its end at which a partial path is left, since the end may be close to
+# non-free cells.
 _MARGIN_M = 0.3
-_FAR_M = 1e4  # longer than any way on a map
+_FAR_M = 1e4  # longer than any path on a map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +99,7 @@ class Route(Batch):
     Args:
         status: `PlanStatus`: OK where the path leads to the goal and enters free ground
             alone, else PARTIAL.
-        depth: edges of the path, 0 where there is none, int64, shape [B].
+        depth: edges of the path, 0 without a path, int64, shape [B].
         rows: references of the edges, as `Reference` keeps them, shape [B, D, N, 4].
         end_m: arc length at which each reference is left for the next, shape [B, D].
         path: predicted positions, NaN where unused, shape [B, D·P, 2].

@@ -1,4 +1,4 @@
-"""Closed loops of planners on a λ field that is known, simulated as the world does it.
+"""Closed-loop simulation of planners on a known λ field, as in the world.
 
 λ is read where a robot stands at the start of a step, and so is whether that
 immobilises it. Nothing is drawn, so a robot that repeats the actions in the same world
@@ -47,8 +47,8 @@ def simulate(
     """Drive a planner to the end of every episode.
 
     Args:
-        plan: as of a `Planner`.
-        select: as of a `Planner`.
+        plan: `plan` of a `Planner`.
+        select: `select` of a `Planner`.
         plan_state: from `init`.
         problem: B problems.
         field: λ, shape [B, H, W].

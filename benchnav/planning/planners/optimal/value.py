@@ -30,7 +30,7 @@ from benchnav.planning.robots import Unicycle
 
 _POINTS = 8  # N
 UNREACHED = 1e6
-"""Cost to go before a path is found, and where there is none."""
+"""Cost to go before a path is found, or without one."""
 # Cost to go that is mostly interpolated from unreached states.
 _MIXED = UNREACHED / 100
 _BARRED = 1e-9  # weight of a non-free cell next to a free one
