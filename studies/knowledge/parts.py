@@ -37,7 +37,7 @@ class Elsewhere(Probe):
     def sense(
         self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
     ) -> Measurement:
-        near = self._near(terrain, robot_state)
+        near = self._in_range(terrain, robot_state)
         cells = self.correlation_m / terrain.grid.resolution_m
         scores = np.stack(
             [_scores(key, terrain.grid.shape, cells) for key in noise_key.keys]

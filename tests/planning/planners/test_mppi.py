@@ -462,7 +462,7 @@ def test_no_tensor_is_made_on_another_device(
         values = mean.new_zeros(2, 20, 4 * 256)
         places = torch.zeros(20, 2, dtype=torch.int64, device=mean.device)
         bank = NoiseBank(
-            scale=scale, values=values, place=places, stride=places, samples=256
+            scale=scale, values=values, offset=places, stride=places, samples=256
         )
         state = MPPIState(
             problem,
