@@ -62,7 +62,7 @@ def enumerated(
             stats.norm.ppf(shares(own, value, "cdf")) if value < 1 else stats.norm.isf(shares(own, 1.0, "sf"))
             for own, value in zip(labels, seen, strict=True)
         ])  # fmt: skip
-        known, inner = scores[inside], covariance[np.ix_(inside, inside)]
+        known, inner = scores[inside], matrix[np.ix_(inside, inside)]
         found = (
             stats.multivariate_normal(np.zeros(len(known)), inner).pdf(known)
             if len(known)
@@ -80,7 +80,7 @@ def enumerated(
             )
             mean, spread = (
                 pull @ known,
-                matrix[place, place] - pull @ covariance[inside, place],
+                matrix[place, place] - pull @ matrix[inside, place],
             )
             off = (scores[place] - mean) / np.sqrt(spread)
             found *= stats.norm.cdf(off) if seen[place] <= 0 else stats.norm.sf(off)
