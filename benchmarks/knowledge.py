@@ -25,7 +25,7 @@ from benchmarks.timing import show
 from benchnav import Grid, Terrain, TraversabilityMixture
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.unit import Built, Settings, simulate
-from benchnav.planning import Copula, Law, Moment, Probe
+from benchnav.planning import Copula, CovarianceModel, NoiseKey, Probe
 from benchnav.planning.sensing.belief import draw_scores
 from studies.units import build_unit, one_unit, stakes_suite
 
@@ -89,13 +89,15 @@ def update(resolution_m: float, radius_m: float) -> dict[str, Any]:
     many cells were sensed.
     """
     height, width = round(12 / resolution_m), round(28 / resolution_m)
-    law = Law(grid=Grid(height, width, resolution_m), correlation_m=1.5)
+    covariance = CovarianceModel(
+        grid=Grid(height, width, resolution_m), correlation_m=1.5
+    )
     parameters = (
         torch.tensor(pair).view(1, 2, 1, 1).expand(1, 2, height, width)
         for pair in ((0.1, 0.9), (0.05, 0.7), (0.1, 0.1))
     )
     prior = TraversabilityMixture(*(values.contiguous() for values in parameters))
-    field = prior.from_normal(draw_scores(law, 1, (0,))[:, 0].float())
+    field = prior.from_normal(draw_scores(covariance, 1, (0,))[:, 0].float())
     flat = torch.zeros(1, height, width)
     terrain = Terrain(
         rgb=torch.zeros(1, 3, height, width, dtype=torch.uint8),
@@ -104,13 +106,13 @@ def update(resolution_m: float, radius_m: float) -> dict[str, Any]:
         slope_deg=flat,
         truth=prior,
         traversability=field,
-        grid=law.grid,
+        grid=covariance.grid,
     )
     belief, times = Copula(), []
-    state = belief.init(prior, law)
+    state = belief.init(prior, covariance)
     for number in range(49):
         pose = torch.tensor([[2 + 0.5 * number, 6.0, 0.0]])
-        sensed = Probe(radius_m).sense(terrain, field, pose, Moment((0,), number))
+        sensed = Probe(radius_m).sense(terrain, field, pose, NoiseKey((0,), number))
         start = time.process_time()
         state = belief.update(state, sensed)
         times.append(1e3 * (time.process_time() - start))

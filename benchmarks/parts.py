@@ -22,7 +22,7 @@ from benchnav.core import cvar
 from benchnav.datagen import TerrainDataset, find_dataset
 from benchnav.models import load_model, predict
 from benchnav.planning import MPPI, Problem, Unicycle
-from benchnav.planning.planners.mppi import roll_out
+from benchnav.planning.planners.mppi_rollouts import roll_out
 
 LEVEL = 0.9
 

@@ -97,7 +97,7 @@ def drive(terrain: Terrain) -> pd.DataFrame:
         # The λ of the ground is the same on every drive.
         world = planning.World(noise="stored", time_budget_s=LEG_S)
         unknown = torch.full((DRIVES,), torch.nan)
-        places = planning.Places(
+        places = planning.Endpoints(
             start_m=position, goal_m=goal, reference_time_s=unknown
         )
         simulation = planning.Simulation(terrain, task, world, places, 0, range(DRIVES))

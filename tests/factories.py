@@ -14,7 +14,7 @@ from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective
 from benchnav.planning.problem import Prediction, Problem, Task, pose_problem
 from benchnav.planning.robots import Robot, Unicycle
-from benchnav.planning.world.world import Places
+from benchnav.planning.world.world import Endpoints
 
 GRID = Grid(16, 16, 0.5)
 
@@ -63,12 +63,12 @@ def terrain(mean: torch.Tensor, std: float = 0.1) -> Terrain:
     )
 
 
-def places(goal_m: torch.Tensor, start_m: torch.Tensor | None = None) -> Places:
+def places(goal_m: torch.Tensor, start_m: torch.Tensor | None = None) -> Endpoints:
     """Goals [B, 2], with starts at (1.25, 1.25) unless they are given, and no reference
     times.
     """
     start_m = torch.full_like(goal_m, 1.25) if start_m is None else start_m
-    return Places(
+    return Endpoints(
         start_m=start_m,
         goal_m=goal_m,
         reference_time_s=torch.full_like(goal_m[:, 0], torch.nan),

@@ -5,7 +5,11 @@ answered with the new one.
 # What programs import.
 IMPORTS = {
     "benchnav.core.figures": "benchnav.viz",
+    "benchnav.planning.Law": "benchnav.planning.CovarianceModel",
+    "benchnav.planning.Moment": "benchnav.planning.NoiseKey",
     "benchnav.planning.OptimalBound": "benchnav.planning.NearOptimal",
+    "benchnav.planning.Places": "benchnav.planning.Endpoints",
+    "benchnav.planning.Sensed": "benchnav.planning.Measurement",
     "benchnav.planning.risk.chance": "benchnav.planning.Chance",
     "benchnav.planning.risk.cvar": "benchnav.planning.CVaR",
     "benchnav.planning.risk.expected_time": "benchnav.planning.ExpectedTime",

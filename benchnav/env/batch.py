@@ -27,7 +27,7 @@ from benchnav.planning.robots import Robot
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.realisation import check_known
 from benchnav.planning.world.simulation import Simulation, SimulationState
-from benchnav.planning.world.world import Places, World, read_world
+from benchnav.planning.world.world import Endpoints, World, read_world
 
 SUCCESS_REWARD = 10.0
 LOST_REWARD = -10.0
@@ -94,7 +94,7 @@ class EnvBatch:
             f"{dataset.path}.",
         )
         places = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
-        self._places = Places(
+        self._places = Endpoints(
             **{name: torch.from_numpy(values) for name, values in places.items()}
         )
         # To be refused at once.

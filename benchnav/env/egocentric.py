@@ -34,8 +34,9 @@ from benchnav.models.predictor import (
     nugget_of,
 )
 from benchnav.planning.robots import steps_in
-from benchnav.planning.sensing.belief import Belief, Law
-from benchnav.planning.sensing.knowledge import Learner, Truth, sensor_keys
+from benchnav.planning.sensing.belief import Belief, CovarianceModel
+from benchnav.planning.sensing.knowledge import Truth, sensor_keys
+from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.sensor import Sensor
 from benchnav.planning.world.outcome import Outcome
 
@@ -308,7 +309,7 @@ class EgocentricBatch(EnvBatch):
             sensor=sees,
             ground=registry.take("ground", perception.ground),
             belief=believes,
-            law=self._law(predictor, statistics),
+            covariance=self._covariance(predictor, statistics),
             measure=risk if callable(risk) else registry.make("risk", risk),
             rules=rules,
             predict=partial(predict, predictor),
@@ -411,12 +412,12 @@ class EgocentricBatch(EnvBatch):
             )
         )
 
-    def _law(
+    def _covariance(
         self, model: TraversabilityModel, statistics: GroundStatistics | None
-    ) -> Law:
+    ) -> CovarianceModel:
         """How the λ of the maps hangs together."""
         recipe, world = self._dataset.recipe, self._world
-        return Law(
+        return CovarianceModel(
             grid=self._maps.grid,
             correlation_m=recipe.correlation_m
             if world.noise == "stored"

@@ -1,7 +1,7 @@
 """What the robots of an environment know of the ground, and how they learn on their
 way.
 
-A shell over `benchnav.planning.sensing.knowledge`, by which robots learn in evaluations
+A shell over `benchnav.planning.sensing.learner`, by which robots learn in evaluations
 too: λ is sensed at each step, and what is known is updated every `replan_every_s` of an
     episode. Here episodes begin at different times. Letters
 in shapes: B episodes, M of them, S state dimensions, H×W cells, N cells of all maps
@@ -18,8 +18,9 @@ from torch import Tensor
 from benchnav.core.batch import Batch, map_tensors
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.env.view import Known
-from benchnav.planning.sensing.knowledge import Knowledge, Learner, Truth
-from benchnav.planning.sensing.sensor import Sensed
+from benchnav.planning.sensing.knowledge import Knowledge, Truth
+from benchnav.planning.sensing.learner import Learner
+from benchnav.planning.sensing.sensor import Measurement
 
 _MOST_KEPT = 256  # maps, of up to a megabyte each
 
@@ -111,7 +112,7 @@ class Experience:
     def _update(self, due: Tensor, truth: Truth) -> None:
         """Updates what is known in some episodes, bool [B]."""
         learner, now = self._learner, self._current()
-        news = now.news & due
+        news = now.has_news & due
         if bool(news.any()):
             # Taken apart, since a prediction costs more than that.
             members = news.nonzero()[:, 0]
@@ -120,12 +121,14 @@ class Experience:
             )
             now = learner.put(now, members, part)
         told = (due & ~news)[:, None, None]
-        sensed, news = now.sensed, now.news
+        sensed, news = now.sensed, now.has_news
         if bool((sensed.mask & told).any()):
             # As a whole, since to take it apart costs more than the update.
-            now = replace(now, sensed=_only(sensed, told), news=torch.zeros_like(news))
+            now = replace(
+                now, sensed=_only(sensed, told), has_news=torch.zeros_like(news)
+            )
             now, _ = learner.update(now, truth)
-            now = replace(now, sensed=_only(sensed, ~told), news=news)
+            now = replace(now, sensed=_only(sensed, ~told), has_news=news)
         self._knowledge = now
 
     def _begun_on(self, maps: Sequence[int], truth: Truth, state: Tensor) -> Knowledge:
@@ -139,7 +142,7 @@ class Experience:
                 knowledge = self._begun(truth.select(own), state[own])
                 prior = self._learner.distribution(knowledge)
                 self._kept[number] = _First(
-                    prior=prior, knowledge=replace(knowledge, believed=None)
+                    prior=prior, knowledge=replace(knowledge, belief_state=None)
                 )
             self._kept.move_to_end(number)
             every.append(self._kept[number])
@@ -147,7 +150,9 @@ class Experience:
             self._kept.popitem(last=False)
         first, *rest = every
         joined = map_tensors(first, lambda *values: torch.cat(values), *rest)
-        return replace(joined.knowledge, believed=self._learner.believe(joined.prior))
+        return replace(
+            joined.knowledge, belief_state=self._learner.believe(joined.prior)
+        )
 
     def _begun(self, truth: Truth, state: Tensor) -> Knowledge:
         """What is known at the start."""
@@ -162,7 +167,7 @@ class Experience:
         return self._knowledge
 
 
-def _only(sensed: Sensed, which: Tensor) -> Sensed:
+def _only(sensed: Measurement, which: Tensor) -> Measurement:
     """What was sensed in some episodes, bool, shape [B, 1, 1], and nothing in the
     others.
     """

@@ -84,7 +84,7 @@ class Clairvoyant(PrivilegedModel):
 
 _SOURCE = "_source"  # attribute that keeps how a model was found
 Source = str | Path | Mapping[str, Any] | Part
-# `Law.nugget` under a model that learnt; docs/reference/sensing.md has the figures it
+# `CovarianceModel.nugget` under a model that learnt; docs/reference/sensing.md has the figures it
 # was chosen by. Without a nugget, scores of neighbouring cells that the model predicts
 # wrongly contradict each other.
 MODEL_NUGGET = 0.1
@@ -441,7 +441,7 @@ def trained_on(source: Source) -> dict[str, str]:
 
 
 def nugget_of(model: TraversabilityModel) -> float:
-    """`Law.nugget` under a model's predictions: 0 where they are each cell's true
+    """`CovarianceModel.nugget` under a model's predictions: 0 where they are each cell's true
     distribution.
     """
     return 0.0 if isinstance(model, Oracle | Clairvoyant) else MODEL_NUGGET

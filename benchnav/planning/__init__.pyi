@@ -3,7 +3,8 @@ from benchnav.planning.objective import GoalDistance, Objective, TravelTime, dis
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI
 from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig
+from benchnav.planning.planners.mppi import MPPI
+from benchnav.planning.planners.mppi_config import MPPIConfig
 from benchnav.planning.planners.optimal.optimal import NearOptimal, Optimal
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, PlanStatus
 from benchnav.planning.planners.straight import Straight
@@ -27,7 +28,7 @@ from benchnav.planning.robots import (
     Robot,
     Unicycle,
 )
-from benchnav.planning.sensing.belief import Belief, Law, Static
+from benchnav.planning.sensing.belief import Belief, CovarianceModel, Static
 from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.near import Near
@@ -35,14 +36,14 @@ from benchnav.planning.sensing.sensor import (
     Appearance,
     Contact,
     Full,
-    Moment,
+    Measurement,
+    NoiseKey,
     Probe,
-    Sensed,
     Sensor,
     Step,
 )
 from benchnav.planning.world.simulation import Simulation
-from benchnav.planning.world.world import Places, World
+from benchnav.planning.world.world import Endpoints, World
 
 __all__ = [
     "CLRRT",
@@ -60,21 +61,22 @@ __all__ = [
     "Classes",
     "Contact",
     "Copula",
+    "CovarianceModel",
     "DifferentialDrive",
+    "Endpoints",
     "ExpectedTime",
     "FreeSpace",
     "Full",
     "GoalDistance",
-    "Law",
     "LocalPlanner",
     "MPPIConfig",
     "Mean",
-    "Moment",
+    "Measurement",
     "Near",
     "NearOptimal",
+    "NoiseKey",
     "Objective",
     "Optimal",
-    "Places",
     "Plan",
     "PlanStatus",
     "Planner",
@@ -84,7 +86,6 @@ __all__ = [
     "RiskMeasure",
     "Robot",
     "Rules",
-    "Sensed",
     "Sensor",
     "Simulation",
     "SingleClass",

@@ -1,9 +1,12 @@
-"""Ground that is not free, one rule for every planner; and what immobilises a robot.
+"""Free space, one rule for all planners, and what immobilises a robot.
 
-S_free is where a map exceeds a threshold, and around the goal. A planner may cross
-other ground at a high finite penalty, so that all planners face the same question and
-there is a way where no free way is predicted. A planner that looks no farther than a
-horizon, as MPPI does, may still wait before such ground. The λ̂ that motion and path
+A cell is free if a map exceeds a threshold there, or if it is at the goal. A planner
+may cross non-free cells at a high finite penalty, so that all planners solve the same
+problem and a path exists where no free path is predicted. A planner with a horizon,
+such as MPPI, may still wait in front of such cells. Motion and path costs use a λ̂ of at
+least `min_traversability`, so that a robot on terrain that is predicted to immobilise
+it can plan its way out. This goes beyond the paper, whose equation 2e forbids non-free
+cells.
 costs are given is at least `min_traversability`, so that a robot on ground predicted to
 immobilise it can plan its way out. Beyond the paper, whose equation 2e forbids such
 ground.
@@ -19,8 +22,8 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 
-# Of a step, and of a metre, on ground that is not free; the paper's penalty a step.
-# Higher than what any way over free ground costs.
+# Penalty of a step, and of a metre, in non-free cells; the paper's penalty of a step.
+# It is higher than the cost of any path over free terrain.
 PENALTY = 1e4
 UNSEEN = ("prior", "optimistic", "pessimistic")
 _LATER = {"unseen": "prior", "replan_every_s": 0.5}
@@ -28,18 +31,18 @@ _LATER = {"unseen": "prior", "replan_every_s": 0.5}
 
 @dataclass(frozen=True, kw_only=True)
 class FreeSpace:
-    """Which ground is free.
+    """Rule for free cells.
 
     Args:
         by: `risk`, the map λ̂ of the risk setting, or `mean`, E[λ] of the prediction.
-        above: a cell is free where that map exceeds this; the paper's λ_stuck.
+        above: threshold that the map exceeds in free cells; the paper's λ_stuck.
     """
 
     by: str = "risk"
     above: float = 0.3
 
     def __post_init__(self) -> None:
-        """Refuses rules that mean nothing."""
+        """Validate the rule."""
         expect(
             self.by in ("risk", "mean"),
             f"`free_space.by` 'risk' or 'mean', got {self.by!r}.",
@@ -54,10 +57,9 @@ class FreeSpace:
     def mask(
         self, risk_map: Tensor, distribution: TraversabilityDistribution
     ) -> Tensor:
-        """Tells which cells are free, bool [B, H, W], from λ̂ [B, H, W] and the
-        prediction.
-        """
-        return (risk_map if self.by == "risk" else distribution.mean()) > self.above
+        """Return the free mask, bool [B, H, W], from λ̂ [B, H, W] and the prediction."""
+        values = risk_map if self.by == "risk" else distribution.mean()
+        return values > self.above
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,13 +68,13 @@ class Rules:
     paper's.
 
     Args:
-        free_space: which ground is free.
-        min_traversability: least λ̂ that motion and path costs are given.
-        goal_radius_m: a robot this near to the goal has arrived.
-        unseen: what is believed of ground that was not seen yet: `prior`, the λ of all
-            training maps; `optimistic`, λ of 1; `pessimistic`, the mean of the worst
-            fifth of the prior, never closed.
-        replan_every_s: time between two updates of what a robot knows.
+        free_space: rule for free cells.
+        min_traversability: minimum λ̂ of motion and path costs.
+        goal_radius_m: distance to the goal in metres below which a robot has reached it.
+        unseen: λ that is assumed for unobserved terrain: `prior`, that of all training
+            maps; `optimistic`, 1; `pessimistic`, the mean of the worst fifth of the
+            prior, which never closes a cell.
+        replan_every_s: time between two updates of a robot's knowledge, in seconds.
     """
 
     free_space: FreeSpace = FreeSpace()
@@ -82,7 +84,7 @@ class Rules:
     replan_every_s: float = 0.5
 
     def __post_init__(self) -> None:
-        """Refuses rules under which nothing moves or arrives."""
+        """Validate the rules."""
         expect(
             0 < self.min_traversability <= 1,
             f"`min_traversability` in (0, 1], got {self.min_traversability}.",
@@ -107,20 +109,23 @@ class Rules:
         distribution: TraversabilityDistribution,
         seen: Tensor | None = None,
     ) -> Tensor:
-        """Tells which cells are free, bool [B, H, W], without those at the goal.
+        """Return the free mask without the area at the goal, bool, shape [B, H, W].
 
         Args:
             risk_map: λ̂, shape [B, H, W].
-            distribution: what is believed of λ, shape [B, H, W].
-            seen: which cells were seen, bool, shape [B, H, W]; None for all.
-                `pessimistic` closes no other.
+            distribution: distribution of λ, shape [B, H, W].
+            seen: mask of observed cells, bool, shape [B, H, W]; None for all. With
+                `pessimistic` unobserved cells are always free.
         """
         free = self.free_space.mask(risk_map, distribution)
-        return free if seen is None or self.unseen != "pessimistic" else free | ~seen
+        if seen is not None and self.unseen == "pessimistic":
+            free = free | ~seen
+        return free
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain data for JSON; what came with later versions is left out where it
-        stands at its default.
+        """Return the rules as plain data for JSON.
+
+        Settings of later versions are omitted at their defaults.
         """
         later = {
             name: value
@@ -134,19 +139,19 @@ class Rules:
 
 @dataclass(frozen=True, kw_only=True)
 class Immobile:
-    """What immobilises a robot.
+    """Rule of immobilisation.
 
     Args:
-        below: observed λ under this immobilises a robot.
-        for_s: an episode ends after so many seconds in a row on such ground, whatever
-            was commanded.
+        below: observed λ below which terrain immobilises a robot.
+        for_s: consecutive time on such terrain after which an episode ends, in seconds,
+            whatever was commanded.
     """
 
     below: float = 0.1
     for_s: float = 2.0
 
     def __post_init__(self) -> None:
-        """Refuses rules that always or never immobilise."""
+        """Validate the rule."""
         expect(0 < self.below <= 1, f"`immobile.below` in (0, 1], got {self.below}.")
         expect(
             0 < self.for_s < float("inf"),
@@ -155,7 +160,7 @@ class Immobile:
 
 
 def cells_at_goal(grid: Grid, goal_m: Tensor, radius_m: float) -> Tensor:
-    """Cells that the goal's disc touches, bool [B, H, W], from goals (x, y) [B, 2]."""
+    """Return a mask of cells in the goal's disc, bool [B, H, W], for goals [B, 2]."""
     rows = torch.arange(grid.height, device=goal_m.device)
     columns = torch.arange(grid.width, device=goal_m.device)
     x, y = grid.centre_of(rows, columns)

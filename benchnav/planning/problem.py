@@ -1,8 +1,7 @@
-"""The navigation problem that a planner is given (paper, equation 2).
+"""The navigation problem of a planner (paper, equation 2).
 
-It holds what is *predicted* alone: the truth stays with the simulation. Letters in
-shapes: B episodes, H×W cells, S state and A action dimensions, *K any further
-    dimensions.
+It only contains predictions: the truth stays in the simulation. Letters in shapes: B
+episodes, H×W cells, S state and A action dimensions, *K any further dimensions.
 """
 
 from dataclasses import dataclass, field, replace
@@ -21,29 +20,29 @@ from benchnav.planning.free_space import PENALTY, Immobile, Rules, cells_at_goal
 from benchnav.planning.objective import Objective
 from benchnav.planning.robots import Robot
 
-# Stands for a λ̂ of 0 in maps for lookups, where the sign tells whether ground is free
-# and 0 is off the map.
+# Replaces a λ̂ of 0 in padded maps, in which the sign marks free cells and 0 is off the
+# map.
 _ZERO = 1e-30
 
 
 class FieldSource(Protocol):
-    """Draws fields of λ for B episodes: `benchnav.planning.sensing.belief.Fields`."""
+    """Source of λ fields of B episodes: `benchnav.planning.sensing.belief.Fields`."""
 
     def sample(self, count: int, key: int, cells: Tensor | None = None) -> Tensor:
-        """See `Problem.sample_fields`."""
+        """Draw fields; see `Problem.sample_fields`."""
 
     def select(self, members: Tensor) -> Self:
-        """Keeps some episodes, by index, int64."""
+        """Return some episodes, by index, int64."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What is to be done.
+    """Task of a robot.
 
     Args:
         robot: F with its action bounds and time step.
         objective: J.
-        rules: free space, least λ̂, goal radius.
+        rules: free space, `min_traversability`, goal radius.
     """
 
     robot: Robot
@@ -53,18 +52,18 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True)
 class Problem(Batch):
-    """A batch of navigation problems on maps of one grid; `pose_problem` makes one.
+    """A batch of navigation problems on maps of one grid; `pose_problem` creates one.
 
     Args:
-        task: what is to be done.
-        observation: what the robots saw.
+        task: the task.
+        observation: the robots' observation.
         distribution: the predicted distribution of λ, shape [B, H, W].
-        risk_map: λ̂ as the risk setting gives it, in [0, 1], shape [B, H, W].
+        risk_map: λ̂ of the risk setting, in [0, 1], shape [B, H, W].
         free: S_free, the goal's disc included, bool, shape [B, H, W].
         start: initial states, shape [B, S].
-        goal_m: (x, y) of the goals, shape [B, 2].
-        time_budget_s: T of each episode, shape [B].
-        fields: draws whole fields of λ, whose cells hang together; see `sample_fields`.
+        goal_m: goals (x, y) in metres, shape [B, 2].
+        time_budget_s: T of each episode in seconds, shape [B].
+        fields: source of correlated fields of λ; see `sample_fields`.
         immobile: what immobilises robots in the world, which planners may plan for;
             None for nothing.
     """
@@ -81,7 +80,7 @@ class Problem(Batch):
     immobile: Immobile | None = None
 
     def __post_init__(self) -> None:
-        """Checks that the batch is one batch."""
+        """Check that all tensors are of one batch."""
         batch = self.start.shape[0]
         expected = {
             "distribution": (batch, *self.grid.shape),
@@ -108,47 +107,46 @@ class Problem(Batch):
 
     @property
     def elevation_m(self) -> Tensor:
-        """Shape [B, H, W]."""
+        """Elevation in metres, shape [B, H, W]."""
         return self.observation.elevation_m
 
     @property
     def robot(self) -> Robot:
-        """F."""
+        """Robot, F."""
         return self.task.robot
 
     @property
     def objective(self) -> Objective:
-        """J, without the penalty of ground that is not free: see `stage_cost`."""
+        """J, without the penalty of non-free cells: see `stage_cost`."""
         return self.task.objective
 
     @property
     def goal_radius_m(self) -> float:
-        """A robot this near has arrived."""
+        """Distance to the goal in metres below which a robot has reached it."""
         return self.task.rules.goal_radius_m
 
     @property
     def dt_s(self) -> float:
-        """Time step of the robot."""
+        """Time step of the robot in seconds."""
         return self.robot.dt_s
 
     def sample_fields(
         self, count: int, key: int, cells: Tensor | None = None
     ) -> Tensor:
-        """Draws fields of λ as what is believed has them, each whole: its cells hang
-        together.
+        """Draw correlated fields of λ from the belief.
 
         Args:
             count: M.
             key: a stream key, see `benchnav.core.rng`; another key draws other fields.
-            cells: which are asked for, bool, shape [B, H, W], which may save time; what
-                others hold means nothing then.
+            cells: mask of the requested cells, bool, shape [B, H, W], which may save
+                time; other cells are then undefined.
 
         Returns:
-            λ in [0, 1], shape [B, M, H, W]; those of an episode do not depend on the
-            others.
+            λ in [0, 1], shape [B, M, H, W]; fields of an episode do not depend on the
+            other episodes.
 
         Raises:
-            ConfigError: nothing was said of how λ hangs together.
+            ConfigError: If the problem has no `fields`.
         """
         if self.fields is None:
             raise ConfigError(
@@ -158,36 +156,32 @@ class Problem(Batch):
         return self.fields.sample(count, key, cells).to(self.risk_map)
 
     def select(self, members: Tensor) -> "Problem":
-        """Keeps some episodes, by index, int64."""
-        kept = super().select(members)
-        return (
-            kept
-            if self.fields is None
-            else replace(kept, fields=self.fields.select(members))
-        )
+        """Return some episodes, by index, int64."""
+        selected = super().select(members)
+        if self.fields is None:
+            return selected
+        return replace(selected, fields=self.fields.select(members))
 
     @cached_property
     def traversability(self) -> Tensor:
-        """The λ̂ that motion and path costs are given: at least `min_traversability`,
-        shape [B, H, W].
+        """λ̂ of motion and path costs, at least `min_traversability`, shape [B, H, W].
 
-        J is given `risk_map` itself, so that a cost of low λ̂ is not lost.
+        J uses `risk_map` itself, so that a cost of low λ̂ is not lost.
         """
         return self.risk_map.clamp(min=self.task.rules.min_traversability)
 
     @cached_property
     def padded_ground(self) -> Tensor:
-        """λ̂ and free space in one map framed for lookups: λ̂ where free, −λ̂ where
-        not, −0 off the map.
+        """λ̂ and free mask in one padded map: λ̂ if free, −λ̂ if not, −0 off the map.
 
-        One lookup a step serves motion, J and the penalty of ground that is not free;
+        One lookup a step serves motion, J and the penalty of non-free cells;
         see `motion_traversability`, `stage_cost` and `free_at`.
         """
         return ground_map(self.grid, self.risk_map, self.free)
 
     @cached_property
     def action_bounds(self) -> tuple[Tensor, Tensor]:
-        """Least and greatest actions, each of shape [A]."""
+        """Minimum and maximum actions, each of shape [A]."""
         return (
             self.start.new_tensor(self.robot.action_low),
             self.start.new_tensor(self.robot.action_high),
@@ -195,60 +189,57 @@ class Problem(Batch):
 
     @property
     def dynamics(self) -> "Dynamics":
-        """What a rollout goes by besides its maps."""
+        """The inputs of a rollout other than its maps."""
         return Dynamics(
             self.grid, self.robot, self.objective, self.task.rules.min_traversability
         )
 
     def ground_at(self, state: Tensor) -> Tensor:
-        """Reads `padded_ground` where the robots stand; shape of `state` [B, *K, S]
-        without the last.
-        """
+        """Return `padded_ground` at states [B, *K, S], shape [B, *K]."""
         return self.grid.lookup(self.padded_ground, state[..., 0], state[..., 1])
 
     def traversability_at(self, state: Tensor) -> Tensor:
-        """λ̂ of motion where the robots stand, 0 off the map; shapes as for
-        `ground_at`.
-        """
+        """Return λ̂ of motion at states, 0 off the map; shapes as for `ground_at`."""
         return motion_traversability(
             self.ground_at(state), self.task.rules.min_traversability
         )
 
     def free_at(self, state: Tensor) -> Tensor:
-        """Tells which robots stand on free ground, bool; shapes as for `ground_at`."""
+        """Return a mask of states in free cells, bool; shapes as for `ground_at`."""
         return self.ground_at(state) > 0
 
     def stage_cost(
         self, state: Tensor, action: Tensor, ground: Tensor, target: Tensor
     ) -> Tensor:
-        """J of a step, and the penalty of ground that is not free.
+        """Return J of a step plus the penalty of non-free cells.
 
         Args:
-            state: shape [B, *K, S].
-            action: shape [B, *K, A].
+            state: states, shape [B, *K, S].
+            action: actions, shape [B, *K, A].
             ground: `ground_at(state)`, shape [B, *K].
-            target: (x, y) to be reached, shape [B, *1, 2].
+            target: target (x, y) in metres, shape [B, *1, 2].
 
         Returns:
-            Shape [B, *K].
+            Cost, shape [B, *K].
         """
         return stage_cost(self.objective, state, action, ground, target)
 
     def terminal_cost(self, state: Tensor, target: Tensor) -> Tensor:
-        """J of the last state, and the penalty of ground that is not free; shapes as
-        for `stage_cost`.
+        """Return the terminal J plus the penalty of non-free cells.
+
+        Shapes as for `stage_cost`.
         """
         return terminal_cost(self.objective, state, self.ground_at(state), target)
 
 
 class Dynamics(NamedTuple):
-    """What a rollout goes by besides its maps, for functions that are compiled.
+    """Inputs of a rollout other than its maps, for compiled functions.
 
     Args:
         grid: size and resolution of the maps.
         robot: F.
         objective: J.
-        min_traversability: least λ̂ of motion.
+        min_traversability: minimum λ̂ of motion.
     """
 
     grid: Grid
@@ -258,28 +249,26 @@ class Dynamics(NamedTuple):
 
 
 def ground_map(grid: Grid, traversability: Tensor, free: Tensor) -> Tensor:
-    """`Problem.padded_ground` of any λ and free space, shape [*B, H, W] of both."""
+    """Return `Problem.padded_ground` of any λ and free mask, both [*B, H, W]."""
     magnitude = traversability.clamp(min=_ZERO)
     return grid.pad(torch.where(free, magnitude, -magnitude), outside=-0.0)
 
 
 def motion_traversability(ground: Tensor, min_traversability: float) -> Tensor:
-    """λ̂ that motion is given: at least `min_traversability` on the map, 0 off it.
+    """Return λ̂ of motion: at least `min_traversability` on the map, 0 off it.
 
     Args:
-        ground: read from `Problem.padded_ground`, any shape.
-        min_traversability: of the task's rules.
+        ground: values of `Problem.padded_ground`, any shape.
+        min_traversability: minimum λ̂ of the task's rules.
 
     Returns:
-        Shape of `ground`.
+        λ̂, shape of `ground`.
     """
     return torch.where(ground == 0, 0, ground.abs().clamp(min=min_traversability))
 
 
 def predicted_traversability(ground: Tensor) -> Tensor:
-    """λ̂ as the risk setting gives it, 0 off the map, from values of
-    `Problem.padded_ground`.
-    """
+    """Return λ̂ of the risk setting, 0 off the map, from `Problem.padded_ground`."""
     magnitude = ground.abs()
     return torch.where(magnitude <= _ZERO, 0, magnitude)
 
@@ -287,34 +276,32 @@ def predicted_traversability(ground: Tensor) -> Tensor:
 def stage_cost(
     objective: Objective, state: Tensor, action: Tensor, ground: Tensor, target: Tensor
 ) -> Tensor:
-    """J of a step and the penalty of ground that is not free; see `Problem.stage_cost`."""
-    return objective.stage(
-        state, action, predicted_traversability(ground), target
-    ) + PENALTY * (ground <= 0)
+    """Return J of a step plus the penalty of non-free cells; see `Problem.stage_cost`."""
+    traversability = predicted_traversability(ground)
+    cost = objective.stage(state, action, traversability, target)
+    return cost + PENALTY * (ground <= 0)
 
 
 def terminal_cost(
     objective: Objective, state: Tensor, ground: Tensor, target: Tensor
 ) -> Tensor:
-    """J of the last state and the penalty of ground that is not free; see
-    `Problem.terminal_cost`.
-    """
-    return objective.terminal(
-        state, predicted_traversability(ground), target
-    ) + PENALTY * (ground <= 0)
+    """Return the terminal J plus the penalty; see `Problem.terminal_cost`."""
+    traversability = predicted_traversability(ground)
+    cost = objective.terminal(state, traversability, target)
+    return cost + PENALTY * (ground <= 0)
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is predicted of B maps.
+    """Prediction of B maps.
 
     Args:
-        observation: what the robots saw.
+        observation: the robots' observation.
         distribution: the predicted distribution of λ, shape [B, H, W].
-        risk_map: λ̂ as the risk setting gives it, shape [B, H, W].
-        free: free terrain, except that at the goal, bool, shape [B, H, W]; None for
-            what the rules derive from λ̂.
-        fields: draws whole fields of λ; None if no planner asks for them.
+        risk_map: λ̂ of the risk setting, shape [B, H, W].
+        free: free mask without the area at the goal, bool, shape [B, H, W]; None for
+            the one that the rules derive from λ̂.
+        fields: source of correlated fields of λ; None if no planner uses them.
     """
 
     observation: Observation
@@ -332,14 +319,14 @@ def pose_problem(
     time_budget_s: Tensor | float,
     immobile: Immobile | None = None,
 ) -> Problem:
-    """Pose the problem of driving from start to goal, facing the goal.
+    """Return the problem of driving from start to goal, initially facing the goal.
 
     Args:
-        task: what is to be done.
-        prediction: of B maps.
-        start_m: (x, y), shape [B, 2].
-        goal_m: (x, y), shape [B, 2].
-        time_budget_s: T, of all or of each, shape [B].
+        task: the task.
+        prediction: prediction of B maps.
+        start_m: starts (x, y) in metres, shape [B, 2].
+        goal_m: goals (x, y) in metres, shape [B, 2].
+        time_budget_s: T in seconds, a number or of shape [B].
         immobile: what immobilises robots in the world; None for nothing.
     """
     rules, free = task.rules, prediction.free
@@ -365,8 +352,7 @@ def pose_problem(
 
 
 def heading_to(position_m: Tensor, goal_m: Tensor) -> Tensor:
-    """Poses (x, y, θ) that look at the goal, shape [B, 3], from positions [B, 2]."""
+    """Return poses (x, y, θ) facing the goal, shape [B, 3], at positions [B, 2]."""
     offset = goal_m - position_m
-    return torch.cat(
-        (position_m, torch.atan2(offset[:, 1], offset[:, 0])[:, None]), dim=1
-    )
+    heading = torch.atan2(offset[:, 1], offset[:, 0])
+    return torch.cat((position_m, heading[:, None]), dim=1)

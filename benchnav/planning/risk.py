@@ -177,6 +177,6 @@ def apply(measure: RiskFunction, distribution: TraversabilityDistribution) -> Te
     )
     expect(
         ((risk_map >= 0) & (risk_map <= 1)).all(),
-        "a risk measure to give λ̂ in [0, 1], got values outside or not a number.",
+        "a risk measure to give λ̂ in [0, 1], got values outside or NaN.",
     )
     return risk_map.to(distribution.dtype)

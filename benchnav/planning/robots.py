@@ -1,4 +1,4 @@
-"""Robots: state transitions F, what an action does on ground of some traversability.
+"""Robots: state transitions F under actions and traversability.
 
 A robot is a `Robot`, with the members listed there and
 
@@ -21,16 +21,14 @@ from torch import Tensor
 from benchnav.core.errors import expect
 from benchnav.core.specified import Specified
 
-# How planners know what an action is.
+# Names of actions, by which planners know their meaning.
 SPEED, TURN_RATE, STEERING = "speed_mps", "turn_rate_radps", "steering_rad"
 
 
 class Robot(Specified, ABC):
-    """The base class of robots; `benchnav.testing.check_robot` tries whether one keeps
-    its contract.
+    """Base class of robots; `benchnav.testing.check_robot` checks the contract.
 
-    What is listed as a property may also be a class attribute, or the field of a
-    dataclass that has a default.
+    Properties may also be class attributes, or fields of a dataclass with defaults.
     """
 
     @property
@@ -41,44 +39,40 @@ class Robot(Specified, ABC):
     @property
     @abstractmethod
     def action_names(self) -> tuple[str, ...]:
-        """What each of the A actions is, with its unit; planners that steer go by these
-        names.
-        """
+        """Names of the A actions, with units, by which planners choose how to steer."""
 
     @property
     @abstractmethod
     def action_low(self) -> tuple[float, ...]:
-        """Least value of each action."""
+        """Minimum of each action."""
 
     @property
     @abstractmethod
     def action_high(self) -> tuple[float, ...]:
-        """Greatest value of each action."""
+        """Maximum of each action."""
 
     @property
     @abstractmethod
     def top_speed_mps(self) -> float:
-        """Greatest speed over ground of λ = 1."""
+        """Maximum speed on terrain of λ = 1, in m/s."""
 
     @property
     def action_rates(self) -> tuple[float, ...] | None:
-        """Greatest change of each action in a second; None where an action is followed
-        at once.
-        """
+        """Maximum change of each action per second; None if unlimited."""
         return None
 
     @abstractmethod
     def initial_state(self, pose: Tensor) -> Tensor:
-        """State of a robot that stands at a pose (x, y, θ): shape [B, S] from [B, 3]."""
+        """Return the states of robots standing at poses (x, y, θ), [B, S] from [B, 3]."""
 
     @abstractmethod
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
-        """Advances one time step.
+        """Return the state after one time step.
 
         Args:
-            state: shape [*B, S], beginning with (x, y, θ).
-            action: shape [*B, A].
-            traversability: λ where the robot stands, in [0, 1], shape [*B].
+            state: states that begin with (x, y, θ), shape [*B, S].
+            action: actions, shape [*B, A].
+            traversability: λ at the robots' positions, in [0, 1], shape [*B].
 
         Returns:
             The next state, shape [*B, S]; no argument is changed.
@@ -87,25 +81,25 @@ class Robot(Specified, ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class _Vehicle(Robot):
-    """What the shipped robots share: a speed within bounds, and a state that is or
-    begins with the pose.
+    """Common part of the shipped robots: a bounded speed, and a state that begins with
+    the pose.
     """
 
     dt_s: float = 0.1
     speed_mps: tuple[float, float] = (0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Refuses a time step or a speed that allows no motion."""
+        """Validate the time step and the speed."""
         expect(self.dt_s > 0, f"`dt_s` > 0, got {self.dt_s}.")
         _check_bounds("speed_mps", self.speed_mps)
 
     @property
     def top_speed_mps(self) -> float:
-        """Greatest |v|."""
+        """Maximum |v| in m/s."""
         return max(map(abs, self.speed_mps))
 
     def initial_state(self, pose: Tensor) -> Tensor:
-        """The pose itself; see `Robot`."""
+        """Return the pose; see `Robot`."""
         return pose.clone()
 
 
@@ -126,22 +120,22 @@ class Unicycle(_Vehicle):
     turn_rate_radps: tuple[float, float] = (-1.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Refuses a time step or bounds that allow no motion."""
+        """Validate the time step and the bounds."""
         super().__post_init__()
         _check_bounds("turn_rate_radps", self.turn_rate_radps)
 
     @property
     def action_low(self) -> tuple[float, ...]:
-        """Least (v, ω)."""
+        """Minimum (v, ω)."""
         return self.speed_mps[0], self.turn_rate_radps[0]
 
     @property
     def action_high(self) -> tuple[float, ...]:
-        """Greatest (v, ω)."""
+        """Maximum (v, ω)."""
         return self.speed_mps[1], self.turn_rate_radps[1]
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
-        """Advances one time step; see `Robot`."""
+        """Return the state after one time step; see `Robot`."""
         return _stack(
             _drive(state, action[..., 0], action[..., 1], traversability * self.dt_s)
         )
@@ -167,7 +161,7 @@ class DifferentialDrive(Unicycle):
     turn_acceleration_radps2: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuses a robot that cannot move."""
+        """Validate the bounds and the accelerations."""
         super().__post_init__()
         expect(
             self.acceleration_mps2 > 0 and self.turn_acceleration_radps2 > 0,
@@ -177,15 +171,15 @@ class DifferentialDrive(Unicycle):
 
     @property
     def action_rates(self) -> tuple[float, ...]:
-        """Greatest change of (v, ω) in a second."""
+        """Maximum change of (v, ω) per second."""
         return self.acceleration_mps2, self.turn_acceleration_radps2
 
     def initial_state(self, pose: Tensor) -> Tensor:
-        """Stands still at the pose; see `Robot`."""
+        """Return a standing state at the pose; see `Robot`."""
         return torch.cat((pose, torch.zeros_like(pose[..., :2])), dim=-1)
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
-        """Advances one time step; see `Robot`."""
+        """Return the state after one time step; see `Robot`."""
         reach, turn_reach = (
             self.acceleration_mps2 * self.dt_s,
             self.turn_acceleration_radps2 * self.dt_s,
@@ -223,7 +217,7 @@ class Bicycle(_Vehicle):
     wheelbase_m: float = 0.5
 
     def __post_init__(self) -> None:
-        """Refuses a robot that cannot move or turn."""
+        """Validate the bounds and the wheelbase."""
         super().__post_init__()
         expect(
             0 < self.steering_rad < math.pi / 2 and self.wheelbase_m > 0,
@@ -233,16 +227,16 @@ class Bicycle(_Vehicle):
 
     @property
     def action_low(self) -> tuple[float, ...]:
-        """Least (v, δ)."""
+        """Minimum (v, δ)."""
         return self.speed_mps[0], -self.steering_rad
 
     @property
     def action_high(self) -> tuple[float, ...]:
-        """Greatest (v, δ)."""
+        """Maximum (v, δ)."""
         return self.speed_mps[1], self.steering_rad
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
-        """Advances one time step; see `Robot`."""
+        """Return the state after one time step; see `Robot`."""
         turn_rate = action[..., 0] * action[..., 1].tan() / self.wheelbase_m
         return _stack(
             _drive(state, action[..., 0], turn_rate, traversability * self.dt_s)
@@ -252,7 +246,7 @@ class Bicycle(_Vehicle):
 def _drive(
     state: Tensor, speed: Tensor, turn_rate: Tensor, scale: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Moves (x, y, θ) for a step; `scale` is λ·dt."""
+    """Return (x, y, θ) after a step; `scale` is λ·dt."""
     x, y, heading = state[..., 0], state[..., 1], state[..., 2]
     moved = scale * speed
     return (
@@ -263,7 +257,7 @@ def _drive(
 
 
 def steps_in(time_s: float, dt_s: float) -> int:
-    """Time steps in so many seconds, to the nearest number, one at least."""
+    """Return the number of time steps in a duration: the nearest, at least one."""
     return max(1, round(time_s / dt_s))
 
 

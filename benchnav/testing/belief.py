@@ -17,8 +17,8 @@ from benchnav.core.grid import Grid
 from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.quantiles import LEVELS, quantiles_at
-from benchnav.planning.sensing.belief import Belief, Law, draw_scores
-from benchnav.planning.sensing.sensor import LEAST_STD, Sensed
+from benchnav.planning.sensing.belief import Belief, CovarianceModel, draw_scores
+from benchnav.planning.sensing.sensor import MIN_STD, Measurement
 from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
 from benchnav.testing.distribution import check_functions
 
@@ -78,12 +78,12 @@ def check_belief(
     for number, (height, width) in enumerate(shapes):
         for kind in ("a mixture", "quantiles")[: 1 if number else 2]:
             breaches.place = f"{height}×{width}, {kind}"
-            law, prior, other = _make_ground(
+            covariance, prior, other = _make_ground(
                 height, width, kind == "quantiles", torch.device(device)
             )
-            if kind == "quantiles" and _refuses_by_name(made, prior, law):
+            if kind == "quantiles" and _refuses_by_name(made, prior, covariance):
                 continue
-            _Trial(made, law, prior, other, tolerance, breaches).run()
+            _Trial(made, covariance, prior, other, tolerance, breaches).run()
     breaches.refuse()
 
 
@@ -92,7 +92,7 @@ class _Trial:
     """A belief on one batch, and where its breaches are noted."""
 
     belief: Belief[Any]
-    law: Law
+    covariance: CovarianceModel
     prior: TraversabilityDistribution
     other: TraversabilityDistribution  # another prediction
     tolerance: float
@@ -102,7 +102,7 @@ class _Trial:
         """Tells what is sensed step by step, then anew under what should change
         nothing.
         """
-        looks = list(_looks(self.prior, self.law))
+        looks = list(_looks(self.prior, self.covariance))
         state = first = self.begin(self.prior)
         if state is NOTHING or not self.is_sound(state):
             return
@@ -144,13 +144,16 @@ class _Trial:
     def begin(self, prior: TraversabilityDistribution) -> Any:
         """A state, or `NOTHING`."""
         return self.breaches.watch(
-            "init", lambda: self.belief.init(prior, self.law), prior=prior, law=self.law
+            "init",
+            lambda: self.belief.init(prior, self.covariance),
+            prior=prior,
+            covariance=self.covariance,
         )
 
     def update(
         self,
         state: Any,
-        sensed: Sensed,
+        sensed: Measurement,
         prior: TraversabilityDistribution | None = None,
     ) -> Any:
         """The next state, or `NOTHING`."""
@@ -256,13 +259,13 @@ class _Trial:
         )
         self.expect_of(last, self.prior, said, _UNTOLD)
 
-    def try_repeated(self, last: Any, sensed: Sensed) -> None:
+    def try_repeated(self, last: Any, sensed: Measurement) -> None:
         """Expects that λ which is told twice without noise changes nothing the second
         time.
         """
-        exact = Sensed(
+        exact = Measurement(
             traversability=sensed.traversability,
-            std=torch.full_like(sensed.traversability, LEAST_STD),
+            std=torch.full_like(sensed.traversability, MIN_STD),
         )
         once = self.update(last, exact)
         twice = NOTHING if once is NOTHING else self.update(once, exact)
@@ -273,7 +276,7 @@ class _Trial:
             )
             self.expect(self.alike(twice, once, self.tolerance), said)
 
-    def try_drawn(self, first: Any, looks: Sequence[Sensed]) -> None:
+    def try_drawn(self, first: Any, looks: Sequence[Measurement]) -> None:
         """Expects that what is drawn from the prediction makes other cells surer on
         average.
 
@@ -284,12 +287,12 @@ class _Trial:
         if not self.belief.learns:
             return
         seen = torch.stack([sensed.mask for sensed in looks]).any(0)
-        law = draw_scores(self.law, _DRAWS, _KEYS).to(
+        scores = draw_scores(self.covariance, _DRAWS, _KEYS).to(
             self.prior.device, self.prior.dtype
         )
         before, after = _shown(self.prior), []
         for number in range(_DRAWS):
-            field = self.prior.from_normal(law[:, number])
+            field = self.prior.from_normal(scores[:, number])
             state = self.update(
                 first, _sensed(torch.where(seen, field, torch.nan), self.prior)
             )
@@ -405,7 +408,7 @@ class _Trial:
                 "got others.",
             )
 
-    def try_members(self, looks: Sequence[Sensed], last: Any) -> None:
+    def try_members(self, looks: Sequence[Measurement], last: Any) -> None:
         """Expects of episodes alone, in another order, and kept on the way, what they
         got in the batch.
         """
@@ -483,10 +486,10 @@ def _means(distribution: TraversabilityDistribution) -> tuple[Tensor, Tensor]:
 
 
 def _refuses_by_name(
-    belief: Belief[Any], prior: TraversabilityDistribution, law: Law
+    belief: Belief[Any], prior: TraversabilityDistribution, covariance: CovarianceModel
 ) -> bool:
     try:
-        belief.init(prior, law)
+        belief.init(prior, covariance)
     except ConfigError as error:
         return type(prior).__name__ in str(error)
     except Exception:
@@ -494,18 +497,20 @@ def _refuses_by_name(
     return False
 
 
-def _sensed(values: Tensor, prior: TraversabilityDistribution) -> Sensed:
+def _sensed(values: Tensor, prior: TraversabilityDistribution) -> Measurement:
     values = values.to(dtype=prior.dtype, device=prior.device)
-    return Sensed(traversability=values, std=torch.full_like(values, _STD))
+    return Measurement(traversability=values, std=torch.full_like(values, _STD))
 
 
-def _looks(prior: TraversabilityDistribution, law: Law) -> Iterator[Sensed]:
+def _looks(
+    prior: TraversabilityDistribution, covariance: CovarianceModel
+) -> Iterator[Measurement]:
     """λ along a way from left to right, also 0 and 1; of the second episode nothing at
     first, of the last never.
     """
-    score = draw_scores(law, 1, _KEYS)[:, 0].to(prior.device)
+    score = draw_scores(covariance, 1, _KEYS)[:, 0].to(prior.device)
     field = prior.from_normal(score.to(prior.dtype))
-    height, width = law.grid.shape
+    height, width = covariance.grid.shape
     for step in range(_STEPS):
         values, row = torch.full_like(field, torch.nan), height // 2
         begin, end = step * width // (_STEPS + 1), (step + 1) * width // (_STEPS + 1)
@@ -519,9 +524,9 @@ def _looks(prior: TraversabilityDistribution, law: Law) -> Iterator[Sensed]:
 
 def _make_ground(
     height: int, width: int, by_quantiles: bool, device: torch.device
-) -> tuple[Law, TraversabilityDistribution, TraversabilityDistribution]:
-    """A law, and two predictions of the λ of four maps."""
-    law = Law(
+) -> tuple[CovarianceModel, TraversabilityDistribution, TraversabilityDistribution]:
+    """A covariance model, and two predictions of the λ of four maps."""
+    covariance = CovarianceModel(
         grid=Grid(height, width, 0.5),
         correlation_m=1.0,
         statistics=GroundStatistics(
@@ -550,4 +555,4 @@ def _make_ground(
         )
         return quantiles_at(mixture, LEVELS) if by_quantiles else mixture
 
-    return law, predict(), predict()
+    return covariance, predict(), predict()

@@ -24,7 +24,7 @@ from benchnav.planning.planners.boundary import (
 )
 from benchnav.planning.planners.planner import INPUTS, Plan, Planner, PlanStatus
 from benchnav.planning.problem import Prediction, Problem, Task, pose_problem
-from benchnav.planning.sensing.belief import Fields, Law, Static
+from benchnav.planning.sensing.belief import CovarianceModel, Fields, Static
 from benchnav.planning.sensing.sensor import Step
 from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
 
@@ -428,5 +428,5 @@ def _make_problem(
 
 def _fields_of(mixture: TraversabilityMixture, grid: Grid) -> Fields:
     """Fields of a prediction, correlated over a metre."""
-    believed = Static().init(mixture, Law(grid=grid, correlation_m=1.0))
+    believed = Static().init(mixture, CovarianceModel(grid=grid, correlation_m=1.0))
     return Fields(Static(), believed, tuple(range(mixture.shape[0])))

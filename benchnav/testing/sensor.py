@@ -17,10 +17,10 @@ from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.planning.sensing.sensor import (
-    LEAST_STD,
+    MIN_STD,
     Appearance,
-    Moment,
-    Sensed,
+    Measurement,
+    NoiseKey,
     Sensor,
 )
 from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
@@ -41,9 +41,9 @@ def check_sensor(
     letting it sense on four hills.
 
     The robots: one in the middle of the map, two at its borders, one off it.
-    The contract: some cell is sensed or seen; a `Sensed` of the field's shape, dtype
+    The contract: some cell is sensed or seen; a `Measurement` of the field's shape, dtype
     and device; λ in [0, 1], NaN where it is not sensed, with a standard deviation of at
-    least `LEAST_STD`; of an `Appearance` the terrain's own layers, with elevation and a
+    least `MIN_STD`; of an `Appearance` the terrain's own layers, with elevation and a
     doubt ≥ 0 in every cell that is seen; the arguments left as they were, and with them
     the global generators of Python, NumPy and PyTorch; the same answer when asked
     again, and for some episodes alone and in another order what it is in the batch;
@@ -132,7 +132,7 @@ class _Trial:
                 ),
                 "Expected for episodes alone and in another order what they got in "
                 "the batch, got another. Draw noise "
-                "by `Moment.normal`.",
+                "by `NoiseKey.normal`.",
             )
         if not is_same:
             return  # or everything would seem to hang on everything
@@ -144,7 +144,7 @@ class _Trial:
             )
         self.try_noise(sensed)
 
-    def try_noise(self, sensed: Sensed) -> None:
+    def try_noise(self, sensed: Measurement) -> None:
         """Expects noise that is another in each episode and in each step."""
         by_key, by_step = (
             other is not NOTHING and _differ(sensed, other)
@@ -156,27 +156,27 @@ class _Trial:
         self.breaches.expect(
             by_step or not by_key,
             "Expected other noise in another step, got the same. Draw it by "
-            "`Moment.normal`.",
+            "`NoiseKey.normal`.",
         )
         self.breaches.expect(
             by_key or not by_step,
             "Expected other noise under another key of the episode, got the same "
             "though it differs from step to step. "
-            "Draw it by `Moment.normal`.",
+            "Draw it by `NoiseKey.normal`.",
         )
 
     def ask(
         self, truth: _Truth, keys: Sequence[int] = _KEYS, step: int | None = None
     ) -> Any:
         """Lets the sensor sense; `NOTHING` where what came is of no use."""
-        given, moment = (
+        given, noise_key = (
             vars(truth),
-            Moment(tuple(keys), self.step if step is None else step),
+            NoiseKey(tuple(keys), self.step if step is None else step),
         )
         answer = self.breaches.watch(
             "sense",
             lambda: self.sensor.sense(
-                truth.terrain, truth.field, truth.robot_state, moment
+                truth.terrain, truth.field, truth.robot_state, noise_key
             ),
             **given,
         )
@@ -196,12 +196,12 @@ class _Trial:
 def _faults(sensed: Any, truth: _Truth) -> Iterator[str]:
     """Tells what is wrong with the form of an answer, a line each."""
     like = truth.field
-    if not isinstance(sensed, Sensed):
-        yield f"Expected a Sensed from `sense`, got {type(sensed).__name__}."
+    if not isinstance(sensed, Measurement):
+        yield f"Expected a Measurement from `sense`, got {type(sensed).__name__}."
         return
     maps = {
-        "`Sensed.traversability`": sensed.traversability,
-        "`Sensed.std`": sensed.std,
+        "`Measurement.traversability`": sensed.traversability,
+        "`Measurement.std`": sensed.std,
     }
     if wrong := [
         fault
@@ -213,9 +213,9 @@ def _faults(sensed: Any, truth: _Truth) -> Iterator[str]:
     found, std = sensed.traversability[sensed.mask], sensed.std[sensed.mask]
     if not bool(((found >= 0) & (found <= 1)).all()):
         yield "Expected λ in [0, 1], or NaN where it is not sensed, got other numbers."
-    if not bool(((std >= LEAST_STD) & std.isfinite()).all()):
+    if not bool(((std >= MIN_STD) & std.isfinite()).all()):
         yield (
-            f"Expected `Sensed.std` of at least {LEAST_STD:g}, and finite, where λ "
+            f"Expected `Measurement.std` of at least {MIN_STD:g}, and finite, where λ "
             "is sensed, got others."
         )
     if sensed.appearance is not None:
@@ -228,7 +228,7 @@ def _faults_of_look(look: Any, truth: _Truth) -> Iterator[str]:
         look.observation, Observation
     ):
         yield (
-            "Expected `Sensed.appearance` as an Appearance with an Observation, "
+            "Expected `Measurement.appearance` as an Appearance with an Observation, "
             "got "
             "something else."
         )
@@ -243,7 +243,7 @@ def _faults_of_look(look: Any, truth: _Truth) -> Iterator[str]:
         return
     pairs = {
         "seen": (look.seen, like.bool()),
-        "doubt": (look.doubt, like),
+        "noise_level": (look.noise_level, like),
         "observation.rgb": (given.rgb, known.rgb),
         "observation.elevation_m": (given.elevation_m, known.elevation_m),
     }
@@ -257,8 +257,8 @@ def _faults_of_look(look: Any, truth: _Truth) -> Iterator[str]:
     yield from filter(None, faults)
     if any(faults):
         return
-    if not bool((look.doubt[look.seen] >= 0).all()):
-        yield "Expected `Appearance.doubt` ≥ 0 where a cell is seen, got others."
+    if not bool((look.noise_level[look.seen] >= 0).all()):
+        yield "Expected `Appearance.noise_level` ≥ 0 where a cell is seen, got others."
     if not bool(given.elevation_m[look.seen].isfinite().all()):
         yield "Expected finite elevation where a cell is seen, got others."
 
@@ -267,7 +267,7 @@ def _tensor_fault(what: str, values: Any, like: Tensor) -> str:
     return find_tensor_fault(what, values, like.dtype, tuple(like.shape), like.device)
 
 
-def _shown(sensed: Sensed) -> tuple[Tensor, ...]:
+def _shown(sensed: Measurement) -> tuple[Tensor, ...]:
     """What is reported, without what means nothing; the first of each tensor's
     dimensions is B.
     """
@@ -278,7 +278,10 @@ def _shown(sensed: Sensed) -> tuple[Tensor, ...]:
     return (
         *own,
         seen,
-        *(values.where(seen, torch.nan) for values in (look.doubt, *_looks(look))),
+        *(
+            values.where(seen, torch.nan)
+            for values in (look.noise_level, *_looks(look))
+        ),
     )
 
 
@@ -288,7 +291,7 @@ def _looks(look: Appearance) -> tuple[Tensor, ...]:
     return (*known.rgb.float().unbind(1), known.elevation_m, *known.layers.values())
 
 
-def _differ(first: Sensed, second: Sensed) -> bool:
+def _differ(first: Measurement, second: Measurement) -> bool:
     """Tells whether two report something else of a cell that both report."""
     both = first.mask & second.mask
     differ = bool((first.traversability != second.traversability)[both].any())
@@ -300,14 +303,14 @@ def _differ(first: Sensed, second: Sensed) -> bool:
 
 
 def _replaced(
-    truth: _Truth, sensed: Sensed, sinks: bool
+    truth: _Truth, sensed: Measurement, sinks: bool
 ) -> Iterator[tuple[str, _Truth]]:
     """Truths that differ in what is not reported, and what that is."""
     terrain, look, mask = truth.terrain, sensed.appearance, sensed.mask
     reported = mask if look is None else mask | look.seen
     # Others in each cell, and in all that sums them up, such as a map's mean and
     # greatest.
-    law = replace(
+    mixture = replace(
         terrain.truth,
         weights=terrain.truth.weights.where(
             mask[:, None], terrain.truth.weights.flip(1, 2)
@@ -318,7 +321,7 @@ def _replaced(
     other = replace(
         terrain,
         class_id=terrain.class_id.where(mask, terrain.class_id + 1),
-        truth=law,
+        truth=mixture,
         traversability=terrain.traversability.where(
             mask, 0.4 * (1 - terrain.traversability)
         ),

@@ -77,9 +77,11 @@ class Coverage:
     def __call__(self, step: int, knowing: Knowing) -> None:
         """Asks what is believed where a time was drawn; of robots that are left."""
         known, members = knowing.known, knowing.members
-        asked = (self._steps[members] == step).any(1) & known.reached.flatten(1).any(1)
+        asked = (self._steps[members] == step).any(1) & known.footprint.flatten(1).any(
+            1
+        )
         cells = (
-            _near(known.reached, self._built.problem.grid.resolution_m)
+            _near(known.footprint, self._built.problem.grid.resolution_m)
             & ~known.ever_sensed
         )
         cells &= asked[:, None, None]

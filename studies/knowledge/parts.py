@@ -16,7 +16,7 @@ from torch import Tensor
 from benchnav import Terrain
 from benchnav.core import rng
 from benchnav.core.copula import correlated_normal
-from benchnav.planning import AStarDWA, Moment, Probe, Sensed
+from benchnav.planning import AStarDWA, Measurement, NoiseKey, Probe
 from benchnav.planning.robots import steps_in
 
 
@@ -35,17 +35,17 @@ class Elsewhere(Probe):
     correlation_m: float = 1.5
 
     def sense(
-        self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-    ) -> Sensed:
-        near = self._near(terrain, robot_state)
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
+        near = self._in_range(terrain, robot_state)
         cells = self.correlation_m / terrain.grid.resolution_m
         scores = np.stack(
-            [_scores(key, terrain.grid.shape, cells) for key in moment.keys]
+            [_scores(key, terrain.grid.shape, cells) for key in noise_key.keys]
         )
         other = torch.full_like(field, torch.nan)
         drawn = torch.from_numpy(scores).to(field)[near]
         other[near] = terrain.truth.at(near).from_normal(drawn[None])[0].to(field.dtype)
-        return super().sense(terrain, other, robot_state, moment)
+        return super().sense(terrain, other, robot_state, noise_key)
 
 
 @lru_cache(maxsize=256)

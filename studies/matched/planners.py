@@ -16,9 +16,9 @@ from torch import Tensor
 from benchnav.core import rng
 from benchnav.planning import MPPI, MPPIConfig, Plan, Problem
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.mppi import (
+from benchnav.planning.planners.mppi import MPPIState
+from benchnav.planning.planners.mppi_rollouts import (
     Ends,
-    MPPIState,
     advance_chunk,
     roll_out,
     total_cost,

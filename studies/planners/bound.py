@@ -26,8 +26,8 @@ from benchnav.core import rng
 from benchnav.core.registry import make, read_part
 from benchnav.eval.run.rollout import run_episodes
 from benchnav.planning import (
+    Endpoints,
     FreeSpace,
-    Places,
     Rules,
     Simulation,
     Task,
@@ -170,7 +170,7 @@ def drive_worlds(fields: ndarray, immobile: Immobile, grid: Grid, name: str) -> 
     problem, terrain = pose_on(
         ground, grid, (start_m, goal_m), task, _LIMIT_S, immobile=immobile
     )
-    places = Places(
+    places = Endpoints(
         start_m=start_m,
         goal_m=goal_m,
         reference_time_s=torch.full((len(ground),), torch.nan),

@@ -49,7 +49,10 @@ def cost_from_start(
     state = Optimal.init(made, problem, rng.generator(0))  # value iteration only
     took = time.perf_counter() - begun
     cost = (
-        ways_from(problem.start, state.held, state).cost.min(1).values.double().numpy()
+        ways_from(problem.start, state.dwell_s, state)
+        .cost.min(1)
+        .values.double()
+        .numpy()
     )
     return np.where(
         cost < made.no_way(state.costs).double().numpy(), cost, np.inf

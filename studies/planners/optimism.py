@@ -25,7 +25,8 @@ from benchnav.core import rng
 from benchnav.planning import MPPI, MPPIConfig, Problem, Step
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.cost_risk import framed_fields, tail_cost
-from benchnav.planning.planners.mppi import MPPIState, advance_chunk, roll_out
+from benchnav.planning.planners.mppi import MPPIState
+from benchnav.planning.planners.mppi_rollouts import advance_chunk, roll_out
 from benchnav.stats.intervals import mean_interval
 from studies.study import Rows, Work
 from studies.units import build_unit, one_unit, stakes_suite

@@ -14,7 +14,8 @@ from benchnav.planning import MPPI, MPPIConfig, Problem, Step, distance
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.cost_risk import framed_fields
-from benchnav.planning.planners.mppi import OF_EPISODES, MPPIState
+from benchnav.planning.planners.mppi import MPPIState
+from benchnav.planning.planners.mppi_rollouts import OF_EPISODES
 from benchnav.planning.planners.noise_bank import Sampled, perturb
 from benchnav.planning.problem import Dynamics, motion_traversability
 from benchnav.planning.robots import component_wise

@@ -303,7 +303,7 @@ def test_the_belief_is_told_how_the_λ_of_this_world_hangs_together(
 ) -> None:
     def length(**world: Any) -> float:
         env = make(dataset_path, belief="copula", world={**STAKES, **world})
-        return batch_of(env)._experience._learner.law.correlation_m
+        return batch_of(env)._experience._learner.covariance.correlation_m
 
     assert length() == 1.5
     assert length(correlation_m=0.7) == 0.7

@@ -101,7 +101,9 @@ def test_each_vector_member_is_the_single_environment_with_its_seed(
         (singles[1]._batch, 4),
     ):
         own._now = replace(
-            own._now, step=own._now.step + more, held=own._now.held + more // 2
+            own._now,
+            step=own._now.step + more,
+            dwell_steps=own._now.dwell_steps + more // 2,
         )
     generator = np.random.default_rng(0)
     ended, episodes = [False] * 3, 0

@@ -14,9 +14,9 @@ from benchnav.core.terrain import Observation
 from benchnav.planning.free_space import FreeSpace, Rules, cells_at_goal
 from benchnav.planning.problem import Prediction, Problem, heading_to, pose_problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
-from benchnav.planning.sensing.belief import Belief, Fields, Law, Static
+from benchnav.planning.sensing.belief import Belief, CovarianceModel, Fields, Static
 from benchnav.planning.sensing.copula import Copula
-from benchnav.planning.sensing.sensor import Sensed
+from benchnav.planning.sensing.sensor import Measurement
 from tests import factories
 from tests.core.distributions import quantiles
 
@@ -217,11 +217,11 @@ def drawing(
     H, W].
     """
     problem = varied()
-    law = Law(grid=problem.grid, correlation_m=correlation_m)
-    state = belief.init(problem.distribution, law)
+    covariance = CovarianceModel(grid=problem.grid, correlation_m=correlation_m)
+    state = belief.init(problem.distribution, covariance)
     if sensed is not None:
         state = belief.update(
-            state, Sensed(traversability=sensed, std=torch.full_like(sensed, 0.01))
+            state, Measurement(traversability=sensed, std=torch.full_like(sensed, 0.01))
         )
     return replace(problem, fields=Fields(belief, state, (7, 3, 11)))
 

@@ -83,7 +83,7 @@ def test_a_users_measure_is_applied_and_its_map_takes_the_mixtures_dtype() -> No
         ),
         (lambda mixture: mixture.mean() + 1, "in [0, 1], got values outside"),
         (lambda mixture: mixture.mean() - 1, "in [0, 1], got values outside"),
-        (lambda mixture: mixture.mean() * torch.nan, "or not a number"),
+        (lambda mixture: mixture.mean() * torch.nan, "or NaN"),
     ],
 )
 def test_what_is_no_map_of_traversability_is_refused(measure, expected: str) -> None:  # type: ignore[no-untyped-def]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from benchnav import Terrain
 from benchnav.core import registry
-from benchnav.planning import Moment, Probe, Problem, Sensed
+from benchnav.planning import Measurement, NoiseKey, Probe, Problem
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
@@ -26,7 +26,9 @@ STATES = torch.tensor([[6.1, 5.8, 0.0]]).expand(BATCH, 3)
 @pytest.fixture(scope="module")
 def ground() -> tuple[Terrain, Tensor]:
     truth = made.mixture(BATCH, SIZE, SIZE, atoms=False)
-    field = truth.from_normal(made.scores(made.law(SIZE, SIZE, 1.0), BATCH, seed=5))
+    field = truth.from_normal(
+        made.scores(made.covariance(SIZE, SIZE, 1.0), BATCH, seed=5)
+    )
     return made.terrain(truth, field), field
 
 
@@ -42,11 +44,11 @@ def sense(
     ground: tuple[Terrain, Tensor],
     keys: tuple[int, ...] = KEYS,
     step: int = 0,
-) -> Sensed:
-    return sensor.sense(*ground, STATES[: len(keys)], Moment(keys, step))
+) -> Measurement:
+    return sensor.sense(*ground, STATES[: len(keys)], NoiseKey(keys, step))
 
 
-def scores(sensed: Sensed, terrain: Terrain) -> Tensor:
+def scores(sensed: Measurement, terrain: Terrain) -> Tensor:
     """Normal scores of what is sensed, a row an episode."""
     return (
         terrain.truth.at(sensed.mask)
@@ -93,7 +95,7 @@ def test_elsewhere_is_one_draw_an_episode_by_its_key_and_looks_at_no_field(
     own = torch.tensor([3])
     for key, same in ((3, True), (99, False)):
         alone = sensor.sense(
-            terrain.select(own), field[own], STATES[own], Moment((key,), 0)
+            terrain.select(own), field[own], STATES[own], NoiseKey((key,), 0)
         ).traversability
         assert torch.equal(alone.nan_to_num(-1), told[own].nan_to_num(-1)) is same
 

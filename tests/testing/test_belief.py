@@ -14,9 +14,15 @@ from benchnav.core.conditioned import ConditionedDistribution
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.planning.sensing.belief import Belief, Law, Static, draw_scores, fields_of
+from benchnav.planning.sensing.belief import (
+    Belief,
+    CovarianceModel,
+    Static,
+    draw_scores,
+    fields_of,
+)
 from benchnav.planning.sensing.copula import Copula
-from benchnav.planning.sensing.sensor import Sensed
+from benchnav.planning.sensing.sensor import Measurement
 from benchnav.testing import check_belief
 from tests.testing.refusal import refusal
 
@@ -28,7 +34,7 @@ class Known(Batch):
     """What was observed of each cell for itself; it can be written into."""
 
     prior: TraversabilityDistribution
-    law: Law
+    covariance: CovarianceModel
     score: Tensor
     std: Tensor
 
@@ -36,16 +42,18 @@ class Known(Batch):
 class Good(Belief[Known]):
     """Learns of each cell that was sensed, and nothing of others; takes mixtures alone."""
 
-    def init(self, prior: TraversabilityDistribution, law: Law) -> Known:
+    def init(
+        self, prior: TraversabilityDistribution, covariance: CovarianceModel
+    ) -> Known:
         if not isinstance(prior, TraversabilityMixture):
             raise ConfigError(f"Expected a mixture, got {type(prior).__name__}.")
         nothing = torch.zeros(prior.shape, dtype=prior.dtype)
-        return Known(prior, law, nothing, nothing + 1)
+        return Known(prior, covariance, nothing, nothing + 1)
 
     def update(
         self,
         state: Known,
-        sensed: Sensed,
+        sensed: Measurement,
         prior: TraversabilityDistribution | None = None,
     ) -> Known:
         if prior is not None:
@@ -66,9 +74,9 @@ class Good(Belief[Known]):
         return other | (before.score != after.score) | (before.std != after.std)
 
     def sample_fields(self, state: Known, count: int, keys: Sequence[int]) -> Tensor:
-        drawn = draw_scores(replace(state.law, correlation_m=0.0), count, keys).to(
-            state.std
-        )
+        drawn = draw_scores(
+            replace(state.covariance, correlation_m=0.0), count, keys
+        ).to(state.std)
         return fields_of(state.prior, state.score[:, None] + state.std[:, None] * drawn)
 
 
@@ -101,7 +109,7 @@ class OnSelf(Good):
     def update(
         self,
         state: Known,
-        sensed: Sensed,
+        sensed: Measurement,
         prior: TraversabilityDistribution | None = None,
     ) -> Known:
         self.count += 1
@@ -113,9 +121,11 @@ class OnSelf(Good):
 class LastBegun(Good):
     """Remembers itself the prediction that was begun last."""
 
-    def init(self, prior: TraversabilityDistribution, law: Law) -> Known:
+    def init(
+        self, prior: TraversabilityDistribution, covariance: CovarianceModel
+    ) -> Known:
         self.prior = prior
-        return super().init(prior, law)
+        return super().init(prior, covariance)
 
     def distribution(self, state: Known) -> TraversabilityDistribution:
         if self.prior.shape == state.prior.shape:
@@ -127,7 +137,7 @@ def blurred(state: Known, *_: Any) -> Known:
     return replace(state, std=state.std * 0.9)
 
 
-def shared(state: Known, before: Known, sensed: Sensed, *_: Any) -> Known:
+def shared(state: Known, before: Known, sensed: Measurement, *_: Any) -> Known:
     """Learns in all episodes what is sensed in any."""
     return replace(state, score=state.score + sensed.mask.float().mean())
 
@@ -145,7 +155,7 @@ def in_turn(fields: Tensor, state: Known, count: int, keys: Sequence[int]) -> Te
 def of_the_prior(
     fields: Tensor, state: Known, count: int, keys: Sequence[int]
 ) -> Tensor:
-    return fields_of(state.prior, draw_scores(state.law, count, keys))
+    return fields_of(state.prior, draw_scores(state.covariance, count, keys))
 
 
 BAD: dict[str, tuple[Any, str]] = {
@@ -218,17 +228,19 @@ def test_a_breach_is_caught_and_named(
 
 def test_a_good_belief_passes_on_predictions_worth_trying() -> None:
     begun: list[tuple[str, tuple[int, ...]]] = []
-    told: list[Sensed] = []
+    told: list[Measurement] = []
 
     class Spy(Good):
-        def init(self, prior: TraversabilityDistribution, law: Law) -> Known:
+        def init(
+            self, prior: TraversabilityDistribution, covariance: CovarianceModel
+        ) -> Known:
             begun.append((type(prior).__name__, tuple(prior.shape)))
-            return super().init(prior, law)
+            return super().init(prior, covariance)
 
         def update(
             self,
             state: Known,
-            sensed: Sensed,
+            sensed: Measurement,
             prior: TraversabilityDistribution | None = None,
         ) -> Known:
             told.append(sensed)
@@ -246,7 +258,7 @@ def test_a_good_belief_passes_on_predictions_worth_trying() -> None:
 
 
 def test_a_refusal_of_quantiles_has_to_name_them() -> None:
-    def refuse(prior: TraversabilityDistribution, law: Law) -> None:
+    def refuse(prior: TraversabilityDistribution, covariance: CovarianceModel) -> None:
         if not isinstance(prior, TraversabilityMixture):
             raise ConfigError("Expected another model.")
 

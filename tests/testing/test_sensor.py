@@ -12,16 +12,16 @@ from benchnav.planning import (
     Appearance,
     Contact,
     Full,
-    Moment,
+    Measurement,
     Near,
+    NoiseKey,
     Probe,
-    Sensed,
     Sensor,
 )
 from benchnav.testing import check_sensor
 from tests.testing.refusal import refusal
 
-Change = Callable[[Sensed, Terrain, Tensor, Moment], Any]
+Change = Callable[[Measurement, Terrain, Tensor, NoiseKey], Any]
 
 
 def telling(good: Sensor, change: Change) -> Sensor:
@@ -29,10 +29,17 @@ def telling(good: Sensor, change: Change) -> Sensor:
 
     class Bad(Sensor):
         def sense(
-            self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-        ) -> Sensed:
+            self,
+            terrain: Terrain,
+            field: Tensor,
+            robot_state: Tensor,
+            noise_key: NoiseKey,
+        ) -> Measurement:
             return change(
-                good.sense(terrain, field, robot_state, moment), terrain, field, moment
+                good.sense(terrain, field, robot_state, noise_key),
+                terrain,
+                field,
+                noise_key,
             )  # type: ignore[no-any-return]
 
     return Bad()
@@ -43,30 +50,39 @@ def given(terrain: Callable[[Terrain], Terrain], good: Sensor | None = None) -> 
 
     class Bad(Sensor):
         def sense(
-            self, truth: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-        ) -> Sensed:
-            return (good or Near()).sense(terrain(truth), field, robot_state, moment)
+            self,
+            truth: Terrain,
+            field: Tensor,
+            robot_state: Tensor,
+            noise_key: NoiseKey,
+        ) -> Measurement:
+            return (good or Near()).sense(terrain(truth), field, robot_state, noise_key)
 
     return Bad()
 
 
-def moved(moment: Callable[[Moment], Moment], good: Sensor | None = None) -> Sensor:
+def moved(
+    noise_key: Callable[[NoiseKey], NoiseKey], good: Sensor | None = None
+) -> Sensor:
     """A good sensor with other noise."""
 
     class Bad(Sensor):
         def sense(
-            self, terrain: Terrain, field: Tensor, robot_state: Tensor, given: Moment
-        ) -> Sensed:
-            return (good or Probe()).sense(terrain, field, robot_state, moment(given))
+            self, terrain: Terrain, field: Tensor, robot_state: Tensor, given: NoiseKey
+        ) -> Measurement:
+            return (good or Probe()).sense(
+                terrain, field, robot_state, noise_key(given)
+            )
 
     return Bad()
 
 
-def probing(change: Callable[[Tensor, Terrain, Tensor, Moment], Tensor]) -> Sensor:
+def probing(change: Callable[[Tensor, Terrain, Tensor, NoiseKey], Tensor]) -> Sensor:
     return telling(
         Probe(),
-        lambda sensed, terrain, field, moment: replace(
-            sensed, traversability=change(sensed.traversability, terrain, field, moment)
+        lambda sensed, terrain, field, noise_key: replace(
+            sensed,
+            traversability=change(sensed.traversability, terrain, field, noise_key),
         ),
     )
 
@@ -110,11 +126,11 @@ class Forgetful(Sensor):
     asked = 0
 
     def sense(
-        self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-    ) -> Sensed:
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
         self.asked += 1
         return Probe().sense(
-            terrain, field, robot_state, Moment(moment.keys, self.asked)
+            terrain, field, robot_state, NoiseKey(noise_key.keys, self.asked)
         )
 
 
@@ -124,13 +140,15 @@ class Ray(Sensor):
     """
 
     def sense(
-        self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-    ) -> Sensed:
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
         seen = torch.zeros_like(field, dtype=torch.bool)
         seen[:, 5, 5] = terrain.elevation_m[:, 5, 4] > -1.2
-        doubt = torch.zeros_like(field)
-        return Sensed.looks(
-            Appearance(seen=seen, observation=terrain.observe(), doubt=doubt)
+        noise_level = torch.zeros_like(field)
+        return Measurement.of_appearance(
+            Appearance(
+                seen=seen, observation=terrain.observe(), noise_level=noise_level
+            )
         )
 
 
@@ -184,41 +202,41 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "says nothing": (
         telling(Probe(), lambda *_: None),
-        "a Sensed from `sense`, got NoneType",
+        "a Measurement from `sense`, got NoneType",
     ),
     "λ of a cell": (
         probing(lambda found, *_: found[:, 0]),
-        "`Sensed.traversability` as torch.float32 of shape [4, 24, 24]",
+        "`Measurement.traversability` as torch.float32 of shape [4, 24, 24]",
     ),
     "float64": (
         probing(lambda found, *_: found.double()),
-        "`Sensed.traversability` as torch.float32",
+        "`Measurement.traversability` as torch.float32",
     ),
     "λ above 1": (probing(lambda found, *_: found + 1), "Expected λ in [0, 1]"),
     "too sure": (
         telling(Probe(), lambda sensed, *_: replace(sensed, std=0 * sensed.std)),
-        "`Sensed.std` of at least 0.001",
+        "`Measurement.std` of at least 0.001",
     ),
     "never sure": (
         telling(Probe(), lambda sensed, *_: replace(sensed, std=sensed.std / 0)),
-        "`Sensed.std` of at least 0.001",
+        "`Measurement.std` of at least 0.001",
     ),
     "sees all, it says": (Seer(), "Expected `sees_all` of type bool, got 'yes'"),
     "no appearance": (
         looking(lambda look: 3),
-        "Expected `Sensed.appearance` as an Appearance",
+        "Expected `Measurement.appearance` as an Appearance",
     ),
     "seen in part": (
         looking(lambda look: replace(look, seen=look.seen.float())),
         "`Appearance.seen` as torch.bool",
     ),
     "doubt of a map": (
-        looking(lambda look: replace(look, doubt=look.doubt[:, 0])),
-        "`Appearance.doubt` as torch.float32",
+        looking(lambda look: replace(look, noise_level=look.noise_level[:, 0])),
+        "`Appearance.noise_level` as torch.float32",
     ),
     "doubt below 0": (
-        looking(lambda look: replace(look, doubt=-look.doubt)),
-        "Expected `Appearance.doubt` ≥ 0",
+        looking(lambda look: replace(look, noise_level=-look.noise_level)),
+        "Expected `Appearance.noise_level` ≥ 0",
     ),
     "elevation unknown": (
         seeing(elevation_m=lambda height: height / 0),
@@ -260,7 +278,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "where ground is good": (
         telling(
             Near(),
-            lambda sensed, _, field, __: Sensed.looks(
+            lambda sensed, _, field, __: Measurement.of_appearance(
                 replace(sensed.appearance, seen=sensed.appearance.seen & (field > 0.5))
             ),
         ),
@@ -308,10 +326,10 @@ BAD: dict[str, tuple[Any, str]] = {
     "steepest slope": (
         telling(
             Near(),
-            lambda sensed, terrain, *_: Sensed.looks(
+            lambda sensed, terrain, *_: Measurement.of_appearance(
                 replace(
                     sensed.appearance,
-                    doubt=sensed.appearance.doubt
+                    noise_level=sensed.appearance.noise_level
                     + terrain.slope_deg.amax((1, 2), keepdim=True),
                 )
             ),
@@ -338,7 +356,11 @@ BAD: dict[str, tuple[Any, str]] = {
         ALONE,
     ),
     "keys of the first": (
-        moved(lambda moment: Moment([moment.keys[0]] * len(moment.keys), moment.step)),
+        moved(
+            lambda noise_key: NoiseKey(
+                [noise_key.keys[0]] * len(noise_key.keys), noise_key.step
+            )
+        ),
         ALONE,
     ),
     "noise of the count": (
@@ -346,15 +368,15 @@ BAD: dict[str, tuple[Any, str]] = {
         "Expected the same when asked again, got another.",
     ),
     "the same in each step": (
-        moved(lambda moment: Moment(moment.keys, 0)),
+        moved(lambda noise_key: NoiseKey(noise_key.keys, 0)),
         "Expected other noise in another step",
     ),
     "colours the same in each step": (
-        moved(lambda moment: Moment(moment.keys, 0), Near()),
+        moved(lambda noise_key: NoiseKey(noise_key.keys, 0), Near()),
         "Expected other noise in another step",
     ),
     "the same in each episode": (
-        moved(lambda moment: Moment([7] * len(moment.keys), moment.step)),
+        moved(lambda noise_key: NoiseKey([7] * len(noise_key.keys), noise_key.step)),
         "Expected other noise under another key",
     ),
     "PyTorch's generator": (

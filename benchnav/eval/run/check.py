@@ -41,7 +41,7 @@ from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.predictor import class_mismatch
 from benchnav.planning.planners.planner import check_steers
 from benchnav.planning.problem import Prediction, pose_problem
-from benchnav.planning.sensing.belief import Fields, Law, Static
+from benchnav.planning.sensing.belief import CovarianceModel, Fields, Static
 from benchnav.planning.world.realisation import check_known, draw_frozen
 
 Say = Callable[[str], None]
@@ -472,7 +472,9 @@ def _unprepared(condition: Condition) -> str:
 
     def prepare() -> None:
         fields = Fields(
-            Static(), Static().init(mixture, Law(grid=grid, correlation_m=0.0)), (0,)
+            Static(),
+            Static().init(mixture, CovarianceModel(grid=grid, correlation_m=0.0)),
+            (0,),
         )
         prediction = Prediction(seen, mixture, ground, fields=fields)
         problem = pose_problem(

@@ -21,7 +21,8 @@ from benchnav.planning.free_space import cells_at_goal
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import steps_in
 from benchnav.planning.sensing.belief import Fields
-from benchnav.planning.sensing.knowledge import Knowledge, Learner, Truth, call
+from benchnav.planning.sensing.knowledge import Knowledge, Truth, call
+from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.world.outcome import Outcome
 
 _LEAST_CHANGE = 0.02  # of λ̂ somewhere on a map, for which its planner is told
@@ -145,13 +146,13 @@ class Knowing:
         which, places = told[:, None, None], told.nonzero()[:, 0]
         fields = before.fields
         if isinstance(fields, Fields):
-            belief, believed = self._how.learner.belief, known.believed
+            belief, believed = self._how.learner.belief, known.belief_state
             if not bool((told | ~running).all()):
                 state = fields.state
                 believed = call(
                     Outcome.BELIEF_ERROR,
                     lambda: belief.put(
-                        state, places, belief.select(known.believed, places)
+                        state, places, belief.select(known.belief_state, places)
                     ),
                 )
             fields = replace(fields, state=believed)
@@ -242,7 +243,7 @@ class Knowing:
                 seen=own(known.seen),
                 sensed=own(known.ever_sensed),
                 outline=reach_outline(
-                    own(known.reached), self._problem.grid.resolution_m
+                    own(known.footprint), self._problem.grid.resolution_m
                 ),
             )
         return maps

@@ -17,7 +17,7 @@ from benchnav.metrics.base import Episode, Learnt, MetricError, measure
 from benchnav.metrics.shipped import SHIPPED
 from benchnav.planning.problem import Problem, Task, heading_to
 from benchnav.planning.world.outcome import Outcome
-from benchnav.planning.world.world import Places
+from benchnav.planning.world.world import Endpoints
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,7 +85,7 @@ def finished_episodes(
 
 
 def unbegun_episodes(
-    task: Task, places: Places, time_budget_s: Tensor, outcome: Outcome
+    task: Task, places: Endpoints, time_budget_s: Tensor, outcome: Outcome
 ) -> list[Episode]:
     """Return episodes that could not begin, as when their model failed: they have no
     step.

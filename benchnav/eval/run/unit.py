@@ -44,19 +44,14 @@ from benchnav.models.base import predict
 from benchnav.models.predictor import Clairvoyant, loaded, nugget_of
 from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Prediction, Problem, heading_to, pose_problem
-from benchnav.planning.sensing.belief import Fields, Law
-from benchnav.planning.sensing.knowledge import (
-    KnowledgeError,
-    Learner,
-    Truth,
-    call,
-    sensor_keys,
-)
+from benchnav.planning.sensing.belief import CovarianceModel, Fields
+from benchnav.planning.sensing.knowledge import KnowledgeError, Truth, call, sensor_keys
+from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.sensor import Step
 from benchnav.planning.world.lower_bound import BOUNDED_ROBOTS, Motion, lower_bound_s
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
-from benchnav.planning.world.world import Places
+from benchnav.planning.world.world import Endpoints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +161,7 @@ class Block:
     """
 
     terrain: Terrain
-    places: Places
+    places: Endpoints
     groups: np.ndarray
 
     def to(self, device: torch.device) -> "Block":
@@ -186,7 +181,7 @@ def read_maps(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> Block
         groups = dataset.read(split, maps, ["group"])["group"]
     return Block(
         terrain=dataset.terrain(split, maps),
-        places=Places(
+        places=Endpoints(
             **{name: torch.from_numpy(values) for name, values in places.items()}
         ),
         groups=np.asarray(groups, dtype=np.int64).reshape(-1),
@@ -254,7 +249,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> Built:
             heading_to(block.places.start_m, block.places.goal_m)
         )
         known = learner.begin(truth, start, predicted)
-        fields = Fields(learner.belief, known.believed, tuple(unit.maps))
+        fields = Fields(learner.belief, known.belief_state, tuple(unit.maps))
         prediction = Prediction(
             known.observation,
             learner.distribution(known),
@@ -289,7 +284,7 @@ def _learner(condition: Condition, block: Block) -> Learner:
     sensor = call(Outcome.SENSOR_ERROR, condition.sensor.create)
     belief = call(Outcome.BELIEF_ERROR, condition.belief.create)
     model = call(Outcome.MODEL_ERROR, lambda: condition.model.object)
-    law = Law(
+    covariance = CovarianceModel(
         grid=block.terrain.grid,
         correlation_m=dataset.recipe.correlation_m
         if world.noise == "stored"
@@ -304,7 +299,7 @@ def _learner(condition: Condition, block: Block) -> Learner:
         sensor=sensor,
         ground=call(Outcome.SENSOR_ERROR, condition.ground.create),
         belief=belief,
-        law=law,
+        covariance=covariance,
         measure=call(Outcome.MODEL_ERROR, condition.risk.create),
         rules=condition.rules,
         predict=partial(predict, model),

@@ -1,9 +1,8 @@
-"""The boundary between a planner and what it steers: copies go out, what comes back is
-checked.
+"""The boundary between a planner and the loop: inputs are copied, outputs are checked.
 
-A planner may write into whatever it is given without moving a robot or changing a map.
-An answer that no robot can carry out is a fault of its episodes, never an error of the
-loop. Letters in shapes: B episodes, S state and A action dimensions.
+A planner may write into its inputs without moving a robot or changing a map. An action
+that no robot can execute is a fault of its episodes, never an error of the loop.
+Letters in shapes: B episodes, S state and A action dimensions.
 """
 
 from dataclasses import dataclass, replace
@@ -22,14 +21,14 @@ NOT_FINITE = "Expected finite actions, got some that are not."
 
 @dataclass(frozen=True)
 class Answer:
-    """What a planner said, made safe.
+    """A planner's output after checks.
 
     Args:
-        action: finite actions; zeros within the bounds for faulty episodes, shape [B,
-            A].
-        plan_state: to be handed back at the next step.
-        plan: its status has shape [B]; layers that cannot be drawn are left out.
-        faulty: which episodes got what no robot can do, bool, shape [B].
+        action: finite actions; zeros within the bounds for faulty episodes, shape
+            [B, A].
+        plan_state: plan state for the next step.
+        plan: its status has shape [B]; invalid layers are removed.
+        faulty: mask of episodes with an invalid output, bool, shape [B].
         reason: what is wrong with the faulty ones, one line.
     """
 
@@ -41,10 +40,10 @@ class Answer:
 
 
 def begin(planner: Planner[Any], problem: Problem, generator: torch.Generator) -> Any:
-    """Lets a planner prepare on a copy of the problem.
+    """Initialise a planner on a copy of the problem.
 
     Args:
-        planner: any planner; what it raises passes through.
+        planner: any planner; its exceptions pass through.
         problem: B problems; not changed, whatever the planner does.
         generator: the planner's randomness.
 
@@ -57,49 +56,46 @@ def begin(planner: Planner[Any], problem: Problem, generator: torch.Generator) -
 def revise(
     planner: Planner[Any], plan_state: Any, problem: Problem, generator: torch.Generator
 ) -> Any:
-    """Lets a planner go on under another λ̂, on a copy of the problem; one that cannot
-    begins anew.
+    """Replan on a copy of a problem with another λ̂, by `revise` or again by `init`.
 
     Args:
-        planner: any planner; what it raises passes through.
+        planner: any planner; its exceptions pass through.
         plan_state: from the last answer.
-        problem: B problems that start where the robots are; not changed, whatever the
-            planner does.
-        generator: the planner's randomness, for one that begins anew.
+        problem: B problems that start at the robots' current states; not changed,
+            whatever the planner does.
+        generator: the planner's randomness, if it starts again.
 
     Returns:
         The next plan state.
     """
-    given = problem.clone()
-    revised = planner.revise(plan_state, given)
+    copy = problem.clone()
+    revised = planner.revise(plan_state, copy)
     return begin(planner, problem, generator) if revised is NotImplemented else revised
 
 
 def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) -> Answer:
-    """Asks a planner for the next actions, on copies, and checks what it answers.
+    """Return a planner's next actions, from copies of its inputs and checked.
 
     Args:
-        planner: any planner; what it raises passes through.
-        step: where the robots are; not changed, whatever the planner does.
+        planner: any planner; its exceptions pass through.
+        step: robot states; not changed, whatever the planner does.
         plan_state: from `begin` or the last answer.
-        problem: for the bounds of the actions; the planner is not given it.
+        problem: problem with the bounds of the actions; the planner does not get it.
 
     Returns:
-        The answer. A wrong type, shape, dtype or device makes every episode faulty, an
-        action that is not finite its own alone.
+        The answer. A wrong type, shape, dtype or device makes every episode faulty, a
+        non-finite action only its own.
     """
-    said = planner.plan(step.clone(), plan_state)
-    standing, nothing = (
-        standing_actions(problem),
-        Plan.empty(len(problem), step.state.device),
-    )
-    if fault := find_fault(said, problem):
+    output = planner.plan(step.clone(), plan_state)
+    standing = standing_actions(problem)
+    no_layers = Plan.empty(len(problem), step.state.device)
+    if fault := find_fault(output, problem):
         everyone = torch.ones_like(step.traversability, dtype=torch.bool)
-        return Answer(standing, plan_state, nothing, everyone, fault)
-    action, following, plan = said
+        return Answer(standing, plan_state, no_layers, everyone, fault)
+    action, following, plan = output
     faulty = ~action.detach().isfinite().all(dim=1)
     if find_layer_faults(plan, problem):
-        plan = replace(nothing, status=plan.status)
+        plan = replace(no_layers, status=plan.status)
     return Answer(
         torch.where(faulty[:, None], standing, action.detach()),
         following,
@@ -110,35 +106,30 @@ def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) ->
 
 
 def standing_actions(problem: Problem) -> Tensor:
-    """What harms least where there is no answer: zeros, within the bounds, shape [B,
-    A].
-    """
-    return (
-        torch.zeros_like(problem.action_bounds[0])
-        .clamp(*problem.action_bounds)
-        .expand(len(problem), -1)
-    )
+    """Return actions for episodes without a valid one: zeros within the bounds, [B, A]."""
+    low, high = problem.action_bounds
+    return torch.zeros_like(low).clamp(low, high).expand(len(problem), -1)
 
 
-def find_fault(said: Any, problem: Problem) -> str:
-    """Tells what makes a whole answer useless, in one line; empty where nothing does.
+def find_fault(output: Any, problem: Problem) -> str:
+    """Return the fault of a planner's output, in one line; empty without a fault.
 
     Args:
-        said: whatever `plan` returned.
-        problem: B problems, for the shape, dtype and device that actions need.
+        output: return value of `plan`.
+        problem: B problems, for the shape, dtype and device of actions.
     """
-    if not isinstance(said, tuple) or len(said) != 3:
-        got = f"{len(said)} values" if isinstance(said, tuple) else type(said).__name__
+    if not isinstance(output, tuple) or len(output) != 3:
+        got = (
+            f"{len(output)} values"
+            if isinstance(output, tuple)
+            else type(output).__name__
+        )
         return f"Expected (action, plan_state, Plan) from `plan`, got {got}."
-    action, _, plan = said
+    action, _, plan = output
     batch, like = len(problem), problem.start
-    if fault := find_tensor_fault(
-        "actions",
-        action,
-        like.dtype,
-        (batch, len(problem.robot.action_low)),
-        like.device,
-    ):
+    shape = batch, len(problem.robot.action_low)
+    fault = find_tensor_fault("actions", action, like.dtype, shape, like.device)
+    if fault:
         return fault
     if not isinstance(plan, Plan):
         return f"Expected a Plan beside the actions, got {type(plan).__name__}."
@@ -148,7 +139,7 @@ def find_fault(said: Any, problem: Problem) -> str:
 
 
 def find_layer_faults(plan: Plan, problem: Problem) -> list[str]:
-    """Tells which layers of a plan cannot be drawn, a line each.
+    """Return faults of the layers of a plan, a line each.
 
     Args:
         plan: any plan.

@@ -1,12 +1,12 @@
-"""The one place that decides what is compiled.
+"""Compilation of rollouts by `torch.compile`.
 
-`torch.compile` fuses a rollout's many small operations, which pays once there are many
+`torch.compile` fuses a rollout's many small operations, which pays if there are many
 rollouts. It needs a C++ compiler at run time; without one the same code runs eagerly,
-and one line says so. PyTorch's own switch `TORCH_COMPILE_DISABLE=1` turns it off.
+and one line reports it. PyTorch's own switch `TORCH_COMPILE_DISABLE=1` turns it off.
 
-Whether a planner runs compiled depends on its settings and on the device alone: not on
-how many episodes a batch has, nor on what the process compiled before, since compiled
-and eager results differ in their last bits and much in speed.
+Whether a planner runs compiled only depends on its settings and the device. It does not
+depend on the number of episodes of a batch, nor on what the process compiled before,
+since compiled and eager results differ in their last bits and much in speed.
 """
 
 import logging
@@ -23,43 +23,44 @@ R = TypeVar("R")
 
 
 def can_compile() -> bool:
-    """Tells whether anything is compiled here: PyTorch's switch is not off, and there
-    is a C++ compiler.
+    """Return whether compilation is available.
+
+    PyTorch's switch is not off, and there is a C++ compiler.
     """
-    compilers = (os.environ.get("CXX", ""), "g++", "clang++")
-    return not _is_switched_off() and any(
-        shutil.which(name) for name in compilers if name
-    )
+    names = (os.environ.get("CXX", ""), "g++", "clang++")
+    has_compiler = any(shutil.which(name) for name in names if name)
+    return not _is_switched_off() and has_compiler
 
 
 def _is_switched_off() -> bool:
-    """Return whether PyTorch compiles nothing; its compiler, which takes a second to
-    import, need not be loaded.
+    """Return whether PyTorch's compilation is switched off.
+
+    Its compiler takes a second to import, and is not imported for this.
     """
     if "torch._dynamo" in sys.modules:
         return bool(torch._dynamo.config.disable)
     return os.environ.get("TORCH_COMPILE_DISABLE") == "1"
 
 
-def worth_compiling(rollouts: int, least: int, device: torch.device) -> bool:
-    """Tells whether so many rollouts an episode are to be compiled."""
-    return device.type == "cuda" or rollouts >= least
+def worth_compiling(rollouts: int, min_rollouts: int, device: torch.device) -> bool:
+    """Return whether that number of rollouts per episode is to be compiled."""
+    return device.type == "cuda" or rollouts >= min_rollouts
 
 
 class Fused(Generic[R]):
-    """A pure function that is compiled at its first call, or runs as it is where that
-    cannot be done.
+    """A pure function that is compiled at its first call, or runs eagerly if it cannot
+    be.
 
     It is compiled once for a single episode and once for any number of them, so that a
-    batch may shrink. Each
-    holds its own verdict: one that cannot be compiled leaves all others as they are.
+    batch may shrink. Each object decides for itself: one that cannot be compiled does
+    not affect others.
 
     Args:
-        function: takes and returns tensors, one of them first, alone or in named
-            tuples; it must not change them.
-        rollouts: how many of an episode a call is for.
-        least: so many are worth the seconds that compiling takes. Fewer run eagerly,
-            which takes the same time however few they are.
+        function: takes and returns tensors, single or in named tuples, the first of
+            them a tensor; it must not change them.
+        rollouts: number of rollouts of an episode in a call.
+        min_rollouts: minimum number that is worth the seconds of compilation. Fewer run
+            eagerly, which takes the same time however few they are.
         batched: indices of the arguments whose first dimension is that of the episodes,
             each item of a tuple counted.
     """
@@ -68,32 +69,27 @@ class Fused(Generic[R]):
         self,
         function: Callable[..., R],
         rollouts: int,
-        least: int,
+        min_rollouts: int,
         batched: tuple[int, ...] = (),
     ) -> None:
-        """Keeps the function; nothing is compiled yet."""
-        self._function, self._rollouts, self._least, self._batched = (
-            function,
-            rollouts,
-            least,
-            batched,
-        )
+        """Store the function; nothing is compiled yet."""
+        self._function = function
+        self._rollouts = rollouts
+        self._min_rollouts = min_rollouts
+        self._batched = batched
         self._fused: Callable[..., R] | None = None
         self._seen: set[tuple[object, ...]] = set()
         self.compiled: bool | None = None
         """Whether it runs compiled; None before the first call."""
 
     def __call__(self, *args: Any) -> R:
-        """Calls the function."""
+        """Call the function, compiled where that pays and is possible."""
         if self.compiled is False:
             return self._function(*args)
-        items = [
-            item for arg in args for item in (arg if isinstance(arg, tuple) else (arg,))
-        ]
-        if self.compiled is None and (
-            _is_switched_off()
-            or not worth_compiling(self._rollouts, self._least, items[0].device)
-        ):
+        items: list[Any] = []
+        for arg in args:
+            items.extend(arg if isinstance(arg, tuple) else (arg,))
+        if self.compiled is None and not self._pays(items[0].device):
             self.compiled = False
             return self._function(*args)
         signature = self._signature(items)
@@ -114,10 +110,16 @@ class Fused(Generic[R]):
         self.compiled = True
         return result
 
+    def _pays(self, device: torch.device) -> bool:
+        """Return whether the function is to be compiled on a device."""
+        if _is_switched_off():
+            return False
+        return worth_compiling(self._rollouts, self._min_rollouts, device)
+
     def _call(
         self, kinds: list[type], items: list[Any], signature: tuple[object, ...]
     ) -> R:
-        """Runs what is compiled, for a new signature under the settings of compiling."""
+        """Run the compiled function; a new signature under the settings of compilation."""
         if self._fused is None:
             self._fused = torch.compile(
                 _of_items(self._function, kinds), dynamic=False, fullgraph=True
@@ -126,8 +128,7 @@ class Fused(Generic[R]):
             try:
                 return self._fused(*items)
             except torch._dynamo.exc.FailOnRecompileLimitHit:
-                # what it was compiled for has changed in what the signature does not
-                # tell
+                # Something changed that the signature does not include.
                 pass
         with _compiling(checked=not all(map(_is_ours, items))):
             for index in self._batched:
@@ -137,10 +138,12 @@ class Fused(Generic[R]):
             return self._fused(*items)
 
     def _signature(self, items: list[Any]) -> tuple[object, ...]:
-        """What a call is compiled for: shapes, dtypes and devices of tensors, the other
-        arguments, PyTorch's modes.
+        """Return the properties of a call that it is compiled for.
+
+        They are shapes, dtypes and devices of tensors, other arguments, and PyTorch's
+        modes.
         """
-        found: list[object] = [
+        parts: list[object] = [
             torch.is_inference_mode_enabled(),
             torch.is_grad_enabled(),
             torch.get_num_threads(),
@@ -152,15 +155,14 @@ class Fused(Generic[R]):
                     if index in self._batched
                     else item.shape
                 )
-                found.append((shape, item.dtype, item.device))
+                parts.append((shape, item.dtype, item.device))
             else:
-                found.append(_key(item))
-        return tuple(found)
+                parts.append(_key(item))
+        return tuple(parts)
 
 
 def _of_items(function: Callable[..., R], kinds: list[type]) -> Callable[..., R]:
-    """Return a function of single items, whose checks at each call are cheaper than
-    those of tuples.
+    """Return a function of single items, whose guards are cheaper than those of tuples.
 
     Args:
         function: takes arguments of these kinds.
@@ -181,16 +183,16 @@ def _of_items(function: Callable[..., R], kinds: list[type]) -> Callable[..., R]
 
 @contextmanager
 def _compiling(checked: bool) -> Iterator[None]:
-    """Settings of PyTorch under which a call is compiled; they take longer to set than
-    a rollout, so only then.
+    """Set PyTorch's options for compilation.
+
+    To set them takes longer than a rollout, so they are only set for it.
 
     Args:
-        checked: whether indices are checked that are computed on the way.
+        checked: whether computed indices are checked.
     """
     import torch._inductor.config  # imported here: it takes a second
 
-    # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on
-    # the CPU.
+    # It would warn of a CUDA toolkit without a GPU, which does not matter on the CPU.
     notices = logging.getLogger("torch.utils.cpp_extension")
     level = notices.level
     notices.setLevel(logging.ERROR)
@@ -212,9 +214,7 @@ def _compiling(checked: bool) -> Iterator[None]:
 
 
 def _key(arg: object) -> object:
-    """An argument by its value where that has a hash; else which object it is, as of a
-    frozen robot with a list.
-    """
+    """Return an argument if it has a hash; else its id, as for a frozen robot with a list."""
     try:
         hash(arg)
     except TypeError:
@@ -223,9 +223,9 @@ def _key(arg: object) -> object:
 
 
 def _is_ours(arg: object) -> bool:
-    """Tells what is of PyTorch or of this package, whose lookups keep to the map, from
-    a user's robot or objective.
+    """Return whether an argument is of PyTorch or this package, whose indices are valid.
 
-    To check each index takes a third of the time.
+    A user's robot or objective may compute others. To check each index takes a third of
+    the time.
     """
     return type(arg).__module__.split(".")[0] in ("torch", "builtins", "benchnav")

@@ -1,16 +1,15 @@
-"""Risk of the cost: action sequences are rolled out on whole fields of λ, and judged by
-the tail of what they cost.
+"""Risk of the cost: action sequences are rolled out on joint samples of the λ field, and
+scored by the tail of their costs.
 
-A risk map tells each cell's risk on its own. What a way costs adds up over cells that
-hang together, and its tail is
-that of the sum: CVaR over M fields of the cost of a sequence of actions on each. On
-fields and on a risk map alike, ground of little λ may immobilise a robot
-(`advance_entrapped`), of which the motion model alone does not know. Source: Cai et al.
+A risk map contains the risk of each cell. The cost of a path adds up over correlated
+cells, and its tail is that of the sum: the CVaR, over M fields, of the cost of a
+sequence of actions on each. On fields and on a risk map alike, low λ may immobilise a
+robot (`advance_entrapped`), which the motion model does not include. Source: Cai et al.
 (2024), "EVORA: Deep evidential traversability learning for risk-aware off-road
 autonomy", CVaR-Cost.
 
 Letters in shapes: B episodes, M fields, K samples, T steps, S state and A action
-dimensions, H×W cells, N cells framed for lookups.
+dimensions, H×W cells, N cells padded for lookups.
 """
 
 import math
@@ -32,66 +31,66 @@ from benchnav.planning.robots import component_wise
 
 
 def framed_fields(problem: Problem, fields: Tensor) -> Tensor:
-    """Fields of λ with the problem's free space, as `Problem.padded_ground` has λ̂, an
-    episode's one after another.
+    """Return padded fields of λ with the problem's free mask, as `Problem.padded_ground`.
 
     Args:
         problem: B problems.
         fields: λ, shape [B, M, H, W].
 
     Returns:
-        Shape [B·M, N].
+        Padded maps, M for each episode in turn, shape [B·M, N].
     """
     free = problem.free[:, None].expand_as(fields)
     return ground_map(problem.grid, fields, free).flatten(0, 1)
 
 
 def within_reach(problem: Problem, state: Tensor, seconds: float) -> Tensor:
-    """Cells on which robots may be within some time, at top speed, bool, shape [B, H,
-    W].
+    """Return a mask of cells that robots may reach in a given time at top speed.
 
     Args:
         problem: B problems.
-        state: where they are, shape [B, S].
-        seconds: the time.
+        state: robot states, shape [B, S].
+        seconds: the time in seconds.
+
+    Returns:
+        Mask, bool, shape [B, H, W].
     """
     grid = problem.grid
     row, column = (torch.arange(size, device=state.device) for size in grid.shape)
     x, y = grid.centre_of(row[:, None], column)
-    away = torch.hypot(x - state[:, 0, None, None], y - state[:, 1, None, None])
-    return (
-        away <= problem.robot.top_speed_mps * seconds + grid.resolution_m
-    )  # as far as a cell's corner
+    distance_m = torch.hypot(x - state[:, 0, None, None], y - state[:, 1, None, None])
+    reach_m = problem.robot.top_speed_mps * seconds
+    return distance_m <= reach_m + grid.resolution_m  # beyond a cell's corner
 
 
 def tail_cost(cost: Tensor, level: float) -> Tensor:
-    """CVaR of the cost over equally likely fields: the mean of the worst share 1 −
-    level of them.
+    """Return the CVaR of the cost: its mean over the worst 1 − level fraction of fields.
 
     Args:
-        cost: shape [B, M, K].
+        cost: cost on each field, shape [B, M, K].
         level: α in [0, 1); at 0 the mean.
 
     Returns:
-        Shape [B, K]. Of a field that is in that share by a part alone the part counts.
+        CVaR, shape [B, K]. A field that is only partly in that fraction has that weight.
     """
     if level == 0:
         return cost.mean(1)
-    worst = (1 - level) * cost.shape[1]
-    count = math.ceil(worst - 1e-9)
-    most = cost.topk(count, dim=1).values
-    return (most[:, :-1].sum(1) + (worst - count + 1) * most[:, -1]) / worst
+    n_worst = (1 - level) * cost.shape[1]
+    count = math.ceil(n_worst - 1e-9)
+    worst_costs = cost.topk(count, dim=1).values
+    last_weight = n_worst - count + 1
+    total = worst_costs[:, :-1].sum(1) + last_weight * worst_costs[:, -1]
+    return total / n_worst
 
 
 class Entrapment(NamedTuple):
-    """What immobilises a robot for good, and what that costs.
+    """Permanent immobilisation of a robot, and its cost.
 
     Args:
         goal: (x, y) of the goal, shape [B, 1, 2].
-        steps_left: from the first step of a rollout until the time is over, shape [B,
-            1].
-        goal_radius_m: how near the goal a robot has reached it.
-        below: λ under which terrain immobilises a robot.
+        steps_left: remaining steps from the start of a rollout, shape [B, 1].
+        goal_radius_m: distance to the goal below which a robot has reached it.
+        below: λ below which terrain immobilises a robot.
         max_steps: consecutive steps on such terrain after which a robot is immobilised.
     """
 
@@ -105,53 +104,54 @@ class Entrapment(NamedTuple):
 def advance_entrapped(
     states: Tensor,
     cost: Tensor,
-    held: Tensor,
+    dwell_steps: Tensor,
     sampled: Sampled,
     padded_ground: Tensor,
     target: Tensor,
     entrapment: Entrapment,
     dynamics: Dynamics,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Rolls samples out as `mppi.advance_chunk` does, where ground of little λ
-    immobilises a robot.
+    """Roll out samples as `mppi.advance_chunk`, where low λ immobilises a robot.
 
-    One that was on such ground for `max_steps` steps in a row stops there, and pays J
-    of standing there, with the penalty of ground that is not free, until its time is
-    over. Its states go on, and cost nothing more. One that has been at the goal has
-    arrived, and is not immobilised on ground behind it.
+    A robot on such terrain for `max_steps` consecutive steps stops there. It pays J of
+    standing there, with the penalty of non-free cells, until its time is over. Its
+    states continue, at no further cost. A robot that has reached the goal is not
+    immobilised behind it.
 
     Args:
-        states: shape [B, K, S].
-        cost: so far, shape [B, K].
-        held: steps in a row on immobilising ground, shape [B, K]; `max_steps` of one
-            that has stopped, −1 of one that has arrived.
+        states: robot states, shape [B, K, S].
+        cost: cost so far, shape [B, K].
+        dwell_steps: consecutive steps on immobilising terrain; `max_steps` for a robot
+            that has stopped, −1 for one that has reached the goal, shape [B, K].
         sampled: action sequences.
-        padded_ground: as of `Problem`, shape [B, N].
-        target: (x, y) to be reached, shape [B, 1, 2].
+        padded_ground: padded maps as in `Problem`, shape [B, N].
+        target: target (x, y), shape [B, 1, 2].
         entrapment: what immobilises a robot.
         dynamics: of the problem.
 
     Returns:
-        States, cost and `held` after these steps.
+        States, cost and `dwell_steps` after these steps.
     """
-    goal, steps_left, goal_radius_m, below, most = entrapment
+    goal, steps_left, goal_radius_m, below, max_steps = entrapment
     grid, robot, objective, min_traversability = dynamics
     for step in range(sampled.mean.shape[1]):
         action = sampled_actions(sampled, step)
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
-        traversability, going = predicted_traversability(ground), held < most
-        away = torch.hypot(states[..., 0] - goal[..., 0], states[..., 1] - goal[..., 1])
-        longer = torch.where(traversability < below, held + 1, 0)
-        longer = torch.where((held < 0) | (away < goal_radius_m), -1, longer)
-        stops = going & (longer >= most)
+        traversability = predicted_traversability(ground)
+        going = dwell_steps < max_steps
+        dx = states[..., 0] - goal[..., 0]
+        dy = states[..., 1] - goal[..., 1]
+        longer_dwell = torch.where(traversability < below, dwell_steps + 1, 0)
+        has_arrived = (dwell_steps < 0) | (torch.hypot(dx, dy) < goal_radius_m)
+        longer_dwell = torch.where(has_arrived, -1, longer_dwell)
+        stops = going & (longer_dwell >= max_steps)
         paid = stage_cost(objective, states, action, ground, target)
-        standing = stage_cost(
-            objective, states, torch.zeros_like(action), ground, target
-        )
-        rest = (steps_left - (step + 1)).clamp(min=0) * standing
-        cost = cost + torch.where(going, paid + torch.where(stops, rest, 0), 0)
-        states = robot(
-            states, action, motion_traversability(ground, min_traversability)
-        )
-        held = torch.where(going, longer, held)
-    return component_wise(states), cost, held
+        no_action = torch.zeros_like(action)
+        standing = stage_cost(objective, states, no_action, ground, target)
+        remaining = (steps_left - (step + 1)).clamp(min=0) * standing
+        step_cost = paid + torch.where(stops, remaining, 0)
+        cost = cost + torch.where(going, step_cost, 0)
+        scale = motion_traversability(ground, min_traversability)
+        states = robot(states, action, scale)
+        dwell_steps = torch.where(going, longer_dwell, dwell_steps)
+    return component_wise(states), cost, dwell_steps

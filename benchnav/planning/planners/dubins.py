@@ -1,10 +1,11 @@
-"""Dubins paths to a point: shortest ways of a vehicle that drives forward and turns no
-tighter than a radius.
+"""Dubins paths to a point: shortest paths of a vehicle that only drives forward and
+has a minimum turning radius.
 
-A path is a row of arcs and straights, "segments", each with a curvature and a length.
-From a pose (x, y, θ) to a point at which any heading will do the shortest has two: an
-arc of the least radius and a straight or, for a point inside the turning circle, an arc
-away from it and one back. A point to the right is solved by mirroring it to the left.
+A path is a sequence of arcs and straights, "segments", each with a curvature and a
+length. From a pose (x, y, θ) to a point with free heading the shortest path has two
+segments: an arc of the minimum radius and a straight. For a point inside the turning
+circle they are an arc away from it and one back. A point to the right is solved by
+mirroring it to the left.
 
 Sources: Dubins (1957), "On curves of minimal length with a constraint on average
 curvature"; Boissonnat and Bui (1994), "Accessibility region for a car that only moves
@@ -21,59 +22,60 @@ from torch import Tensor
 def dubins_length_to_point(
     start: Tensor, point: Tensor, radius: float | Tensor
 ) -> Tensor:
-    """Length of the shortest path to points with free heading; see
-    `dubins_segments_to_point`.
+    """Return the length of shortest paths to points with free heading.
+
+    Arguments as for `dubins_segments_to_point`.
     """
-    arc, rest, *_ = _to_point(start, point, radius)
-    return (arc + rest) * radius
+    arc, second, *_ = _to_point(start, point, radius)
+    return (arc + second) * radius
 
 
 def dubins_segments_to_point(
     start: Tensor, point: Tensor, radius: Tensor, far_side: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Finds the shortest path from poses to points at which any heading will do.
+    """Return shortest paths from poses to points with free heading.
 
     Args:
         start: poses (x, y, θ) in metres and radians, shape [*B, 3].
-        point: positions (x, y), shape [*B, 2]; the leading dimensions of both
+        point: positions (x, y) in metres, shape [*B, 2]; the leading dimensions of both
             broadcast.
-        radius: least turning radius in metres, broadcasts to [*B].
-        far_side: on the turning circle that lies away from the point, in place of the
-            shortest.
+        radius: minimum turning radius in metres, broadcasts to [*B].
+        far_side: whether to start on the turning circle away from the point, instead of
+            on the shortest path.
 
     Returns:
-        Curvatures, positive to the left, in 1/m, and lengths in metres of two segments,
+        Curvatures in 1/m, positive to the left, and lengths in metres of two segments,
         an arc and a straight or two arcs, each of shape [*B, 2].
     """
-    arc, rest, side, inside = _to_point(start, point, radius, far_side)
-    sides = torch.where(inside, -side, side), torch.where(inside, side, 0)
+    arc, second, side, inside = _to_point(start, point, radius, far_side)
+    first_side = torch.where(inside, -side, side)
+    second_side = torch.where(inside, side, 0)
     radius = radius[..., None]
-    return torch.stack(sides, dim=-1) / radius, torch.stack(
-        (arc, rest), dim=-1
-    ) * radius
+    curvature = torch.stack((first_side, second_side), dim=-1) / radius
+    return curvature, torch.stack((arc, second), dim=-1) * radius
 
 
 def sample_segments(
     start: Tensor, curvature: Tensor, length_m: Tensor, spacing: float, count: int
 ) -> Tensor:
-    """Samples paths by arc length.
+    """Sample paths by arc length.
 
     Args:
         start: poses (x, y, θ) in metres and radians, shape [*B, 3].
-        curvature: of the segments, shape [*B, G].
-        length_m: of the segments, shape [*B, G].
-        spacing: arc length from one point to the next in metres.
-        count: number of points N; those past the end repeat the end pose.
+        curvature: curvatures of the segments in 1/m, shape [*B, G].
+        length_m: lengths of the segments, shape [*B, G].
+        spacing: arc length between neighbouring points in metres.
+        count: number of points N; those beyond the end repeat the end pose.
 
     Returns:
         Poses, shape [*B, N, 3]; headings run on without wrapping.
     """
     arc = torch.arange(count, dtype=start.dtype, device=start.device) * spacing
     x, y, heading = (start[..., i, None] for i in range(3))
-    begin, at_begin = torch.zeros_like(heading), heading
-    for bend, length in zip(
-        curvature[..., None].unbind(-2), length_m[..., None].unbind(-2), strict=True
-    ):
+    begin = torch.zeros_like(heading)
+    at_begin = heading
+    curvatures = curvature[..., None].unbind(-2)
+    for bend, length in zip(curvatures, length_m[..., None].unbind(-2), strict=True):
         within = torch.minimum((arc - begin).clamp(min=0), length)
         half_turn = within * (0.5 * bend)
         chord = within * torch.sinc(half_turn / math.pi)
@@ -88,17 +90,17 @@ def sample_segments(
 def _to_point(
     start: Tensor, point: Tensor, radius: float | Tensor, far_side: bool = False
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Lengths of both segments in radii, the side of the first circle (±1), whether it
-    holds the point.
+    """Return lengths of both segments in radii, the side of the first circle (±1), and
+    whether it contains the point.
     """
-    # The point as the pose has it, ahead and to the left, in radii.
+    # The point relative to the pose, x ahead and y to the left, in radii.
     scale = 1 / radius
-    offset_x, offset_y = (
-        (point[..., 0] - start[..., 0]) * scale,
-        (point[..., 1] - start[..., 1]) * scale,
-    )
-    cos, sin = start[..., 2].cos(), start[..., 2].sin()
-    x, y = offset_x * cos + offset_y * sin, offset_y * cos - offset_x * sin
+    dx = (point[..., 0] - start[..., 0]) * scale
+    dy = (point[..., 1] - start[..., 1]) * scale
+    cos = start[..., 2].cos()
+    sin = start[..., 2].sin()
+    x = dx * cos + dy * sin
+    y = dy * cos - dx * sin
     side = torch.where(y < 0, -1.0, 1.0).to(y)
     y = y.abs()
     if far_side:
@@ -107,26 +109,21 @@ def _to_point(
     inside = power < 0
     # The arc ends where its tangent meets the point.
     straight = power.clamp(min=0).sqrt()
-    arc = _wrap(
-        torch.atan2(y - 1, x) + torch.atan2(torch.ones_like(straight), straight)
-    )
+    tangent = torch.atan2(torch.ones_like(straight), straight)
+    arc = _wrap(torch.atan2(y - 1, x) + tangent)
     # Triangle of the right circle's centre (0, -1), the last circle's centre (2 away)
     # and the point.
     square = x * x + (y + 1) * (y + 1)
     apex = torch.acos(((square + 3) / (4 * square.sqrt())).clamp(-1, 1))
     away = _wrap(math.pi / 2 + apex - torch.atan2(y + 1, x))
     back = math.tau - torch.acos(((5 - square) / 4).clamp(-1, 1))
-    return (
-        torch.where(inside, away, arc),
-        torch.where(inside, back, straight),
-        side,
-        inside,
-    )
+    first = torch.where(inside, away, arc)
+    second = torch.where(inside, back, straight)
+    return first, second, side, inside
 
 
 def _wrap(angle: Tensor) -> Tensor:
-    """Angles in [0, 2π); rounding just under a full turn counts as none."""
+    """Return angles in [0, 2π); rounding just below a full turn counts as 0."""
     wrapped = torch.remainder(angle, math.tau)
-    return torch.where(
-        wrapped > math.tau - torch.finfo(angle.dtype).eps ** 0.75, 0, wrapped
-    )
+    limit = math.tau - torch.finfo(angle.dtype).eps ** 0.75
+    return torch.where(wrapped > limit, 0, wrapped)

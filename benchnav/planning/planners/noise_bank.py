@@ -1,4 +1,4 @@
-"""The noise of MPPI: normal numbers that are drawn once and read anew at each step.
+"""Noise of MPPI: normal numbers that are drawn once and read differently at each step.
 
 Letters in shapes: A action dimensions, T horizon steps, K samples, N numbers of a part
     of the bank.
@@ -17,48 +17,46 @@ _RUNS = 4  # length N of a part of the bank, in runs of K numbers
 
 @dataclass(frozen=True)
 class NoiseBank:
-    """Normal numbers, and where each step reads them.
+    """Normal numbers, and the offsets at which each step reads them.
 
-    Drawing normals costs more than rolling out what they perturb. So a bank of them is
-    drawn when a planner begins, a few times as many as a step needs, and each step
-    reads it from other places: the bank has a part for each time step of the horizon,
-    and of it every action gets a run that begins at a place of its own. From step to
-    step the parts change hands and the places move, by strides that are drawn too.
-    Within a step all numbers are independent, as no two of them lie at one place of the
-    bank; from step to step numbers occur again, in other company. All is a pure
-    function of seed and step, on any device. A part has N numbers.
+    To draw normals costs more than to roll out what they perturb. A bank of a few times
+    as many as a step needs is therefore drawn when a planner starts, and each step
+    reads it at other offsets. The bank has a part for each time step of the horizon. In
+    a part, every action has a run of numbers with its own offset. From step to step
+    the parts are exchanged and the offsets move, by strides that are drawn too. Within
+    a step all numbers are independent, since no two are at the same position. From step
+    to step numbers occur again in other combinations. All is a pure function of seed
+    and step, on any device.
 
     Args:
         scale: standard deviation of each action's noise, shape [A].
-        values: so scaled, shape [A, T, N].
-        place: where the runs of step 0 begin in their parts, int64, shape [T, A].
-        stride: how far they move on from step to step, int64, shape [T, A].
+        values: numbers of that scale, shape [A, T, N].
+        offset: offsets of the runs of step 0 in their parts, int64, shape [T, A].
+        stride: change of the offsets from step to step, int64, shape [T, A].
         samples: K, the length of a run.
     """
 
     scale: Tensor
     values: Tensor
-    place: Tensor
+    offset: Tensor
     stride: Tensor
     samples: int
 
     def at(self, step: int) -> Tensor:
-        """The noise of a step, shape [T, A, K]."""
+        """Return the noise of a step, shape [T, A, K]."""
         actions, horizon, numbers = self.values.shape
-        within = (self.place + step * self.stride) % (numbers - self.samples + 1)
-        # Parts move backward: forward, with the plan, a moment of it would meet the
-        # same part at every step.
+        within = (self.offset + step * self.stride) % (numbers - self.samples + 1)
+        # Parts move backward: forward, with the plan, a time of the horizon would get
+        # the same part at every step.
         part = (torch.arange(horizon, device=within.device) - step) % horizon
         action = torch.arange(actions, device=within.device)
         begin = (action * horizon + part[:, None]) * numbers + within
-        # Row i of the windows is the run that begins at number i; nothing is copied
-        # before the selection.
-        windows = self.values.as_strided(
-            (self.values.numel() - self.samples + 1, self.samples), (1, 1)
-        )
-        return windows.index_select(0, begin.flatten()).view(
-            horizon, actions, self.samples
-        )
+        # Row i of the windows is the run with offset i; nothing is copied before the
+        # selection.
+        n_windows = self.values.numel() - self.samples + 1
+        windows = self.values.as_strided((n_windows, self.samples), (1, 1))
+        chosen = windows.index_select(0, begin.flatten())
+        return chosen.view(horizon, actions, self.samples)
 
 
 class Sampled(NamedTuple):
@@ -84,14 +82,12 @@ def sampled_actions(sampled: Sampled, step: int) -> Tensor:
 
 
 def perturb(mean: Tensor, noise: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Samples actions: clip(u + ε), within bounds [A], the action dimension next to
-    last.
-    """
+    """Return clip(u + ε) within bounds [A]; the action dimension is next to last."""
     return torch.clamp(mean + noise, low[:, None], high[:, None])
 
 
 def draw_bank(seed: int, horizon: int, samples: int, scale: Tensor) -> NoiseBank:
-    """Draws a bank on the CPU, the same for every device.
+    """Draw a bank on the CPU, the same for all devices.
 
     Args:
         seed: root of the noise.
@@ -99,16 +95,16 @@ def draw_bank(seed: int, horizon: int, samples: int, scale: Tensor) -> NoiseBank
         samples: K.
         scale: standard deviation of each action's noise, shape [A].
     """
-    # PyTorch's generator looks at 32 bits of a seed alone: the key is a hash of all of
-    # them.
+    # PyTorch's generator only uses 32 bits of a seed: the key is a hash of all of them.
     generator = rng.generator(rng.stream_key(seed, "noise"))
     actions, numbers = len(scale), _RUNS * samples
     values = torch.randn(
         (actions, horizon, numbers), generator=generator, dtype=scale.dtype
     ).to(scale.device)
-    places, shape = numbers - samples + 1, (horizon, actions)
-    place, stride = (
-        torch.randint(places, shape, generator=generator).to(scale.device)
+    n_offsets = numbers - samples + 1
+    shape = horizon, actions
+    offset, stride = (
+        torch.randint(n_offsets, shape, generator=generator).to(scale.device)
         for _ in range(2)
     )
-    return NoiseBank(scale, values * scale[:, None, None], place, stride, samples)
+    return NoiseBank(scale, values * scale[:, None, None], offset, stride, samples)

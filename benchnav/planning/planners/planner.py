@@ -1,9 +1,8 @@
-"""What a planner is and what it returns, and what a local planner is.
+"""Interfaces of planners and local planners, and of what they return.
 
-A planner is stateless: `init` makes a plan state, `plan` takes one and returns the
-    next. Both are
-pure: the same arguments give the same result. Letters in shapes: B episodes, N points,
-M samples, E edges, S state and A action dimensions.
+A planner is stateless: `init` creates a plan state, `plan` receives one and returns the
+next. Both are pure: the same arguments give the same result. Letters in shapes: B
+episodes, N points, M samples, E edges, S state and A action dimensions.
 """
 
 import math
@@ -22,8 +21,7 @@ from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import STEERING, Robot
 from benchnav.planning.sensing.sensor import Step
 
-# What a `Plan` draws, with the dimensions of each layer between that of the episodes
-# and (x, y).
+# Layers of a `Plan`, with the dimensions between that of the episodes and (x, y).
 LAYERS = {"path": "N", "samples": "MN", "reference": "N", "tree": "EN"}
 
 # Remedies for a robot that a planner does not steer.
@@ -40,19 +38,19 @@ INPUTS = frozenset({"risk_map", "distribution", "fields"})
 
 
 class PlanStatus(IntEnum):
-    """How planning went for an episode."""
+    """Result of planning for an episode."""
 
     OK = 0
-    # no way to the goal was found yet; the action leads along the best way so far
+    # no path to the goal has been found yet; the action follows the best partial path
     PARTIAL = 1
     FAILED = 2  # the planner gives up; the episode ends as a planner failure
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """How planning went, and what playback draws.
+    """Status of planning, and the layers that playback draws.
 
-    Unused points are NaN; a planner leaves at size 0 what it does not have.
+    Unused points are NaN; layers that a planner does not have are of size 0.
 
     Args:
         status: `PlanStatus` of each episode, int64, shape [B].
@@ -72,18 +70,18 @@ class Plan:
 
     @classmethod
     def empty(
-        cls, batch: int, device: torch.device | str = "cpu", **known: Tensor
+        cls, batch: int, device: torch.device | str = "cpu", **layers: Tensor
     ) -> "Plan":
-        """Makes a plan with status OK and nothing to draw but what is given."""
+        """Return a plan with status OK and only the given layers."""
         blank = {
             name: torch.empty(batch, *[0] * len(inner), 2, device=device)
             for name, inner in LAYERS.items()
         }
         status = torch.zeros(batch, dtype=torch.int64, device=device)
-        return cls(**{"status": status, **blank, **known})
+        return cls(**{"status": status, **blank, **layers})
 
     def lines(self, member: int) -> dict[str, Tensor]:
-        """What is drawn of one episode, by layer: polylines, shape [lines, N, 2]."""
+        """Return the layers of one episode as polylines, shape [lines, N, 2]."""
         layers = {name: getattr(self, name)[member] for name in LAYERS}
         return {
             name: layer if layer.dim() == 3 else layer[None]
@@ -95,47 +93,42 @@ State = TypeVar("State")
 
 
 class Planner(Specified, ABC, Generic[State]):
-    """The base class of planners; `benchnav.testing.check_planner` tries whether one
-    keeps its contract.
+    """Base class of planners; `benchnav.testing.check_planner` checks the contract.
 
-    `init` and `plan` are to be written, all else has a default. A planner holds its
-    settings alone: whatever evolves is in the plan state, so that one planner serves
-        any batch in any order.
+    `init` and `plan` are required, all else has a default. A planner only holds its
+    settings. Everything that changes is in the plan state, so that one planner serves
+    any batch in any order.
     """
 
     steers: tuple[tuple[str, ...], ...] | None = None
-    """Action names of the robots that it steers; a robot of other actions is refused.
-    None: any robot.
-    """
+    """Action names of the robots that it steers, others are rejected; None: any robot."""
 
     robots: tuple[type[Robot], ...] | None = None
-    """Kinds of robots that it plans for, of those that it steers; None: all."""
+    """Kinds of robots that it plans for, among those that it steers; None: all."""
 
     blind: bool = False
-    """On the class: it uses no map, so that one run stands for every model and risk
-    setting. See `uses`.
+    """On the class: whether it uses no map; one run then stands for all models and risk
+    settings. See `uses`.
     """
 
     plans_once: bool = False
-    """It plans at the start alone; a robot that learns on its way is refused."""
+    """Whether it plans only at the start; robots that learn are then rejected."""
 
     given_truth: bool = False
-    """It is given λ itself; another model than `clairvoyant` is refused."""
+    """Whether it receives λ itself; models other than `clairvoyant` are then rejected."""
 
     @property
     def compiled(self) -> bool | None:
-        """Whether it runs compiled; None before its first plan, and where nothing is
-        ever compiled.
-        """
+        """Whether it runs compiled; None before the first plan, or if it never is."""
         return None
 
     @abstractmethod
     def init(self, problem: Problem, generator: torch.Generator) -> State:
-        """Prepares to plan.
+        """Return the first plan state.
 
         Args:
-            problem: B problems, with what is predicted.
-            generator: source of randomness, on the CPU; only drawn from here.
+            problem: B problems, with predictions.
+            generator: source of randomness on the CPU; only drawn from in this call.
 
         Returns:
             The first plan state.
@@ -143,28 +136,26 @@ class Planner(Specified, ABC, Generic[State]):
 
     @abstractmethod
     def plan(self, step: Step, plan_state: State) -> tuple[Tensor, State, Plan]:
-        """Chooses the next action of every episode.
+        """Return the next action of every episode.
 
         Args:
-            step: where the robots are, and the λ that they observed.
-            plan_state: from `init` or the previous call; not changed.
+            step: robot states, and the λ that they observed.
+            plan_state: from `init` or the previous call; it is not changed.
 
         Returns:
-            Actions within the bounds, shape [B, A]; the next plan state; what was
-            planned.
+            Actions within the bounds, shape [B, A]; the next plan state; the plan.
         """
 
     def select(self, plan_state: State, members: Tensor) -> State:
-        """Keeps some episodes, which then are planned for alone, so that those that
-        have ended cost no more.
+        """Return the plan state of some episodes, so that ended ones cost no time.
 
         Args:
-            plan_state: of all episodes; not changed.
-            members: which are kept, int64, shape [M].
+            plan_state: plan state of all episodes; it is not changed.
+            members: indices of the episodes to keep, int64, shape [M].
 
         Returns:
-            Their plan state; `NotImplemented`, the default, where ended episodes have
-            to stay in the batch.
+            Their plan state; `NotImplemented`, the default, if ended episodes must stay
+            in the batch.
         """
         return NotImplemented
 
@@ -172,115 +163,115 @@ class Planner(Specified, ABC, Generic[State]):
         """Replan for an updated λ̂ map.
 
         Args:
-            plan_state: from the last call; not changed.
-            problem: of the same episodes, which starts where the robots are now;
-                prediction, λ̂ and free ground may be others than before, all else is as
-                it was.
+            plan_state: from the last call; it is not changed.
+            problem: problems of the same episodes that start at the robots' current
+                states; only prediction, λ̂ and free mask may differ.
 
         Returns:
-            A plan state under the new problem; `NotImplemented`, the default, where the
-            planner has to begin anew by `init`.
+            A plan state for the new problem; `NotImplemented`, the default, if the
+            planner must start again with `init`.
         """
         return NotImplemented
 
     def uses(self, task: Task) -> frozenset[str]:
-        """Names the predicted inputs that bear on its actions; conditions that differ
-        only in the others run once.
+        """Return the predicted inputs that affect its actions.
+
+        Conditions that differ only in other inputs run once.
 
         Args:
-            task: what is to be done. Its rules say from which input free space comes,
-                see `FreeSpace.source`.
+            task: the task; its rules define which input free space comes from, see
+                `FreeSpace.source`.
 
         Returns:
-            Some of `INPUTS`; by default all of them, of a blind planner none.
+            A subset of `INPUTS`; by default all of them, for a blind planner none.
         """
         return frozenset() if self.blind else INPUTS
 
     def follows(self, task: Task) -> str:
-        """What it minimises in place of the task's J, in one line for tables; empty
-        where that is J alone.
-        """
+        """Return what it minimises instead of J, in one line for tables; empty for J."""
         return ""
 
     def remarks(self, task: Task) -> tuple[str, ...]:
-        """Notes that tables show, a line each, such as limits that are not the robot's."""
+        """Return notes for tables, a line each, such as limits that the robot lacks."""
         return ()
 
 
 class LocalPlanner(Planner[State]):
-    """The base class of local planners: planners that are told where to go at each
-    step.
+    """Base class of local planners: planners that receive a target at each step.
 
-    Its plan states are a `Batch` with a `problem`; by itself it plans toward the goal.
+    Their plan states are a `Batch` with a `problem`. As planners they head for the goal.
     """
 
     name: str
-    """What tables call it."""
+    """Name in tables."""
 
     @property
     def seeks_goal(self) -> bool:
-        """Whether it minimises a cost that runs to the goal, whatever target it is
-        given.
-        """
+        """Whether its cost runs to the goal, whatever the target is."""
         return False
 
     def plan(self, step: Step, plan_state: Any) -> tuple[Tensor, State, Plan]:
-        """Plans toward the goal; see `Planner`."""
+        """Return actions toward the goal; see `Planner`."""
         return self.plan_toward(step, plan_state, plan_state.problem.goal_m)
 
     @abstractmethod
     def plan_toward(
         self, step: Step, plan_state: State, target_m: Tensor
     ) -> tuple[Tensor, State, Plan]:
-        """Chooses actions toward a target (x, y), shape [B, 2]; else as `Planner.plan`."""
+        """Return actions toward targets (x, y), shape [B, 2]; see `Planner.plan`."""
 
     def commit_action(self, plan_state: State, action: Tensor) -> State:
-        """Notes the actions that are taken, which may be others than it chose, shape
-        [B, A].
+        """Return the plan state after executed actions, shape [B, A].
+
+        They may differ from the actions that it chose.
         """
         return plan_state
 
     def select(self, plan_state: Any, members: Tensor) -> State:
-        """Keeps some episodes; see `Planner`."""
+        """Return the plan state of some episodes; see `Planner`."""
         return plan_state.select(members)
 
     def revise(self, plan_state: Any, problem: Problem) -> State:
-        """Keeps all but the problem; see `Planner`."""
+        """Return the plan state with the new problem; see `Planner`."""
         return replace(plan_state, problem=problem)
 
 
 def check_finite(
-    owner: str, settings: Any, above: tuple[str, ...], least: tuple[str, ...] = ()
+    owner: str,
+    settings: Any,
+    above: tuple[str, ...],
+    at_least_zero: tuple[str, ...] = (),
 ) -> None:
-    """Refuses settings that are not finite, or under 0; None stands for a setting that
-    is not given.
+    """Check that settings are finite and not negative; None is always valid.
 
     Args:
-        owner: whose settings they are, for the message.
+        owner: owner of the settings, for the message.
         settings: a dataclass.
-        above: fields that may not be 0 either.
-        least: fields that may.
+        above: names of fields that must not be 0.
+        at_least_zero: names of fields that may be 0.
 
     Raises:
-        ConfigError: there are such.
+        ConfigError: If one is not.
     """
-    for name in (*above, *least):
-        value, sign = getattr(settings, name), ">" if name in above else "≥"
-        fits = value is None or (0 <= value < math.inf and (value or sign == "≥"))
+    for name in (*above, *at_least_zero):
+        value = getattr(settings, name)
+        sign = ">" if name in above else "≥"
+        is_in_range = value is None or 0 <= value < math.inf
+        fits = is_in_range and (value != 0 or sign == "≥")
         expect(fits, f"`{name}` {sign} 0 and finite for {owner}, got {value}.")
 
 
 def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:
-    """Refuses a robot that a planner cannot steer.
+    """Check that a planner can steer a robot.
 
     Args:
         planner: any planner.
         robot: any robot.
-        name: of the planner, for the message.
+        name: name of the planner, for the message.
 
     Raises:
-        ConfigError: the names of the robot's actions are none that the planner knows,
-            or it is of another kind.
+        ConfigError: If the planner does not know the robot's actions, or the robot is
+            of another kind.
     """
     if planner.robots is not None and type(robot) not in planner.robots:
         kinds = " or ".join(kind.__name__ for kind in planner.robots)
@@ -288,11 +279,13 @@ def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:
             f"Expected robot {kinds} for planner {name!r}, got {type(robot).__name__}."
         )
     names = tuple(robot.action_names)
-    known = (names,) if planner.steers is None else planner.steers
-    actions = " or ".join(f"({', '.join(each)})" for each in known)
-    steered = STEERING in names and not any(STEERING in each for each in known)
+    steered_names = (names,) if planner.steers is None else planner.steers
+    actions = " or ".join(f"({', '.join(option)})" for option in steered_names)
+    knows_angle = any(STEERING in option for option in steered_names)
+    steered = STEERING in names and not knows_angle
+    steered = STEERING in names and not any(STEERING in each for each in steered_names)
     expect(
-        names in known,
+        names in steered_names,
         f"a robot with actions {actions} for planner {name!r}, got "
         f"{type(robot).__name__} with "
         f"({', '.join(names)}). {_STEERED if steered else _SAMPLED}",
@@ -300,15 +293,15 @@ def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:
 
 
 def rollout_path(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
-    """Positions along action sequences, the first included.
+    """Return positions along action sequences, the first included.
 
     Args:
         problem: B problems.
         state: initial states, shape [B, S].
-        actions: shape [B, T, A, K].
+        actions: action sequences, shape [B, T, A, K].
 
     Returns:
-        Shape [B, K, T + 1, 2].
+        Positions (x, y), shape [B, K, T + 1, 2].
     """
     states = state[:, None].expand(-1, actions.shape[-1], -1)
     positions = [states[..., :2]]

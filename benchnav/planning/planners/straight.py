@@ -1,7 +1,7 @@
-"""Driving straight at the goal: the baseline that a planner has to beat.
+"""Straight driving to the goal: the blind baseline.
 
-`Straight` is blind: it uses the goal alone. Planners with a global path recover by the
-    same control law.
+`Straight` uses only the goal. Planners with a global path recover by the same control
+law.
 Letters in shapes: B episodes, S state and A action dimensions.
 """
 
@@ -17,20 +17,23 @@ from benchnav.planning.sensing.sensor import Step
 
 # Turn commanded for a radian of heading error: rad/s of turn rate, or rad of steering.
 _TURN_GAIN = 4.0
-# A robot that looks farther away than this turns before it drives, so that it leaves
-# narrow places straight.
+# A robot with a larger heading error turns before it drives, so that it leaves narrow
+# passages straight.
 _AWAY_RAD = 0.2
-# Greatest speed for a metre that is left, 1/s, so that a target is not overshot.
+# Maximum speed per metre of remaining distance, 1/s, so that it does not overshoot.
 _APPROACH = 2.0
-# Least share of the top speed of a robot that steers: it cannot turn while it stands.
+# Minimum fraction of the top speed of a robot that cannot turn in place.
 _CREEP = 0.3
 
 STEERS = ((SPEED, TURN_RATE), (SPEED, STEERING))
 
 
 def turn_toward(state: Tensor, target_m: Tensor) -> Tensor:
-    """Angles from the headings of states [*B, S] to positions [*B, 2], in [−π, π),
-    shape [*B].
+    """Return angles from headings to positions, in [−π, π), shape [*B].
+
+    Args:
+        state: states that begin with (x, y, θ), shape [*B, S].
+        target_m: positions (x, y) in metres, shape [*B, 2].
     """
     offset = target_m - state[..., :2]
     missing = torch.atan2(offset[..., 1], offset[..., 0]) - state[..., 2]
@@ -38,55 +41,54 @@ def turn_toward(state: Tensor, target_m: Tensor) -> Tensor:
 
 
 def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
-    """Actions that turn toward a target and drive at it, once the robot looks there.
+    """Return actions that turn toward a target and then drive to it.
 
     Args:
-        state: shape [B, S], beginning with (x, y, θ).
-        target_m: (x, y), shape [B, 2].
-        robot: one of the actions `STEERS`.
+        state: states that begin with (x, y, θ), shape [B, S].
+        target_m: targets (x, y) in metres, shape [B, 2].
+        robot: a robot with one of the actions `STEERS`.
 
     Returns:
         Actions within the bounds, shape [B, 2].
     """
     missing = turn_toward(state, target_m)
     low, high, rates = robot.action_low, robot.action_high, robot.action_rates
-    # A robot of limited acceleration has to be able to end its turn in time.
+    # A robot of limited acceleration must be able to stop its turn in time.
     gain = _TURN_GAIN if rates is None else min(_TURN_GAIN, 2 * rates[1] / high[1])
-    least = 0.0 if TURN_RATE in robot.action_names else _CREEP
-    aligned = high[0] * (1 - missing.abs() / _AWAY_RAD).clamp(min=least)
-    speed = torch.minimum(
-        aligned, _APPROACH * torch.linalg.vector_norm(target_m - state[:, :2], dim=1)
-    )
+    min_fraction = 0.0 if TURN_RATE in robot.action_names else _CREEP
+    aligned = high[0] * (1 - missing.abs() / _AWAY_RAD).clamp(min=min_fraction)
+    distance_m = torch.linalg.vector_norm(target_m - state[:, :2], dim=1)
+    speed = torch.minimum(aligned, _APPROACH * distance_m)
     actions = zip((speed, gain * missing), low, high, strict=True)
     return torch.stack(
-        [action.clamp(least, most) for action, least, most in actions], dim=1
+        [action.clamp(lower, upper) for action, lower, upper in actions], dim=1
     )
 
 
 class Straight(Planner[Problem]):
-    """The blind baseline: full speed straight at the goal, whatever the ground is."""
+    """The blind baseline: full speed straight to the goal, whatever the terrain."""
 
     steers = STEERS
     blind = True
 
     def follows(self, task: Task) -> str:
-        """That it minimises nothing; see `Planner`."""
+        """Return that it minimises nothing; see `Planner`."""
         return "none (it drives straight at the goal)"
 
     def init(self, problem: Problem, generator: torch.Generator) -> Problem:
-        """Keeps the problem, for its goals; draws nothing. See `Planner`."""
+        """Return the problem as the plan state; draws nothing. See `Planner`."""
         return problem
 
     def plan(self, step: Step, plan_state: Problem) -> tuple[Tensor, Problem, Plan]:
-        """Steers toward the goal; see `Planner`."""
+        """Return actions toward the goal; see `Planner`."""
         action = steer_toward(step.state, plan_state.goal_m, plan_state.robot)
         line = torch.stack((step.state[:, :2], plan_state.goal_m), dim=1)
         return action, plan_state, Plan.empty(len(action), action.device, path=line)
 
     def revise(self, plan_state: Problem, problem: Problem) -> Problem:
-        """Goes on as before; see `Planner`."""
+        """Return the new problem as the plan state; see `Planner`."""
         return problem
 
     def select(self, plan_state: Problem, members: Tensor) -> Problem:
-        """Keeps some episodes; see `Planner`."""
+        """Return some episodes; see `Planner`."""
         return plan_state.select(members)

@@ -1,1 +1,1 @@
-"""What robots learn on their way: what they sense, and what a belief makes of it."""
+"""Sensing and belief: measurements during an episode, and the λ that they imply."""

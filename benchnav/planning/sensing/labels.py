@@ -1,18 +1,17 @@
-"""Which of two classes cells are of: a Potts field of two states, sampled by 64 chains
-at once, a bit each.
+"""A Potts field of two states on look-alike cells, sampled by 64 chains, a bit each.
 
-Cells that may be of one of two classes have neighbours, of four, that may be of the
-same two. Zero field, strength β:
+Cells that may be of one of two classes are coupled to those of their four neighbours
+that may be of the same two. Without an outer field, at strength β:
 
-    P(labels) ∝ exp(β · number of such neighbours with one label).
+    P(labels) ∝ exp(β · number of coupled neighbours with equal labels).
 
-A cell's 64 labels are the bits of one integer, so that a few operations on integers
-sweep all chains (multi-spin coding). Heat-bath sweeps go over one colour of the
-checkerboard after the other. P(class) is estimated from clusters (Swendsen and Wang
-1987): neighbours of one label are tied with the probability 1 − exp(−β), and cells that
-no ties join to evidence are of either class by half, whatever their bit. Random numbers
-are keyed by cell and by how many sweeps an episode has had, so that an episode has the
-same whoever is beside it.
+A cell's 64 labels are the bits of one integer, so that a few integer operations sweep
+all chains (multi-spin coding). Heat-bath sweeps alternate between the two colours of
+the checkerboard. P(class) is estimated from clusters (Swendsen and Wang 1987): bonds
+join coupled neighbours of equal label with the probability 1 − exp(−β). A cell that no
+bonds join to evidence is of either class with probability ½, whatever its bit. Random
+numbers are keyed by cell and by the number of sweeps of an episode, so that they do not
+depend on the other episodes of a batch.
 Letters in shapes: B episodes, H×W cells, S chains.
 """
 
@@ -26,9 +25,9 @@ from torch import Tensor
 from benchnav.core import rng
 
 CHAINS = 64
-_SWEEPS = 64  # of which random numbers are kept; later ones take them from other cells
-_STEP = 11, 29  # by how many rows and columns, of the torus
-_MOST = 4  # neighbours
+_SWEEPS = 64  # with stored random numbers; later sweeps take those of other cells
+_STEP = 11, 29  # offset of these cells in rows and columns, on the torus
+_NEIGHBOURS = 4
 
 _HALVES = (0x5555555555555555, 0x3333333333333333, 0x0F0F0F0F0F0F0F0F)
 
@@ -38,9 +37,9 @@ class Lattice:
     """Couplings between neighbouring cells.
 
     Args:
-        right: all bits set where a cell and the one to its right do, int64, shape [B,
-            H, W].
-        down: as much of the one below.
+        right: all bits set where a cell is coupled to the one to its right, int64,
+            shape [B, H, W].
+        down: likewise for the cell below.
         strength: β.
     """
 
@@ -50,22 +49,22 @@ class Lattice:
 
     @classmethod
     def of(cls, pair: Tensor, strength: float) -> "Lattice":
-        """The lattice of cells of pairs, by the number of the pair, 0 for none, int64,
-        shape [B, H, W].
+        """Return the couplings of cells.
+
+        Args:
+            pair: index of each cell's pair from 1; 0 without one, int64, [B, H, W].
+            strength: β.
         """
-        right, down = torch.zeros_like(pair), torch.zeros_like(pair)
-        right[..., :-1] = -(
-            (pair[..., :-1] == pair[..., 1:]) & (pair[..., 1:] > 0)
-        ).long()
-        down[..., :-1, :] = -(
-            (pair[..., :-1, :] == pair[..., 1:, :]) & (pair[..., 1:, :] > 0)
-        ).long()
+        right = torch.zeros_like(pair)
+        down = torch.zeros_like(pair)
+        same_right = (pair[..., :-1] == pair[..., 1:]) & (pair[..., 1:] > 0)
+        same_down = (pair[..., :-1, :] == pair[..., 1:, :]) & (pair[..., 1:, :] > 0)
+        right[..., :-1] = -same_right.long()
+        down[..., :-1, :] = -same_down.long()
         return cls(right, down, strength)
 
     def neighbours(self, words: Tensor) -> tuple[Tensor, ...]:
-        """Words of the cells to the right, to the left, below and above, 0 where none
-        hangs together.
-        """
+        """Return words of the right, left, lower and upper neighbours; 0 if uncoupled."""
         return (
             words.roll(-1, -1) & self.right,
             (words & self.right).roll(1, -1),
@@ -74,9 +73,9 @@ class Lattice:
         )
 
     def degree(self) -> Tensor:
-        """How many neighbours each cell has, int64, shape [B, H, W]."""
-        none = torch.full_like(self.right, -1)
-        return -sum(self.neighbours(none), torch.zeros_like(none))
+        """Return the number of coupled neighbours, int64, shape [B, H, W]."""
+        all_bits = torch.full_like(self.right, -1)
+        return -sum(self.neighbours(all_bits), torch.zeros_like(all_bits))
 
 
 @dataclass(frozen=True)
@@ -84,10 +83,10 @@ class Noise:
     """Random bits of a sweep.
 
     Args:
-        chosen: for 0 to 4 neighbours of the first class, whether the cell becomes of
-            it, int64, five of [B, H, W].
-        right: whether a cell is tied to its right neighbour, if they are of one class.
-        down: as much of the one below.
+        chosen: for 0 to 4 neighbours of the first class, whether the cell takes that
+            class, int64, five of shape [B, H, W].
+        right: bonds to the right neighbour, effective if both are of one class.
+        down: likewise for the cell below.
     """
 
     chosen: tuple[Tensor, ...]
@@ -103,45 +102,51 @@ def noise(
     strength: float,
     size: int,
 ) -> Noise:
-    """The random bits of each episode's next sweep.
+    """Return the random bits of each episode's next sweep.
 
     Args:
-        sweep: how many each episode has had, int64, shape [B].
-        row: of the cells, int64, shape [B, H, W].
-        column: of the cells.
-        degree: how many neighbours they have.
+        sweep: number of sweeps of each episode so far, int64, shape [B].
+        row: rows of the cells, int64, shape [B, H, W].
+        column: columns of the cells.
+        degree: number of coupled neighbours of the cells.
         strength: β.
-        size: of the torus that random numbers are kept for, at least that of a map.
+        size: side of the torus of stored random numbers, at least that of a map.
     """
-    bank, uses = _bank(strength, size).to(row.device), sweep[:, None, None] // _SWEEPS
+    bank = _bank(strength, size).to(row.device)
+    uses = sweep[:, None, None] // _SWEEPS
     turn = sweep[:, None, None] % _SWEEPS
-    place = ((row + uses * _STEP[0]) % size) * size + (column + uses * _STEP[1]) % size
+    bank_row = (row + uses * _STEP[0]) % size
+    bank_column = (column + uses * _STEP[1]) % size
+    index = bank_row * size + bank_column
     levels = [
-        (2 * many - degree + _MOST).clamp(0, 2 * _MOST) for many in range(_MOST + 1)
+        (2 * n_first - degree + _NEIGHBOURS).clamp(0, 2 * _NEIGHBOURS)
+        for n_first in range(_NEIGHBOURS + 1)
     ]
-    chosen = tuple(bank[turn, place, level] for level in levels)
-    return Noise(
-        chosen, bank[turn, place, 2 * _MOST + 1], bank[turn, place, 2 * _MOST + 2]
-    )
+    chosen = tuple(bank[turn, index, level] for level in levels)
+    right = bank[turn, index, 2 * _NEIGHBOURS + 1]
+    down = bank[turn, index, 2 * _NEIGHBOURS + 2]
+    return Noise(chosen, right, down)
 
 
 @lru_cache(maxsize=4)
 def _bank(strength: float, size: int) -> Tensor:
-    """Bits of all sweeps: for log odds of −4β to 4β, and two ties; int64, shape
-    [sweeps, size², 11].
+    """Return the bits of all sweeps, int64, shape [sweeps, size², 11].
+
+    The first nine are for log odds of −4β to 4β, the other two are bonds.
     """
     key = rng.stream_key(0, "labels", "sweeps")
-    chances = 1 / (1 + np.exp(-strength * np.arange(-_MOST, _MOST + 1)))
-    found = np.empty((_SWEEPS, size * size, 2 * _MOST + 3), dtype=np.int64)
+    log_odds = strength * np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)
+    probabilities = 1 / (1 + np.exp(-log_odds))
+    bond_probability = -np.expm1(-strength)
+    bits = np.empty((_SWEEPS, size * size, 2 * _NEIGHBOURS + 3), dtype=np.int64)
     for sweep in range(_SWEEPS):
-        drawn = rng.uniform(key, np.array([sweep]), (3, size * size, CHAINS))[0]
-        for level, chance in enumerate(chances):
-            found[sweep, :, level] = _packed(drawn[0] < chance)
-        for way in (1, 2):
-            found[sweep, :, 2 * _MOST + way] = _packed(
-                drawn[way] < -np.expm1(-strength)
-            )
-    return torch.from_numpy(found)
+        uniform = rng.uniform(key, np.array([sweep]), (3, size * size, CHAINS))[0]
+        for level, probability in enumerate(probabilities):
+            bits[sweep, :, level] = _packed(uniform[0] < probability)
+        for direction in (1, 2):
+            bonds = _packed(uniform[direction] < bond_probability)
+            bits[sweep, :, 2 * _NEIGHBOURS + direction] = bonds
+    return torch.from_numpy(bits)
 
 
 def _packed(bits: np.ndarray) -> np.ndarray:
@@ -149,39 +154,35 @@ def _packed(bits: np.ndarray) -> np.ndarray:
 
 
 def fair(height: int, width: int) -> Tensor:
-    """Labels by the toss of a coin, int64, shape [H, W]."""
-    bits = (
-        rng.uniform(
-            rng.stream_key(0, "labels", "first"), np.arange(height * width), (CHAINS,)
-        )
-        < 0.5
-    )
+    """Return labels of probability ½, int64, shape [H, W]."""
+    key = rng.stream_key(0, "labels", "first")
+    bits = rng.uniform(key, np.arange(height * width), (CHAINS,)) < 0.5
     return torch.from_numpy(_packed(bits)).view(height, width)
 
 
-def swept(
+def sweep_labels(
     labels: Tensor, lattice: Lattice, free: Tensor, even: Tensor, drawn: Noise
 ) -> Tensor:
-    """Draws labels anew given their neighbours', int64, shape [B, H, W].
+    """Resample labels given their neighbours', int64, shape [B, H, W].
 
     Args:
-        labels: int64, shape [B, H, W].
-        lattice: of these cells.
+        labels: current labels, int64, shape [B, H, W].
+        lattice: couplings of these cells.
         free: all bits set where a label may change, int64.
         even: all bits set on the cells of one colour of the checkerboard, int64.
         drawn: random bits.
     """
     for colour in (free & even, free & ~even):
         right, left, below, above = lattice.neighbours(labels)
-        # The number of neighbours of the first class, of three binary digits.
-        odd, pair, other, second = (
-            right ^ left,
-            right & left,
-            below ^ above,
-            below & above,
-        )
-        ones, carry = odd ^ other, odd & other
-        twos, fours = pair ^ second ^ carry, pair & second
+        # Binary digits of the number of neighbours of the first class.
+        odd_row = right ^ left
+        pair_row = right & left
+        odd_column = below ^ above
+        pair_column = below & above
+        ones = odd_row ^ odd_column
+        carry = odd_row & odd_column
+        twos = pair_row ^ pair_column ^ carry
+        fours = pair_row & pair_column
         none = ~(ones | twos | fours)
         exactly = (none, ones & ~twos, twos & ~ones, ones & twos, fours)
         new = torch.zeros_like(labels)
@@ -191,30 +192,32 @@ def swept(
     return labels
 
 
-def joined(labels: Tensor, lattice: Lattice, evidence: Tensor, drawn: Noise) -> Tensor:
-    """In which chains ties join cells to evidence, int64, shape [B, H, W].
+def connected_to_evidence(
+    labels: Tensor, lattice: Lattice, evidence: Tensor, drawn: Noise
+) -> Tensor:
+    """Return the chains in which bonds join a cell to evidence, int64, [B, H, W].
 
     Args:
-        labels: int64, shape [B, H, W].
-        lattice: of these cells.
-        evidence: all bits set on cells of which something is known, int64.
+        labels: labels of the chains, int64, shape [B, H, W].
+        lattice: couplings of these cells.
+        evidence: all bits set on cells with evidence of their label, int64.
         drawn: random bits.
     """
     right = lattice.right & drawn.right & ~(labels ^ labels.roll(-1, -1))
     down = lattice.down & drawn.down & ~(labels ^ labels.roll(-1, -2))
-    ties = Lattice(right, down, lattice.strength)
-    found = evidence
+    bonds = Lattice(right, down, lattice.strength)
+    connected = evidence
     while True:
-        before = found
-        for _ in range(4):  # to look whether all is found takes as long as a step
-            one, two, three, four = ties.neighbours(found)
-            found = found | one | two | three | four
-        if torch.equal(found, before):
-            return found
+        before = connected
+        for _ in range(4):  # a check for convergence takes as long as a step
+            for neighbours in bonds.neighbours(connected):
+                connected = connected | neighbours
+        if torch.equal(connected, before):
+            return connected
 
 
-def tally(words: Tensor) -> Tensor:
-    """How many bits are set, int64."""
+def count_bits(words: Tensor) -> Tensor:
+    """Return the number of set bits, int64."""
     pairs, fours, bytes_ = _HALVES
     words = words - ((words >> 1) & pairs)
     words = (words & fours) + ((words >> 2) & fours)
@@ -223,10 +226,10 @@ def tally(words: Tensor) -> Tensor:
 
 
 def unpacked(words: Tensor) -> Tensor:
-    """Bits of words of shape [*], bool, shape [*, S]."""
+    """Return the bits of words of shape [*], bool, shape [*, S]."""
     return (words[..., None] >> torch.arange(CHAINS, device=words.device) & 1).bool()
 
 
 def packed(bits: Tensor) -> Tensor:
-    """Words of bits of shape [*, S], int64, shape [*]."""
+    """Return words of bits of shape [*, S], int64, shape [*]."""
     return (bits.long() << torch.arange(CHAINS, device=bits.device)).sum(-1)

@@ -1,15 +1,14 @@
-"""The sensor `near`: a camera on a mast sees the ground around the robot, the better
-the nearer.
+"""The sensor `near`: a mast camera whose noise grows with distance.
 
-A cell is in line of sight unless ground between stands over the line from the mast to
-it. The horizon is carried outwards from ring to ring of cells around the robot's,
-between which it is linear (XDraw), so that planes and long walls along the grid are
-exact. Line of sight is that of a mast in the middle of the robot's cell. Ground that is
-out of range, out of the field of view or hidden under the horizon raises no horizon:
-which cells are seen depends on nothing but the ground that is seen, as long as what is
-hidden stays lower than its horizon.
-Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of the rings, seen
-    or in them all.
+A cell is in line of sight unless terrain in between rises above the line from the mast
+to it. The horizon is carried outwards from ring to ring of cells around the robot's,
+linear between cells (XDraw), so that planes and long walls along the grid are exact.
+Line of sight is that of a mast in the middle of the robot's cell. Terrain that is out
+of range, out of the field of view or hidden below the horizon raises no horizon. Hence
+the mask of observed cells depends only on observed terrain, as long as hidden terrain
+stays below its horizon.
+Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of the rings,
+    observed or in total.
 
 Source: Franklin, Ray and Mehta (1994), "Geometric algorithms for siting of air defense
     missile batteries", for XDraw.
@@ -25,26 +24,25 @@ from torch import Tensor
 from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
 from benchnav.core.terrain import Observation, Terrain
-from benchnav.planning.sensing.sensor import Appearance, Moment, Sensed, Sensor
+from benchnav.planning.sensing.sensor import Appearance, Measurement, NoiseKey, Sensor
 
 
 @dataclass(frozen=True)
 class Near(Sensor):
-    """What the ground near the robot looks like, from a mast, with noise that grows
-    with distance.
+    """Appearance of terrain near the robot, from a mast, with noise.
 
-    The robot's own cell and its eight neighbours are always seen; other cells where
-    their centre is in range, in the field of view and in line of sight. Noise is drawn
-    for each cell and step alone, normal, with a standard deviation that is proportional
-    to the distance of the cell's centre. The defaults give ±4 of 255 and ±16 mm at 8 m,
-    as a good stereo camera does; slopes of cells of 0.5 m are then known to about 1°.
+    The robot's own cell and its eight neighbours are always observed; other cells if
+    their centre is in range, in the field of view and in line of sight. Noise is normal
+    and independent for each cell and step; its standard deviation is proportional to
+    the distance of the cell's centre. The defaults give ±4 of 255 and ±16 mm at 8 m, as
+    a good stereo camera does; slopes of cells of 0.5 m are then known to about 1°.
     Layers other than colour and elevation have no noise, and slope is computed from
     observed elevation.
 
     Args:
-        range_m: how far it sees.
+        range_m: range in metres.
         fov_deg: field of view, centred on the robot's heading, in (0, 360].
-        height_m: of the mast over the ground under the robot.
+        height_m: height of the mast above the terrain under the robot, in metres.
         colour_noise: standard deviation of each channel of a colour, 0–255, for each
             metre of distance.
         elevation_noise: standard deviation of elevation in metres, for each metre of
@@ -58,7 +56,7 @@ class Near(Sensor):
     elevation_noise: float = 0.002
 
     def __post_init__(self) -> None:
-        """Refuses cameras that are none."""
+        """Validate range, field of view, height and noise."""
         for name in ("range_m", "height_m"):
             value = getattr(self, name)
             expect(
@@ -77,23 +75,22 @@ class Near(Sensor):
             )
 
     def sense(
-        self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-    ) -> Sensed:
-        """Looks around once; robots off the map see nothing."""
+        self, terrain: Terrain, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
+        """Return the appearance of cells in sight; robots off the map see nothing."""
         distance = self._distances(terrain, robot_state.double())
         seen = distance.isfinite()
-        noise = moment.normal("look", seen, (4,)) * distance[seen][:, None]
+        noise = noise_key.normal("look", seen, (4,)) * distance[seen][:, None]
         colour = terrain.rgb.movedim(1, -1)[seen] + self.colour_noise * noise[:, :3]
         rgb = torch.zeros_like(terrain.rgb)
         rgb.movedim(1, -1)[seen] = colour.round().clamp(0, 255).to(rgb.dtype)
         heights = terrain.elevation_m[seen]
-        elevation = torch.full_like(terrain.elevation_m, math.nan)
-        elevation[seen] = (heights + self.elevation_noise * noise[:, 3]).to(
-            heights.dtype
-        )
+        noisy_heights = heights + self.elevation_noise * noise[:, 3]
+        elevation_m = torch.full_like(terrain.elevation_m, math.nan)
+        elevation_m[seen] = noisy_heights.to(heights.dtype)
         observation = Observation(
             rgb=rgb,
-            elevation_m=elevation,
+            elevation_m=elevation_m,
             slope_deg=torch.full_like(terrain.slope_deg, math.nan),
             grid=terrain.grid,
             layers={
@@ -101,92 +98,95 @@ class Near(Sensor):
                 for name, layer in terrain.layers.items()
             },
         )
-        return Sensed.looks(
+        return Measurement.of_appearance(
             Appearance(
-                seen=seen, observation=observation, doubt=distance.to(field.dtype)
+                seen=seen, observation=observation, noise_level=distance.to(field.dtype)
             )
         )
 
     def _distances(self, terrain: Terrain, robot_state: Tensor) -> Tensor:
-        """Metres to the centres of the cells that are seen, infinite for all others,
-        shape [B, H, W].
+        """Return distances to the centres of observed cells, in metres, [B, H, W].
+
+        The distance is infinite for all other cells.
         """
-        grid, (x, y, heading) = terrain.grid, robot_state[:, :3].T[..., None]
-        cells = min(
-            max(1, math.ceil(self.range_m / grid.resolution_m)), max(grid.shape) - 1
-        )
-        rings = _rings(cells, robot_state.device)
+        grid = terrain.grid
+        x, y, heading = robot_state[:, :3].T[..., None]
+        range_cells = max(1, math.ceil(self.range_m / grid.resolution_m))
+        rings = _rings(min(range_cells, max(grid.shape) - 1), robot_state.device)
         row, column = grid.cell_of(x, y)
         rows, columns = row + rings.row, column + rings.column
         on_map = (
             (rows >= 0) & (rows < grid.height) & (columns >= 0) & (columns < grid.width)
         )
         on_map &= grid.contains(x, y)
-        to_x, to_y = grid.centre_of(rows, columns)
-        to_x, to_y = to_x - x, to_y - y
-        distance = torch.hypot(to_x, to_y)
+        centre_x, centre_y = grid.centre_of(rows, columns)
+        dx = centre_x - x
+        dy = centre_y - y
+        distance = torch.hypot(dx, dy)
         in_view = distance <= self.range_m
         if self.fov_deg < 360:
-            off_heading = (torch.atan2(to_y, to_x) - heading + math.pi).remainder(
-                math.tau
-            ) - math.pi
+            turn = torch.atan2(dy, dx) - heading + math.pi
+            off_heading = turn.remainder(math.tau) - math.pi
             in_view &= off_heading.abs() <= math.radians(self.fov_deg) / 2
         in_view = on_map & (in_view | (rings.number <= 1))
 
-        place = rows.clamp(0, grid.height - 1) * grid.width + columns.clamp(
-            0, grid.width - 1
-        )
-        ground = terrain.elevation_m.flatten(1).gather(1, place).double()
-        rise = (ground - ground[:, :1] - self.height_m) / rings.number.clamp(min=1)
-        visible = in_view & rings.in_sight(rise.where(in_view, -math.inf))
-        found = torch.full_like(terrain.elevation_m, math.inf, dtype=distance.dtype)
+        row_on_map = rows.clamp(0, grid.height - 1)
+        cell = row_on_map * grid.width + columns.clamp(0, grid.width - 1)
+        height_m = terrain.elevation_m.flatten(1).gather(1, cell).double()
+        rise = height_m - height_m[:, :1] - self.height_m
+        gradient = rise / rings.number.clamp(min=1)
+        visible = in_view & rings.in_sight(gradient.where(in_view, -math.inf))
+        distances = torch.full_like(terrain.elevation_m, math.inf, dtype=distance.dtype)
         member, ray = visible.nonzero(as_tuple=True)
-        found[member, rows[member, ray], columns[member, ray]] = distance[member, ray]
-        return found
+        cells = member, rows[member, ray], columns[member, ray]
+        distances[cells] = distance[member, ray]
+        return distances
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Rings(Batch):
-    """Cells around one, ring by ring, the one itself first, and those that the rays to
-    them pass between.
+    """Cells around a central one, ring by ring from the centre, and their rays.
 
     Args:
-        row: of each cell less that of the first, int64, shape [N].
-        column: likewise.
-        number: of the ring: rows or columns to the first cell, whichever are more,
-            shape [N].
-        inner: for each cell the two of the ring within that its ray passes between, by
-            their places in that ring, shape [N, 2].
-        share: of the second of them, float64, shape [N].
+        row: row of each cell relative to the centre, int64, shape [N].
+        column: column, likewise.
+        number: number of the ring, shape [N]: the larger of the distances to the
+            centre in rows and in columns.
+        inner: for each cell, the two cells of the next inner ring between which its ray
+            passes, as indices within that ring, shape [N, 2].
+        fraction: weight of the second of them, float64, shape [N].
     """
 
     row: Tensor
     column: Tensor
     number: Tensor
     inner: Tensor
-    share: Tensor
+    fraction: Tensor
 
     def in_sight(self, rise: Tensor) -> Tensor:
-        """Tells which cells are not under the horizon.
+        """Return a mask of cells that are not below the horizon, bool, shape [B, N].
 
         Args:
-            rise: height of each cell over the mast's top by the number of its ring,
-                which along a ray is as good as the tangent; −∞ for cells that raise no
-                horizon, shape [B, N].
+            rise: height of each cell above the mast's top, divided by the number of its
+                ring, which orders cells along a ray as the tangent does. −∞ for cells
+                that raise no horizon, shape [B, N].
         """
-        found, horizon = [torch.ones_like(rise[:, :9], dtype=torch.bool)], rise[:, 1:9]
+        visible = [torch.ones_like(rise[:, :9], dtype=torch.bool)]
+        horizon = rise[:, 1:9]
         for number in range(2, int(self.number[-1]) + 1):
             ring = slice((2 * number - 1) ** 2, (2 * number + 1) ** 2)
-            one, other = (horizon[:, places] for places in self.inner[ring].T)
-            before = torch.lerp(one, other, self.share[ring])
-            found.append(rise[:, ring] >= before)
-            horizon = torch.maximum(rise[:, ring], before)
-        return torch.cat(found, 1)
+            first, second = self.inner[ring].T
+            inner_horizon = torch.lerp(
+                horizon[:, first], horizon[:, second], self.fraction[ring]
+            )
+            visible.append(rise[:, ring] >= inner_horizon)
+            horizon = torch.maximum(rise[:, ring], inner_horizon)
+        return torch.cat(visible, 1)
 
 
 @lru_cache(maxsize=8)
 def _rings(cells: int, device: torch.device) -> _Rings:
-    """The rings up to a number."""
+    """Return the rings up to the number `cells`."""
     steps = torch.arange(-cells, cells + 1)
     row, column = (
         values.flatten() for values in torch.meshgrid(steps, steps, indexing="ij")
@@ -195,20 +195,22 @@ def _rings(cells: int, device: torch.device) -> _Rings:
     # By ring and, within it, by row and column: `order` is stable.
     order = number.argsort(stable=True)
     row, column, number = row[order], column[order], number[order]
-    first = (2 * number - 1).clamp(min=0) ** 2
-    places = torch.empty(len(steps), len(steps), dtype=torch.int64)
-    places[row + cells, column + cells] = torch.arange(len(order)) - first
-    # The ray crosses the ring within at (number − 1) / number of the way, where one of
-    # the two is a whole number.
-    before, whole = torch.stack((row, column)) * (number - 1), number.clamp(min=1)
-    least, part = before.div(whole, rounding_mode="floor"), before % whole
-    most = least + (part > 0)
-    inner = torch.stack([places[tuple(ends + cells)] for ends in (least, most)], 1)
-    made = _Rings(
+    ring_start = (2 * number - 1).clamp(min=0) ** 2
+    indices = torch.empty(len(steps), len(steps), dtype=torch.int64)
+    indices[row + cells, column + cells] = torch.arange(len(order)) - ring_start
+    # The ray crosses the next inner ring at the fraction (number − 1) / number, where
+    # one of its two coordinates is an integer.
+    scaled = torch.stack((row, column)) * (number - 1)
+    divisor = number.clamp(min=1)
+    lower = scaled.div(divisor, rounding_mode="floor")
+    remainder = scaled % divisor
+    upper = lower + (remainder > 0)
+    inner = torch.stack([indices[tuple(ends + cells)] for ends in (lower, upper)], 1)
+    rings = _Rings(
         row=row,
         column=column,
         number=number,
         inner=inner,
-        share=part.sum(0) / whole.double(),
+        fraction=remainder.sum(0) / divisor.double(),
     )
-    return made.to(device)
+    return rings.to(device)

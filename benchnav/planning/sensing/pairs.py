@@ -1,5 +1,5 @@
-"""Which cells may be of one of two look-alike classes, and what is predicted of them
-under either.
+"""Pairs of look-alike classes: the cells that may be of one, and their prediction under
+either class.
 
 Letters in shapes: B episodes, H×W cells.
 """
@@ -14,90 +14,90 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError, expect
 from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.planning.sensing.belief import Law
+from benchnav.planning.sensing.belief import CovarianceModel
 
-_LEAST_MASS, _LEAST_CLASS = (
-    0.05,
-    0.01,
-)  # of a cell's weight: the pair's, and each of its classes'
+# Minimum weight of a cell's pair, and of each of its classes.
+_MIN_PAIR_WEIGHT = 0.05
+_MIN_CLASS_WEIGHT = 0.01
 
 
-def statistics_of(law: Law) -> GroundStatistics:
-    """The statistics of the ground, which say what looks alike.
+def statistics_of(covariance: CovarianceModel) -> GroundStatistics:
+    """Return the terrain statistics, which list the look-alike classes.
 
     Raises:
-        ConfigError: there are none.
+        ConfigError: If the covariance model has none.
     """
     expect(
-        law.statistics is not None,
-        "statistics of the ground, which say which classes look alike, got none. Take "
-        "a model that has them, or the "
-        "belief copula.",
+        covariance.statistics is not None,
+        "terrain statistics, which list the look-alike classes, got None. Take a model "
+        "that has them, or the belief copula.",
     )
-    return cast(GroundStatistics, law.statistics)
+    return cast(GroundStatistics, covariance.statistics)
 
 
 def split(
-    prior: TraversabilityDistribution, law: Law
+    prior: TraversabilityDistribution, covariance: CovarianceModel
 ) -> tuple[TraversabilityMixture, TraversabilityMixture, Tensor, Tensor]:
-    """Splits a prediction by the label of cells.
+    """Split a prediction by the class of look-alike cells.
 
     Args:
-        prior: of shape [B, H, W].
-        law: which classes look alike.
+        prior: the model's prediction, shape [B, H, W].
+        covariance: the covariance model, whose statistics list the look-alike classes.
 
     Returns:
-        The prediction under the first and under the second class of each cell's pair;
-        the number of that pair, from 1, 0 for none, int64; and the log odds of its
-        first class, float64, 0 for none; each of shape [B, H, W]. Components that
-        belong to no class are none of a pair's.
+        The predictions under the first and under the second class of each cell's pair,
+        the pair's index from 1 (0 if the cell has no pair, int64), and the log odds of
+        its first class (float64, 0 without a pair), each of shape [B, H, W]. Components
+        that belong to no class are in both predictions.
 
     Raises:
-        ConfigError: the prediction tells no classes, or the law does not say which look
-            alike.
+        ConfigError: If the prediction has no classes, or the statistics do not list the
+            look-alike classes.
     """
-    names, pairs = law.class_names, statistics_of(law).look_alikes
+    names = covariance.class_names
+    pairs = statistics_of(covariance).look_alikes
+    is_mixture = isinstance(prior, TraversabilityMixture)
     if not isinstance(prior, TraversabilityMixture) or prior.group is None:
+        without = " without `group`" if is_mixture else ""
         raise ConfigError(
             "Expected a mixture whose components belong to classes for the belief "
-            "classes, got "
-            f"{type(prior).__name__}{' without `group`' if isinstance(prior, TraversabilityMixture) else ''}. "
+            f"classes, got {type(prior).__name__}{without}. "
             "Take another model, or the belief copula."
         )
-    strange = sorted({name for pair in pairs for name in pair} - set(names))
+    paired_names = {name for pair in pairs for name in pair}
+    unknown = sorted(paired_names - set(names))
     expect(
-        not strange,
-        f"look-alike classes among those of the prediction, got {', '.join(strange)}.",
+        not unknown,
+        f"look-alike classes among those of the prediction, got {', '.join(unknown)}.",
     )
     pair = torch.zeros(prior.shape, dtype=torch.int64, device=prior.device)
     odds = torch.zeros(prior.shape, dtype=torch.float64, device=prior.device)
     if not pairs:
         return prior, prior, pair, odds
     weights = prior.weights.double()
-    shares = replace(
-        prior, weights=weights / weights.sum(-3, keepdim=True)
-    ).class_probabilities(len(names))
+    normalised = replace(prior, weights=weights / weights.sum(-3, keepdim=True))
+    probabilities = normalised.class_probabilities(len(names))
     group = torch.tensor(prior.group, device=prior.device).view(-1, 1, 1)
-    heaviest = torch.full_like(odds, _LEAST_MASS)
+    max_weight = torch.full_like(odds, _MIN_PAIR_WEIGHT)
     scales = [torch.ones_like(weights), torch.ones_like(weights)]
-    for number, names_of in enumerate(pairs, 1):
-        ids = names.index(names_of[0]), names.index(names_of[1])
-        first, second = (shares[:, own] for own in ids)
-        mass = first + second
-        own = (mass >= heaviest) & (torch.minimum(first, second) > _LEAST_CLASS)
-        heaviest, pair = (
-            torch.where(own, mass, heaviest),
-            torch.where(own, number, pair),
-        )
-        odds = torch.where(own, (first / second).log(), odds)
-        for place, (kept, share) in enumerate(zip(ids, (first, second), strict=True)):
-            scale = torch.where(
-                group == kept,
-                (mass / share)[:, None],
-                torch.where(group == sum(ids) - kept, 0.0, 1.0),
-            )
-            scales[place] = torch.where(own[:, None], scale, scales[place])
-    one, other = (
+    for index, (first_name, second_name) in enumerate(pairs, 1):
+        ids = names.index(first_name), names.index(second_name)
+        first = probabilities[:, ids[0]]
+        second = probabilities[:, ids[1]]
+        pair_weight = first + second
+        both_likely = torch.minimum(first, second) > _MIN_CLASS_WEIGHT
+        is_of_pair = (pair_weight >= max_weight) & both_likely
+        max_weight = torch.where(is_of_pair, pair_weight, max_weight)
+        pair = torch.where(is_of_pair, index, pair)
+        odds = torch.where(is_of_pair, (first / second).log(), odds)
+        for part, probability in enumerate((first, second)):
+            # The class gets all of the pair's weight; the other class of it gets none.
+            other_id = ids[1 - part]
+            others = torch.where(group == other_id, 0.0, 1.0)
+            gain = (pair_weight / probability)[:, None]
+            scale = torch.where(group == ids[part], gain, others)
+            scales[part] = torch.where(is_of_pair[:, None], scale, scales[part])
+    under_first, under_second = (
         replace(prior, weights=(weights * scale).to(prior.dtype)) for scale in scales
     )
-    return one, other, pair, odds
+    return under_first, under_second, pair, odds

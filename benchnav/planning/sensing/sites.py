@@ -1,5 +1,5 @@
-"""What labels of look-alike classes are drawn from: the cells around what is new, and
-the nearest observed ones.
+"""Inputs of the draw of labels: the cells around new observations, and the nearest
+observed cells.
 
 Letters in shapes: B episodes, H×W cells, R×C cells of a block, N observed cells, S
     chains.
@@ -13,38 +13,38 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from benchnav.core.batch import Batch
-from benchnav.planning.sensing.copula import bounds, nearest
+from benchnav.planning.sensing.conditioning import bounds, nearest
 from benchnav.planning.sensing.gaussian import Field
 from benchnav.planning.sensing.labels import Lattice, Noise, noise, unpacked
 
 _REACH = 12  # cells
-_SETTLED = (
-    0.005  # probability of a label under which an observed cell is not drawn again
-)
-LEAST_CHANGE = 0.01
-"""Of the probability of a cell that was not observed."""
-_LEAST_PRECISION = 1e-6  # of a term
+# Probability of the less likely label under which an observed cell is not drawn again.
+_SETTLED = 0.005
+MIN_CHANGE = 0.01
+"""Minimum change of the probability of a cell that was not observed."""
+_MIN_PRECISION = 1e-6  # of a term
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence(Batch):
-    """What labels are drawn from, and the labels.
+    """Evidence from which labels are drawn, and the labels.
 
     Args:
-        field: how the scores hang together, B of them.
-        lower: least observed score under the first and the second class, NaN where
-            there is none, shape [B, 2, H, W].
-        upper: greatest observed score; where it is the least, the score itself.
+        field: correlations of the scores, of B fields.
+        lower: minimum observed score under the first and the second class, NaN if not
+            observed, shape [B, 2, H, W].
+        upper: maximum observed score; for a number, equal to the minimum.
         noise_std: standard deviation of the noise of the score, shape [B, H, W].
-        density: log f / φ of what was observed under either class, 0 where it is an
-            interval, shape [B, 2, H, W].
-        precision: of the Gaussian terms that stand for observations, shape [B, H, W].
+        density: log f / φ of the observation under either class, 0 for an interval,
+            shape [B, 2, H, W].
+        precision: precision of the Gaussian terms of observations, shape [B, H, W].
         shift: precision times mean of the terms.
-        pair: number of the pair of which each cell may be, from 1; 0 for none, int64,
-            shape [B, H, W].
-        chance: of the first class given what was observed, float64, shape [B, H, W].
-        labels: of the chains; a bit is set for the first class, int64, shape [B, H, W].
-        sweeps: how many each episode had, int64, shape [B].
+        pair: index of the pair of each cell, from 1; 0 without one, int64, shape
+            [B, H, W].
+        p_first: posterior probability of the first class, float64, shape [B, H, W].
+        labels: labels of the chains; a set bit is the first class, int64, shape
+            [B, H, W].
+        sweeps: number of sweeps of each episode, int64, shape [B].
     """
 
     field: Field
@@ -55,52 +55,54 @@ class Evidence(Batch):
     precision: Tensor
     shift: Tensor
     pair: Tensor
-    chance: Tensor
+    p_first: Tensor
     labels: Tensor
     sweeps: Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """The cells of a rectangle around what is new.
+    """Cells of a rectangle around new observations.
 
     Args:
         at: indices into maps, shapes [B, 1] and twice [B, RC].
-        row: int64, shape [B, R, C].
-        column: int64.
-        pair: number of the pair of which they may be, int64.
-        chance: of the first class, as it was known.
-        observed: which are, bool.
-        own: which are in reach; the others keep their labels, bool.
-        lattice: of these cells.
-        degree: how many neighbours hang together with each.
-        torus: length of a side of a map, by which random numbers are kept.
+        row: rows, int64, shape [B, R, C].
+        column: columns, int64.
+        pair: index of the pair of each cell, int64.
+        p_first: probability of the first class before the update.
+        observed: mask of observed cells, bool.
+        in_reach: mask of cells in reach; the others keep their labels, bool.
+        lattice: couplings of these cells.
+        degree: number of coupled neighbours of each cell.
+        torus: side of a map, by which stored random numbers are indexed.
     """
 
     at: tuple[Tensor, Tensor, Tensor]
     row: Tensor
     column: Tensor
     pair: Tensor
-    chance: Tensor
+    p_first: Tensor
     observed: Tensor
-    own: Tensor
+    in_reach: Tensor
     lattice: Lattice
     degree: Tensor
     torus: int
 
     @classmethod
     def around(cls, evidence: Evidence, changed: Tensor, strength: float) -> "Block":
-        """The block that has all cells in reach of what changed, and their neighbours."""
+        """Return the block of all cells in reach of changed ones, and their neighbours."""
         ends = torch.tensor(
             [bounds(new) for new in changed.cpu().numpy()], device=changed.device
         )
+        row_ends, column_ends = ends.permute(1, 2, 0)
         lines = []
         for (low, high), size in zip(
-            ends.permute(1, 2, 0), changed.shape[1:], strict=True
+            (row_ends, column_ends), changed.shape[1:], strict=True
         ):
-            most = min(int((high - low).max()) + 1 + 2 * (_REACH + 1), size)
-            begin = (low - _REACH - 1).clamp(min=0).clamp(max=size - most)
-            lines.append(begin[:, None] + torch.arange(most, device=low.device))
+            length = int((high - low).max()) + 1 + 2 * (_REACH + 1)
+            length = min(length, size)
+            begin = (low - _REACH - 1).clamp(min=0).clamp(max=size - length)
+            lines.append(begin[:, None] + torch.arange(length, device=low.device))
         row = lines[0][:, :, None].expand(-1, -1, lines[1].shape[1])
         column = lines[1][:, None].expand_as(row)
         at = (
@@ -108,28 +110,28 @@ class Block:
             row.flatten(1),
             column.flatten(1),
         )
-        pair, chance, observed = (
+        pair, p_first, observed = (
             values[at].view_as(row)
-            for values in (evidence.pair, evidence.chance, ~evidence.noise_std.isnan())
+            for values in (evidence.pair, evidence.p_first, ~evidence.noise_std.isnan())
         )
-        away = torch.zeros_like(row)
-        for place, (low, high) in zip(
-            (row, column), ends.permute(1, 2, 0), strict=True
-        ):
-            off = torch.maximum(low[:, None, None] - place, place - high[:, None, None])
-            away = torch.maximum(away, off)
-        # Beyond the neighbours of cells in reach nothing counts: what is there depends
-        # on the other episodes.
-        pair, own = torch.where(away <= _REACH + 1, pair, 0), away <= _REACH
+        distance = torch.zeros_like(row)
+        for index, (low, high) in ((row, row_ends), (column, column_ends)):
+            before = low[:, None, None] - index
+            after = index - high[:, None, None]
+            distance = torch.maximum(distance, torch.maximum(before, after))
+        # Only neighbours of cells in reach are coupled: the size of the block depends
+        # on the other episodes of the batch.
+        pair = torch.where(distance <= _REACH + 1, pair, 0)
+        in_reach = distance <= _REACH
         lattice = Lattice.of(pair, strength)
         return cls(
             at=at,
             row=row,
             column=column,
             pair=pair,
-            chance=chance,
+            p_first=p_first,
             observed=observed,
-            own=own,
+            in_reach=in_reach,
             lattice=lattice,
             degree=lattice.degree(),
             torus=max(changed.shape[1:]),
@@ -137,8 +139,8 @@ class Block:
 
     @property
     def free(self) -> Tensor:
-        """All bits set where a sweep draws labels."""
-        return -((self.pair > 0) & self.own & ~self.observed).long()
+        """All bits set on cells whose labels a sweep draws."""
+        return -((self.pair > 0) & self.in_reach & ~self.observed).long()
 
     @property
     def even(self) -> Tensor:
@@ -147,14 +149,15 @@ class Block:
 
     @property
     def evidence(self) -> Tensor:
-        """All bits set where something is known of the label: observed, or out of reach
-        and told by what is farther.
+        """All bits set on cells with evidence of their label.
+
+        They are observed, or out of reach and settled by cells that are farther away.
         """
-        told = ~self.own & ((self.chance - 0.5).abs() > LEAST_CHANGE)
-        return -((self.pair > 0) & (self.observed | told)).long()
+        informative = ~self.in_reach & ((self.p_first - 0.5).abs() > MIN_CHANGE)
+        return -((self.pair > 0) & (self.observed | informative)).long()
 
     def noise(self, sweeps: Tensor) -> Noise:
-        """Random bits of the next sweep."""
+        """Return the random bits of the next sweep."""
         return noise(
             sweeps,
             self.row,
@@ -167,35 +170,33 @@ class Block:
 
 @dataclass(frozen=True, kw_only=True)
 class Sites:
-    """Observed cells, those that are new last, and what is known of them.
+    """Observed cells, new ones last, and their scores.
 
     Args:
-        row: where they are, int64, shape [B, N].
-        column: int64.
-        cell: place in the block, int64, shape [B, N].
-        near: places of the four cells beside each, int64, shape [B, N, 4].
-        tied: all bits set where they hang together with it, int64.
+        row: rows, int64, shape [B, N].
+        column: columns, int64.
+        cell: index in the block, int64, shape [B, N].
+        neighbours: block indices of the four neighbours, int64, shape [B, N, 4].
+        coupled: all bits set where a neighbour is coupled to the cell, int64.
         strength: β.
-        lower: least score under either class, shape [B, 2, N].
-        upper: greatest score.
-        density: log f / φ, 0 of intervals.
-        std: of the noise, shape [B, N].
-        noise: variance of the noise, or of the term that stands for an interval, shape
-            [B, N].
+        lower: minimum score under either class, shape [B, 2, N].
+        upper: maximum score.
+        density: log f / φ, 0 for intervals.
+        std: standard deviation of the noise, shape [B, N].
+        noise: variance of the noise, or of the term of an interval, shape [B, N].
         factor: Cholesky factor of the covariance of noisy scores, shape [B, N, N].
-        scores: noisy scores of each chain, 0 where they are new or empty, shape [B, S,
-            N].
-        fresh: which are new, bool, shape [B, N].
-        held: which are intervals that have a term.
-        open: which are drawn.
-        loose: which may be given the other label together with a patch.
+        scores: noisy scores of each chain, 0 where new or padded, shape [B, S, N].
+        fresh: mask of new observations, bool, shape [B, N].
+        censored: mask of intervals that have a term.
+        open: mask of cells whose labels are drawn.
+        flippable: mask of cells that may flip together with a patch.
     """
 
     row: Tensor
     column: Tensor
     cell: Tensor
-    near: Tensor
-    tied: Tensor
+    neighbours: Tensor
+    coupled: Tensor
     strength: float
     lower: Tensor
     upper: Tensor
@@ -205,160 +206,154 @@ class Sites:
     factor: Tensor
     scores: Tensor
     fresh: Tensor
-    held: Tensor
+    censored: Tensor
     open: Tensor
-    loose: Tensor
+    flippable: Tensor
 
     @classmethod
     def of(
         cls, evidence: Evidence, changed: Tensor, block: Block, window: int
     ) -> "Sites":
-        """The observed cells nearest to what is new."""
-        found = [
-            nearest(known, new, window)
-            for known, new in zip(
-                (~evidence.noise_std.isnan()).cpu().numpy(),
-                changed.cpu().numpy(),
-                strict=True,
-            )
+        """Return the observed cells nearest to new observations."""
+        is_observed = (~evidence.noise_std.isnan()).cpu().numpy()
+        cells = [
+            nearest(mask, new, window)
+            for mask, new in zip(is_observed, changed.cpu().numpy(), strict=True)
         ]
-        row, column, there = (
-            pad_sequence([torch.from_numpy(own) for own in each], batch_first=True)
-            .flip(1)
-            .to(changed.device)
-            for each in zip(
-                *((row, column, row >= 0) for row, column in found), strict=True
-            )
+        rows = [torch.from_numpy(row) for row, _ in cells]
+        columns = [torch.from_numpy(column) for _, column in cells]
+        is_site = [row >= 0 for row in rows]
+        # Padded in front, so that new observations are last.
+        row, column, exists = (
+            pad_sequence(values, batch_first=True).flip(1).to(changed.device)
+            for values in (rows, columns, is_site)
         )
         at = block.at[0], row, column
-        top, left, across = (
-            block.row[:, 0, :1],
-            block.column[:, 0, :1],
-            block.row.shape[2],
-        )
-        down, right = row - top, column - left
-        inside = (
-            there
-            & (down >= 0)
-            & (down < block.row.shape[1])
-            & (right >= 0)
-            & (right < across)
-        )
-        cell = torch.where(inside, down * across + right, 0)
-        inside &= block.own.flatten(1).gather(1, cell)
-        near, tied = _beside(cell, block.lattice)
+        height, width = block.row.shape[1:]
+        down = row - block.row[:, 0, :1]
+        right = column - block.column[:, 0, :1]
+        in_rows = (down >= 0) & (down < height)
+        in_columns = (right >= 0) & (right < width)
+        inside = exists & in_rows & in_columns
+        cell = torch.where(inside, down * width + right, 0)
+        inside &= block.in_reach.flatten(1).gather(1, cell)
+        neighbours, coupled = _neighbours(cell, block.lattice)
 
-        def both(values: Tensor) -> Tensor:
-            return torch.where(
-                there[:, None], values.transpose(0, 1)[:, *at].transpose(0, 1), 0.0
-            )
+        def by_class(values: Tensor) -> Tensor:
+            at_sites = values.transpose(0, 1)[:, *at].transpose(0, 1)
+            return torch.where(exists[:, None], at_sites, 0.0)
 
-        lower, upper, pair = (
-            both(evidence.lower),
-            both(evidence.upper),
-            evidence.pair[at] > 0,
-        )
-        std = torch.where(there, evidence.noise_std[at], 1.0)
-        fresh, interval = changed[at] & there, (upper > lower)[:, 0]
-        held, precision = (
-            interval & ~fresh,
-            evidence.precision[at].clamp(min=_LEAST_PRECISION),
-        )
-        noise = torch.where(held, 1 / precision, std.square())
-        apart = (place[:, :, None] - place[:, None] for place in (row, column))
-        covariance = evidence.field.covariance(block.at[0][..., None], *apart)
-        covariance = torch.where(there[:, :, None] & there[:, None], covariance, 0.0)
-        covariance.diagonal(dim1=1, dim2=2).copy_(torch.where(there, 1 + noise, 1.0))
+        lower = by_class(evidence.lower)
+        upper = by_class(evidence.upper)
+        has_pair = evidence.pair[at] > 0
+        std = torch.where(exists, evidence.noise_std[at], 1.0)
+        fresh = changed[at] & exists
+        interval = (upper > lower)[:, 0]
+        censored = interval & ~fresh
+        precision = evidence.precision[at].clamp(min=_MIN_PRECISION)
+        noise = torch.where(censored, 1 / precision, std.square())
+        row_offset = row[:, :, None] - row[:, None]
+        column_offset = column[:, :, None] - column[:, None]
+        member = block.at[0][..., None]
+        covariance = evidence.field.covariance(member, row_offset, column_offset)
+        both_exist = exists[:, :, None] & exists[:, None]
+        covariance = torch.where(both_exist, covariance, 0.0)
+        covariance.diagonal(dim1=1, dim2=2).copy_(torch.where(exists, 1 + noise, 1.0))
         labels = unpacked(evidence.labels[at]).transpose(1, 2)
         scores = torch.where(labels, lower[:, :1], lower[:, 1:])
-        scores = torch.where(
-            held[:, None], (evidence.shift[at] / precision)[:, None], scores
-        )
-        unsettled = (evidence.chance[at] - 0.5).abs() < 0.5 - _SETTLED
+        term_mean = evidence.shift[at] / precision
+        scores = torch.where(censored[:, None], term_mean[:, None], scores)
+        unsettled = (evidence.p_first[at] - 0.5).abs() < 0.5 - _SETTLED
         return cls(
             row=row,
             column=column,
             cell=cell,
-            near=near,
-            tied=torch.where(inside[..., None], tied, 0),
+            neighbours=neighbours,
+            coupled=torch.where(inside[..., None], coupled, 0),
             strength=block.lattice.strength,
             lower=lower,
             upper=upper,
-            density=both(evidence.density),
+            density=by_class(evidence.density),
             std=std,
             noise=noise,
             factor=torch.linalg.cholesky(covariance),
-            scores=torch.where((there & ~fresh)[:, None], scores, 0.0),
+            scores=torch.where((exists & ~fresh)[:, None], scores, 0.0),
             fresh=fresh,
-            held=held,
-            open=fresh | (inside & pair & unsettled),
-            loose=inside & pair & ~interval,
+            censored=censored,
+            open=fresh | (inside & has_pair & unsettled),
+            flippable=inside & has_pair & ~interval,
         )
 
     def draw(
         self,
-        place: int,
+        site: int,
         mean: Tensor,
         variance: Tensor,
         labels: Tensor,
         uniforms: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Draws the label of one cell of each episode, and a score within it.
+        """Draw the label of one site of each episode, and a score under it.
 
         Args:
-            place: among the sites.
-            mean: of the noisy score given others, shape [B, S].
-            variance: as much, shape [B, 1].
-            labels: of the block, int64, shape [B, RC].
-            uniforms: shape [B, S, 2].
+            site: index of the site.
+            mean: mean of the noisy score given others, shape [B, S].
+            variance: its variance, shape [B, 1].
+            labels: labels of the block, int64, shape [B, RC].
+            uniforms: random numbers in [0, 1), shape [B, S, 2].
 
         Returns:
-            Whether the label is the first, the probability of that, the log density of
-            what was observed, and the score, each of shape [B, S].
+            Whether the label is the first (bool), the probability of that, the log
+            density of the observation, and the score, each of shape [B, S].
         """
-        beside = labels.gather(1, self.near[:, place]) & self.tied[:, place]
+        coupled = self.coupled[:, site]
+        neighbour_labels = labels.gather(1, self.neighbours[:, site]) & coupled
         odds = self.strength * (
-            unpacked(beside).sum(1) * 2 + self.tied[:, place].sum(1)[:, None]
+            unpacked(neighbour_labels).sum(1) * 2 + coupled.sum(1)[:, None]
         )
         lower, upper, density = (
-            own[:, :, place, None] for own in (self.lower, self.upper, self.density)
+            values[:, :, site, None]
+            for values in (self.lower, self.upper, self.density)
         )
-        number, std, mean = upper <= lower, variance.sqrt()[:, None], mean[:, None]
-        low, high = (lower - mean) / std, (upper - mean) / std
-        at_number = (
-            density - 0.5 * low.square() - std.log() - 0.5 * math.log(2 * math.pi)
-        )
-        # An interval on the side where Φ is small, so that nothing is lost to rounding.
+        is_number = upper <= lower
+        std = variance.sqrt()[:, None]
+        mean = mean[:, None]
+        low = (lower - mean) / std
+        high = (upper - mean) / std
+        half_log_tau = 0.5 * math.log(2 * math.pi)
+        log_density = density - 0.5 * low.square() - std.log() - half_log_tau
+        # Mirrored to the lower tail, where Φ loses no digits.
         mirrored = low + high > 0
         low, high = torch.where(mirrored, -high, low), torch.where(mirrored, -low, high)
         log_high = torch.special.log_ndtr(high)
-        apart = (torch.special.log_ndtr(low) - log_high).clamp(max=-1e-300)
-        told = torch.where(number, at_number, log_high + torch.log(-torch.expm1(apart)))
-        chance = torch.sigmoid(odds + told[:, 0] - told[:, 1])
-        by_class = told + torch.nn.functional.logsigmoid(torch.stack((odds, -odds), 1))
-        first, below = uniforms[..., 0] < chance, torch.special.ndtr(low)
-        rank = below + (torch.special.ndtr(high) - below) * uniforms[:, None, :, 1]
+        log_ratio = (torch.special.log_ndtr(low) - log_high).clamp(max=-1e-300)
+        log_mass = log_high + torch.log(-torch.expm1(log_ratio))
+        log_evidence = torch.where(is_number, log_density, log_mass)
+        p_first = torch.sigmoid(odds + log_evidence[:, 0] - log_evidence[:, 1])
+        log_prior = torch.nn.functional.logsigmoid(torch.stack((odds, -odds), 1))
+        log_total = (log_evidence + log_prior).logsumexp(1)
+        first = uniforms[..., 0] < p_first
+        p_low = torch.special.ndtr(low)
+        rank = p_low + (torch.special.ndtr(high) - p_low) * uniforms[:, None, :, 1]
         inner = torch.special.ndtri(rank.clamp(min=1e-300))
         inner = mean + std * torch.where(mirrored, -inner, inner)
-        inner = torch.where(
-            number, lower, torch.maximum(torch.minimum(inner, upper), lower)
-        )
-        return (
-            first,
-            chance,
-            by_class.logsumexp(1),
-            torch.where(first, inner[:, 0], inner[:, 1]),
-        )
+        inner = torch.maximum(torch.minimum(inner, upper), lower)
+        score = torch.where(is_number, lower, inner)
+        score = torch.where(first, score[:, 0], score[:, 1])
+        return first, p_first, log_total, score
 
 
-def _beside(cell: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
-    """The four cells beside some of a block, and all bits set where they hang together,
-    each of shape [B, N, 4].
+def _neighbours(cell: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
+    """Return the four neighbours of some cells of a block, and their couplings.
+
+    All bits of a coupling are set or none; both have the shape [B, N, 4].
     """
-    across, most = lattice.right.shape[2], lattice.right[0].numel() - 1
-    every = lattice.neighbours(torch.full_like(lattice.right, -1))
-    ties = torch.stack([part.flatten(1) for part in every], 2)
-    steps = torch.tensor((1, -1, across, -across), device=cell.device)
-    return (cell[..., None] + steps).clamp(0, most), ties.gather(
-        1, cell[..., None].expand(-1, -1, 4)
+    width = lattice.right.shape[2]
+    last = lattice.right[0].numel() - 1
+    all_bits = torch.full_like(lattice.right, -1)
+    couplings = torch.stack(
+        [part.flatten(1) for part in lattice.neighbours(all_bits)], 2
     )
+    steps = torch.tensor((1, -1, width, -width), device=cell.device)
+    index = cell[..., None]
+    neighbours = (index + steps).clamp(0, last)
+    return neighbours, couplings.gather(1, index.expand(-1, -1, 4))

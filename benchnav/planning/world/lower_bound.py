@@ -59,24 +59,24 @@ from benchnav.planning.robots import (
 
 BOUNDED_ROBOTS = (Unicycle, DifferentialDrive, Bicycle)
 
-_MOST_SQUARES = 300_000  # of a map; the equations' factors stay under a gigabyte
-_LEAST_TRAVERSABILITY = 1e-3
+_MAX_SQUARES = 300_000  # of a map; the equations' factors stay under a gigabyte
+_MIN_TRAVERSABILITY = 1e-3
 _ULPS = 4 * 2.0**-24  # of a position, as a share of the map's extent
 _RELAXATION = 1.6
 # of what the gradient misses, in units of the flux at the goal over the slowness
 _WEIGHT = 5.0
 _EXCESS = 1.004  # of slopes, at which to stop
 _CHECK_EVERY = 25  # steps
-_MOST_STEPS = 300
+_MAX_STEPS = 300
 
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """What bounds the motion of robots in an episode.
+    """Bounds of the motion of robots in an episode.
 
     Args:
         robot: one of the shipped robots, whose λ scales its speed.
-        goal_radius_m: a robot this near to the goal has arrived.
+        goal_radius_m: distance to the goal below which a robot has reached it.
         immobile: what immobilises a robot; None for nothing.
     """
 
@@ -93,17 +93,17 @@ class Motion:
 def lower_bound_s(
     field: ndarray, grid: Grid, motion: Motion, start_m: ndarray, goal_m: ndarray
 ) -> float:
-    """Bound the time to the goal from below, for all trajectories.
+    """Return a lower bound of the time to the goal, for all trajectories.
 
     Args:
         field: λ of each cell during the whole episode, in [0, 1], shape [H, W].
-        grid: of the map.
-        motion: of the robot.
-        start_m: (x, y), shape [2].
-        goal_m: (x, y), shape [2].
+        grid: grid of the map.
+        motion: bounds of the robot's motion.
+        start_m: start (x, y) in metres, shape [2].
+        goal_m: goal (x, y) in metres, shape [2].
 
     Returns:
-        Seconds; 0 at the goal, infinite where no trajectory arrives.
+        Seconds; 0 at the goal, infinite if no trajectory reaches it.
     """
     start_m, goal_m = np.asarray(start_m, np.float64), np.asarray(goal_m, np.float64)
     error_m = _ULPS * max(grid.extent_m)
@@ -116,30 +116,33 @@ def lower_bound_s(
         .astype(int)
         .clip(0, np.array(squares.shape) - 1)
     )
-    kept = np.ones_like(ends)
+    is_reachable = np.ones_like(ends)
     if motion.immobile is not None:
         # In single precision, as the world compares.
         exits = (fine >= np.float32(motion.immobile.below)) | ends
         exits[begin] = True
-        kept = _near(exits, squares, _deepest_m(motion, motion.immobile) + 2 * error_m)
-    parts, _ = label(kept, generate_binary_structure(2, 2))
-    kept = parts == parts[begin]
-    if not (kept & ends).any():
+        is_reachable = _near(
+            exits, squares, _deepest_m(motion, motion.immobile) + 2 * error_m
+        )
+    parts, _ = label(is_reachable, generate_binary_structure(2, 2))
+    is_reachable = parts == parts[begin]
+    if not (is_reachable & ends).any():
         return math.inf
     reach = (
         _reached(fine, squares, motion.step_m, 2 * error_m) + error_m / motion.step_m
     )
-    slowness = 1 / (motion.robot.top_speed_mps * reach.clip(_LEAST_TRAVERSABILITY))
-    mesh = Mesh(squares, slowness, kept, ends & kept)
+    slowness = 1 / (motion.robot.top_speed_mps * reach.clip(_MIN_TRAVERSABILITY))
+    mesh = Mesh(squares, slowness, is_reachable, ends & is_reachable)
     return mesh.value_at(largest(mesh, motion.goal_radius_m), start_m)
 
 
 def _refined(grid: Grid, step_m: float) -> Grid:
-    """Squares about as wide as a step, a whole number of them along each side of a
-    cell.
+    """Return a grid of squares about as wide as a step.
+
+    A whole number of them covers each side of a cell.
     """
     times = max(1, math.ceil(grid.resolution_m / step_m - 1e-6))
-    times = max(1, min(times, math.isqrt(_MOST_SQUARES // (grid.height * grid.width))))
+    times = max(1, min(times, math.isqrt(_MAX_SQUARES // (grid.height * grid.width))))
     return Grid(grid.height * times, grid.width * times, grid.resolution_m / times)
 
 
@@ -149,9 +152,7 @@ def _deepest_m(motion: Motion, immobile: Immobile) -> float:
 
 
 def _squares_within(squares: Grid, point_m: ndarray, radius_m: float) -> ndarray:
-    """Tell which closed squares come as near to a point as a radius, bool, of the shape
-    of the squares.
-    """
+    """Return a mask of closed squares within a radius of a point, bool."""
     gaps_m = []
     for size, at_m in zip(squares.shape, point_m[::-1], strict=True):
         low_m = np.arange(size) * squares.resolution_m
@@ -162,16 +163,14 @@ def _squares_within(squares: Grid, point_m: ndarray, radius_m: float) -> ndarray
 
 
 def _around(squares: Grid, reach_m: float) -> list[tuple[int, int, float]]:
-    """Offsets of squares at most so far away, and how far: the least distance of the
-    closed squares.
-    """
-    most = math.floor(reach_m / squares.resolution_m) + 1
+    """Return offsets of squares within a distance, and the minimum distance of each."""
+    max_offset = math.floor(reach_m / squares.resolution_m) + 1
     offsets = [
         (row, column)
-        for row in range(-most, most + 1)
-        for column in range(-most, most + 1)
+        for row in range(-max_offset, max_offset + 1)
+        for column in range(-max_offset, max_offset + 1)
     ]
-    found = [
+    squares_around = [
         (
             *offset,
             squares.resolution_m
@@ -179,11 +178,11 @@ def _around(squares: Grid, reach_m: float) -> list[tuple[int, int, float]]:
         )
         for offset in offsets
     ]
-    return [each for each in found if each[2] <= reach_m]
+    return [entry for entry in squares_around if entry[2] <= reach_m]
 
 
 def _shifted(values: ndarray, row: int, column: int) -> ndarray:
-    """Values some rows and columns on, 0 beyond the edge."""
+    """Return values shifted by some rows and columns, 0 beyond the edge."""
     height, width = values.shape
     margin = max(abs(row), abs(column))
     framed = np.pad(values, margin)
@@ -191,24 +190,24 @@ def _shifted(values: ndarray, row: int, column: int) -> ndarray:
 
 
 def _near(exits: ndarray, squares: Grid, reach_m: float) -> ndarray:
-    """Tell which squares have a point at most so far from an exit, bool."""
-    found = exits.copy()
+    """Return a mask of squares with a point within a distance of an exit, bool."""
+    is_near = exits.copy()
     for row, column, _ in _around(squares, reach_m):
-        found |= _shifted(exits, row, column)
-    return found
+        is_near |= _shifted(exits, row, column)
+    return is_near
 
 
 def _reached(fine: ndarray, squares: Grid, step_m: float, error_m: float) -> ndarray:
-    """λ⁺: the greatest λ from which one step leads into each square, of the shape of
-    the squares.
-    """
-    found = fine.copy()
+    """Return λ⁺, the maximum λ from which one step leads into each square."""
+    fastest = fine.copy()
     for row, column, away_m in _around(squares, step_m + error_m):
-        there = _shifted(fine, row, column)
-        found = np.where(
-            (there * step_m + error_m >= away_m) & (there > found), there, found
+        shifted = _shifted(fine, row, column)
+        fastest = np.where(
+            (shifted * step_m + error_m >= away_m) & (shifted > fastest),
+            shifted,
+            fastest,
         )
-    return found
+    return fastest
 
 
 class Mesh:
@@ -228,7 +227,7 @@ class Mesh:
     """
 
     def __init__(
-        self, squares: Grid, slowness: ndarray, kept: ndarray, ends: ndarray
+        self, squares: Grid, slowness: ndarray, is_kept: ndarray, ends: ndarray
     ) -> None:
         """Lay triangles out."""
         self.squares = squares
@@ -236,8 +235,8 @@ class Mesh:
             squares.height + 1, -1
         )
         corners = node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]
-        low, right, up, far = (corner[kept] for corner in corners)
-        even = np.add.outer(*map(np.arange, squares.shape))[kept] % 2 == 0
+        low, right, up, far = (corner[is_kept] for corner in corners)
+        even = np.add.outer(*map(np.arange, squares.shape))[is_kept] % 2 == 0
         # Right angles at the lower left and the upper right corner, or at the other
         # two.
         self.right = np.concatenate(
@@ -246,7 +245,7 @@ class Mesh:
         across = np.concatenate((np.where(even, right, low), np.where(even, up, far)))
         upward = np.concatenate((np.where(even, up, far), np.where(even, right, low)))
         self.along = np.stack((across, upward))
-        self.rise = np.tile(slowness[kept] * squares.resolution_m, 2)
+        self.rise = np.tile(slowness[is_kept] * squares.resolution_m, 2)
         self.free = np.zeros(node.size, dtype=bool)
         self.free[self.right] = self.free[self.along] = True
         for corner in corners:
@@ -254,11 +253,12 @@ class Mesh:
 
     @cached_property
     def rises(self) -> csr_array:
-        """From W at the free nodes to its rise over both legs of all triangles, shape
-        [2·T, free nodes].
+        """Matrix from W at the free nodes to its rise over both legs of all triangles.
+
+        Its shape is [2·T, free nodes].
         """
-        count, each = len(self.right), np.arange(len(self.right))
-        values, rows = np.repeat([1.0, -1.0], count), np.tile(each, 2)
+        count, triangles = len(self.right), np.arange(len(self.right))
+        values, rows = np.repeat([1.0, -1.0], count), np.tile(triangles, 2)
         shape = count, len(self.free)
         legs = [
             csr_array((values, (rows, np.concatenate((end, self.right)))), shape)
@@ -267,19 +267,22 @@ class Mesh:
         return csr_array(vstack(legs).tocsc()[:, self.free])
 
     def excess(self, value: ndarray) -> float:
-        """Greatest slope of W over what is allowed, from W at all nodes, shape [N]."""
+        """Return the maximum slope of W relative to its bound, from W at all N nodes."""
         over = np.hypot(*(value[end] - value[self.right] for end in self.along))
         return float((over / self.rise).max())
 
     def value_at(self, value: ndarray, point_m: ndarray) -> float:
-        """W at a point, from W at all nodes, shape [N]; of a removed square it means
-        nothing.
+        """Return W at a point, from W at all nodes, shape [N].
+
+        It is undefined in a removed square.
         """
-        place = point_m / self.squares.resolution_m
+        position = point_m / self.squares.resolution_m
         column, row = (
-            np.floor(place).astype(int).clip(0, np.array(self.squares.shape)[::-1] - 1)
+            np.floor(position)
+            .astype(int)
+            .clip(0, np.array(self.squares.shape)[::-1] - 1)
         )
-        x, y = place - (column, row)
+        x, y = position - (column, row)
         nodes = value.reshape(self.squares.height + 1, -1)[
             row : row + 2, column : column + 2
         ]
@@ -295,11 +298,11 @@ class Mesh:
 
 
 def largest(mesh: Mesh, goal_radius_m: float) -> ndarray:
-    """Find nearly the largest W whose slopes are allowed, at all nodes, shape [N].
+    """Return nearly the largest W of bounded slope, at all nodes, shape [N].
 
     Args:
-        mesh: its triangles.
-        goal_radius_m: a length of the disc in which W ends, by which steps are scaled.
+        mesh: triangles.
+        goal_radius_m: radius of the disc on which W is 0, a length that scales steps.
     """
     rises, size = mesh.rises, mesh.squares.resolution_m
     value, count = np.zeros(len(mesh.free)), len(mesh.right)
@@ -316,12 +319,12 @@ def largest(mesh: Mesh, goal_radius_m: float) -> ndarray:
     source = size**2 / weight
     allowed = multiplier = np.zeros(2 * count)
     best = value
-    for step in range(1, _MOST_STEPS + 1):
+    for step in range(1, _MAX_STEPS + 1):
         free = solve(source + back @ (allowed - multiplier))
         over = _RELAXATION * (rises @ free) + (1 - _RELAXATION) * allowed
-        wanted = over + multiplier
-        length = np.hypot(wanted[:count], wanted[count:])
-        allowed = wanted * np.tile(mesh.rise / np.maximum(length, mesh.rise), 2)
+        target = over + multiplier
+        length = np.hypot(target[:count], target[count:])
+        allowed = target * np.tile(mesh.rise / np.maximum(length, mesh.rise), 2)
         multiplier = multiplier + over - allowed
         if step % _CHECK_EVERY == 0:
             value = np.zeros(len(mesh.free))

@@ -1,4 +1,4 @@
-"""How episodes end.
+"""Outcomes of episodes.
 
 Letters in shapes: B episodes, N steps.
 """
@@ -15,27 +15,24 @@ STUCK_DISTANCE_M = 0.5
 
 
 class Outcome(IntEnum):
-    """How an episode stands, or how it ended. All but SUCCESS count as failures."""
+    """State or end of an episode. All ends but SUCCESS count as failures."""
 
     RUNNING = 0
     SUCCESS = 1
     TIMEOUT = 2
-    # a timeout whose last 10 s drove and moved under 0.5 m: low λ stopped the robot
+    # a timeout; in its last 10 s the robot was driven and moved under 0.5 m: low λ
     STUCK = 3
     OUT_OF_BOUNDS = 4
-    PLANNER_FAILURE = 5  # the planner gave up
-    # a timeout whose last 10 s did not drive and moved under 0.5 m: the planner stopped
-    # it
+    PLANNER_FAILURE = 5  # the planner returned `PlanStatus.FAILED`
+    # a timeout; in its last 10 s the robot was not driven and moved under 0.5 m
     STALLED = 6
-    PLANNER_ERROR = (
-        7  # the planner raised, ran out of time, or returned what no robot can do
-    )
-    MODEL_ERROR = 8  # the model or the risk measure raised, or gave no distribution
-    IMMOBILISED = (
-        9  # on ground that immobilises a robot, for as long as the world allows
-    )
-    SENSOR_ERROR = 10  # the sensor raised, or gave what is none
-    BELIEF_ERROR = 11  # the belief raised, or gave what is none
+    # the planner raised, exceeded its time limit, or returned an invalid action
+    PLANNER_ERROR = 7
+    MODEL_ERROR = 8  # the model or risk measure raised, or returned no distribution
+    # consecutive time on immobilising terrain exceeded the world's limit
+    IMMOBILISED = 9
+    SENSOR_ERROR = 10  # the sensor raised, or returned an invalid measurement
+    BELIEF_ERROR = 11  # the belief raised, or returned an invalid value
 
 
 # Outcomes caused by an exception in user code.
@@ -46,16 +43,15 @@ FAILURES = tuple(o for o in Outcome if o not in (Outcome.RUNNING, Outcome.SUCCES
 def tell_standstill(
     outcome: Tensor, steps: Tensor, positions_m: Tensor, driven_m: Tensor, dt_s: float
 ) -> Tensor:
-    """Tells timeouts in which the robot stood: stuck where it drove, stalled where it
-    did not.
+    """Replace timeouts in which the robot stood by STUCK or STALLED.
 
     Args:
-        outcome: shape [B].
-        steps: steps that each episode took, int64, shape [B].
-        positions_m: shape [B, N + 1, 2], those after an episode's end not looked at.
-        driven_m: how far each step would have moved the robot on ground of λ = 1, shape
-            [B, N].
-        dt_s: time step.
+        outcome: outcomes, int64, shape [B].
+        steps: number of steps of each episode, int64, shape [B].
+        positions_m: positions, those beyond an episode's end ignored, shape
+            [B, N + 1, 2].
+        driven_m: commanded distance of each step, that at λ = 1, shape [B, N].
+        dt_s: time step in seconds.
 
     Returns:
         Outcomes, shape [B].
@@ -64,14 +60,13 @@ def tell_standstill(
         return outcome
     window = steps_in(STUCK_WINDOW_S, dt_s)
     back = torch.arange(-window, 1, device=steps.device)
-    place = (steps[:, None] + back).clamp(min=0)
-    recent = positions_m.gather(1, place[..., None].expand(-1, -1, 2))
-    moved = torch.linalg.vector_norm(recent - recent[:, :1], dim=2).amax(dim=1)
-    taken = steps[:, None] + back[:-1]
-    drove = torch.where(taken >= 0, driven_m.gather(1, taken.clamp(min=0)), 0.0).sum(
-        dim=1
-    )
-    standing = torch.where(drove >= STUCK_DISTANCE_M, Outcome.STUCK, Outcome.STALLED)
-    return torch.where(
-        (outcome == Outcome.TIMEOUT) & (moved < STUCK_DISTANCE_M), standing, outcome
-    )
+    index = (steps[:, None] + back).clamp(min=0)
+    recent = positions_m.gather(1, index[..., None].expand(-1, -1, 2))
+    moved_m = torch.linalg.vector_norm(recent - recent[:, :1], dim=2).amax(dim=1)
+    step_indices = steps[:, None] + back[:-1]
+    step_m = driven_m.gather(1, step_indices.clamp(min=0))
+    driven_total_m = torch.where(step_indices >= 0, step_m, 0.0).sum(dim=1)
+    was_driven = driven_total_m >= STUCK_DISTANCE_M
+    standing = torch.where(was_driven, Outcome.STUCK, Outcome.STALLED)
+    stands = (outcome == Outcome.TIMEOUT) & (moved_m < STUCK_DISTANCE_M)
+    return torch.where(stands, standing, outcome)

@@ -1,13 +1,14 @@
-"""The λ that robots meet: a value for each episode, step and place.
+"""Realised λ: a value for each episode, step and position.
 
-Noise is keyed by (root key, map, step), or by (root key, map) where λ stays what it is,
-so every planner and setting meets the same, whatever the batch or the order.
+Noise is keyed by (root key, map, step), or by (root key, map) if λ is constant during
+an episode. Hence all planners and settings meet common random numbers, whatever the
+batch or the order.
 
-Frozen λ is drawn once an episode as a correlated field, each cell with its own
-distribution: a field of correlated standard normals goes through each cell's quantile
-function (`benchnav.core.copula`). Where ground can immobilise a robot, a draw in which
-no feasible path joins start and goal is rejected and drawn again: what is asked is
-which way to take, and there has to be one. Letters in shapes: B episodes, N steps, H×W
+Frozen λ is drawn once per episode as a correlated field: a field of correlated standard
+normals passes through each cell's quantile function (`benchnav.core.copula`). If
+terrain can immobilise a robot, draws without a feasible path from start to goal are
+rejected: the benchmark asks which path to take, so one must exist. Letters in shapes: B
+episodes, N steps, H×W cells, K components.
 cells, K components.
 """
 
@@ -25,45 +26,44 @@ from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
-from benchnav.planning.world.world import Places, World
+from benchnav.planning.world.world import Endpoints, World
 
 MOST_ATTEMPTS = 100
 
-_FIRST = np.zeros(
-    1, dtype=np.int64
-)  # of each map's stream, the one element that is drawn
+# Index of the only element of each map's stream.
+_FIRST = np.zeros(1, dtype=np.int64)
 
 
 class Realisation:
-    """The λ of B episodes, as the world's noise has it.
+    """Realised λ of B episodes.
 
     Args:
         terrain: the true maps.
-        world: what λ does.
+        world: the model of λ.
         places: starts and goals.
-        steps: most steps N of the time budgets.
+        steps: maximum number of steps N of the time budgets.
         key: root key of the noise; see `rng.stream_key`.
-        maps: names each episode's stream under that root, B of them.
+        maps: index of each episode's stream under that root, B of them.
 
     Attributes:
-        field: the λ of every cell where it stays what it is, shape [B, H, W]; None
-            where it is resampled.
-        attempts: how many fields were drawn for each episode, int64, shape [B].
+        field: λ of all cells if it is constant, shape [B, H, W]; None if it is
+            resampled.
+        attempts: number of fields drawn for each episode, int64, shape [B].
     """
 
     def __init__(
         self,
         terrain: Terrain,
         world: World,
-        places: Places,
+        places: Endpoints,
         steps: int,
         key: int,
         maps: Sequence[int],
     ) -> None:
-        """Draws all noise.
+        """Draw all noise.
 
         Raises:
-            ConfigError: λ of some cells is not known.
+            ConfigError: If λ of some cells is missing.
         """
         check_known(terrain, world)
         self._grid, self._truth = terrain.grid, terrain.truth
@@ -90,11 +90,11 @@ class Realisation:
         self._ground = self._grid.pad(layers, outside=0.0)
 
     def at(self, state: Tensor, step: Tensor) -> Tensor:
-        """λ that robots meet at their next step.
+        """Return λ at the next step of robots.
 
         Args:
-            state: shape [B, S].
-            step: steps taken so far, int64, shape [B].
+            state: robot states, shape [B, S].
+            step: number of steps taken, int64, shape [B].
 
         Returns:
             λ in [0, 1], shape [B].
@@ -102,59 +102,59 @@ class Realisation:
         x, y = state[:, 0], state[:, 1]
         if self.field is not None:
             return self._grid.lookup(self._ground[:, 0], x, y)
-        noise = self._noise.gather(
-            1, step.clamp(max=self._noise.shape[1] - 1)[:, None]
-        )[:, :, None]
+        last = self._noise.shape[1] - 1
+        noise = self._noise.gather(1, step.clamp(max=last)[:, None])[:, :, None]
         count = self._ground.shape[1]
-        found = self._grid.lookup(
+        values = self._grid.lookup(
             self._ground.flatten(0, 1),
             x.repeat_interleave(count),
             y.repeat_interleave(count),
         )
-        weights, means, stds = found.view(len(x), 3, count // 3, 1, 1).unbind(1)
-        met = TraversabilityMixture(weights, means, stds).from_normal(noise)[:, 0, 0]
-        return torch.where(self._grid.contains(x, y), met, 0.0)
+        weights, means, stds = values.view(len(x), 3, count // 3, 1, 1).unbind(1)
+        mixture = TraversabilityMixture(weights, means, stds)
+        traversability = mixture.from_normal(noise)[:, 0, 0]
+        return torch.where(self._grid.contains(x, y), traversability, 0.0)
 
     def field_at(self, step: int) -> Tensor:
-        """λ of every cell at a step where it is resampled, shape [B, H, W]: one noise a
-        step, in each cell's own scale.
+        """Return resampled λ of all cells at a step, shape [B, H, W].
+
+        One noise value per step scales all cells, each by its own distribution.
 
         Args:
-            step: steps taken so far; beyond the last the last.
+            step: number of steps taken; steps beyond the last repeat it.
         """
         noise = self._noise[:, min(step, self._noise.shape[1] - 1), None, None]
         return self._truth.from_normal(noise.expand(-1, *self._grid.shape))
 
     def exchange_(self, members: Tensor, others: "Realisation") -> None:
-        """Gives some episodes what they meet in another realisation of the same world,
-        in place.
+        """Replace episodes by those of another realisation of the same world, in place.
 
         Args:
             members: indices of the episodes, int64, shape [M].
-            others: of M episodes on maps of the same grid.
+            others: realisation of M episodes on maps of the same grid.
         """
         self._ground.index_copy_(0, members, others._ground)
         self._truth = map_tensors(
-            self._truth, lambda own, new: own.index_copy(0, members, new), others._truth
+            self._truth, lambda old, new: old.index_copy(0, members, new), others._truth
         )
         self.attempts.index_copy_(0, members, others.attempts)
         if self.field is not None and others.field is not None:
             self.field.index_copy_(0, members, others.field)
             return
-        # Time budgets may differ; what is beyond an episode's own is never met.
-        most = max(self._noise.shape[1], others._noise.shape[1])
-        own, new = (
-            torch.nn.functional.pad(n, (0, most - n.shape[1]))
-            for n in (self._noise, others._noise)
+        # Time budgets may differ; noise beyond an episode's own budget is never used.
+        n_steps = max(self._noise.shape[1], others._noise.shape[1])
+        old, new = (
+            torch.nn.functional.pad(noise, (0, n_steps - noise.shape[1]))
+            for noise in (self._noise, others._noise)
         )
-        self._noise = own.index_copy(0, members, new)
+        self._noise = old.index_copy(0, members, new)
 
 
 def check_known(terrain: Terrain, world: World) -> None:
-    """Refuses maps with cells whose λ a world cannot tell.
+    """Check that λ of all cells is available in a world.
 
     Raises:
-        ConfigError: they have such cells.
+        ConfigError: If it is missing in some cells.
     """
     if bool(terrain.truth.means.isnan().any()):
         raise ConfigError(
@@ -171,26 +171,27 @@ def check_known(terrain: Terrain, world: World) -> None:
 
 
 def draw_frozen(
-    terrain: Terrain, world: World, places: Places, key: int, maps: Sequence[int]
+    terrain: Terrain, world: World, places: Endpoints, key: int, maps: Sequence[int]
 ) -> tuple[Tensor, Tensor]:
-    """Draws the λ of B episodes.
+    """Draw the λ of B episodes.
 
     Args:
         terrain: the true maps.
-        world: correlation length and kernel, and what immobilises a robot.
+        world: correlation length, kernel, and what immobilises a robot.
         places: starts and goals.
         key: root key of the noise.
-        maps: names each episode's stream under that root, B of them.
+        maps: index of each episode's stream under that root, B of them.
 
     Returns:
-        λ in [0, 1], shape [B, H, W]; and how many fields of each episode were drawn,
+        λ in [0, 1], shape [B, H, W], and the number of fields drawn for each episode,
         int64, shape [B].
 
     Raises:
-        ConfigError: the correlation is too long for the maps, or all draws of some
+        ConfigError: If the correlation is too long for the maps, or all draws of some
             episode were rejected.
     """
-    grid, cells = terrain.grid, world.correlation_m / terrain.grid.resolution_m
+    grid = terrain.grid
+    correlation_cells = world.correlation_m / grid.resolution_m
     longest = LONGEST_CORRELATION * min(grid.extent_m)
     expect(
         world.correlation_m <= longest,
@@ -207,21 +208,20 @@ def draw_frozen(
                 rng.stream_key(key, int(maps[i]), "field", attempt),
                 _FIRST,
                 grid.shape,
-                cells,
+                correlation_cells,
                 world.kernel,
             )
             for i in pending.tolist()
         ]
-        drawn = terrain.truth.select(pending).from_normal(
-            torch.from_numpy(np.concatenate(normals)).to(field)
-        )
+        scores = torch.from_numpy(np.concatenate(normals)).to(field)
+        drawn = terrain.truth.select(pending).from_normal(scores)
         field[pending] = drawn
         attempts[pending] += 1
         if world.immobile is None:
             return field, attempts
-        pending = pending[
-            ~joined(drawn >= world.immobile.below, grid, places.select(pending))
-        ]
+        is_firm = drawn >= world.immobile.below
+        is_feasible = joined(is_firm, grid, places.select(pending))
+        pending = pending[~is_feasible]
         if len(pending) == 0:
             return field, attempts
     raise ConfigError(
@@ -231,26 +231,30 @@ def draw_frozen(
     )
 
 
-def joined(ground: Tensor, grid: Grid, places: Places) -> Tensor:
-    """Tells in which episodes ground joins start and goal, from cell to cell over
-    shared edges.
+def joined(ground: Tensor, grid: Grid, places: Endpoints) -> Tensor:
+    """Return in which episodes a mask connects start and goal over shared edges.
 
-    Cells that touch at a corner alone are no way for a robot.
+    Cells that only touch at a corner are not connected.
 
     Args:
-        ground: where a robot can go, bool, shape [B, H, W].
+        ground: mask of traversable cells, bool, shape [B, H, W].
+        grid: size and resolution.
+        places: starts and goals.
+
+    Returns:
+        Mask of the episodes, bool, shape [B].
         grid: size and resolution.
         places: starts and goals.
 
     Returns:
         bool, shape [B].
     """
-    within = np.zeros((3, 3, 3))  # a map's cells are joined to its own alone
-    within[1] = generate_binary_structure(2, 1)
-    parts = torch.from_numpy(label(ground.cpu().numpy(), within)[0])
+    connectivity = np.zeros((3, 3, 3))  # none between maps
+    connectivity[1] = generate_binary_structure(2, 1)
+    parts = torch.from_numpy(label(ground.cpu().numpy(), connectivity)[0])
     member = torch.arange(len(parts))
     start, goal = (
-        parts[member, *grid.cell_of(*place.cpu().T)]
-        for place in (places.start_m, places.goal_m)
+        parts[member, *grid.cell_of(*position.cpu().T)]
+        for position in (places.start_m, places.goal_m)
     )
     return ((start > 0) & (start == goal)).to(ground.device)

@@ -1,6 +1,6 @@
-"""The simulation: true episodes, stepped as one batch.
+"""Simulation of true episodes, stepped as one batch.
 
-It holds the true terrain; λ is read where the robot stands and scales its motion.
+It holds the true terrain. λ is read at the robot's position and scales its motion.
 Letters in shapes: B episodes, S state and A action dimensions.
 """
 
@@ -16,16 +16,18 @@ from benchnav.planning.problem import Task
 from benchnav.planning.robots import steps_in
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.realisation import Realisation
-from benchnav.planning.world.world import Places, World
+from benchnav.planning.world.world import Endpoints, World
 
 
 @dataclass(frozen=True)
 class SimulationState:
-    """Where a batch of episodes stands.
+    """State of a batch of episodes.
 
     Args:
         state: robot states, shape [B, S].
-        outcome: `Outcome` of each, int64, shape [B].
+        outcome: `Outcome` of each episode, int64, shape [B].
+        step: number of steps taken in each, int64, shape [B].
+        dwell_steps: consecutive steps on immobilising terrain, int64, shape [B].
         step: steps taken by each, int64, shape [B].
         held: steps in a row, up to now, on ground that immobilises a robot, int64,
             shape [B].
@@ -34,11 +36,11 @@ class SimulationState:
     state: Tensor
     outcome: Tensor
     step: Tensor
-    held: Tensor
+    dwell_steps: Tensor
 
     @property
     def running(self) -> Tensor:
-        """Which episodes go on, bool, shape [B]."""
+        """Mask of episodes that have not ended, bool, shape [B]."""
         return self.outcome == Outcome.RUNNING
 
 
@@ -47,19 +49,19 @@ class Simulation:
 
     Args:
         terrain: the true maps.
-        task: robot, goal radius; the same that planners are given.
-        world: what λ does.
+        task: robot and goal radius, the same as for planners.
+        world: the model of λ.
         places: starts and goals.
         noise_key: root key of the noise; see `rng.stream_key`.
-        maps: names each episode's stream under that root, B of them.
+        maps: index of each episode's stream under that root, B of them.
 
     Attributes:
         robot: F.
-        time_budget_s: T of each episode, shape [B].
+        time_budget_s: T of each episode in seconds, shape [B].
         steps: T in time steps, int64, shape [B].
-        field: the λ of every cell where it stays what it is, shape [B, H, W]; None
-            where it is resampled.
-        attempts: how many fields were drawn until ground joined start and goal, int64,
+        field: λ of all cells if it is constant, shape [B, H, W]; None if it is
+            resampled.
+        attempts: number of fields drawn until one connected start and goal, int64,
             shape [B].
     """
 
@@ -68,25 +70,23 @@ class Simulation:
         terrain: Terrain,
         task: Task,
         world: World,
-        places: Places,
+        places: Endpoints,
         noise_key: int,
         maps: Sequence[int],
     ) -> None:
-        """Draws all noise."""
+        """Draw all noise."""
         self.robot = task.robot
         self.time_budget_s = world.budget_s(
             places.reference_time_s, task.robot.top_speed_mps
         )
         self.steps = world.steps(self.time_budget_s, task.robot.dt_s)
-        self._grid, self._goal_m, self._goal_radius_m = (
-            terrain.grid,
-            places.goal_m,
-            task.rules.goal_radius_m,
-        )
+        self._grid = terrain.grid
+        self._goal_m = places.goal_m
+        self._goal_radius_m = task.rules.goal_radius_m
         self._realisation = Realisation(
             terrain, world, places, int(self.steps.max()), noise_key, maps
         )
-        # Which `exchange_` changes in place.
+        # `exchange_` changes them in place.
         self.field, self.attempts = self._realisation.field, self._realisation.attempts
         self._immobile = world.immobile
         self._low = places.goal_m.new_tensor(task.robot.action_low)
@@ -94,82 +94,82 @@ class Simulation:
 
     @property
     def immobilising(self) -> Tensor:
-        """Cells that immobilise a robot, bool, shape [B, H, W]; none where λ is
-        resampled or nothing immobilises.
+        """Mask of immobilising cells, bool, shape [B, H, W].
+
+        Empty if λ is resampled or the world does not immobilise robots.
         """
         if self.field is None or self._immobile is None:
             return self._goal_m.new_zeros(len(self._goal_m), *self._grid.shape).bool()
         return self.field < self._immobile.below
 
     def field_at(self, step: int) -> Tensor:
-        """λ of every cell at a step, shape [B, H, W]; where it is resampled, as every
-        robot would meet it then.
-        """
+        """Return λ of all cells at a step, shape [B, H, W]."""
         return self._realisation.field_at(step) if self.field is None else self.field
 
     def init(self, start: Tensor) -> SimulationState:
-        """Puts the robots at their initial states, shape [B, S]."""
+        """Return the state at the start, from robot states [B, S]."""
         zero = torch.zeros(len(start), dtype=torch.int64, device=start.device)
         return SimulationState(start.clone(), zero, zero, zero)
 
     def step(
         self, now: SimulationState, action: Tensor
     ) -> tuple[SimulationState, Tensor]:
-        """Advances the running episodes by one step; ended ones stay as they are.
+        """Advance the running episodes by one step; ended ones do not change.
 
         Args:
-            now: where the episodes stand; not changed.
-            action: shape [B, A]; clipped to the bounds.
+            now: current state; it is not changed.
+            action: actions, clipped to the bounds, shape [B, A].
 
         Returns:
-            Where they stand next, and the λ that each robot met, shape [B].
+            The next state, and λ under each robot in this step, shape [B].
         """
         traversability = self._realisation.at(now.state, now.step)
-        # A robot of a user's may write into what it is given.
-        moved = self.robot(
-            now.state.clone(), action.clamp(self._low, self._high), traversability
-        )
+        # A user's robot may write into its arguments.
+        action = action.clamp(self._low, self._high)
+        moved = self.robot(now.state.clone(), action, traversability)
         state = torch.where(now.running[:, None], moved, now.state)
         step = now.step + now.running
         arrived = distance(state, self._goal_m) < self._goal_radius_m
         inside = self._grid.contains(state[:, 0], state[:, 1])
         outcome = torch.where(step >= self.steps, Outcome.TIMEOUT, Outcome.RUNNING)
-        held = now.held
+        dwell_steps = now.dwell_steps
         if self._immobile is not None:
-            held = torch.where(traversability < self._immobile.below, held + 1, 0)
-            most = steps_in(self._immobile.for_s, self.robot.dt_s)
-            outcome = torch.where(held >= most, Outcome.IMMOBILISED, outcome)
+            dwell_steps = torch.where(
+                traversability < self._immobile.below, dwell_steps + 1, 0
+            )
+            max_steps = steps_in(self._immobile.for_s, self.robot.dt_s)
+            outcome = torch.where(
+                dwell_steps >= max_steps, Outcome.IMMOBILISED, outcome
+            )
         outcome = torch.where(inside, outcome, Outcome.OUT_OF_BOUNDS)
         outcome = torch.where(arrived, Outcome.SUCCESS, outcome)
         outcome = torch.where(now.running, outcome, now.outcome)
-        return SimulationState(state, outcome, step, held), traversability
+        return SimulationState(state, outcome, step, dwell_steps), traversability
 
     def unhindered(self, now: SimulationState, action: Tensor) -> Tensor:
-        """Where an action would take the robots on ground of λ = 1, shape [B, S]; what
-        was commanded.
-        """
+        """Return the commanded motion: states after an action at λ = 1, shape [B, S]."""
         ones = torch.ones_like(now.state[:, 0])
         return self.robot(now.state.clone(), action.clamp(self._low, self._high), ones)
 
     def exchange_(self, members: Tensor, others: "Simulation") -> None:
-        """Gives some episodes the maps, goals and noise of another simulation, in
-        place; the rest keep theirs.
+        """Replace episodes by those of another simulation, in place.
 
         Args:
             members: indices of the episodes, int64, shape [M].
-            others: M episodes of the same task and world.
+            others: simulation of M episodes of the same task and world.
         """
         for name in ("_goal_m", "time_budget_s", "steps"):
-            setattr(
-                self,
-                name,
-                getattr(self, name).index_copy(0, members, getattr(others, name)),
-            )
+            values = getattr(self, name)
+            setattr(self, name, values.index_copy(0, members, getattr(others, name)))
         self._realisation.exchange_(members, others._realisation)
 
 
 def end(now: SimulationState, which: Tensor, outcome: Outcome) -> SimulationState:
-    """Ends running episodes, bool [B], with an outcome that the simulation cannot see
-    itself.
+    """Return the state with some running episodes ended by an outcome.
+
+    Args:
+        now: current state.
+        which: mask of the episodes, bool, shape [B].
+        outcome: an outcome that the simulation cannot determine itself.
     """
     return replace(now, outcome=torch.where(now.running & which, outcome, now.outcome))

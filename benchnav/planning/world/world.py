@@ -1,5 +1,4 @@
-"""World: what traversability does to a robot, as a value; the presets of world and
-rules; and places.
+"""Worlds: how traversability affects a robot; the presets of world and rules; endpoints.
 
 Letters in shapes: B episodes.
 """
@@ -25,14 +24,14 @@ _BUDGETS = ("time_budget_s", "time_budget_ratio")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Places(Batch):
-    """Where episodes begin and end.
+class Endpoints(Batch):
+    """Endpoints and reference times of episodes.
 
     Args:
-        start_m: (x, y), shape [B, 2].
-        goal_m: (x, y), shape [B, 2].
-        reference_time_s: grid reference times at 1 m/s, NaN where there is none, shape
-            [B].
+        start_m: start (x, y) in metres, shape [B, 2].
+        goal_m: goal (x, y) in metres, shape [B, 2].
+        reference_time_s: grid reference times at 1 m/s in seconds, NaN without one,
+            shape [B].
     """
 
     start_m: Tensor
@@ -42,23 +41,23 @@ class Places(Batch):
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """What λ does; the defaults are the paper's, where low λ slows a robot and ends
-    nothing.
+    """Model of λ; the defaults are the paper's, where low λ only slows a robot.
 
     Args:
         noise: `resampled` at each step; `stored`, the map's own realised λ; or
-            `frozen`, drawn once an episode as a correlated field, each cell with its
-            own distribution.
-        correlation_m: ℓ of frozen noise: cells at distance d have the correlation
-            exp(−d²/2ℓ²) before each takes its own distribution.
-        kernel: of frozen noise: `gaussian`, or `matern32`, a rougher field, whose
-            correlation is the same at distance ℓ; beliefs go on believing the Gaussian.
+            `frozen`, drawn once per episode as a correlated field with each cell's own
+            distribution.
+        correlation_m: ℓ of frozen noise in metres: normal scores of cells at distance d
+            have the correlation exp(−d²/2ℓ²).
+        kernel: kernel of frozen noise: `gaussian`, or `matern32`, a rougher field with
+            the same correlation at distance ℓ; beliefs assume the Gaussian.
         immobile: what ends an episode as immobilised; None for nothing.
-        time_budget_s: T; an episode that is not at the goal by then has failed.
+        time_budget_s: T in seconds; an episode that has not reached the goal by then
+            fails.
         time_budget_ratio: T in multiples of the map's grid reference time at the
             robot's top speed, instead of `time_budget_s`.
-        preset: the entry of `PRESETS` that the world was derived from, whose rules go
-            with it.
+        preset: the entry of `PRESETS` from which the world was derived, and whose rules
+            apply.
     """
 
     noise: str = "resampled"
@@ -70,7 +69,7 @@ class World:
     preset: str = field(default="paper", compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Refuses worlds in which no episode can run."""
+        """Validate noise, kernel, correlation and time budget."""
         expect(
             self.noise in NOISES,
             f"`noise` {', '.join(map(repr, NOISES[:-1]))} or {NOISES[-1]!r}, got "
@@ -99,8 +98,7 @@ class World:
 
     @classmethod
     def paper(cls, **changes: Any) -> "World":
-        """Return the paper's world: λ is resampled at each step; low λ slows a robot
-        and ends nothing.
+        """Return the paper's world: λ is resampled at each step and only slows a robot.
 
         Args:
             **changes: fields with other values than the preset's.
@@ -109,8 +107,7 @@ class World:
 
     @classmethod
     def stakes(cls, **changes: Any) -> "World":
-        """Return the world in which λ stays the same during an episode and low λ
-        immobilises a robot.
+        """Return a world of constant λ in which low λ immobilises a robot.
 
         Args:
             **changes: fields with other values than the preset's.
@@ -119,9 +116,7 @@ class World:
 
     @property
     def spec(self) -> dict[str, Any]:
-        """The preset by name, and all fields that differ from it, as `read_world` takes
-        them.
-        """
+        """The preset by name, and all fields that differ from it, for `read_world`."""
         base, now = plain(PRESETS[self.preset].world), plain(self)
         return {
             "preset": self.preset,
@@ -129,29 +124,27 @@ class World:
         }
 
     def budget_s(self, reference_time_s: Tensor, top_speed_mps: float) -> Tensor:
-        """T of each episode.
+        """Return T of each episode.
 
         Args:
-            reference_time_s: grid reference times at 1 m/s, NaN where there is none,
-                shape [B].
-            top_speed_mps: of the robot.
+            reference_time_s: grid reference times at 1 m/s, NaN without one, shape [B].
+            top_speed_mps: top speed of the robot in m/s.
 
         Returns:
-            Seconds, float64, shape [B].
+            Time budgets in seconds, float64, shape [B].
 
         Raises:
-            ConfigError: T is a multiple of a reference time that is not there.
+            ConfigError: If T is a multiple of a missing reference time.
         """
         reference_time_s = reference_time_s.double()
         if self.time_budget_s is not None:
             return torch.full_like(reference_time_s, self.time_budget_s)
         assert self.time_budget_ratio is not None
-        lacking = reference_time_s.isnan()
-        if bool(lacking.any()):
+        is_missing = reference_time_s.isnan()
+        if bool(is_missing.any()):
             raise ConfigError(
-                "Expected a reference time on each map, of which the time budget is a "
-                "multiple (`time_budget_ratio`), "
-                f"got none on {int(lacking.sum())} of {len(lacking)} maps, which were "
+                "Expected a reference time on each map for `time_budget_ratio`, "
+                f"got none on {int(is_missing.sum())} of {len(is_missing)} maps, which were "
                 "not asked to be solvable. Make "
                 "such maps: benchnav-datagen create RECIPE id=NAME "
                 "splits.SPLIT.solvable=true; or give "
@@ -161,10 +154,10 @@ class World:
         return self.time_budget_ratio * reference_time_s / top_speed_mps
 
     def steps(self, budget_s: Tensor, dt_s: float) -> Tensor:
-        """Time steps in time budgets, int64, shape of `budget_s`.
+        """Return time budgets in time steps, int64, shape of `budget_s`.
 
         Raises:
-            ConfigError: If there is none, or more than `MAX_STEPS`.
+            ConfigError: If one has no step, or more than `MAX_STEPS`.
         """
         steps = (budget_s / dt_s).round()
         if bool((~(steps >= 1)).any()):
@@ -181,10 +174,10 @@ class World:
         return steps.long()
 
     def to_dict(self) -> dict[str, Any]:
-        """All that bears on what happens, as plain data for JSON.
+        """Return all settings that affect episodes, as plain data for JSON.
 
-        What the noise does not use is left out, and the kernel where it is the one that
-        was there before there was a choice, so that ids stay.
+        Settings that the noise does not use are omitted, and so is the first kernel,
+        which was the only one in version 1, so that ids do not change.
         """
         unused = () if self.noise == "frozen" else ("correlation_m", "kernel")
         if self.kernel == KERNELS[0]:
@@ -199,12 +192,12 @@ class World:
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """A world, and the rules of a task that go with it.
+    """A world, and the rules of a task that belong to it.
 
     Args:
         purpose: one line.
-        world: what λ does.
-        rules: free space, least λ̂, goal radius.
+        world: the model of λ.
+        rules: free space, `min_traversability`, goal radius.
     """
 
     purpose: str
@@ -214,13 +207,12 @@ class Preset:
 
 PRESETS: Mapping[str, Preset] = {
     "paper": Preset(
-        purpose="The paper's: λ is drawn anew at each step; low λ slows a robot and "
-        "ends nothing.",
+        purpose="The paper's: λ is resampled at each step; low λ only slows a robot.",
         world=World(),
         rules=Rules(),
     ),
     "stakes": Preset(
-        purpose="λ stays what it is at a place, and soft ground immobilises a robot.",
+        purpose="λ of a cell is constant, and soft terrain immobilises a robot.",
         world=World(
             noise="frozen",
             immobile=Immobile(),
@@ -236,13 +228,13 @@ PRESETS: Mapping[str, Preset] = {
 
 
 def _changed_preset(name: str, changes: Mapping[str, Any]) -> World:
-    # One of the two ways to give a time budget replaces the other.
-    other = dict.fromkeys(_BUDGETS) if changes.keys() & set(_BUDGETS) else {}
-    return replace(PRESETS[name].world, **{**other, **changes})
+    # Either way of giving a time budget replaces the other.
+    no_budget = dict.fromkeys(_BUDGETS) if changes.keys() & set(_BUDGETS) else {}
+    return replace(PRESETS[name].world, **{**no_budget, **changes})
 
 
 def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
-    """Reads a world and the rules that go with it.
+    """Read a world and the rules that belong to it.
 
     Args:
         world: name of a preset, or a mapping of changes with the preset's name under
@@ -250,30 +242,27 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
         task: a mapping of changes to the preset's rules, if there are any.
 
     Returns:
-        World, rules, and what tables call them: the preset's name and all that is
-            changed.
+        World, rules, and their name in tables: the preset's name and all changes.
 
     Raises:
-        ConfigError: there is no such preset or field, or a value is of the wrong kind.
+        ConfigError: If a preset or field does not exist, or a value has the wrong type.
     """
     world = world.spec if isinstance(world, World) else world
     expect(
         isinstance(world, Mapping | str),
         f"`world` as a mapping of settings, got {world!r}.",
     )
-    given = {"preset": world} if isinstance(world, str) else dict(world)
-    name = given.pop("preset", "paper")
+    changes_given = {"preset": world} if isinstance(world, str) else dict(world)
+    name = changes_given.pop("preset", "paper")
     check_known("a world", name, PRESETS)
     preset = PRESETS[name]
-    budgets = [key for key in _BUDGETS if given.get(key) is not None]
-    if (
-        len(budgets) == 1
-    ):  # of the two ways to give a time budget one takes the other's place
-        given |= dict.fromkeys(set(_BUDGETS) - set(budgets))
-    changed_world = read(World, given, "`{}`".format, "world", preset.world)
+    budgets = [key for key in _BUDGETS if changes_given.get(key) is not None]
+    if len(budgets) == 1:  # either way of giving a time budget replaces the other
+        changes_given |= dict.fromkeys(set(_BUDGETS) - set(budgets))
+    changed_world = read(World, changes_given, "`{}`".format, "world", preset.world)
     for key in ("correlation_m", "kernel"):
         expect(
-            key not in given or changed_world.noise == "frozen",
+            key not in changes_given or changed_world.noise == "frozen",
             f"`world.{key}` with `world.noise` frozen, got it with "
             f"{changed_world.noise!r}.",
         )
@@ -286,11 +275,11 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
     return changed_world, rules, " ".join([name, *changes])
 
 
-def _differences(preset: Any, made: Any) -> list[str]:
-    """What tables call the fields in which a value differs from its preset."""
+def _differences(preset: Any, value: Any) -> list[str]:
+    """Return the names in tables of fields that differ from the preset."""
     changed = []
     for f in fields(preset):
-        before, after = getattr(preset, f.name), getattr(made, f.name)
+        before, after = getattr(preset, f.name), getattr(value, f.name)
         if before == after or (after is None and f.name != "immobile"):
             continue
         if isinstance(after, FreeSpace):

@@ -31,21 +31,22 @@ from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.belief import Belief, Predicted, Static
 from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.copula import Copula
-from benchnav.planning.sensing.knowledge import KnowledgeError, Learner, Truth
+from benchnav.planning.sensing.knowledge import KnowledgeError, Truth
+from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.near import Near
 from benchnav.planning.sensing.score_table import TabulatedDistribution
 from benchnav.planning.sensing.sensor import (
     Contact,
     Full,
-    Moment,
+    Measurement,
+    NoiseKey,
     Probe,
-    Sensed,
     Sensor,
 )
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.realisation import joined
 from benchnav.planning.world.simulation import Simulation
-from benchnav.planning.world.world import Places, World
+from benchnav.planning.world.world import Endpoints, World
 from tests.planning.planners.driving import generator
 from tests.planning.planners.test_planners import NAMES, make
 from tests.planning.sensing import made
@@ -54,7 +55,7 @@ BATCH, SIZE = 8, 24
 IMMOBILE = Immobile()
 WORLD = World(noise="stored", immobile=IMMOBILE, time_budget_s=24.0)
 RULES = Rules(free_space=FreeSpace(by="mean", above=0.1), min_traversability=0.05)
-LAW = made.law(SIZE, SIZE, 1.5)
+COVARIANCE = made.covariance(SIZE, SIZE, 1.5)
 KEYS = tuple(range(BATCH))
 SHIPPED = sorted(
     set(NAMES) - {"straight", "optimal"}
@@ -94,7 +95,7 @@ class Drives:
 def learning(problem: Problem, truth: Truth, **changes: Any) -> Learning:
     """How robots learn on ground of the law, and what they know when they set out."""
     given: dict[str, Any] = {
-        "sensor": Full(), "ground": Probe(1.5), "belief": Copula(), "law": LAW, "measure": measure,
+        "sensor": Full(), "ground": Probe(1.5), "belief": Copula(), "covariance": COVARIANCE, "measure": measure,
         "rules": problem.task.rules, "predict": fails(),
     }  # fmt: skip
     learner = Learner(**given | changes)
@@ -114,11 +115,11 @@ def drives(seed: int = 0, replan_every_s: float = 0.5, **changes: Any) -> Drives
     start, goal = (
         torch.tensor([place] * 40) for place in ((1.25, 1.25), (10.25, 9.75))
     )
-    places = Places(
+    places = Endpoints(
         start_m=start, goal_m=goal, reference_time_s=torch.full((40,), torch.nan)
     )
-    field = truth.from_normal(made.scores(LAW, 40, seed).float())
-    kept = joined(field >= IMMOBILE.below, LAW.grid, places).nonzero()[:BATCH, 0]
+    field = truth.from_normal(made.scores(COVARIANCE, 40, seed).float())
+    kept = joined(field >= IMMOBILE.below, COVARIANCE.grid, places).nonzero()[:BATCH, 0]
     truth, field, places = truth.select(kept), field[kept], places.select(kept)
     start, goal, terrain = places.start_m, places.goal_m, made.terrain(truth, field)
     rules = replace(RULES, replan_every_s=replan_every_s)
@@ -205,10 +206,10 @@ class Noting(Sensor):
         self.inner, self.noted, self.sees_all = inner, noted, inner.sees_all  # type: ignore[misc]
 
     def sense(
-        self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment
-    ) -> Sensed:
-        sensed = self.inner.sense(terrain, field, robot_state, moment)
-        members = torch.tensor([KEYS.index(key) for key in moment.keys])
+        self, terrain: Any, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
+        sensed = self.inner.sense(terrain, field, robot_state, noise_key)
+        members = torch.tensor([KEYS.index(key) for key in noise_key.keys])
         self.noted[members] |= (
             sensed.mask if sensed.appearance is None else sensed.appearance.seen
         )
@@ -216,7 +217,7 @@ class Noting(Sensor):
 
 
 ALIKE = replace(
-    LAW,
+    COVARIANCE,
     statistics=GroundStatistics(
         weights=(0.3, 0.7), means=(0.1, 0.75), stds=(0.1, 0.1), look_alikes=(("soft", "firm"),), potts_strength=0.5,
         layer_means={"rgb": (10.0, 20.0, 30.0), "elevation_m": (0.5,), "slope_deg": (7.0,)},
@@ -262,7 +263,7 @@ def test_what_was_not_sensed_changes_no_action(
         )
         how = learning(
             posed, truth, sensor=Noting(sensor, noted[0]), ground=Noting(ground, noted[1]), belief=BELIEFS[belief],
-            law=ALIKE, predict=lambda terrain, seen: Oracle().predict_terrain(terrain),
+            covariance=ALIKE, predict=lambda terrain, seen: Oracle().predict_terrain(terrain),
         )  # fmt: skip
         known = how.start
         problem = replace(
@@ -271,7 +272,7 @@ def test_what_was_not_sensed_changes_no_action(
             distribution=how.learner.distribution(known),
         )  # fmt: skip
         nan = torch.full((len(few),), torch.nan)
-        places = Places(
+        places = Endpoints(
             start_m=problem.start[:, :2], goal_m=problem.goal_m, reference_time_s=nan
         )
         simulation = Simulation(
@@ -342,15 +343,15 @@ def test_maps_are_revised_when_it_is_due_and_where_something_is_known(
     step, last = found[-1]
     # The planner's λ̂ is that of the belief, within the least change.
     belief, seen = Copula(), given.learning.truth
-    state = belief.init(given.problem.distribution, LAW)
-    sensed: Sensed | None = None
+    state = belief.init(given.problem.distribution, COVARIANCE)
+    sensed: Measurement | None = None
     at = given.problem.start.clone()
     for now in range(step + 1):
-        new = Probe(1.5).sense(seen.terrain, seen.field, at, Moment(KEYS, now))
+        new = Probe(1.5).sense(seen.terrain, seen.field, at, NoiseKey(KEYS, now))
         sensed = (
             new
             if sensed is None
-            else Sensed(
+            else Measurement(
                 traversability=torch.where(
                     new.mask, new.traversability, sensed.traversability
                 ),
@@ -387,7 +388,7 @@ def test_the_goal_stays_free_whatever_is_known_of_it() -> None:
     )
     assert first.free[:, row, column].all()
     assert not first.free[:, row - 3, column - 2].any()
-    at_goal = cells_at_goal(LAW.grid, given.problem.goal_m, RULES.goal_radius_m)
+    at_goal = cells_at_goal(COVARIANCE.grid, given.problem.goal_m, RULES.goal_radius_m)
     assert first.free[at_goal].all()
     assert (~first.free)[(field < 0.02) & ~at_goal].double().mean() > 0.9
 
@@ -406,14 +407,14 @@ def test_the_goal_that_stays_free_is_that_of_the_episode_that_is_left() -> None:
     told = knowing.learn(0, given.problem.start[1:2], torch.ones(1, dtype=torch.bool))
     assert told is not None
     assert torch.equal(
-        told.free, cells_at_goal(LAW.grid, goal[1:2], RULES.goal_radius_m)
+        told.free, cells_at_goal(COVARIANCE.grid, goal[1:2], RULES.goal_radius_m)
     )
 
 
 def test_a_robot_that_has_ended_sees_and_senses_nothing_more() -> None:
     """Also where it is moved on, as a loop might that goes on for the others."""
     given = drives(
-        sensor=Near(range_m=2.0), ground=Probe(1.0), law=ALIKE,
+        sensor=Near(range_m=2.0), ground=Probe(1.0), covariance=ALIKE,
         predict=lambda terrain, seen: Oracle().predict_terrain(terrain),
     )  # fmt: skip
     knowing, running = Knowing(given.learning, given.problem), torch.arange(BATCH) < 3
@@ -450,7 +451,7 @@ class Wrong(Sensor):
         self.said = said
 
     def sense(
-        self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment
+        self, terrain: Any, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
     ) -> Any:
         return self.said(field)
 
@@ -459,16 +460,16 @@ class Wrong(Sensor):
     ("said", "words"),
     [
         (fails(), "ValueError: no echo"),
-        (lambda field: None, "Expected a Sensed from `sense`, got NoneType."),
+        (lambda field: None, "Expected a Measurement from `sense`, got NoneType."),
         (
-            lambda field: Sensed(traversability=field[:1], std=field),
-            "`Sensed.traversability`",
+            lambda field: Measurement(traversability=field[:1], std=field),
+            "`Measurement.traversability`",
         ),
         (
-            lambda field: Sensed(traversability=field, std=field.double()),
-            "`Sensed.std`",
+            lambda field: Measurement(traversability=field, std=field.double()),
+            "`Measurement.std`",
         ),
-        (lambda field: Sensed(traversability=field + 1, std=field), "in [0, 1]"),
+        (lambda field: Measurement(traversability=field + 1, std=field), "in [0, 1]"),
     ],
 )
 def test_a_sensor_that_fails_ends_its_episodes(
@@ -485,17 +486,21 @@ def test_a_sensor_under_the_key_of_the_other_kind_is_refused() -> None:
     given = drives()
     truth = given.learning.truth
     with pytest.raises(KnowledgeError, match="List λ sensors under `grounds`"):
-        learning(given.problem, truth, sensor=Probe(1.0), law=ALIKE)
+        learning(given.problem, truth, sensor=Probe(1.0), covariance=ALIKE)
     # What senses both may stand under either.
     both = Wrong(
-        lambda field: Sensed(
+        lambda field: Measurement(
             traversability=field,
             std=torch.full_like(field, 0.1),
             appearance=looks_of(truth, field),
         )
     )
     assert learning(
-        given.problem, truth, sensor=both, law=ALIKE, predict=lambda t, o: t.truth
+        given.problem,
+        truth,
+        sensor=both,
+        covariance=ALIKE,
+        predict=lambda t, o: t.truth,
     )
     found = given.run(
         astar_dwa(),
@@ -506,10 +511,10 @@ def test_a_sensor_under_the_key_of_the_other_kind_is_refused() -> None:
 
 
 def looks_of(truth: Truth, field: Tensor) -> Any:
-    moment = Moment(KEYS, 0)
+    noise_key = NoiseKey(KEYS, 0)
     return (
         Full()
-        .sense(truth.terrain, field, torch.zeros(len(field), 3), moment)
+        .sense(truth.terrain, field, torch.zeros(len(field), 3), noise_key)
         .appearance
     )
 
@@ -601,16 +606,16 @@ def test_a_planner_that_raises_while_robots_learn_is_a_planner_error() -> None:
 def test_a_sensor_and_a_belief_may_write_into_what_they_are_given() -> None:
     class Scribbles(Sensor):
         def sense(
-            self, terrain: Any, field: Tensor, robot_state: Tensor, moment: Moment
-        ) -> Sensed:
-            sensed = Probe(1.5).sense(terrain, field, robot_state, moment)
+            self, terrain: Any, field: Tensor, robot_state: Tensor, noise_key: NoiseKey
+        ) -> Measurement:
+            sensed = Probe(1.5).sense(terrain, field, robot_state, noise_key)
             field.zero_()
             robot_state.zero_()
             terrain.truth.means.zero_()
             return sensed
 
     class Scrawls(Copula):
-        def update(self, state: Any, sensed: Sensed, prior: Any = None) -> Any:
+        def update(self, state: Any, sensed: Measurement, prior: Any = None) -> Any:
             found = super().update(state, sensed, prior)
             sensed.traversability.zero_()
             return found
@@ -693,7 +698,7 @@ def part_of(given: Drives, members: list[int]) -> Drives:
     """Some of the episodes, as if there were no others."""
     kept, truth = torch.tensor(members), given.learning.truth
     problem, own = given.problem.select(kept), truth.select(kept)
-    places = Places(
+    places = Endpoints(
         start_m=problem.start[:, :2], goal_m=problem.goal_m,
         reference_time_s=torch.full((len(members),), torch.nan),
     )  # fmt: skip

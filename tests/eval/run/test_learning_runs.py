@@ -37,7 +37,7 @@ from benchnav.eval.run.unit import Settings, build
 from benchnav.planning.free_space import Immobile
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.sensing.knowledge import sensor_keys
-from benchnav.planning.sensing.sensor import Moment, Probe
+from benchnav.planning.sensing.sensor import NoiseKey, Probe
 from benchnav.planning.world.lower_bound import Motion, lower_bound_s
 from tests import factories
 from tests.commands import call
@@ -89,7 +89,7 @@ class Known(Batch):
 class Remembers(Belief[Known]):
     fault: str = ""
 
-    def init(self, prior, law):
+    def init(self, prior, covariance):
         return Known(prior=prior, value=torch.full(prior.shape, torch.nan))
 
     def update(self, state, sensed, prior=None):
@@ -219,7 +219,7 @@ def test_what_was_sensed_is_what_sensors_told_on_the_driven_path(
                         own.terrain,
                         own.field,
                         track[step][None],
-                        Moment(own.keys, step),
+                        NoiseKey(own.keys, step),
                     )
                     .mask
                 )

@@ -11,7 +11,7 @@ from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 
 from benchnav.core import rng
 from benchnav.planning.free_space import Immobile
-from benchnav.planning.planners.mppi import advance_chunk, roll_out
+from benchnav.planning.planners.mppi_rollouts import advance_chunk, roll_out
 from benchnav.planning.planners.planner import rollout_path
 from benchnav.planning.problem import Problem
 from benchnav.planning.sensing.sensor import Step

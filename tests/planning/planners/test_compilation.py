@@ -16,9 +16,10 @@ from benchnav.planning.planners import compilation
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig
 from benchnav.planning.planners.astar.dwa import DWAConfig
 from benchnav.planning.planners.compilation import Fused, worth_compiling
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig
+from benchnav.planning.planners.mppi import MPPI
+from benchnav.planning.planners.mppi_config import MPPIConfig
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing.belief import Fields, Law, Static
+from benchnav.planning.sensing.belief import CovarianceModel, Fields, Static
 from tests import factories
 from tests.planning.planners.driving import first, generator
 
@@ -218,7 +219,9 @@ def test_compiled_and_eager_rollouts_on_fields_agree(
     belief = Static()
     source = Fields(
         belief,
-        belief.init(known, Law(grid=factories.problem(maps).grid, correlation_m=1.0)),
+        belief.init(
+            known, CovarianceModel(grid=factories.problem(maps).grid, correlation_m=1.0)
+        ),
         (7, 3),
     )
     problem = replace(

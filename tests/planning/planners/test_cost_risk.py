@@ -25,12 +25,11 @@ from benchnav.planning.planners.cost_risk import (
     tail_cost,
     within_reach,
 )
-from benchnav.planning.planners.mppi import (
-    MPPI,
+from benchnav.planning.planners.mppi import MPPI, MPPIState
+from benchnav.planning.planners.mppi_config import MPPIConfig
+from benchnav.planning.planners.mppi_rollouts import (
     Dwell,
     Ends,
-    MPPIConfig,
-    MPPIState,
     advance_chunk,
     cost_spread,
     roll_out,
@@ -39,7 +38,7 @@ from benchnav.planning.planners.mppi import (
 from benchnav.planning.planners.noise_bank import Sampled
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
-from benchnav.planning.sensing.belief import Fields, Law, Static
+from benchnav.planning.sensing.belief import CovarianceModel, Fields, Static
 from tests import factories
 from tests.planning.planners.driving import first, generator, rollout_cost
 
@@ -113,7 +112,9 @@ def test_fields_of_ground_that_is_known_for_sure_are_the_map_bit_for_bit() -> No
     problem, belief = varied(3), Static()
     sure = factories.normal(problem.risk_map, torch.zeros_like(problem.risk_map))
     source = Fields(
-        belief, belief.init(sure, Law(grid=problem.grid, correlation_m=1.0)), (7, 3, 5)
+        belief,
+        belief.init(sure, CovarianceModel(grid=problem.grid, correlation_m=1.0)),
+        (7, 3, 5),
     )
     posed = replace(problem, distribution=sure, fields=source)
     wanted, _ = drives(MPPI(SMALL), problem)
@@ -180,7 +181,9 @@ def test_the_tail_over_drawn_fields_is_that_over_all_that_there_are() -> None:
     known = TraversabilityMixture(weights, means, torch.zeros_like(means))
     belief = Static(correlated=False)
     source = Fields(
-        belief, belief.init(known, Law(grid=posed.grid, correlation_m=1.0)), (7,)
+        belief,
+        belief.init(known, CovarianceModel(grid=posed.grid, correlation_m=1.0)),
+        (7,),
     )
     posed = replace(posed, distribution=known, fields=source)
     plan_state = MPPI(replace(SMALL, samples=16)).init(posed, generator())
@@ -261,11 +264,11 @@ def test_fields_of_a_seed_are_others_than_those_of_another() -> None:
 def test_an_episode_alone_does_as_it_does_in_a_batch(once: bool) -> None:
     problem = varied(3)
     belief = Static()
-    law = Law(grid=problem.grid, correlation_m=1.0)
+    covariance = CovarianceModel(grid=problem.grid, correlation_m=1.0)
     doubtful = factories.normal(
         problem.risk_map, torch.full_like(problem.risk_map, 0.2)
     )
-    source = Fields(belief, belief.init(doubtful, law), (7, 3, 5))
+    source = Fields(belief, belief.init(doubtful, covariance), (7, 3, 5))
     problem = replace(problem, distribution=doubtful, fields=source)
     planner = MPPI(replace(SMALL, risk_on="cost", fields=20, level=0.5, once=once))
     whole, state = drives(planner, problem, steps=1)
@@ -312,7 +315,7 @@ def test_each_episode_has_its_own_start_goal_fields_and_time_held(
     goal = torch.tensor([[1.75, 6.75], [1.75, 5.25], [6.25, 1.25]])
     source = Fields(
         Static(),
-        Static().init(doubtful, Law(grid=problem.grid, correlation_m=1.0)),
+        Static().init(doubtful, CovarianceModel(grid=problem.grid, correlation_m=1.0)),
         (7, 3, 5),
     )
     problem = replace(
@@ -362,7 +365,7 @@ def test_cells_that_rollouts_cannot_reach_are_not_looked_up_and_change_nothing(
     )
     source = Fields(
         Static(),
-        Static().init(doubtful, Law(grid=problem.grid, correlation_m=1.0)),
+        Static().init(doubtful, CovarianceModel(grid=problem.grid, correlation_m=1.0)),
         (7, 3),
     )
     problem = replace(problem, distribution=doubtful, fields=source)
@@ -631,7 +634,7 @@ def test_a_robot_remembers_for_how_long_it_was_held() -> None:
     for observed, wanted in ((math.nan, 0), (0.05, 1), (0.02, 2), (0.3, 0), (0.05, 1)):
         step = replace(first(problem), traversability=torch.tensor([observed]))
         _, plan_state, _ = planner.plan(step, plan_state)
-        assert plan_state.held.tolist() == [wanted]
+        assert plan_state.dwell_steps.tolist() == [wanted]
     # In a world that holds nobody there is nothing to plan for.
     free = replace(problem, immobile=None)
     wanted, _ = drives(MPPI(SMALL), free)

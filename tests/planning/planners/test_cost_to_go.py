@@ -15,10 +15,10 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConfig
-from benchnav.planning.planners.mppi import (
-    MPPI,
+from benchnav.planning.planners.mppi import MPPI
+from benchnav.planning.planners.mppi_config import MPPIConfig
+from benchnav.planning.planners.mppi_rollouts import (
     Ends,
-    MPPIConfig,
     advance_chunk,
     roll_out,
     weigh,

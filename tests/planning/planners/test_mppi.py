@@ -9,9 +9,10 @@ from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import FreeSpace, Immobile, Rules
 from benchnav.planning.objective import GoalDistance, Objective
-from benchnav.planning.planners import mppi
+from benchnav.planning.planners import mppi, mppi_rollouts
 from benchnav.planning.planners.cost_risk import framed_fields
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
+from benchnav.planning.planners.mppi import MPPI, MPPIState
+from benchnav.planning.planners.mppi_config import MPPIConfig
 from benchnav.planning.planners.noise_bank import NoiseBank, draw_bank
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.planners.turns import (
@@ -134,9 +135,15 @@ def test_the_average_reaches_the_bounds_and_no_further() -> None:
         torch.tensor([0.0, -1.0]),
         torch.tensor([3.0, 1.0]),
     )
-    assert mppi.average(mean, noise, weights, low, high)[0, 0].tolist() == [3.0, 1.0]
+    assert mppi_rollouts.average(mean, noise, weights, low, high)[0, 0].tolist() == [
+        3.0,
+        1.0,
+    ]
     first_only = torch.tensor([[1.0, 0.0]])
-    assert mppi.average(mean, noise, first_only, low, high)[0, 0].tolist() == [2.0, 0.5]
+    assert mppi_rollouts.average(mean, noise, first_only, low, high)[0, 0].tolist() == [
+        2.0,
+        0.5,
+    ]
 
 
 def test_the_spread_is_the_mean_excess_of_samples_that_pay_no_more_steps_off_free_ground() -> (
@@ -145,8 +152,8 @@ def test_the_spread_is_the_mean_excess_of_samples_that_pay_no_more_steps_off_fre
     cost = torch.tensor(
         [[3.0, 1.0, 2.0, 1e4 + 2.0], [2e4 + 5.0, 3e4, 2e4 + 6.0, 2e4 + 7.0], [4.0] * 4]
     )
-    assert mppi.cost_spread(cost)[:2, 0].tolist() == pytest.approx([1.0, 1.0])
-    assert 0 < mppi.cost_spread(cost)[2, 0] < 1e-20
+    assert mppi_rollouts.cost_spread(cost)[:2, 0].tolist() == pytest.approx([1.0, 1.0])
+    assert 0 < mppi_rollouts.cost_spread(cost)[2, 0] < 1e-20
 
 
 class Scaled(GoalDistance):
@@ -455,7 +462,7 @@ def test_no_tensor_is_made_on_another_device(
         values = mean.new_zeros(2, 20, 4 * 256)
         places = torch.zeros(20, 2, dtype=torch.int64, device=mean.device)
         bank = NoiseBank(
-            scale=scale, values=values, place=places, stride=places, samples=256
+            scale=scale, values=values, offset=places, stride=places, samples=256
         )
         state = MPPIState(
             problem,
@@ -531,7 +538,11 @@ def marked(horizon: int, samples: int) -> NoiseBank:
         one.values.shape
     )
     return NoiseBank(
-        scale=SCALE, values=places, place=one.place, stride=one.stride, samples=samples
+        scale=SCALE,
+        values=places,
+        offset=one.offset,
+        stride=one.stride,
+        samples=samples,
     )
 
 

@@ -49,7 +49,7 @@ def problem(
 def time_to_go(planner: Any, posed: Problem) -> Tensor:
     """By value iteration only."""
     state = Optimal.init(planner, posed, generator())
-    return ways_from(posed.start, state.held, state).cost.min(1).values
+    return ways_from(posed.start, state.dwell_s, state).cost.min(1).values
 
 
 def curve(x: float, y: float, heading: float, radius_m: float = 1.0) -> float:
@@ -175,7 +175,7 @@ def test_the_time_held_is_counted_while_it_drives() -> None:
     for met, wanted in ((0.05, 0.1), (0.02, 0.2), (0.5, 0.0)):
         step = replace(first(posed), traversability=torch.tensor([met]))
         state = planner.plan(step, state)[1]
-        assert state.held.tolist() == pytest.approx([wanted])
+        assert state.dwell_s.tolist() == pytest.approx([wanted])
 
 
 def test_ground_that_is_not_free_is_gone_around_and_crossed_where_there_is_no_other_way() -> (

@@ -13,7 +13,8 @@ from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners import boundary
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.cl_rrt import cl_rrt
-from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT, CLRRTConfig
+from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT
+from benchnav.planning.planners.cl_rrt.config import CLRRTConfig
 from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig
 from benchnav.planning.planners.planner import PlanStatus
 from benchnav.planning.problem import Problem

@@ -9,7 +9,7 @@ from benchnav.core.copula import correlated_normal
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
-from benchnav.planning.sensing.belief import Law
+from benchnav.planning.sensing.belief import CovarianceModel
 
 
 def mixture(
@@ -27,10 +27,12 @@ def mixture(
     )
 
 
-def law(
+def covariance(
     height: int, width: int, correlation_m: float = 1.0, resolution_m: float = 0.5
-) -> Law:
-    return Law(grid=Grid(height, width, resolution_m), correlation_m=correlation_m)
+) -> CovarianceModel:
+    return CovarianceModel(
+        grid=Grid(height, width, resolution_m), correlation_m=correlation_m
+    )
 
 
 def terrain(
@@ -44,10 +46,10 @@ def terrain(
     )  # fmt: skip
 
 
-def scores(law: Law, count: int, seed: int = 0) -> Tensor:
+def scores(covariance: CovarianceModel, count: int, seed: int = 0) -> Tensor:
     """Normal scores as the world draws them, shape [count, H, W]."""
     key = rng.stream_key(seed, "scores")
     drawn = correlated_normal(
-        key, np.arange(count), law.grid.shape, law.correlation_cells
+        key, np.arange(count), covariance.grid.shape, covariance.correlation_cells
     )
     return torch.from_numpy(drawn)

@@ -8,22 +8,23 @@ from torch import Tensor
 from benchnav.core.grid import Grid
 from benchnav.core.ground import GroundStatistics
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.planning.sensing.belief import Law
-from benchnav.planning.sensing.classes import Classes, ClassesState
-from benchnav.planning.sensing.sensor import Sensed
+from benchnav.planning.sensing.belief import CovarianceModel
+from benchnav.planning.sensing.class_state import ClassesState
+from benchnav.planning.sensing.classes import Classes
+from benchnav.planning.sensing.sensor import Measurement
 
 NAMES = ("packed", "crusted", "rock", "firm", "drift")
 MEANS, STDS = (0.75, 0.5, 0.3, 0.9, 0.5), (0.15, 0.15, 0.2, 0.13, 0.15)
 PAIRS = (("packed", "crusted"), ("firm", "drift"))
 
 
-def law_of(
+def covariance_of(
     height: int,
     width: int,
     correlation_m: float = 1.0,
     strength: float = 0.8,
     pairs: tuple[tuple[str, str], ...] = PAIRS,
-) -> Law:
+) -> CovarianceModel:
     statistics = GroundStatistics(
         weights=(1.0,),
         means=(0.5,),
@@ -32,7 +33,7 @@ def law_of(
         look_alikes=pairs,
         potts_strength=strength,
     )
-    return Law(
+    return CovarianceModel(
         grid=Grid(height, width, 0.5),
         correlation_m=correlation_m,
         statistics=statistics,
@@ -72,17 +73,20 @@ def mixed(batch: int, height: int, width: int, seed: int = 0) -> TraversabilityM
 
 def looked(
     shape: tuple[int, ...], values: dict[tuple[int, int], float], std: float = 0.1
-) -> Sensed:
+) -> Measurement:
     found = torch.full(shape, torch.nan, dtype=torch.float64)
     for (row, column), value in values.items():
         found[:, row, column] = value
-    return Sensed(traversability=found, std=torch.full_like(found, std))
+    return Measurement(traversability=found, std=torch.full_like(found, std))
 
 
 def after(
-    belief: Classes, prior: TraversabilityMixture, law: Law, *looks: Sensed
+    belief: Classes,
+    prior: TraversabilityMixture,
+    covariance: CovarianceModel,
+    *looks: Measurement,
 ) -> ClassesState:
-    state = belief.init(prior, law)
+    state = belief.init(prior, covariance)
     for sensed in looks:
         state = belief.update(state, sensed)
     return state

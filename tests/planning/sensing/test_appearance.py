@@ -15,7 +15,7 @@ from benchnav.datagen.synth import elevation
 from benchnav.datagen.synth.generate import generate
 from benchnav.planning.sensing.appearance import Memory, masked, remember
 from benchnav.planning.sensing.near import Near
-from benchnav.planning.sensing.sensor import Appearance, Full, Moment
+from benchnav.planning.sensing.sensor import Appearance, Full, NoiseKey
 
 MEANS = {
     "rgb": (10.4, 99.6, 200.5),
@@ -32,10 +32,14 @@ def terrain_from(recipe_id: str, maps: int = 3) -> Terrain:
 
 
 def appearance_of(
-    terrain: Terrain, seen: Tensor, doubt: float | Tensor = 0.0
+    terrain: Terrain, seen: Tensor, noise_level: float | Tensor = 0.0
 ) -> Appearance:
-    doubts = torch.full(seen.shape, doubt) if isinstance(doubt, float) else doubt
-    return Appearance(seen=seen, observation=terrain.observe(), doubt=doubts)
+    doubts = (
+        torch.full(seen.shape, noise_level)
+        if isinstance(noise_level, float)
+        else noise_level
+    )
+    return Appearance(seen=seen, observation=terrain.observe(), noise_level=doubts)
 
 
 @pytest.mark.parametrize("recipe_id", ["tiny-v1", "stakes-v1", "vegetation-v1"])
@@ -44,7 +48,9 @@ def test_what_was_all_seen_without_noise_is_the_observation_bit_for_bit(
 ) -> None:
     terrain = terrain_from(recipe_id)
     states = torch.zeros(3, 3)
-    sensed = Full().sense(terrain, terrain.traversability, states, Moment((1, 2, 3), 0))
+    sensed = Full().sense(
+        terrain, terrain.traversability, states, NoiseKey((1, 2, 3), 0)
+    )
     assert sensed.appearance is not None
     known = masked(remember(Memory.none(terrain), sensed.appearance), MEANS)
     truth = terrain.observe()
@@ -64,7 +70,7 @@ def test_a_clear_look_near_the_robot_is_the_observation_there() -> None:
     memory = Memory.none(terrain)
     for step in range(3):
         looked = near.sense(
-            terrain, terrain.traversability, states + step, Moment((1, 2, 3), step)
+            terrain, terrain.traversability, states + step, NoiseKey((1, 2, 3), step)
         ).appearance
         assert looked is not None
         memory = remember(memory, looked)
@@ -94,7 +100,7 @@ def test_where_nothing_was_seen_are_the_training_means(seed: int, share: float) 
         rgb=torch.full((2, 3, height, width), 7, dtype=torch.uint8),
         elevation_m=torch.where(seen, ground, torch.nan),
         layers={"vegetation_m": ground},
-        doubt=ground,
+        noise_level=ground,
         grid=grid,
     )
     known = masked(memory, MEANS)
@@ -128,7 +134,7 @@ def test_of_two_looks_the_one_with_less_doubt_is_kept_and_of_equal_ones_the_earl
     terrain = terrain_from("vegetation-v1", 1)
     shape = terrain.elevation_m.shape
 
-    def look(value: int, cells: slice, doubt: float) -> Appearance:
+    def look(value: int, cells: slice, noise_level: float) -> Appearance:
         observation = Observation(
             rgb=torch.full_like(terrain.rgb, value),
             elevation_m=torch.full(shape, float(value)),
@@ -139,23 +145,25 @@ def test_of_two_looks_the_one_with_less_doubt_is_kept_and_of_equal_ones_the_earl
         seen = torch.zeros(shape, dtype=torch.bool)
         seen[:, :, cells] = True
         return Appearance(
-            seen=seen, observation=observation, doubt=torch.full(shape, doubt)
+            seen=seen,
+            observation=observation,
+            noise_level=torch.full(shape, noise_level),
         )
 
     memory = before = Memory.none(terrain)
-    for value, cells, doubt in (
+    for value, cells, noise_level in (
         (1, slice(0, 4), 2.0),
         (2, slice(2, 6), 1.0),
         (3, slice(0, 8), 2.0),
         (4, slice(7, 9), torch.inf),
         (5, slice(0, 9), torch.inf),
     ):
-        memory = remember(memory, look(value, cells, doubt))
+        memory = remember(memory, look(value, cells, noise_level))
     expected = [1, 1, 2, 2, 2, 2, 3, 3, 4]
     assert memory.elevation_m[0, 5, :9].tolist() == expected
     assert memory.rgb[0, :, 5, :9].tolist() == [expected] * 3
     assert memory.layers["vegetation_m"][0, 5, :9].tolist() == expected
-    assert memory.doubt[0, 5, :9].tolist() == [2, 2, 1, 1, 1, 1, 2, 2, torch.inf]
+    assert memory.noise_level[0, 5, :9].tolist() == [2, 2, 1, 1, 1, 1, 2, 2, torch.inf]
     assert memory.seen[0, 5].tolist() == [True] * 9 + [False] * (shape[2] - 9)
     assert not before.seen.any()
     assert not before.rgb.any()

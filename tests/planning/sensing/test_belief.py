@@ -10,25 +10,25 @@ from benchnav.core.copula import correlations
 from benchnav.core.errors import ConfigError
 from benchnav.core.pooled import pool
 from benchnav.planning.sensing.belief import (
-    Law,
+    CovarianceModel,
     Predicted,
     Static,
     draw_scores,
     fields_of,
 )
 from benchnav.planning.sensing.score_table import VALUES, value_at
-from benchnav.planning.sensing.sensor import Sensed
+from benchnav.planning.sensing.sensor import Measurement
 from tests.planning.sensing import made
 
-LAW = made.law(10, 12, 1.5)
+COVARIANCE = made.covariance(10, 12, 1.5)
 KEYS = (5, 6)
 
 
 def test_static_gives_the_prediction_whatever_is_sensed() -> None:
     prior, other = made.mixture(2, 10, 12), made.mixture(2, 10, 12, seed=1)
     belief = Static()
-    state = belief.init(prior, LAW)
-    seen = Sensed(traversability=torch.zeros(2, 10, 12), std=torch.ones(2, 10, 12))
+    state = belief.init(prior, COVARIANCE)
+    seen = Measurement(traversability=torch.zeros(2, 10, 12), std=torch.ones(2, 10, 12))
     assert belief.distribution(belief.update(state, seen)) is prior
     assert belief.distribution(belief.update(state, seen, other)) is other
     assert not belief.learns
@@ -38,13 +38,13 @@ def test_static_gives_the_prediction_whatever_is_sensed() -> None:
 
 def test_static_believes_something_else_where_the_prediction_is_another() -> None:
     prior, belief = made.mixture(2, 10, 12), Static()
-    state = belief.init(prior, LAW)
+    state = belief.init(prior, COVARIANCE)
     cells = torch.zeros(2, 10, 12, dtype=torch.bool)
     cells[1, 3, 4:7] = True
     other = replace(
         prior, means=torch.where(cells[:, None], 1 - prior.means, prior.means)
     )
-    nothing = Sensed(
+    nothing = Measurement(
         traversability=torch.full((2, 10, 12), torch.nan), std=torch.ones(2, 10, 12)
     )
     assert torch.equal(
@@ -56,8 +56,8 @@ def test_static_believes_something_else_where_the_prediction_is_another() -> Non
 def test_episodes_take_the_places_of_others() -> None:
     prior, other = made.mixture(3, 10, 12), made.mixture(2, 10, 12, seed=1)
     belief = Static()
-    state = belief.init(prior, LAW)
-    whole = belief.put(state, torch.tensor([2, 0]), belief.init(other, LAW))
+    state = belief.init(prior, COVARIANCE)
+    whole = belief.put(state, torch.tensor([2, 0]), belief.init(other, COVARIANCE))
     wanted = torch.stack((other.mean()[1], prior.mean()[1], other.mean()[0]))
     assert torch.equal(belief.distribution(whole).mean(), wanted)
     assert torch.equal(belief.distribution(state).mean(), prior.mean())
@@ -67,7 +67,7 @@ def test_episodes_take_the_places_of_others() -> None:
 def test_fields_have_the_marginals_and_the_laws_correlation(correlated: bool) -> None:
     prior = made.mixture(2, 10, 12)
     belief = Static(correlated)
-    fields = belief.sample_fields(belief.init(prior, LAW), 800, KEYS)
+    fields = belief.sample_fields(belief.init(prior, COVARIANCE), 800, KEYS)
     assert fields.shape == (2, 800, 10, 12)
     for own, row, column in ((0, 0, 0), (1, 9, 11), (0, 4, 5)):
         drawn = fields[own, :, row, column].numpy()
@@ -84,23 +84,23 @@ def test_fields_have_the_marginals_and_the_laws_correlation(correlated: bool) ->
 def test_an_episodes_fields_are_its_own_keys() -> None:
     prior = made.mixture(2, 10, 12)
     belief = Static()
-    both = belief.sample_fields(belief.init(prior, LAW), 4, KEYS)
+    both = belief.sample_fields(belief.init(prior, COVARIANCE), 4, KEYS)
     one = belief.sample_fields(
-        belief.init(prior.select(torch.tensor([1])), LAW), 4, KEYS[1:]
+        belief.init(prior.select(torch.tensor([1])), COVARIANCE), 4, KEYS[1:]
     )
     assert torch.equal(both[1:], one)
-    more = belief.sample_fields(belief.init(prior, LAW), 6, KEYS)
+    more = belief.sample_fields(belief.init(prior, COVARIANCE), 6, KEYS)
     assert torch.equal(more[:, :4], both)
 
 
 def test_a_length_that_is_none_is_refused() -> None:
     with pytest.raises(ConfigError, match="correlation_m"):
-        Law(grid=LAW.grid, correlation_m=-1.0)
+        CovarianceModel(grid=COVARIANCE.grid, correlation_m=-1.0)
 
 
 def test_fields_that_are_drawn_have_the_laws_nugget() -> None:
-    law = replace(made.law(4, 6, 1.5), nugget=0.3)
-    drawn = draw_scores(law, 4000, (7,))[0].flatten(1)
+    covariance = replace(made.covariance(4, 6, 1.5), nugget=0.3)
+    drawn = draw_scores(covariance, 4000, (7,))[0].flatten(1)
     found = np.corrcoef(drawn.numpy().T)[0, 1:3]
     np.testing.assert_allclose(drawn.std(0), 1, atol=0.04)
     np.testing.assert_allclose(found, 0.7 * np.exp(-np.array([1, 4]) / 18), atol=0.04)
@@ -110,10 +110,11 @@ def test_fields_that_are_drawn_have_the_laws_nugget() -> None:
 def test_scores_are_correlated_as_those_of_the_world_along_both_axes(
     correlation_m: float,
 ) -> None:
-    law = made.law(5, 7, correlation_m)
-    drawn = draw_scores(law, 20000, (7,))[0].flatten(1).double()
+    covariance = made.covariance(5, 7, correlation_m)
+    drawn = draw_scores(covariance, 20000, (7,))[0].flatten(1).double()
     down, across = (
-        correlations(size, law.correlation_cells) for size in law.grid.shape
+        correlations(size, covariance.correlation_cells)
+        for size in covariance.grid.shape
     )
     row, column = np.divmod(np.arange(35), 7)
     wanted = down[abs(row[:, None] - row)] * across[abs(column[:, None] - column)]
@@ -122,11 +123,11 @@ def test_scores_are_correlated_as_those_of_the_world_along_both_axes(
 
 
 def test_fields_that_are_told_from_a_table_have_the_ranks_of_their_scores() -> None:
-    prior, law = made.mixture(3, 10, 12), made.law(10, 12)
-    scores = draw_scores(law, 200, (1, 2, 3)).double()
+    prior, covariance = made.mixture(3, 10, 12), made.covariance(10, 12)
+    scores = draw_scores(covariance, 200, (1, 2, 3)).double()
     assert prior.searched
     found, wanted = (
-        Predicted(prior=prior, law=law).fields(scores),
+        Predicted(prior=prior, covariance=covariance).fields(scores),
         fields_of(prior, scores),
     )
     assert float((found - wanted).abs().max()) < 0.01
@@ -135,7 +136,7 @@ def test_fields_that_are_told_from_a_table_have_the_ranks_of_their_scores() -> N
         assert torch.equal(found == end, wanted == end)
         assert float((wanted == end).double().mean()) > 0.02
     known = (
-        Predicted(prior=prior, law=law)
+        Predicted(prior=prior, covariance=covariance)
         .select(torch.tensor([2, 0]))
         .fields(scores[[2, 0]])
     )
@@ -143,13 +144,13 @@ def test_fields_that_are_told_from_a_table_have_the_ranks_of_their_scores() -> N
 
 
 def test_of_ground_that_is_known_for_sure_fields_are_exact() -> None:
-    mixed, law = made.mixture(1, 10, 12), made.law(10, 12)
+    mixed, covariance = made.mixture(1, 10, 12), made.covariance(10, 12)
     sure = replace(mixed, stds=torch.zeros_like(mixed.stds))
-    scores = draw_scores(law, 20, (1,)).double()
+    scores = draw_scores(covariance, 20, (1,)).double()
     both = torch.rand(mixed.shape, generator=torch.Generator().manual_seed(0)) < 0.5
     for prior in (sure, choose(both, mixed, sure), pool([mixed, sure])):
         assert not prior.searched
-        found = Predicted(prior=prior, law=law).fields(scores)
+        found = Predicted(prior=prior, covariance=covariance).fields(scores)
         assert torch.equal(found, fields_of(prior, scores))
     away = fields_of(sure, scores)[:, :, None] - mixed.means[:, None]
     assert float(away.abs().amin(2).max()) < 1e-6

@@ -13,16 +13,16 @@ from torch import Tensor
 
 from benchnav.core.copula import correlations
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.planning.sensing.belief import Law
+from benchnav.planning.sensing.belief import CovarianceModel
 from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.labels import unpacked
-from benchnav.planning.sensing.sensor import Sensed
+from benchnav.planning.sensing.sensor import Measurement
 from tests.planning.sensing import made
 from tests.planning.sensing.made_classes import (
     MEANS,
     STDS,
+    covariance_of,
     even,
-    law_of,
     prediction,
 )
 
@@ -40,14 +40,14 @@ def islands() -> TraversabilityMixture:
 
 
 def enumerated(
-    values: dict[tuple[int, int], float], law: Law, std: float
+    values: dict[tuple[int, int], float], covariance: CovarianceModel, std: float
 ) -> np.ndarray:
     """Probability of the first class, over all labellings; at most one value is 0 or 1."""
     places, seen = list(values), np.array(list(values.values()))
     at = np.array(places)
-    across = correlations(12, law.correlation_cells)
+    across = correlations(12, covariance.correlation_cells)
     away = np.abs(at[:, None] - at[None])
-    covariance = across[away[..., 0]] * across[away[..., 1]] + std**2 * np.eye(len(at))
+    matrix = across[away[..., 0]] * across[away[..., 1]] + std**2 * np.eye(len(at))
     inside = (seen > 0) & (seen < 1)
 
     def shares(label: int, value: float, name: str) -> float:
@@ -62,7 +62,7 @@ def enumerated(
             stats.norm.ppf(shares(own, value, "cdf")) if value < 1 else stats.norm.isf(shares(own, 1.0, "sf"))
             for own, value in zip(labels, seen, strict=True)
         ])  # fmt: skip
-        known, inner = scores[inside], covariance[np.ix_(inside, inside)]
+        known, inner = scores[inside], matrix[np.ix_(inside, inside)]
         found = (
             stats.multivariate_normal(np.zeros(len(known)), inner).pdf(known)
             if len(known)
@@ -74,13 +74,13 @@ def enumerated(
             found *= shares(own, value, "pdf") / stats.norm.pdf(score)
         for place in np.flatnonzero(~inside):
             pull = (
-                np.linalg.solve(inner, covariance[inside, place])
+                np.linalg.solve(inner, matrix[inside, place])
                 if len(known)
                 else np.zeros(0)
             )
             mean, spread = (
                 pull @ known,
-                covariance[place, place] - pull @ covariance[inside, place],
+                matrix[place, place] - pull @ matrix[inside, place],
             )
             off = (scores[place] - mean) / np.sqrt(spread)
             found *= stats.norm.cdf(off) if seen[place] <= 0 else stats.norm.sf(off)
@@ -91,12 +91,12 @@ def enumerated(
         for labels in itertools.product((0, 1), repeat=len(places))
     }
     total, first = 0.0, np.zeros((3, 3))
-    assert law.statistics is not None
+    assert covariance.statistics is not None
     for bits in itertools.product((0, 1), repeat=9):
         field = np.array(bits).reshape(3, 3)
         alike = (field[1:] == field[:-1]).sum() + (field[:, 1:] == field[:, :-1]).sum()
         weight = (
-            np.exp(law.statistics.potts_strength * alike)
+            np.exp(covariance.statistics.potts_strength * alike)
             * known[tuple(field[place] for place in places)]
         )
         total, first = total + weight, first + weight * (field == 0)
@@ -115,8 +115,8 @@ def enumerated(
 def test_probabilities_are_those_of_all_labellings(
     looks: list[dict[tuple[int, int], float]], std: float
 ) -> None:
-    law, prior = law_of(12, 12), islands()
-    state = Classes().init(prior, law)
+    covariance, prior = covariance_of(12, 12), islands()
+    state = Classes().init(prior, covariance)
     # Random numbers of its own for each patch.
     labels = torch.randint(
         -(2**62), 2**62, state.labels.shape, generator=torch.Generator().manual_seed(2)
@@ -130,17 +130,17 @@ def test_probabilities_are_those_of_all_labellings(
             for (row, column), value in values.items():
                 found[own, top + row, left + column] = value
         state = Classes().update(
-            state, Sensed(traversability=found, std=torch.full_like(found, std))
+            state, Measurement(traversability=found, std=torch.full_like(found, std))
         )
-    chance = state.probability()
+    p_first = state.probability()
     patches = [
-        chance[own, row : row + 3, column : column + 3]
+        p_first[own, row : row + 3, column : column + 3]
         for own, (row, column) in enumerate(PLACES)
     ]
     values = {place: value for each in looks for place, value in each.items()}
     # Each patch has 64 chains of its own.
     np.testing.assert_allclose(
-        torch.stack(patches).mean(0), enumerated(values, law, std), atol=0.025
+        torch.stack(patches).mean(0), enumerated(values, covariance, std), atol=0.025
     )
     assert float(torch.stack(patches).std(0).max()) < 0.1
 
@@ -171,13 +171,16 @@ def potts(count: int, size: int, strength: float, seed: int) -> Tensor:
 @pytest.mark.parametrize("count", [20, pytest.param(400, marks=pytest.mark.slow)])
 def test_probabilities_of_classes_are_calibrated_on_simulated_maps(count: int) -> None:
     size, std, strength = 24, 0.1, 0.85
-    law, prior = law_of(size, size, 1.5, strength), even(count, size, size)
-    first, scores = potts(count, size, strength, 1), made.scores(law, count, 3)
+    covariance, prior = (
+        covariance_of(size, size, 1.5, strength),
+        even(count, size, size),
+    )
+    first, scores = potts(count, size, strength, 1), made.scores(covariance, count, 3)
     mean, deviation = (
         torch.where(first, own[0], own[1]).double() for own in (MEANS, STDS)
     )
     generator, line = np.random.default_rng(5), torch.arange(size)
-    state = Classes().init(prior, law)
+    state = Classes().init(prior, covariance)
     for step in range(12):
         near = (
             (line[:, None] - 5 - step) ** 2 + (line - 5 - 0.5 * step) ** 2 <= 4
@@ -187,14 +190,14 @@ def test_probabilities_of_classes_are_calibrated_on_simulated_maps(count: int) -
             near, (mean + deviation * (scores + noise)).clamp(0, 1), torch.nan
         )
         state = Classes().update(
-            state, Sensed(traversability=found, std=torch.full_like(found, std))
+            state, Measurement(traversability=found, std=torch.full_like(found, std))
         )
-    chance, seen = state.probability(), state.copula.observed
+    p_first, seen = state.probability(), state.copula.observed
     reach = torch.nn.functional.max_pool2d(seen[:, None].double(), 9, 1, 4)[:, 0] > 0
     own = (first & seen).flatten(1).sum(1) / seen.flatten(1).sum(1)
     touching = ((own > 0.1) & (own < 0.9))[:, None, None].expand_as(seen)
     for cells in (seen, reach & ~seen, reach & ~seen & touching):
-        told, truth = chance[cells], first[cells].double()
+        told, truth = p_first[cells], first[cells].double()
         score = -torch.where(first[cells], told, 1 - told).log().mean()
         assert float(score) < np.log(2) - 0.05
         # The map is the unit: cells of one hang together.
@@ -220,17 +223,20 @@ def test_probabilities_of_classes_are_calibrated_on_simulated_maps(count: int) -
 
 def test_where_a_label_is_settled_all_chains_hold_it() -> None:
     """Also where scores that fit together badly have turned a patch."""
-    law, prior = law_of(6, 8), even(40, 6, 8)
-    generator, state = torch.Generator().manual_seed(0), Classes().init(prior, law)
+    covariance, prior = covariance_of(6, 8), even(40, 6, 8)
+    generator, state = (
+        torch.Generator().manual_seed(0),
+        Classes().init(prior, covariance),
+    )
     for step in range(4):
         found = torch.full(prior.shape, torch.nan, dtype=torch.float64)
         found[:, 2:4, 2 * step : 2 * step + 2] = torch.rand(
             40, 2, 2, generator=generator
         ).double()
         state = Classes().update(
-            state, Sensed(traversability=found, std=torch.full_like(found, 0.1))
+            state, Measurement(traversability=found, std=torch.full_like(found, 0.1))
         )
         share = unpacked(state.labels).double().mean(-1)
-        settled = state.copula.observed & ((state.chance - 0.5).abs() > 0.4999)
+        settled = state.copula.observed & ((state.p_first - 0.5).abs() > 0.4999)
         assert settled.any()
-        assert float((share - state.chance)[settled].abs().max()) < 0.1
+        assert float((share - state.p_first)[settled].abs().max()) < 0.1

@@ -12,14 +12,14 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning.sensing.classes import Classes
 from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.labels import unpacked
-from benchnav.planning.sensing.sensor import Sensed
+from benchnav.planning.sensing.sensor import Measurement
 from tests.planning.sensing import made
 from tests.planning.sensing.made_classes import (
     MEANS,
     STDS,
     after,
+    covariance_of,
     even,
-    law_of,
     looked,
     mixed,
     prediction,
@@ -34,9 +34,9 @@ LOOKS = (
 
 def test_without_look_alikes_it_is_the_copula_belief() -> None:
     prior, other = mixed(2, 12, 14), mixed(2, 12, 14, seed=1)
-    law = law_of(12, 14, pairs=())
+    covariance = covariance_of(12, 14, pairs=())
     mine, plain = Classes(0.8, 5), Copula(0.8, 5)
-    state, wanted = mine.init(prior, law), plain.init(prior, law)
+    state, wanted = mine.init(prior, covariance), plain.init(prior, covariance)
     for sensed, new in zip(LOOKS, (None, other, None), strict=True):
         before, was = state, wanted
         state, wanted = (
@@ -59,8 +59,8 @@ def test_cells_that_cannot_be_of_a_pair_are_as_under_the_copula_belief() -> None
     weights = torch.zeros(2, 5, 12, 14, dtype=torch.float64)
     weights[:, 2] = 1
     weights[1, :2, :, 7:], weights[1, 2, :, 7:] = 0.5, 0  # in the second episode alone
-    prior, law = prediction(weights), law_of(12, 14)
-    state, plain = Classes().init(prior, law), Copula().init(prior, law)
+    prior, covariance = prediction(weights), covariance_of(12, 14)
+    state, plain = Classes().init(prior, covariance), Copula().init(prior, covariance)
     for sensed in LOOKS:
         state, plain = Classes().update(state, sensed), Copula().update(plain, sensed)
     assert torch.equal(state.copula.mean[0], plain.mean[0])
@@ -69,7 +69,7 @@ def test_cells_that_cannot_be_of_a_pair_are_as_under_the_copula_belief() -> None
 
 def test_before_anything_is_sensed_it_is_the_prediction() -> None:
     prior = mixed(2, 12, 14)
-    state = Classes().init(prior, law_of(12, 14))
+    state = Classes().init(prior, covariance_of(12, 14))
     found = Classes().distribution(state)
     for value in (0.1, 0.5, 0.9, 1.0):
         torch.testing.assert_close(
@@ -84,14 +84,14 @@ def test_before_anything_is_sensed_it_is_the_prediction() -> None:
 
 def test_cells_for_themselves_follow_bayes_rule() -> None:
     prior = mixed(2, 12, 14)
-    law = law_of(12, 14, 0.0, 0.0)
+    covariance = covariance_of(12, 14, 0.0, 0.0)
     values = {(3, 3): 0.62, (4, 4): 0.3, (5, 5): 0.0, (3, 10): 0.8, (4, 10): 1.0}
-    state = after(Classes(), prior, law, looked((2, 12, 14), values, std=1e-3))
+    state = after(Classes(), prior, covariance, looked((2, 12, 14), values, std=1e-3))
     wanted = state.odds.clone()
     for (row, column), value in values.items():
         likely = [
             look.prior.log_prob(torch.full(prior.shape, value).double())[:, row, column]
-            for look in state.looks
+            for look in state.per_class
         ]
         wanted[:, row, column] += likely[0] - likely[1]
     own = state.pair > 0
@@ -104,15 +104,15 @@ def test_cells_for_themselves_follow_bayes_rule() -> None:
 
 
 def test_further_looks_at_a_cell_count_with_their_own_noise() -> None:
-    prior, law = mixed(1, 12, 14), law_of(12, 14, 0.0, 0.0)
+    prior, covariance = mixed(1, 12, 14), covariance_of(12, 14, 0.0, 0.0)
     values, stds = (0.62, 0.5, 0.7), (0.5, 0.3, 0.4)
     looks = [
         looked((1, 12, 14), {(3, 3): value}, std)
         for value, std in zip(values, stds, strict=True)
     ]
-    state = after(Classes(), prior, law, *looks)
+    state = after(Classes(), prior, covariance, *looks)
     log_odds = float(state.odds[0, 3, 3])
-    for sign, look in zip((1, -1), state.looks, strict=True):
+    for sign, look in zip((1, -1), state.per_class, strict=True):
         own = [torch.full(prior.shape, value).double() for value in values]
         scores = np.array(
             [float(look.prior.to_normal(value)[0][0, 3, 3]) for value in own]
@@ -129,36 +129,49 @@ def test_further_looks_at_a_cell_count_with_their_own_noise() -> None:
 
 
 def test_strength_and_length_of_ones_own_go_before_those_of_the_law() -> None:
-    prior, law, sensed = even(2, 12, 14), law_of(12, 14, 1.5, 0.3), LOOKS[0]
-    plain = after(Classes(), prior, law, sensed)
-    strong = after(Classes(strength=0.8), prior, law, sensed)
-    assert torch.equal(
-        strong.chance, after(Classes(), prior, law_of(12, 14, 1.5, 0.8), sensed).chance
+    prior, covariance, sensed = (
+        even(2, 12, 14),
+        covariance_of(12, 14, 1.5, 0.3),
+        LOOKS[0],
     )
-    beside = (strong.chance - 0.5).abs()[:, 2, 3] - (plain.chance - 0.5).abs()[:, 2, 3]
+    plain = after(Classes(), prior, covariance, sensed)
+    strong = after(Classes(strength=0.8), prior, covariance, sensed)
+    assert torch.equal(
+        strong.p_first,
+        after(Classes(), prior, covariance_of(12, 14, 1.5, 0.8), sensed).p_first,
+    )
+    beside = (strong.p_first - 0.5).abs()[:, 2, 3] - (plain.p_first - 0.5).abs()[
+        :, 2, 3
+    ]
     assert bool((beside > 0.05).all())
-    short = after(Classes(0.6), prior, law, sensed)
+    short = after(Classes(0.6), prior, covariance, sensed)
     assert torch.equal(
         short.copula.mean,
-        after(Classes(), prior, law_of(12, 14, 0.6, 0.3), sensed).copula.mean,
+        after(Classes(), prior, covariance_of(12, 14, 0.6, 0.3), sensed).copula.mean,
     )
-    narrow = after(Classes(window=1), prior, law, *LOOKS)
+    narrow = after(Classes(window=1), prior, covariance, *LOOKS)
     assert not torch.equal(
-        narrow.copula.mean, after(Classes(), prior, law, *LOOKS).copula.mean
+        narrow.copula.mean, after(Classes(), prior, covariance, *LOOKS).copula.mean
     )
 
 
 def test_a_fitted_strength_counts_up_to_the_critical_one() -> None:
-    prior, law, sensed = even(2, 12, 14), law_of(12, 14, strength=2.26), LOOKS[0]
-    found = after(Classes(), prior, law, sensed).chance
-    assert torch.equal(found, after(Classes(strength=0.88), prior, law, sensed).chance)
+    prior, covariance, sensed = (
+        even(2, 12, 14),
+        covariance_of(12, 14, strength=2.26),
+        LOOKS[0],
+    )
+    found = after(Classes(), prior, covariance, sensed).p_first
+    assert torch.equal(
+        found, after(Classes(strength=0.88), prior, covariance, sensed).p_first
+    )
     assert not torch.equal(
-        found, after(Classes(strength=2.26), prior, law, sensed).chance
+        found, after(Classes(strength=2.26), prior, covariance, sensed).p_first
     )
 
 
 def test_what_is_known_is_an_episodes_own() -> None:
-    prior, law = mixed(3, 30, 40), law_of(30, 40)
+    prior, covariance = mixed(3, 30, 40), covariance_of(30, 40)
     generator = torch.Generator().manual_seed(4)
     looks = []
     for step in range(4):
@@ -173,37 +186,37 @@ def test_what_is_known_is_an_episodes_own() -> None:
                     .clamp(max=1)
                 )
                 found[own, row : row + 2 + own, column : column + 3] = block
-        looks.append(Sensed(traversability=found, std=torch.full_like(found, 0.1)))
-    state = after(Classes(window=12), prior, law, *looks)
+        looks.append(Measurement(traversability=found, std=torch.full_like(found, 0.1)))
+    state = after(Classes(window=12), prior, covariance, *looks)
     for own in range(3):
         kept = torch.tensor([own])
         alone = after(
             Classes(window=12),
             prior.select(kept),
-            law,
+            covariance,
             *(each.select(kept) for each in looks),
         )
         chosen = Classes().select(state, kept)
         assert torch.equal(alone.labels, chosen.labels)
-        torch.testing.assert_close(alone.chance, chosen.chance, rtol=0, atol=1e-9)
+        torch.testing.assert_close(alone.p_first, chosen.p_first, rtol=0, atol=1e-9)
         torch.testing.assert_close(
             alone.copula.mean, chosen.copula.mean, rtol=0, atol=1e-9
         )
 
 
 def test_an_update_changes_nothing_that_it_was_given() -> None:
-    state = after(Classes(), mixed(2, 12, 14), law_of(12, 14), LOOKS[0])
+    state = after(Classes(), mixed(2, 12, 14), covariance_of(12, 14), LOOKS[0])
     kept = state.clone()
     Classes().update(state, LOOKS[1], mixed(2, 12, 14, seed=2))
-    for name in ("chance", "labels", "density", "sweeps", "odds"):
+    for name in ("p_first", "labels", "density", "sweeps", "odds"):
         assert torch.equal(getattr(state, name), getattr(kept, name))
     assert torch.equal(state.copula.mean, kept.copula.mean)
 
 
 def test_observed_cells_keep_their_traversability_whatever_their_class() -> None:
-    prior, law = even(1, 12, 14), law_of(12, 14)
+    prior, covariance = even(1, 12, 14), covariance_of(12, 14)
     values = {(3, 3): 0.62, (3, 4): 0.6, (5, 6): 0.66}
-    state = after(Classes(), prior, law, looked((1, 12, 14), values, std=1e-3))
+    state = after(Classes(), prior, covariance, looked((1, 12, 14), values, std=1e-3))
     assert 0.02 < float(state.probability()[0, 3, 3]) < 0.98
     found = Classes().distribution(state)
     for place, value in values.items():
@@ -214,7 +227,7 @@ def test_observed_cells_keep_their_traversability_whatever_their_class() -> None
 
 
 def test_quantiles_of_some_cells_are_those_of_the_distribution() -> None:
-    state = after(Classes(), mixed(2, 12, 14), law_of(12, 14), *LOOKS)
+    state = after(Classes(), mixed(2, 12, 14), covariance_of(12, 14), *LOOKS)
     cells = torch.zeros(2, 12, 14, dtype=torch.bool)
     cells[0, 2:7, 2:12], cells[1, 9:12, 3:9] = True, True
     found, wanted = Classes().at(state, cells), Classes().distribution(state).at(cells)
@@ -224,8 +237,8 @@ def test_quantiles_of_some_cells_are_those_of_the_distribution() -> None:
 
 
 def test_only_cells_of_which_something_is_learnt_change() -> None:
-    prior, law = even(1, 40, 40), law_of(40, 40)
-    before = Classes().init(prior, law)
+    prior, covariance = even(1, 40, 40), covariance_of(40, 40)
+    before = Classes().init(prior, covariance)
     state = Classes().update(before, looked((1, 40, 40), {(5, 5): 0.9, (5, 6): 0.95}))
     changed = Classes().changed(before, state)
     assert bool(changed[0, 4:8, 4:8].all())
@@ -244,15 +257,15 @@ LOOKS_NOTHING = looked((1, 40, 40), {})
 
 
 def test_sensed_traversability_is_kept_under_a_new_prediction() -> None:
-    prior, law = even(2, 12, 14), law_of(12, 14)
+    prior, covariance = even(2, 12, 14), covariance_of(12, 14)
     new = mixed(2, 12, 14)
     values = {(3, 3): 0.95, (3, 4): 0.93, (4, 3): 0.9, (5, 10): 0.3, (5, 11): 1.0}
     sensed = looked((2, 12, 14), values)
     changed = Classes().update(
-        after(Classes(), prior, law, sensed), looked((2, 12, 14), {}), new
+        after(Classes(), prior, covariance, sensed), looked((2, 12, 14), {}), new
     )
-    wanted = after(Classes(), new, law, sensed)
-    for one, other in zip(changed.looks, wanted.looks, strict=True):
+    wanted = after(Classes(), new, covariance, sensed)
+    for one, other in zip(changed.per_class, wanted.per_class, strict=True):
         torch.testing.assert_close(
             one.lower, other.lower, rtol=0, atol=1e-3, equal_nan=True
         )
@@ -267,10 +280,10 @@ def test_sensed_traversability_is_kept_under_a_new_prediction() -> None:
 
 
 def test_of_a_new_prediction_the_cells_count_that_are_others() -> None:
-    prior, law = mixed(2, 12, 14), law_of(12, 14)
+    prior, covariance = mixed(2, 12, 14), covariance_of(12, 14)
     anew = torch.zeros(2, 12, 14, dtype=torch.bool)
     anew[0, :, 7:] = True
-    first = after(Classes(), prior, law, LOOKS[0])
+    first = after(Classes(), prior, covariance, LOOKS[0])
     state = Classes().update(
         first, looked((2, 12, 14), {}), prior.replaced(anew, even(2, 12, 14))
     )
@@ -278,7 +291,7 @@ def test_of_a_new_prediction_the_cells_count_that_are_others() -> None:
     assert torch.equal(state.odds, torch.where(anew, 0.0, first.odds))
     # In the other episode, and of seen ground far from λ that was scored anew, all is
     # as it was.
-    for name in ("labels", "chance", "density"):
+    for name in ("labels", "p_first", "density"):
         assert torch.equal(getattr(state, name)[1], getattr(first, name)[1])
     assert torch.equal(state.sweeps[1], first.sweeps[1])
     assert torch.equal(state.copula.mean[1], first.copula.mean[1])
@@ -288,11 +301,11 @@ def test_of_a_new_prediction_the_cells_count_that_are_others() -> None:
 
 
 def test_ground_that_is_seen_later_has_patches_of_either_class() -> None:
-    law, unseen = (
-        law_of(12, 14),
+    covariance, unseen = (
+        covariance_of(12, 14),
         prediction(torch.eye(5).double()[2].view(1, 5, 1, 1).expand(1, 5, 12, 14)),
     )
-    before = Classes().init(unseen, law)
+    before = Classes().init(unseen, covariance)
     # Whatever the labels were of ground that could be of no pair.
     for labels in (before.labels, torch.full_like(before.labels, -1)):
         state = Classes().update(
@@ -306,7 +319,7 @@ def test_ground_that_is_seen_later_has_patches_of_either_class() -> None:
 
 
 def test_cells_of_no_class_are_as_under_the_copula_belief() -> None:
-    law, chosen = law_of(12, 14), torch.zeros(2, 12, 14, dtype=torch.bool)
+    covariance, chosen = covariance_of(12, 14), torch.zeros(2, 12, 14, dtype=torch.bool)
     chosen[:, :, :5] = True
     unseen = TraversabilityMixture(
         *(torch.full((2, 1, 12, 14), own).double() for own in (1.0, 0.6, 0.2))
@@ -316,8 +329,8 @@ def test_cells_of_no_class_are_as_under_the_copula_belief() -> None:
     assert prior.group == (0, 1, 2, 3, 4, -1)
     sensed = looked((2, 12, 14), {(3, 10): 0.9, (4, 10): 1.0})
     state, plain = (
-        after(Classes(), prior, law, sensed),
-        Copula().update(Copula().init(prior, law), sensed),
+        after(Classes(), prior, covariance, sensed),
+        Copula().update(Copula().init(prior, covariance), sensed),
     )
     assert torch.equal(state.pair > 0, (mixed(2, 12, 14).weights[:, 2] < 0.5) & chosen)
     assert torch.equal(state.copula.mean, plain.mean)
@@ -331,13 +344,15 @@ def test_cells_of_no_class_are_as_under_the_copula_belief() -> None:
 
 
 def test_episodes_that_take_the_places_of_others_are_what_they_were_alone() -> None:
-    belief, law, more = (
+    belief, covariance, more = (
         Classes(),
-        law_of(12, 14),
+        covariance_of(12, 14),
         LOOKS[2].select(torch.tensor([0, 0, 0])),
     )
-    one = after(belief, mixed(3, 12, 14), law, LOOKS[0].select(torch.tensor([0, 0, 0])))
-    two = after(Classes(0.8), mixed(2, 12, 14, seed=1), law, LOOKS[1])
+    one = after(
+        belief, mixed(3, 12, 14), covariance, LOOKS[0].select(torch.tensor([0, 0, 0]))
+    )
+    two = after(Classes(0.8), mixed(2, 12, 14, seed=1), covariance, LOOKS[1])
     whole, cells = (
         belief.put(one, torch.tensor([2, 0]), two),
         torch.ones(3, 12, 14, dtype=torch.bool),
@@ -359,15 +374,16 @@ def test_episodes_that_take_the_places_of_others_are_what_they_were_alone() -> N
 
 
 def test_a_length_can_be_estimated() -> None:
-    prior, law = even(1, 24, 24), law_of(24, 24, 1.5)
-    scores = made.scores(law_of(24, 24, 0.5), 1)
+    prior, covariance = even(1, 24, 24), covariance_of(24, 24, 1.5)
+    scores = made.scores(covariance_of(24, 24, 0.5), 1)
     field = torch.full((1, 24, 24), torch.nan, dtype=torch.float64)
     field[:, 10:14, 4:20] = (MEANS[0] + STDS[0] * scores)[:, 10:14, 4:20].clamp(
         0.01, 0.99
     )
-    sensed = Sensed(traversability=field, std=torch.full_like(field, 0.1))
+    sensed = Measurement(traversability=field, std=torch.full_like(field, 0.1))
     short, fixed = (
-        after(Classes(length), prior, law, sensed) for length in ("estimated", "world")
+        after(Classes(length), prior, covariance, sensed)
+        for length in ("estimated", "world")
     )
     assert float(short.copula.field.length) < 2.0
     assert float(fixed.copula.field.length) == 3.0
@@ -376,11 +392,11 @@ def test_a_length_can_be_estimated() -> None:
 def test_fields_that_are_drawn_have_the_distribution_and_patches() -> None:
     weights = torch.zeros(1, 5, 12, 14, dtype=torch.float64)
     weights[:, 0], weights[:, 1] = 0.7, 0.3
-    prior, law = prediction(weights), law_of(12, 14)
+    prior, covariance = prediction(weights), covariance_of(12, 14)
     state = after(
         Classes(),
         prior,
-        law,
+        covariance,
         looked((1, 12, 14), {(3, 3): 0.95, (3, 4): 0.9, (4, 3): 0.93}),
     )
     fields = Classes().sample_fields(state, 250, (7,))

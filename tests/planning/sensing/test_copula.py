@@ -17,38 +17,47 @@ from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.quantiles import LEVELS, QuantileDistribution
-from benchnav.planning.sensing.belief import Law
+from benchnav.planning.sensing.belief import CovarianceModel
 from benchnav.planning.sensing.copula import Copula, CopulaState
 from benchnav.planning.sensing.gaussian import Observed, condition, predict
 from benchnav.planning.sensing.lattice import Lattice
-from benchnav.planning.sensing.sensor import LEAST_STD, Contact, Moment, Probe, Sensed
+from benchnav.planning.sensing.sensor import (
+    MIN_STD,
+    Contact,
+    Measurement,
+    NoiseKey,
+    Probe,
+)
 from tests.planning.sensing import made
 
 HEIGHT, WIDTH = 14, 16
-LAW = made.law(HEIGHT, WIDTH, 1.5)
+COVARIANCE = made.covariance(HEIGHT, WIDTH, 1.5)
 INF = float("inf")
 FILE = "benchnav.planning.sensing.copula:Copula"
 
 
 def looked(
-    values: dict[tuple[int, int], float], std: float = LEAST_STD, batch: int = 1
-) -> Sensed:
+    values: dict[tuple[int, int], float], std: float = MIN_STD, batch: int = 1
+) -> Measurement:
     found = torch.full((batch, HEIGHT, WIDTH), torch.nan, dtype=torch.float64)
     for (row, column), value in values.items():
         found[:, row, column] = value
-    return Sensed(traversability=found, std=torch.full_like(found, std))
+    return Measurement(traversability=found, std=torch.full_like(found, std))
 
 
 def after(
-    belief: Copula, prior: TraversabilityDistribution, *looks: Sensed, law: Law = LAW
+    belief: Copula,
+    prior: TraversabilityDistribution,
+    *looks: Measurement,
+    covariance: CovarianceModel = COVARIANCE,
 ) -> CopulaState:
-    state = belief.init(prior, law)
+    state = belief.init(prior, covariance)
     for sensed in looks:
         state = belief.update(state, sensed)
     return state
 
 
-def covariance(
+def cov_between(
     one: list[tuple[int, int]], other: list[tuple[int, int]], length: float = 3.0
 ) -> np.ndarray:
     away = ((np.array(one)[:, None] - np.array(other)[None]) ** 2).sum(-1)
@@ -60,7 +69,7 @@ EVERY = [(row, column) for row in range(HEIGHT) for column in range(WIDTH)]
 
 def test_before_anything_is_sensed_it_is_the_prediction() -> None:
     prior = made.mixture(2, HEIGHT, WIDTH)
-    found = Copula().distribution(Copula().init(prior, LAW))
+    found = Copula().distribution(Copula().init(prior, COVARIANCE))
     for level in (0.1, 0.5, 0.9):
         torch.testing.assert_close(
             found.quantile(level), prior.quantile(level), atol=1e-9, rtol=0
@@ -77,8 +86,8 @@ def test_scores_that_are_observed_condition_the_field_as_linear_algebra_says() -
     for place in where:
         mask[0][place] = True
     score = prior.at(mask).to_normal(values[None])[0].numpy().ravel()
-    inner = covariance(where, where) + 0.04 * np.eye(3)
-    across = covariance(where, EVERY)
+    inner = cov_between(where, where) + 0.04 * np.eye(3)
+    across = cov_between(where, EVERY)
     mean = (across.T @ np.linalg.solve(inner, score)).reshape(HEIGHT, WIDTH)
     variance = 1 - (across * np.linalg.solve(inner, across)).sum(0).reshape(
         HEIGHT, WIDTH
@@ -97,16 +106,18 @@ def test_of_a_nugget_neighbours_know_nothing_and_a_cell_that_was_sensed_all(
     prior = made.mixture(1, HEIGHT, WIDTH)
     places = {(4, 4): 0.55, (4, 5): 0.3}
     told = looked(places, std=0.01)
-    belief, law = (
-        (Copula(), replace(LAW, nugget=0.4)) if by_law else (Copula(nugget=0.4), LAW)
+    belief, covariance = (
+        (Copula(), replace(COVARIANCE, nugget=0.4))
+        if by_law
+        else (Copula(nugget=0.4), COVARIANCE)
     )
-    state = after(belief, prior, told, law=law)
+    state = after(belief, prior, told, covariance=covariance)
     where = list(places)
     mask = told.mask
     score = prior.at(mask).to_normal(told.traversability[mask][None])[0].numpy().ravel()
     same = np.eye(HEIGHT * WIDTH)[[EVERY.index(place) for place in where]]
-    inner = 0.6 * covariance(where, where) + (0.4 + 1e-4) * np.eye(2)
-    across = 0.6 * covariance(where, EVERY) + 0.4 * same
+    inner = 0.6 * cov_between(where, where) + (0.4 + 1e-4) * np.eye(2)
+    across = 0.6 * cov_between(where, EVERY) + 0.4 * same
     mean = (across.T @ np.linalg.solve(inner, score)).reshape(HEIGHT, WIDTH)
     variance = 1 - (across * np.linalg.solve(inner, across)).sum(0).reshape(
         HEIGHT, WIDTH
@@ -126,7 +137,7 @@ def test_nuggets_that_are_no_share_are_refused(nugget: float) -> None:
     with pytest.raises(ConfigError, match="nugget"):
         Copula(nugget=nugget)
     with pytest.raises(ConfigError, match="nugget"):
-        replace(LAW, nugget=nugget)
+        replace(COVARIANCE, nugget=nugget)
 
 
 def test_ground_at_zero_is_an_interval_up_to_the_atoms_end() -> None:
@@ -201,7 +212,7 @@ def test_the_same_look_without_noise_changes_nothing() -> None:
     state = after(Copula(), prior, looked({(6, 6): 0.5}))
     again = Copula().update(state, looked({(6, 6): 0.5}))
     assert again.mean is state.mean or torch.equal(again.mean, state.mean)
-    assert float(again.noise_std[0, 6, 6]) == LEAST_STD
+    assert float(again.noise_std[0, 6, 6]) == MIN_STD
 
 
 def test_the_order_of_looks_and_the_other_episodes_do_not_matter() -> None:
@@ -218,13 +229,13 @@ def test_the_order_of_looks_and_the_other_episodes_do_not_matter() -> None:
     )
     torch.testing.assert_close(forward.mean, backward.mean, atol=0.012, rtol=0)
     torch.testing.assert_close(forward.std, backward.std, atol=0.012, rtol=0)
-    state = Copula().init(prior, LAW)
+    state = Copula().init(prior, COVARIANCE)
     for place, sensed in enumerate(looks):
         both = sensed.traversability.repeat(2, 1, 1)
         both[1] = torch.nan
         both[1, 2 : 4 + 4 * place, 2 + 3 * place] = 0.4
         state = Copula().update(
-            state, Sensed(traversability=both, std=torch.full_like(both, 0.1))
+            state, Measurement(traversability=both, std=torch.full_like(both, 0.1))
         )
     assert torch.equal(state.mean[:1], forward.mean)
     assert torch.equal(state.std[:1], forward.std)
@@ -233,15 +244,15 @@ def test_the_order_of_looks_and_the_other_episodes_do_not_matter() -> None:
 
 
 def test_nothing_is_told_beyond_four_lengths() -> None:
-    law = made.law(40, 40, 1.0)
+    covariance = made.covariance(40, 40, 1.0)
     prior = made.mixture(1, 40, 40)
     found = torch.full((1, 40, 40), torch.nan, dtype=torch.float64)
     found[0, 20, 20] = 0.2
     state = after(
         Copula(),
         prior,
-        Sensed(traversability=found, std=torch.full_like(found, 0.01)),
-        law=law,
+        Measurement(traversability=found, std=torch.full_like(found, 0.01)),
+        covariance=covariance,
     )
     told = (state.mean != 0).nonzero()[:, 1:] - 20
     assert 5 <= int(told.abs().max()) <= 8
@@ -253,24 +264,29 @@ def test_nothing_is_told_beyond_four_lengths() -> None:
 
 
 def test_the_reach_is_of_an_episodes_own_cells_whatever_others_sense() -> None:
-    law, prior = made.law(HEIGHT, WIDTH, 0.5), made.mixture(2, HEIGHT, WIDTH)
+    covariance, prior = (
+        made.covariance(HEIGHT, WIDTH, 0.5),
+        made.mixture(2, HEIGHT, WIDTH),
+    )
     sensed = looked({(6, 6): 0.5}, 0.1, batch=2)
     sensed.traversability[1, 0, 0] = sensed.traversability[1, 13, 15] = 0.4
-    both = after(Copula(), prior, sensed, law=law)
+    both = after(Copula(), prior, sensed, covariance=covariance)
     first = torch.tensor([0])
-    alone = after(Copula(), prior.select(first), sensed.select(first), law=law)
+    alone = after(
+        Copula(), prior.select(first), sensed.select(first), covariance=covariance
+    )
     assert torch.equal(both.mean[:1] != 0, alone.mean != 0)
     assert torch.equal(both.std[:1] != 1, alone.std != 1)
 
 
 def simulated(
     length: float, batch: int = 15, size: int = 24
-) -> tuple[TraversabilityMixture, Tensor, Sensed]:
+) -> tuple[TraversabilityMixture, Tensor, Measurement]:
     """Ground of some ℓ in metres, of which the cells along a winding way are observed
     with noise.
     """
-    law = made.law(size, size, length)
-    prior, score = made.mixture(batch, size, size), made.scores(law, batch)
+    covariance = made.covariance(size, size, length)
+    prior, score = made.mixture(batch, size, size), made.scores(covariance, batch)
     noise = torch.from_numpy(np.random.default_rng(0).normal(0, 0.1, score.shape))
     row = np.arange(size)
     way = abs(row[:, None] - size / 2 - 6 * np.sin(row / 4)) <= 3.0
@@ -278,16 +294,20 @@ def simulated(
         ~torch.from_numpy(way), torch.nan
     )
     assert 140 <= way.sum() <= 170
-    return prior, field, Sensed(traversability=field, std=torch.full_like(field, 0.1))
+    return (
+        prior,
+        field,
+        Measurement(traversability=field, std=torch.full_like(field, 0.1)),
+    )
 
 
 @pytest.mark.parametrize("length", [0.6, 1.0, 1.5, 2.5])
 def test_the_length_that_is_estimated_is_that_of_the_ground(length: float) -> None:
     prior, _, sensed = simulated(length)
-    law = made.law(24, 24, 99.0)
+    covariance = made.covariance(24, 24, 99.0)
     for window in (256, 64):
-        state = after(Copula("estimated", window), prior, sensed, law=law)
-        found = state.field.length * law.grid.resolution_m
+        state = after(Copula("estimated", window), prior, sensed, covariance=covariance)
+        found = state.field.length * covariance.grid.resolution_m
         assert float(found.median()) == pytest.approx(length, rel=0.2)
 
 
@@ -317,7 +337,7 @@ def test_an_estimate_is_the_mode_of_the_posterior_by_brute_force() -> None:
         held = high > low
         modes = []
         grid = 1.5 * 2 ** (np.arange(-8, 9) / 4)
-        for length in grid / LAW.grid.resolution_m:
+        for length in grid / COVARIANCE.grid.resolution_m:
             along = correlations(WIDTH, length)
             away = abs(np.array(where)[:, None] - np.array(where)[None])
             inner = along[away[..., 0]] * along[away[..., 1]] + 0.01 * np.eye(
@@ -332,26 +352,28 @@ def test_an_estimate_is_the_mode_of_the_posterior_by_brute_force() -> None:
             spread = inner[np.ix_(held, held)] - gain @ inner[np.ix_(~held, held)]
             end = (high[held] - gain @ low[~held]) / np.sqrt(np.diag(spread))
             assert len(end) == 1
-            away_from_median = np.log(length * LAW.grid.resolution_m / 1.5) / np.log(2)
+            away_from_median = np.log(
+                length * COVARIANCE.grid.resolution_m / 1.5
+            ) / np.log(2)
             modes.append(numbers + stats.norm.logcdf(end)[0] - away_from_median**2 / 2)
         expected = grid[int(np.argmax(modes))]
-        assert float(state.field.length) * LAW.grid.resolution_m == pytest.approx(
-            expected
-        )
+        assert float(
+            state.field.length
+        ) * COVARIANCE.grid.resolution_m == pytest.approx(expected)
         assert expected != 1.5
 
 
 def test_a_length_is_estimated_each_time_that_observations_have_doubled() -> None:
     prior, field, _ = simulated(0.6, batch=2)
-    belief, law = Copula("estimated", window=40), made.law(24, 24)
+    belief, covariance = Copula("estimated", window=40), made.covariance(24, 24)
     places = (~field[0].isnan()).nonzero().tolist()
-    state, found = belief.init(prior, law), []
+    state, found = belief.init(prior, covariance), []
     assert state.field.length.tolist() == [3.0, 3.0]
     for row, column in places[:100]:
         value = torch.full_like(field, torch.nan)
         value[0, row, column] = field[0, row, column]
         state = belief.update(
-            state, Sensed(traversability=value, std=torch.full_like(value, 0.1))
+            state, Measurement(traversability=value, std=torch.full_like(value, 0.1))
         )
         found.append(int(state.estimated_from[0]))
     assert sorted(set(found)) == [0, 8, 16, 32, 64]
@@ -360,16 +382,21 @@ def test_a_length_is_estimated_each_time_that_observations_have_doubled() -> Non
     assert float(state.field.length[1]) == 3.0
     # All cells are then as if that length had been believed from the beginning.
     short, _, sensed = simulated(0.6)
-    state = after(belief, short, sensed, law=law)
+    state = after(belief, short, sensed, covariance=covariance)
     for own, length in enumerate(
-        (state.field.length * law.grid.resolution_m).tolist()[:3]
+        (state.field.length * covariance.grid.resolution_m).tolist()[:3]
     ):
         own_ = torch.tensor([own])
         one = after(
-            Copula(length, window=40), short.select(own_), sensed.select(own_), law=law
+            Copula(length, window=40),
+            short.select(own_),
+            sensed.select(own_),
+            covariance=covariance,
         )
         torch.testing.assert_close(state.mean[own_], one.mean, atol=1e-6, rtol=0)
-        alone = after(belief, short.select(own_), sensed.select(own_), law=law)
+        alone = after(
+            belief, short.select(own_), sensed.select(own_), covariance=covariance
+        )
         assert torch.equal(alone.mean, state.mean[own_])
         drawn = belief.sample_fields(state, 2, tuple(range(15)))[own_]
         assert torch.equal(belief.sample_fields(alone, 2, (own,)), drawn)
@@ -385,7 +412,7 @@ def test_the_length_that_is_believed_takes_the_worlds_place(
         Copula(),
         prior,
         looked({(6, 6): 0.2}),
-        law=made.law(HEIGHT, WIDTH, correlation_m),
+        covariance=made.covariance(HEIGHT, WIDTH, correlation_m),
     )
     assert torch.equal(state.mean, other.mean)
     if correlation_m == 0:
@@ -403,12 +430,12 @@ def test_many_observations_of_a_smooth_field_are_taken_by_a_lattice(
         lambda *given: used.append(len(given[2][0])) or around(*given),
     )
     for length_m, window in ((1.5, 8), (2.5, 64), (2.5, 8)):
-        law = made.law(HEIGHT, WIDTH, length_m)
+        covariance = made.covariance(HEIGHT, WIDTH, length_m)
         after(
             Copula(window=window),
             made.mixture(1, HEIGHT, WIDTH),
             looked(dict.fromkeys(EVERY[:20], 0.5), 0.1),
-            law=law,
+            covariance=covariance,
         )
     assert used == [20]  # where ℓ is five cells and there is room for eight alone
 
@@ -423,7 +450,7 @@ def test_an_approximation_that_errs_makes_no_cell_less_sure(
         mean, variance, skew = predict(*given)
         return mean + 0.1, wider * variance, skew
 
-    monkeypatch.setattr("benchnav.planning.sensing.copula.predict", errs)
+    monkeypatch.setattr("benchnav.planning.sensing.conditioning.predict", errs)
     found = Copula().update(before, looked({(4, 5): 0.5}, 0.1))
     assert float((found.std - before.std).max()) <= 0
     # A variance that is off by little takes the new mean along.
@@ -444,23 +471,26 @@ def test_numbers_make_no_cell_less_sure_and_tell_the_same_one_by_one(
     """With the dense equations, and where the window is small and ℓ long with the
     lattice.
     """
-    generator, law = np.random.default_rng(seed), made.law(HEIGHT, WIDTH, length_m)
+    generator, covariance = (
+        np.random.default_rng(seed),
+        made.covariance(HEIGHT, WIDTH, length_m),
+    )
     prior = TraversabilityMixture(
         *(torch.full((1, 1, HEIGHT, WIDTH), one).double() for one in (1.0, 0.5, 0.1))
     )
-    field = prior.from_normal(made.scores(law, 1, seed))[0]
+    field = prior.from_normal(made.scores(covariance, 1, seed))[0]
     places = generator.choice(EVERY, count, replace=False, axis=0)
     looks = [
         looked({(row, column): float(field[row, column]) for row, column in some}, 0.2)
         for some in np.array_split(places, parts)
     ]
     belief = Copula(window=window)
-    state = belief.init(prior, law)
+    state = belief.init(prior, covariance)
     for sensed in looks:
         before, state = state, belief.update(state, sensed)
         assert float((state.std - before.std).max()) <= 0
     once = belief.update(
-        belief.init(prior, law),
+        belief.init(prior, covariance),
         looked({tuple(p): float(field[tuple(p)]) for p in places}, 0.2),
     )
     for name in ("mean", "std"):
@@ -493,7 +523,7 @@ def test_what_was_learnt_is_never_forgotten(
 ) -> None:
     """Against all observations at once, in the cells within ℓ of what was sensed."""
     height, width = round(10 / resolution_m), round(16 / resolution_m)
-    law = made.law(height, width, 1.5, resolution_m)
+    covariance = made.covariance(height, width, 1.5, resolution_m)
     shape = (1, 2, height, width)
     weights, means, stds = (
         torch.tensor(pair).view(1, 2, 1, 1).expand(shape)
@@ -502,17 +532,17 @@ def test_what_was_learnt_is_never_forgotten(
     prior = TraversabilityMixture(
         weights.contiguous(), means.contiguous(), stds.contiguous()
     )
-    field = prior.from_normal(made.scores(law, 1, 7).float())
+    field = prior.from_normal(made.scores(covariance, 1, 7).float())
     terrain, sensor, belief = (
         made.terrain(prior, field, resolution_m),
         Probe(radius_m),
         Copula(),
     )
-    state = belief.init(prior, law)
+    state = belief.init(prior, covariance)
     for step, pose in enumerate(way(turns)):
         if step % 5 == 0:
             state = belief.update(
-                state, sensor.sense(terrain, field, pose[None], Moment((1,), step))
+                state, sensor.sense(terrain, field, pose[None], NoiseKey((1,), step))
             )
     cells = state.observed[0].nonzero(as_tuple=True)
     known = Observed(
@@ -556,14 +586,14 @@ def test_what_was_observed_at_a_cell_is_kept_where_there_is_no_room_for_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     prior = made.mixture(1, HEIGHT, WIDTH)
-    field = prior.from_normal(made.scores(LAW, 1))
+    field = prior.from_normal(made.scores(COVARIANCE, 1))
     told = {
         place: 0.0 if place % 3 == 1 else max(float(field[0, 6, place]), 0.2)
         for place in range(2, 12)
     }
     for room in (1, 2, 256):
-        monkeypatch.setattr("benchnav.planning.sensing.copula._MOST_AT_ONCE", room)
-        state = Copula().init(prior, LAW)
+        monkeypatch.setattr("benchnav.planning.sensing.conditioning._MAX_EXACT", room)
+        state = Copula().init(prior, COVARIANCE)
         for place, value in told.items():
             before, state = (
                 state,
@@ -576,8 +606,8 @@ def test_what_was_observed_at_a_cell_is_kept_where_there_is_no_room_for_it(
 
 def test_a_look_at_more_cells_than_the_window_tells_of_all() -> None:
     prior = made.mixture(1, HEIGHT, WIDTH)
-    field = prior.from_normal(made.scores(LAW, 1))
-    sensed = Sensed(traversability=field, std=torch.full_like(field, 0.1))
+    field = prior.from_normal(made.scores(COVARIANCE, 1))
+    sensed = Measurement(traversability=field, std=torch.full_like(field, 0.1))
     state = after(Copula(window=16), prior, sensed)
     assert (state.std < 0.5).all()
     held = field < 0.02
@@ -663,12 +693,12 @@ def test_fields_that_are_drawn_have_what_is_believed_and_what_was_observed() -> 
                 float(found.cdf(level)[0][place]), abs=0.07
             )
     # Cells between are drawn together: their scores keep the correlation that is left.
-    left = covariance([(6, 7)], [(6, 8)]) - (
-        covariance([(6, 7)], [(4, 4), (9, 9)])
+    left = cov_between([(6, 7)], [(6, 8)]) - (
+        cov_between([(6, 7)], [(4, 4), (9, 9)])
         @ np.linalg.inv(
-            covariance([(4, 4), (9, 9)], [(4, 4), (9, 9)]) + 0.0025 * np.eye(2)
+            cov_between([(4, 4), (9, 9)], [(4, 4), (9, 9)]) + 0.0025 * np.eye(2)
         )
-        @ covariance([(4, 4), (9, 9)], [(6, 8)])
+        @ cov_between([(4, 4), (9, 9)], [(6, 8)])
     )
     assert left > 0.3
     ranks = (
@@ -689,18 +719,18 @@ def test_nine_of_ten_cells_near_the_robot_lie_in_the_90_percent_interval(
     by maps.
     """
     batch, steps = 150, 10
-    law = made.law(20, 20, 1.5)
+    covariance = made.covariance(20, 20, 1.5)
     prior = made.mixture(batch, 20, 20)
-    field = prior.from_normal(made.scores(law, batch))
+    field = prior.from_normal(made.scores(covariance, batch))
     terrain, keys = made.terrain(prior, field), list(range(batch))
     belief = Copula()
-    state = belief.init(prior, law)
+    state = belief.init(prior, covariance)
     for step in range(steps):
         where = torch.tensor(
             [[1.25 + 0.6 * step, 5.1, 0.0]], dtype=torch.float64
         ).repeat(batch, 1)
         state = belief.update(
-            state, sensor.sense(terrain, field, where, Moment(keys, step))
+            state, sensor.sense(terrain, field, where, NoiseKey(keys, step))
         )
     row, column = torch.arange(20)[:, None] * 0.5 + 0.25, torch.arange(20) * 0.5 + 0.25
     near = torch.hypot(row - 5.1, column - float(where[0, 0])) <= 3.0
@@ -730,7 +760,7 @@ def test_of_some_cells_it_is_told_quickly_what_is_believed(base: str) -> None:
     if base == "quantiles":
         values = torch.stack([prior.quantile(level) for level in LEVELS], 1)
         prior = QuantileDistribution(values)
-    state = Copula().init(prior, LAW)
+    state = Copula().init(prior, COVARIANCE)
     for sensed in (
         looked({(4, 4): 0.5, (4, 7): 0.0}, 0.05, 2),
         looked({(9, 9): 1.0}, 0.2, 2),
@@ -754,7 +784,7 @@ def test_of_some_cells_it_is_told_quickly_what_is_believed(base: str) -> None:
 
 def test_cells_are_told_that_have_changed() -> None:
     prior = made.mixture(2, HEIGHT, WIDTH)
-    before = Copula().init(prior, LAW)
+    before = Copula().init(prior, COVARIANCE)
     sensed = looked({(6, 6): 0.2}, 0.1, 2)
     sensed.traversability[1] = torch.nan
     after = Copula().update(before, sensed)
@@ -769,7 +799,7 @@ def test_cells_are_told_that_have_changed() -> None:
     )
 
 
-@pytest.mark.parametrize("noise_std", [LEAST_STD, 0.1])
+@pytest.mark.parametrize("noise_std", [MIN_STD, 0.1])
 def test_beside_ground_at_zero_risk_is_that_of_all_fields_that_match(
     noise_std: float,
 ) -> None:

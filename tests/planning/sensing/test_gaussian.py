@@ -12,10 +12,10 @@ from benchnav.planning.sensing.gaussian import (
     Observed,
     Posterior,
     condition,
-    interval_moments,
     posterior,
     predict,
 )
+from benchnav.planning.sensing.truncated_normal import interval_moments
 
 INF = float("inf")
 SHAPE, LENGTH = (10, 11), 2.0

@@ -21,18 +21,18 @@ from benchnav.planning.sensing.copula import Copula
 from benchnav.planning.sensing.knowledge import (
     Knowledge,
     KnowledgeError,
-    Learner,
     Truth,
     nothing_sensed,
     unseen_ground,
 )
+from benchnav.planning.sensing.learner import Learner
 from benchnav.planning.sensing.near import Near
 from benchnav.planning.sensing.sensor import (
     Contact,
     Full,
-    Moment,
+    Measurement,
+    NoiseKey,
     Probe,
-    Sensed,
     Sensor,
 )
 from benchnav.planning.world.outcome import Outcome
@@ -81,7 +81,7 @@ class Model:
 def learner(model: Any = None, **changes: Any) -> Learner:
     given: dict[str, Any] = {
         "sensor": SEES, "ground": Contact(), "belief": Copula(), "rules": RULES,
-        "law": replace(made.law(SIZE, SIZE), statistics=STATISTICS), "measure": lambda own: own.cvar(0.5),
+        "covariance": replace(made.covariance(SIZE, SIZE), statistics=STATISTICS), "measure": lambda own: own.cvar(0.5),
         "predict": model or Model(),
     }  # fmt: skip
     return Learner(**given | changes)
@@ -102,7 +102,7 @@ def moved(
 
 def near(robot_state: Tensor = START) -> Tensor:
     appearance = SEES.sense(
-        TRUTH.terrain, TRUTH.field, robot_state, Moment(KEYS, 0)
+        TRUTH.terrain, TRUTH.field, robot_state, NoiseKey(KEYS, 0)
     ).appearance
     assert appearance is not None
     return appearance.seen
@@ -262,19 +262,25 @@ def test_a_sensor_that_looks_and_senses_at_once_does_both_in_the_same_episodes()
 ):
     class Both(Sensor):
         def sense(
-            self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-        ) -> Sensed:
-            sensed = Contact().sense(terrain, field, robot_state, moment)
+            self,
+            terrain: Terrain,
+            field: Tensor,
+            robot_state: Tensor,
+            noise_key: NoiseKey,
+        ) -> Measurement:
+            sensed = Contact().sense(terrain, field, robot_state, noise_key)
             return replace(
                 sensed,
-                appearance=SEES.sense(terrain, field, robot_state, moment).appearance,
+                appearance=SEES.sense(
+                    terrain, field, robot_state, noise_key
+                ).appearance,
             )
 
     how = learner(sensor=Both(), belief=Static())
     two = torch.tensor([True, False, True])
     known = how.sense(begin(how), TRUTH, START, 1, two, torch.ones_like(two))
     assert known.ever_sensed.flatten(1).sum(1).tolist() == [1, 0, 1]
-    assert known.reached.flatten(1).any(1).tolist() == [True, False, True]
+    assert known.footprint.flatten(1).any(1).tolist() == [True, False, True]
 
 
 def test_ground_that_turns_out_bad_is_closed_once_it_is_seen() -> None:
@@ -300,10 +306,14 @@ def test_sensors_are_asked_when_it_is_due_and_where_robots_are(belief: Any) -> N
             self.inner = inner
 
         def sense(
-            self, terrain: Terrain, field: Tensor, robot_state: Tensor, moment: Moment
-        ) -> Sensed:
+            self,
+            terrain: Terrain,
+            field: Tensor,
+            robot_state: Tensor,
+            noise_key: NoiseKey,
+        ) -> Measurement:
             asked.append(type(self.inner).__name__)
-            return self.inner.sense(terrain, field, robot_state, moment)
+            return self.inner.sense(terrain, field, robot_state, noise_key)
 
     how = learner(sensor=Asked(SEES), ground=Asked(Contact()), belief=belief)
     known = begin(how)
@@ -317,7 +327,7 @@ def test_sensors_are_asked_when_it_is_due_and_where_robots_are(belief: Any) -> N
     looked = how.sense(known, TRUTH, START + 2, 1, two, torch.ones_like(two))
     assert asked == ["Near", *ground, "Near", *ground]
     more = (looked.seen & ~known.seen).flatten(1).any(1)
-    assert more.tolist() == two.tolist() == looked.news.tolist()
+    assert more.tolist() == two.tolist() == looked.has_news.tolist()
     wanted = known.seen | near(START + 2) & two[:, None, None]
     assert torch.equal(looked.seen, wanted)
     # In a later step that tells nothing new, all is as it was.
@@ -332,12 +342,12 @@ def test_all_looks_between_two_updates_count_and_of_one_cell_the_later() -> None
     every = torch.ones(BATCH, dtype=torch.bool)
     one = how.sense(known, TRUTH, START, 1, every, torch.ones_like(every))
     both = how.sense(one, TRUTH, START + 0.5, 2, every, torch.ones_like(every))
-    first = Probe(0.8, 0.3).sense(TRUTH.terrain, TRUTH.field, START, Moment(KEYS, 1))
+    first = Probe(0.8, 0.3).sense(TRUTH.terrain, TRUTH.field, START, NoiseKey(KEYS, 1))
     second = Probe(0.8, 0.3).sense(
-        TRUTH.terrain, TRUTH.field, START + 0.5, Moment(KEYS, 2)
+        TRUTH.terrain, TRUTH.field, START + 0.5, NoiseKey(KEYS, 2)
     )
     assert torch.equal(both.ever_sensed, first.mask | second.mask)
-    assert torch.equal(both.reached, second.mask)
+    assert torch.equal(both.footprint, second.mask)
     wanted = torch.where(second.mask, second.traversability, first.traversability)
     assert torch.equal(both.sensed.traversability.nan_to_num(-1), wanted.nan_to_num(-1))
     assert (both.sensed.std[both.sensed.mask] == 0.3).all()
@@ -346,7 +356,9 @@ def test_all_looks_between_two_updates_count_and_of_one_cell_the_later() -> None
     assert not after.sensed.mask.any()
     assert torch.equal(after.ever_sensed, both.ever_sensed)
     assert changed[both.ever_sensed].any()
-    at_once = Copula().update(Copula().init(TRUTH.terrain.truth, how.law), both.sensed)
+    at_once = Copula().update(
+        Copula().init(TRUTH.terrain.truth, how.covariance), both.sensed
+    )
     torch.testing.assert_close(
         how.distribution(after).mean(), Copula().distribution(at_once).mean()
     )
@@ -377,9 +389,9 @@ def test_episodes_are_kept_and_take_the_places_of_others() -> None:
 def test_without_statistics_nothing_is_known_of_unseen_ground() -> None:
     with pytest.raises(
         ConfigError,
-        match=r"`Law\.statistics` for a robot that does not see all, got None",
+        match=r"`CovarianceModel\.statistics` for a sensor that does not show the whole map, got None",
     ):
-        begin(learner(law=made.law(SIZE, SIZE)))
+        begin(learner(covariance=made.covariance(SIZE, SIZE)))
 
 
 def test_nothing_is_sensed_where_nothing_was() -> None:

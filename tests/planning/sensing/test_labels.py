@@ -9,12 +9,12 @@ from torch import Tensor
 from benchnav.planning.sensing.labels import (
     CHAINS,
     Lattice,
+    connected_to_evidence,
+    count_bits,
     fair,
-    joined,
     noise,
     packed,
-    swept,
-    tally,
+    sweep_labels,
     unpacked,
 )
 
@@ -26,10 +26,10 @@ def test_bits_are_packed_counted_and_unpacked() -> None:
     bits = torch.rand(50, CHAINS, generator=torch.Generator().manual_seed(1)) < 0.4
     words = packed(bits)
     assert torch.equal(unpacked(words), bits)
-    assert torch.equal(tally(words), bits.sum(-1))
+    assert torch.equal(count_bits(words), bits.sum(-1))
     whole = torch.tensor([-1, 0])
-    assert tally(whole).tolist() == [64, 0]
-    assert abs(tally(fair(20, 20)).double().mean() - 32) < 1
+    assert count_bits(whole).tolist() == [64, 0]
+    assert abs(count_bits(fair(20, 20)).double().mean() - 32) < 1
 
 
 def enumerated() -> np.ndarray:
@@ -70,11 +70,13 @@ def sampled(members: Tensor, sweeps: int) -> tuple[Tensor, Tensor, Tensor]:
             STRENGTH,
             SIZE,
         )
-        labels = swept(labels, lattice, ~known, even, drawn)
+        labels = sweep_labels(labels, lattice, ~known, even, drawn)
         if sweep >= 10:
-            tied = joined(labels, lattice, known, drawn)
-            shares = shares + tally(labels).double().mean(0) / CHAINS / (sweeps - 10)
-            found = tally(labels & tied) + 0.5 * (CHAINS - tally(tied))
+            tied = connected_to_evidence(labels, lattice, known, drawn)
+            shares = shares + count_bits(labels).double().mean(0) / CHAINS / (
+                sweeps - 10
+            )
+            found = count_bits(labels & tied) + 0.5 * (CHAINS - count_bits(tied))
             clusters = clusters + found.mean(0) / CHAINS / (sweeps - 10)
     return shares, clusters, labels
 

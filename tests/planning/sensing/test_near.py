@@ -13,7 +13,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.synth.elevation import fractal
 from benchnav.planning.sensing.near import Near
-from benchnav.planning.sensing.sensor import Appearance, Moment
+from benchnav.planning.sensing.sensor import Appearance, NoiseKey
 from tests.planning.sensing import made
 
 KEYS = (21, 22, 23)
@@ -38,12 +38,12 @@ def ground(elevation_m: Tensor, resolution_m: float = 0.5) -> Terrain:
 def look(
     near: Near, terrain: Terrain, *states: tuple[float, ...], step: int = 3
 ) -> Appearance:
-    moment = Moment(KEYS[: len(states)], step)
+    noise_key = NoiseKey(KEYS[: len(states)], step)
     sensed = near.sense(
         terrain,
         terrain.traversability,
         torch.tensor(states, dtype=torch.float64),
-        moment,
+        noise_key,
     )
     assert sensed.appearance is not None
     assert not sensed.mask.any()
@@ -223,8 +223,8 @@ def test_noise_is_normal_and_grows_with_distance() -> None:
     looks = [look(near, terrain, (x, y, 0.0), step=step) for step in range(300)]
     seen = looks[0].seen[0]
     away = torch.from_numpy(np.hypot(*offsets(seen.shape, x, y)))[seen]
-    torch.testing.assert_close(looks[0].doubt[0][seen], away.float())
-    assert (looks[0].doubt[0][~seen] == math.inf).all()
+    torch.testing.assert_close(looks[0].noise_level[0][seen], away.float())
+    assert (looks[0].noise_level[0][~seen] == math.inf).all()
     heights = (
         torch.stack([each.observation.elevation_m[0][seen] for each in looks]).double()
         - 7
@@ -290,8 +290,8 @@ def test_noise_is_of_the_episode_the_cell_and_the_step_alone() -> None:
     ) -> Tensor:
         some = terrain.select(torch.tensor(members))
         state = torch.tensor([states[own] for own in members])
-        moment = Moment([keys[own] for own in members], step)
-        found = near.sense(some, some.traversability, state, moment).appearance
+        noise_key = NoiseKey([keys[own] for own in members], step)
+        found = near.sense(some, some.traversability, state, noise_key).appearance
         assert found is not None
         return found.observation.elevation_m
 

@@ -10,8 +10,8 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning.sensing.classes import Classes
 from tests.planning.sensing.made_classes import (
     NAMES,
+    covariance_of,
     even,
-    law_of,
     prediction,
 )
 
@@ -23,10 +23,10 @@ def test_a_cell_is_of_the_heavier_pair_and_of_none_that_has_little() -> None:
     weights[0, :, 0, 2] = torch.tensor([0.02, 0.02, 0.96, 0.0, 0.0])
     weights[0, :, 0, 3] = torch.tensor([0.995, 0.005, 0.0, 0.0, 0.0])
     weights[0, :, 0, 4] = torch.tensor([0.04, 0.02, 0.94, 0.0, 0.0])
-    state = Classes().init(prediction(weights), law_of(3, 5))
+    state = Classes().init(prediction(weights), covariance_of(3, 5))
     assert state.pair[0, 0].tolist() == [1, 2, 0, 0, 1]
     # What the other classes have stays theirs under either.
-    first, second = (look.prior for look in state.looks)
+    first, second = (look.prior for look in state.per_class)
     assert isinstance(first, TraversabilityMixture)
     assert isinstance(second, TraversabilityMixture)
     wanted = torch.tensor([0.6, 0.0, 0.0, 0.2, 0.2]).double()
@@ -35,13 +35,13 @@ def test_a_cell_is_of_the_heavier_pair_and_of_none_that_has_little() -> None:
 
 
 def test_predictions_and_laws_without_classes_are_refused() -> None:
-    prior, law = even(1, 4, 4), law_of(4, 4)
+    prior, covariance = even(1, 4, 4), covariance_of(4, 4)
     with pytest.raises(ConfigError, match="without `group`"):
-        Classes().init(replace(prior, group=None), law)
+        Classes().init(replace(prior, group=None), covariance)
     with pytest.raises(ConfigError, match="statistics"):
-        Classes().init(prior, replace(law, statistics=None))
+        Classes().init(prior, replace(covariance, statistics=None))
     with pytest.raises(ConfigError, match="drift, firm"):
-        Classes().init(prior, replace(law, class_names=NAMES[:3]))
+        Classes().init(prior, replace(covariance, class_names=NAMES[:3]))
     with pytest.raises(ConfigError, match="strength"):
         Classes(strength=-1.0)
     with pytest.raises(ConfigError, match="window"):

@@ -84,7 +84,7 @@ def test_rounding_leaves_λ_between_0_and_1(level: float) -> None:
 def test_a_row_has_the_scores_of_its_own_cell(
     prior: TraversabilityDistribution, cells: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(score_table, "_AT_ONCE", cells)
+    monkeypatch.setattr(score_table, "_CHUNK_SIZE", cells)
     row = prior.at(torch.ones(prior.shape, dtype=torch.bool))
     found = scores_of(row)
     for place, value in enumerate(VALUES):

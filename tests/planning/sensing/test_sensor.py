@@ -9,7 +9,13 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
 from benchnav.planning.sensing.copula import Copula
-from benchnav.planning.sensing.sensor import LEAST_STD, Contact, Moment, Probe, Sensed
+from benchnav.planning.sensing.sensor import (
+    MIN_STD,
+    Contact,
+    Measurement,
+    NoiseKey,
+    Probe,
+)
 from tests.planning.sensing import made
 
 BATCH, HEIGHT, WIDTH = 3, 12, 14
@@ -22,15 +28,15 @@ STATES = torch.tensor(
 @pytest.fixture
 def ground() -> tuple[Terrain, torch.Tensor]:
     truth = made.mixture(BATCH, HEIGHT, WIDTH)
-    law = made.law(HEIGHT, WIDTH)
-    field = truth.from_normal(made.scores(law, BATCH))
+    covariance = made.covariance(HEIGHT, WIDTH)
+    field = truth.from_normal(made.scores(covariance, BATCH))
     return made.terrain(truth, field), field
 
 
 def sense(
     sensor: Contact | Probe, ground: tuple[Terrain, torch.Tensor], step: int = 3
-) -> Sensed:
-    return sensor.sense(*ground, STATES, Moment(KEYS, step))
+) -> Measurement:
+    return sensor.sense(*ground, STATES, NoiseKey(KEYS, step))
 
 
 def test_contact_is_the_λ_of_the_robots_cell_as_it_is(
@@ -39,7 +45,7 @@ def test_contact_is_the_λ_of_the_robots_cell_as_it_is(
     sensed = sense(Contact(), ground)
     assert sensed.mask.nonzero().tolist() == [[0, 2, 4], [1, 11, 0], [2, 0, 13]]
     assert torch.equal(sensed.traversability[sensed.mask], ground[1][sensed.mask])
-    assert (sensed.std[sensed.mask] == LEAST_STD).all()
+    assert (sensed.std[sensed.mask] == MIN_STD).all()
 
 
 def test_a_robot_off_the_map_senses_nothing_by_contact(
@@ -47,7 +53,7 @@ def test_a_robot_off_the_map_senses_nothing_by_contact(
 ) -> None:
     away = STATES.clone()
     away[1, 0] = -0.1
-    sensed = Contact().sense(*ground, away, Moment(KEYS, 0))
+    sensed = Contact().sense(*ground, away, NoiseKey(KEYS, 0))
     assert sensed.mask.flatten(1).any(1).tolist() == [True, False, True]
 
 
@@ -72,7 +78,7 @@ def test_the_noise_of_a_probe_is_normal_in_scores() -> None:
     found = []
     for step in range(80):
         sensed = Probe(2.0, 0.3).sense(
-            made.terrain(truth, field), field, STATES, Moment(KEYS, step)
+            made.terrain(truth, field), field, STATES, NoiseKey(KEYS, step)
         )
         assert (sensed.std[sensed.mask] == 0.3).all()
         score, _ = truth.at(sensed.mask).to_normal(
@@ -90,14 +96,14 @@ def test_an_atom_is_read_as_it_is_and_ground_beside_it_may_be_mistaken_for_it() 
     for value in (0.0, 1.0):
         field = torch.full((BATCH, HEIGHT, WIDTH), value, dtype=torch.float64)
         sensed = Probe(2.0, 0.5).sense(
-            made.terrain(truth, field), field, STATES, Moment(KEYS, 0)
+            made.terrain(truth, field), field, STATES, NoiseKey(KEYS, 0)
         )
         assert bool((sensed.traversability[sensed.mask] == value).all())
     field = truth.from_normal(upper + 0.1)
     told = []
     for step in range(80):
         sensed = Probe(2.0, 0.1).sense(
-            made.terrain(truth, field), field, STATES, Moment(KEYS, step)
+            made.terrain(truth, field), field, STATES, NoiseKey(KEYS, step)
         )
         told.append(sensed.traversability[sensed.mask] == 0)
     assert float(torch.cat(told).double().mean()) == pytest.approx(
@@ -110,20 +116,20 @@ def test_what_many_looks_of_a_probe_say_of_the_cells_around_holds_as_often_as_it
 ):
     """Of λ in the belief's central 90 %, where atoms are looked at again and again."""
     batch, size = 300, 13
-    law, ground = made.law(size, size), made.mixture(batch, size, size)
+    covariance, ground = made.covariance(size, size), made.mixture(batch, size, size)
     share = torch.full_like(ground.weights[:, :1], 0.3)
     low, high = ground.means.split(1, 1)
     truth = TraversabilityMixture(
         torch.cat((share, 1 - share), 1), torch.cat((low - 0.1, high), 1), ground.stds
     )
-    field = truth.from_normal(made.scores(law, batch))
+    field = truth.from_normal(made.scores(covariance, batch))
     assert 0.1 < float((field == 0).double().mean()) < 0.2
     terrain, belief = made.terrain(truth, field), Copula()
     states = torch.tensor([[3.25, 3.25, 0.0]] * batch, dtype=torch.float64)
-    known = belief.init(truth, law)
+    known = belief.init(truth, covariance)
     for step in range(30):
         sensed = Probe(1.0, 0.1).sense(
-            terrain, field, states, Moment(range(batch), step)
+            terrain, field, states, NoiseKey(range(batch), step)
         )
         known = belief.update(known, sensed)
     row, column = (torch.arange(size) - 6 for _ in range(2))
@@ -150,7 +156,7 @@ def test_noise_is_of_the_episode_the_cell_and_the_step_alone(
         ground[0].select(order),
         ground[1][order],
         STATES[order],
-        Moment([KEYS[2], KEYS[0]], 3),
+        NoiseKey([KEYS[2], KEYS[0]], 3),
     )
     assert torch.equal(
         some.traversability[some.mask], both.traversability[order][some.mask]
@@ -159,7 +165,7 @@ def test_noise_is_of_the_episode_the_cell_and_the_step_alone(
     assert not torch.equal(
         later.traversability[later.mask], both.traversability[both.mask]
     )
-    other = Probe(1.0).sense(*ground, STATES, Moment([KEYS[1], KEYS[1], KEYS[2]], 3))
+    other = Probe(1.0).sense(*ground, STATES, NoiseKey([KEYS[1], KEYS[1], KEYS[2]], 3))
     changed = (other.traversability != both.traversability)[
         both.mask.nonzero(as_tuple=True)
     ]

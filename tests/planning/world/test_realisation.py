@@ -13,7 +13,7 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
 from benchnav.planning.free_space import Immobile
 from benchnav.planning.world.realisation import Realisation, draw_frozen, joined
-from benchnav.planning.world.world import Places, World
+from benchnav.planning.world.world import Endpoints, World
 from tests import factories
 
 KEY = rng.stream_key(0, "noise")
@@ -221,7 +221,7 @@ def ground(
     )
 
 
-def across(batch: int, size: int = 16) -> Places:
+def across(batch: int, size: int = 16) -> Endpoints:
     """From one corner to the other."""
     start, goal = (
         torch.full((batch, 2), 1.25),

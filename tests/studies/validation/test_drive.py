@@ -9,7 +9,7 @@ from torch import Tensor
 from benchnav.core import rng
 from benchnav.planning import MPPIConfig, Plan, Planner, Problem, Step
 from benchnav.planning.free_space import PENALTY
-from benchnav.planning.planners.mppi import advance_chunk
+from benchnav.planning.planners.mppi_rollouts import advance_chunk
 from benchnav.planning.planners.noise_bank import Sampled
 from benchnav.planning.problem import Dynamics, ground_map
 from benchnav.planning.robots import component_wise

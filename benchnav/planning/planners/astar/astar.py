@@ -1,12 +1,11 @@
 """A*: cheapest paths over the cells of a 2.5D map.
 
-λ̂ does not change during an episode, so the exact cost to go h* is found once for every
-cell, by one compiled search, Dijkstra's, backward from the goal, on the host. A* with
-h* as its heuristic expands the
-cells of a cheapest path alone: replanning from wherever the robot stands is following
-pointers. Ground that is not free costs its penalty a metre, on the half of an edge that
-lies in it, so that every cell has a path. A step between two cells that touch at a
-corner and are not free costs as much on its whole length (`gridgraph.squeezes`).
+The exact cost to go h* of every cell is computed once per λ̂ map, by one compiled
+search, Dijkstra's, backward from the goal, on the host. A* with h* as its heuristic
+only expands the cells of a cheapest path. Hence replanning from any robot position is
+following pointers. Non-free cells cost their penalty per metre, on the half of an edge
+that lies in them, so that every cell has a path. A step between two non-free cells that
+touch at a corner costs the penalty on its whole length (`gridgraph.squeezes`).
 Sources: Hart, Nilsson and Raphael (1968); paper IV-A1. Letters in shapes: B episodes,
 H×W cells, N points, E edges.
 """
@@ -38,10 +37,10 @@ class CostToGo(Batch):
     """Cheapest paths from every cell to the goal.
 
     Args:
-        cost: of the path to the goal region, by the objective's `path_cost`, penalties
-            included, shape [B, H, W].
-        following: flat index of the next cell, itself where the path ends, int64, shape
-            [B, H·W].
+        cost: cost of the path to the goal region, by the objective's `path_cost`,
+            penalties included, shape [B, H, W].
+        following: flat index of the next cell, the cell itself where the path ends,
+            int64, shape [B, H·W].
     """
 
     cost: Tensor
@@ -49,8 +48,9 @@ class CostToGo(Batch):
 
 
 def edge_costs(problem: Problem) -> Tensor:
-    """Costs of moving between neighbouring cells, each half of an edge at its own
-    cell's λ̂.
+    """Return costs of moving between neighbouring cells.
+
+    Each half of an edge costs what its own cell's λ̂ implies.
 
     Args:
         problem: B problems.
@@ -59,7 +59,7 @@ def edge_costs(problem: Problem) -> Tensor:
         Cost of each edge of `gridgraph.neighbour_pairs`, float64, shape [B, E].
 
     Raises:
-        ConfigError: the objective's `path_cost` is not finite and above 0.
+        ConfigError: If the objective's `path_cost` is not finite and above 0.
     """
     source, target, cells = gridgraph.neighbour_pairs(*problem.grid.shape)
     length_m = (
@@ -70,37 +70,34 @@ def edge_costs(problem: Problem) -> Tensor:
 
 
 def revised_edge_costs(problem: Problem, before: Tensor, changed: Tensor) -> Tensor:
-    """Return `edge_costs` where ground has changed in some cells, computed for the
-    edges near these.
+    """Return `edge_costs` after changes of some cells, computed only for edges near them.
 
     Args:
         problem: B problems.
         before: costs of edges before the change, float64, shape [B, E]; they are not
             changed.
-        changed: cells whose λ̂, free ground or elevation has changed, one at least,
+        changed: mask of cells with another λ̂, free mask or elevation, one at least,
             bool, shape [B, H, W].
     """
     source, target, cells = gridgraph.neighbour_pairs(*problem.grid.shape)
     # A diagonal step also depends on the two cells next to it, which touch its source.
     near = torch.nn.functional.max_pool2d(changed.float(), 3, stride=1, padding=1) > 0
     member, edge = _of_cells(near.flatten(1), source).nonzero(as_tuple=True)
-    of_map, edges = member * near[0].numel(), edge.cpu().numpy()
-    begin, end = (
-        torch.from_numpy(own[edges]).to(edge.device) for own in (source, target)
-    )
-    length_m = (
-        torch.from_numpy(cells[edges]).to(edge.device) * problem.grid.resolution_m
-    )
+    of_map = member * near[0].numel()
+    edges = edge.cpu().numpy()
+    begin = torch.from_numpy(source[edges]).to(edge.device)
+    end = torch.from_numpy(target[edges]).to(edge.device)
+    length_cells = torch.from_numpy(cells[edges]).to(edge.device)
+    length_m = length_cells * problem.grid.resolution_m
     layers = (
         partial(_of_flat_cells, values.flatten(), of_map) for values in _layers(problem)
     )
-    return before.index_put(
-        (member, edge), _costs(problem, begin, end, length_m, *layers)
-    )
+    costs = _costs(problem, begin, end, length_m, *layers)
+    return before.index_put((member, edge), costs)
 
 
 def _layers(problem: Problem) -> tuple[Tensor, Tensor, Tensor]:
-    """What costs of edges depend on, each of shape [B, H, W]."""
+    """Return the inputs of edge costs, each of shape [B, H, W]."""
     return problem.traversability, problem.elevation_m, problem.free
 
 
@@ -113,11 +110,11 @@ def _costs(
     elevation_of: Callable[[Cells], Tensor],
     free_of: Callable[[Cells], Tensor],
 ) -> Tensor:
-    """Costs of some edges, by what tells λ̂, elevation and free ground of cells; of the
-    shape that these return.
+    """Return costs of some edges, from functions that return λ̂, elevation and free mask
+    of cells; their shape is that of the costs.
     """
     traversability, elevation_m, free = (
-        [of(own) for own in (source, target)]
+        [of(ends) for ends in (source, target)]
         for of in (traversability_of, elevation_of, free_of)
     )
     grade = (elevation_m[1].double() - elevation_m[0].double()) / length_m
@@ -125,17 +122,18 @@ def _costs(
     name = f"`path_cost` of {type(objective).__name__}"
     per_m = [objective.path_cost(values.double(), grade) for values in traversability]
     for cost in per_m:
-        got = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
+        shape = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
         expect(
-            got == list(grade.shape),
-            f"{name} of the shape of λ̂ and grade, {list(grade.shape)}, got {got}. "
+            shape == list(grade.shape),
+            f"{name} of the shape of λ̂ and grade, {list(grade.shape)}, got {shape}. "
             "Give a cost for each piece of a "
             "path.",
         )
-    least, most = torch.stack([torch.stack(cost.aminmax()) for cost in per_m]).aminmax()
-    if not 0 < least <= most < torch.inf:
+    extrema = torch.stack([torch.stack(cost.aminmax()) for cost in per_m])
+    min_cost, max_cost = extrema.aminmax()
+    if not 0 < min_cost <= max_cost < torch.inf:
         raise ConfigError(
-            f"Expected {name} as finite numbers > 0, got {least:g} to {most:g}. "
+            f"Expected {name} as finite numbers > 0, got {min_cost:g} to {max_cost:g}. "
             "Return a cost > 0 per metre."
         )
     squeezed = gridgraph.squeezes(free_of, source, target, problem.grid.width)
@@ -144,8 +142,9 @@ def _costs(
 
 
 def _of_cells(values: Tensor, cells: np.ndarray) -> Tensor:
-    """Values [B, H·W] of some cells, shape [B, E]; by NumPy on the host, which takes a
-    tenth of PyTorch's time.
+    """Return values [B, H·W] of some cells, shape [B, E].
+
+    On the host NumPy does it in a tenth of PyTorch's time.
     """
     if values.device.type == "cpu":
         return torch.from_numpy(np.take(values.numpy(), cells, axis=1))
@@ -153,22 +152,21 @@ def _of_cells(values: Tensor, cells: np.ndarray) -> Tensor:
 
 
 def _of_flat_cells(values: Tensor, of_map: Tensor, cells: Tensor) -> Tensor:
-    """Values [B·H·W] of cells, shape [N], by the first cell of the map of each and its
-    place in the map.
+    """Return values [B·H·W] of N cells, by the first cell of each cell's map and its
+    index in the map.
     """
     return values[of_map + cells]
 
 
 def search(problem: Problem, costs: Iterable[Tensor] | None = None) -> CostToGo:
-    """Finds cheapest paths to the goal's own cell and to those centred within its
-    radius.
+    """Return cheapest paths to the goal's own cell and to those within its radius.
 
-    Works on the host: on another device this copies the maps there and the answer back,
-        once.
+    The search runs on the host: maps of another device are copied there and the result
+    back, once.
 
     Args:
         problem: B problems.
-        costs: of edges, B of shape [E]; None for `edge_costs`.
+        costs: costs of edges, B of shape [E]; None for `edge_costs`.
 
     Returns:
         Cost to go, of the problem's dtype and device.
@@ -176,18 +174,16 @@ def search(problem: Problem, costs: Iterable[Tensor] | None = None) -> CostToGo:
     grid, goal_m = problem.grid, problem.goal_m.cpu()
     centres = cell_centres(grid, torch.arange(grid.height * grid.width))
     goals = distance(centres, goal_m[:, None]) < problem.goal_radius_m
-    # On coarse grids no centre may be that near; the goal's own cell always counts.
+    # On coarse grids no centre may be within the radius; the goal's own cell always is
+    # a goal.
     goals.scatter_(1, cell_at(grid, goal_m)[:, None], True)
-    on_host = (
-        of_map.cpu().numpy()
-        for of_map in (edge_costs(problem) if costs is None else costs)
-    )
-    cost, following = gridgraph.cost_to_go(
-        on_host, goals.unflatten(1, grid.shape).numpy(), grid.shape
-    )
-    following = np.where(
-        following == gridgraph.NO_CELL, np.arange(following.shape[1]), following
-    )
+    if costs is None:
+        costs = edge_costs(problem)
+    on_host = (of_map.cpu().numpy() for of_map in costs)
+    goal_maps = goals.unflatten(1, grid.shape).numpy()
+    cost, following = gridgraph.cost_to_go(on_host, goal_maps, grid.shape)
+    own = np.arange(following.shape[1])
+    following = np.where(following == gridgraph.NO_CELL, own, following)
     start = problem.start
     return CostToGo(
         torch.from_numpy(cost).to(start), torch.from_numpy(following).to(start.device)
@@ -195,7 +191,7 @@ def search(problem: Problem, costs: Iterable[Tensor] | None = None) -> CostToGo:
 
 
 def framed(problem: Problem, field: CostToGo) -> Tensor:
-    """Cost to go, and what a level metre costs in each cell, framed for `cost_at`.
+    """Return padded cost to go and padded costs of a level metre, for `cost_at`.
 
     Args:
         problem: B problems.
@@ -215,19 +211,19 @@ def framed(problem: Problem, field: CostToGo) -> Tensor:
 
 
 def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
-    """Cost to go from anywhere: by the centre, of the cell itself or of one next to it,
-    that makes it least.
+    """Return the cost to go from any position.
 
-    The straight line to that centre costs what the two cells' metres cost, half and
-    half, as an edge does. So at a centre the cost is that of its cell (where grades
-    cost nothing), and between them it leaves no steps as large as a cell. In cells
-    where paths end it is 0.
+    It is the minimum over the centres of the cell itself and of its neighbours, of the
+    cost from the centre plus that of the straight line to it. A line costs half of each
+    of the two cells' costs per metre, as an edge does. Hence at a centre the cost is
+    that of its cell (if grades cost nothing), and between centres it has no jumps as
+    large as a cell. In cells where paths end it is 0.
 
     Args:
-        grid: of the maps.
+        grid: grid of the maps.
         costs: from `framed`, shape [B, 2, N].
-        x_m: positions, shape [B, J].
-        y_m: positions, shape [B, J].
+        x_m: x of the positions in metres, shape [B, J].
+        y_m: y of the positions in metres, shape [B, J].
 
     Returns:
         Shape [B, J].
@@ -235,8 +231,10 @@ def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
     size = grid.resolution_m
     to_go, per_m = costs.unbind(1)
     column, row = (x_m / size).floor(), (y_m / size).floor()
-    own, ended = grid.lookup(per_m, x_m, y_m), grid.lookup(to_go, x_m, y_m) == 0
-    sides, best = (-0.5, 0.5, 1.5), torch.full_like(x_m, torch.inf)
+    own_cost = grid.lookup(per_m, x_m, y_m)
+    ended = grid.lookup(to_go, x_m, y_m) == 0
+    sides = (-0.5, 0.5, 1.5)
+    best = torch.full_like(x_m, torch.inf)
     centres = {
         (up, right): ((column + right) * size, (row + up) * size)
         for up in sides
@@ -244,37 +242,35 @@ def cost_at(grid: Grid, costs: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
     }
     metre = {side: grid.lookup(per_m, *centre) for side, centre in centres.items()}
     for (up, right), (centre_x, centre_y) in centres.items():
-        there = metre[up, right]
-        # Cells that touch at a corner and are not free leave no way between them, see
-        # `edge_costs`; where they are the cell itself and its neighbour across an edge,
-        # one of the ends is not free.
+        other_cost = metre[up, right]
+        # Two non-free cells that touch at a corner block the diagonal between them, see
+        # `edge_costs`. If they are the cell itself and its neighbour across an edge, an
+        # end of the line is not free.
         closed = torch.minimum(metre[up, 0.5], metre[0.5, right]) >= PENALTY
-        squeezed = closed & (torch.maximum(own, there) < PENALTY)
+        squeezed = closed & (torch.maximum(own_cost, other_cost) < PENALTY)
         length = torch.sqrt((x_m - centre_x) ** 2 + (y_m - centre_y) ** 2)
-        line = length * (0.5 * (own + there) + PENALTY * squeezed)
+        line = length * (0.5 * (own_cost + other_cost) + PENALTY * squeezed)
         best = torch.minimum(best, grid.lookup(to_go, centre_x, centre_y) + line)
     return torch.where(ended, 0, best)
 
 
 def cell_at(grid: Grid, state: Tensor) -> Tensor:
-    """Flat indices of the cells in which states [*B, S] or positions lie, int64, shape
-    [*B].
-    """
+    """Return flat indices of cells of states [*B, S] or positions, int64, shape [*B]."""
     row, column = grid.cell_of(state[..., 0], state[..., 1])
     return row * grid.width + column
 
 
 def cell_centres(grid: Grid, cell: Tensor) -> Tensor:
-    """(x, y) of the centres of cells, by flat index [*B], shape [*B, 2]."""
+    """Return centres (x, y) of cells, by flat index [*B], shape [*B, 2]."""
     return torch.stack(grid.centre_of(cell // grid.width, cell % grid.width), dim=-1)
 
 
 def path_cells(field: CostToGo, cell: Tensor, count: int) -> Tensor:
-    """Follows cheapest paths.
+    """Return the cells of cheapest paths.
 
     Args:
         field: from `search`.
-        cell: flat index of the first cells, shape [B].
+        cell: flat indices of the first cells, shape [B].
         count: points to return.
 
     Returns:
@@ -287,8 +283,9 @@ def path_cells(field: CostToGo, cell: Tensor, count: int) -> Tensor:
 
 
 def cell_points(problem: Problem, field: CostToGo, cells: Tensor) -> Tensor:
-    """(x, y) of the centres of cells, of the goal where a path ends, shape [B, N, 2],
-    from flat indices [B, N].
+    """Return centres (x, y) of cells, or the goal where a path ends, shape [B, N, 2].
+
+    Cells are flat indices, [B, N].
     """
     ended = field.following.gather(1, cells) == cells
     centres = cell_centres(problem.grid, cells).to(problem.start)
@@ -296,12 +293,12 @@ def cell_points(problem: Problem, field: CostToGo, cells: Tensor) -> Tensor:
 
 
 def path_points(problem: Problem, field: CostToGo, state: Tensor, count: int) -> Tensor:
-    """Points of the cheapest paths from where the robots stand.
+    """Return points of the cheapest paths from the robots' positions.
 
     Args:
         problem: B problems.
         field: from `search`.
-        state: shape [B, S].
+        state: robot states, shape [B, S].
         count: points to return.
 
     Returns:

@@ -22,7 +22,7 @@ class AStarDWAConfig(GuideConfig):
 
 
 class AStarDWA(Guided[DWAState]):
-    """A* gives way-points to the dynamic window approach.
+    """A* provides waypoints to the dynamic window approach.
 
     Args:
         config: settings.
@@ -31,6 +31,6 @@ class AStarDWA(Guided[DWAState]):
     steers = ((SPEED, TURN_RATE),)
 
     def __init__(self, config: AStarDWAConfig | None = None) -> None:
-        """Keeps the settings; all else is in the plan state."""
+        """Store the settings."""
         config = config or AStarDWAConfig()
         super().__init__(config, DWA(config.dwa))

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 
 from benchnav.core.errors import expect
 from benchnav.planning.planners.astar.guided import GuideConfig, Guided
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
+from benchnav.planning.planners.mppi import MPPI, MPPIState
+from benchnav.planning.planners.mppi_config import MPPIConfig
 from benchnav.planning.planners.straight import STEERS
 
 
@@ -35,7 +36,7 @@ class AStarMPPIConfig(GuideConfig):
 
 
 class AStarMPPI(Guided[MPPIState]):
-    """A* gives way-points to model predictive path integral control.
+    """A* provides waypoints to model predictive path integral control.
 
     With a cost to go, which is A*'s, MPPI minimises a cost that runs to the goal; A*'s
     path then serves recovery.
@@ -47,6 +48,6 @@ class AStarMPPI(Guided[MPPIState]):
     steers = STEERS  # MPPI drives any robot, the recovery these.
 
     def __init__(self, config: AStarMPPIConfig | None = None) -> None:
-        """Keeps the settings; all else is in the plan state."""
+        """Store the settings."""
         config = config or AStarMPPIConfig()
         super().__init__(config, MPPI(config.mppi))

@@ -1,15 +1,15 @@
-"""The dynamic window approach (DWA): the best constant (v, ω) within reach of the
-accelerations.
+"""The dynamic window approach (DWA): the best constant (v, ω) that is reachable under
+the acceleration limits.
 
-From Fox, Burgard and Thrun (1997), "The dynamic window approach to collision
-avoidance", come the window, the velocity pairs that the robot can reach within one
-step, and the search for the one whose arc is best. A robot without limits reaches all
-that its bounds allow. How arcs are judged is not theirs: each pair is held for the
-whole horizon, rolled out through F under λ̂, and judged by J toward a way-point and by
-the heading that it ends with. There are no admissible velocities by braking distance,
-no terms for clearance and speed; a pair that leaves free ground before it arrives pays
-the penalty of each step off it, which is why DWA creeps in narrow places and needs a
-recovery where it stands.
+Two parts are from Fox, Burgard and Thrun (1997), "The dynamic window approach to
+collision avoidance": the window, the velocity pairs that the robot can reach within one
+step, and the search for the pair with the best arc. A robot without limits reaches all
+pairs within its bounds. The scoring of arcs is ours: each pair is executed for the
+whole horizon, rolled out through F under λ̂, and scored by J toward a waypoint and by
+its final heading. There are no admissible velocities by braking distance, and no terms
+for clearance and speed. A pair that enters non-free cells before it reaches the
+waypoint pays the penalty of each such step. DWA therefore creeps in narrow passages,
+and needs a recovery where it stands.
 Letters in shapes: B episodes, M velocity pairs, T horizon steps, S state dimensions.
 """
 
@@ -44,7 +44,7 @@ from benchnav.planning.sensing.sensor import Step
 # A chunk of the horizon compiles in seconds.
 _CHUNK_STEPS = 10
 _WORTH_COMPILING = 100  # pairs
-# Of a trajectory's positions, every so many are drawn.
+# Stride of a trajectory's drawn positions.
 _DRAW_EVERY = 5
 
 
@@ -53,16 +53,16 @@ class DWAConfig:
     """Settings of DWA; the paper gives none, these are ours.
 
     Args:
-        speeds: linear velocities in the window.
-        turn_rates: angular velocities in the window; an odd number has that of straight
-            driving among them.
-        horizon_s: how long a pair is held; to the nearest number of steps T, one at
-            least.
+        speeds: number of linear velocities in the window.
+        turn_rates: number of angular velocities in the window; an odd number includes
+            straight driving.
+        horizon_s: duration of a pair in seconds, to the nearest number of steps T, at
+            least one.
         heading_weight: cost of a radian between the last heading and the direction of
-            the way-point, as a share of what J costs a robot that stands for the
-            horizon; it lets a robot turn on the spot, which changes no distance.
-        arrival_m: a trajectory this near to the way-point has arrived and costs no
-            more, so that a near way-point does not slow the robot.
+            the waypoint, as a fraction of the cost J of standing for the horizon. It
+            lets a robot turn in place, which changes no distance.
+        arrival_m: distance to the waypoint in metres below which a trajectory costs no
+            more, so that a near waypoint does not slow the robot.
     """
 
     speeds: int = 10
@@ -72,7 +72,7 @@ class DWAConfig:
     arrival_m: float = 0.2
 
     def __post_init__(self) -> None:
-        """Refuses an empty window, and weights that mean nothing."""
+        """Validate the window and the weights."""
         check_finite(
             "DWA",
             self,
@@ -83,11 +83,11 @@ class DWAConfig:
 
 @dataclass(frozen=True)
 class DWAState(Batch):
-    """What DWA carries from step to step.
+    """Plan state of DWA.
 
     Args:
-        problem: what is being solved.
-        velocity: (v, ω) that the robots have, shape [B, 2].
+        problem: the problem.
+        velocity: current (v, ω) of the robots, shape [B, 2].
     """
 
     problem: Problem
@@ -104,13 +104,13 @@ class DWA(LocalPlanner[DWAState]):
     name = "DWA"
 
     def __init__(self, config: DWAConfig | None = None) -> None:
-        """Keeps the settings; all else is in the plan state."""
+        """Store the settings."""
         self.config = config or DWAConfig()
         pairs = self.config.speeds * self.config.turn_rates
-        # Of the episodes are: states, cost, under_way, pairs, padded_ground, target.
-        self._rollout = Fused(
-            rollout, pairs, _WORTH_COMPILING, batched=(0, 1, 2, 3, 4, 5)
-        )
+        # States, cost, under_way, pairs, padded_ground and target have an episode
+        # dimension.
+        batched = (0, 1, 2, 3, 4, 5)
+        self._rollout = Fused(rollout, pairs, _WORTH_COMPILING, batched=batched)
 
     @property
     def compiled(self) -> bool | None:
@@ -118,79 +118,82 @@ class DWA(LocalPlanner[DWAState]):
         return self._rollout.compiled
 
     def uses(self, task: Task) -> frozenset[str]:
-        """λ̂ and free space; see `Planner`."""
+        """Return λ̂ and the input of free space; see `Planner`."""
         return frozenset({"risk_map", task.rules.free_space.source})
 
     def init(self, problem: Problem, generator: torch.Generator) -> DWAState:
-        """Starts from standing robots; draws nothing. See `LocalPlanner`."""
+        """Return the plan state of standing robots; draws nothing. See `LocalPlanner`."""
         return DWAState(problem, problem.start.new_zeros(len(problem), 2))
 
     def plan_toward(
         self, step: Step, plan_state: DWAState, target_m: Tensor
     ) -> tuple[Tensor, DWAState, Plan]:
-        """Picks the window's best pair; see `LocalPlanner`."""
+        """Return the window's best pair; see `LocalPlanner`."""
         problem = plan_state.problem
         window = velocity_window(problem, plan_state.velocity, self.config)
         cost = score(problem, step.state, window, target_m, self.config, self._rollout)
         best = cost.argmin(dim=1)[:, None, None]
         layers = {}
         if step.draw:
-            held = window.mT[:, None].expand(
+            actions = window.mT[:, None].expand(
                 -1, steps_in(self.config.horizon_s, problem.dt_s), -1, -1
             )
-            drawn = rollout_path(problem, step.state, held)
+            drawn = rollout_path(problem, step.state, actions)
             path = drawn.take_along_dim(best[..., None], 1)[:, 0]
             layers = {"path": path, "samples": drawn[:, :, ::_DRAW_EVERY]}
         plan = Plan.empty(len(problem), step.state.device, **layers)
         return window.take_along_dim(best, 1)[:, 0], plan_state, plan
 
     def commit_action(self, plan_state: DWAState, action: Tensor) -> DWAState:
-        """Notes the velocities that the robots now have; see `LocalPlanner`."""
+        """Return the plan state with the robots' new velocities; see `LocalPlanner`."""
         problem = plan_state.problem
         return DWAState(problem, action.clamp(*reachable(problem, plan_state.velocity)))
 
 
 def reachable(problem: Problem, velocity: Tensor) -> tuple[Tensor, Tensor]:
-    """Least and greatest velocities within one step's reach, from (v, ω) now, each of
-    shape [B, 2].
+    """Return minimum and maximum velocities that are reachable within one step.
+
+    Args:
+        problem: problem with the robot's limits.
+        velocity: current (v, ω), shape [B, 2].
     """
     speed, turn_rate = velocity.unbind(1)
-    # Numbers, for a tensor made of them would be sent to the device at every step.
+    # Numbers, since a tensor of them would be copied to the device at every step.
     reach, turn_reach = (
         rate * problem.dt_s
         for rate in problem.robot.action_rates or (math.inf, math.inf)
     )
-    least = torch.stack((speed - reach, turn_rate - turn_reach), dim=1)
-    most = torch.stack((speed + reach, turn_rate + turn_reach), dim=1)
-    return least.clamp(*problem.action_bounds), most.clamp(*problem.action_bounds)
+    low = torch.stack((speed - reach, turn_rate - turn_reach), dim=1)
+    high = torch.stack((speed + reach, turn_rate + turn_reach), dim=1)
+    return low.clamp(*problem.action_bounds), high.clamp(*problem.action_bounds)
 
 
 def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Tensor:
-    """Velocity pairs that the robot can reach within one step.
+    """Return the velocity pairs that the robot can reach within one step.
 
     Args:
-        problem: for its robot's bounds, limits and time step.
+        problem: problem with the robot's bounds, limits and time step.
         velocity: current (v, ω), shape [B, 2].
         config: settings.
 
     Returns:
         Pairs (v, ω) within the bounds, shape [B, M, 2].
     """
-    least, most = (bound[:, None] for bound in reachable(problem, velocity))
-    shares = [
+    low, high = (bound[:, None] for bound in reachable(problem, velocity))
+    fractions = [
         torch.linspace(0, 1, count, device=velocity.device, dtype=velocity.dtype)
         for count in (config.speeds, config.turn_rates)
     ]
-    return least + (most - least) * torch.cartesian_prod(*shares)
+    return low + (high - low) * torch.cartesian_prod(*fractions)
 
 
 class Arcs(NamedTuple):
-    """Where velocity pairs have led, and what that cost.
+    """Rollouts of velocity pairs.
 
     Args:
-        states: shape [B, M, S].
-        cost: shape [B, M].
-        under_way: which have not reached the target, bool, shape [B, M].
+        states: robot states, shape [B, M, S].
+        cost: cost so far, shape [B, M].
+        under_way: mask of pairs that have not reached the target, bool, shape [B, M].
     """
 
     states: Tensor
@@ -207,8 +210,9 @@ def rollout(
     arrival_m: float,
     steps: int,
 ) -> Arcs:
-    """Hold each pair for some steps, and add up costs of those under way; takes a
-    problem in its parts.
+    """Roll out each pair for some steps, and add up costs of those under way.
+
+    Arguments are parts of a problem.
     """
     states, cost, under_way = arcs
     grid, robot, objective, min_traversability = dynamics
@@ -229,13 +233,13 @@ def score(
     config: DWAConfig,
     advance: Callable[..., Arcs] = rollout,
 ) -> Tensor:
-    """Rolls out the window's pairs and sums their costs.
+    """Return the summed costs of the window's pairs.
 
     Args:
         problem: B problems.
-        state: shape [B, S].
+        state: robot states, shape [B, S].
         window: pairs (v, ω), shape [B, M, 2].
-        target_m: way-points (x, y), shape [B, 2].
+        target_m: waypoints (x, y) in metres, shape [B, 2].
         config: settings.
         advance: `rollout` or the same compiled.
 
@@ -260,24 +264,19 @@ def score(
             count,
         )
     states, cost, under_way = arcs
-    # The unit of the heading's weight: the size of what J, without penalties, costs
-    # robots that stand for the horizon.
+    # The unit of the heading's weight: J, without penalties, of robots that stand for
+    # the horizon.
     standing = problem.start.new_zeros(len(problem), 2).clamp(*problem.action_bounds)
     traversability = predicted_traversability(problem.ground_at(state))
     stage = problem.objective.stage(state, standing, traversability, target_m)
-    unit = (
-        steps * stage + problem.objective.terminal(state, traversability, target_m)
-    ).abs()
-    # From the last heading to the way-point as seen from where the robot is now. It is
-    # not wrapped: a turn past the way-point counts as such, else a robot that spins
-    # would find another round as good as stopping.
+    terminal = problem.objective.terminal(state, traversability, target_m)
+    unit = (steps * stage + terminal).abs()
+    # Angle from the last heading to the waypoint as seen from the robot's current
+    # position. It is not wrapped: a turn past the waypoint counts as such, since a
+    # robot that spins would otherwise score another full turn like stopping.
     state = state[:, None]
-    heading_error = (
-        turn_toward(state, target) - (states[..., 2] - state[..., 2])
-    ).abs()
+    turned = states[..., 2] - state[..., 2]
+    heading_error = (turn_toward(state, target) - turned).abs()
     weight = config.heading_weight * unit
-    return (
-        cost
-        + (problem.terminal_cost(states, target) + weight[:, None] * heading_error)
-        * under_way
-    )
+    terminal = problem.terminal_cost(states, target)
+    return cost + (terminal + weight[:, None] * heading_error) * under_way

@@ -1,9 +1,9 @@
-"""A global path that gives way-points to any local planner.
+"""A global path that provides waypoints to any local planner.
 
-A* gives the cheapest path from wherever the robot stands; the local planner heads for a
-way-point on it. A robot that its local planner holds in place is steered along the
-path. Source: paper IV-A1, after Fan et al. (2021), "STEP". Letters in shapes: B
-    episodes, A action dimensions.
+A* returns the cheapest path from the robot's position; the local planner heads for a
+waypoint on it. A robot that its local planner keeps at one position is steered along
+the path. Source: paper IV-A1, after Fan et al. (2021), "STEP". Letters in shapes: B
+episodes, A action dimensions.
 """
 
 from dataclasses import dataclass, replace
@@ -34,9 +34,9 @@ class GuideConfig:
     """Settings of the global path.
 
     Args:
-        lookahead_m: how far along the path the way-point lies at most.
-        explore: optimism about ground that the robot would get to know on its way; see
-            `optimistic`.
+        lookahead_m: maximum distance along the path to the waypoint, in metres.
+        explore: optimism about terrain that the robot may observe before it is on it;
+            see `optimistic`.
     """
 
     added: ClassVar = ("explore",)
@@ -45,22 +45,22 @@ class GuideConfig:
     explore: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuses a look-ahead that looks nowhere, and pessimism."""
+        """Validate the look-ahead and the optimism."""
         check_finite("A*", self, ("lookahead_m",), ("explore",))
 
 
 @dataclass(frozen=True)
 class GuidedState(Batch, Generic[Local]):
-    """What a guided planner carries from step to step.
+    """Plan state of a guided planner.
 
     Args:
-        problem: what is being solved, with the λ̂ that path costs are given.
-        edge_costs: of moving between neighbouring cells, float64, shape [B, E]; see
-            `astar.edge_costs`.
+        problem: the problem, with the λ̂ that path costs use.
+        edge_costs: costs of moving between neighbouring cells, float64, shape [B, E];
+            see `astar.edge_costs`.
         field: cheapest paths to the goal.
-        ground: what a metre costs in each cell.
+        ground: costs of a metre in each cell.
         local: the local planner's plan state.
-        recovery: of robots that stand.
+        recovery: recovery of robots that stand.
     """
 
     problem: Problem
@@ -72,15 +72,15 @@ class GuidedState(Batch, Generic[Local]):
 
 
 class Guided(Planner[GuidedState[Local]], Generic[Local]):
-    """A local planner guided by A*, as a planner.
+    """A planner that consists of A* and a local planner.
 
     Args:
         config: settings of the global path.
-        local: drives to way-points.
+        local: planner that drives to waypoints.
     """
 
     def __init__(self, config: GuideConfig, local: LocalPlanner[Local]) -> None:
-        """Keeps the settings; all else is in the plan state."""
+        """Store the settings."""
         self.config, self.local = config, local
 
     @property
@@ -89,8 +89,9 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         return self.local.compiled
 
     def uses(self, task: Task) -> frozenset[str]:
-        """What the local planner uses, free space, and λ̂ where a path's cost does; see
-        `Planner`.
+        """Return the inputs of the local planner, of free space and of path costs.
+
+        See `Planner`.
         """
         path = set()
         if self._cost_uses_map(task):
@@ -99,67 +100,53 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
 
     @staticmethod
     def _cost_uses_map(task: Task) -> bool:
-        """Whether the cost of a metre of path changes with λ̂, on level ground or on a
-        slope.
-        """
-        traversability = torch.linspace(task.rules.min_traversability, 1.0, 9).expand(
-            3, 9
-        )
+        """Return whether the cost of a path depends on λ̂, on level terrain or slopes."""
+        lowest = task.rules.min_traversability
+        traversability = torch.linspace(lowest, 1.0, 9).expand(3, 9)
         grade = torch.tensor([-0.3, 0.0, 0.3])[:, None].expand(3, 9)
         cost = task.objective.path_cost(traversability, grade)
         return bool((cost != cost[:, :1]).any())
 
     def follows(self, task: Task) -> str:
-        """What A* and the local planner minimise where that is not J alone; see
-        `Planner`.
-        """
-        own = self.local.follows(task)
+        """Return what A* and the local planner minimise instead of J; see `Planner`."""
+        local_aim = self.local.follows(task)
         if isinstance(task.objective, GoalDistance) or not has_path_cost(
             task.objective
         ):
-            return f"3D path length (A*), {own or 'J'} ({self.local.name})"
-        return own and f"J (A*), {own} ({self.local.name})"
+            return f"3D path length (A*), {local_aim or 'J'} ({self.local.name})"
+        return local_aim and f"J (A*), {local_aim} ({self.local.name})"
 
     def remarks(self, task: Task) -> tuple[str, ...]:
-        """Says what a path costs where J does not, and where no risk setting moves the
-        path; see `Planner`.
-        """
-        found, objective = [], task.objective
+        """Return notes on path costs that do not use J or λ̂; see `Planner`."""
+        remarks, objective = [], task.objective
         if not has_path_cost(objective):
-            found.append(
+            remarks.append(
                 f"A* takes the shortest path: {type(objective).__name__} has no "
                 "`path_cost`"
             )
         if not self._cost_uses_map(task) and task.rules.free_space.by == "mean":
-            found.append(
+            remarks.append(
                 "A* finds the same path under every risk setting, since its cost does "
                 "not use λ̂ and free ground is "
                 f"set by the mean; risk moves {self.local.name} alone (objective "
                 "travel_time moves the path)"
             )
-        return tuple(found)
+        return tuple(remarks)
 
     def init(self, problem: Problem, generator: torch.Generator) -> GuidedState[Local]:
-        """Searches the maps; see `Planner`."""
+        """Return the plan state after a search of the maps; see `Planner`."""
         local = self.local.init(self._local_problem(problem), generator)
-        recovery, problem = (
-            Recovery.none(problem.start),
-            optimistic(problem, self.config.explore),
-        )
+        recovery = Recovery.none(problem.start)
+        problem = optimistic(problem, self.config.explore)
         costs = astar.edge_costs(problem)
-        return GuidedState(
-            problem,
-            costs,
-            astar.search(problem, costs),
-            ground_costs(problem),
-            local,
-            recovery,
-        )
+        field = astar.search(problem, costs)
+        ground = ground_costs(problem)
+        return GuidedState(problem, costs, field, ground, local, recovery)
 
     def plan(
         self, step: Step, plan_state: GuidedState[Local]
     ) -> tuple[Tensor, GuidedState[Local], Plan]:
-        """Follows the cheapest path; see `Planner`."""
+        """Return actions along the cheapest path; see `Planner`."""
         problem, field, state = plan_state.problem, plan_state.field, step.state
         # The robot, and as many points as can lie within the look-ahead.
         count = 2 + int(self.config.lookahead_m / problem.grid.resolution_m)
@@ -173,13 +160,13 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         recovery = aim(
             recovery, plan_state.recovery.active, problem, field, state, straight
         )
-        away = steer_toward(state, recovery.target_m, problem.robot)
-        action = torch.where(recovery.active[:, None], away, action)
+        steered = steer_toward(state, recovery.target_m, problem.robot)
+        action = torch.where(recovery.active[:, None], steered, action)
         if step.draw:
             # Long enough for a path that crosses the map twice; longer ones are cut.
-            whole = 2 * (problem.grid.height + problem.grid.width)
+            max_points = 2 * (problem.grid.height + problem.grid.width)
             plan = replace(
-                plan, reference=astar.path_points(problem, field, state, whole)
+                plan, reference=astar.path_points(problem, field, state, max_points)
             )
         local = self.local.commit_action(local, action)
         return action, replace(plan_state, local=local, recovery=recovery), plan
@@ -187,8 +174,9 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
     def revise(
         self, plan_state: GuidedState[Local], problem: Problem
     ) -> GuidedState[Local]:
-        """Searches the maps again whose ground has changed, and keeps the local
-        planner's motion; see `Planner`.
+        """Return the plan state after a search of changed maps; see `Planner`.
+
+        The local planner's motion is kept.
         """
         local = self.local.revise(plan_state.local, self._local_problem(problem))
         before, costs, field = (
@@ -204,10 +192,10 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         members = changed.flatten(1).any(1).nonzero()[:, 0]
         if len(members):
             costs = astar.revised_edge_costs(problem, costs, changed)
-            found = astar.search(
-                problem.select(members), (costs[own] for own in members.tolist())
+            searched = astar.search(
+                problem.select(members), (costs[member] for member in members.tolist())
             )
-            field = field.put(members, found)
+            field = field.put(members, searched)
         ground = ground_costs(problem)
         return replace(
             plan_state,
@@ -221,39 +209,34 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
     def select(
         self, plan_state: GuidedState[Local], members: Tensor
     ) -> GuidedState[Local]:
-        """Keeps some episodes; see `Planner`."""
-        # The local planner alone knows which of its tensors are of episodes.
+        """Return the plan state of some episodes; see `Planner`."""
+        # Only the local planner knows which of its tensors have an episode dimension.
         shared: GuidedState[Any] = replace(plan_state, local=None)  # type: ignore[arg-type]
         return replace(
             shared.select(members), local=self.local.select(plan_state.local, members)
         )
 
     def _local_problem(self, problem: Problem) -> Problem:
-        """The local planner's problem: J to the goal where it seeks that, else J from
-        waypoint to waypoint.
-        """
+        """Return the local planner's problem: J to the goal, or to the next waypoint."""
         if self.local.seeks_goal:
             return problem
-        return replace(
-            problem,
-            task=replace(problem.task, objective=toward_waypoints(problem.objective)),
-        )
+        objective = toward_waypoints(problem.objective)
+        return replace(problem, task=replace(problem.task, objective=objective))
 
 
 def optimistic(problem: Problem, explore: float) -> Problem:
-    """The problem whose λ̂ is raised, to 1 at most, by so many times the spread of what
-    is believed of each cell.
+    """Return the problem with λ̂ raised, to 1 at most, by a multiple of its spread.
 
-    A path through ground that may be good is then worth a try, since the robot gets to
-    know that ground before it is on it, and can still turn away. No distance says which
-    ground that is: what a robot senses before it commits itself has hardly any spread
-    left by then, and neither has what lies within the correlation of that, under a
-    belief that learns. Under one that does not, nothing is settled on the way, and the
-    bonus is a mere taste for risk. Free ground stays what it is.
+    A path through uncertain terrain is then worth trying, since the robot observes that
+    terrain before it is on it, and can still turn away. No distance limits the bonus.
+    Under a belief that learns, terrain that is sensed early, or correlated with such
+    terrain, has hardly any spread left. Under one that does not learn, nothing is
+    settled during the episode, and the bonus only favours risk. The free mask does not
+    change.
 
     Args:
         problem: B problems.
-        explore: how many times; 0 gives the problem itself.
+        explore: multiple of the spread; 0 returns the problem itself.
     """
     if explore == 0:
         return problem

@@ -1,8 +1,8 @@
-"""Recovery: what becomes of a robot that its local planner holds in place.
+"""Recovery of robots that a local planner keeps at one position.
 
-Where a local planner has held a robot in place for a second, the robot is steered along
-the path, cell by cell, until it has left the place; one that drives and is held by the
-ground is left to its planner. Not of
+If a robot has been kept at one position for a second, it is steered along the path,
+cell by cell, until it has left that position. A robot that drives but is slowed by the
+terrain is left to its planner. Recovery is not part of
 the paper. Letters in shapes: B episodes, S state and A action dimensions.
 """
 
@@ -39,18 +39,18 @@ _RECOVERY_S = 20.0
 
 @dataclass(frozen=True)
 class Recovery(Batch):
-    """How long each robot has stood, and whether it is being steered away.
+    """Standing times of robots, and the recoveries in progress.
 
     Args:
-        place_m: (x, y) that it has not left, shape [B, 2].
-        steps: steps that it has been there, int64, shape [B].
-        driven_m: how far it was to drive in these, shape [B].
-        active: it is being steered away, bool, shape [B].
-        target_m: (x, y) that it is then steered to, shape [B, 2].
-        cell: flat index of the path's cell at or behind that, int64, shape [B].
+        anchor_m: position (x, y) that a robot has not left, shape [B, 2].
+        steps: number of steps at that position, int64, shape [B].
+        driven_m: commanded distance in these steps, shape [B].
+        active: mask of robots in recovery, bool, shape [B].
+        target_m: target (x, y) of the recovery, shape [B, 2].
+        cell: flat index of the path's cell at or behind the target, int64, shape [B].
     """
 
-    place_m: Tensor
+    anchor_m: Tensor
     steps: Tensor
     driven_m: Tensor
     active: Tensor
@@ -59,37 +59,35 @@ class Recovery(Batch):
 
     @classmethod
     def none(cls, state: Tensor) -> "Recovery":
-        """That of robots, shape [B, S], which have not been anywhere yet."""
+        """Return the state of robots, shape [B, S], before the first step."""
         zero = torch.zeros_like(state[:, 0])
-        place = torch.full_like(state[:, :2], torch.inf)
-        return cls(place, zero.long(), zero, zero.bool(), place, zero.long())
+        nowhere = torch.full_like(state[:, :2], torch.inf)
+        return cls(nowhere, zero.long(), zero, zero.bool(), nowhere, zero.long())
 
 
 def watch(recovery: Recovery, state: Tensor, action: Tensor, robot: Robot) -> Recovery:
-    """Begins and ends recoveries.
+    """Return the recovery state with recoveries started and ended.
 
     Args:
-        recovery: up to the last step.
-        state: where the robots are now, shape [B, S].
-        action: what the local planner would do next, the speed first, shape [B, A].
-        robot: for its time step and top speed.
+        recovery: state up to the last step.
+        state: current robot states, shape [B, S].
+        action: next actions of the local planner, the speed first, shape [B, A].
+        robot: robot with its time step and top speed.
     """
-    left = distance(state, recovery.place_m) >= torch.where(
-        recovery.active, _LEFT_M, _STANDING_M
-    )
+    limit_m = torch.where(recovery.active, _LEFT_M, _STANDING_M)
+    has_left = distance(state, recovery.anchor_m) >= limit_m
     time_s = (recovery.steps + 1) * robot.dt_s
-    given_up = recovery.active & (time_s >= _PATIENCE_S + _RECOVERY_S)
-    anew = left | given_up
-    held = (time_s >= _PATIENCE_S) & (
-        recovery.driven_m < _IDLE * robot.top_speed_mps * time_s
-    )
+    timed_out = recovery.active & (time_s >= _PATIENCE_S + _RECOVERY_S)
+    restarts = has_left | timed_out
+    is_idle = recovery.driven_m < _IDLE * robot.top_speed_mps * time_s
+    is_standing = (time_s >= _PATIENCE_S) & is_idle
+    step_m = action[:, 0].abs() * robot.dt_s
     return replace(
         recovery,
-        place_m=torch.where(anew[:, None], state[:, :2], recovery.place_m),
-        steps=torch.where(anew, 0, recovery.steps + 1),
-        driven_m=torch.where(anew, 0, recovery.driven_m)
-        + action[:, 0].abs() * robot.dt_s,
-        active=~anew & (recovery.active | held),
+        anchor_m=torch.where(restarts[:, None], state[:, :2], recovery.anchor_m),
+        steps=torch.where(restarts, 0, recovery.steps + 1),
+        driven_m=torch.where(restarts, 0, recovery.driven_m) + step_m,
+        active=~restarts & (recovery.active | is_standing),
     )
 
 
@@ -101,20 +99,19 @@ def aim(
     state: Tensor,
     straight: Tensor,
 ) -> Recovery:
-    """Says where robots are steered: along the path, from the centre of one cell to
-    that of the next.
+    """Return the recovery state with targets along the path, from cell centre to centre.
 
-    Where dearer ground lies on the line to the next cell, it is reached by way of the
-    corner that the two cells share, which no other cell has a part in. A robot keeps to
-    a target until it is there.
+    If the line to the next cell crosses more expensive terrain, the cell is reached by
+    the corner that the two cells share, which no other cell is part of. A robot keeps
+    its target until it is there.
 
     Args:
-        recovery: now, from `watch`, with the targets of the last step.
-        begun: those whose recovery began earlier, bool, shape [B].
+        recovery: state from `watch`, with the targets of the last step.
+        begun: mask of robots whose recovery began earlier, bool, shape [B].
         problem: B problems.
         field: cheapest paths to the goal.
-        state: where the robots are now, shape [B, S].
-        straight: no dearer ground lies on the line to the next cell, bool, shape [B].
+        state: current robot states, shape [B, S].
+        straight: mask of robots whose line to the next cell is worth it, bool, shape [B].
 
     Returns:
         The recovery with the targets of this step.

@@ -1,7 +1,7 @@
-"""The way-point that a local planner heads for: the farthest point of a path that is
-worth a short cut.
+"""Waypoints of local planners: the farthest point of a path to which a straight line
+is worth it.
 
-The way-point is the farthest point of the path, within the look-ahead, whose straight
+The waypoint is the farthest point of the path, within the look-ahead, whose straight
 line costs at most 1.1 times the path under A*'s own costs. Both are integrated exactly
 over the cells that they cross, so no corner between two sampled points is missed.
 Letters in shapes: B episodes, J lines, N points, H×W cells.
@@ -20,24 +20,23 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.astar.astar import cell_at, cell_centres
 from benchnav.planning.problem import Problem
 
-# A straight line may cost this much more than the path that it shortens.
+# Maximum cost of a straight line relative to the path that it shortens.
 _SHORT_CUT = 1.1
 
 
 @dataclass(frozen=True)
 class GroundCosts(Batch):
-    """What a metre of straight line costs in each cell; maps framed by `Grid.pad` for
-    lookups.
+    """Costs of a metre of straight line in each cell; maps are padded by `Grid.pad`.
 
     A metre costs path_cost(λ̂, gradient · direction) + penalty_per_m.
 
     Args:
         grid: size and resolution of the maps.
-        path_cost: cost of a metre, from λ̂ and grade.
+        path_cost: function of λ̂ and grade that returns the cost of a metre.
         traversability: λ̂, shape [B, (H + 2)·(W + 2)].
-        penalty_per_m: of ground that is not free, shape [B, (H + 2)·(W + 2)].
-        rise_x: of a metre along x, shape [B, (H + 2)·(W + 2)].
-        rise_y: of a metre along y, shape [B, (H + 2)·(W + 2)].
+        penalty_per_m: penalty of non-free cells, shape [B, (H + 2)·(W + 2)].
+        rise_x: rise of a metre along x, shape [B, (H + 2)·(W + 2)].
+        rise_y: rise of a metre along y, shape [B, (H + 2)·(W + 2)].
     """
 
     grid: Grid
@@ -49,7 +48,7 @@ class GroundCosts(Batch):
 
 
 def ground_costs(problem: Problem) -> GroundCosts:
-    """A*'s own costs a metre, of B problems."""
+    """Return A*'s own costs of a metre, for B problems."""
     grid = problem.grid
     along_y, along_x = torch.gradient(
         problem.elevation_m, spacing=grid.resolution_m, dim=(1, 2)
@@ -67,68 +66,63 @@ def ground_costs(problem: Problem) -> GroundCosts:
 def line_costs(
     ground: GroundCosts, start_m: Tensor, end_m: Tensor, crossings: int
 ) -> Tensor:
-    """Integrates the cost of straight lines over the cells that they cross.
+    """Return the cost of straight lines, integrated over the cells that they cross.
 
     Args:
         ground: costs of a metre.
-        start_m: (x, y) of one end, shape [B, J, 2].
-        end_m: (x, y) of the other, shape [B, J, 2].
-        crossings: most columns, and most rows, into which a line may pass from its
+        start_m: (x, y) of one end in metres, shape [B, J, 2].
+        end_m: (x, y) of the other end, shape [B, J, 2].
+        crossings: maximum number of columns, and of rows, that a line enters after its
             first.
 
     Returns:
-        Shape [B, J].
+        Cost, shape [B, J].
     """
     offset = end_m - start_m
     cuts = _grid_cuts(start_m, offset, ground.grid.resolution_m, crossings)
-    share = cuts.diff(dim=-1)
-    middle = (
-        start_m[:, :, None]
-        + (0.5 * (cuts[..., 1:] + cuts[..., :-1]))[..., None] * offset[:, :, None]
-    )
+    fraction = cuts.diff(dim=-1)
+    centre = (0.5 * (cuts[..., 1:] + cuts[..., :-1]))[..., None]
+    middle = start_m[:, :, None] + centre * offset[:, :, None]
     length = torch.linalg.vector_norm(offset, dim=-1)[..., None]
 
     def at_pieces(padded: Tensor) -> Tensor:
         return ground.grid.lookup(padded, middle[..., 0], middle[..., 1])
 
-    rise = (
-        at_pieces(ground.rise_x) * offset[..., :1]
-        + at_pieces(ground.rise_y) * offset[..., 1:]
-    )
-    # Of a line without length any grade will do: it costs nothing.
-    grade = rise / length.clamp(min=1e-9)
+    rise_x = at_pieces(ground.rise_x) * offset[..., :1]
+    rise_y = at_pieces(ground.rise_y) * offset[..., 1:]
+    # The grade of a line without length does not matter: it costs nothing.
+    grade = (rise_x + rise_y) / length.clamp(min=1e-9)
     per_m = ground.path_cost(at_pieces(ground.traversability), grade)
-    return ((per_m + at_pieces(ground.penalty_per_m)) * share * length).sum(dim=-1)
+    per_m = per_m + at_pieces(ground.penalty_per_m)
+    return (per_m * fraction * length).sum(dim=-1)
 
 
 def choose_waypoint(
     ground: GroundCosts, points_m: Tensor, lookahead_m: float
 ) -> tuple[Tensor, Tensor]:
-    """Picks the farthest point of a path whose straight line costs hardly more than the
-    path.
+    """Return the farthest point of a path whose straight line costs hardly more than
+    the path.
 
     Args:
         ground: A*'s costs of a metre.
-        points_m: the robot, then the centre of each next cell of its path, then the
-            goal, shape [B, N, 2].
-        lookahead_m: how far along the path to look.
+        points_m: the robot, the centres of the next cells of its path, and the goal,
+            (x, y) in metres, shape [B, N, 2].
+        lookahead_m: look-ahead along the path in metres.
 
     Returns:
-        (x, y), shape [B, 2], the path's next point where no line is worth it; and
-        whether at least the line to that next point is worth it, bool, shape [B].
+        Waypoint (x, y), shape [B, 2]: the path's next point if no line is worth it; and
+        a mask of episodes in which the line to that next point is, bool, shape [B].
     """
     grid = ground.grid
     robot, ahead = points_m[:, :1], points_m[:, 1:]
-    # Half-way to the next cell's centre lies the edge or the corner that the two cells
-    # share.
+    # The edge or corner that two cells share is half-way to the next cell's centre.
     gate = 0.5 * (cell_centres(grid, cell_at(grid, robot)).to(robot) + ahead[:, :1])
     count = ahead.shape[1]
     # Straight lines to each point, the path's legs, and the first leg by way of the
     # gate.
     begin = torch.cat((robot.expand_as(ahead), ahead[:, :-1], robot, gate), dim=1)
     end = torch.cat((ahead, ahead[:, 1:], gate, ahead[:, :1]), dim=1)
-    # Only what is within the look-ahead counts, and that spans no more columns or rows
-    # than this.
+    # Lines within the look-ahead cross no more columns or rows than this.
     crossings = math.ceil(lookahead_m / grid.resolution_m) + 1
     costs = line_costs(ground, begin, end, crossings)
     lines, legs, by_gate = costs.split((count, count - 1, 2), dim=1)
@@ -136,29 +130,27 @@ def choose_waypoint(
     # touch.
     first = torch.minimum(lines[:, :1], by_gate.sum(dim=1, keepdim=True))
     path = torch.cat((first, legs), dim=1).cumsum(dim=1)
-    near = (
-        torch.linalg.vector_norm(points_m.diff(dim=1), dim=2).cumsum(dim=1)
-        <= lookahead_m
-    )
+    along_m = torch.linalg.vector_norm(points_m.diff(dim=1), dim=2).cumsum(dim=1)
+    in_range = along_m <= lookahead_m
     rank = torch.arange(count, device=ahead.device)
-    worth = lines <= _SHORT_CUT * path
-    farthest = torch.where(worth & near, rank, 0).amax(dim=1)
-    return ahead.take_along_dim(farthest[:, None, None], 1)[:, 0], worth[:, 0]
+    is_worth = lines <= _SHORT_CUT * path
+    farthest = torch.where(is_worth & in_range, rank, 0).amax(dim=1)
+    return ahead.take_along_dim(farthest[:, None, None], 1)[:, 0], is_worth[:, 0]
 
 
 def _grid_cuts(
     start_m: Tensor, offset_m: Tensor, resolution_m: float, crossings: int
 ) -> Tensor:
-    """Shares of a line at which it begins, crosses the grid's lines, and ends; sorted,
-    [B, J, 2·crossings + 2].
+    """Return sorted fractions of lines at which they begin, cross grid lines, and end.
+
+    Shape [B, J, 2·crossings + 2].
     """
     lines = torch.arange(crossings, device=start_m.device) + 1
     begin, along = start_m[..., None], offset_m[..., None]
     low = torch.minimum(begin, begin + along)
     crossed = ((low / resolution_m).floor() + lines) * resolution_m
-    # A line along an axis's grid lines crosses none of them: not a number, or infinite.
-    shares = (
-        ((crossed - begin) / along).nan_to_num(1.0, 1.0, 1.0).clamp(0, 1).flatten(2)
-    )
-    ends = torch.zeros_like(shares[..., :1]), torch.ones_like(shares[..., :1])
-    return torch.cat((*ends, shares), dim=-1).sort(dim=-1).values
+    # A line along an axis never crosses that axis's grid lines: NaN or infinite.
+    fractions = ((crossed - begin) / along).nan_to_num(1.0, 1.0, 1.0)
+    fractions = fractions.clamp(0, 1).flatten(2)
+    ends = torch.zeros_like(fractions[..., :1]), torch.ones_like(fractions[..., :1])
+    return torch.cat((*ends, fractions), dim=-1).sort(dim=-1).values

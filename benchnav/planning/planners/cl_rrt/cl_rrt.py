@@ -1,58 +1,54 @@
 """Closed-loop rapidly-exploring random trees (CL-RRT).
 
-A tree is grown not by steering states but by simulating the robot with its controller:
-a node is chosen for a sampled point, a Dubins reference is drawn from the node to the
-point, and the closed loop of pure pursuit and a PID on speed (`pursuit`) drives along
-it through F with predicted traversability. The edge stays as far as it is free of
-collision; what the robot then executes is the same controller on the same references.
-The best path is the one of least simulated time; J is not read. Source: Kuwata et al.
-(2009), "Real-time motion planning with applications to autonomous urban driving"; paper
-IV-A2.
+A tree is not grown by steering states but by simulating the robot with its controller.
+A node is chosen for a sampled point, and a Dubins reference is drawn from the node to
+the point. The closed loop of pure pursuit and a PID on speed (`pursuit`) drives along
+it through F with predicted traversability. An edge is kept as far as it is free of
+collision. The robot then executes the same controller on the same references. The best
+path is that of minimum simulated time; J is not used. Source: Kuwata et al. (2009),
+"Real-time motion planning with applications to autonomous urban driving"; paper IV-A2.
 
-Read on in `tree`, whose `search` is one plan, and in `edges`, which simulates and
-judges. This module is what the source calls the execution loop, algorithm 2: when to
-plan, and from what.
+See also `tree`, whose `search` is one plan, and `edges`, which simulates. This module
+is the execution loop of the source, algorithm 2: when to plan, and from which state.
 
-- The source grows one tree all the time, propagates its best path again from the latest
-  state, and stops where there is none that is safe. Here a tree is grown where a plan
-  is due, at the path's end or when the robot has strayed or stalled (paper IV-A2), and
-  not kept. Nodes need not be safe to stop at.
-- References are Dubins paths; the source draws straight lines and takes Dubins lengths
+- The source grows one tree all the time, simulates its best path again from the latest
+  state, and stops if no path is safe. Here a tree is grown only when a plan is due, at
+  the path's end or when the robot has strayed or stalled (paper IV-A2), and is not
+  kept. Nodes need not be safe to stop at.
+- References are Dubins paths; the source draws straight lines and uses Dubins lengths
   for its heuristics.
-- Where λ̂ falls along a path to the goal, so that what is ahead costs over a tenth more
-  than by the map that it was chosen on, a new tree is grown and the cheaper of both
-  paths is driven. Both costs are times along the predicted positions under the new λ̂.
-  Without a new path the next steps try again, up to `most_failures` times. A partial
-  path is left at once. So a map that stays as it is costs no tree, and one that changes
-  little by little only a few.
-- Sampled points carry no heading, so references are the shortest paths to a point with
-  free heading: the least over all end headings of the Dubins length, and no random
-      heading makes a detour.
-- A plan without a way to the goal leads along the best partial path, and is tried anew
-  at the next steps with references of half the radius each time, down to the robot's
-  own tightest turn or the spacing of their
-  points: at full radius a robot that faces ground that is not free has no way at all,
-  and one that can slow down can turn tighter. After `most_failures` such plans a
-  partial path is driven to its end. It is left a little before its end, and not tried
-  anew from ground that is not free: a robot that slid into a wall could leave it on the
-      other side.
-- Where `most_failures` plans in a row found no partial path either, the next ones may
-  cross: their edges go on over ground that is not free, at its penalty a metre, and the
-  cheapest path is driven as a partial one. Before that the tree stays on free ground,
-  so that a free way is taken wherever one is found; and once the robot is across, it
-  looks for one again. The planner never gives up.
-- Expansions go in rounds: all samples of a round, of all episodes, are simulated at
+- If λ̂ decreases along a path to the goal, so that the remaining path costs over a tenth
+  more than on the map on which it was chosen, a new tree is grown and the cheaper of
+  both paths is driven. Both costs are times along the predicted positions under the new
+  λ̂. Without a new path the next steps try again, up to `most_failures` times. A partial
+  path is left at once. Hence a constant map costs no tree, and one that changes slowly
+  only a few.
+- Sampled points have no heading, so references are the shortest paths to a point with
+  free heading: the minimum over all end headings of the Dubins length. No random
+  heading causes a detour.
+- A plan without a path to the goal follows the best partial path. The next steps plan
+  again, each time with references of half the radius, down to the robot's own tightest
+  turn or the spacing of their points: at full radius a robot that faces non-free cells
+  may have no path, and one that can slow down can turn tighter. After `most_failures`
+  such plans a partial path is driven to its end. It is left slightly before its end,
+  and there is no further plan from non-free cells: a robot that slid into a wall could
+  leave it on the other side.
+- If `most_failures` consecutive plans found no partial path either, the next ones may
+  cross: their edges continue over non-free cells, at their penalty per metre, and the
+  cheapest path is driven as a partial one. Before that the tree stays in free cells, so
+  that a free path is used wherever one is found; once the robot is across, it looks for
+  one again. The planner never gives up.
+- Expansions are in rounds: all samples of a round, of all episodes, are simulated at
   once. Samples are a pure function of the plan state's seed and step, the same for each
   episode of a batch.
-- A path has at most one edge a round, so that a plan reaches as far as `rounds` edges
-  do (100 m by default); a goal farther off is approached along partial paths.
+- A path has at most one edge per round, so that a plan reaches as far as `rounds` edges
+  do (100 m by default); a goal farther away is approached along partial paths.
 
-Letters in shapes: B episodes, M of which plan anew, D edges of a path, R edges of a
-    round.
+Letters in shapes: B episodes, M of which plan, D edges of a path, R edges of a round.
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -63,10 +59,10 @@ from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import TravelTime, distance
+from benchnav.planning.planners.cl_rrt.config import CLRRTConfig
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import (
     SPACING_M,
-    FollowerConfig,
     PathFollower,
     Reference,
     Tracking,
@@ -76,98 +72,37 @@ from benchnav.planning.planners.planner import (
     Plan,
     Planner,
     PlanStatus,
-    check_finite,
     check_steers,
 )
 from benchnav.planning.problem import Problem, Task, motion_traversability
 from benchnav.planning.robots import SPEED, TURN_RATE
 from benchnav.planning.sensing.sensor import Step
 
-_STALL_M = 0.25  # progress less than this in `stall_s` is none
-# fraction by which the cost of the path ahead rises before it is compared with a new
-# one
+_STALL_M = 0.25  # minimum progress within `stall_s`
+# Fraction by which the cost of the remaining path rises before it is compared with a
+# new one.
 _RISE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class CLRRTConfig:
-    """Settings of CL-RRT. The paper gives none of these numbers; the defaults are ours.
-
-    Args:
-        expansions: edges tried in a plan.
-        expansions_per_round: edges simulated at once; divides `expansions`.
-        step_m: greatest length of an edge along its reference.
-        edge_time_s: greatest duration of an edge; one that takes longer ends there.
-        goal_bias: share of the expansions that aim at the goal.
-        turning_radius_m: of the references, as long as they lead to the goal.
-        replan_distance_m: a robot farther than this from the nearest predicted position
-            plans anew.
-        stall_s: so does one that makes no progress for so long.
-        most_failures: plans in a row without a way to the goal after which a partial
-            path is driven to its end and, without one, edges may cross ground that is
-            not free.
-        follower: of the controller, in simulation and on the way.
-    """
-
-    expansions: int = 500
-    expansions_per_round: int = 25
-    step_m: float = 5.0
-    edge_time_s: float = 10.0
-    goal_bias: float = 0.25
-    turning_radius_m: float = 1.0
-    replan_distance_m: float = 1.0
-    stall_s: float = 5.0
-    most_failures: int = 5
-    follower: FollowerConfig = field(default_factory=FollowerConfig)
-
-    def __post_init__(self) -> None:
-        """Refuses settings that grow no tree."""
-        above = (
-            "expansions",
-            "expansions_per_round",
-            "step_m",
-            "edge_time_s",
-            "turning_radius_m",
-        )
-        check_finite(
-            "CL-RRT", self, (*above, "replan_distance_m", "stall_s", "most_failures")
-        )
-        expect(
-            self.expansions % self.expansions_per_round == 0,
-            "`expansions` as a multiple of `expansions_per_round` = "
-            f"{self.expansions_per_round} for CL-RRT, got "
-            f"{self.expansions}.",
-        )
-        expect(
-            0 <= self.goal_bias <= 1,
-            f"`goal_bias` in 0–1 for CL-RRT, got {self.goal_bias}.",
-        )
-
-    @property
-    def rounds(self) -> int:
-        """Rounds of a plan, which is also the most edges that a path can have: D."""
-        return self.expansions // self.expansions_per_round
-
-
-@dataclass(frozen=True, kw_only=True)
 class CLRRTState(Batch):
-    """What CL-RRT carries from step to step.
+    """Plan state of CL-RRT.
 
     Args:
-        problem: what is being solved.
-        route: what is being followed.
-        edge: which edge of the path, int64, shape [B].
-        tracking: of the controller.
-        progress_m: arc length along the reference of that edge, shape [B].
-        failures: plans in a row without a way to the goal, int64, shape [B].
-        mark_m: progress along the path when last some was seen, shape [B].
-        mark_step: the step of it, int64, shape [B].
+        problem: the problem.
+        route: route that is followed.
+        edge: index of the current edge of the path, int64, shape [B].
+        tracking: state of the controller.
+        progress_m: arc length along the reference of that edge in metres, shape [B].
+        failures: consecutive plans without a path to the goal, int64, shape [B].
+        mark_m: progress along the path at the last mark, shape [B].
+        mark_step: step of that mark, int64, shape [B].
         ground: `Problem.padded_ground` on which the path was chosen, shape [B, N].
-        doubted: the path has become dearer since, and is to be compared with a new one,
-            bool, shape [B].
+        doubted: mask of paths that have become more expensive, and are to be compared
+            with new ones, bool, shape [B].
         follower: the controller.
         seed: root of the samples.
-        step: steps planned so far.
+        step: number of steps planned so far.
     """
 
     problem: Problem
@@ -186,7 +121,7 @@ class CLRRTState(Batch):
 
 
 class CLRRT(Planner[CLRRTState]):
-    """A tree of closed-loop simulations, and the controller on its quickest branch.
+    """Planner that grows a tree of closed-loop simulations and follows its best branch.
 
     Args:
         config: settings.
@@ -195,23 +130,21 @@ class CLRRT(Planner[CLRRTState]):
     steers = ((SPEED, TURN_RATE),)
 
     def __init__(self, config: CLRRTConfig | None = None) -> None:
-        """Keeps the settings; all else is in the plan state."""
+        """Store the settings."""
         self.config = config or CLRRTConfig()
 
     def uses(self, task: Task) -> frozenset[str]:
-        """λ̂ and free space; see `Planner`."""
+        """Return λ̂ and the input of free space; see `Planner`."""
         return frozenset({"risk_map", task.rules.free_space.source})
 
     def follows(self, task: Task) -> str:
-        """What the tree minimises where that is not J; see `Planner`."""
-        return (
-            ""
-            if isinstance(task.objective, TravelTime)
-            else "simulated time to the goal"
-        )
+        """Return what the tree minimises instead of J; see `Planner`."""
+        if isinstance(task.objective, TravelTime):
+            return ""
+        return "simulated time to the goal"
 
     def remarks(self, task: Task) -> tuple[str, ...]:
-        """Notes for tables; see `Planner`."""
+        """Return notes for tables; see `Planner`."""
         config, robot = self.config.follower, task.robot
         follower = PathFollower(config, robot)
         remarks = []
@@ -231,10 +164,10 @@ class CLRRT(Planner[CLRRTState]):
         return tuple(remarks)
 
     def init(self, problem: Problem, generator: torch.Generator) -> CLRRTState:
-        """Starts with no path, so that the first step plans; see `Planner`.
+        """Return a plan state without a path, so that the first step plans.
 
         Raises:
-            ConfigError: the robot cannot follow references, or none of the turning
+            ConfigError: If the robot cannot follow references, or not of the turning
                 radius.
         """
         config = self.config
@@ -271,7 +204,7 @@ class CLRRT(Planner[CLRRTState]):
     def plan(
         self, step: Step, plan_state: CLRRTState
     ) -> tuple[Tensor, CLRRTState, Plan]:
-        """Follows the path, planning anew where that is due; see `Planner`."""
+        """Return actions along the path, after a new plan if one is due; see `Planner`."""
         config, problem, state = self.config, plan_state.problem, step.state
         now = self._follow(state, plan_state)
         ground = problem.ground_at(state)
@@ -308,16 +241,18 @@ class CLRRT(Planner[CLRRTState]):
         )
 
     def select(self, plan_state: CLRRTState, members: Tensor) -> CLRRTState:
-        """Keeps some episodes, so that trees are grown for them alone; see `Planner`."""
+        """Return the plan state of some episodes; see `Planner`."""
         return plan_state.select(members)
 
     def revise(self, plan_state: CLRRTState, problem: Problem) -> CLRRTState:
-        """Keep paths that cost what they did, doubt dearer ones, leave those that are
-        free no more; see `Planner`.
+        """Return the plan state under another λ̂; see `Planner`.
+
+        Paths of unchanged cost are kept, more expensive ones are doubted, and those
+        that are no longer free are left.
         """
         route, before = plan_state.route, plan_state.problem
         points, length_m = self._ahead(route, problem, problem.start)
-        was, now = (own.ground_at(points) for own in (before, problem))
+        was, now = (problem_of.ground_at(points) for problem_of in (before, problem))
         closed = ((was > 0) & (now < 0) & (length_m > 0)).any(dim=1)
         judged = problem.grid.lookup(plan_state.ground, points[..., 0], points[..., 1])
         cost, judged_cost = (
@@ -337,7 +272,7 @@ class CLRRT(Planner[CLRRTState]):
     def _ahead(
         self, route: Route, problem: Problem, state: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Pieces of the paths as `Route.pieces`, those behind the robots of length 0."""
+        """Return pieces of paths as `Route.pieces`; those behind robots have length 0."""
         points, length_m = route.pieces(0.5 * problem.grid.resolution_m)
         away = distance(points, state[:, None, :2]).masked_fill(length_m == 0, math.inf)
         ahead = (
@@ -347,8 +282,9 @@ class CLRRT(Planner[CLRRTState]):
         return points, torch.where(ahead, length_m, 0)
 
     def _cost(self, now: CLRRTState, ground: Tensor, length_m: Tensor) -> Tensor:
-        """Cost of pieces in seconds, [B], from values of `padded_ground` and lengths
-        [B, K], as of a tree's edges.
+        """Return costs of pieces in seconds, [B], as those of a tree's edges.
+
+        Pieces are given by values of `padded_ground` and lengths, [B, K].
         """
         robot, rules = now.problem.robot, now.problem.task.rules
         reach_mps = (
@@ -393,8 +329,9 @@ class CLRRT(Planner[CLRRTState]):
         )
 
     def _off_route(self, state: Tensor, now: CLRRTState) -> Tensor:
-        """Tells who needs a plan: at the end of the path, too far from it, or stalled;
-        bool [B].
+        """Return a mask of robots that need a plan, bool, [B].
+
+        They are at the end of the path, too far from it, or stalled.
         """
         offset = now.route.path - state[:, None, :2]
         square = (offset * offset).sum(dim=-1).nan_to_num(nan=math.inf).amin(dim=1)
@@ -416,26 +353,26 @@ class CLRRT(Planner[CLRRTState]):
         used_up = lost & (now.route.depth[due] > 0)
         failures = torch.where(used_up, 0, now.failures[due])
         route = self._search(state[due], now, due, failures)
-        found = route.status == PlanStatus.OK
+        reaches_goal = route.status == PlanStatus.OK
         crosses = (failures >= self.config.most_failures) & (route.depth > 0)
-        failures = torch.where(found | crosses, 0, failures + 1)
+        failures = torch.where(reaches_goal | crosses, 0, failures + 1)
         compared = now.doubted[due] & ~lost
         better = ~compared
-        if bool((compared & found).any()):
+        if bool((compared & reaches_goal).any()):
             costs = [
-                self._cost_ahead(now, each, state)[due]
-                for each in (now.route.put(due, route), now.route)
+                self._cost_ahead(now, candidate, state)[due]
+                for candidate in (now.route.put(due, route), now.route)
             ]
             better = better | (costs[0] < costs[1])
-        taken = (lost | (found & better)).nonzero()[:, 0]
+        taken = (lost | (reaches_goal & better)).nonzero()[:, 0]
         members = due[taken]
         # A path that nothing better is found for is kept as it is.
-        kept = compared & (failures >= self.config.most_failures)
-        failures = torch.where(kept, 0, failures)
+        stays = compared & (failures >= self.config.most_failures)
+        failures = torch.where(stays, 0, failures)
         return replace(
             now,
             ground=now.ground.index_copy(0, due, now.problem.padded_ground[due]),
-            doubted=now.doubted.index_copy(0, due, compared & ~found & ~kept),
+            doubted=now.doubted.index_copy(0, due, compared & ~reaches_goal & ~stays),
             route=now.route.put(members, route.select(taken)),
             edge=now.edge.index_fill(0, members, 0),
             progress_m=now.progress_m.index_fill(0, members, 0),
@@ -447,9 +384,7 @@ class CLRRT(Planner[CLRRTState]):
     def _search(
         self, root: Tensor, now: CLRRTState, members: Tensor, failures: Tensor
     ) -> Route:
-        """Grows trees from root states [M, S] of some episodes and takes the best path
-        of each.
-        """
+        """Return the best paths of trees grown from root states [M, S]."""
         config, problem = self.config, now.problem
         if len(members) < len(problem):
             problem = problem.select(members)
@@ -475,7 +410,7 @@ class CLRRT(Planner[CLRRTState]):
     def _closed_loop(
         self, problem: Problem, follower: PathFollower, failures: Tensor
     ) -> ClosedLoop:
-        """What trees are grown with after so many failed plans, int64 [B]."""
+        """Return the closed loop of trees after a number of failed plans, int64 [B]."""
         config = self.config
         least_m = max(follower.tightest_m, min(config.turning_radius_m, SPACING_M))
         tries = failures % config.most_failures
@@ -492,7 +427,7 @@ class CLRRT(Planner[CLRRTState]):
 
 
 def _reference(route: Route, edge: Tensor) -> Reference:
-    """References of one edge [B] of each path."""
+    """Return the references of one edge [B] of each path."""
     batch, depth, count, _ = route.rows.shape
     path = torch.arange(batch, device=edge.device) * depth + edge.clamp(max=depth - 1)
     return Reference(route.rows.reshape(-1, 4), path * count, count)

@@ -47,15 +47,15 @@ _CHECK_STEPS = 8  # between looks at whether all edges of a round have ended
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedLoop:
-    """The robots and their controller on predicted ground, for all edges of a tree.
+    """Robots and their controller on predicted terrain, for all edges of a tree.
 
     Args:
         problem: B problems.
         follower: the controller.
-        radius_m: turning radius of the references, shape [B].
-        crossing: whether edges may enter ground that is not free, bool, shape [B].
-        step_m: greatest length of an edge along its reference.
-        edge_time_s: greatest duration of an edge.
+        radius_m: turning radius of the references in metres, shape [B].
+        crossing: whether edges may enter non-free cells, bool, shape [B].
+        step_m: maximum length of an edge along its reference in metres.
+        edge_time_s: maximum duration of an edge in seconds.
     """
 
     problem: Problem
@@ -67,18 +67,18 @@ class ClosedLoop:
 
     @property
     def drawn_points(self) -> int:
-        """Drawn points P of an edge."""
+        """Number of drawn points P of an edge."""
         return 1 + math.ceil(self.step_m / DRAWN_M)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoopState(Batch):
-    """All that it takes to drive on from somewhere. Shapes begin with [B, R].
+    """Closed-loop state from which a simulation can continue.
 
     Args:
-        state: of the robot, shape [B, R, S].
-        tracking: of the controller.
-        free: the robot stands on free ground, bool, shape [B, R].
+        state: robot state, shape [B, R, S].
+        tracking: state of the controller, shape [B, R].
+        free: mask of robots in free cells, bool, shape [B, R].
     """
 
     state: Tensor
@@ -88,20 +88,20 @@ class LoopState(Batch):
 
 @dataclass(frozen=True, kw_only=True)
 class Edges:
-    """Edges that were driven.
+    """Simulated edges.
 
     Args:
-        at: where the closed loop stands at its end.
-        kept: whether anything is left of the edge, bool, shape [B, R].
-        time_s: its duration, shape [B, R].
-        blocked_m: metres of it on ground that is not free, shape [B, R].
-        arrived: it ends at the goal, bool, shape [B, R].
-        end_m: arc length along its reference at which it ends, shape [B, R].
+        at: closed-loop state at its end.
+        exists: mask of edges of which a part is left, bool, shape [B, R].
+        time_s: duration in seconds, shape [B, R].
+        blocked_m: metres in non-free cells, shape [B, R].
+        arrived: mask of edges that end at the goal, bool, shape [B, R].
+        end_m: arc length along its reference at its end in metres, shape [B, R].
         drawn: positions along it, NaN past its end, shape [B, R, P, 2].
     """
 
     at: LoopState
-    kept: Tensor
+    exists: Tensor
     time_s: Tensor
     blocked_m: Tensor
     arrived: Tensor
@@ -112,7 +112,7 @@ class Edges:
 def draw_references(
     loop: ClosedLoop, pose: Tensor, target_m: Tensor
 ) -> tuple[Reference, Tensor]:
-    """Draws the shortest paths to points at which any heading will do.
+    """Return the shortest paths to points with free heading.
 
     Args:
         loop: gives radii and lengths.
@@ -136,7 +136,7 @@ def draw_references(
 def drive(
     loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Tensor
 ) -> Edges:
-    """Drives along references and keeps what is free of collision.
+    """Return edges driven along references, as far as they are free of collision.
 
     Args:
         loop: robots, controller and ground.
@@ -164,7 +164,7 @@ def drive(
         _at(path, before)[..., :2], _at(integral, last), _at(error, last)
     )
     return Edges(
-        kept=last > 0,
+        exists=last > 0,
         at=LoopState(state=_at(path, last), tracking=tracking, free=_at(free, last)),
         time_s=last.to(path) * problem.dt_s,
         blocked_m=_at(_blocked_m(path, free, squeezed), last),
@@ -177,7 +177,7 @@ def drive(
 def _simulate(
     loop: ClosedLoop, begin: LoopState, reference: Reference, end_m: Tensor
 ) -> list[Tensor]:
-    """Drives until all edges have ended or collided.
+    """Simulate until all edges have ended or collided.
 
     Returns:
         At each of T steps: states, shape [T, B, R, S]; progress; whether the robot is
@@ -209,8 +209,9 @@ def _simulate(
 
 
 def _squeezed(problem: Problem, path: Tensor, free: Tensor) -> Tensor:
-    """Tell at which steps a robot has just passed between two cells that are not free,
-    bool, shape [T, B, R].
+    """Return at which steps a robot has just passed between two non-free cells.
+
+    Bool, shape [T, B, R].
 
     Args:
         problem: B problems.
@@ -231,31 +232,25 @@ def _squeezed(problem: Problem, path: Tensor, free: Tensor) -> Tensor:
 
 
 def _blocked_m(path: Tensor, free: Tensor, squeezed: Tensor) -> Tensor:
-    """Metres driven on ground that is not free, or between such cells, up to each step,
-    shape [T, B, R].
-    """
+    """Return metres in or between non-free cells up to each step, shape [T, B, R]."""
     moved = torch.where(free[:-1] & ~squeezed[1:], 0, distance(path[1:], path[:-1]))
     return torch.nn.functional.pad(moved.cumsum(dim=0), (0, 0, 0, 0, 1, 0))
 
 
 def _first(condition: Tensor) -> Tensor:
-    """First step at which a condition [T, B, R] holds, int64, shape [B, R]; 0 where it
-    never does.
-    """
+    """Return the first step of a condition [T, B, R], int64, [B, R]; 0 without one."""
     return condition.to(torch.uint8).argmax(dim=0)
 
 
 def _at(log: Tensor, step: Tensor) -> Tensor:
-    """Picks from the first dimension: a log [T, B, R, *F] at steps [B, R] gives [B, R,
-    *F].
-    """
+    """Return a log [T, B, R, *F] at steps [B, R] of its first dimension, [B, R, *F]."""
     return log.take_along_dim(step.reshape(1, *step.shape, *[1] * (log.dim() - 3)), 0)[
         0
     ]
 
 
 def _thin(path: Tensor, progress: Tensor, last: Tensor, count: int) -> Tensor:
-    """Thins simulated positions to equal progress, the last position kept.
+    """Return simulated positions at equal progress, the last position included.
 
     Args:
         path: positions, shape [T, B, R, 2].

@@ -29,8 +29,8 @@ from benchnav.planning.planners.planner import check_finite
 from benchnav.planning.robots import SPEED, TURN_RATE, Robot
 
 SPACING_M = 0.1  # between the points of a reference
-_LEAST_CURVATURE = 1e-6
-_LEAST_SQUARE_M2 = 1e-6
+_MIN_CURVATURE = 1e-6
+_MIN_SQUARE_M2 = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class FollowerConfig:
     Args:
         lookahead_m: distance along the path from the robot to the point that it steers
             for, at least.
-        lookahead_s: the same as what the robot drives in so many seconds at the wanted
+        lookahead_s: the same as the time in seconds to drive it at the wanted
             speed, where that is more.
         speed_mps: speed over ground that is wanted; without it the robot's top speed
             forward.
@@ -57,19 +57,21 @@ class FollowerConfig:
     speed_kd: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuses settings that lead nowhere."""
-        least = "lookahead_s", "speed_kp", "speed_ki", "speed_kd"
-        check_finite("a path follower", self, ("lookahead_m", "speed_mps"), least)
+        """Validate the settings."""
+        at_least_zero = "lookahead_s", "speed_kp", "speed_ki", "speed_kd"
+        check_finite(
+            "a path follower", self, ("lookahead_m", "speed_mps"), at_least_zero
+        )
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Paths to follow, kept as rows of one table so that a lookup is one gather.
+    """Paths to follow, stored as rows of one table so that a lookup is one gather.
 
     Args:
         rows: points (x, y, cos θ, sin θ) of all paths, `SPACING_M` apart, shape [R, 4].
-        first: row at which each path begins, int64, shape [*B].
-        count: points N of a path.
+        first: first row of each path, int64, shape [*B].
+        count: number of points N of a path.
     """
 
     rows: Tensor
@@ -78,7 +80,7 @@ class Reference:
 
     @classmethod
     def along(cls, poses: Tensor, length_m: Tensor) -> "Reference":
-        """Makes references that run straight on past the ends of their paths.
+        """Return references that continue straight past the ends of their paths.
 
         Args:
             poses: (x, y, θ) each `SPACING_M` on, past the end the end pose, shape [*B,
@@ -99,8 +101,7 @@ class Reference:
         return cls(rows.reshape(-1, 4), first, count)
 
     def at(self, arc_m: Tensor) -> Tensor:
-        """Looks up the last point at or before an arc length, which must lie on the
-        path.
+        """Return the last point at or before an arc length, which must be on the path.
 
         Returns:
             (x, y, cos θ, sin θ), shape [*B, 4].
@@ -111,7 +112,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Tracking(Batch):
-    """What a follower carries from step to step, beside its progress.
+    """State of a follower from step to step, except its progress.
 
     Args:
         position_m: where the robot was a step ago, shape [*B, 2].
@@ -125,15 +126,13 @@ class Tracking(Batch):
 
     @classmethod
     def standing(cls, state: Tensor) -> "Tracking":
-        """Tracking of robots that stand at the beginning of their references, states
-        [*B, S].
-        """
+        """Return the tracking of standing robots, from states [*B, S]."""
         zero = torch.zeros_like(state[..., 0])
         return cls(state[..., :2], zero, zero)
 
 
 class PathFollower:
-    """Follows references.
+    """Follower of references.
 
     Args:
         config: settings.
@@ -141,12 +140,12 @@ class PathFollower:
             it has some.
 
     Raises:
-        ConfigError: the robot has other actions, cannot drive forward, or turns one way
-            alone.
+        ConfigError: If the robot has other actions, cannot drive forward, or only turns
+            one way.
     """
 
     def __init__(self, config: FollowerConfig, robot: Robot) -> None:
-        """Reads the bounds."""
+        """Store the robot's bounds."""
         names, low, high = (
             tuple(robot.action_names),
             robot.action_low,
@@ -177,7 +176,7 @@ class PathFollower:
     def advance(
         self, reference: Reference, state: Tensor, progress_m: Tensor
     ) -> Tensor:
-        """Moves the progress forward to where the robot is now.
+        """Return the progress after the robot's motion.
 
         Args:
             reference: paths, of shape [*B].
@@ -201,7 +200,7 @@ class PathFollower:
         tracking: Tracking,
         progress_m: Tensor,
     ) -> tuple[Tensor, Tracking]:
-        """Chooses an action.
+        """Return an action and the next tracking.
 
         Args:
             reference: paths, of shape [*B].
@@ -218,7 +217,7 @@ class PathFollower:
         aim = reference.at(progress_m + self.lookahead_m)
         aim_x, aim_y = aim[..., 0] - x, aim[..., 1] - y
         sideways = aim_y * heading.cos() - aim_x * heading.sin()
-        curvature = 2 * sideways / (aim_x * aim_x + aim_y * aim_y + _LEAST_SQUARE_M2)
+        curvature = 2 * sideways / (aim_x * aim_x + aim_y * aim_y + _MIN_SQUARE_M2)
 
         # PID: the wanted speed, corrected by the error of the speed over ground.
         moved = state[..., :2] - tracking.position_m
@@ -234,7 +233,7 @@ class PathFollower:
         if config.speed_kd:
             speed = speed + (error - tracking.error_mps) * (config.speed_kd / self.dt_s)
         speed = torch.minimum(
-            speed, self.turn_rate_radps / curvature.abs().clamp(min=_LEAST_CURVATURE)
+            speed, self.turn_rate_radps / curvature.abs().clamp(min=_MIN_CURVATURE)
         )
         speed = speed.clamp(low, high)
         turn_rate = (speed * curvature).clamp(

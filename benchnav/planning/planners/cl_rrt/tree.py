@@ -42,26 +42,23 @@ from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, Tracking
 from benchnav.planning.planners.dubins import dubins_length_to_point
 from benchnav.planning.planners.planner import PlanStatus
 
-_EXPLORE = (
-    0.7,
-    0.3,
-)  # share of choices that explore, before and after a way to the goal is known
-_PARTIAL_GAIN_M = (
-    0.5  # a partial path that leads no further than this toward the goal is none
-)
-# a partial path is left so far before its end, which may lie close to what is not free
+# Fraction of choices that explore, before and after a path to the goal is known.
+_EXPLORE = (0.7, 0.3)
+_PARTIAL_GAIN_M = 0.5  # minimum gain toward the goal of a partial path
+# Distance before its end at which a partial path is left, since the end may be close to
+# non-free cells.
 _MARGIN_M = 0.3
-_FAR_M = 1e4  # longer than any way on a map
+_FAR_M = 1e4  # longer than any path on a map
 
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """Which edges a round tries.
+    """Edges that a round tries.
 
     Args:
         parent: node at which each begins, int64, shape [B, R].
-        target_m: point that its reference leads to, shape [B, R, 2].
-        aimed: that point is the goal, bool, shape [B, R].
+        target_m: end point (x, y) of its reference in metres, shape [B, R, 2].
+        aimed: mask of edges to the goal, bool, shape [B, R].
     """
 
     parent: Tensor
@@ -86,25 +83,23 @@ class Tree(Choice, Edges):
 
     @property
     def cost(self) -> Tensor:
-        """What the way to each node costs, shape [B, V]."""
+        """Cost of the path to each node, shape [B, V]."""
         return self.time_s + PENALTY * self.blocked_m
 
     @property
     def best(self) -> tuple[Tensor, Tensor]:
-        """What the best way to the goal costs, inf where none is known, and its node,
-        each of shape [B].
-        """
+        """Cost of the best path to the goal, inf without one, and its node, each [B]."""
         return torch.where(self.arrived, self.cost, math.inf).min(dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Route(Batch):
-    """What was planned for each episode.
+    """Plan of each episode.
 
     Args:
         status: `PlanStatus`: OK where the path leads to the goal and enters free ground
             alone, else PARTIAL.
-        depth: edges of the path, 0 where there is none, int64, shape [B].
+        depth: edges of the path, 0 without a path, int64, shape [B].
         rows: references of the edges, as `Reference` keeps them, shape [B, D, N, 4].
         end_m: arc length at which each reference is left for the next, shape [B, D].
         path: predicted positions, NaN where unused, shape [B, D·P, 2].
@@ -144,8 +139,9 @@ class Route(Batch):
 
     @property
     def line(self) -> Tensor:
-        """Points of the references as far as they are driven, NaN where unused, shape
-        [B, D·Q, 2].
+        """Points of the references as far as they are driven, shape [B, D·Q, 2].
+
+        Unused points are NaN.
         """
         points = self.rows[:, :, :: round(DRAWN_M / SPACING_M), :2]
         arc_m = torch.arange(points.shape[2], device=points.device) * DRAWN_M
@@ -164,7 +160,7 @@ def search(
     chance: Tensor,
     goal_edges: int,
 ) -> Route:
-    """Grows a tree for each episode and takes the best route of each.
+    """Return the best route of a tree grown for each episode.
 
     Args:
         loop: robots, controller and ground.
@@ -187,7 +183,7 @@ def search(
 
 
 def plant(loop: ClosedLoop, root: Tensor, tracking: Tracking) -> Tree:
-    """A tree of the root alone; arguments as for `search`."""
+    """Return a tree of only the root; arguments as for `search`."""
     begin = LoopState(state=root, tracking=tracking, free=loop.problem.free_at(root))
     at = map_tensors(begin, lambda values: values[:, None])
     zero = torch.zeros_like(root[:, :1])
@@ -197,7 +193,7 @@ def plant(loop: ClosedLoop, root: Tensor, tracking: Tracking) -> Tree:
         target_m=at.state[..., :2],
         aimed=false,
         at=at,
-        kept=~false,
+        exists=~false,
         time_s=zero,
         blocked_m=zero,
         arrived=false,
@@ -210,7 +206,7 @@ def plant(loop: ClosedLoop, root: Tensor, tracking: Tracking) -> Tree:
 def choose(
     loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_edges: int
 ) -> Choice:
-    """Chooses nodes, and where to go from them.
+    """Choose nodes, and targets of edges from them.
 
     Args:
         loop: robots, controller and ground.
@@ -221,7 +217,7 @@ def choose(
             nodes that have not.
     """
     best = tree.best[0][:, None]
-    found = best < math.inf
+    is_reached = best < math.inf
     straight_m = (
         distance(tree.at.state, loop.problem.goal_m[:, None])
         - loop.problem.goal_radius_m
@@ -235,7 +231,7 @@ def choose(
 
     # Line 2 of algorithm 1: the first node by length alone (explore), or by the whole
     # way (optimise).
-    explore = chance < torch.where(found, _EXPLORE[1], _EXPLORE[0])  # [B, R]
+    explore = chance < torch.where(is_reached, _EXPLORE[1], _EXPLORE[0])  # [B, R]
     length_m = dubins_length_to_point(
         tree.at.state[:, None, :, :3], sample_m[:, None], loop.radius_m[:, None, None]
     )
@@ -251,7 +247,7 @@ def choose(
         )
         > 0
     )
-    promise_m = tree.to_goal_m + closed_m + torch.where(found, spent_m, 0)
+    promise_m = tree.to_goal_m + closed_m + torch.where(is_reached, spent_m, 0)
     promise_m, promising = torch.where(tried, math.inf, promise_m).topk(
         lanes, dim=1, largest=False
     )
@@ -265,31 +261,31 @@ def choose(
 
 
 def stand(tree: Tree, node: Tensor) -> LoopState:
-    """Where the closed loop stands at nodes, int64 [B, R]."""
+    """Return the closed-loop state at nodes, int64 [B, R]."""
     return map_tensors(tree.at, lambda values: _take(values, node))
 
 
 def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
-    """The tree with the ends of edges as its next nodes, rejected ones too, so that
-    tables stay of a size.
+    """Return the tree with the ends of edges as its next nodes.
+
+    Rejected edges are added too, so that the size of tables is constant.
     """
-    kept, parent = edges.kept, choice.parent
+    exists, parent = edges.exists, choice.parent
     edges = replace(
         edges,
         time_s=torch.where(
-            kept, tree.time_s.gather(1, parent) + edges.time_s, math.inf
+            exists, tree.time_s.gather(1, parent) + edges.time_s, math.inf
         ),
         blocked_m=tree.blocked_m.gather(1, parent) + edges.blocked_m,
-        arrived=edges.arrived & kept,
+        arrived=edges.arrived & exists,
     )
-    to_goal_m = torch.where(kept, _to_goal_m(loop, edges.at.state), math.inf)
+    to_goal_m = torch.where(exists, _to_goal_m(loop, edges.at.state), math.inf)
     new = Tree(**vars(choice), **vars(edges), to_goal_m=to_goal_m)
     return map_tensors(tree, lambda old, added: torch.cat((old, added), dim=1), new)
 
 
 def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
-    """Takes the cheapest path to the goal or, where there is none, the best partial
-    one.
+    """Return the cheapest path to the goal or, without one, the best partial path.
 
     Args:
         loop: robots, controller and ground.
@@ -297,8 +293,8 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
         rounds: in which it was grown, so that no path has more edges: D.
     """
     cost, cheapest = tree.best
-    found = cost < math.inf
-    chain = [torch.where(found, cheapest, _best_partial(tree))[:, None]]
+    is_reached = cost < math.inf
+    chain = [torch.where(is_reached, cheapest, _best_partial(tree))[:, None]]
     for _ in range(rounds):
         chain.append(tree.parent.gather(1, chain[-1]))
     backward = torch.cat(chain, dim=1)  # ends in zeros
@@ -306,36 +302,35 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
     order = depth[:, None] - 1 - torch.arange(rounds, device=depth.device)
     nodes = torch.where(order >= 0, backward.gather(1, order.clamp(min=0)), 0)
     end_m = tree.end_m.gather(1, nodes)
-    early = (order == 0) & ~found[:, None]
+    early = (order == 0) & ~is_reached[:, None]
     crossed = loop.crossing & (tree.blocked_m.gather(1, chain[0])[:, 0] > 0)
 
     pose = stand(tree, tree.parent.gather(1, nodes)).state[..., :3]
     reference, _ = draw_references(loop, pose, _take(tree.target_m, nodes))
     drawn = _take(tree.drawn.flatten(2), nodes).unflatten(-1, (-1, 2))
     return Route(
-        status=torch.where(found & ~crossed, PlanStatus.OK, PlanStatus.PARTIAL),
+        status=torch.where(is_reached & ~crossed, PlanStatus.OK, PlanStatus.PARTIAL),
         depth=depth,
         rows=reference.rows.reshape(*nodes.shape, -1, 4),
         end_m=torch.where(early, end_m - _MARGIN_M, end_m),
         path=_pack(
             torch.where((nodes > 0)[..., None, None], drawn, math.nan).flatten(1, 2)
         ),
-        tree=torch.where(tree.kept[:, 1:, None, None], tree.drawn[:, 1:], math.nan),
+        tree=torch.where(tree.exists[:, 1:, None, None], tree.drawn[:, 1:], math.nan),
     )
 
 
 def no_route(loop: ClosedLoop, rounds: int, edges: int) -> Route:
-    """Routes without a path, of the shapes that searched ones have: of trees with
-    nothing but roots.
-    """
+    """Return routes without a path, of the shapes of searched ones."""
     root = plant(loop, loop.problem.start, Tracking.standing(loop.problem.start))
     tree = map_tensors(root, lambda values: values.repeat_interleave(1 + edges, dim=1))
     return best_route(loop, tree, rounds)
 
 
 def _best_partial(tree: Tree) -> Tensor:
-    """Nodes nearest to the goal, those on free ground first; the root unless that gains
-    enough.
+    """Return nodes nearest to the goal, those in free cells first.
+
+    It is the root unless the gain is sufficient.
     """
     remaining_m = tree.to_goal_m + torch.where(tree.at.free, 0.0, _FAR_M)
     least_m, node = remaining_m.min(dim=1)
@@ -343,20 +338,18 @@ def _best_partial(tree: Tree) -> Tensor:
 
 
 def _to_goal_m(loop: ClosedLoop, state: Tensor) -> Tensor:
-    """Dubins lengths from states [B, V, S] to the goals, shape [B, V]."""
+    """Return Dubins lengths from states [B, V, S] to the goals, shape [B, V]."""
     return dubins_length_to_point(
         state[..., :3], loop.problem.goal_m[:, None], loop.radius_m[:, None]
     )
 
 
 def _take(values: Tensor, index: Tensor) -> Tensor:
-    """Picks from the second dimension: values [B, V, *F] at indices [B, R] give [B, R,
-    *F].
-    """
+    """Return values [B, V, *F] at indices [B, R] of the second dimension, [B, R, *F]."""
     return values.take_along_dim(index if values.dim() == 2 else index[..., None], 1)
 
 
 def _pack(points: Tensor) -> Tensor:
-    """Moves points that are not NaN to the front, in their order, shape [B, N, 2]."""
+    """Return points [B, N, 2] with those that are not NaN first, in their order."""
     order = points[..., 0].isnan().to(torch.uint8).argsort(dim=1, stable=True)
     return _take(points, order)

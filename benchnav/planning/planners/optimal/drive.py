@@ -1,4 +1,4 @@
-"""Closed loops of planners on a λ field that is known, simulated as the world does it.
+"""Closed-loop simulation of planners on a known λ field, as in the world.
 
 λ is read where a robot stands at the start of a step, and so is whether that
 immobilises it. Nothing is drawn, so a robot that repeats the actions in the same world
@@ -47,8 +47,8 @@ def simulate(
     """Drive a planner to the end of every episode.
 
     Args:
-        plan: as of a `Planner`.
-        select: as of a `Planner`.
+        plan: `plan` of a `Planner`.
+        select: `select` of a `Planner`.
         plan_state: from `init`.
         problem: B problems.
         field: λ, shape [B, H, W].
@@ -88,15 +88,15 @@ def simulate(
             dwell = torch.where(observed < immobile.below, dwell + 1, 0)
             ended = ended | (dwell >= steps_in(immobile.for_s, problem.dt_s))
         if bool(ended.any()):
-            kept = (~ended).nonzero()[:, 0]
-            if len(kept) == 0:
+            running_on = (~ended).nonzero()[:, 0]
+            if len(running_on) == 0:
                 break
-            plan_state = select(plan_state, kept)
+            plan_state = select(plan_state, running_on)
             running, state, dwell, observed = (
-                running[kept],
-                state[kept],
-                dwell[kept],
-                observed[kept],
+                running[running_on],
+                state[running_on],
+                dwell[running_on],
+                observed[running_on],
             )
     return Drive(states=states, actions=actions, steps=arrival)
 

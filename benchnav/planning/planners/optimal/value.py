@@ -1,19 +1,18 @@
-"""Value iteration over (x, y, θ): the least cost to go of a unicycle on a map of what a
-second of driving costs.
+"""Value iteration over (x, y, θ): the minimum cost to go of a unicycle on a cost map.
 
-A robot stands at a cell's centre and looks along one of Q headings. It holds an action
-for about a cell: full speed along five arcs, or a turn on the spot by one heading. λ
-scales speed and turn rate alike, so that an arc is the same curve on any ground, and
-takes 1/λ times as long: where arcs end and which cells they pass is the same for all
-cells of all maps. So a sweep over all states is a convolution of the values for each
-arc. Between cells values are interpolated, bilinearly, over those that are open.
+A state is a cell centre and one of Q headings. An action lasts for about a cell: full
+speed along one of five arcs, or a turn in place by one heading. λ scales speed and turn
+rate by the same factor. Hence an arc is the same curve on all terrain, and takes 1/λ
+times as long; its end and its cells are the same for all cells of all maps. A sweep
+over all states is therefore a convolution of the values for each arc. Between cells
+values are interpolated, bilinearly, over those that are open.
 Source: Falcone and Ferretti (2013), "Semi-Lagrangian approximation schemes for linear
-    and Hamilton-Jacobi equations".
+and Hamilton-Jacobi equations".
 
-Where terrain immobilises a robot after some dwell time, a state has several costs to
-go: the least of all drives, and those of drives that can still be begun after more and
-more dwell time. With each stands the dwell time up to which it can be begun, without
-rounding, so that moves add up exactly.
+If terrain immobilises a robot after some dwell time, a state has several costs to go:
+the minimum over all drives, and those over drives that are still possible after more
+and more dwell time. Each is stored with the dwell time up to which it is possible,
+without rounding, so that moves add up exactly.
 Letters in shapes: B maps, H×W cells, Q headings, A actions, N points along an arc, R
 reach of an arc in cells, L levels of dwell time.
 """
@@ -30,26 +29,26 @@ from benchnav.core.grid import Grid
 from benchnav.planning.robots import Unicycle
 
 _POINTS = 8  # N
-UNREACHED = 1e6  # cost to go before a way is found, and where there is none
-_MIXED = (
-    UNREACHED / 100
-)  # from there on a cost to go is for the most part of what is not reached
-_BARRED = 1e-9  # weight of a cell that is not free beside one that is
-_SETTLED = 1e-3  # least change that counts
+UNREACHED = 1e6
+"""Cost to go before a path is found, or without one."""
+# Cost to go that is mostly interpolated from unreached states.
+_MIXED = UNREACHED / 100
+_BARRED = 1e-9  # weight of a non-free cell next to a free one
+_TOLERANCE = 1e-3  # change of a cost at which iteration has converged
 _CHECK_EVERY = 10  # sweeps
-_MOST_SWEEPS = 40  # for a cell of the longer side
-_LEAST_DWELL_S = 1e-6  # a drive that leaves no more than that cannot be begun
-_MAPS_AT_ONCE = 8  # so that what is worked on stays near the cache
+_MAX_SWEEPS = 40  # per cell of the longer side
+_MIN_DWELL_S = 1e-6  # a drive that leaves no more dwell time is impossible
+_CHUNK_MAPS = 8  # so that intermediate results fit the CPU cache
 
 
 @dataclass(frozen=True)
 class Moves:
-    """What a robot may do for about a cell, with λ = 1.
+    """Actions of a robot for about a cell at λ = 1.
 
     Args:
         actions: (v, ω), shape [A, 2].
-        seconds: how long it is held, shape [A].
-        turns: by how many headings it turns, A of them.
+        seconds: duration of each action, shape [A].
+        turns: number of headings by which each turns, A of them.
     """
 
     actions: Tensor
@@ -58,40 +57,39 @@ class Moves:
 
     @classmethod
     def of(cls, robot: Unicycle, cell_m: float, headings: int) -> "Moves":
-        """Those of a unicycle: as far as turns come to whole headings, but at least
-        one, and at most a cell else.
+        """Return the actions of a unicycle.
+
+        Turns last for a whole number of headings, at least one and otherwise at most
+        for a cell; straight driving lasts for a cell.
         """
-        (top, most), bin_rad = robot.action_high, 2 * math.pi / headings
-        found = [((top, 0.0), cell_m / top, 0)]
-        for speed, rate in ((top, most / 2), (top, most), (0.0, most)):
-            bins = (
-                max(1, math.floor(cell_m * rate / speed / bin_rad + 1e-9))
-                if speed
-                else 1
-            )
-            found += [
-                ((speed, side * rate), bins * bin_rad / rate, side * bins)
-                for side in (1, -1)
-            ]
-        actions, seconds, turns = zip(*found, strict=True)
+        top, max_rate = robot.action_high
+        bin_rad = 2 * math.pi / headings
+        moves = [((top, 0.0), cell_m / top, 0)]
+        for speed, rate in ((top, max_rate / 2), (top, max_rate), (0.0, max_rate)):
+            bins = 1
+            if speed:
+                bins = max(1, math.floor(cell_m * rate / speed / bin_rad + 1e-9))
+            duration = bins * bin_rad / rate
+            moves += [((speed, side * rate), duration, side * bins) for side in (1, -1)]
+        actions, seconds, turns = zip(*moves, strict=True)
         return cls(
             torch.tensor(actions, dtype=torch.float64),
             torch.tensor(seconds, dtype=torch.float64),
             turns,
         )
 
-    def offsets(self, heading: Tensor, share: Tensor) -> Tensor:
-        """How far a robot is from where it was, after some share of each action.
+    def offsets(self, heading: Tensor, fraction: Tensor) -> Tensor:
+        """Return displacements after fractions of each action.
 
         Args:
-            heading: θ, shape [*K].
-            share: of the time that actions are held, shape [N].
+            heading: θ in radians, shape [*K].
+            fraction: fractions of the duration of actions, shape [N].
 
         Returns:
             (x, y) in metres, shape [*K, A, N, 2].
         """
         speed, rate = self.actions.T.to(heading)[..., None]
-        time = self.seconds.to(heading)[:, None] * share
+        time = self.seconds.to(heading)[:, None] * fraction
         angle = heading[..., None, None]
         # sin(ωt/2) / (ωt/2) of the chord, along the mean heading.
         chord = speed * time * torch.sinc(rate * time / (2 * math.pi))
@@ -100,26 +98,26 @@ class Moves:
 
 
 def headings_of(count: int) -> Tensor:
-    """Angles of Q headings, float64, shape [Q]."""
+    """Return the angles of Q headings, float64, shape [Q]."""
     return torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Costs(Batch):
-    """What driving on maps costs.
+    """Costs of driving on maps.
 
     Args:
         rate: cost of a second of driving with λ = 1, shape [B, H, W].
-        open: cells between which values are interpolated, bool, shape [B, H, W].
-        final: cost to go where ways end, under 0 where the robot has arrived before;
-            NaN elsewhere, shape [B, H, W].
-        hazard: chance of being lost on a metre, as −ln of that of not being lost, shape
-            [B, H, W]; None for none.
-        loss: cost of being lost, shape [B].
+        open: mask of cells between which values are interpolated, bool, [B, H, W].
+        final: cost to go where paths end, negative within the goal's disc; NaN
+            elsewhere, shape [B, H, W].
+        hazard: hazard of immobilisation per metre, −ln of the survival probability,
+            shape [B, H, W]; None for none.
+        loss: cost of an immobilised robot, shape [B].
         immobile_s: dwell time for each second of driving with λ = 1, 0 on other
-            terrain, shape [B, H, W]; None where nothing immobilises a robot.
-        lost_after_s: dwell time after which a robot is lost.
-        levels: L, of dwell time.
+            terrain, shape [B, H, W]; None if nothing immobilises a robot.
+        lost_after_s: dwell time in seconds after which a robot is immobilised.
+        levels: number L of levels of dwell time.
     """
 
     rate: Tensor
@@ -134,14 +132,14 @@ class Costs(Batch):
 
 @dataclass(frozen=True, kw_only=True)
 class CostToGo(Batch):
-    """The least cost to go of every state.
+    """Minimum cost to go of every state.
 
     Args:
-        value: cost to go, `UNREACHED` where there is no drive, shape [B, L, Q, H, W].
-            At level l it is the least of drives that a robot can still begin after l /
-            L of the dwell time after which it is lost.
-        max_dwell_s: dwell time of the robot under which that drive reaches the goal, of
-            the same shape; None where nothing immobilises a robot.
+        value: cost to go, `UNREACHED` without a drive, shape [B, L, Q, H, W]. At level
+            l it is the minimum over drives that are still possible after l / L of the
+            dwell time that immobilises a robot.
+        max_dwell_s: current dwell time of a robot below which that drive reaches the
+            goal, of the same shape; None if nothing immobilises a robot.
     """
 
     value: Tensor
@@ -149,20 +147,20 @@ class CostToGo(Batch):
 
 
 def value_iteration(costs: Costs, moves: Moves, grid: Grid, headings: int) -> CostToGo:
-    """Return the least cost to go of every state.
+    """Return the minimum cost to go of every state.
 
     Args:
-        costs: of B maps.
-        moves: what the robot may do.
-        grid: of the maps.
+        costs: costs on B maps.
+        moves: actions of the robot.
+        grid: grid of the maps.
         headings: Q.
     """
     arcs = _arcs(moves, grid, headings, costs.rate)
-    maps = torch.arange(len(costs.rate), device=costs.rate.device).split(_MAPS_AT_ONCE)
+    maps = torch.arange(len(costs.rate), device=costs.rate.device).split(_CHUNK_MAPS)
     solved = [_solve(costs.select(chunk), arcs, grid) for chunk in maps]
-    dwell = [each.max_dwell_s for each in solved if each.max_dwell_s is not None]
+    dwell = [part.max_dwell_s for part in solved if part.max_dwell_s is not None]
     return CostToGo(
-        value=torch.cat([each.value for each in solved]),
+        value=torch.cat([part.value for part in solved]),
         max_dwell_s=torch.cat(dwell) if dwell else None,
     )
 
@@ -172,11 +170,12 @@ class _Arc:
     """An action at all headings.
 
     Args:
-        seconds: for how long it is held.
-        metres: how far it leads.
-        turn: by how many headings.
-        passed: share of it in each cell around the first, shape [Q, 1, 2R + 1, 2R + 1].
-        ends: weights of the cells between which it ends, of the same shape.
+        seconds: duration.
+        metres: length.
+        turn: number of headings by which it turns.
+        passed: fraction of it in each cell around the first, shape
+            [Q, 1, 2R + 1, 2R + 1].
+        ends: interpolation weights of the cells around its end, of the same shape.
         points: cells of the points along it, rows and columns, N each of shape [Q].
     """
 
@@ -189,133 +188,125 @@ class _Arc:
 
     @property
     def reach(self) -> int:
-        """R."""
+        """Reach R in cells."""
         return self.ends.shape[-1] // 2
 
 
 def _arcs(moves: Moves, grid: Grid, headings: int, like: Tensor) -> list[_Arc]:
-    # Where along an arc ground is looked at, and its end.
-    shares = torch.cat(
-        ((torch.arange(_POINTS) + 0.5) / _POINTS, torch.ones(1))
-    ).double()
-    offsets = (
-        moves.offsets(headings_of(headings), shares) / grid.resolution_m
-    )  # [Q, A, N + 1, 2]
+    # Fractions of an arc at which costs are read, and its end.
+    fractions = (torch.arange(_POINTS) + 0.5) / _POINTS
+    fractions = torch.cat((fractions, torch.ones(1))).double()
+    # Shape [Q, A, N + 1, 2].
+    offsets = moves.offsets(headings_of(headings), fractions) / grid.resolution_m
     reach = max(1, math.ceil(float(offsets.abs().max()) - 1e-9))
-    found = []
-    for place, (seconds, turn) in enumerate(
+    arcs = []
+    for index, (seconds, turn) in enumerate(
         zip(moves.seconds.tolist(), moves.turns, strict=True)
     ):
         passed, ends = (
             torch.zeros(headings, 2 * reach + 1, 2 * reach + 1) for _ in range(2)
         )
-        own = offsets[:, place].flip(-1) + reach  # rows and columns
-        cells = (own[:, :-1] + 0.5).floor().long()
+        cells_at = offsets[:, index].flip(-1) + reach  # rows and columns
+        cells = (cells_at[:, :-1] + 0.5).floor().long()
         for heading in range(headings):
             for row, column in cells[heading].tolist():
                 passed[heading, row, column] += 1 / _POINTS
-            end = own[heading, -1].tolist()
+            end = cells_at[heading, -1].tolist()
             row, column = (min(math.floor(part + 1e-9), 2 * reach - 1) for part in end)
             for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
-                beside = (
-                    abs(1 - down - (end[0] - row)),
-                    abs(1 - across - (end[1] - column)),
-                )
-                ends[heading, row + down, column + across] += beside[0] * beside[1]
-        metres = float(moves.actions[place, 0].abs()) * seconds
+                down_weight = abs(1 - down - (end[0] - row))
+                across_weight = abs(1 - across - (end[1] - column))
+                weight = down_weight * across_weight
+                ends[heading, row + down, column + across] += weight
+        metres = float(moves.actions[index, 0].abs()) * seconds
         points = tuple(
             (cells[:, number, 0].tolist(), cells[:, number, 1].tolist())
             for number in range(_POINTS)
         )
-        found.append(
+        arcs.append(
             _Arc(
-                seconds,
-                metres,
-                turn,
-                passed[:, None].to(like),
-                ends[:, None].to(like),
-                points,
+                seconds=seconds,
+                metres=metres,
+                turn=turn,
+                passed=passed[:, None].to(like),
+                ends=ends[:, None].to(like),
+                points=points,
             )
         )
-    return found
+    return arcs
 
 
 def _solve(costs: Costs, arcs: list[_Arc], grid: Grid) -> CostToGo:
-    headings, levels = len(arcs[0].ends), costs.levels
+    headings = len(arcs[0].ends)
     frame = (arcs[0].reach,) * 4
     weights = torch.where(costs.open, 1.0, _BARRED)[:, None]
-    spent, share, dwells = [], [], []
-    kept: list[Tensor | None] = []
-    # Off the map a second costs as much as no way at all, and a cell beyond is as the
-    # one at the border.
-    rate, framed = (
-        pad(costs.rate[:, None], frame, value=UNREACHED),
-        pad(weights, frame, mode="replicate"),
-    )
+    step_costs, scales, dwells = [], [], []
+    survivals: list[Tensor | None] = []
+    # Off the map a second costs as much as a missing path, and weights are those of the
+    # border.
+    rate = pad(costs.rate[:, None], frame, value=UNREACHED)
+    framed = pad(weights, frame, mode="replicate")
     for arc in arcs:
         cost = arc.seconds * conv2d(rate, arc.passed)
-        share.append(1 / conv2d(framed, arc.ends))
-        keep = None
+        scales.append(1 / conv2d(framed, arc.ends))
+        survival = None
         if costs.hazard is not None:
-            keep = torch.exp(
-                -arc.metres * conv2d(pad(costs.hazard[:, None], frame), arc.passed)
-            )
-            cost = cost + (1 - keep) * costs.loss[:, None, None, None]
-        spent.append(cost)
-        kept.append(keep)
+            hazard = conv2d(pad(costs.hazard[:, None], frame), arc.passed)
+            survival = torch.exp(-arc.metres * hazard)
+            cost = cost + (1 - survival) * costs.loss[:, None, None, None]
+        step_costs.append(cost)
+        survivals.append(survival)
         dwells.append(None if costs.immobile_s is None else _dwell_along(costs, arc))
 
-    def at_end(arc: _Arc, share: Tensor, values: Tensor) -> Tensor:
-        """Values between the cells and headings where an arc ends."""
+    def at_end(arc: _Arc, scale: Tensor, values: Tensor) -> Tensor:
+        """Interpolate values at the end of an arc."""
         turned = values.roll(-arc.turn, 2)
         if not arc.metres:
             return turned
         inside = pad((turned * weights[:, None]).flatten(0, 1), frame, mode="replicate")
-        return (
-            conv2d(inside, arc.ends, groups=headings).view_as(values) * share[:, None]
-        )
+        summed = conv2d(inside, arc.ends, groups=headings).view_as(values)
+        return summed * scale[:, None]
 
     final = costs.final[:, None, None]
-    value = (
-        torch.where(final.isnan(), UNREACHED, final)
-        .expand(-1, levels, headings, -1, -1)
-        .clone()
-    )
-    dwell = (
-        None if costs.immobile_s is None else torch.full_like(value, costs.lost_after_s)
-    )
-    settled = torch.zeros_like(final, dtype=torch.bool)[..., :1, :1]
-    for sweep in range(1, _MOST_SWEEPS * max(grid.shape)):
+    start = torch.where(final.isnan(), UNREACHED, final)
+    value = start.expand(-1, costs.levels, headings, -1, -1).clone()
+    dwell = None
+    if costs.immobile_s is not None:
+        dwell = torch.full_like(value, costs.lost_after_s)
+    converged = torch.zeros_like(final, dtype=torch.bool)[..., :1, :1]
+    for sweep in range(1, _MAX_SWEEPS * max(grid.shape)):
         before, dwell_before = value, dwell
-        for number, arc in enumerate(arcs):
-            ended, along = at_end(arc, share[number], value), dwells[number]
+        for index, arc in enumerate(arcs):
+            ended = at_end(arc, scales[index], value)
+            along = dwells[index]
             ended_dwell = None
             if along is not None:
                 assert dwell is not None
-                ended, ended_dwell = along.before(
-                    ended, at_end(arc, share[number], dwell), costs.lost_after_s
-                )
-            keep = kept[number]
-            found = (ended if keep is None else ended * keep[:, None]) + spent[number][
-                :, None
-            ]
-            better = final.isnan() & (found < value)
-            value = torch.where(better, found, value)
+                end_dwell = at_end(arc, scales[index], dwell)
+                ended, ended_dwell = along.before(ended, end_dwell, costs.lost_after_s)
+            survival = survivals[index]
+            if survival is not None:
+                ended = ended * survival[:, None]
+            candidate = ended + step_costs[index][:, None]
+            better = final.isnan() & (candidate < value)
+            value = torch.where(better, candidate, value)
             if ended_dwell is not None:
                 assert dwell is not None
                 dwell = torch.where(better, ended_dwell, dwell)
-        # A map that has settled stays, so that none depends on those beside it.
-        value = torch.where(settled, before, value)
+        # A converged map does not change, so that none depends on the others of a
+        # chunk.
+        value = torch.where(converged, before, value)
         if dwell is not None and dwell_before is not None:
-            dwell = torch.where(settled, dwell_before, dwell)
+            dwell = torch.where(converged, dwell_before, dwell)
         if sweep % _CHECK_EVERY == 0:
             change = before - value
             if dwell is not None:
-                # Between states with a way and without, values go down for long, and
-                # mean nothing.
+                # Between reached and unreached states, values decrease for long, but
+                # do not matter.
                 change = torch.where(value < _MIXED, change, 0.0)
-            settled = change.flatten(1).amax(1)[:, None, None, None, None] < _SETTLED
-            if bool(settled.all()):
+            largest = change.flatten(1).amax(1)[:, None, None, None, None]
+            converged = largest < _TOLERANCE
+            if bool(converged.all()):
                 break
     return CostToGo(value=value, max_dwell_s=dwell)
 
@@ -325,11 +316,12 @@ class _Dwell:
     """Dwell time along an arc, from every state.
 
     Args:
-        first_s: until the arc first leaves immobilising terrain, or of all of it, shape
-            [B, Q, H, W].
-        last_s: after it last left it, 0 where it never does, of the same shape.
-        leaves: whether a point of it lies on other terrain, bool, of the same shape.
-        is_lost: whether a robot is lost between both, bool, of the same shape.
+        first_s: until the arc first leaves immobilising terrain, or its whole duration,
+            shape [B, Q, H, W].
+        last_s: after it last entered such terrain, 0 if it ends elsewhere or never
+            leaves it, of the same shape.
+        leaves: mask of arcs with a point on other terrain, bool, of the same shape.
+        is_lost: mask of arcs that immobilise between both, bool, of the same shape.
     """
 
     first_s: Tensor
@@ -340,29 +332,24 @@ class _Dwell:
     def before(
         self, value: Tensor, max_dwell_s: Tensor, lost_after_s: float
     ) -> tuple[Tensor, Tensor]:
-        """Return costs to go and their dwell times at an arc's beginning, from those at
-        its end, [B, L, Q, H, W].
+        """Return costs to go and dwell times at an arc's beginning, from those at its
+        end, [B, L, Q, H, W].
         """
         levels = value.shape[1]
-        dwell = (
-            torch.where(self.leaves[:, None], lost_after_s, max_dwell_s)
-            - self.first_s[:, None]
-        )
+        at_end_s = torch.where(self.leaves[:, None], lost_after_s, max_dwell_s)
+        dwell = at_end_s - self.first_s[:, None]
         is_lost = self.is_lost[:, None] | (max_dwell_s <= self.last_s[:, None])
         dwell = torch.where(is_lost, 0.0, dwell)
         # The more dwell time a drive leaves, the more it costs: the first that leaves
         # enough is the cheapest.
-        least_s = [
-            max(level * lost_after_s / levels, _LEAST_DWELL_S)
-            for level in range(levels)
+        min_dwell_s = [
+            max(level * lost_after_s / levels, _MIN_DWELL_S) for level in range(levels)
         ]
-        index = torch.stack([(dwell < least).sum(1) for least in least_s], 1)
-        none = torch.full_like(value[:, :1], UNREACHED)
-        unlimited = torch.full_like(none, lost_after_s)
-        return (
-            torch.cat((value, none), 1).gather(1, index),
-            torch.cat((dwell, unlimited), 1).gather(1, index),
-        )
+        index = torch.stack([(dwell < min_s).sum(1) for min_s in min_dwell_s], 1)
+        unreached = torch.full_like(value[:, :1], UNREACHED)
+        unlimited = torch.full_like(unreached, lost_after_s)
+        values = torch.cat((value, unreached), 1).gather(1, index)
+        return values, torch.cat((dwell, unlimited), 1).gather(1, index)
 
 
 def _dwell_along(costs: Costs, arc: _Arc) -> _Dwell:

@@ -6,7 +6,8 @@ from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConfig
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig
+from benchnav.planning.planners.mppi import MPPI
+from benchnav.planning.planners.mppi_config import MPPIConfig
 from benchnav.planning.planners.planner import check_steers
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle

@@ -191,7 +191,7 @@ def test_the_recovery_of_an_episode_stays_its_own_when_others_leave_the_batch() 
             following.recovery.active.tolist()
             == plan_state.recovery.active[members].tolist()
         )
-        for name in ("place_m", "steps", "driven_m", "target_m", "cell"):
+        for name in ("anchor_m", "steps", "driven_m", "target_m", "cell"):
             expected = getattr(plan_state.recovery, name)[members]
             torch.testing.assert_close(
                 getattr(some.recovery, name), expected, rtol=0, atol=0
@@ -302,5 +302,5 @@ def test_no_tensor_is_made_on_another_device_but_by_the_search(
         recovery = following.recovery
         assert on_cuda(action, plan.reference, planner.local.targets[0])
         assert on_cuda(
-            recovery.place_m, recovery.steps, recovery.driven_m, recovery.active
+            recovery.anchor_m, recovery.steps, recovery.driven_m, recovery.active
         )

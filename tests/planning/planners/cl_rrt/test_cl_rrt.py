@@ -16,7 +16,8 @@ from benchnav.eval.run.rollout import run_episodes
 from benchnav.planning.free_space import Immobile
 from benchnav.planning.objective import TravelTime, distance
 from benchnav.planning.planners.cl_rrt import cl_rrt
-from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT, CLRRTConfig, CLRRTState
+from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT, CLRRTState
+from benchnav.planning.planners.cl_rrt.config import CLRRTConfig
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig
 from benchnav.planning.planners.cl_rrt.tree import Route, search

@@ -91,7 +91,7 @@ def test_edge_is_what_controller_and_robot_do_step_by_step() -> None:
         action, tracking = loop.follower.act(reference, state, tracking, progress)
         state = loop.problem.robot(state, action, loop.problem.traversability_at(state))
         steps += 1
-    assert edges.kept.all()
+    assert edges.exists.all()
     assert edges.time_s.item() == pytest.approx(steps * 0.1)
     torch.testing.assert_close(edges.at.state, state)
     torch.testing.assert_close(edges.at.tracking.position_m, before[..., :2])
@@ -135,7 +135,7 @@ def test_edge_ends_at_the_goal() -> None:
 
 def test_nearer_half_of_an_edge_that_would_enter_a_wall_stays() -> None:
     edges = edge(make_loop(walled_map()), (5.0, 4.0, 0.0), (9.9, 4.0))
-    assert edges.kept.all()
+    assert edges.exists.all()
     assert edges.at.free.all()
     assert edges.blocked_m.item() == 0
     assert edges.at.state[0, 0, 0] == pytest.approx(
@@ -145,7 +145,7 @@ def test_nearer_half_of_an_edge_that_would_enter_a_wall_stays() -> None:
 
 def test_edge_that_begins_at_a_wall_is_rejected() -> None:
     edges = edge(make_loop(walled_map()), (7.95, 4.0, 0.0), (9.0, 4.0))
-    assert not edges.kept.any()
+    assert not edges.exists.any()
 
 
 def test_edge_that_may_cross_goes_on_and_counts_the_metres() -> None:
@@ -192,7 +192,7 @@ def test_robot_on_ground_that_is_not_free_may_leave_it_but_not_enter_more() -> N
     maps = walled_map()
     maps[:, :, 22:24] = 0.1  # the next wall, at x = 11 m
     edges = edge(make_loop(maps), (8.5, 4.0, 0.0), (10.0, 4.0), (13.0, 4.0))
-    assert edges.kept.all()
+    assert edges.exists.all()
     assert edges.at.free.tolist() == [[True, True]]
     assert edges.at.state[0, 0, 0] == pytest.approx(10.0, abs=0.1)
     assert edges.at.state[0, 1, 0] < 11
@@ -212,7 +212,7 @@ def test_edge_between_two_cells_that_touch_at_a_corner_is_one_through_a_wall(
     # Along the diagonal each time step leads from corner to corner, and none ends in
     # the wall.
     edges = edge(loop, (7.0, 7.0, math.pi / 4), (9.0, 9.0), (7.5, 7.5))
-    assert edges.kept.all()
+    assert edges.exists.all()
     beyond = edges.at.state[0, :, 0] > 8
     assert beyond.tolist() == [crossing, False]
     assert edges.at.free.all()

@@ -1,0 +1,71 @@
+"""Settings of CL-RRT."""
+
+from dataclasses import dataclass, field
+
+from benchnav.core.errors import expect
+from benchnav.planning.planners.cl_rrt.pursuit import (
+    FollowerConfig,
+)
+from benchnav.planning.planners.planner import (
+    check_finite,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CLRRTConfig:
+    """Settings of CL-RRT. The paper gives none of these numbers; the defaults are ours.
+
+    Args:
+        expansions: number of edges tried in a plan.
+        expansions_per_round: edges simulated at once; divides `expansions`.
+        step_m: maximum length of an edge along its reference in metres.
+        edge_time_s: maximum duration of an edge in seconds.
+        goal_bias: fraction of the expansions toward the goal.
+        turning_radius_m: radius of the references while they lead to the goal.
+        replan_distance_m: distance from the nearest predicted position beyond which a
+            robot plans again, in metres.
+        stall_s: time without progress after which a robot plans again, in seconds.
+        most_failures: consecutive plans without a path to the goal after which a
+            partial path is driven to its end and, without one, edges may cross non-free
+            cells.
+        follower: settings of the controller, in simulation and in execution.
+    """
+
+    expansions: int = 500
+    expansions_per_round: int = 25
+    step_m: float = 5.0
+    edge_time_s: float = 10.0
+    goal_bias: float = 0.25
+    turning_radius_m: float = 1.0
+    replan_distance_m: float = 1.0
+    stall_s: float = 5.0
+    most_failures: int = 5
+    follower: FollowerConfig = field(default_factory=FollowerConfig)
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        above = (
+            "expansions",
+            "expansions_per_round",
+            "step_m",
+            "edge_time_s",
+            "turning_radius_m",
+        )
+        check_finite(
+            "CL-RRT", self, (*above, "replan_distance_m", "stall_s", "most_failures")
+        )
+        expect(
+            self.expansions % self.expansions_per_round == 0,
+            "`expansions` as a multiple of `expansions_per_round` = "
+            f"{self.expansions_per_round} for CL-RRT, got "
+            f"{self.expansions}.",
+        )
+        expect(
+            0 <= self.goal_bias <= 1,
+            f"`goal_bias` in 0–1 for CL-RRT, got {self.goal_bias}.",
+        )
+
+    @property
+    def rounds(self) -> int:
+        """Rounds of a plan, also the maximum number of edges of a path: D."""
+        return self.expansions // self.expansions_per_round

@@ -1,0 +1,207 @@
+"""State of the belief of look-alike classes: observations under either class.
+
+Letters in shapes: B episodes, H×W cells.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from benchnav.core.batch import Batch
+from benchnav.planning.sensing import copula as within
+from benchnav.planning.sensing.copula import CopulaState
+from benchnav.planning.sensing.sensor import MIN_STD, Measurement
+from benchnav.planning.sensing.sites import Evidence
+from benchnav.planning.sensing.truncated_normal import interval_moments
+
+# Change of an observed score below which its label is not drawn again.
+_SAME_SCORE = 0.05
+MIN_PROBABILITY = 1e-9
+"""Minimum probability of a class, so that its log odds are finite."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassesState(Batch):
+    """State of the belief of look-alike classes.
+
+    Args:
+        copula: scores at the more probable class of each observed cell; its prediction
+            is that of the first class.
+        per_class: observations under the first and under the second class; their
+            posterior scores are not computed.
+        density: log f / φ of the observation under either class, 0 for an interval,
+            shape [B, 2, H, W].
+        pair: index of the pair of each cell, from 1; 0 without one, int64, shape
+            [B, H, W].
+        odds: predicted log odds of the first class, float64, shape [B, H, W].
+        p_first: posterior probability of the first class under even prior odds,
+            float64, shape [B, H, W].
+        labels: labels of the chains; a set bit is the first class, int64, shape
+            [B, H, W].
+        sweeps: number of sweeps of each episode, int64, shape [B].
+    """
+
+    copula: CopulaState
+    per_class: tuple[CopulaState, CopulaState]
+    density: Tensor
+    pair: Tensor
+    odds: Tensor
+    p_first: Tensor
+    labels: Tensor
+    sweeps: Tensor
+
+    def probability(self) -> Tensor:
+        """Return the posterior probability of the first class, shape [B, H, W].
+
+        It is 1 for cells without a pair.
+        """
+        log_odds = self.odds + torch.logit(self.p_first, eps=MIN_PROBABILITY)
+        return torch.where(self.pair > 0, torch.sigmoid(log_odds), 1.0)
+
+
+def log_density_ratio(given_class: CopulaState, cells: Tensor, value: Tensor) -> Tensor:
+    """Return log f / φ of observed λ [N] in some cells under a class, shape [N].
+
+    It is 0 for intervals.
+    """
+    low, high = within.scores_at(given_class.prior, cells, value)
+    prior = given_class.prior.at(cells)
+    log_prob = prior.log_prob(value[None].double())[0].double()
+    log_ratio = log_prob + 0.5 * (low.square() + math.log(2 * math.pi))
+    return torch.where(high > low, 0.0, log_ratio)
+
+
+def note(state: ClassesState, sensed: Measurement) -> tuple[ClassesState, Tensor]:
+    """Add a measurement to the observations under either class.
+
+    Returns:
+        The state, and the mask of changed observations, bool, shape [B, H, W].
+    """
+    changed = torch.zeros_like(sensed.mask)
+    per_class = []
+    density = state.density.clone()
+    for part, given_class in enumerate(state.per_class):
+        noted, news = within.note(given_class, sensed)
+        if bool(news.any()):
+            value = sensed.traversability[news]
+            std = sensed.std[news].double().clamp(min=MIN_STD)
+            low, high = within.scores_at(given_class.prior, news, value)
+            # A repeated number adds its own density, and that of its distance from the
+            # earlier one.
+            old = given_class.lower[news]
+            old_std = given_class.noise_std[news]
+            is_repeated = (high <= low) & (old >= given_class.upper[news])
+            squared = (low - old).square() / (std.square() + old_std.square())
+            new_density = log_density_ratio(given_class, news, value)
+            total = density[:, part][news] + new_density - 0.5 * squared
+            density[:, part][news] = torch.where(is_repeated, total, new_density)
+        per_class.append(noted)
+        changed |= news
+    first, second = per_class
+    return replace(state, per_class=(first, second), density=density), changed
+
+
+def moved_cells(before: ClassesState, after: ClassesState) -> Tensor:
+    """Return a mask of observed cells with other scores or another pair.
+
+    Bool, shape [B, H, W].
+    """
+    moved = before.pair != after.pair
+    for old, new in zip(before.per_class, after.per_class, strict=True):
+        for old_end, new_end in ((old.lower, new.lower), (old.upper, new.upper)):
+            is_near = (old_end - new_end).abs() <= _SAME_SCORE
+            moved |= ~((old_end == new_end) | is_near)
+    return moved & after.per_class[0].observed & (after.pair > 0)
+
+
+def evidence_of(state: ClassesState) -> Evidence:
+    """Return the evidence from which labels are drawn."""
+    first, second = state.per_class
+    return Evidence(
+        field=state.copula.field,
+        lower=torch.stack((first.lower, second.lower), 1),
+        upper=torch.stack((first.upper, second.upper), 1),
+        noise_std=first.noise_std,
+        density=state.density,
+        precision=state.copula.precision,
+        shift=state.copula.shift,
+        pair=state.pair,
+        p_first=state.p_first,
+        labels=state.labels,
+        sweeps=state.sweeps,
+    )
+
+
+def labelled(state: ClassesState) -> CopulaState:
+    """Return the scores observed under the more probable class of each cell.
+
+    Intervals that differ from before have no terms.
+    """
+    chosen = state.probability() >= 0.5
+    first, second = state.per_class
+    before = state.copula
+    lower, upper, noise_std = (
+        torch.where(chosen, getattr(first, name), getattr(second, name))
+        for name in ("lower", "upper", "noise_std")
+    )
+    is_number = upper <= lower
+    same_ends = (lower == before.lower) & (upper == before.upper)
+    same = same_ends & (noise_std == before.noise_std)
+    old_precision = torch.where(same, before.precision, 0.0)
+    precision = torch.where(is_number, 1 / noise_std.square(), old_precision)
+    old_shift = torch.where(same, before.shift, 0.0)
+    shift = torch.where(is_number, precision * lower, old_shift)
+    return replace(
+        before,
+        value=first.value,
+        lower=lower,
+        upper=upper,
+        noise_std=noise_std,
+        precision=precision,
+        shift=shift,
+    )
+
+
+def moments_of(state: ClassesState) -> tuple[Tensor, Tensor, Tensor]:
+    """Return mean, standard deviation and skewness of scores under either class.
+
+    Each has the shape [B, 2, H, W].
+    """
+    copula = state.copula
+    chosen = state.probability() >= 0.5
+    cells = copula.observed & (state.pair > 0)
+    means, stds, skews = (
+        torch.stack((values, values), 1)
+        for values in (copula.mean, copula.std, copula.skew)
+    )
+    if not bool(cells.any()):
+        return means, stds, skews
+    mean = copula.mean[cells]
+    variance = copula.std[cells].square().clamp(min=1e-12)
+    # The cavity of the cell's own term. The prior field has a precision of 1.
+    cavity_precision = (1 / variance - copula.precision[cells]).clamp(min=1)
+    centre = (mean / variance - copula.shift[cells]) / cavity_precision
+    cavity = 1 / cavity_precision
+    for part, given_class in enumerate(state.per_class):
+        lower = given_class.lower[cells]
+        upper = given_class.upper[cells]
+        total = cavity + given_class.noise_std[cells].square()
+        gain = cavity / total
+        is_number = upper <= lower
+        bounds = centre, total, lower, torch.where(is_number, lower + 1, upper)
+        moments = interval_moments(*(values.cpu().numpy() for values in bounds))
+        noisy_mean, noisy_variance = (
+            torch.from_numpy(values).to(lower) for values in moments
+        )
+        noisy_mean = torch.where(is_number, lower, noisy_mean)
+        noisy_variance = torch.where(is_number, 0.0, noisy_variance)
+        std = (cavity - cavity * gain + gain.square() * noisy_variance).sqrt()
+        new_mean = centre + gain * (noisy_mean - centre)
+        new = new_mean, std, torch.zeros_like(std)
+        is_chosen = chosen[cells] == (part == 0)
+        for values, new_values in zip((means, stds, skews), new, strict=True):
+            old_values = values[:, part][cells]
+            values[:, part][cells] = torch.where(is_chosen, old_values, new_values)
+    return means, stds, skews

@@ -1,0 +1,412 @@
+"""Learner: how a robot's knowledge is updated during an episode.
+
+Letters in shapes: B episodes, S state dimensions, H×W cells, N cells of all maps
+    together.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchnav.core.batch import map_tensors
+from benchnav.core.chosen import choose
+from benchnav.core.distribution import TraversabilityDistribution
+from benchnav.core.errors import expect
+from benchnav.core.ground import GroundStatistics
+from benchnav.core.terrain import Observation, Terrain
+from benchnav.planning import risk
+from benchnav.planning.free_space import Rules
+from benchnav.planning.sensing.appearance import Memory, masked, remember
+from benchnav.planning.sensing.belief import Belief, CovarianceModel
+from benchnav.planning.sensing.knowledge import (
+    Knowledge,
+    Truth,
+    call,
+    check_map,
+    nothing_sensed,
+    unseen_ground,
+)
+from benchnav.planning.sensing.sensor import Measurement, NoiseKey, Sensor
+from benchnav.planning.world.outcome import Outcome
+
+Predict = Callable[[Terrain, Observation], TraversabilityDistribution]
+"""Function that predicts from an observation.
+
+The terrain, with current λ, is only for privileged models.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learner:
+    """Parts that update a robot's knowledge.
+
+    Args:
+        sensor: sensor of appearance.
+        ground: sensor of λ.
+        belief: belief about λ.
+        covariance: covariance model of the λ field.
+        measure: risk measure that returns λ̂.
+        rules: free space, and the λ assumed for unobserved terrain.
+        predict: the model; unused if the sensor shows the whole map.
+        keeps_spread: whether the spread of the belief is stored with λ̂, for policies.
+    """
+
+    sensor: Sensor
+    ground: Sensor
+    belief: Belief[Any]
+    covariance: CovarianceModel
+    measure: risk.RiskFunction
+    rules: Rules
+    predict: Predict
+    keeps_spread: bool = False
+
+    @property
+    def statistics(self) -> GroundStatistics:
+        """Statistics of the training maps, used for unobserved terrain.
+
+        Raises:
+            ConfigError: If the covariance model has no statistics.
+        """
+        expect(
+            self.covariance.statistics is not None,
+            "`CovarianceModel.statistics` for a sensor that does not show the whole "
+            "map, got None.",
+        )
+        assert self.covariance.statistics is not None
+        return self.covariance.statistics
+
+    def begin(
+        self,
+        truth: Truth,
+        robot_state: Tensor,
+        prediction: TraversabilityDistribution | None,
+    ) -> Knowledge:
+        """Return the knowledge at the start: observed appearance, no measured λ.
+
+        Args:
+            truth: for the sensor and privileged models.
+            robot_state: robot states, shape [B, S].
+            prediction: prediction of the whole map if the sensor shows it; else None.
+
+        Raises:
+            KnowledgeError: If the sensor, the model, the belief or the risk measure
+                raises, or returns an invalid value.
+        """
+        memory = None
+        observation = truth.terrain.observe()
+        if not self.sensor.sees_all:
+            noise_key = NoiseKey(truth.keys, 0)
+            first = self._measurement(self.sensor, truth, robot_state, noise_key)
+            assert first.appearance is not None
+            memory = remember(Memory.none(observation), first.appearance)
+            observation, prediction = self._predict(memory, truth)
+        assert prediction is not None
+        belief_state = self.believe(prediction)
+        risk_map, spread = self._measured(prediction)
+        seen = None if memory is None else memory.seen
+        no_episodes = torch.zeros(
+            len(robot_state), dtype=torch.bool, device=robot_state.device
+        )
+        no_cells = torch.zeros_like(truth.field, dtype=torch.bool)
+        return Knowledge(
+            memory=memory,
+            has_news=no_episodes,
+            sensed=nothing_sensed(truth.field),
+            ever_sensed=no_cells,
+            footprint=no_cells.clone(),
+            observation=observation,
+            belief_state=belief_state,
+            risk_map=risk_map,
+            spread=spread,
+            free=self.rules.free(risk_map, prediction, seen),
+        )
+
+    def believe(self, prediction: TraversabilityDistribution) -> Any:
+        """Return the belief state of a prediction without measurements.
+
+        Raises:
+            KnowledgeError: If the belief raises.
+        """
+        return call(
+            Outcome.BELIEF_ERROR,
+            lambda: self.belief.init(prediction.clone(), self.covariance),
+        )
+
+    def sense(
+        self,
+        knowledge: Knowledge,
+        truth: Truth,
+        robot_state: Tensor,
+        step: int | Sequence[int],
+        observes: Tensor,
+        measures: Tensor,
+    ) -> Knowledge:
+        """Add the observations of a step.
+
+        Appearance at every step adds hardly more than appearance at each update, and
+        takes far longer. A belief that does not learn receives no λ.
+
+        Args:
+            knowledge: current knowledge; it is not changed.
+            truth: true state in this step.
+            robot_state: robot states, shape [B, S].
+            step: number of steps taken, for all episodes or for each, B of them.
+            observes: mask of episodes that use the appearance sensor, bool, shape [B].
+            measures: mask of episodes that use the sensor of λ, bool, shape [B].
+
+        Returns:
+            Knowledge of B episodes.
+
+        Raises:
+            KnowledgeError: If a sensor raises, or returns an invalid measurement.
+        """
+        noise_key = NoiseKey(truth.keys, step)
+        no_cells = torch.zeros_like(knowledge.footprint)
+        knowledge = replace(knowledge, footprint=no_cells)
+        uses = (
+            (self.sensor, observes),
+            (self.ground, measures & self.belief.learns),
+        )
+        for sensor, episode_mask in uses:
+            if sensor.sees_all or not bool(episode_mask.any()):
+                continue
+            new = self._measurement(sensor, truth, robot_state, noise_key)
+            before = knowledge.sensed
+            in_use = episode_mask[:, None, None]
+            mask = new.mask & in_use
+            traversability = torch.where(
+                mask, new.traversability, before.traversability
+            )
+            std = torch.where(mask, new.std, before.std)
+            knowledge = replace(
+                knowledge,
+                sensed=Measurement(traversability=traversability, std=std),
+                ever_sensed=knowledge.ever_sensed | mask,
+                footprint=knowledge.footprint | mask,
+            )
+            if new.appearance is None or knowledge.memory is None:
+                continue
+            appearance = replace(new.appearance, seen=new.appearance.seen & in_use)
+            memory = remember(knowledge.memory, appearance)
+            # A cell that is observed for the first time, or with less noise.
+            is_better = memory.noise_level != knowledge.memory.noise_level
+            knowledge = replace(
+                knowledge,
+                memory=memory,
+                has_news=knowledge.has_news | is_better.flatten(1).any(1),
+                footprint=knowledge.footprint | appearance.seen,
+            )
+        return knowledge
+
+    def update(self, knowledge: Knowledge, truth: Truth) -> tuple[Knowledge, Tensor]:
+        """Update prediction, belief, λ̂ and free mask with new observations.
+
+        Args:
+            knowledge: current knowledge; it is not changed.
+            truth: for privileged models only.
+
+        Returns:
+            The knowledge, and a mask of cells whose belief changed, bool, shape
+            [B, H, W].
+
+        Raises:
+            KnowledgeError: If the model, the belief or the risk measure raises, or
+                returns an invalid value.
+        """
+        has_news = bool(knowledge.has_news.any())
+        if not has_news and not bool(knowledge.sensed.mask.any()):
+            return knowledge, torch.zeros_like(knowledge.free)
+        before = knowledge.belief_state
+        observation = knowledge.observation
+        prior = None
+        if has_news and knowledge.memory is not None:
+            observation, prior = self._predict(knowledge.memory, truth)
+        after = call(
+            Outcome.BELIEF_ERROR,
+            lambda: self.belief.update(before, knowledge.sensed, prior),
+        )
+        changed = call(
+            Outcome.BELIEF_ERROR,
+            lambda: self._checked_cells(self.belief.changed(before, after), knowledge),
+        )
+        knowledge = replace(
+            knowledge,
+            has_news=torch.zeros_like(knowledge.has_news),
+            sensed=nothing_sensed(knowledge.risk_map),
+            observation=observation,
+            belief_state=after,
+        )
+        if bool(changed.any()):
+            knowledge = self._inferred(knowledge, changed)
+        return knowledge, changed
+
+    def at(self, knowledge: Knowledge, cells: Tensor) -> TraversabilityDistribution:
+        """Return the belief in cells, bool [B, H, W], as a map of one row, [1, N].
+
+        Raises:
+            KnowledgeError: If the belief raises, or returns an invalid value.
+        """
+        expected_shape = (1, int(cells.sum()))
+
+        def believe() -> TraversabilityDistribution:
+            believed = self.belief.at(knowledge.belief_state, cells)
+            expect(
+                believed.shape == expected_shape,
+                f"a distribution of shape {list(expected_shape)} from `at`, got "
+                f"{list(believed.shape)}.",
+            )
+            return believed
+
+        return call(Outcome.BELIEF_ERROR, believe)
+
+    def distribution(self, knowledge: Knowledge) -> TraversabilityDistribution:
+        """Return the distribution of λ, shape [B, H, W].
+
+        Raises:
+            KnowledgeError: If the belief raises, or returns an invalid value.
+        """
+
+        def believe() -> TraversabilityDistribution:
+            believed = self.belief.distribution(knowledge.belief_state)
+            expected_shape = tuple(knowledge.free.shape)
+            shape = getattr(believed, "shape", type(believed).__name__)
+            expect(
+                shape == expected_shape,
+                f"a distribution of shape {list(expected_shape)} from `distribution`, "
+                f"got {shape}.",
+            )
+            return believed
+
+        return call(Outcome.BELIEF_ERROR, believe)
+
+    def select(self, knowledge: Knowledge, members: Tensor) -> Knowledge:
+        """Return some episodes, by index, int64.
+
+        Raises:
+            KnowledgeError: If the belief raises.
+        """
+        belief_state = call(
+            Outcome.BELIEF_ERROR,
+            lambda: self.belief.select(knowledge.belief_state, members),
+        )
+        others = replace(knowledge, belief_state=None).select(members)
+        return replace(others, belief_state=belief_state)
+
+    def put(
+        self, knowledge: Knowledge, members: Tensor, others: Knowledge
+    ) -> Knowledge:
+        """Replace episodes, by index, int64.
+
+        Raises:
+            KnowledgeError: If the belief raises.
+        """
+        belief_state = call(
+            Outcome.BELIEF_ERROR,
+            lambda: self.belief.put(
+                knowledge.belief_state, members, others.belief_state
+            ),
+        )
+        without_state = replace(knowledge, belief_state=None)
+        merged = without_state.put(members, replace(others, belief_state=None))
+        return replace(merged, belief_state=belief_state)
+
+    def _inferred(self, knowledge: Knowledge, changed: Tensor) -> Knowledge:
+        """Return the knowledge with λ̂ and the free mask of changed cells updated."""
+        believed = self.at(knowledge, changed)
+        # Measures take a batch of maps.
+        batch = map_tensors(believed, lambda values: values[None])
+        risk_map, spread = self._measured(batch)
+        seen = None
+        if knowledge.memory is not None:
+            seen = knowledge.memory.seen[changed][None]
+        free = call(
+            Outcome.BELIEF_ERROR, lambda: self.rules.free(risk_map[0], believed, seen)
+        )
+        new_values = risk_map.flatten().to(knowledge.risk_map.dtype)
+        updated = replace(
+            knowledge,
+            risk_map=knowledge.risk_map.index_put((changed,), new_values),
+            free=knowledge.free.index_put((changed,), free[0]),
+        )
+        if knowledge.spread is None or spread is None:
+            return updated
+        new_spread = spread.flatten().to(knowledge.spread.dtype)
+        return replace(
+            updated, spread=knowledge.spread.index_put((changed,), new_spread)
+        )
+
+    def _measured(
+        self, believed: TraversabilityDistribution
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return λ̂ and, if it is stored, the spread of a batch of maps."""
+
+        def measure() -> tuple[Tensor, Tensor | None]:
+            risk_map = risk.apply(self.measure, believed)
+            return risk_map, believed.spread() if self.keeps_spread else None
+
+        return call(Outcome.MODEL_ERROR, measure)
+
+    def _predict(
+        self, memory: Memory, truth: Truth
+    ) -> tuple[Observation, TraversabilityDistribution]:
+        """Return the model's input and its prediction, with `rules.unseen` elsewhere."""
+        statistics = self.statistics
+        observation = masked(memory, statistics.layer_means)
+        terrain = replace(truth.terrain, traversability=truth.field)
+        predicted = call(
+            Outcome.MODEL_ERROR, lambda: self.predict(terrain, observation)
+        )
+        unseen = unseen_ground(
+            statistics, self.rules.unseen, memory.seen.shape, truth.field
+        )
+        return observation, choose(memory.seen, predicted, unseen)
+
+    def _measurement(
+        self, sensor: Sensor, truth: Truth, robot_state: Tensor, noise_key: NoiseKey
+    ) -> Measurement:
+        """Return a sensor's measurement after validation."""
+
+        def sense() -> Measurement:
+            inputs = truth.terrain, truth.field, robot_state
+            # Sensors of this package do not change their inputs.
+            if not type(sensor).__module__.startswith("benchnav."):
+                inputs = truth.terrain.clone(), truth.field.clone(), robot_state.clone()
+            measurement = self._checked(sensor.sense(*inputs, noise_key), truth.field)
+            expect(
+                sensor is not self.sensor or measurement.appearance is not None,
+                "`Measurement.appearance` from a sensor of appearance, got None. List "
+                "λ sensors under `grounds`.",
+            )
+            return measurement
+
+        return call(Outcome.SENSOR_ERROR, sense)
+
+    def _checked(self, sensed: Any, like: Tensor) -> Measurement:
+        """Return a sensor's measurement if it is valid, else raise ConfigError."""
+        expect(
+            isinstance(sensed, Measurement),
+            f"a Measurement from `sense`, got {type(sensed).__name__}.",
+        )
+        for name in ("traversability", "std"):
+            check_map(f"`Measurement.{name}`", getattr(sensed, name), like.dtype, like)
+        values = sensed.traversability[sensed.mask]
+        expect(
+            bool(((values >= 0) & (values <= 1)).all()),
+            "`Measurement.traversability` in [0, 1], or NaN.",
+        )
+        if sensed.appearance is not None:
+            check_map("`Appearance.seen`", sensed.appearance.seen, torch.bool, like)
+            check_map(
+                "`Appearance.noise_level`",
+                sensed.appearance.noise_level,
+                like.dtype,
+                like,
+            )
+        return sensed
+
+    def _checked_cells(self, cells: Any, knowledge: Knowledge) -> Tensor:
+        check_map("cells from `changed`", cells, torch.bool, knowledge.free)
+        return cells
