@@ -5,6 +5,8 @@ answered with the new one.
 # What programs import.
 IMPORTS = {
     "benchnav.core.figures": "benchnav.viz",
+    "benchnav.metrics.Learnt": "benchnav.metrics.LearningRecord",
+    "benchnav.metrics.motion.StuckShare": "benchnav.metrics.motion.StuckFraction",
     "benchnav.planning.OptimalBound": "benchnav.planning.NearOptimal",
     "benchnav.planning.risk.chance": "benchnav.planning.Chance",
     "benchnav.planning.risk.cvar": "benchnav.planning.CVaR",
