@@ -1,3 +1,1 @@
-"""What every package stands on: values, random streams, the registry of parts,
-settings, files and commands.
-"""
+"""Foundation of all packages: values, random streams, parts, files and commands."""

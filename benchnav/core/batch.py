@@ -1,5 +1,6 @@
-"""Batches: frozen dataclasses of tensors whose first dimension is that of the members,
-episodes or maps.
+"""Batches: frozen dataclasses of tensors whose first dimension indexes the elements.
+
+Elements are episodes or maps. Letters in shapes: B elements; M selected elements.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,20 +16,20 @@ Value = TypeVar("Value", bound=Any)
 
 
 class Batch:
-    """The base of dataclasses whose tensors, and those of the batches in them, have the
-    members first.
-    """
+    """Base class of dataclasses whose tensors and nested batches have B elements."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Give each dataclass the short representation, which its decorator keeps."""
+        """Set the short representation, which the dataclass decorator keeps."""
         super().__init_subclass__(**kwargs)
         cls.__repr__ = short_repr  # type: ignore[method-assign]
 
     def select(self, members: Tensor) -> Self:
-        """Keeps some members, by index, int64, shape [M]; one may be taken more than
-        once.
+        """Return a batch of selected elements; an index may repeat.
+
+        Args:
+            members: indices of the elements, int64, shape [M].
         """
-        # A batch in it keeps them as it does by itself.
+        # A nested batch may override `select`.
         return _mapped(
             self,
             lambda values: values[members],
@@ -37,30 +38,34 @@ class Batch:
         )
 
     def put(self, members: Tensor, others: Self) -> Self:
-        """Puts M members in the places of others, by index, int64, shape [M]; this one
-        is not changed.
+        """Return a batch with some elements replaced.
+
+        Args:
+            members: indices of the elements to replace, int64, shape [M].
+            others: the M new elements.
         """
         return map_tensors(
             self, lambda old, new: old.index_copy(0, members, new), others
         )
 
     def clone(self) -> Self:
-        """A copy that shares no tensor."""
+        """Return a copy that shares no tensor."""
         return map_tensors(self, torch.clone)
 
     def to(self, device: torch.device | str) -> Self:
-        """The same on a device."""
+        """Return the batch on a device."""
         return map_tensors(self, lambda values: values.to(device))
 
 
 def map_tensors(value: Value, change: Callable[..., Tensor], *others: Value) -> Value:
-    """Changes each tensor of a dataclass, and of the batches, tuples of batches and
-    mappings in it; all else stays.
+    """Apply a function to each tensor of a dataclass.
+
+    This includes nested batches, tuples of batches and mappings; other fields stay.
 
     Args:
         value: the dataclass.
-        change: is given a tensor, and those that have its place in the others.
-        others: more of the same kind.
+        change: function of a tensor and of the corresponding tensors of `others`.
+        others: dataclasses of the same type.
     """
     return _mapped(
         value, change, lambda first, *rest: map_tensors(first, change, *rest), others
@@ -73,16 +78,14 @@ def _mapped(
     inner: Callable[..., Any],
     others: Sequence[Any],
 ) -> Value:
-    """Changes each tensor by `change` and each batch by `inner`."""
-    given: Any = value
-    names = [each.name for each in fields(given)]
-    found = {
-        n: _changed(
-            getattr(given, n), change, inner, [getattr(one, n) for one in others]
-        )
-        for n in names
-    }
-    return cast(Value, replace(given, **found))
+    """Apply `change` to each tensor and `inner` to each nested batch."""
+    batch: Any = value
+    changes = {}
+    for field in fields(batch):
+        name = field.name
+        rest = [getattr(other, name) for other in others]
+        changes[name] = _changed(getattr(batch, name), change, inner, rest)
+    return cast(Value, replace(batch, **changes))
 
 
 def _changed(
@@ -96,50 +99,52 @@ def _changed(
     if isinstance(first, Batch):
         return inner(first, *rest)
     if isinstance(first, tuple) and first and isinstance(first[0], Batch):
-        return tuple(inner(own, *same) for own, *same in zip(first, *rest, strict=True))
+        return tuple(inner(*batches) for batches in zip(first, *rest, strict=True))
     if isinstance(first, Mapping):
         return {
-            key: _changed(own, change, inner, [other[key] for other in rest])
-            for key, own in first.items()
+            key: _changed(value, change, inner, [mapping[key] for mapping in rest])
+            for key, value in first.items()
         }
     return first
 
 
 def put_if_alike(value: Value, members: Tensor, others: Value) -> Value:
-    """Puts some members of another batch in the same places of this one; of an unlike
-    kind or size, gives the other.
+    """Replace selected elements by those of another batch of the same type and shapes.
 
     Args:
-        value: of B members; it is not changed.
-        members: which ones, by index, int64.
-        others: of B members too.
+        value: batch of B elements.
+        members: indices of the elements, int64, shape [M].
+        others: batch of B elements.
+
+    Returns:
+        A new batch; `others` if its type or shapes differ.
     """
-    alike = [[own.shape for own in _tensors(each)] for each in (value, others)]
-    if type(value) is not type(others) or alike[0] != alike[1]:
+    shapes = [tensor.shape for tensor in tensors_of(value)]
+    other_shapes = [tensor.shape for tensor in tensors_of(others)]
+    if type(value) is not type(others) or shapes != other_shapes:
         return others
     return value.put(members, others.select(members))
 
 
 def first_tensor(value: Batch) -> Tensor:
-    """The first tensor of a dataclass, the batches and tuples of batches in it
-    included.
+    """Return the first tensor of a dataclass or of its nested batches.
 
     Raises:
-        StopIteration: it has none.
+        StopIteration: If there is no tensor.
     """
-    return next(_tensors(value))
+    return next(tensors_of(value))
 
 
-def _tensors(value: Any) -> Iterator[Tensor]:
+def tensors_of(value: Any) -> Iterator[Tensor]:
+    """Yield the tensors of a value and of its nested batches, tuples and lists."""
     if isinstance(value, Tensor):
         yield value
-    parts = (
-        [getattr(value, each.name) for each in fields(cast(Any, value))]
-        if isinstance(value, Batch)
-        else value
-    )
-    for part in parts if isinstance(parts, list | tuple) else ():
-        yield from _tensors(part)
+    elif isinstance(value, Batch):
+        for field in fields(cast(Any, value)):
+            yield from tensors_of(getattr(value, field.name))
+    elif isinstance(value, list | tuple):
+        for part in value:
+            yield from tensors_of(part)
 
 
 def find_tensor_fault(
@@ -149,10 +154,17 @@ def find_tensor_fault(
     shape: tuple[int, ...],
     device: torch.device,
 ) -> str:
-    """Tells in one line what makes something another tensor than is expected; empty
-    where nothing does.
+    """Return a message if a value is not the expected tensor, or empty text.
+
+    Args:
+        what: the value in the message.
+        values: the value.
+        dtype: expected dtype.
+        shape: expected shape.
+        device: expected device.
     """
-    wanted, got = f"{dtype} of shape {list(shape)} on {device}", type(values).__name__
+    expected = f"{dtype} of shape {list(shape)} on {device}"
+    got = type(values).__name__
     if isinstance(values, Tensor):
         got = f"{values.dtype} of shape {list(values.shape)} on {values.device}"
-    return "" if got == wanted else f"Expected {what} as {wanted}, got {got}."
+    return "" if got == expected else f"Expected {what} as {expected}, got {got}."

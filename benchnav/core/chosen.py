@@ -1,7 +1,7 @@
-"""A distribution that is one of two in each cell, such as a prediction where ground was
-seen and a prior elsewhere.
+"""A choice between two distributions in each cell of a map.
 
-Letters in shapes: H×W cells, K components, *B any leading dimensions.
+For example, the prediction in observed cells and a prior elsewhere.
+Letters in shapes: H×W cells; K components; *B any leading dimensions.
 """
 
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ from torch import Tensor
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.mixture import TraversabilityMixture
 
-NO_CLASS = -1  # the group of components that belong to no class
+NO_CLASS = -1  # group of components without a class
 
 
 @dataclass(frozen=True)
 class ChosenDistribution(TraversabilityDistribution):
-    """One distribution where cells are chosen, another in all other cells.
+    """The first distribution in chosen cells, the second in all others.
 
     Args:
-        first: of shape [*B, H, W]; its dtype is that of both.
-        second: of shape [*B, H, W].
-        chosen: which cells have the first, bool, shape [*B, H, W].
+        first: distribution of shape [*B, H, W]; results have its dtype.
+        second: distribution of shape [*B, H, W].
+        chosen: mask of the cells of the first, bool, shape [*B, H, W].
     """
 
     first: TraversabilityDistribution
@@ -35,74 +35,63 @@ class ChosenDistribution(TraversabilityDistribution):
         return self.chosen.shape
 
     def cdf(self, value: Tensor | float) -> Tensor:
-        """P(λ ≤ value), shape [*B, H, W]; see the base."""
+        """Return P(λ ≤ value), shape [*B, H, W]."""
         return self._pick(self.first.cdf(value), self.second.cdf(value))
 
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
-        """P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]; see the base."""
-        (low, high), (other_low, other_high) = (
-            self.first.cdf_limits(value),
-            self.second.cdf_limits(value),
-        )
-        return self._pick(low, other_low), self._pick(high, other_high)
+        """Return P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]."""
+        limits = self.first.cdf_limits(value)
+        return self._pick_both(limits, self.second.cdf_limits(value))
 
     @property
     def searched(self) -> bool:
-        """See the base."""
+        """Whether both distributions search for quantiles."""
         return self.first.searched and self.second.searched
 
     def quantile(self, probability: Tensor | float) -> Tensor:
-        """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the
-        base.
-        """
-        return self._pick(
-            self.first.quantile(probability), self.second.quantile(probability)
-        )
+        """Return the quantiles of λ, shape [*B, H, W]."""
+        quantiles = self.first.quantile(probability)
+        return self._pick(quantiles, self.second.quantile(probability))
 
     def mean(self) -> Tensor:
-        """E[λ], shape [*B, H, W]."""
+        """Return E[λ], shape [*B, H, W]."""
         return self._pick(self.first.mean(), self.second.mean())
 
     def cvar(self, level: float) -> Tensor:
-        """Conditional value at risk, shape [*B, H, W]; see the base."""
+        """Return the conditional value at risk, shape [*B, H, W]."""
         return self._pick(self.first.cvar(level), self.second.cvar(level))
 
     def expected_time(self, floor: float) -> Tensor:
-        """E[1 / max(λ, floor)], shape [*B, H, W]; see the base."""
-        return self._pick(
-            self.first.expected_time(floor), self.second.expected_time(floor)
-        )
+        """Return E[1 / max(λ, floor)], shape [*B, H, W]."""
+        times = self.first.expected_time(floor)
+        return self._pick(times, self.second.expected_time(floor))
 
     def time_cvar(self, level: float, floor: float) -> Tensor:
-        """CVaR of the time 1 / max(λ, floor), shape [*B, H, W]; see the base."""
-        return self._pick(
-            self.first.time_cvar(level, floor), self.second.time_cvar(level, floor)
-        )
+        """Return the CVaR of the time 1 / max(λ, floor), shape [*B, H, W]."""
+        times = self.first.time_cvar(level, floor)
+        return self._pick(times, self.second.time_cvar(level, floor))
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log density on (0, 1), log mass at 0 and at 1, shape [*B, H, W]; see the
-        base.
-        """
+        """Return log density on (0, 1) and log mass at 0 and 1, shape [*B, H, W]."""
         return self._pick(self.first.log_prob(value), self.second.log_prob(value))
 
     def from_normal(self, normal: Tensor) -> Tensor:
-        """λ of standard normal numbers, shape [*B, H, W]; see the base."""
-        return self._pick(
-            self.first.from_normal(normal), self.second.from_normal(normal)
-        )
+        """Return λ of standard normal scores, shape [*B, H, W]."""
+        traversability = self.first.from_normal(normal)
+        return self._pick(traversability, self.second.from_normal(normal))
 
     def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
-        """The interval of standard normal numbers, each of shape [*B, H, W]; see the
-        base.
-        """
-        (low, high), (other_low, other_high) = (
-            self.first.to_normal(value),
-            self.second.to_normal(value),
-        )
-        return self._pick(low, other_low), self._pick(high, other_high)
+        """Return the interval of standard normal scores, each of shape [*B, H, W]."""
+        interval = self.first.to_normal(value)
+        return self._pick_both(interval, self.second.to_normal(value))
 
     def _pick(self, first: Tensor, second: Tensor) -> Tensor:
         return torch.where(self.chosen, first, second.to(first.dtype))
+
+    def _pick_both(
+        self, first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        return self._pick(first[0], second[0]), self._pick(first[1], second[1])
 
 
 def choose(
@@ -110,37 +99,29 @@ def choose(
     first: TraversabilityDistribution,
     second: TraversabilityDistribution,
 ) -> TraversabilityDistribution:
-    """The first distribution where cells are chosen, the second in all other cells.
+    """Return the first distribution in chosen cells, the second in all others.
 
     Args:
         chosen: bool, shape [*B, H, W].
-        first: of shape [*B, H, W].
-        second: of shape [*B, H, W].
+        first: distribution of shape [*B, H, W].
+        second: distribution of shape [*B, H, W].
 
     Returns:
-        A mixture again where both are; the components of the second then belong to no
-        class.
+        A mixture if both are mixtures, in which components of the second have no class;
+        otherwise a `ChosenDistribution`.
     """
     if not isinstance(first, TraversabilityMixture) or not isinstance(
         second, TraversabilityMixture
     ):
         return ChosenDistribution(first, second, chosen)
-    own = chosen.unsqueeze(-3)
-    parts = [first, second]
-    weights = torch.cat(
-        [
-            torch.where(own == (part is first), part.weights, 0.0).to(first.weights)
-            for part in parts
-        ],
-        -3,
-    )
-    means, stds = (
-        torch.cat([getattr(part, name).to(first.weights) for part in parts], -3)
-        for name in ("means", "stds")
-    )
-    group = (
-        None
-        if first.group is None
-        else (*first.group, *[NO_CLASS] * second.weights.shape[-3])
-    )
+    like = first.weights
+    is_first = chosen.unsqueeze(-3)
+    first_weights = torch.where(is_first, like, 0.0).to(like)
+    second_weights = torch.where(~is_first, second.weights, 0.0).to(like)
+    weights = torch.cat([first_weights, second_weights], -3)
+    means = torch.cat([first.means.to(like), second.means.to(like)], -3)
+    stds = torch.cat([first.stds.to(like), second.stds.to(like)], -3)
+    group = None
+    if first.group is not None:
+        group = (*first.group, *[NO_CLASS] * second.weights.shape[-3])
     return TraversabilityMixture(weights, means, stds, group)

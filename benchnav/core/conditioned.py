@@ -1,12 +1,11 @@
-"""A distribution whose normal score is known better than before: what observations
-nearby tell of a cell.
+"""A distribution that is conditioned on a posterior of its normal score.
 
-A field of λ goes through correlated standard normals, λ = Q(Φ(z)). Where observations
+A λ field is a transform of correlated standard normals z, λ = Q(Φ(z)). If observations
 give z a posterior N(μ, σ²), λ has the quantile function Q(Φ(μ + σ Φ⁻¹(u))) and the CDF
-Φ((Φ⁻¹(F(x)) − μ) / σ). Where the posterior is skew, as beside ground whose score is
-known to lie in an interval, σ multiplies a shifted log-normal number of that skewness
-in place of the normal one.
-Letters in shapes: H×W cells, *B any leading dimensions.
+Φ((Φ⁻¹(F(x)) − μ) / σ). If the posterior is skewed, as next to interval-censored
+observations, σ multiplies a shifted log-normal variable of that skewness instead of a
+normal one.
+Letters in shapes: H×W cells; *B any leading dimensions.
 """
 
 import math
@@ -20,7 +19,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 
 _SMALLEST_STD = 1e-9
-LEAST_SKEW = 1e-3  # under which a number counts as normal
+LEAST_SKEW = 1e-3  # below it, a variable counts as normal
 
 
 @dataclass(frozen=True)
@@ -28,13 +27,14 @@ class ConditionedDistribution(TraversabilityDistribution):
     """A distribution given a posterior of its normal score in each cell.
 
     Args:
-        base: what is known without the observations, of shape [*B, H, W].
-        score_mean: μ, shape [*B, H, W].
-        score_std: σ ≥ 0, shape [*B, H, W]; where it is 0, all of λ is Q(Φ(μ)).
-        score_skew: skewness of the score, shape [*B, H, W]; None for none.
+        base: prior distribution of shape [*B, H, W].
+        score_mean: posterior mean μ, shape [*B, H, W].
+        score_std: posterior standard deviation σ ≥ 0, shape [*B, H, W]; where it is 0,
+            λ is Q(Φ(μ)).
+        score_skew: posterior skewness, shape [*B, H, W]; if None, 0.
 
     Raises:
-        ConfigError: the shapes differ.
+        ConfigError: If the shapes differ.
     """
 
     base: TraversabilityDistribution
@@ -43,14 +43,10 @@ class ConditionedDistribution(TraversabilityDistribution):
     score_skew: Tensor | None = None
 
     def __post_init__(self) -> None:
-        """Checks the shapes."""
+        """Validate the shapes."""
         skew = self.score_std if self.score_skew is None else self.score_skew
-        if (
-            not self.score_mean.shape
-            == self.score_std.shape
-            == skew.shape
-            == self.base.shape
-        ):
+        shapes = (self.score_std.shape, skew.shape, self.base.shape)
+        if any(shape != self.score_mean.shape for shape in shapes):
             raise ConfigError(
                 "Expected `score_mean` and `score_std` of the base's shape "
                 f"{list(self.base.shape)}, got "
@@ -63,148 +59,128 @@ class ConditionedDistribution(TraversabilityDistribution):
         return self.base.shape
 
     def cdf(self, value: Tensor | float) -> Tensor:
-        """P(λ ≤ value), shape [*B, H, W]; see the base."""
+        """Return P(λ ≤ value), shape [*B, H, W]."""
         return torch.special.ndtr(self._scores(value)[1]).to(self.dtype)
 
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
-        """P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]; see the base."""
+        """Return P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]."""
         lower, upper = self._scores(value)
-        return torch.special.ndtr(lower).to(self.dtype), torch.special.ndtr(upper).to(
-            self.dtype
-        )
+        below = torch.special.ndtr(lower).to(self.dtype)
+        return below, torch.special.ndtr(upper).to(self.dtype)
 
     def quantile(self, probability: Tensor | float) -> Tensor:
-        """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the
-        base.
-        """
-        share = torch.as_tensor(probability, dtype=torch.float64, device=self.device)
-        score = torch.special.ndtri(share).clamp(-MOST_SCORE, MOST_SCORE)
+        """Return the quantiles of λ, shape [*B, H, W]."""
+        u = torch.as_tensor(probability, dtype=torch.float64, device=self.device)
+        score = torch.special.ndtri(u).clamp(-MOST_SCORE, MOST_SCORE)
         value = self.from_normal(score.expand(self.shape))
         if not isinstance(probability, Tensor) and 0 < probability < 1:
             return value
-        # The ends of the range, which no finite score reaches.
-        ends = self.base.quantile((share >= 1).double().expand(self.shape)).to(
-            self.dtype
-        )
-        return torch.where(
-            ((share <= 0) | (share >= 1)) & (self.score_std > 0), ends, value
-        )
+        # No finite score reaches the ends of the range.
+        ends = self.base.quantile((u >= 1).double().expand(self.shape))
+        is_end = ((u <= 0) | (u >= 1)) & (self.score_std > 0)
+        return torch.where(is_end, ends.to(self.dtype), value)
 
     def from_normal(self, normal: Tensor) -> Tensor:
-        """λ of the rank that a standard normal number has, shape [*B, H, W]; see the
-        base.
-        """
+        """Return λ of standard normal scores, shape [*B, H, W]."""
         if self.score_skew is not None:
             normal = skewed(normal, self.score_skew).to(self.score_std.dtype)
-        return self.base.from_normal(self.score_mean + self.score_std * normal).to(
-            self.dtype
-        )
+        prior_score = self.score_mean + self.score_std * normal
+        return self.base.from_normal(prior_score).to(self.dtype)
 
     def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
-        """The interval of standard normal numbers that `from_normal` takes to λ, each
-        of shape [*B, H, W].
-        """
+        """Return the interval of standard normal scores, each of shape [*B, H, W]."""
         lower, upper = self._scores(value)
         return lower.to(self.dtype), upper.to(self.dtype)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log density on (0, 1), log mass at 0 and at 1, shape [*B, H, W]; not a number
-        where the base has none.
+        """Return log density on (0, 1) and log mass at 0 and 1, shape [*B, H, W].
+
+        It is NaN where the base has no density.
         """
-        value, std = value.double(), self.score_std.double().clamp(min=_SMALLEST_STD)
+        value = value.double()
+        std = self.score_std.double().clamp(min=_SMALLEST_STD)
         lower, upper = self._scores(value)
-        prior = self.base._exact().to_normal(value)[1]  # whose density is known
-        inside = (
-            self.base._exact().log_prob(value).double()
-            + (prior.square() - upper.square()) / 2
-            - std.log()
-        )
+        base = self.base._exact()
+        prior = base.to_normal(value)[1]
+        # Change of variables from the prior score, with the prior's density.
+        log_ratio = (prior.square() - upper.square()) / 2
+        inside = base.log_prob(value).double() + log_ratio - std.log()
         if self.score_skew is not None:
-            inside = torch.where(
-                upper.isinf(), -math.inf, inside - _slope(upper, self.score_skew).log()
-            )
-        mass = torch.where(value <= 0, upper, -lower)
-        total = torch.where(
-            (value <= 0) | (value >= 1), torch.special.log_ndtr(mass), inside
-        )
+            log_slope = _slope(upper, self.score_skew).log()
+            inside = torch.where(upper.isinf(), -math.inf, inside - log_slope)
+        tail = torch.where(value <= 0, upper, -lower)
+        is_end = (value <= 0) | (value >= 1)
+        total = torch.where(is_end, torch.special.log_ndtr(tail), inside)
         return torch.where((value < 0) | (value > 1), -math.inf, total).to(self.dtype)
 
     def _scores(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
-        """Standard normal numbers in float64, whose Φ are P(λ < value) and P(λ ≤
-        value).
-        """
+        """Return Φ⁻¹ of P(λ < value) and of P(λ ≤ value), float64."""
         lower, upper = self.base._exact().to_normal(value)
-        mean, std = (
-            self.score_mean.double(),
-            self.score_std.double().clamp(min=_SMALLEST_STD),
-        )
-        ends = (lower - mean) / std, (upper - mean) / std
+        mean = self.score_mean.double()
+        std = self.score_std.double().clamp(min=_SMALLEST_STD)
+        lower = (lower - mean) / std
+        upper = (upper - mean) / std
         if self.score_skew is None:
-            return ends
-        return unskewed(ends[0], self.score_skew), unskewed(ends[1], self.score_skew)
+            return lower, upper
+        return unskewed(lower, self.score_skew), unskewed(upper, self.score_skew)
 
 
 def skewed(normal: Tensor, skew: Tensor) -> Tensor:
-    """Makes of a standard normal number one of mean 0 and variance 1 that is skew, a
-    shifted log-normal one, float64.
+    """Transform a standard normal variable to a shifted log-normal one.
 
     Args:
-        normal: any shape.
-        skew: its skewness, of a shape that broadcasts.
+        normal: values of any shape.
+        skew: skewness of the result, of a shape that broadcasts.
+
+    Returns:
+        Values of mean 0 and variance 1, float64.
     """
-    sign, root, scale, width = _log_normal(skew)
-    found = sign * ((sign * width * normal).exp() - root) / scale
-    return torch.where(skew.abs() < LEAST_SKEW, normal.double(), found)
+    sign, mean, std, sigma = _log_normal(skew)
+    transformed = sign * ((sign * sigma * normal).exp() - mean) / std
+    return torch.where(skew.abs() < LEAST_SKEW, normal.double(), transformed)
 
 
 def unskewed(value: Tensor, skew: Tensor) -> Tensor:
-    """The number that `skewed` makes a value of; infinite beyond its range."""
-    sign, root, scale, width = _log_normal(skew)
-    found = sign * (root + sign * value * scale).clamp(min=0).log() / width
-    return torch.where(skew.abs() < LEAST_SKEW, value, found)
+    """Return the inverse of `skewed`; infinite beyond its range."""
+    sign, mean, std, sigma = _log_normal(skew)
+    normal = sign * (mean + sign * value * std).clamp(min=0).log() / sigma
+    return torch.where(skew.abs() < LEAST_SKEW, value, normal)
 
 
 def _slope(normal: Tensor, skew: Tensor) -> Tensor:
-    """Derivative of `skewed`."""
-    sign, _, scale, width = _log_normal(skew)
-    return torch.where(
-        skew.abs() < LEAST_SKEW, 1.0, width * (sign * width * normal).exp() / scale
-    )
+    """Return the derivative of `skewed`."""
+    sign, _, std, sigma = _log_normal(skew)
+    slope = sigma * (sign * sigma * normal).exp() / std
+    return torch.where(skew.abs() < LEAST_SKEW, 1.0, slope)
 
 
 def _log_normal(skew: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of exp(σ z) for the σ that gives it a skewness: the sign, the mean, the standard
-    deviation, and σ.
-    """
-    size = skew.double().abs().clamp(min=LEAST_SKEW)
-    half = 1 + size.square() / 2
-    third = (half + (half.square() - 1).sqrt()).pow(1 / 3)
-    power = third + 1 / third - 1  # exp(σ²)
-    return (
-        torch.where(skew < 0, -1.0, 1.0).double(),
-        power.sqrt(),
-        (power * (power - 1)).sqrt(),
-        power.log().sqrt(),
-    )
+    """Return sign, mean, standard deviation and σ of exp(σ z) with a given skewness."""
+    abs_skew = skew.double().abs().clamp(min=LEAST_SKEW)
+    # Solve skew² = (w + 2)² (w − 1) for w = exp(σ²).
+    a = 1 + abs_skew.square() / 2
+    root = (a + (a.square() - 1).sqrt()).pow(1 / 3)
+    w = root + 1 / root - 1
+    sign = torch.where(skew < 0, -1.0, 1.0).double()
+    return sign, w.sqrt(), (w * (w - 1)).sqrt(), w.log().sqrt()
 
 
 def conditioned(
     base: TraversabilityDistribution, mean: Tensor, std: Tensor
 ) -> TraversabilityDistribution:
-    """The distribution of λ where its normal score has a posterior.
+    """Condition a distribution of λ on a posterior of its normal score.
 
     Args:
-        base: what is known without the observations, of shape [*B, H, W].
-        mean: μ of the score, shape [*B, H, W].
-        std: σ ≥ 0 of the score, shape [*B, H, W].
+        base: prior distribution of shape [*B, H, W].
+        mean: posterior mean μ of the score, shape [*B, H, W].
+        std: posterior standard deviation σ ≥ 0 of the score, shape [*B, H, W].
 
     Returns:
-        A mixture again, exactly, where the base is one of a single component: clip(m +
-        s (μ + σ z)); else a `ConditionedDistribution`.
+        If the base is a mixture of a single component, the exact mixture
+        clip(m + s (μ + σ z)); otherwise a `ConditionedDistribution`.
     """
     if not isinstance(base, TraversabilityMixture) or base.weights.shape[-3] > 1:
         return ConditionedDistribution(base, mean, std)
     means = base.means + base.stds * mean.unsqueeze(-3)
-    return TraversabilityMixture(
-        base.weights, means, base.stds * std.unsqueeze(-3), base.group
-    )
+    stds = base.stds * std.unsqueeze(-3)
+    return TraversabilityMixture(base.weights, means, stds, base.group)

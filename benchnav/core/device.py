@@ -1,4 +1,4 @@
-"""Where tensors are computed: on the CPU, or on a GPU through CUDA."""
+"""Devices of computation: the CPU, or a GPU through CUDA."""
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -10,17 +10,17 @@ from benchnav.core.errors import BenchnavError, expect
 
 CPU = torch.device("cpu")
 
-# What PyTorch raises where a GPU, and not the code that it runs, has failed.
+# Exceptions of PyTorch for failures of a GPU, in contrast to those of code.
 GPU_FAULTS = (torch.OutOfMemoryError, torch.AcceleratorError)
 
 
 class DeviceError(BenchnavError):
-    """A GPU failed; nothing that was computed there is to be believed."""
+    """A GPU failed; its results are invalid."""
 
 
-def gpu_failed(said: object) -> DeviceError:
-    """Tells in one line that a GPU failed, and what PyTorch said of it."""
-    line = str(said).strip().splitlines()[0].rstrip(".")
+def gpu_failed(error: object) -> DeviceError:
+    """Return an error of one line with PyTorch's message about a failed GPU."""
+    line = str(error).strip().splitlines()[0].rstrip(".")
     return DeviceError(
         f"The GPU failed: {line}. Finished work is kept: give the same command again, "
         "if need be with fewer `jobs`."
@@ -28,14 +28,13 @@ def gpu_failed(said: object) -> DeviceError:
 
 
 def find_device(name: str) -> torch.device:
-    """Finds a device by name.
+    """Return a device by name.
 
     Args:
-        name: "cpu"; "cuda"; or "auto", which is CUDA where there is a GPU and else the
-            CPU.
+        name: "cpu", "cuda", or "auto" for CUDA if there is a GPU and else the CPU.
 
     Raises:
-        ConfigError: there is no such device here.
+        ConfigError: If the device is not available.
     """
     expect(
         name in ("auto", "cpu", "cuda"),
@@ -49,31 +48,29 @@ def find_device(name: str) -> torch.device:
     return torch.device("cuda" if has_gpu and name != "cpu" else "cpu")
 
 
-def device_of_run(about: Mapping[str, Any]) -> torch.device:
-    """Finds the device that a run was computed on.
+def device_of_run(run: Mapping[str, Any]) -> torch.device:
+    """Return the device that a run was computed on.
 
     Args:
-        about: its `run.json`.
+        run: contents of its `run.json`.
 
     Raises:
-        ConfigError: there is no such device here.
+        ConfigError: If the device is not available.
     """
     expect(
-        about["device"] != "cuda" or torch.cuda.is_available(),
+        run["device"] != "cuda" or torch.cuda.is_available(),
         "a GPU, on which this run was computed, got none that PyTorch can use.",
     )
-    return find_device(about["device"])
+    return find_device(run["device"])
 
 
 def gpu_name(device: str | torch.device) -> str | None:
-    """What a GPU is called; None of the CPU."""
+    """Return the name of a GPU; None for the CPU."""
     return torch.cuda.get_device_name() if torch.device(device).type == "cuda" else None
 
 
 def exact_convolutions() -> AbstractContextManager[None]:
-    """A context in which a GPU convolves in full float32, the same way each time, as
-    the CPU does.
-    """
+    """Return a context in which GPU convolutions are float32 and deterministic."""
     flags: AbstractContextManager[None] = torch.backends.cudnn.flags(
         enabled=True, benchmark=False, deterministic=True, allow_tf32=False
     )

@@ -1,7 +1,6 @@
-"""The errors BenchNav raises on purpose; `benchnav.core.command` prints them as one
-line, and exits with their status.
+"""Errors of BenchNav; `benchnav.core.command` prints them as one line and exits.
 
-A message names the argument, what was expected, what came, and what to do.
+A message states the argument, the expectation, the value and the remedy.
 """
 
 import errno
@@ -13,69 +12,73 @@ from typing import ClassVar
 
 
 class BenchnavError(Exception):
-    """Base of every error that a user can mend."""
+    """Base class of errors that a user can fix."""
 
     status: ClassVar[int] = 2
     """Exit status of a command that ends with it."""
 
 
 class ConfigError(BenchnavError, ValueError):
-    """A setting, recipe or argument is not usable as given."""
+    """A setting, recipe or argument is invalid."""
 
 
 class TrainingError(BenchnavError):
-    """A training failed on its way, after usable settings."""
+    """A training failed although its settings are valid."""
 
     status: ClassVar[int] = 1
 
 
-def expect(holds: object, what: str) -> None:
-    """Refuses a setting, recipe or argument that is not usable.
+def expect(is_valid: object, what: str) -> None:
+    """Raise an error unless a setting, recipe or argument is valid.
 
     Args:
-        holds: whether it is.
-        what: the argument, what was expected, what came and what to do, in a sentence
-            that goes on from "Expected".
+        is_valid: whether it is valid.
+        what: argument, expectation, value and remedy, which continue "Expected".
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: If it is not valid.
     """
-    if not holds:
+    if not is_valid:
         raise ConfigError(f"Expected {what}")
 
 
-def choose(what: str, asked: Collection[str] | None, known: Iterable[str]) -> list[str]:
-    """Gives what is asked for of what there is, in the order of that; None asks for
-    all.
+def choose(
+    what: str, requested: Collection[str] | None, options: Iterable[str]
+) -> list[str]:
+    """Return the requested options in their own order.
+
+    Args:
+        what: name of the argument in messages.
+        requested: requested options; if None, all.
+        options: all options.
 
     Raises:
-        ConfigError: nothing is asked for, or something that is not there, of the
-            argument `what`.
+        ConfigError: If no option is requested, or one that does not exist.
     """
-    known = list(known)
-    asked = known if asked is None else asked
-    unknown = [name for name in asked if name not in known]
-    expect(asked and not unknown, f"`{what}` among {known}, got {unknown or 'none'}.")
-    return [name for name in known if name in asked]
+    options = list(options)
+    requested = options if requested is None else requested
+    unknown = [name for name in requested if name not in options]
+    is_valid = requested and not unknown
+    expect(is_valid, f"`{what}` among {options}, got {unknown or 'none'}.")
+    return [name for name in options if name in requested]
 
 
-# NUL ends a path, others move the cursor of a terminal; surrogates stand for bytes that
-# are no UTF-8.
+# NUL ends a path, other control characters move the cursor of a terminal; surrogates
+# stand for bytes that are not UTF-8.
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
-def check_text(text: str, place: str = "") -> None:
-    """Refuse text that no name, path or setting holds: control characters but for tab
-    and line break.
+def check_text(text: str, location: str = "") -> None:
+    """Reject text with control characters except for tabs and line breaks.
 
     Args:
-        text: what a user wrote.
-        place: where it stands, for the message.
+        text: text from a user.
+        location: location of the text in messages.
 
     Raises:
-        ConfigError: If it holds such a character, or bytes that are no UTF-8.
+        ConfigError: If it contains control characters, or bytes that are not UTF-8.
     """
-    where = f" in {place}" if place else ""
+    where = f" in {location}" if location else ""
     expect(
         not _CONTROL.search(text),
         f"text in UTF-8 without control characters{where}, got {text!r}. Leave them "
@@ -84,15 +87,14 @@ def check_text(text: str, place: str = "") -> None:
 
 
 def check_label(what: str, text: str) -> None:
-    """Refuse what no table can show: text that is empty, or has a line break or a
-    character that is not printed.
+    """Reject text that a table cannot show: empty, unprintable or of several lines.
 
     Args:
-        what: what is called by the text.
-        text: what a user wrote.
+        what: meaning of the text in messages.
+        text: text from a user.
 
     Raises:
-        ConfigError: If it is such.
+        ConfigError: If the text is invalid.
     """
     expect(
         text.strip() and text.isprintable(),
@@ -101,10 +103,10 @@ def check_label(what: str, text: str) -> None:
 
 
 class OutOfMemoryError(BenchnavError):
-    """Memory ran out; nothing that was given is to blame but its size."""
+    """Memory ran out; only the size of the input is at fault."""
 
 
-# What PyTorch, HDF5 and C++ say where `MemoryError` is not what they raise.
+# Messages of PyTorch, HDF5 and C++, which do not raise `MemoryError`.
 _NO_MEMORY = re.compile(
     r"can't allocate memory|cannot allocate memory|not enough memory|out of memory|std::bad_alloc|unable to allocate",
     re.IGNORECASE,
@@ -112,40 +114,35 @@ _NO_MEMORY = re.compile(
 
 
 def out_of_memory(error: BaseException) -> OutOfMemoryError | None:
-    """Return what to say where an error, or one that it was raised from, is that memory
-    ran out; else None.
-    """
+    """Return the error to raise if an error or its cause is a lack of memory."""
     if isinstance(error, BenchnavError) and _NO_MEMORY.search(str(error)):
-        return None  # which says so
+        return None  # its message already states it
     cause: BaseException | None = error
     seen: set[int] = set()  # an error may be its own cause
     while cause is not None and id(cause) not in seen:
         seen.add(id(cause))
         if isinstance(cause, OutOfMemoryError):
             return cause
-        is_known = (
-            isinstance(cause, MemoryError)
-            or getattr(cause, "errno", None) == errno.ENOMEM
-        )
-        if is_known or (
-            isinstance(cause, RuntimeError | OSError) and _NO_MEMORY.search(str(cause))
-        ):
-            said = (
-                " ".join(str(cause).split())[:200].rstrip(".") or type(cause).__name__
-            )
+        if _is_out_of_memory(cause):
+            text = " ".join(str(cause).split())[:200].rstrip(".")
             return OutOfMemoryError(
-                f"Memory ran out ({said}). Ask for less at once: fewer `jobs`, "
-                "samples or maps of a batch, smaller "
-                "maps or a smaller network."
+                f"Memory ran out ({text or type(cause).__name__}). Ask for less at "
+                "once: fewer `jobs`, samples or maps of a batch, smaller maps or a "
+                "smaller network."
             )
         cause = cause.__cause__
     return None
 
 
+def _is_out_of_memory(error: BaseException) -> bool:
+    if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+        return True
+    is_runtime = isinstance(error, RuntimeError | OSError)
+    return is_runtime and _NO_MEMORY.search(str(error)) is not None
+
+
 class DatasetError(BenchnavError):
-    """A dataset file is missing, damaged, of another format, or lacks what was asked
-    for.
-    """
+    """A dataset file is missing, damaged, of another format or incomplete."""
 
 
 class CheckpointError(BenchnavError):
@@ -154,7 +151,7 @@ class CheckpointError(BenchnavError):
 
 @contextmanager
 def quiet(*loggers: str) -> Iterator[None]:
-    """Keeps what libraries log off the terminal; what a user has to know is raised."""
+    """Silence loggers of libraries; errors that matter to a user are raised."""
     levels = {name: logging.getLogger(name).level for name in loggers}
     for name in loggers:
         logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -1,11 +1,11 @@
-"""The 8-connected graph over a map's cells, and exact shortest paths in it for a batch
-of maps.
+"""The 8-connected graph of a map's cells, with exact shortest paths for batches.
 
-A diagonal step between two free cells is closed where both cells next to it are not
-free: these touch at the corner that the step would pass. So what is joined by steps is
-joined over shared edges. Each map has a compiled Dijkstra search to itself: one search
-of the whole batch takes twice as long, since its heap leaves the processor's cache.
-Letters in shapes: B maps, H×W cells; a cell's flat index is row·W + column.
+A diagonal step between two free cells is closed if both cells next to it are not free,
+since they touch at the corner that the step would cross. Cells that are connected by
+steps are therefore connected over shared edges. Each map has its own compiled Dijkstra
+search: a single search of the batch takes twice as long, since its heap exceeds the
+processor's cache.
+Letters in shapes: B maps; H×W cells, with flat index row·W + column; E edges.
 """
 
 from collections.abc import Callable, Iterable
@@ -27,74 +27,68 @@ Mask = TypeVar("Mask", ndarray, "Tensor")
 
 @lru_cache(maxsize=8)
 def neighbour_pairs(height: int, width: int) -> tuple[ndarray, ndarray, ndarray]:
-    """Lists the directed edges between 8-connected cells, in the order of their
-    targets.
+    """Return the directed edges between 8-connected cells, sorted by target.
 
     Returns:
-        Flat index of the source cells, of the target cells, and the length of each edge
-        in cell widths (1 or √2), each of shape [E]. The arrays are shared: do not write
-        to them.
+        Flat indices of source cells and of target cells, and edge lengths in cell
+        widths (1 or √2), each of shape [E]. The arrays are shared: do not modify them.
     """
-    index = np.arange(height * width).reshape(height, width)
-    padded = np.pad(index, 1, constant_values=NO_CELL)
-    # Of each cell the nine around it, row by row.
-    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(-1, 9)
+    indices = np.arange(height * width).reshape(height, width)
+    padded = np.pad(indices, 1, constant_values=NO_CELL)
+    # The 3×3 cells around each cell.
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(-1, 9)
     lengths = np.hypot(*(np.indices((3, 3)) - 1)).ravel()
-    target, place = np.nonzero((around != NO_CELL) & (lengths > 0))
-    return around[target, place], target, lengths[place]
+    target, offset = np.nonzero((windows != NO_CELL) & (lengths > 0))
+    return windows[target, offset], target, lengths[offset]
 
 
 def squeezes(
     free_of: Callable[[Cells], Mask], source: Cells, target: Cells, width: int
 ) -> Mask:
-    """Tell which steps from a free cell to a free cell pass between two cells that are
-    not free.
+    """Return a mask of diagonal steps between free cells past two non-free cells.
 
     Args:
-        free_of: tells of cells, by flat index, whether they are free, bool.
+        free_of: function from flat indices to whether the cells are free, bool.
         source: flat index of the cell that each step leaves, an array or a tensor.
         target: flat index of the cell that it enters, at most one row and one column
             away, of the same shape.
-        width: W.
+        width: number of columns W.
 
     Returns:
-        bool, of the shape that `free_of` gives. No step over a shared edge is among
-        them.
+        Bool, of the shape that `free_of` returns; False for steps over a shared edge.
     """
-    one, other = (
-        source // width * width + target % width,
-        target // width * width + source % width,
-    )
-    return free_of(source) & free_of(target) & ~free_of(one) & ~free_of(other)
+    first_corner = source // width * width + target % width
+    second_corner = target // width * width + source % width
+    is_free = free_of(source) & free_of(target)
+    return is_free & ~free_of(first_corner) & ~free_of(second_corner)
 
 
 def cost_to_go(
     edge_costs: Iterable[ndarray], goals: ndarray, shape: tuple[int, int]
 ) -> tuple[ndarray, ndarray]:
-    """Finds the least cost from every cell to the nearest goal cell of its own map.
+    """Return the minimum cost from each cell to the nearest goal cell of its map.
 
     Args:
-        edge_costs: cost > 0 of each edge of `neighbour_pairs`, infinite where it may
-            not be taken, shape [E] of each of B maps, one by one.
-        goals: goal cells, bool, shape [B, H, W].
+        edge_costs: for each of B maps, the cost > 0 of each edge of `neighbour_pairs`,
+            infinite for closed edges, shape [E].
+        goals: mask of goal cells, bool, shape [B, H, W].
         shape: (H, W).
 
     Returns:
-        Cost to go, infinite where no path leads to a goal, shape [B, H, W]; and the
-        flat index of the next cell on a shortest path, `NO_CELL` at goals and where
-        there is none, int64, shape [B, H·W].
+        Cost to go, infinite where no path leads to a goal, float64, shape [B, H, W];
+        and the flat index of the next cell on a shortest path, `NO_CELL` at goals and
+        without a path, int64, shape [B, H·W].
     """
-    batch, cells = len(goals), shape[0] * shape[1]
-    # Searching backward from the goals, so the edges are turned round: rows are their
-    # targets, their order.
+    batch = len(goals)
+    n_cells = shape[0] * shape[1]
+    # The search starts at the goals, so edges are reversed: rows are their targets.
     source, target, _ = neighbour_pairs(*shape)
-    columns, rows = (
-        source.astype(np.int32),
-        np.searchsorted(target, np.arange(cells + 1)).astype(np.int32),
-    )
-    graph = csr_array((np.empty(len(source)), columns, rows), shape=(cells, cells))
-    cost, following = np.empty((batch, cells)), np.empty((batch, cells), np.int64)
-    # The finite limit keeps infinite edges from being taken.
+    columns = source.astype(np.int32)
+    rows = np.searchsorted(target, np.arange(n_cells + 1)).astype(np.int32)
+    graph = csr_array((np.empty(len(source)), columns, rows), shape=(n_cells, n_cells))
+    cost = np.empty((batch, n_cells))
+    next_cell = np.empty((batch, n_cells), np.int64)
+    # A finite limit excludes infinite edges.
     search = partial(
         dijkstra,
         graph,
@@ -102,11 +96,11 @@ def cost_to_go(
         return_predecessors=True,
         limit=np.finfo(np.float64).max,
     )
-    for b, (graph.data, starts) in enumerate(
-        zip(edge_costs, goals.reshape(batch, cells), strict=True)
-    ):
-        cost[b], following[b], _ = search(indices=np.flatnonzero(starts))
-    return cost.reshape(batch, *shape), np.where(following >= 0, following, NO_CELL)
+    maps = zip(edge_costs, goals.reshape(batch, n_cells), strict=True)
+    for b, (map_costs, map_goals) in enumerate(maps):
+        graph.data = map_costs
+        cost[b], next_cell[b], _ = search(indices=np.flatnonzero(map_goals))
+    return cost.reshape(batch, *shape), np.where(next_cell >= 0, next_cell, NO_CELL)
 
 
 def travel_time_costs(
@@ -115,32 +109,26 @@ def travel_time_costs(
     resolution_m: float,
     closed_corners: bool = True,
 ) -> ndarray:
-    """Gives the time each edge takes at a commanded 1 m/s, each half at its own cell's
-    speed.
+    """Return the time of each edge at a commanded 1 m/s, half of it in either cell.
 
     Args:
-        traversability: share of the commanded speed, shape [B, H, W].
-        free: cells that may be entered, bool, shape [B, H, W].
-        resolution_m: cell width in metres.
-        closed_corners: whether `squeezes` are closed, as they are since version 1.2.
+        traversability: λ in [0, 1], shape [B, H, W].
+        free: mask of free cells, bool, shape [B, H, W].
+        resolution_m: edge length of a cell in metres.
+        closed_corners: whether `squeezes` are closed, as since version 1.2.
 
     Returns:
-        Seconds, infinite at an edge with an end that is not free or that squeezes
-        between two, shape [B, E].
+        Seconds, infinite for closed edges and edges of non-free cells, float64, shape
+        [B, E].
     """
     batch, height, width = traversability.shape
     source, target, length = neighbour_pairs(height, width)
+    is_free = free.reshape(batch, -1)
     pace = np.full((batch, height * width), np.inf)
-    np.divide(
-        1.0, traversability.reshape(batch, -1), out=pace, where=free.reshape(batch, -1)
-    )
-    costs = (
-        0.5
-        * length
-        * resolution_m
-        * (np.take(pace, source, axis=1) + np.take(pace, target, axis=1))
-    )
+    np.divide(1.0, traversability.reshape(batch, -1), out=pace, where=is_free)
+    both_paces = np.take(pace, source, axis=1) + np.take(pace, target, axis=1)
+    costs = 0.5 * length * resolution_m * both_paces
     if closed_corners:
-        open_ = partial(np.take, free.reshape(batch, -1), axis=1)
-        costs[squeezes(open_, source, target, width)] = np.inf
+        free_of = partial(np.take, is_free, axis=1)
+        costs[squeezes(free_of, source, target, width)] = np.inf
     return costs

@@ -1,6 +1,6 @@
-"""What is known of ground before any of it is seen: statistics of the training maps.
+"""Statistics of the training maps: the prior for unobserved terrain.
 
-Letters in shapes: K components, H×W cells, *B any leading dimensions.
+Letters in shapes: K components; H×W cells; *B any leading dimensions.
 """
 
 import json
@@ -15,25 +15,26 @@ from benchnav.core.mixture import TraversabilityMixture
 
 FORMAT = "benchnav-ground-1"
 SEEN = "seen"
-"""Layer of an observation that is 1 where a cell was seen and 0 elsewhere, for models
-that declare it as an input.
+"""Layer of an observation that is 1 in observed cells and 0 elsewhere.
+
+It is for models that declare it as an input.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroundStatistics:
-    """Statistics of all training maps together.
+    """Statistics over all training maps.
 
     Args:
-        weights: of the Gaussian mixture of λ, clipped to [0, 1], over all cells, K
-            numbers.
-        means: of its components, before clipping.
-        stds: of its components, before clipping.
-        layer_means: mean of each channel of each layer of an `Observation`, by the
-            layer's name; of `rgb` three, 0–255.
-        look_alikes: pairs of classes of one colour, by their names.
-        potts_strength: β of the two-state random field over which of a pair's classes a
-            cell is of: the log odds that a neighbour (of four) of one class adds.
+        weights: weights of the Gaussian mixture of λ over all cells, clipped to [0, 1],
+            K numbers.
+        means: means of its components, before clipping.
+        stds: standard deviations of its components, before clipping.
+        layer_means: mean of each channel by layer of an `Observation`; three for `rgb`,
+            in 0–255.
+        look_alikes: pairs of names of look-alike classes.
+        potts_strength: coupling β of the two-state random field of a pair's classes:
+            the log odds that each of four neighbours adds to its class.
     """
 
     weights: tuple[float, ...]
@@ -44,7 +45,7 @@ class GroundStatistics:
     potts_strength: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuses mixtures that are none."""
+        """Validate the mixture."""
         expect(
             len(self.weights) == len(self.means) == len(self.stds) > 0,
             "as many `weights` as `means` and `stds`, got "
@@ -59,61 +60,63 @@ class GroundStatistics:
     def mixture(
         self, shape: Sequence[int], like: torch.Tensor
     ) -> TraversabilityMixture:
-        """The mixture in each cell of maps.
+        """Return the mixture in each cell of maps.
 
         Args:
             shape: [*B, H, W].
-            like: gives dtype and device.
+            like: tensor of the dtype and device.
         """
         *batch, height, width = shape
-        weights, means, stds = (
-            like.new_tensor(values)[:, None, None].expand(
-                *batch, len(values), height, width
-            )
-            for values in (self.weights, self.means, self.stds)
+        maps = (*batch, len(self.weights), height, width)
+
+        def expand(values: tuple[float, ...]) -> torch.Tensor:
+            return like.new_tensor(values)[:, None, None].expand(maps)
+
+        return TraversabilityMixture(
+            expand(self.weights), expand(self.means), expand(self.stds)
         )
-        return TraversabilityMixture(weights, means, stds)
 
     def to_json(self) -> str:
-        """As the text of a file."""
+        """Return the text of a file."""
         return json.dumps({"format": FORMAT, **asdict(self)}, indent=1) + "\n"
 
     @classmethod
     def from_json(cls, text: str) -> "GroundStatistics":
-        """Reads what `to_json` wrote.
+        """Read the text of a file.
 
         Raises:
-            ConfigError: it is of another format, or damaged.
+            ConfigError: If it has another format or is damaged.
         """
         try:
-            about: dict[str, Any] = json.loads(text)
-            found = about.pop("format", None)
+            record: dict[str, Any] = json.loads(text)
+            file_format = record.pop("format", None)
             expect(
-                found == FORMAT,
-                f"ground statistics of the format {FORMAT}, got {found!r}.",
+                file_format == FORMAT,
+                f"ground statistics of the format {FORMAT}, got {file_format!r}.",
             )
-            made = cls(
-                weights=tuple(about["weights"]),
-                means=tuple(about["means"]),
-                stds=tuple(about["stds"]),
-                layer_means={
-                    name: tuple(values) for name, values in about["layer_means"].items()
-                },
-                look_alikes=tuple((one, other) for one, other in about["look_alikes"]),
-                potts_strength=about["potts_strength"],
+            layer_means = {
+                name: tuple(values) for name, values in record["layer_means"].items()
+            }
+            statistics = cls(
+                weights=tuple(record["weights"]),
+                means=tuple(record["means"]),
+                stds=tuple(record["stds"]),
+                layer_means=layer_means,
+                look_alikes=tuple((a, b) for a, b in record["look_alikes"]),
+                potts_strength=record["potts_strength"],
             )
-            channels = {name: len(values) for name, values in made.layer_means.items()}
-            wanted = {"rgb": 3, "elevation_m": 1, "slope_deg": 1}
+            channels = {name: len(values) for name, values in layer_means.items()}
+            required = {"rgb": 3, "elevation_m": 1, "slope_deg": 1}
             expect(
-                wanted.items() <= channels.items(),
-                f"`layer_means` of so many channels: {wanted}, got {channels}.",
+                required.items() <= channels.items(),
+                f"`layer_means` with the numbers of channels {required}, got "
+                f"{channels}.",
             )
-            return made
+            return statistics
         except ConfigError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ConfigError(
                 "Expected ground statistics as `benchnav-datagen ground` writes "
-                f"them, got {type(error).__name__} "
-                f"{error}. Make them again."
+                f"them, got {type(error).__name__} {error}. Create them again."
             ) from error

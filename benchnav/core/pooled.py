@@ -1,7 +1,6 @@
-"""Several distributions as one: the average of their CDFs, as of the members of an
-ensemble or of classes.
+"""The average of the CDFs of several distributions, such as those of an ensemble.
 
-Letters in shapes: M members, H×W cells, *B any leading dimensions.
+Letters in shapes: M members; H×W cells; *B any leading dimensions.
 """
 
 import math
@@ -20,27 +19,27 @@ _HALVINGS = 40  # of [0, 1], to 10⁻¹²
 
 @dataclass(frozen=True)
 class PooledDistribution(TraversabilityDistribution):
-    """The average of distributions; `pool` makes one of distributions that are alike
-    likely.
+    """The weighted average of distributions; `pool` creates one of equal weights.
 
     Args:
-        members: one or more, of one shape, dtype and device.
-        weights: how likely each is, summing to 1 over M, shape [*B, M, H, W]; None
-            where each is as likely as the others.
+        members: at least one distribution, of one shape, dtype and device.
+        weights: weights of the members, summing to 1 over M, shape [*B, M, H, W]; if
+            None, equal weights.
 
     Raises:
-        ConfigError: there are none, they differ, or the weights are of another shape.
+        ConfigError: If there are no members, if their shape, dtype or device differ, or
+            if the weights have another shape.
     """
 
     members: tuple[TraversabilityDistribution, ...]
     weights: Tensor | None = None
 
     def __post_init__(self) -> None:
-        """Checks that the members fit one another."""
-        expect(self.members, "one distribution or more to pool, got none.")
+        """Validate that the members have one shape, dtype and device."""
+        expect(self.members, "at least one distribution to pool, got none.")
         kinds = {
-            f"{list(own.shape)} as {own.dtype} on {own.device}": None
-            for own in self.members
+            f"{list(member.shape)} as {member.dtype} on {member.device}": None
+            for member in self.members
         }
         if len(kinds) > 1:
             raise ConfigError(
@@ -49,10 +48,10 @@ class PooledDistribution(TraversabilityDistribution):
             )
         if self.weights is not None:
             *batch, height, width = self.shape
-            wanted = [*batch, len(self.members), height, width]
+            expected_shape = [*batch, len(self.members), height, width]
             expect(
-                list(self.weights.shape) == wanted,
-                f"`weights` of shape {wanted}, got {list(self.weights.shape)}.",
+                list(self.weights.shape) == expected_shape,
+                f"`weights` of shape {expected_shape}, got {list(self.weights.shape)}.",
             )
 
     @property
@@ -61,97 +60,103 @@ class PooledDistribution(TraversabilityDistribution):
         return self.members[0].shape
 
     def cdf(self, value: Tensor | float) -> Tensor:
-        """P(λ ≤ value), shape [*B, H, W]; see the base."""
-        return self._average([own.cdf(value) for own in self.members])
+        """Return P(λ ≤ value), shape [*B, H, W]."""
+        return self._average([member.cdf(value) for member in self.members])
 
     def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
-        """P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]; see the base."""
-        lower, upper = zip(
-            *(own.cdf_limits(value) for own in self.members), strict=True
-        )
+        """Return P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]."""
+        limits = [member.cdf_limits(value) for member in self.members]
+        lower, upper = zip(*limits, strict=True)
         return self._average(lower), self._average(upper)
 
     @property
     def searched(self) -> bool:
-        """See the base."""
-        return all(own.searched for own in self.members)
+        """Whether all members search for quantiles."""
+        return all(member.searched for member in self.members)
 
     def quantile(self, probability: Tensor | float) -> Tensor:
-        """Least λ that is not exceeded with this probability, within 10⁻¹²; exact at 0
-        and 1, shape [*B, H, W].
+        """Return the quantiles of λ by bisection, shape [*B, H, W].
+
+        They are within 10⁻¹², and exact at 0 and 1.
         """
         exact = self._exact()
-        share = torch.as_tensor(
-            probability, dtype=torch.float64, device=self.device
-        ).expand(self.shape)
+        u = torch.as_tensor(probability, dtype=torch.float64, device=self.device)
+        u = u.expand(self.shape)
         low = torch.zeros(self.shape, dtype=torch.float64, device=self.device)
-        high = torch.where(exact.cdf(low) >= share, 0.0, torch.ones_like(low))
+        high = torch.where(exact.cdf(low) >= u, 0.0, torch.ones_like(low))
         for _ in range(_HALVINGS):
             middle = (low + high) / 2
-            reached = exact.cdf(middle) >= share
-            low, high = (
-                torch.where(reached, low, middle),
-                torch.where(reached, middle, high),
-            )
+            is_upper = exact.cdf(middle) >= u
+            low = torch.where(is_upper, low, middle)
+            high = torch.where(is_upper, middle, high)
         return high.to(self.dtype)
 
     def mean(self) -> Tensor:
-        """E[λ], shape [*B, H, W]."""
-        return self._average([own.mean() for own in self.members])
+        """Return E[λ], shape [*B, H, W]."""
+        return self._average([member.mean() for member in self.members])
 
     def expected_time(self, floor: float) -> Tensor:
-        """E[1 / max(λ, floor)], shape [*B, H, W]; see the base."""
-        return self._average([own.expected_time(floor) for own in self.members])
+        """Return E[1 / max(λ, floor)], shape [*B, H, W]."""
+        return self._average([member.expected_time(floor) for member in self.members])
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log of the average density, shape [*B, H, W]; not a number where a member has
-        none.
+        """Return the log of the average density, shape [*B, H, W].
+
+        It is NaN where a member has no density.
         """
-        densities = torch.stack([own.log_prob(value).double() for own in self.members])
+        log_probs = [member.log_prob(value).double() for member in self.members]
+        stacked = torch.stack(log_probs)
         if self.weights is None:
-            return (densities.logsumexp(0) - math.log(len(self.members))).to(self.dtype)
-        return (
-            (densities + self.weights.double().movedim(-3, 0).log())
-            .logsumexp(0)
-            .to(self.dtype)
-        )
+            total = stacked.logsumexp(0) - math.log(len(self.members))
+        else:
+            log_weights = self.weights.double().movedim(-3, 0).log()
+            total = (stacked + log_weights).logsumexp(0)
+        return total.to(self.dtype)
 
     def _average(self, values: Sequence[Tensor]) -> Tensor:
-        whole = torch.stack([value.double() for value in values])
+        stacked = torch.stack([value.double() for value in values])
         if self.weights is None:
-            return whole.mean(0).to(self.dtype)
-        return (whole * self.weights.double().movedim(-3, 0)).sum(0).to(self.dtype)
+            return stacked.mean(0).to(self.dtype)
+        weights = self.weights.double().movedim(-3, 0)
+        return (stacked * weights).sum(0).to(self.dtype)
 
 
 def pool(
     distributions: Sequence[TraversabilityDistribution],
 ) -> TraversabilityDistribution:
-    """Averages the CDFs of distributions, as of the members of an ensemble.
+    """Average the CDFs of distributions, such as those of an ensemble.
 
     Args:
-        distributions: M of one shape, dtype and device.
+        distributions: M distributions of one shape, dtype and device.
 
     Returns:
-        Of mixtures whose components belong to the same classes a mixture of all
-        components, exactly; else a `PooledDistribution`; of a single one itself.
+        The distribution itself if M is 1. An exact mixture of all components if all are
+        mixtures whose components have the same classes. Otherwise a
+        `PooledDistribution`.
 
     Raises:
-        ConfigError: there are none, or they differ in shape, dtype or device.
+        ConfigError: If there are no distributions, or shape, dtype or device differ.
     """
     pooled = PooledDistribution(tuple(distributions))
-    if len(pooled.members) == 1:
+    n_members = len(pooled.members)
+    if n_members == 1:
         return pooled.members[0]
-    mixtures = [own for own in distributions if isinstance(own, TraversabilityMixture)]
-    if len(mixtures) < len(pooled.members) or len({own.group for own in mixtures}) > 1:
-        return pooled
-    shares = [
-        own.weights / (own.weights.sum(-3, keepdim=True) * len(mixtures))
-        for own in mixtures
+    mixtures = [
+        member for member in distributions if isinstance(member, TraversabilityMixture)
     ]
+    groups = {mixture.group for mixture in mixtures}
+    if len(mixtures) < n_members or len(groups) > 1:
+        return pooled
+    weights = [
+        mixture.weights / (mixture.weights.sum(-3, keepdim=True) * n_members)
+        for mixture in mixtures
+    ]
+    means = [mixture.means for mixture in mixtures]
+    stds = [mixture.stds for mixture in mixtures]
     group = mixtures[0].group
     return TraversabilityMixture(
-        torch.cat(shares, -3),
-        torch.cat([own.means for own in mixtures], -3),
-        torch.cat([own.stds for own in mixtures], -3),
-        None if group is None else group * len(mixtures),
+        torch.cat(weights, -3),
+        torch.cat(means, -3),
+        torch.cat(stds, -3),
+        None if group is None else group * n_members,
     )

@@ -1,6 +1,4 @@
-"""What a column of numbers holds: its name, its unit, and which way is better; for
-tables, tests and figures.
-"""
+"""Quantities of a column: name, unit and better direction, for tables and figures."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -13,18 +11,18 @@ class Quantity:
     """A quantity that conditions are compared by.
 
     Args:
-        name: word by which suites and commands name it.
-        column: its column in tables of episodes.
-        suffix: the unit that ends the column's name, such as `_s`; empty if it has
-            none.
-        words: what sentences call it.
-        unit: unit of differences and margins, and of tables; empty if it has none.
-        scale: that unit over the column's, such as 100 for points over a fraction.
-        heading: of its column in a report.
-        meaning: what one value is, a phrase without its full stop.
-        better: which way is better.
-        of_arrivals: conditions are compared only over the episodes in which both
-            reached the goal.
+        name: identifier in suites and commands.
+        column: column in tables of episodes.
+        suffix: unit at the end of the column's name, such as `_s`; may be empty.
+        words: name in sentences.
+        unit: unit of differences, margins and tables; may be empty.
+        scale: factor from the column's unit to `unit`, such as 100 from a fraction to
+            percentage points.
+        heading: heading of its column in a report.
+        meaning: phrase that defines one value, without a full stop.
+        better: better direction.
+        of_arrivals: whether conditions are compared only over the episodes in which
+            both reached the goal.
     """
 
     name: str
@@ -39,5 +37,5 @@ class Quantity:
     of_arrivals: bool = False
 
     def summary_column(self, statistic: str) -> str:
-        """The column of a statistic in a summary, such as `total_time_mean_s`."""
+        """Return a statistic's column in a summary, such as `total_time_mean_s`."""
         return f"{self.column.removesuffix(self.suffix)}_{statistic}{self.suffix}"

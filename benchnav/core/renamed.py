@@ -1,10 +1,10 @@
-"""Names of version 1 and those that replace them since version 2: an old name is
-answered with the new one.
-"""
+"""Names of version 1 and their replacements in version 2, for error messages."""
 
-# What programs import.
+# Imports of programs.
 IMPORTS = {
     "benchnav.core.figures": "benchnav.viz",
+    "benchnav.metrics.Learnt": "benchnav.metrics.LearningRecord",
+    "benchnav.metrics.motion.StuckShare": "benchnav.metrics.motion.StuckFraction",
     "benchnav.planning.Law": "benchnav.planning.CovarianceModel",
     "benchnav.planning.Moment": "benchnav.planning.NoiseKey",
     "benchnav.planning.OptimalBound": "benchnav.planning.NearOptimal",

@@ -1,9 +1,8 @@
-"""Where the shipped maps and models are: inside an installed wheel, and beside the
-package in a checkout.
+"""Locations of the shipped maps and models.
 
-`setup.py` puts them into the wheel, under `_shipped`. In a checkout, and where it is
-installed as editable, that folder is not there, and they are read from `datasets/` and
-`checkpoints/` of the repository.
+`setup.py` puts them into the wheel, under `_shipped`. A checkout or an editable
+installation lacks that folder; they are read from `datasets/` and `checkpoints/` of the
+repository.
 """
 
 from pathlib import Path
@@ -13,8 +12,6 @@ PACKAGE = Path(__file__).parents[1]
 
 
 def shipped_folder(kind: Literal["datasets", "checkpoints"]) -> Path:
-    """The folder of what is shipped of a kind; of an incomplete copy of the package it
-    may be missing.
-    """
+    """Return the folder of shipped files; an incomplete copy may lack it."""
     inside = PACKAGE / "_shipped"
     return (inside if inside.is_dir() else PACKAGE.parent) / kind

@@ -1,4 +1,4 @@
-"""A representation of values with many fields, of at most six lines."""
+"""A short representation of values with many fields, of at most six lines."""
 
 import textwrap
 from collections.abc import Mapping, Sized
@@ -10,16 +10,14 @@ _SPACE = "\0"
 
 
 def short_repr(value: Any) -> str:
-    """Name the fields of a dataclass: of tensors and arrays dtype and shape, of other
-    values their text or type.
-    """
-    shown = [
-        _field(each.name, getattr(value, each.name))
-        for each in fields(value)
-        if each.repr
+    """Return the fields of a dataclass with dtype and shape, or text, of values."""
+    texts = [
+        _field(field.name, getattr(value, field.name))
+        for field in fields(value)
+        if field.repr
     ]
-    # A field stays on one line: its spaces are hidden while lines are broken.
-    text = ", ".join(field.replace(" ", _SPACE) for field in shown if field)
+    # Hide spaces while lines are broken, so that each field stays on one line.
+    text = ", ".join(field.replace(" ", _SPACE) for field in texts if field)
     text = f"{type(value).__name__}({text})"
     lines = textwrap.wrap(
         text, _WIDTH, subsequent_indent="  ", max_lines=MAX_LINES, placeholder=" …)"
@@ -37,9 +35,10 @@ def _field(name: str, value: Any) -> str:
         return f"{name}={text}"
     if is_dataclass(value):
         shape = getattr(value, "shape", None)
-        return (
-            f"{name} {type(value).__name__}{'' if shape is None else f' {list(shape)}'}"
-        )
+        type_name = type(value).__name__
+        if shape is None:
+            return f"{name} {type_name}"
+        return f"{name} {type_name} {list(shape)}"
     size = f" of {len(value)}" if isinstance(value, Sized) else ""
     kind = "mapping" if isinstance(value, Mapping) else type(value).__name__
     return f"{name} {kind}{size}"

@@ -1,6 +1,4 @@
-"""Objects that remember the arguments they were created with, so that another process
-can create them again.
-"""
+"""Objects that store the arguments of their constructor, for other processes."""
 
 from typing import Any, Self
 
@@ -8,14 +6,13 @@ _ARGUMENTS = "_arguments"
 
 
 class Specified:
-    """The base class of all parts: planners, models, risk measures, robots, …
+    """Base class of all parts: planners, models, risk measures, robots, …
 
-    It changes nothing but that the arguments of the constructor are kept; see
-    `arguments_of`.
+    It only stores the arguments of the constructor, see `arguments_of`.
     """
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Keep the arguments."""
+        """Store the arguments."""
         if cls.__init__ is object.__init__ and (args or kwargs):
             raise TypeError(f"{cls.__name__}() takes no arguments")
         instance = super().__new__(cls)
@@ -25,7 +22,5 @@ class Specified:
 
 
 def arguments_of(instance: Any) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
-    """Return the positional and keyword arguments that an object was created with; None
-    if they are unknown.
-    """
+    """Return an object's positional and keyword arguments; None if unknown."""
     return vars(instance).get(_ARGUMENTS) if isinstance(instance, Specified) else None

@@ -1,8 +1,7 @@
-"""Metrics of episodes: what is computed of one finished episode, and what tables, tests
-and reports say of it.
+"""Finished episodes, and the base class of their metrics.
 
-Letters in shapes: N steps, S state and A action dimensions. A state begins with (x, y,
-    θ) in metres and radians.
+Letters in shapes: N steps, S state and A action dimensions. A state begins with
+(x, y, θ) in metres and radians.
 """
 
 import math
@@ -20,17 +19,17 @@ from benchnav.planning.robots import Robot
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Learnt:
-    """What a robot learnt during an episode.
+class LearningRecord:
+    """Record of a robot's learning during an episode.
 
     Args:
-        revisions: how often its planner was given another map.
-        seen_cells: cells whose appearance it saw.
-        sensed_cells: cells whose λ it sensed.
-        ahead: RMSE of the believed E[λ], and mean log score of the belief, over the
-            cells ahead of the robot; NaN at steps without an update, shape [N, 2].
-        step_s: wall time of sensing and belief for one step, in seconds; NaN if no step
-            was planned.
+        revisions: number of times that the planner received an updated map.
+        seen_cells: number of cells whose appearance was observed.
+        sensed_cells: number of cells whose λ was measured.
+        ahead: RMSE of the posterior mean E[λ], and mean log score of the belief, over
+            the cells ahead of the robot; NaN at steps without an update, shape [N, 2].
+        step_s: wall time of sensing and belief update per step, in seconds; NaN if no
+            step was planned.
     """
 
     revisions: int
@@ -42,34 +41,34 @@ class Learnt:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Episode:
-    """A finished episode: all that a metric may look at. Arrays are float64 and cannot
-    be written to.
+    """A finished episode: the input of a metric. Arrays are float64 and read-only.
 
     Args:
-        states: of the robot, the first at the start and the last where it ended, shape
-            [N + 1, S].
-        actions: commanded in each step, shape [N, A].
-        action_names: what each of the A actions is, such as `speed_mps`.
-        speed_mps: speed that each action would have given on ground of λ = 1, shape
-            [N].
-        turn_rate_radps: turn rate, likewise, shape [N].
+        states: states of the robot from the start to the end, shape [N + 1, S].
+        actions: commanded action of each step, shape [N, A].
+        action_names: names of the A action dimensions, such as `speed_mps`.
+        speed_mps: speed that each action gives on terrain of λ = 1, in m/s, shape [N].
+        turn_rate_radps: turn rate that each action gives on terrain of λ = 1, in rad/s,
+            shape [N].
         traversability: observed λ of each step, in [0, 1], shape [N].
         outcome: how it ended, such as `success` or `immobilised`.
         dt_s: time step in seconds.
         time_budget_s: time budget T in seconds.
-        reference_time_s: least travel time over the grid at 1 m/s, in seconds; NaN if
+        reference_time_s: minimum travel time over the grid at 1 m/s, in seconds; NaN if
             there is none.
         goal_m: position of the goal (x, y) in metres, shape [2].
-        goal_radius_m: a robot this near to the goal has reached it.
-        stuck_traversability: λ_stuck, at or under which a step counts as stuck.
-        robot: F.
-        planning_s: wall time of planning of each step, a batch's over its episodes,
-            shape [N].
-        preparing_s: wall time of what the planner prepared, likewise, in seconds.
-        learnt: what the robot learnt; None if it learnt nothing.
-        rejected_draws: draws of λ without a feasible path, before the one that was met.
-        lower_bound_s: time to the goal that no trajectory undercuts, infinite if none
-            reaches it; NaN if unknown.
+        goal_radius_m: distance in metres within which a robot has reached the goal.
+        stuck_traversability: λ_stuck; a step with λ at or below it counts as stuck.
+        robot: transition function F.
+        planning_s: wall time of planning per step, in seconds; that of a batch divided
+            by its episodes, shape [N].
+        preparing_s: wall time of the planner's preparation, in seconds; divided in the
+            same way.
+        learning: record of learning; None if the robot does not learn.
+        rejected_draws: number of λ fields without a feasible path that were rejected
+            before the one of this episode.
+        lower_bound_s: lower bound of the time to the goal, in seconds; infinite if the
+            goal is unreachable, NaN if unknown.
     """
 
     states: np.ndarray
@@ -88,21 +87,19 @@ class Episode:
     robot: Robot
     planning_s: np.ndarray
     preparing_s: float
-    learnt: Learnt | None = None
+    learning: LearningRecord | None = None
     rejected_draws: int = 0
     lower_bound_s: float = math.nan
 
     def __post_init__(self) -> None:
-        """Makes the arrays read-only, so that no metric changes what the next one is
-        given.
-        """
-        for own in fields(self):
-            value = getattr(self, own.name)
+        """Make the arrays read-only, so that no metric changes what others receive."""
+        for field in fields(self):
+            value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
 
     def __repr__(self) -> str:
-        """One line: how it ended, and when."""
+        """Return one line with the outcome and the end time."""
         robot = type(self.robot).__name__
         return (
             f"Episode(outcome={self.outcome!r}, steps={self.steps}, "
@@ -121,7 +118,7 @@ class Episode:
 
     @property
     def end_time_s(self) -> float:
-        """When it ended, in seconds."""
+        """Duration of the episode in seconds."""
         return self.steps * self.dt_s
 
     @property
@@ -136,30 +133,29 @@ class Episode:
 
 
 class MetricError(BenchnavError):
-    """A metric failed, or returned what is no number."""
+    """A metric raised, or returned an invalid value."""
 
 
 class Metric(Specified, ABC):
-    """A number for each episode: one column of the episodes' table, and what is said of
-    it.
+    """A number for each episode: one column of the episodes' table.
 
-    What is listed below is a class attribute, or a property of an object with options.
-    Whatever else a metric needs are keyword parameters of its constructor, its options.
+    The attributes below are class attributes, or properties of an object with options.
+    Options are keyword parameters of the constructor.
 
     Attributes:
-        name: word by which suites and commands name it.
-        column: its column in tables of episodes. A wall time begins with `planning_` or
-            `learning_`, so that repeated runs are not compared by it.
-        suffix: the unit that ends the column's name, such as `_s`.
-        words: what sentences call it; if empty, its name with spaces.
+        name: identifier in suites and commands.
+        column: column in tables of episodes. Wall times begin with `planning_` or
+            `learning_`, so that repeated runs are not compared by them.
+        suffix: unit at the end of the column's name, such as `_s`.
+        words: name in sentences; if empty, `name` with spaces.
         unit: unit of differences, margins and tables.
-        scale: that unit over the column's.
-        heading: of its column in the report; if empty, its words and unit.
-        meaning: what one value is, a phrase.
+        scale: factor from the column's unit to `unit`.
+        heading: heading of its column in the report; if empty, its words and unit.
+        meaning: phrase that defines one value.
         better: `higher`, `lower` or `neither`.
-        of_arrivals: conditions are compared only over the episodes in which both
-            reached the goal.
-        min_steps: steps that an episode must have; of a shorter one the value is NaN.
+        of_arrivals: whether conditions are compared only over the episodes in which
+            both reached the goal.
+        min_steps: minimum number of steps; the value of a shorter episode is NaN.
     """
 
     name: str
@@ -176,7 +172,7 @@ class Metric(Specified, ABC):
 
     @abstractmethod
     def compute(self, episode: Episode) -> float:
-        """Computes the value of one episode, in the column's unit.
+        """Compute the value of one episode, in the column's unit.
 
         Args:
             episode: a finished episode with at least `min_steps` steps.
@@ -186,24 +182,22 @@ class Metric(Specified, ABC):
         """
 
     def value(self, episode: Episode) -> float:
-        """Returns what `compute` returns, or NaN for an episode with fewer than
-        `min_steps` steps.
-        """
+        """Compute the value; NaN for an episode with fewer than `min_steps` steps."""
         return self.compute(episode) if episode.steps >= self.min_steps else math.nan
 
     @property
     def quantity(self) -> Quantity:
-        """What tables, tests and figures say of the values."""
+        """Column, unit and texts for tables, tests and figures."""
         words = self.words or str(self.name).replace("_", " ")
         unit = f" [{self.unit}]" if self.unit else ""
-        known = {own.name: getattr(self, own.name) for own in fields(Quantity)}
-        return Quantity(
-            **known | {"words": words, "heading": self.heading or f"{words}{unit}"}
-        )
+        values = {field.name: getattr(self, field.name) for field in fields(Quantity)}
+        values["words"] = words
+        values["heading"] = self.heading or f"{words}{unit}"
+        return Quantity(**values)
 
 
 class Recorded(Metric):
-    """A number that the episode holds under the name of the column."""
+    """A metric that reads the attribute of the episode named like the column."""
 
     min_steps = 0
 
@@ -214,17 +208,17 @@ class Recorded(Metric):
 
 
 def measure(metric: Metric, episode: Episode) -> float:
-    """Computes a metric that may be a user's.
+    """Compute a metric that a user may have written.
 
     Args:
-        metric: any metric.
-        episode: what it is computed of.
+        metric: metric.
+        episode: finished episode.
 
     Returns:
         A finite number or NaN.
 
     Raises:
-        MetricError: If the metric raises, or returns anything else.
+        MetricError: If the metric raises, or returns an invalid value.
     """
     try:
         value = (
@@ -240,6 +234,5 @@ def measure(metric: Metric, episode: Episode) -> float:
 def _no_number(metric: Metric, got: str) -> MetricError:
     return MetricError(
         f"Expected a finite number or NaN from metric {metric.name!r}, got {got}. "
-        "Return NaN for an episode that "
-        "has no such value."
+        "Return NaN where the value is undefined."
     )

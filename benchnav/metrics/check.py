@@ -1,6 +1,4 @@
-"""Whether a metric keeps its contract, tried before a run on episodes that a robot
-drives without a planner.
-"""
+"""Validation of a metric before a run: its attributes, and short sample episodes."""
 
 import math
 from typing import get_args
@@ -9,40 +7,33 @@ import numpy as np
 import torch
 
 from benchnav.core.quantity import Better
-from benchnav.metrics.base import Episode, Learnt, Metric
+from benchnav.metrics.base import Episode, LearningRecord, Metric
 from benchnav.planning.robots import Robot
 
 _STEPS = 12
 
 
 def attribute_faults(metric: Metric) -> list[str]:
-    """Return what of a metric's attributes is invalid, a sentence each.
+    """Return one message for each invalid attribute of a metric.
 
     Args:
-        metric: any metric.
+        metric: metric.
     """
     faults = []
 
-    def expect(holds: bool, name: str, what: str) -> None:
-        if not holds:
-            faults.append(
-                f"Expected `{name}` {what}, got {getattr(metric, name, None)!r}."
-            )
+    def expect(is_valid: bool, name: str, expectation: str) -> None:
+        if not is_valid:
+            value = getattr(metric, name, None)
+            faults.append(f"Expected `{name}` {expectation}, got {value!r}.")
 
     for name in ("name", "column", "meaning"):
         value = getattr(metric, name, None)
-        expect(
-            isinstance(value, str) and bool(value.strip()) and value.isprintable(),
-            name,
-            "as text on one line",
-        )
+        is_line = isinstance(value, str) and value.isprintable()
+        expect(is_line and bool(value.strip()), name, "as text on one line")
     for name in ("suffix", "words", "unit", "heading"):
         value = getattr(metric, name)
-        expect(
-            isinstance(value, str) and (value.isprintable()),
-            name,
-            "as text on one line, or empty",
-        )
+        is_line = isinstance(value, str) and value.isprintable()
+        expect(is_line, name, "as text on one line, or empty")
     if faults:
         return faults
     expect(metric.column.isidentifier(), "column", "of letters, digits and _")
@@ -60,17 +51,17 @@ def attribute_faults(metric: Metric) -> list[str]:
 
 
 def sample_episodes(robot: Robot) -> list[Episode]:
-    """Drives a robot without a planner: a success, a failure that stood, and a failure
-    of one step.
+    """Simulate sample episodes of a robot without a planner.
 
     Args:
-        robot: F.
+        robot: transition function F.
 
     Returns:
-        Episodes of at least one step; in the first the robot also learnt.
+        A success with a record of learning, a failure without motion, and a failure of
+        one step.
     """
-    wave = 0.5 + 0.4 * np.sin(np.arange(_STEPS))
-    learnt = Learnt(
+    traversability = 0.5 + 0.4 * np.sin(np.arange(_STEPS))
+    learning = LearningRecord(
         revisions=1,
         seen_cells=40,
         sensed_cells=7,
@@ -78,33 +69,37 @@ def sample_episodes(robot: Robot) -> list[Episode]:
         step_s=0.001,
     )
     return [
-        _drive(robot, wave, "success", learnt),
-        _drive(robot, np.zeros(_STEPS), "immobilised", None),
-        _drive(robot, wave[:1], "timeout", None),
+        _simulate(robot, traversability, "success", learning),
+        _simulate(robot, np.zeros(_STEPS), "immobilised", None),
+        _simulate(robot, traversability[:1], "timeout", None),
     ]
 
 
-def _drive(
-    robot: Robot, traversability: np.ndarray, outcome: str, learnt: Learnt | None
+def _simulate(
+    robot: Robot,
+    traversability: np.ndarray,
+    outcome: str,
+    learning: LearningRecord | None,
 ) -> Episode:
     steps = len(traversability)
-    low, high = torch.tensor(robot.action_low), torch.tensor(robot.action_high)
+    low = torch.tensor(robot.action_low)
+    high = torch.tensor(robot.action_high)
     actions = low + (high - low) * torch.linspace(0.9, 0.4, steps)[:, None]
+    fractions = torch.tensor(traversability, dtype=actions.dtype)
     states = [robot.initial_state(torch.tensor([[2.0, 3.0, 0.1]]))]
-    free = []
-    for action, value in zip(
-        actions, torch.tensor(traversability, dtype=actions.dtype), strict=True
-    ):
-        free.append(robot(states[-1], action[None], torch.ones(1)) - states[-1])
-        states.append(robot(states[-1], action[None], value[None]))
-    moved = torch.cat(free).double().numpy() / robot.dt_s
+    commanded = []  # motion on terrain of λ = 1
+    for action, fraction in zip(actions, fractions, strict=True):
+        state = states[-1]
+        commanded.append(robot(state, action[None], torch.ones(1)) - state)
+        states.append(robot(state, action[None], fraction[None]))
+    velocity = torch.cat(commanded).double().numpy() / robot.dt_s
     track = torch.cat(states).double().numpy()
     return Episode(
         states=track,
         actions=actions.double().numpy(),
         action_names=robot.action_names,
-        speed_mps=np.hypot(moved[:, 0], moved[:, 1]),
-        turn_rate_radps=moved[:, 2].copy(),
+        speed_mps=np.hypot(velocity[:, 0], velocity[:, 1]),
+        turn_rate_radps=velocity[:, 2].copy(),
         traversability=traversability.copy(),
         outcome=outcome,
         dt_s=robot.dt_s,
@@ -116,5 +111,5 @@ def _drive(
         robot=robot,
         planning_s=np.full(steps, 0.002),
         preparing_s=0.01,
-        learnt=learnt,
+        learning=learning,
     )

@@ -1,12 +1,10 @@
-"""What the draw of λ was like: how many were rejected before it, and how fast a robot
-could have reached the goal.
-"""
+"""Metrics of the λ field: rejected draws, and a lower bound of the time to the goal."""
 
 from benchnav.metrics.base import Recorded
 
 
 class RejectedDraws(Recorded):
-    """Draws of λ that were rejected."""
+    """Number of λ fields that were rejected before the one of the episode."""
 
     name = column = "rejected_draws"
     meaning = (
@@ -15,14 +13,13 @@ class RejectedDraws(Recorded):
 
 
 class LowerBound(Recorded):
-    """Time to the goal that no trajectory undercuts."""
+    """Lower bound of the time to the goal."""
 
     name = "lower_bound"
     column = "lower_bound_s"
     suffix = "_s"
     unit = "s"
     meaning = (
-        "time to the goal that no trajectory undercuts, infinite where none arrives; "
-        "of planners that are given λ, in "
-        "worlds with one λ field an episode"
+        "lower bound of the time to the goal, infinite if it is unreachable; "
+        "of planners that are given λ, in worlds with one λ field per episode"
     )

@@ -1,4 +1,4 @@
-"""Energy for the driven path, from the power that slip makes a drive draw."""
+"""Energy along the driven path, from the power that a drive draws under slip."""
 
 import numpy as np
 
@@ -10,14 +10,14 @@ class Energy(Metric):
     """Energy E = ∫ P/λ dt that the drive draws along the path.
 
     Wheels that turn at the commanded speed u and push with a force F draw F·u. The
-    robot moves at v = λ·u, since slip is 1 − λ, so that P = F·v = λ·F·u of it moves the
-    robot and the rest is lost in slip. A drive that keeps P draws P/λ. It cannot draw
-    without limit: λ counts as at least `min_traversability`, and the greatest power is
-        P/`min_traversability`. Steps whose action commands no motion draw nothing.
+    robot moves at v = λ·u, since slip is 1 − λ. So P = F·v = λ·F·u moves the robot and
+    slip dissipates the remainder: a drive with constant P draws P/λ. Its power is
+    limited: λ counts as at least `min_traversability`, so that the maximum power is
+    P/`min_traversability`. Steps whose action commands no motion draw nothing.
 
     Args:
-        power_w: P, the power that moves the robot over ground, in watts; constant.
-        min_traversability: least λ that counts, in (0, 1].
+        power_w: P, the constant power that moves the robot over terrain, in watts.
+        min_traversability: lower limit of λ in P/λ, in (0, 1].
     """
 
     name = "energy"

@@ -1,75 +1,76 @@
-"""Metrics of what a robot learnt during an episode; NaN if it learnt nothing."""
+"""Metrics of learning during an episode; NaN if the robot does not learn."""
 
 import math
 
 import numpy as np
 
-from benchnav.metrics.base import Episode, Learnt, Metric
+from benchnav.metrics.base import Episode, LearningRecord, Metric
 
 
-class _OfLearnt(Metric):
+class _LearningMetric(Metric):
     """A metric of robots that learn."""
 
     min_steps = 0
 
     def compute(self, episode: Episode) -> float:
-        """Return the value; NaN if the robot learnt nothing."""
-        return math.nan if episode.learnt is None else float(self.of(episode.learnt))
+        """Return the value; NaN if the robot does not learn."""
+        if episode.learning is None:
+            return math.nan
+        return float(self.of(episode.learning))
 
-    def of(self, learnt: Learnt) -> float:
-        """Return the value of a robot that learnt: what it holds under the name of the
-        column.
-        """
-        value: float = getattr(learnt, self.column)
+    def of(self, record: LearningRecord) -> float:
+        """Return the attribute of the record that is named like the column."""
+        value: float = getattr(record, self.column)
         return value
 
 
-class Revisions(_OfLearnt):
-    """How often the planner was given another map."""
+class Revisions(_LearningMetric):
+    """Number of times that the planner received an updated map."""
 
     name = column = heading = "revisions"
-    meaning = "how often its planner was given another map"
+    meaning = "number of times that the planner received an updated map"
 
 
-class SeenCells(_OfLearnt):
-    """Cells whose appearance the robot saw."""
+class SeenCells(_LearningMetric):
+    """Number of cells whose appearance was observed."""
 
     name = column = "seen_cells"
     heading = "cells seen"
-    meaning = "cells whose appearance a robot saw"
+    meaning = "number of cells whose appearance was observed"
 
 
-class SensedCells(_OfLearnt):
-    """Cells whose λ the robot sensed."""
+class SensedCells(_LearningMetric):
+    """Number of cells whose λ was measured."""
 
     name = column = "sensed_cells"
     heading = "cells sensed"
-    meaning = "cells whose λ it sensed"
+    meaning = "number of cells whose λ was measured"
 
 
-class _Ahead(_OfLearnt):
-    """A mean over the updates of an episode."""
+class _Ahead(_LearningMetric):
+    """Mean of a column of `ahead` over the updates of an episode."""
 
     index: int
 
-    def of(self, learnt: Learnt) -> float:
+    def of(self, record: LearningRecord) -> float:
         """Return the mean; NaN if nothing was updated."""
-        updates = learnt.ahead[~np.isnan(learnt.ahead[:, 0])]
-        # Both columns at once: a mean of one column sums in another order.
-        return updates.mean(0)[self.index] if len(updates) else math.nan
+        updates = record.ahead[~np.isnan(record.ahead[:, 0])]
+        if not len(updates):
+            return math.nan
+        # Average both columns: the mean of a single column sums in a different order.
+        return updates.mean(0)[self.index]
 
 
 class AheadRmse(_Ahead):
-    """Root mean square error of the believed E[λ] ahead of the robot."""
+    """Root mean square error of the posterior mean E[λ] ahead of the robot."""
 
     name = column = "ahead_rmse"
     heading = "RMSE ahead"
     better = "lower"
     index = 0
     meaning = (
-        "root mean square error of the believed E[λ] over the cells ahead of the "
-        "robot of which λ was not sensed, mean "
-        "over updates"
+        "root mean square error of the posterior mean E[λ] over the cells ahead of "
+        "the robot whose λ was not measured, mean over updates"
     )
 
 
@@ -80,11 +81,11 @@ class AheadLogScore(_Ahead):
     heading = "log score ahead"
     better = "higher"
     index = 1
-    meaning = "mean log score of the belief over these cells, at least −10 a cell"
+    meaning = "mean log score of the belief over these cells, at least −10 per cell"
 
 
-class LearningTime(_OfLearnt):
-    """Wall time of sensing and belief."""
+class LearningTime(_LearningMetric):
+    """Wall time of sensing and belief update per step."""
 
     name = "learning_time"
     column = "learning_ms"
@@ -92,9 +93,10 @@ class LearningTime(_OfLearnt):
     heading = "belief [ms]"
     better = "lower"
     meaning = (
-        "time of a step for sensing and belief, of a batch divided by its episodes"
+        "wall time per step of sensing and belief update, "
+        "that of a batch divided by its episodes"
     )
 
-    def of(self, learnt: Learnt) -> float:
+    def of(self, record: LearningRecord) -> float:
         """Return the time in milliseconds."""
-        return 1e3 * learnt.step_s
+        return 1e3 * record.step_s

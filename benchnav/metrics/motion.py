@@ -1,4 +1,4 @@
-"""Metrics of the ground that a robot met and of the path that it drove.
+"""Metrics of the observed traversability and of the driven path.
 
 Source: Endo, Honda and Ishigami (2024), IV-A, for the average traversability.
 """
@@ -24,7 +24,7 @@ class Traversability(Metric):
         return float(episode.traversability.mean())
 
 
-class StuckShare(Metric):
+class StuckFraction(Metric):
     """Fraction of steps with an observed λ at most λ_stuck."""
 
     name = column = "stuck_share"
@@ -32,7 +32,7 @@ class StuckShare(Metric):
     scale = 100
     better = "lower"
     heading = "stuck steps [%]"
-    meaning = "share of steps with observed λ at most `free_space.above`"
+    meaning = "fraction of steps with observed λ at most `free_space.above`"
 
     def compute(self, episode: Episode) -> float:
         """Return the fraction, in [0, 1]."""
@@ -72,5 +72,9 @@ class Roughness(Metric):
 
 
 def path_length_m(track: np.ndarray) -> float:
-    """Length of a driven path, positions of shape [N, 2]."""
+    """Return the length of a driven path in metres.
+
+    Args:
+        track: positions (x, y) in metres, shape [N, 2].
+    """
     return float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum())

@@ -1,6 +1,4 @@
-"""Metrics of planning time: wall times of a batch over the number of episodes that it
-was for.
-"""
+"""Metrics of planning time: the wall time of a batch divided by its episodes."""
 
 import numpy as np
 
@@ -8,7 +6,7 @@ from benchnav.metrics.base import Episode, Metric
 
 
 class _LaterSteps(Metric):
-    """A percentile of the planning times of all steps but the first."""
+    """A percentile of the planning times from the second step on."""
 
     unit = "ms"
     better = "lower"
@@ -27,9 +25,8 @@ class PlanningTime(_LaterSteps):
     column = "planning_ms"
     percent = 50
     meaning = (
-        "planning time of a step of a batch, per episode of it, from the "
-        "second "
-        "step on: median"
+        "median planning time per step, from the second step on, "
+        "that of a batch divided by its episodes"
     )
 
 
@@ -40,21 +37,21 @@ class HighPlanningTime(_LaterSteps):
     column = "planning_ms_p95"
     percent = 95
     meaning = (
-        "planning time of a step of a batch, per episode of it, from the "
-        "second "
-        "step on: 95th percentile"
+        "95th percentile of the planning time per step, from the second step on, "
+        "that of a batch divided by its episodes"
     )
 
 
 class StartTime(Metric):
-    """Time of preparing, compiling and the first step."""
+    """Time of preparation, compilation and the first step."""
 
     name = "planning_start"
     column = "planning_start_ms"
     unit = "ms"
     better = "lower"
     meaning = (
-        "time of preparing, compiling and the first step, per episode of the batch"
+        "time of preparation, compilation and the first step, "
+        "that of a batch divided by its episodes"
     )
 
     def compute(self, episode: Episode) -> float:

@@ -1,6 +1,4 @@
-"""The metrics that every run has, in the order of its columns; others are named in a
-suite's `metrics`.
-"""
+"""The metrics of every run, in the order of its columns; a suite adds others."""
 
 from collections.abc import Mapping
 
@@ -14,7 +12,7 @@ TRAVERSABILITY = motion.Traversability()
 TIME_RATIO = times.TimeRatio()
 SCORE = times.Score()
 PATH_LENGTH = motion.PathLength()
-STUCK_SHARE = motion.StuckShare()
+STUCK_FRACTION = motion.StuckFraction()
 ROUGHNESS = motion.Roughness()
 PLANNING = (planning.PlanningTime(), planning.HighPlanningTime(), planning.StartTime())
 REVISIONS = learning.Revisions()
@@ -25,26 +23,24 @@ LEARNING_TIME = learning.LearningTime()
 LOWER_BOUND = draw.LowerBound()
 
 SHIPPED: tuple[Metric, ...] = (
-    *(
-        SUCCESS,
-        TOTAL_TIME,
-        times.EndTime(),
-        TRAVERSABILITY,
-        times.ReferenceTime(),
-        TIME_RATIO,
-        SCORE,
-    ),
-    *(
-        PATH_LENGTH,
-        STUCK_SHARE,
-        ROUGHNESS,
-        *PLANNING,
-        REVISIONS,
-        SEEN_CELLS,
-        SENSED_CELLS,
-        *AHEAD,
-    ),
-    *(LEARNING_TIME, draw.RejectedDraws(), LOWER_BOUND),
+    SUCCESS,
+    TOTAL_TIME,
+    times.EndTime(),
+    TRAVERSABILITY,
+    times.ReferenceTime(),
+    TIME_RATIO,
+    SCORE,
+    PATH_LENGTH,
+    STUCK_FRACTION,
+    ROUGHNESS,
+    *PLANNING,
+    REVISIONS,
+    SEEN_CELLS,
+    SENSED_CELLS,
+    *AHEAD,
+    LEARNING_TIME,
+    draw.RejectedDraws(),
+    LOWER_BOUND,
 )
 QUANTITIES: Mapping[str, Quantity] = {
     metric.name: metric.quantity for metric in SHIPPED

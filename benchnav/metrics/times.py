@@ -17,18 +17,18 @@ class Success(Recorded):
     scale = 100
     better = "higher"
     heading = "Succ. [%]"
-    meaning = "share of episodes that reached the goal"
+    meaning = "fraction of episodes that reached the goal"
 
 
 class TotalTime(Metric):
-    """T_total: time to the goal, and the time budget T for a failure."""
+    """T_total: time to the goal; the time budget T for a failure."""
 
     name = words = "T_total"
     column = "total_time_s"
     suffix = "_s"
     unit = "s"
     better = "lower"
-    meaning = "time to the goal, a failure counted as the time budget T"
+    meaning = "time to the goal; failures count as the time budget T"
     min_steps = 0
 
     def compute(self, episode: Episode) -> float:
@@ -37,7 +37,7 @@ class TotalTime(Metric):
 
 
 class EndTime(Recorded):
-    """When the episode ended."""
+    """Duration of the episode."""
 
     name = "end_time"
     column = "end_time_s"
@@ -47,13 +47,13 @@ class EndTime(Recorded):
 
 
 class ReferenceTime(Recorded):
-    """The dataset's reference time of the map."""
+    """Reference time of the map, from the dataset."""
 
     name = "reference_time"
     column = "reference_time_s"
     suffix = "_s"
     unit = "s"
-    meaning = "least travel time over the grid at 1 m/s, of the dataset"
+    meaning = "minimum travel time over the grid at 1 m/s, from the dataset"
 
 
 class TimeRatio(Metric):
@@ -66,26 +66,23 @@ class TimeRatio(Metric):
 
     def compute(self, episode: Episode) -> float:
         """Return the ratio; NaN for a failure."""
-        return (
-            episode.end_time_s / episode.reference_at_top_speed_s
-            if episode.success
-            else math.nan
-        )
+        if not episode.success:
+            return math.nan
+        return episode.end_time_s / episode.reference_at_top_speed_s
 
 
 class Score(Metric):
-    """BARN's score: OT over the time, kept within 2 OT and 8 OT; 0 for a failure.
+    """BARN's score: OT / clip(time, 2 OT, 8 OT); 0 for a failure.
 
-    OT is half the reference time at the robot's top speed, so that arriving in that
-    time is the best.
+    OT is half the reference time at the robot's top speed, so that a robot which
+    reaches the goal in the reference time has the maximum score.
     """
 
     name = column = "score"
     better = "higher"
     meaning = (
-        "BARN's: OT / clip(time, 2 OT, 8 OT), OT half the reference time at "
-        "top "
-        "speed; 0 for failures"
+        "BARN's score OT / clip(time, 2 OT, 8 OT), with OT half the reference time at "
+        "top speed; 0 for failures"
     )
     min_steps = 0
 

@@ -1,3 +1,1 @@
-"""Statistics of comparisons: paired differences, intervals, tests, the best set, and
-their tables.
-"""
+"""Statistics of comparisons: differences, intervals, tests, the best set, tables."""

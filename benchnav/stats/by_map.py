@@ -1,80 +1,82 @@
-"""One number a map, the statistical unit: all episodes on a map, under other seeds or
-realisations, make one.
+"""One value per map, the statistical unit, from all episodes on the map.
 
-Where a dataset has groups of maps, all episodes of a group make one, and "map" means
-group in all of `stats`.
+If a dataset has groups of maps, the group is the unit, and "map" means group in all of
+`benchnav.stats`.
 Letters in shapes: N episodes; M maps.
 """
 
 import numpy as np
 
-# Of the scale of what is summed: far more than rounding, far less than a time step.
+# Relative to the scale of the summed values: well above rounding errors, and well below
+# a time step.
 _ROUNDING = 1e-9
 
 
 def alike(values: np.ndarray, scale: float) -> np.ndarray:
-    """Return values in which sizes that differ by rounding are one size, and 0 where
-    they are as small.
+    """Return values whose magnitudes are equal where they differed only by rounding.
 
-    Tests by ranks and by signs ask which values are 0 and which are equal. Sums of
-    times on a grid of steps answer that but for rounding, which the order of episodes
-    decides.
+    Rank and sign tests depend on which values are 0 and which are tied. In sums of
+    times, ties are broken by rounding errors, which depend on the order of episodes.
 
     Args:
         values: shape [M].
-        scale: largest number that the values were computed from.
+        scale: largest magnitude that the values were computed from.
 
     Returns:
-        Shape [M], within a few `_ROUNDING` of the scale.
+        Shape [M], float64, within a few `_ROUNDING` times `scale` of `values`.
     """
     order = np.argsort(np.abs(values))
-    sizes = np.concatenate([[0.0], np.abs(values)[order]])
-    is_new = ~(np.diff(sizes) <= _ROUNDING * scale)
-    first = np.maximum.accumulate(np.where(is_new, np.arange(1, len(sizes)), 0))
+    magnitudes = np.concatenate([[0.0], np.abs(values)[order]])
+    is_new = ~(np.diff(magnitudes) <= _ROUNDING * scale)
+    indices = np.where(is_new, np.arange(1, len(magnitudes)), 0)
+    first = np.maximum.accumulate(indices)
     snapped = np.empty(len(values))
-    snapped[order] = sizes[first]
+    snapped[order] = magnitudes[first]
     return np.copysign(snapped, values) + 0.0
 
 
 def sums_by_map(
     values: np.ndarray, maps: np.ndarray, scale: float | None = None
 ) -> np.ndarray:
-    """Return the sum of each map over the mean number of episodes a map, without
-    rounding (see `alike`).
+    """Return the sum of each map over the mean number of episodes per map.
+
+    Values that differ only by rounding are equal in the result, see `alike`.
 
     Args:
-        values: one an episode, shape [N].
-        maps: which map each was on, any labels, shape [N].
-        scale: largest number that the values were computed from; their own where not
-            given.
+        values: value of each episode, shape [N].
+        maps: label of each episode's map, shape [N].
+        scale: largest magnitude that the values were computed from; if None, that of
+            the values themselves.
 
     Returns:
-        Shape [M], in the order of sorted labels.
+        Shape [M], float64, in the order of sorted labels.
     """
     if not len(values):
         return np.empty(0)
-    _, member, size = np.unique(maps, return_inverse=True, return_counts=True)
-    sums = np.bincount(member, weights=values) / size.mean()
-    return alike(sums, float(np.abs(values).max()) if scale is None else scale)
+    _, index, size = np.unique(maps, return_inverse=True, return_counts=True)
+    sums = np.bincount(index, weights=values) / size.mean()
+    if scale is None:
+        scale = float(np.abs(values).max())
+    return alike(sums, scale)
 
 
 def by_map(
     values: np.ndarray, maps: np.ndarray, scale: float | None = None
 ) -> np.ndarray:
-    """Return one number a map, whose mean over maps is that over episodes.
+    """Return one value per map, with the same mean over maps as over episodes.
 
-    Of maps with equally many episodes it is the mean of each. Else it is the
-    contribution of each map to the mean of all, Σ(v − v̄)·M/N + v̄, whose standard
-    deviation is that of a ratio estimator.
+    If all maps have the same number of episodes, it is the mean of each map. Otherwise
+    it is the contribution of each map to the overall mean, Σ(v − v̄)·M/N + v̄, whose
+    standard deviation is that of a ratio estimator.
     Source: Cochran (1977), "Sampling Techniques", 6.3.
 
     Args:
-        values: one an episode, shape [N].
-        maps: which map each was on, any labels, shape [N].
+        values: value of each episode, shape [N].
+        maps: label of each episode's map, shape [N].
         scale: as in `sums_by_map`.
 
     Returns:
-        Shape [M], in the order of sorted labels.
+        Shape [M], float64, in the order of sorted labels.
     """
     sums = sums_by_map(values, maps, scale)
     _, size = np.unique(maps, return_counts=True)

@@ -1,9 +1,9 @@
 """Paired differences of two conditions over episodes, with intervals and tests.
 
-All functions take `rows`: episodes that both conditions have in common, one a row.
-`success`, `total_time_s`, `time_budget_s` and other columns are of the first condition,
-those that end in `_other` of the second. `group` is the statistical unit, a map or a
-group of maps. A difference is of the first less the second.
+All functions take `rows`, a table with one row per episode that both conditions have in
+common. The columns `success`, `total_time_s`, `time_budget_s`, … belong to the first
+condition, those that end in `_other` to the second. `group` is the statistical unit, a
+map or a group of maps. Differences are the first condition minus the second.
 Letters in shapes: M maps.
 """
 
@@ -22,24 +22,21 @@ Interval = tuple[float, float, float]
 
 
 def gain_by_map(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Return the difference of the number of successes, and the number of episodes, by
-    map, both of shape [M].
-    """
+    """Return differences of success counts, and numbers of episodes, each shape [M]."""
     gain = rows["success"].astype(int) - rows["success_other"].astype(int)
     by_unit = gain.groupby(rows["group"].to_numpy())
     return by_unit.sum().to_numpy(), by_unit.size().to_numpy()
 
 
 def mean_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.ndarray:
-    """Return the difference of a column as one number a map whose mean is that over
-    episodes, shape [M].
-    """
+    """Return `by_map` of the difference of a column, shape [M]."""
     return by_map(*_differences(rows, column))
 
 
 def summed_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.ndarray:
-    """Return the difference of a column as tests by signs and ranks need it:
-    `sums_by_map`, shape [M].
+    """Return `sums_by_map` of the difference of a column, for sign and rank tests.
+
+    The result has shape [M].
     """
     return sums_by_map(*_differences(rows, column))
 
@@ -47,12 +44,10 @@ def summed_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.n
 def _differences(
     rows: pd.DataFrame, column: str
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return differences by episode, their maps, and the largest value that they are
-    computed from.
-    """
-    sides = rows[[column, f"{column}_other"]].to_numpy(dtype=float)
-    scale = float(np.abs(sides).max(initial=0))
-    return sides[:, 0] - sides[:, 1], rows["group"].to_numpy(), scale
+    """Return differences by episode, their maps, and the largest magnitude of values."""
+    paired = rows[[column, f"{column}_other"]].to_numpy(dtype=float)
+    scale = float(np.abs(paired).max(initial=0))
+    return paired[:, 0] - paired[:, 1], rows["group"].to_numpy(), scale
 
 
 def interval_of(rows: pd.DataFrame, column: str, confidence: float = 0.95) -> Interval:
@@ -60,8 +55,8 @@ def interval_of(rows: pd.DataFrame, column: str, confidence: float = 0.95) -> In
 
     Args:
         rows: see the module.
-        column: `success` has the interval of `success_interval`, `total_time_s` that of
-            `time_difference`, others Student's.
+        column: `success` uses `success_interval`, `total_time_s` uses
+            `time_difference`, others Student's interval.
         confidence: nominal coverage.
 
     Returns:
@@ -82,12 +77,11 @@ def interval_of(rows: pd.DataFrame, column: str, confidence: float = 0.95) -> In
 
 
 def difference_p(rows: pd.DataFrame, column: str, direction: str = "") -> float:
-    """Return p of no difference of a column by flipping the signs of maps; 1 if there
-    is no episode.
+    """Return the p-value of a sign-flip test over maps; 1 if there is no episode.
 
     Args:
         rows: see the module.
-        column: counted exactly for `success`.
+        column: column to compare; the test of `success` is exact.
         direction: `higher` or `lower` for a one-sided test; two-sided if empty.
     """
     if column == "success":
@@ -96,8 +90,7 @@ def difference_p(rows: pd.DataFrame, column: str, direction: str = "") -> float:
 
 
 def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> Interval:
-    """Return the difference of T_total, a failure counted as T, with the interval of
-    `total_time_interval`.
+    """Return the difference of T_total, with the interval of `total_time_interval`.
 
     Args:
         rows: see the module.
@@ -106,15 +99,17 @@ def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> Interval:
     Returns:
         Difference and ends in seconds.
     """
-    arrived, arrival_s, budget_s = [], [], []
+    maps_of_success = []
+    success_s = []
+    budget_s = []
     for suffix in ("", "_other"):
         success = rows[f"success{suffix}"].astype(bool)
-        arrived.append(set(rows.loc[success, "group"]))
-        arrival_s.append(rows.loc[success, f"total_time_s{suffix}"])
+        maps_of_success.append(set(rows.loc[success, "group"]))
+        success_s.append(rows.loc[success, f"total_time_s{suffix}"])
         budget_s.append(rows[f"time_budget_s{suffix}"])
-    arrivals = pd.concat(arrival_s)
-    # No arrival takes less than nothing, where there is none to go by.
-    arrival = arrivals.mean() if len(arrivals) else 0.0
+    times_s = pd.concat(success_s)
+    # Without any success, a failure costs at most the whole T.
+    mean_time_s = times_s.mean() if len(times_s) else 0.0
     gain, draws = gain_by_map(rows)
     _, low, high = success_interval(gain, draws, confidence)
     failed = rows["success_other"].astype(float) - rows["success"]
@@ -122,30 +117,28 @@ def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> Interval:
         mean_differences(rows),
         by_map(failed.to_numpy(), rows["group"].to_numpy()),
         (-high, -low),
-        pd.concat(budget_s).mean() - arrival,
-        len(set.intersection(*arrived)),
+        pd.concat(budget_s).mean() - mean_time_s,
+        len(set.intersection(*maps_of_success)),
         confidence,
     )
     return float(mean), float(low_s), float(high_s)
 
 
 def budgets_differ(rows: pd.DataFrame) -> bool:
-    """Return whether T of the two conditions differs on some map."""
-    one, other = rows["time_budget_s"], rows["time_budget_s_other"]
-    known = (
-        one.notna() & other.notna()
-    )  # of an episode that began at its goal T is unknown
-    return not np.allclose(one[known], other[known], rtol=1e-6)
+    """Return whether T of the two conditions differs on any map."""
+    first = rows["time_budget_s"]
+    second = rows["time_budget_s_other"]
+    # T of an episode that began at its goal is NaN.
+    is_known = first.notna() & second.notna()
+    return not np.allclose(first[is_known], second[is_known], rtol=1e-6)
 
 
 def in_budgets(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with times as fractions of each condition's own T."""
+    """Return the rows with times as fractions of each condition's T."""
     fractions: dict[str, pd.Series | float] = {}
     for suffix in ("", "_other"):
-        # An episode that began at its goal took nothing of a T that is unknown.
-        taken = rows[f"total_time_s{suffix}"] / rows[f"time_budget_s{suffix}"]
-        fractions |= {
-            f"total_time_s{suffix}": taken.fillna(0),
-            f"time_budget_s{suffix}": 1.0,
-        }
+        fraction = rows[f"total_time_s{suffix}"] / rows[f"time_budget_s{suffix}"]
+        # T of an episode that began at its goal is NaN; it took no time.
+        fractions[f"total_time_s{suffix}"] = fraction.fillna(0)
+        fractions[f"time_budget_s{suffix}"] = 1.0
     return rows.assign(**fractions)

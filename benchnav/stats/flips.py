@@ -1,14 +1,12 @@
-"""Tests of paired differences: signs of maps are flipped, or two contestants are
-exchanged on each map.
+"""Randomisation tests of paired differences, by sign flips or exchanges on each map.
 
-Under the hypothesis the two are exchangeable on each map. All ways are counted where
-that is possible, else 9 999 drawn ones with a fixed seed. Before signs are drawn, maps
-are put into an order that neither their own order nor that of the two contestants
-decides, so p depends on neither. Maps without a difference do not count.
+Under H₀ the two contestants are exchangeable on each map. Up to 13 maps, all
+assignments are counted; beyond, 9 999 random ones with a fixed seed. Maps are sorted by
+their values first, so that p depends neither on the order of maps nor on that of the
+contestants. Maps without a difference do not count.
 Sources: Fisher (1935), "The Design of Experiments", 21; Phipson and Smyth (2010),
-"Permutation p-values should never be zero", for the way that was observed, which counts
-too.
-Letters in shapes: M maps, P parts of a difference, R ways.
+"Permutation p-values should never be zero", for counting the observed assignment.
+Letters in shapes: M maps; P parts of a difference; R assignments.
 """
 
 from collections.abc import Callable
@@ -17,85 +15,94 @@ from functools import lru_cache
 import numpy as np
 from scipy.stats import binom, rankdata, wilcoxon
 
-# Up to this many maps all ways are counted.
-_EXACT, _DRAWN = 13, 9_999
-_ROUNDING = 1e-9  # of the largest difference: ways that tie with the observed one count
+# Largest number of maps with an exact test.
+_EXACT = 13
+# Random assignments with more maps.
+_DRAWN = 9_999
+# Relative to the largest difference: assignments that tie with the observed one count.
+_ROUNDING = 1e-9
 
 
 @lru_cache(maxsize=2)
 def _signs(maps: int) -> np.ndarray:
-    """Return ±1, all ways for few maps, else drawn ones; shape [R, M]."""
+    """Return signs ±1 of all assignments, or of random ones for many maps, [R, M]."""
     if maps <= _EXACT:
         bits = np.arange(2**maps)[:, None] >> np.arange(maps) & 1
-        return 1.0 - 2.0 * bits
-    return 1.0 - 2.0 * np.random.default_rng(0).integers(
-        0, 2, (_DRAWN, maps), dtype=np.int8
-    )
+    else:
+        generator = np.random.default_rng(0)
+        bits = generator.integers(0, 2, (_DRAWN, maps), dtype=np.int8)
+    return 1.0 - 2.0 * bits
 
 
 def exchange_p(
-    one: np.ndarray,
-    other: np.ndarray,
+    first: np.ndarray,
+    second: np.ndarray,
     difference: Callable[..., np.ndarray],
     direction: str = "",
 ) -> float:
-    """Return p of no difference in any function of sums over maps: the fraction of ways
-    that are as far out.
+    """Return the p-value of no difference in a function of sums over maps.
+
+    It is the fraction of assignments whose difference is at least the observed one.
 
     Args:
-        one: parts of the first contestant by map, shape [M, P].
-        other: those of the second.
-        difference: of two sums of parts, each of shape [..., P]: shape [...];
-            antisymmetric.
-        direction: in which the first is thought to lie, `higher` or `lower`; two-sided
-            if empty.
+        first: parts of the first contestant by map, shape [M, P].
+        second: parts of the second contestant by map, shape [M, P].
+        difference: antisymmetric function of two sums of parts, each of shape [..., P];
+            returns shape [...].
+        direction: alternative for the first contestant, `higher` or `lower`; if empty,
+            two-sided.
     """
-    gap, total = one - other, (one + other).sum(0)
+    gap = first - second
+    total = (first + second).sum(0)
     gap = gap[gap.any(1)]
-    first = (gap != 0).argmax(1)
-    oriented = gap * np.sign(gap[np.arange(len(gap)), first])[:, None]
-    gaps = _signs(len(gap)) @ oriented[np.lexsort(oriented.T[::-1])[::-1]]
-    ways = difference(_half(total, gaps), _half(total, -gaps))
-    observed = float(difference(one.sum(0), other.sum(0)))
-    tolerance = _ROUNDING * np.abs(ways).max()
+    leading = (gap != 0).argmax(1)
+    oriented = gap * np.sign(gap[np.arange(len(gap)), leading])[:, None]
+    descending = np.lexsort(oriented.T[::-1])[::-1]
+    gaps = _signs(len(gap)) @ oriented[descending]
+    differences = difference(_half(total, gaps), _half(total, -gaps))
+    observed = float(difference(first.sum(0), second.sum(0)))
+    tolerance = _ROUNDING * np.abs(differences).max()
     if not direction:
-        ways, observed = np.abs(ways), abs(observed)
+        differences = np.abs(differences)
+        observed = abs(observed)
     elif direction == "lower":
         observed = -observed
-    beyond = int((ways >= observed - tolerance).sum())
-    return beyond / len(ways) if len(gap) <= _EXACT else (1 + beyond) / (1 + len(ways))
+    beyond = int((differences >= observed - tolerance).sum())
+    if len(gap) <= _EXACT:
+        return beyond / len(differences)
+    return (1 + beyond) / (1 + len(differences))
 
 
 def _half(total: np.ndarray, gap: np.ndarray) -> np.ndarray:
-    """Return half of their sum; what rounding leaves of 0, whose root would be far from
-    0, is 0.
+    """Return (total + gap) / 2, with rounding errors about 0 set to 0.
+
+    A function such as a root would amplify them.
     """
     half = (total + gap) / 2
     return np.where(np.abs(half) < 1e-12 * np.abs(total), 0, half)
 
 
 def mean_flip_p(differences: np.ndarray, direction: str = "") -> float:
-    """Return p of a mean difference of 0.
+    """Return the p-value of a mean difference of 0.
 
     Args:
-        differences: by map, without rounding (see `by_map.alike`), shape [M].
+        differences: by map, with exact ties (see `by_map.alike`), shape [M].
         direction: `higher` or `lower` for a one-sided test; two-sided if empty.
     """
-    one = differences[:, None]
-    return exchange_p(one, 0 * one, lambda a, b: (a - b)[..., 0], direction)
+    column = differences[:, None]
+    return exchange_p(column, 0 * column, lambda a, b: (a - b)[..., 0], direction)
 
 
 def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
-    """Return p of no difference in counts, such as successes, over all ways however
-    many maps there are.
+    """Return the exact p-value of no difference in counts, for any number of maps.
 
-    Of n maps with the same size of gain the number of those kept positive is binomial,
-    so that the sum over all maps is a convolution of as many binomials as there are
-    sizes. With one episode a map it is the exact McNemar test.
+    Among n maps with the same absolute gain, the number with a positive sign is
+    binomial. The distribution of the sum is thus a convolution of one binomial per
+    absolute gain. With one episode per map it is the exact McNemar test.
 
     Args:
-        gain: count of the first less that of the second by map, whole numbers, shape
-            [M].
+        gain: count of the first minus that of the second by map, such as successes,
+            whole numbers, shape [M].
         direction: `higher` or `lower` for a one-sided test; two-sided if empty.
     """
     gain = gain // max(np.gcd.reduce(gain), 1)  # repeated episodes count once
@@ -106,25 +113,30 @@ def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
         spread[:: 2 * size] = binom.pmf(np.arange(count + 1), count, 0.5)
         probabilities = np.convolve(probabilities, spread)
     total = np.abs(gain).sum()
-    sums, observed = np.arange(-total, total + 1), gain.sum()
-    far = {"higher": sums >= observed, "lower": sums <= observed}.get(
-        direction, np.abs(sums) >= abs(observed)
-    )
-    return min(float(probabilities[far].sum()), 1.0)
+    sums = np.arange(-total, total + 1)
+    observed = gain.sum()
+    if direction == "higher":
+        is_extreme = sums >= observed
+    elif direction == "lower":
+        is_extreme = sums <= observed
+    else:
+        is_extreme = np.abs(sums) >= abs(observed)
+    return min(float(probabilities[is_extreme].sum()), 1.0)
 
 
 def signed_rank_p(differences: np.ndarray) -> float:
-    """Return two-sided p of Wilcoxon's signed-rank test; 1 if no map differs.
+    """Return the two-sided p-value of Wilcoxon's signed-rank test; 1 if no map differs.
 
-    If few maps differ the test is exact with ties too: the ranks' signs are flipped in
-    all ways. SciPy's p is the same there, but it calls a function for each way.
+    If at most 13 maps differ, the test is exact even with ties: all sign assignments of
+    the ranks are counted. SciPy returns the same p, but calls a function for each
+    assignment.
 
     Args:
-        differences: by map without rounding, as from `by_map.sums_by_map`, shape [M].
+        differences: by map, with exact ties as from `by_map.sums_by_map`, shape [M].
     """
     differing = differences[differences != 0]
     if len(differing) > _EXACT:
         return float(wilcoxon(differing).pvalue)
-    # Whole numbers, those of ties too.
+    # Ranks of ties are multiples of 1/2.
     twice_ranks = np.rint(2 * rankdata(np.abs(differing))) * np.sign(differing)
     return sign_flip_p(twice_ranks.astype(np.int64))

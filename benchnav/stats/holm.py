@@ -1,4 +1,4 @@
-"""Correction of p-values for their number, and the level of significance."""
+"""Correction of p-values for multiple tests, and the level of significance."""
 
 import numpy as np
 
@@ -6,18 +6,19 @@ ALPHA = 0.05
 
 
 def holm(p: np.ndarray) -> np.ndarray:
-    """Correct p-values for their number.
+    """Correct p-values for multiple tests.
 
-    statsmodels' `multipletests` returns the same, but collects garbage at each call,
-    which takes longer than the tests.
+    statsmodels' `multipletests` returns the same, but runs the garbage collector at
+    each call, which takes longer than the tests.
     Source: Holm (1979), "A simple sequentially rejective multiple test procedure".
 
     Args:
-        p: shape [N].
+        p: p-values, shape [N].
 
     Returns:
-        Shape [N], at most 1.
+        Corrected p-values, at most 1, shape [N].
     """
     order = np.argsort(p)
-    stepped = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)).clip(max=1)
-    return stepped[np.argsort(order)]
+    factors = np.arange(len(p), 0, -1)
+    corrected = np.maximum.accumulate(p[order] * factors).clip(max=1)
+    return corrected[np.argsort(order)]

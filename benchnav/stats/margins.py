@@ -1,6 +1,7 @@
 """Tests of a difference against a margin: non-inferiority, superiority and equivalence.
 
-Each is decided by where the interval of the difference ends (two one-sided tests).
+Each compares the ends of the interval of the difference with the margin (two one-sided
+tests).
 Sources: Schuirmann (1987), "A comparison of the two one-sided tests procedure and the
 power approach for assessing the equivalence of average bioavailability"; Wellek (2010),
 "Testing Statistical Hypotheses of Equivalence and Noninferiority", 1.
@@ -11,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import brentq
 
-# Largest confidence at which p is searched, but for rounding to 0 and 1.
+# Largest confidence in the search for p.
 _MAX = 1 - 1e-12
 
 
@@ -21,12 +22,13 @@ def margin_p(
     direction: str,
     margin: float,
 ) -> float:
-    """Return p of a hypothesis with a margin; 1 if the difference has no interval.
+    """Return the p-value of a hypothesis with a margin; 1 if there is no interval.
 
     Args:
-        interval: by confidence the difference and the ends of its interval.
+        interval: function of the confidence; returns the difference and the ends of its
+            interval.
         kind: `non-inferiority`, `superiority` or `equivalence`.
-        direction: which is better, `higher` or `lower`; empty for equivalence.
+        direction: the better direction, `higher` or `lower`; empty for equivalence.
         margin: above 0, in the unit of the difference.
     """
     sides = {"higher": (-1.0,), "lower": (1.0,)}.get(direction, (-1.0, 1.0))
@@ -37,17 +39,17 @@ def margin_p(
 def _side_p(
     interval: Callable[[float], tuple[float, float, float]], margin: float, side: float
 ) -> float:
-    """Return p that the difference is beyond a margin, below −margin (side −1) or above
-    it (side 1).
+    """Return the p-value of H₀: the difference is beyond the margin on one side.
 
-    It is the level at which the end of the one-sided interval comes to lie on the
-    margin.
+    That is below −margin (side −1) or above margin (side 1). p is the level at which
+    the end of the one-sided interval equals the margin.
     """
 
     def end(signed: float) -> float:
-        """Return the end on the margin's side; of a negative confidence the other end."""
+        """Return the end on the margin's side, or the opposite end if `signed` < 0."""
         _, low, high = interval(abs(signed))
-        return side * (high if (side > 0) == (signed >= 0) else low)
+        is_upper = (side > 0) == (signed >= 0)
+        return side * (high if is_upper else low)
 
     if np.isnan(end(0.5)):
         return 1.0

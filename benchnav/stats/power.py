@@ -1,10 +1,10 @@
-"""What a number of maps can show of a mean difference that is nearly normal, which it
-is from some twenty maps on.
+"""Minimum detectable differences and numbers of maps for a given power.
 
-A difference d with standard deviation σ is significant with probability `POWER` if
-d·√M/σ is the quantile of 1 − α/2
-plus that of `POWER`. Source: Chow, Shao and Wang (2008), "Sample Size Calculations in
-    Clinical Research", 3.1.
+The mean difference is taken as normal, which is accurate from about twenty maps on. A
+difference d with standard deviation σ is significant with probability `POWER` if d·√M/σ
+is the quantile of 1 − α/2 plus that of `POWER`.
+Source: Chow, Shao and Wang (2008), "Sample Size Calculations in Clinical Research",
+3.1.
 """
 
 import math
@@ -15,17 +15,17 @@ POWER = 0.8
 
 
 def smallest_difference(std: float, maps: int, alpha: float) -> float:
-    """Difference that a study of so many maps would show, with a chance of `POWER`.
+    """Return the minimum detectable difference at a power of `POWER`.
 
     Args:
         std: standard deviation over maps of the difference, in its unit.
         maps: number of maps.
-        alpha: p under which a difference counts as shown; after a correction over K
-            pairs, that of the first, 0.05/K.
+        alpha: level of significance; with a correction over K pairs, that of the first,
+            0.05/K.
 
     Returns:
-        In the unit of `std`; infinite where no sign-flip test of so many maps can reach
-        `alpha`, whatever they show.
+        A difference in the unit of `std`; infinite if no sign-flip test of this number
+        of maps can reach `alpha`.
     """
     if 2.0 ** (1 - maps) >= alpha:
         return math.inf
@@ -33,12 +33,12 @@ def smallest_difference(std: float, maps: int, alpha: float) -> float:
 
 
 def maps_needed(std: float, difference: float, alpha: float) -> int:
-    """Smallest number of maps that would show a difference with a chance of `POWER`.
+    """Return the minimum number of maps to detect a difference at a power of `POWER`.
 
     Args:
         std: as in `smallest_difference`.
         difference: above 0, in the unit of `std`.
-        alpha: as there.
+        alpha: as in `smallest_difference`.
     """
     return math.ceil((_quantiles(alpha) * std / difference) ** 2)
 

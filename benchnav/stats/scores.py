@@ -1,15 +1,14 @@
-"""Scores of several contestants on the same maps: intervals, differences of each pair
-with a test, and the best.
+"""Scores of several contestants on the same maps: intervals, paired tests, the best.
 
-A score is any function of sums over maps, so one way serves means, roots, ratios and
-distances alike. The map is the unit, or the group of maps where a dataset has groups:
+A score is any function of sums over maps, so that means, roots, ratios and distances
+are treated in the same way. The statistical unit is the map, or the group of maps where
+a dataset has groups:
 
-- an interval is that of the bootstrap by percentiles, over maps in an order that their
-  sums decide;
-- a test exchanges the two contestants on each map (`flips.exchange_p`);
-- Holm's correction is over all pairs of contestants that compete, within a score.
+- intervals are percentile bootstrap intervals over maps, sorted by their sums;
+- tests exchange the two contestants on each map (`flips.exchange_p`);
+- Holm's correction covers all pairs of competing contestants, for each score.
 
-Letters in shapes: M maps; C columns of a sum, such as classes, else 1.
+Letters in shapes: M maps; C columns of a sum, such as classes, else 1; P parts.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,18 +31,18 @@ _TO_BEST = ("difference", "low", "high", "p_holm")
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """A number that follows from sums over maps.
+    """A function of sums over maps.
 
     Args:
-        name: of its columns.
+        name: name of its columns.
         parts: names of the sums that it is computed from.
-        of: their function, of one argument a part, each of shape [..., C]: values,
-            shape [...].
-        better: whether higher or lower values are better; empty if neither is.
-        target: the value whose distance is compared, lower being better; None if the
-            score itself is.
-        heading: of its column in tables, in two lines.
-        meaning: what the column holds.
+        of: function with one argument per part, each of shape [..., C]; returns values
+            of shape [...].
+        better: better direction; empty if there is none.
+        target: if given, contestants are compared by their distance to this value, and
+            lower is better.
+        heading: heading of its column in tables, in two lines.
+        meaning: definition of the column's values.
     """
 
     name: str
@@ -60,7 +59,7 @@ class Score:
         return " ".join(self.heading.split())
 
     def judged(self, values: Any) -> Any:
-        """Return what is compared: the values, or their distance to the target."""
+        """Return the compared quantity: the values, or their distance to the target."""
         return values if self.target is None else abs(values - self.target)
 
     def value(self, sums: Sums) -> float:
@@ -71,8 +70,9 @@ class Score:
     def split(
         self, sums: Sums
     ) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        """Return the parts by map in one table, shape [M, P], and the score of their
-        sums, [..., P] to [...].
+        """Return the parts as a table of shape [M, P], and the score of its sums.
+
+        The score is a function of sums of shape [..., P]; it returns shape [...].
         """
         columns = [sums[part].reshape(len(sums[part]), -1) for part in self.parts]
         ends = np.cumsum([part.shape[1] for part in columns])[:-1]
@@ -88,25 +88,23 @@ def summarise(scores: Sequence[Score], sums: Mapping[str, Sums]) -> pd.DataFrame
     """Compute the scores of each contestant.
 
     Args:
-        scores: which.
+        scores: scores to compute.
         sums: by contestant and part, over M maps, shape [M] or [M, C].
 
     Returns:
-        A row a contestant: `units`, M; and of each score that its sums have `NAME` and
-        its 95 % interval `NAME_low`, `NAME_high`, NaN under `bootstrap.LEAST_MAPS`
-        maps.
+        One row per contestant: `units`, M; and for each score that its sums define,
+        `NAME` with its 95 % interval `NAME_low`, `NAME_high`, which is NaN with fewer
+        than `bootstrap.LEAST_MAPS` maps.
     """
     rows = {}
-    for contestant, own in sums.items():
-        row: dict[str, float] = {"units": len(next(iter(own.values())))}
-        for score in _known(scores, own):
-            table, of = score.split(own)
+    for contestant, contestant_sums in sums.items():
+        row: dict[str, float] = {"units": len(next(iter(contestant_sums.values())))}
+        for score in _defined(scores, contestant_sums):
+            table, of = score.split(contestant_sums)
             low, high = _bootstrap(table[np.lexsort(table.T)], of)
-            row |= {
-                score.name: float(of(table.sum(0))),
-                f"{score.name}_low": low,
-                f"{score.name}_high": high,
-            }
+            row[score.name] = float(of(table.sum(0)))
+            row[f"{score.name}_low"] = low
+            row[f"{score.name}_high"] = high
         rows[contestant] = row
     return pd.DataFrame.from_dict(rows, orient="index")
 
@@ -120,61 +118,59 @@ def compare_pairs(
     """Compare all pairs of contestants, map by map.
 
     Args:
-        scores: what is compared.
-        sums: as in `summarise`, of the same M maps each.
-        competing: the contestants whose pairs Holm's correction is over.
-        same: name of a sum, such as a number of cells, in which the maps of two must
-            agree.
+        scores: scores to compare.
+        sums: as in `summarise`, over the same M maps for each contestant.
+        competing: contestants whose pairs Holm's correction covers.
+        same: name of a sum in which the maps of a pair must agree, such as the number
+            of cells.
 
     Returns:
-        A row a pair and score: `measure`, its name; `one`, `other`; `difference` of
-        what is judged, `one` less `other`, with its 95 % interval `low`, `high`; `p`;
-        and, of competing contestants only, `p_holm`. Pairs that lack the score or
-        differ in `same` are left out.
+        One row per pair and score: `measure`, the score's name; `one`, `other`;
+        `difference` of the compared quantity, `one` minus `other`, with its 95 %
+        interval `low`, `high`; `p`; and `p_holm`, for competing contestants only. Pairs
+        that lack the score or differ in `same` are omitted.
     """
-    found = []
-    for one, other in combinations(sums, 2):
-        if not np.array_equal(sums[one][same], sums[other][same]):
+    records = []
+    for first, second in combinations(sums, 2):
+        first_sums = sums[first]
+        second_sums = sums[second]
+        if not np.array_equal(first_sums[same], second_sums[same]):
             continue
-        for score in _known(scores, sums[one], sums[other]):
-            if row := _compare(score, sums[one], sums[other]):
-                found.append({"measure": score.name, "one": one, "other": other, **row})
-    table = pd.DataFrame(found, columns=_PAIR).astype(dict.fromkeys(_PAIR[3:], float))
+        for score in _defined(scores, first_sums, second_sums):
+            if row := _compare(score, first_sums, second_sums):
+                labels = {"measure": score.name, "one": first, "other": second}
+                records.append({**labels, **row})
+    table = pd.DataFrame(records, columns=_PAIR)
+    table = table.astype(dict.fromkeys(_PAIR[3:], float))
     rivals = table[table["one"].isin(competing) & table["other"].isin(competing)]
     for _, rows in rivals.groupby("measure"):
         table.loc[rows.index, "p_holm"] = holm(rows["p"].to_numpy())
     return table
 
 
-def _compare(score: Score, one: Sums, other: Sums) -> dict[str, float]:
-    table, of = score.split(one)
-    other_table, _ = score.split(other)
+def _compare(score: Score, first: Sums, second: Sums) -> dict[str, float]:
+    first_table, of = score.split(first)
+    second_table, _ = score.split(second)
 
     def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return score.judged(of(a)) - score.judged(of(b))
 
-    observed = float(difference(table.sum(0), other_table.sum(0)))
+    observed = float(difference(first_table.sum(0), second_table.sum(0)))
     if not np.isfinite(observed):
         return {}
-    both = np.hstack([table, other_table])
-    order = _order_of_pairs(table, other_table)
+    paired = np.hstack([first_table, second_table])
+    order = _order_of_pairs(first_table, second_table)
     low, high = _bootstrap(
-        both[order], lambda sums: difference(*np.split(sums, 2, axis=-1))
+        paired[order], lambda sums: difference(*np.split(sums, 2, axis=-1))
     )
-    return {
-        "difference": observed,
-        "low": low,
-        "high": high,
-        "p": exchange_p(table, other_table, difference),
-    }
+    p = exchange_p(first_table, second_table, difference)
+    return {"difference": observed, "low": low, "high": high, "p": p}
 
 
-def _known(scores: Sequence[Score], *sums: Sums) -> list[Score]:
-    return [
-        score
-        for score in scores
-        if all(part in own for part in score.parts for own in sums)
-    ]
+def _defined(scores: Sequence[Score], *sums: Sums) -> list[Score]:
+    """Return the scores whose parts are in the sums of all contestants."""
+    names = set.intersection(*(set(parts) for parts in sums))
+    return [score for score in scores if names.issuperset(score.parts)]
 
 
 def _bootstrap(
@@ -183,17 +179,20 @@ def _bootstrap(
     """Return the ends of the interval of a function of sums over maps."""
     if len(table) < LEAST_MAPS:
         return np.nan, np.nan
-    return percentile_interval(of(bootstrap_counts(len(table)) @ table))
+    sums = bootstrap_counts(len(table)) @ table
+    return percentile_interval(of(sums))
 
 
-def _order_of_pairs(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return an order of maps that stays the same when the two change places."""
-    keys = [np.hstack([one + other, gap]) for gap in (one - other, other - one)]
-    orders = [np.lexsort(key.T) for key in keys]
-    first, second = (
-        key[order].ravel().tolist() for key, order in zip(keys, orders, strict=True)
-    )
-    return orders[first > second]
+def _order_of_pairs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return an order of maps that does not depend on the order of the two."""
+    total = first + second
+    key = np.hstack([total, first - second])
+    swapped_key = np.hstack([total, second - first])
+    order = np.lexsort(key.T)
+    swapped_order = np.lexsort(swapped_key.T)
+    values = key[order].ravel().tolist()
+    swapped_values = swapped_key[swapped_order].ravel().tolist()
+    return swapped_order if values > swapped_values else order
 
 
 def against_best(
@@ -202,15 +201,15 @@ def against_best(
     """Find the best contestant by each score, and which are significantly worse.
 
     Args:
-        scores: which; those that have no better way have no best.
-        summary: rows from `summarise` of the contestants that compete.
-        pairs: from `compare_pairs`.
+        scores: scores to use; one without a better direction has no best.
+        summary: rows from `summarise` of the competing contestants.
+        pairs: rows from `compare_pairs`.
 
     Returns:
-        Rows by contestant, one for each score that it has: `measure`, `best`; of all
-        but the best `difference`, the contestant less the best, `low`, `high`, `p_holm`
-        as from `compare_pairs`; `alike`, true if it is not significantly worse; and
-        `marked`, true if it is alike and another contestant is not.
+        One row per contestant and score: `measure`; `best`; except for the best,
+        `difference` to the best, `low`, `high` and `p_holm` as in `compare_pairs`;
+        `alike`, true if it is not significantly worse; and `marked`, true if it is
+        alike and another contestant is not.
     """
     swapped = pairs.assign(
         one=pairs["other"],
@@ -219,8 +218,8 @@ def against_best(
         low=-pairs["high"],
         high=-pairs["low"],
     )
-    both = pd.concat([pairs, swapped])
-    found = []
+    ordered = pd.concat([pairs, swapped])
+    tables = []
     for score in scores:
         if score.name not in summary or not (score.better or score.target is not None):
             continue
@@ -228,13 +227,12 @@ def against_best(
         if values.empty:
             continue
         loss = -values if score.better == "higher" else values
-        best = loss.sort_index().idxmin()  # of equal ones the first by name
-        rows = both[(both["measure"] == score.name) & (both["other"] == best)]
-        rows = rows.set_index("one")[list(_TO_BEST)].reindex(loss.index)
+        best = loss.sort_index().idxmin()  # if several are equal, the first by name
+        is_to_best = (ordered["measure"] == score.name) & (ordered["other"] == best)
+        rows = ordered[is_to_best].set_index("one")
+        rows = rows[list(_TO_BEST)].reindex(loss.index)
         alike = ~(rows["p_holm"] < ALPHA)
-        found.append(
-            rows.assign(
-                measure=score.name, best=best, alike=alike, marked=alike & ~alike.all()
-            )
-        )
-    return pd.concat(found)
+        marked = alike & ~alike.all()
+        table = rows.assign(measure=score.name, best=best, alike=alike, marked=marked)
+        tables.append(table)
+    return pd.concat(tables)

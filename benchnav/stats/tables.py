@@ -1,6 +1,4 @@
-"""Tables of comparisons: columns that write their own cells, and how numbers are
-written.
-"""
+"""Tables of comparisons: columns, and formats of numbers."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,10 +16,12 @@ class Column:
     """A column of a table.
 
     Args:
-        heading: over it; a line break within it is kept in a terminal only.
-        cell: the text of a row.
-        meaning: what the column holds, under the table; not explained if empty.
-        title: before the meaning, if that is of several columns; the heading if empty.
+        heading: heading; a line break in it is shown only in a terminal.
+        cell: function from a row to its text.
+        meaning: definition of the column, printed below the table; if empty, there is
+            none.
+        title: text before the meaning, if that covers several columns; if empty, the
+            heading.
     """
 
     heading: str
@@ -31,58 +31,62 @@ class Column:
 
 
 def table_of(rows: Iterable[Row], columns: Sequence[Column], **options: Any) -> Table:
-    """Write rows as a table.
+    """Return a table of rows.
 
     Args:
         rows: values by name.
-        columns: those of labels first.
+        columns: columns, those of labels first.
         options: other fields of `Table`.
     """
+    texts = [tuple(column.cell(row) for column in columns) for row in rows]
+    explained = []
+    for column in columns:
+        if column.meaning:
+            title = column.title or " ".join(column.heading.split())
+            explained.append((title, column.meaning))
     return Table(
         headings=tuple(column.heading for column in columns),
-        rows=tuple(tuple(column.cell(row) for column in columns) for row in rows),
-        explained=tuple(
-            (column.title or " ".join(column.heading.split()), column.meaning)
-            for column in columns
-            if column.meaning
-        ),
+        rows=tuple(texts),
+        explained=tuple(explained),
         **options,
     )
 
 
 def labels_of(*names: str) -> list[Column]:
-    """Return columns that show values as they are, under their names."""
+    """Return columns that show values unchanged, with their names as headings."""
     return [Column(name, cell_of(name)) for name in names]
 
 
 def cell_of(name: str, write: Callable[[Any], str] = str) -> Callable[[Row], str]:
-    """Return what writes one value of a row.
+    """Return a function that formats one value of a row.
 
     Args:
-        name: of the value.
-        write: writes it.
+        name: name of the value.
+        write: function from the value to its text.
     """
     return lambda row: write(row[name])
 
 
 def p_value(p: float) -> str:
-    """Write a p-value; of drawn sign flips the minimum is 0.0001."""
+    """Format a p-value; the minimum of random sign flips is 0.0001."""
     return "≤ 0.0001" if p <= 1e-4 else f"{p:.2g}"
 
 
 def short(value: float) -> str:
-    """Write a number with one decimal place, unless that is 0."""
+    """Format a number with one decimal place, unless that is 0."""
     return f"{value:.1f}".removesuffix(".0")
 
 
 def signed(value: float, digits: int = 1) -> str:
-    """Write a difference with its sign; a dash for NaN."""
-    # No minus before a zero.
-    return NOTHING if np.isnan(value) else f"{round(value, digits) + 0.0:+.{digits}f}"
+    """Format a difference with its sign; a dash for NaN."""
+    if np.isnan(value):
+        return NOTHING
+    rounded = round(value, digits) + 0.0  # turns −0 into 0
+    return f"{rounded:+.{digits}f}"
 
 
 def signed_interval(low: float, high: float, digits: int = 1) -> str:
-    """Write the ends of an interval of a difference; a dash for NaN."""
-    return (
-        NOTHING if np.isnan(low) else f"{signed(low, digits)} to {signed(high, digits)}"
-    )
+    """Format the ends of an interval of a difference; a dash for NaN."""
+    if np.isnan(low):
+        return NOTHING
+    return f"{signed(low, digits)} to {signed(high, digits)}"

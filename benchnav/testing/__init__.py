@@ -1,6 +1,4 @@
-"""Checks for the tests of whoever writes a planner, model, robot, objective, risk
-measure, sensor, belief or metric.
-"""
+"""Checks of custom parts: that a planner, model, … fulfils its contract."""
 
 from benchnav.core.public_names import face
 

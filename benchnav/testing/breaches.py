@@ -1,6 +1,4 @@
-"""What all checks share: watching calls, comparing answers, and telling every breach of
-a contract at once.
-"""
+"""Common tools of all checks: observed calls, comparisons, and a list of breaches."""
 
 import pickle
 import random
@@ -19,58 +17,62 @@ from benchnav.core.batch import find_tensor_fault
 from benchnav.core.errors import BenchnavError, ConfigError
 
 SEED = 20240229
-NOTHING = object()  # what a call that raised has answered
+NOTHING = object()  # stands for the answer of a call that raised
 
 
 class Breaches:
-    """Collects what breaks a contract: each breach once, with the places where it was
-    found.
+    """A collection of breaches of a contract: each once, with its locations.
 
     Args:
-        kind: of the part, as in `check_<kind>`.
-        name: of the part, for people.
+        kind: kind of the part, as in `check_<kind>`.
+        name: name of the part in messages.
+
+    Attributes:
+        location: where the next breaches are noted, such as a size of maps.
     """
 
     def __init__(self, kind: str, name: str) -> None:
-        """Begins without a breach, and at no place."""
-        self._kind, self._name, self.place = kind, name, ""
-        self._found: dict[str, list[str]] = {}
-        self._places: dict[str, None] = {}
+        """Create an empty collection."""
+        self._kind = kind
+        self._name = name
+        self.location = ""
+        self._breaches: dict[str, list[str]] = {}
+        self._locations: dict[str, None] = {}
 
-    def expect(self, kept: bool, breach: str) -> bool:
-        """Notes a breach at `place`, unless that part of the contract was kept; gives
-        whether it was.
-        """
-        self._places[self.place] = None
-        if not kept:
-            places = self._found.setdefault(breach, [])
-            if self.place and self.place not in places:
-                places.append(self.place)
-        return kept
+    def expect(self, is_fulfilled: bool, breach: str) -> bool:
+        """Note a breach unless the expectation is fulfilled; return whether it is."""
+        self._locations[self.location] = None
+        if not is_fulfilled:
+            locations = self._breaches.setdefault(breach, [])
+            if self.location and self.location not in locations:
+                locations.append(self.location)
+        return is_fulfilled
 
     def is_tensor(
         self, what: str, like: Tensor, shape: tuple[int, ...]
     ) -> Callable[[Any], bool]:
-        """Gives what expects finite numbers of a shape, in the dtype and on the device
-        of another tensor.
+        """Return a function that expects finite numbers of a shape.
+
+        Args:
+            what: the values in messages.
+            like: tensor of the expected dtype and device.
+            shape: expected shape.
         """
 
         def fits(values: Any) -> bool:
             fault = find_tensor_fault(what, values, like.dtype, shape, like.device)
-            is_finite = f"Expected finite {what}, got others."
-            return self.expect(not fault, fault) and self.expect(
-                bool(values.isfinite().all()), is_finite
-            )
+            if not self.expect(not fault, fault):
+                return False
+            is_finite = bool(values.isfinite().all())
+            return self.expect(is_finite, f"Expected finite {what}, got others.")
 
         return fits
 
     def batches(self, device: torch.device | str) -> Iterator["Draws"]:
-        """Goes through the dtypes and leading dimensions to be tried, each of which is
-        a place.
-        """
+        """Yield each dtype and leading shape to check, after setting `location`."""
         for dtype in (torch.float32, torch.float64):
             for leading in ((6,), (6, 5), (6, 5, 2)):
-                self.place = f"*B = {list(leading)}, {dtype}"
+                self.location = f"*B = {list(leading)}, {dtype}"
                 like = torch.zeros(1, dtype=dtype, device=device)
                 yield Draws(leading, like, torch.Generator().manual_seed(SEED))
 
@@ -78,69 +80,60 @@ class Breaches:
         self,
         what: str,
         act: Callable[..., Any],
-        given: Mapping[str, Any],
-        is_of_use: Callable[[Any], bool],
+        arguments: Mapping[str, Any],
+        is_usable: Callable[[Any], bool],
         tolerance: float = 1e-5,
     ) -> Any:
-        """Tries a pure function of a batch: twice, and for the last of the batch alone.
+        """Call a pure function of a batch twice, and for its last element only.
 
         Args:
-            what: its name, for people.
+            what: name of the function in messages.
             act: the function.
-            given: its arguments by name: tensors, the batch first, or values that
-                `select` takes members from.
-            is_of_use: whether there is a point in trying on, given the answer.
-            tolerance: by how much answers alone and in a batch may differ.
+            arguments: its arguments by name: tensors whose first dimension is the
+                batch, or values with a method `select`.
+            is_usable: function that returns whether an answer can be checked further.
+            tolerance: tolerance between answers for a single element and a batch.
 
         Returns:
-            The answer; `NOTHING` where it is of no use.
+            The answer; `NOTHING` if it is not usable.
         """
-        answer = self.watch(what, lambda: act(**given), **given)
-        if answer is NOTHING or not is_of_use(answer):
+        answer = self.watch(what, lambda: act(**arguments), **arguments)
+        if answer is NOTHING or not is_usable(answer):
             return NOTHING
         self.expect(
-            same(act(**given), answer),
+            same(act(**arguments), answer),
             f"Expected the same from `{what}` when asked again, got another.",
         )
-        alone = self.watch(
-            what, lambda: act(**{name: _last(value) for name, value in given.items()})
-        )
+        last_only = {name: _last(value) for name, value in arguments.items()}
+        single = self.watch(what, lambda: act(**last_only))
         self.expect(
-            same(alone, _last(answer), tolerance),
+            same(single, _last(answer), tolerance),
             f"Expected the same from `{what}` for one alone and in a batch, got "
             "another.",
         )
         return answer
 
-    def watch(self, what: str, act: Callable[[], Any], **given: Any) -> Any:
-        """Calls, and notes what the call did that it should not.
+    def watch(self, what: str, act: Callable[[], Any], **arguments: Any) -> Any:
+        """Call a function, and note an exception or a side effect.
 
         Args:
-            what: its name, for people.
+            what: name of the function in messages.
             act: the call.
-            given: its arguments by name; tensors, arrays, generators and numbers in
-                them are compared before and after, however deep they lie.
+            arguments: its arguments by name; all tensors, arrays, generators and
+                numbers nested in them are compared before and after the call.
 
         Returns:
-            The answer; `NOTHING` where it raised.
+            The answer; `NOTHING` if the call raised.
         """
-        before, states, answer = dict(_leaves(given)), _generators(), NOTHING
+        before = dict(_leaves(arguments))
+        states = _generators()
+        answer = NOTHING
         try:
             answer = act()
         except Exception as error:
-            text = " ".join(str(error).split())
-            named = (
-                text
-                if isinstance(error, BenchnavError)
-                else f"{type(error).__name__}: {text}"
-            )
-            frames = traceback.extract_tb(error.__traceback__)
-            frame = [own for own in frames if "site-packages" not in own.filename][
-                -1:
-            ] or frames[-1:]
-            where = f"({Path(frame[0].filename).name}, line {frame[0].lineno})"
-            self.expect(False, f"Expected an answer from `{what}`, got {named} {where}")
-        after = dict(_leaves(given))
+            got = f"{_text_of(error)} {_origin_of(error)}"
+            self.expect(False, f"Expected an answer from `{what}`, got {got}")
+        after = dict(_leaves(arguments))
         changed = [
             name for name, leaf in before.items() if not same(leaf, after.get(name))
         ]
@@ -153,25 +146,28 @@ class Breaches:
         for whose, state in _generators().items():
             self.expect(
                 states.get(whose, state) == state,
-                f"Expected {whose} global generator to be left alone, got it changed. "
-                "Draw from one of your "
-                "own, or from the one that is given.",
+                f"Expected {whose} global generator to be unchanged, got it changed. "
+                "Draw from a generator of your own, or from the one that is passed.",
             )
         return answer
 
-    def refuse(self) -> None:
-        """Raises one error that names every breach; does nothing where there is none.
+    def raise_any(self) -> None:
+        """Raise one error that lists all breaches, if there are any.
 
         Raises:
-            ConfigError: there are breaches.
+            ConfigError: If there are breaches.
         """
-        if not self._found:
+        if not self._breaches:
             return
-        tried = sum(bool(place) for place in self._places)
+        n_locations = sum(bool(location) for location in self._locations)
         listed = ""
-        for number, (breach, at) in enumerate(self._found.items(), start=1):
-            where = "wherever it was tried" if 1 < len(at) == tried else ", ".join(at)
-            listed += f"\n({number}) {breach}{f' [{where}]' if where else ''}"
+        for number, (breach, locations) in enumerate(self._breaches.items(), start=1):
+            where = ", ".join(locations)
+            if 1 < len(locations) == n_locations:
+                where = "wherever it was tried"
+            listed += f"\n({number}) {breach}"
+            if where:
+                listed += f" [{where}]"
         raise ConfigError(
             f"Expected a {self._kind} that keeps the contract of "
             f"`benchnav.testing.check_{self._kind}`, got "
@@ -181,11 +177,11 @@ class Breaches:
 
 @dataclass(frozen=True)
 class Draws:
-    """Draws arguments of functions of a batch.
+    """A source of random arguments for functions of a batch.
 
     Args:
-        leading: their leading dimensions *B.
-        like: gives their dtype and device.
+        leading: leading dimensions *B.
+        like: tensor of the dtype and device.
         generator: source of randomness.
     """
 
@@ -194,31 +190,29 @@ class Draws:
     generator: torch.Generator
 
     def uniform(self, low: Sequence[float], high: Sequence[float]) -> Tensor:
-        """Uniform numbers between bounds of length N, shape [*B, N]."""
-        least, most = self.like.new_tensor(low), self.like.new_tensor(high)
-        share = torch.rand(*self.leading, len(least), generator=self.generator).to(
-            self.like
-        )
-        return least + (most - least) * share
+        """Draw uniform numbers between bounds of length N, shape [*B, N]."""
+        lower = self.like.new_tensor(low)
+        upper = self.like.new_tensor(high)
+        uniform = torch.rand(*self.leading, len(lower), generator=self.generator)
+        return lower + (upper - lower) * uniform.to(self.like)
 
 
 def same(first: Any, second: Any, tolerance: float = 0.0) -> bool:
-    """Tells whether two values are the same, tensors by what they hold: NaN equals NaN.
+    """Return whether two values are equal; NaN equals NaN.
 
     Args:
-        first: anything; dataclasses field by field.
-        second: anything.
-        tolerance: by how much tensors, then of any dtype, may differ.
+        first: any value; dataclasses and tuples are compared field by field.
+        second: any value.
+        tolerance: tolerance between tensors; if above 0, their dtypes may differ.
     """
     if is_dataclass(first) and type(first) is type(second):
         return all(
-            same(getattr(first, f.name), getattr(second, f.name), tolerance)
-            for f in fields(first)
+            same(getattr(first, field.name), getattr(second, field.name), tolerance)
+            for field in fields(first)
         )
     if isinstance(first, tuple) and isinstance(second, tuple):
-        return len(first) == len(second) and all(
-            map(partial(same, tolerance=tolerance), first, second)
-        )
+        is_same = partial(same, tolerance=tolerance)
+        return len(first) == len(second) and all(map(is_same, first, second))
     if not isinstance(first, Tensor) or not isinstance(second, Tensor):
         return type(first) is type(second) and bool(first == second)
     if first.shape != second.shape or not (tolerance or first.dtype == second.dtype):
@@ -228,6 +222,21 @@ def same(first: Any, second: Any, tolerance: float = 0.0) -> bool:
     )
 
 
+def _text_of(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    if isinstance(error, BenchnavError):
+        return text
+    return f"{type(error).__name__}: {text}"
+
+
+def _origin_of(error: Exception) -> str:
+    """Return file and line of the innermost frame outside installed packages."""
+    frames = traceback.extract_tb(error.__traceback__)
+    local = [frame for frame in frames if "site-packages" not in frame.filename]
+    frame = (local or frames)[-1]
+    return f"({Path(frame.filename).name}, line {frame.lineno})"
+
+
 def _last(value: Any) -> Any:
     return value[-1:] if isinstance(value, Tensor) else value.select(torch.tensor([-1]))
 
@@ -235,9 +244,7 @@ def _last(value: Any) -> Any:
 def _leaves(
     value: Any, name: str = "", seen: set[int] | None = None
 ) -> Iterator[tuple[str, Any]]:
-    """Lists copies of all tensors, arrays, generators and numbers within a value, by
-    where they are.
-    """
+    """Yield path and copy of each tensor, array, generator and number in a value."""
     seen = set() if seen is None else seen
     if isinstance(value, bool | int | float | str | None):
         yield name, repr(value)
@@ -262,7 +269,7 @@ def _leaves(
 
 
 def _generators() -> dict[str, bytes]:
-    """States of the global generators, in a form that `==` compares."""
+    """Return the states of the global generators as bytes, for comparison by `==`."""
     states = {
         "Python's": pickle.dumps(random.getstate()),
         "NumPy's": pickle.dumps(np.random.get_state()),  # noqa: NPY002

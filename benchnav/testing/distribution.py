@@ -1,4 +1,4 @@
-"""The contract of distributions of traversability, tried on what a model predicts.
+"""The check of distributions of traversability, on predictions of a model.
 
 Letters in shapes: B maps, H×W cells.
 """
@@ -13,110 +13,81 @@ from torch import Tensor
 from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.testing.breaches import NOTHING, Breaches
 
-_VALUES = (
-    0.0,
-    0.01,
-    0.05,
-    0.1,
-    0.2,
-    0.3,
-    0.4,
-    0.5,
-    0.6,
-    0.7,
-    0.8,
-    0.9,
-    0.95,
-    0.99,
-    1.0,
-)
+_TENTHS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+_VALUES = (0.0, 0.01, 0.05, *_TENTHS, 0.95, 0.99, 1.0)
 _PROBABILITIES = (0.0, 0.01, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.99, 1.0)
-_LEVEL, _FLOOR = 0.9, 0.05  # of the CVaR and the expected time that are compared
-# times the tolerance, within which the exact forms and those of the base are to be
+_LEVEL, _FLOOR = 0.9, 0.05  # of the compared CVaR and expected time
+# Factor of the tolerance between closed forms and the base's quadrature.
 _QUADRATURE = 10
 
 
 def check_functions(
     distribution: TraversabilityDistribution, tolerance: float, breaches: Breaches
 ) -> None:
-    """Tells where a distribution's functions are not those of a distribution on [0, 1],
-    or not of each other.
+    """Note where a distribution's functions are invalid on [0, 1] or inconsistent.
 
     Args:
-        distribution: of shape [B, H, W].
-        tolerance: by how much λ and probabilities may be off.
-        breaches: where what is wrong is noted.
+        distribution: distribution of shape [B, H, W].
+        tolerance: tolerance of λ and of probabilities.
+        breaches: collection of breaches.
     """
-    expect, own = (
-        breaches.expect,
-        distribution.select(torch.tensor([0], device=distribution.device)),
-    )
-    like = torch.zeros(1, dtype=own.dtype, device=own.device)
+    expect = breaches.expect
+    first_map = torch.tensor([0], device=distribution.device)
+    distribution = distribution.select(first_map)
+    like = torch.zeros(1, dtype=distribution.dtype, device=distribution.device)
 
-    def ask(name: str, *arguments: Any) -> Any:
-        """What a method gives, or `NOTHING` where that is of no use."""
-        answer = breaches.watch(name, lambda: getattr(own, name)(*arguments))
-        is_map = breaches.is_tensor(
-            f"what `{name}` of the distribution gives", like, own.shape
-        )
+    def call(name: str, *arguments: Any) -> Any:
+        """Return a method's answer, or `NOTHING` if it is not usable."""
+        method = getattr(distribution, name)
+        answer = breaches.watch(name, lambda: method(*arguments))
+        what = f"what `{name}` of the distribution gives"
+        is_map = breaches.is_tensor(what, like, distribution.shape)
         return answer if answer is not NOTHING and is_map(answer) else NOTHING
 
-    shares = [ask("cdf", value) for value in (-tolerance, *_VALUES)]
-    values = [ask("quantile", probability) for probability in _PROBABILITIES]
-    if any(answer is NOTHING for answer in (*shares, *values)):
+    probabilities = [call("cdf", value) for value in (-tolerance, *_VALUES)]
+    values = [call("quantile", probability) for probability in _PROBABILITIES]
+    if any(answer is NOTHING for answer in (*probabilities, *values)):
         return
+    starts_at_0 = bool((probabilities[0] == 0).all())
+    ends_at_1 = bool((probabilities[-1] == 1).all())
     expect(
-        _ascend(shares, tolerance)
-        and bool((shares[0] == 0).all())
-        and bool((shares[-1] == 1).all()),
-        "Expected `cdf` to ascend from 0 under λ = 0 to 1 at λ = 1, got another.",
+        _ascend(probabilities, tolerance) and starts_at_0 and ends_at_1,
+        "Expected `cdf` to ascend from 0 below λ = 0 to 1 at λ = 1, got another.",
     )
+    is_within = bool((values[0] >= 0).all()) and bool((values[-1] <= 1).all())
     expect(
-        _ascend(values, 0)
-        and bool((values[0] >= 0).all())
-        and bool((values[-1] <= 1).all()),
+        _ascend(values, 0) and is_within,
         "Expected `quantile` to ascend within [0, 1], got another.",
     )
     for value, probability in zip(values, _PROBABILITIES, strict=True):
-        under, over = (
-            own.cdf(value - tolerance).double(),
-            own.cdf(value + tolerance).double(),
-        )
+        below = distribution.cdf(value - tolerance).double()
+        above = distribution.cdf(value + tolerance).double()
+        is_inverse = below <= probability + tolerance
+        is_inverse &= above >= probability - tolerance
         expect(
-            bool(
-                (
-                    (under <= probability + tolerance)
-                    & (over >= probability - tolerance)
-                ).all()
-            ),
+            bool(is_inverse.all()),
             "Expected `quantile` to be the inverse of `cdf`, got another.",
         )
-    if type(own).cdf_limits is not TraversabilityDistribution.cdf_limits:
-        for value, share in zip(_VALUES, shares[1:], strict=True):
-            lower, upper = own.cdf_limits(value)
-            least = own.cdf(value - tolerance) - tolerance
+    if type(distribution).cdf_limits is not TraversabilityDistribution.cdf_limits:
+        for value, probability in zip(_VALUES, probabilities[1:], strict=True):
+            lower, upper = distribution.cdf_limits(value)
+            minimum = distribution.cdf(value - tolerance) - tolerance
+            is_limit = (minimum <= lower) & (lower <= upper)
+            is_limit &= (upper - probability).abs() <= tolerance
             expect(
-                bool(
-                    (
-                        (least <= lower)
-                        & (lower <= upper)
-                        & ((upper - share).abs() <= tolerance)
-                    ).all()
-                ),
+                bool(is_limit.all()),
                 "Expected `cdf_limits` to be P(λ < value) and `cdf`, got others.",
             )
-    _check_integrals(own, ask, _QUADRATURE * tolerance, breaches)
+    _check_integrals(distribution, call, _QUADRATURE * tolerance, breaches)
 
 
 def _check_integrals(
-    own: TraversabilityDistribution,
-    ask: Callable[..., Any],
+    distribution: TraversabilityDistribution,
+    call: Callable[..., Any],
     tolerance: float,
     breaches: Breaches,
 ) -> None:
-    """Tells where what a class gives in place of the base's integrals is something
-    else.
-    """
+    """Note where an overridden integral differs from the base's quadrature."""
     base = TraversabilityDistribution
     for name, arguments in (
         ("mean", ()),
@@ -124,19 +95,19 @@ def _check_integrals(
         ("expected_time", (_FLOOR,)),
         ("time_cvar", (_LEVEL, _FLOOR)),
     ):
-        found = ask(name, *arguments)
-        if found is NOTHING or getattr(type(own), name) is getattr(base, name):
+        integral = call(name, *arguments)
+        is_inherited = getattr(type(distribution), name) is getattr(base, name)
+        if integral is NOTHING or is_inherited:
             continue
-        wanted = getattr(base, name)(own, *arguments)
-        off = ((found - wanted).abs() / wanted.clamp(min=1)).max()
+        expected = getattr(base, name)(distribution, *arguments)
+        error = ((integral - expected).abs() / expected.clamp(min=1)).max()
         breaches.expect(
-            bool(off <= tolerance),
-            f"Expected `{name}` to be what `cdf` and `quantile` make of it, got "
-            "another.",
+            bool(error <= tolerance),
+            f"Expected `{name}` to follow from `cdf` and `quantile`, got another.",
         )
 
 
-def _ascend(maps: list[Tensor], slack: float) -> bool:
+def _ascend(maps: list[Tensor], tolerance: float) -> bool:
     return all(
-        bool((second >= first - slack).all()) for first, second in pairwise(maps)
+        bool((second >= first - tolerance).all()) for first, second in pairwise(maps)
     )

@@ -1,4 +1,4 @@
-"""The contract of metrics, tried on episodes that a robot drives without a planner."""
+"""The check of metrics, on sample episodes of a robot without a planner."""
 
 from functools import partial
 from typing import Any
@@ -10,32 +10,34 @@ from benchnav.testing.breaches import NOTHING, Breaches
 
 
 def check_metric(metric: Any, robot: Any = "unicycle") -> None:
-    """Tries whether a metric keeps the contract.
+    """Check that a metric fulfils its contract.
 
-    The contract: attributes as `benchnav.metrics.Metric` lists them; for a success, a
-    failure that stood and a failure of one step a finite number or NaN, which is the
-    same when computed again; arguments and global generators left as they were.
+    The contract:
+
+    - its attributes are those of `benchnav.metrics.Metric`;
+    - `compute` returns a finite number or NaN for a success, a failure without motion
+      and a failure of one step, and the same number again;
+    - arguments and global generators are unchanged.
 
     Args:
-        metric: any metric, or the name, file or mapping of one as suites have it.
-        robot: that drives the episodes, likewise.
+        metric: a metric, or its name, file or mapping as in suites.
+        robot: robot of the episodes, or its name, file or mapping.
 
     Raises:
-        ConfigError: If the metric breaks the contract; every breach is named.
+        ConfigError: If the metric breaks the contract; the message lists all breaches.
     """
-    made: Metric = registry.take("metric", metric)
-    breaches = Breaches("metric", type(made).__name__)
-    for fault in attribute_faults(made):
+    new_metric: Metric = registry.take("metric", metric)
+    breaches = Breaches("metric", type(new_metric).__name__)
+    for fault in attribute_faults(new_metric):
         breaches.expect(False, fault)
-    breaches.refuse()
+    breaches.raise_any()
     for episode in sample_episodes(registry.take("robot", robot)):
-        breaches.place = f"{episode}"
-        value, again = (
-            breaches.watch("compute", partial(measure, made, episode), metric=made)
-            for _ in range(2)
-        )
+        breaches.location = f"{episode}"
+        compute = partial(measure, new_metric, episode)
+        value = breaches.watch("compute", compute, metric=new_metric)
+        again = breaches.watch("compute", compute, metric=new_metric)
         breaches.expect(
             NOTHING in (value, again) or repr(value) == repr(again),
             "Expected the same value when computed again, got another.",
         )
-    breaches.refuse()
+    breaches.raise_any()

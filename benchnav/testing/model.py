@@ -1,4 +1,4 @@
-"""The contract of traversability models, tried on small maps made on the spot.
+"""The check of traversability models on small generated maps.
 
 Letters in shapes: M members, B maps, H×W cells, C classes, K components.
 """
@@ -29,7 +29,7 @@ from benchnav.testing.distribution import check_functions
 from benchnav.testing.trainable import try_training, untrained, with_inputs
 
 _MAPS = 3
-_CLASSES = tuple(map(str, range(10)))  # more than any map of the contract shows
+_CLASSES = tuple(map(str, range(10)))  # more than any map contains
 
 
 def check_model(
@@ -43,71 +43,71 @@ def check_model(
     device: torch.device | str = "cpu",
     tolerance: float = 1e-4,
 ) -> None:
-    """Tries whether a model keeps the contract, by letting it predict one map and
-    three.
+    """Check that a model fulfils its contract, on one map and on a batch of three.
 
-    A model that passes can be evaluated and planned with like any other. The contract:
-    a TraversabilityDistribution of shape [B, H, W] for maps of any size, on the
-    observation's device, of one floating-point dtype; a CDF that ascends from 0 to 1,
-    quantiles in [0, 1] that are its inverse, and integrals that are theirs; of a
-    mixture finite parameters, weights ≥ 0 that sum to 1, standard deviations ≥ 0; the
-    observation left as it was, and with it the global generators of Python, NumPy and
-    PyTorch; the same answer when asked again, and for a map alone what it is in a
-    batch; `class_names`, where given, one a class, whose probabilities the distribution
-    gives: of a mixture a component, or what `group` sums up; `member_probabilities`,
-        where given, of shape [M, B, C, H, W], and the class probabilities, in each
-        cell, in the order of their average, which may have been calibrated as a whole.
+    The contract:
 
-    A class of trainable models is tried as training uses it: its hooks fit, a step
-    changes its weights, cells whose λ was not observed are left out of a finite loss,
-    and settings and tensors give the same model back. Layers that it asks for and the
-    recipe's maps do not have are drawn at random.
+    - the prediction is a TraversabilityDistribution of shape [B, H, W] for maps of any
+      size, on the observation's device, of one floating-point dtype;
+    - its CDF ascends from 0 to 1, its quantiles in [0, 1] are the inverse, and its
+      integrals follow from these;
+    - a mixture has finite parameters, weights ≥ 0 that sum to 1, and standard
+      deviations ≥ 0;
+    - the observation and the global generators of Python, NumPy and PyTorch are
+      unchanged;
+    - the prediction is the same when repeated, and for a single map as in a batch;
+    - `class_names`, if not empty, has one name per class of the distribution: per
+      component of a mixture, or per group of `group`;
+    - `member_probabilities`, if not None, has shape [M, B, C, H, W]; in each cell the
+      class probabilities are in the order of their average, which may be calibrated.
+
+    A class of trainable models is used as in training: its hooks are consistent, a step
+    changes its weights, cells with unobserved λ do not affect a finite loss, and
+    settings and tensors restore the same model. Layers that it requires and the recipe
+    lacks are random.
 
     Args:
-        model: any model, or what `load_model` takes; the oracle is given the Terrain.
-            Or a class of trainable models, by itself, as path/to/file.py:Class or by
-            name.
-        shapes: (H, W) of the maps to try; a model that takes maps of one size alone
-            names it here.
-        recipe: of the maps, a shipped id or the path of a YAML file; its first scenario
-            is used.
-        device: where the observations are.
-        tolerance: by how much sums, averages, λ, probabilities, and a map's parameters
-            alone and in a batch may differ; batches of other sizes are worked out in
-            another order.
+        model: a model, or an argument of `load_model`; the oracle receives the Terrain.
+            Or a class of trainable models, as a class, path/to/file.py:Class or name.
+        shapes: (H, W) of the maps; for a model with a fixed size of maps, that size.
+        recipe: recipe of the maps, a shipped id or the path of a YAML file; its first
+            scenario is used.
+        device: device of the observations.
+        tolerance: tolerance of sums, averages, λ, probabilities, and between a single
+            map and a batch, where the order of operations may differ.
 
     Raises:
-        ConfigError: the model breaks the contract; every breach is named.
+        ConfigError: If the model breaks the contract; the message lists all breaches.
     """
-    fresh = untrained(model)
-    made: Any = fresh
-    if fresh is None:
-        made = (
-            load_model(model)
-            if isinstance(model, str | Path | Mapping)
-            else registry.take("model", model)
-        )
-    breaches = Breaches("model", type(made).__name__)
+    trainable = untrained(model)
+    new_model: Any = trainable
+    if trainable is None and isinstance(model, str | Path | Mapping):
+        new_model = load_model(model)
+    elif trainable is None:
+        new_model = registry.take("model", model)
+    breaches = Breaches("model", type(new_model).__name__)
     for height, width in shapes:
-        breaches.place = f"{height}×{width}"
-        terrain = _make_terrain(recipe, height, width, torch.device(device))
-        if isinstance(made, TrainableModel):
-            terrain = with_inputs(terrain, made)
-        if fresh is not None and not try_training(fresh, terrain, _CLASSES, breaches):
-            continue
+        breaches.location = f"{height}×{width}"
+        terrain = _create_terrain(recipe, height, width, torch.device(device))
+        if isinstance(new_model, TrainableModel):
+            terrain = with_inputs(terrain, new_model)
+        if trainable is not None:
+            can_predict = try_training(trainable, terrain, _CLASSES, breaches)
+            if not can_predict:
+                continue
         is_sound = partial(
             _is_sound, device=terrain.rgb.device, tolerance=tolerance, breaches=breaches
         )
         predicted = breaches.try_function(
             "predict",
-            lambda observation: predict(made, observation),
+            lambda observation: predict(new_model, observation),
             {"observation": terrain},
             is_sound,
             tolerance,
         )
         if predicted is not NOTHING:
-            _check_classes(made, terrain, predicted, tolerance, breaches)
-    breaches.refuse()
+            _check_classes(new_model, terrain, predicted, tolerance, breaches)
+    breaches.raise_any()
 
 
 def _is_sound(
@@ -116,9 +116,7 @@ def _is_sound(
     tolerance: float,
     breaches: Breaches,
 ) -> bool:
-    """Tells what is wrong with a distribution whose shape is known to fit; false where
-    it lies elsewhere.
-    """
+    """Note faults of a prediction of the right shape; return if its device is right."""
     if isinstance(predicted, TraversabilityMixture):
         values = {
             "weights": predicted.weights,
@@ -141,67 +139,64 @@ def _are_on(
     breaches: Breaches,
 ) -> bool:
     others = [value.device for value in values if value.device != device]
-    found = (
-        f"Expected parameters on the observation's device {device}, got "
-        f"{others[0] if others else ''}."
+    got = others[0] if others else ""
+    return breaches.expect(
+        not others,
+        f"Expected parameters on the observation's device {device}, got {got}.",
     )
-    return breaches.expect(not others, found)
 
 
 def _are_parameters(
     values: Mapping[str, Tensor], tolerance: float, breaches: Breaches
 ) -> bool:
-    """Tells whether a mixture can be made of its parameters."""
-    expect, weights = breaches.expect, values["weights"]
+    """Note faults of a mixture's parameters; return whether there are none."""
+    expect = breaches.expect
+    weights = values["weights"]
     dtypes = sorted({str(value.dtype) for value in values.values()})
-    sound = expect(
+    is_sound = expect(
         len(dtypes) == 1 and weights.is_floating_point(),
         f"Expected parameters of one floating-point dtype, got {', '.join(dtypes)}.",
     )
     for name, value in values.items():
-        sound &= expect(
+        is_sound &= expect(
             bool(value.isfinite().all()),
             f"Expected finite `{name}`, got some that are not.",
         )
-        below = name != "means" and bool((value < 0).any())
-        sound &= expect(not below, f"Expected `{name}` ≥ 0, got some below.")
+        is_negative = name != "means" and bool((value < 0).any())
+        is_sound &= expect(not is_negative, f"Expected `{name}` ≥ 0, got some below.")
     sums = weights.double().sum(1)
-    return sound & expect(
+    return is_sound & expect(
         same(sums, torch.ones_like(sums), tolerance),
         "Expected `weights` that sum to 1 over the components, got other sums.",
     )
 
 
 def _fit_names(names: int, predicted: TraversabilityDistribution) -> str:
-    """Says where a distribution does not have the classes that a model names; empty
-    where it does.
-    """
+    """Return a message if the number of `class_names` is wrong; otherwise, no text."""
+    if names == 0:
+        return ""
     if not isinstance(predicted, TraversabilityMixture):
         try:
-            got: Any = list(predicted.class_probabilities(names).shape) if names else []
+            got: Any = list(predicted.class_probabilities(names).shape)
         except ConfigError:
             got = f"a {type(predicted).__name__} without classes"
-        shape = [*predicted.shape[:-2], names, *predicted.shape[-2:]] if names else []
+        shape = [*predicted.shape[:-2], names, *predicted.shape[-2:]]
+        if got == shape:
+            return ""
+        return f"Expected class probabilities of shape {shape}, got {got}."
+    group = predicted.group
+    n_components = predicted.weights.shape[1]
+    if group is None and names != n_components:
         return (
-            ""
-            if got == shape
-            else f"Expected class probabilities of shape {shape}, got {got}."
-        )
-    group, components = predicted.group, predicted.weights.shape[1]
-    if group is None:
-        fits = names in (0, components)
-        return (
-            ""
-            if fits
-            else f"Expected a name in `class_names` for each of {components} "
+            f"Expected a name in `class_names` for each of {n_components} "
             f"components, got {names}."
         )
-    fits = names == 0 or names > max(group)
-    breach = (
-        f"Expected classes in `group` under {names}, the number of "
-        f"`class_names`, got {max(group)}."
-    )
-    return "" if fits else breach
+    if group is not None and names <= max(group):
+        return (
+            f"Expected classes in `group` below {names}, the number of "
+            f"`class_names`, got {max(group)}."
+        )
+    return ""
 
 
 def _check_classes(
@@ -211,20 +206,23 @@ def _check_classes(
     tolerance: float,
     breaches: Breaches,
 ) -> None:
-    """Tells where what a model says of classes does not fit its distribution."""
-    names, expect = len(model.class_names), breaches.expect
+    """Note where a model's classes do not fit its distribution."""
+    names = len(model.class_names)
+    expect = breaches.expect
     breach = _fit_names(names, predicted)
     if not expect(not breach, breach):
         return
-    seen = terrain.observe()
+    observation = terrain.observe()
     members = breaches.watch(
         "member_probabilities",
-        lambda: model.member_probabilities(seen),
-        observation=seen,
+        lambda: model.member_probabilities(observation),
+        observation=observation,
     )
     if members is None or members is NOTHING:
         return
-    expect(names > 0, "Expected `class_names` beside `member_probabilities`, got none.")
+    expect(
+        names > 0, "Expected `class_names` with `member_probabilities`, got no names."
+    )
     if names:
         weights = predicted.class_probabilities(names)
     elif isinstance(predicted, TraversabilityMixture):
@@ -239,30 +237,32 @@ def _check_classes(
     )
     shape = f"[M, {str(list(weights.shape))[1:]}"
     if expect(fits, f"Expected `member_probabilities` of shape {shape}, got {got}."):
-        # A class that weighs more on average does not weigh less in the end, in any
-        # cell.
-        falls = (
-            weights.gather(1, members.mean(0).argsort(1, descending=True)).diff(dim=1)
-            <= tolerance
-        )
+        # In each cell, a class with a larger average has no smaller weight.
+        descending = members.mean(0).argsort(1, descending=True)
+        is_ordered = weights.gather(1, descending).diff(dim=1) <= tolerance
         order = "in the order of the average of `member_probabilities`"
-        expect(bool(falls.all()), f"Expected class probabilities {order}, got another.")
+        expect(
+            bool(is_ordered.all()),
+            f"Expected class probabilities {order}, got another.",
+        )
 
 
-def _make_terrain(
+def _create_terrain(
     recipe: str, height: int, width: int, device: torch.device
 ) -> Terrain:
-    """Makes three maps of a recipe's first scenario on another grid."""
-    made = load_recipe(recipe)
-    name, scenario = next(iter(made.scenarios.items()))
-    made = replace(
-        made,
+    """Return three maps of a recipe's first scenario, on a grid of another size."""
+    original = load_recipe(recipe)
+    name, scenario = next(iter(original.scenarios.items()))
+    cell_m = original.resolution_m
+    adapted = replace(
+        original,
         height=height,
         width=width,
         places=None,
         start_m=(0.0, 0.0),
-        goal_m=((width - 0.5) * made.resolution_m, (height - 0.5) * made.resolution_m),
+        goal_m=((width - 0.5) * cell_m, (height - 0.5) * cell_m),
         scenarios={name: scenario},
         splits={"contract": Split(scenario=name, maps=_MAPS)},
     )
-    return terrain_of(generate(made, "contract", np.arange(_MAPS)), made).to(device)
+    maps = generate(adapted, "contract", np.arange(_MAPS))
+    return terrain_of(maps, adapted).to(device)

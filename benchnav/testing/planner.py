@@ -1,4 +1,4 @@
-"""The contract of planners, tried on small maps made on the spot.
+"""The check of planners on small generated maps.
 
 Letters in shapes: B episodes, H×W cells, S state and A action dimensions.
 """
@@ -40,87 +40,88 @@ def check_planner(
     device: torch.device | str = "cpu",
     tolerance: float = 1e-3,
 ) -> None:
-    """Tries whether a planner keeps the contract, by letting it plan a few steps on
-    four maps.
+    """Check that a planner fulfils its contract, in a few steps on four maps.
 
-    For the tests of whoever writes a planner, as Gymnasium's `check_env` is for those
-    of an environment: one that passes can be evaluated like any other, and its rows do
-        not hang on the batch, the order or what is drawn.
+    Like Gymnasium's `check_env` for environments, it is meant for tests. The maps are
+    free terrain, a closed wall, a start on terrain predicted to immobilise the robot,
+    and a wall with a gap.
 
-    The maps: free ground, a closed wall, a start on ground predicted to immobilise the
-        robot, a wall with a gap.
-    The contract: finite actions within the robot's bounds, of shape [B, A], in the
-    states' dtype and on their device; a `Plan` with a `PlanStatus` for each episode,
-    and layers of the shapes that it names; the problem, the step and the plan state
-    left as they were, and with them the global generators of Python, NumPy and PyTorch;
-    the same answer when asked again, from the same seed, after other problems were
-    begun, and whether it is drawn or not; for an episode alone, and for some that
-    `select` keeps, what it is in a batch; no error where some robots of the batch have
-    arrived or left the map. What a planner makes of a closed wall is its own affair.
-    What it does not name in `uses` is replaced, under rules by which free space comes
-    from λ̂ and from the prediction; no action may change.
+    The contract:
+
+    - actions are finite, within the robot's bounds, of shape [B, A], in the dtype and
+      on the device of the states;
+    - a `Plan` has a `PlanStatus` for each episode, and layers of the documented shapes;
+    - problem, step, plan state and the global generators of Python, NumPy and PyTorch
+      are unchanged;
+    - the action is the same when repeated, with the same seed, after `init` on other
+      problems, and with or without drawing;
+    - it is the same for a single episode, and for episodes selected by `select`, as in
+      the batch;
+    - robots of the batch that have reached the goal or left the map cause no error;
+    - inputs that are not in `uses` have no effect, whatever free space derives from.
 
     Args:
-        planner: any planner, or the name, file or mapping of one as suites have it.
-        robots: likewise; every registered one when not given. Those that the planner
-            does not steer, by its `steers`, are left out.
-        objective: likewise; the goal distance when not given.
-        shapes: (H, W) of the maps to try.
-        device: where the problems are.
-        tolerance: by how much an action alone and in a batch may differ, as a share of
-            its bounds' range.
+        planner: a planner, or its name, file or mapping as in suites.
+        robots: robots, or their names, files or mappings; if None, all registered ones.
+            Those that `steers` or `robots` of the planner exclude are skipped.
+        objective: an objective, or its name, file or mapping; if None, the distance to
+            the goal.
+        shapes: (H, W) of the maps.
+        device: device of the problems.
+        tolerance: tolerance between actions of a single episode and of a batch, as a
+            fraction of the range of the bounds.
 
     Raises:
-        ConfigError: the planner breaks the contract; every breach is named.
+        ConfigError: If the planner breaks its contract; the message lists all breaches.
     """
-    made = registry.take("planner", planner)
-    breaches = Breaches("planner", type(made).__name__)
-    named = made.steers is None or (
-        isinstance(made.steers, tuple) and all(map(_are_lines, made.steers))
+    new_planner = registry.take("planner", planner)
+    breaches = Breaches("planner", type(new_planner).__name__)
+    steers = new_planner.steers
+    breaches.expect(
+        steers is None or (isinstance(steers, tuple) and all(map(_are_lines, steers))),
+        f"Expected `steers` as tuples of action names, got {steers!r}.",
     )
     breaches.expect(
-        named, f"Expected `steers` as tuples of action names, got {made.steers!r}."
+        isinstance(new_planner.blind, bool),
+        f"Expected `blind` of type bool, got {new_planner.blind!r}.",
     )
-    breaches.expect(
-        isinstance(made.blind, bool),
-        f"Expected `blind` of type bool, got {made.blind!r}.",
-    )
-    breaches.refuse()
-    steered, rules = 0, Rules()
-    for given in registry.names("robot") if robots is None else robots:
-        robot = registry.take("robot", given)
-        if made.steers is not None and tuple(robot.action_names) not in made.steers:
+    breaches.raise_any()
+    n_robots = 0
+    rules = Rules()
+    for label in registry.names("robot") if robots is None else robots:
+        robot = registry.take("robot", label)
+        if steers is not None and tuple(robot.action_names) not in steers:
             continue
-        if made.robots is not None and type(robot) not in made.robots:
+        if new_planner.robots is not None and type(robot) not in new_planner.robots:
             continue
-        steered += 1
-        name = given if isinstance(given, str) else type(robot).__name__
-        goal = objective or GoalDistance()
+        n_robots += 1
+        name = label if isinstance(label, str) else type(robot).__name__
         goal = registry.take(
-            "objective", goal, robot=robot, goal_radius_m=rules.goal_radius_m
+            "objective",
+            objective or GoalDistance(),
+            robot=robot,
+            goal_radius_m=rules.goal_radius_m,
+        )
+        task = Task(robot=robot, objective=goal, rules=rules)
+        create = partial(
+            _create_problem,
+            device=torch.device(device),
+            known=new_planner.given_truth,
         )
         for height, width in shapes:
-            breaches.place = f"{name} on {height}×{width}"
-            task = Task(robot=robot, objective=goal, rules=rules)
-            posed = _make_problem(
-                task, height, width, torch.device(device), made.given_truth
-            )
-            _Trial(made, posed, tolerance, breaches).run()
+            breaches.location = f"{name} on {height}×{width}"
+            problem = create(task, height, width)
+            _PlannerCheck(new_planner, problem, tolerance, breaches).run()
+        height, width = shapes[0]
         for by in ("risk", "mean"):
-            breaches.place = f"{name} on {shapes[0][0]}×{shapes[0][1]}"
-            task = Task(
-                robot=robot,
-                objective=goal,
-                rules=replace(rules, free_space=FreeSpace(by=by)),
-            )
-            posed = _make_problem(
-                task, *shapes[0], torch.device(device), made.given_truth
-            )
-            _Trial(made, posed, tolerance, breaches).check_uses()
+            breaches.location = f"{name} on {height}×{width}"
+            free_space_rules = replace(rules, free_space=FreeSpace(by=by))
+            problem = create(replace(task, rules=free_space_rules), height, width)
+            _PlannerCheck(new_planner, problem, tolerance, breaches).check_uses()
     breaches.expect(
-        steered > 0, "Expected a robot among those tried that it steers, got none."
+        n_robots > 0, "Expected a robot among those tried that it steers, got none."
     )
-    breaches.refuse()
+    breaches.raise_any()
 
 
 def _are_lines(values: Any) -> bool:
@@ -130,8 +131,8 @@ def _are_lines(values: Any) -> bool:
 
 
 @dataclass(frozen=True)
-class _Trial:
-    """A planner on one batch, and where its breaches are noted."""
+class _PlannerCheck:
+    """The check of a planner on one batch."""
 
     planner: Planner[Any]
     problem: Problem
@@ -139,126 +140,112 @@ class _Trial:
     breaches: Breaches
 
     def run(self) -> None:
-        """Plans some steps, then anew under what should change nothing; stops at what
-        makes the rest meaningless.
+        """Plan several steps, then again in ways that should change nothing.
+
+        It stops at the first breach that prevents further checks.
         """
-        problem, start = self.problem, self.problem.start
+        problem = self.problem
+        start = problem.start
         self.check_words()
-        first = plan_state = self.begin(problem)
-        step = Step(
-            state=start,
-            traversability=torch.full_like(start[:, 0], torch.nan),
-            time_s=0.0,
-        )
-        tried: list[tuple[Step, Tensor]] = []
+        first_state = plan_state = self.begin(problem)
+        step = _first_step(problem)
+        answered: list[tuple[Step, Tensor]] = []
         last = torch.tensor([len(problem) - 1], device=start.device)
-        two = torch.cat((last, last - 1))
+        last_two = torch.cat((last, last - 1))
+        indices = torch.arange(len(problem), device=start.device)
         for number in range(_STEPS + 1):
-            running = (
-                torch.arange(len(problem), device=start.device)
-                >= (number == _STEPS) * two[1]
-            )
+            running = indices >= (number == _STEPS) * last_two[1]
             step = _step(problem, step, ~running, number)
             answer = self.ask(step, plan_state, problem)
             if answer is NOTHING:
                 return
-            action, following, plan = answer
+            action, next_plan_state, plan = answer
             self.check_answer(action[running], plan)
             self.ask_again(step, plan_state, action)
-            tried.append((step, action))
-            plan_state, observed = following, problem.traversability_at(step.state)
-            moved = problem.robot(
-                step.state, action.clamp(*problem.action_bounds), observed
-            )
-            step = replace(step, state=moved, traversability=observed)
-        again = (
+            answered.append((step, action))
+            plan_state = next_plan_state
+            step = _moved(problem, step, action)
+        breach = (
             "Expected the same action from a generator of the same seed, got another."
         )
-        following = self.expect_action(again, tried[0], self.begin(problem), problem)
-        plan_state = self.begin(problem.select(last))
-        for answered in tried[:_STEPS]:
-            alone = (
-                "Expected for an episode alone the action that it got in a "
-                "batch, "
-                "got another."
-            )
-            plan_state = self.expect_action(alone, answered, plan_state, problem, last)
-        act = partial(self.planner.select, following, two)
-        kept = (
-            NOTHING
-            if following is NOTHING
-            else self.breaches.watch("select", act, plan_state=following)
+        second_state = self.expect_action(
+            breach, answered[0], self.begin(problem), problem
         )
-        if kept is not NotImplemented:
-            among = (
+        plan_state = self.begin(problem.select(last))
+        breach = (
+            "Expected for an episode alone the action that it got in a batch, got "
+            "another."
+        )
+        for pair in answered[:_STEPS]:
+            plan_state = self.expect_action(breach, pair, plan_state, problem, last)
+        selected = NOTHING
+        if second_state is not NOTHING:
+            select = partial(self.planner.select, second_state, last_two)
+            selected = self.breaches.watch("select", select, plan_state=second_state)
+        if selected is not NotImplemented:
+            breach = (
                 "Expected of episodes that `select` keeps the actions that they "
                 "got among all, got others."
             )
-            self.expect_action(among, tried[1], kept, problem, two)
-        self.begin(_with_other_prediction(problem.select(two)))
+            self.expect_action(breach, answered[1], selected, problem, last_two)
+        self.begin(_with_other_prediction(problem.select(last_two)))
         self.expect_action(
             "Expected the first step's action to be the same after other steps and "
             "problems, got another. "
             "Keep what evolves in the plan state, not on the planner.",
-            tried[0],
-            first,
+            answered[0],
+            first_state,
             problem,
         )
 
     def check_uses(self) -> None:
-        """Plans some steps, and again with other values of each input that the planner
-        says it does not use.
-        """
-        problem, expect = self.problem, self.breaches.expect
+        """Plan several steps, and again with other values of each unused input."""
+        problem = self.problem
+        expect = self.breaches.expect
         used = self.breaches.watch("uses", lambda: self.planner.uses(problem.task))
         if used is NOTHING:
             return
-        of_inputs = isinstance(used, frozenset) and used <= INPUTS
-        known = ", ".join(sorted(INPUTS))
+        are_inputs = isinstance(used, frozenset) and used <= INPUTS
+        listed = ", ".join(sorted(INPUTS))
         if not expect(
-            of_inputs,
-            f"Expected `uses` to return a frozenset of {known}, got {used!r}.",
+            are_inputs,
+            f"Expected `uses` to return a frozenset of {listed}, got {used!r}.",
         ):
             return
-        blind = not self.planner.blind or not used
+        is_consistent = not self.planner.blind or not used
         expect(
-            blind, "Expected `uses` of a `blind` planner to give no input, got some."
+            is_consistent,
+            "Expected `uses` of a `blind` planner to give no input, got some.",
         )
         for name in sorted(INPUTS - used):
             other = _with_other(problem, name)
-            same_action = (
+            breach = (
                 f"Expected the same action whatever `{name}` holds, which "
                 "is not in `uses`, got another."
             )
-            step = Step(
-                state=problem.start,
-                traversability=torch.full_like(problem.start[:, 0], torch.nan),
-                time_s=0.0,
-            )
-            states = self.begin(problem), self.begin(other)
+            step = _first_step(problem)
+            plan_state = self.begin(problem)
+            other_state = self.begin(other)
             for number in range(_STEPS):
                 step = replace(step, time_s=number * problem.dt_s)
-                answer = self.ask(step, states[0], problem)
+                answer = self.ask(step, plan_state, problem)
                 if answer is NOTHING:
                     return
-                following = self.expect_action(
-                    same_action, (step, answer[0]), states[1], other
+                action, plan_state, _ = answer
+                other_state = self.expect_action(
+                    breach, (step, action), other_state, other
                 )
-                states = answer[1], following
-                observed = problem.traversability_at(step.state)
-                moved = problem.robot(
-                    step.state, answer[0].clamp(*problem.action_bounds), observed
-                )
-                step = replace(step, state=moved, traversability=observed)
+                step = _moved(problem, step, action)
 
     def begin(self, problem: Problem) -> Any:
+        """Return the initial plan state, or `NOTHING`."""
         generator = torch.Generator().manual_seed(SEED)
         return self.breaches.watch(
             "init", lambda: self.planner.init(problem, generator), problem=problem
         )
 
     def ask(self, step: Step, plan_state: Any, problem: Problem) -> Any:
-        """Asks for an action; `NOTHING` where what came is of no use."""
+        """Return the planner's answer, or `NOTHING` if it is not usable."""
         if plan_state is NOTHING:
             return NOTHING
         act = partial(self.planner.plan, step, plan_state)
@@ -276,52 +263,60 @@ class _Trial:
         problem: Problem,
         members: Tensor | None = None,
     ) -> Any:
-        """Expects an action at a step, exactly, or nearly of some members; gives the
-        next plan state, if any.
+        """Expect an action at a step; return the next plan state, or `NOTHING`.
+
+        Args:
+            breach: message if the action differs.
+            answered: the step, and the expected action of each episode.
+            plan_state: plan state before the step.
+            problem: problem of all episodes.
+            members: indices of episodes to plan for, within `tolerance`; if None, all
+                episodes, exactly.
         """
-        step, action = answered
+        step, expected = answered
         if members is not None:
-            step, action, problem = (
-                step.select(members),
-                action[members],
-                problem.select(members),
-            )
+            step = step.select(members)
+            expected = expected[members]
+            problem = problem.select(members)
         answer = self.ask(step, plan_state, problem)
         if answer is NOTHING:
             self.breaches.expect(plan_state is NOTHING, breach)
             return NOTHING
+        action, next_plan_state, _ = answer
         low, high = problem.action_bounds
-        near = (answer[0] - action).abs() <= self.tolerance * (high - low)
-        is_kept = same(answer[0], action) or (members is not None and bool(near.all()))
-        self.breaches.expect(is_kept, breach)
-        return answer[1]
+        is_same = same(action, expected)
+        if members is not None and not is_same:
+            is_close = (action - expected).abs() <= self.tolerance * (high - low)
+            is_same = bool(is_close.all())
+        self.breaches.expect(is_same, breach)
+        return next_plan_state
 
-    def ask_again(self, step: Step, plan_state: Any, action: Tensor) -> None:
-        """Asks again with drawing switched, which is to change nothing."""
-        answer = self.ask(replace(step, draw=not step.draw), plan_state, self.problem)
+    def ask_again(self, step: Step, plan_state: Any, expected: Tensor) -> None:
+        """Plan again with drawing toggled, which should change nothing."""
+        toggled = replace(step, draw=not step.draw)
+        answer = self.ask(toggled, plan_state, self.problem)
         if answer is NOTHING:
             return
-        self.check_layers(answer[2])
-        if not same(answer[0], action):
-            again = (
-                "Expected the same action for the same step and plan state, got "
-                "another when asked again."
+        action, _, plan = answer
+        self.check_layers(plan)
+        if same(action, expected):
+            return
+        answer = self.ask(step, plan_state, self.problem)
+        if self.breaches.expect(
+            answer is not NOTHING and same(answer[0], expected),
+            "Expected the same action for the same step and plan state, got "
+            "another when asked again.",
+        ):
+            self.breaches.expect(
+                False,
+                "Expected the same action whether it is drawn or not, got another.",
             )
-            answer = self.ask(step, plan_state, self.problem)
-            if self.breaches.expect(
-                answer is not NOTHING and same(answer[0], action), again
-            ):
-                self.breaches.expect(
-                    False,
-                    "Expected the same action whether it is drawn or not, got another.",
-                )
 
     def check_words(self) -> None:
-        watch, expect, task = (
-            self.breaches.watch,
-            self.breaches.expect,
-            self.problem.task,
-        )
+        """Note invalid texts of the planner."""
+        watch = self.breaches.watch
+        expect = self.breaches.expect
+        task = self.problem.task
         follows = watch("follows", lambda: self.planner.follows(task))
         remarks = watch("remarks", lambda: self.planner.remarks(task))
         expect(
@@ -334,99 +329,122 @@ class _Trial:
         )
 
     def check_answer(self, action: Tensor, plan: Plan) -> None:
-        """Tells what is wrong with an answer of the right form; ended episodes may get
-        any action.
-        """
-        expect, (low, high) = self.breaches.expect, self.problem.action_bounds
-        slack = 1e-5 * (high - low)
+        """Note invalid values of an answer; ended episodes may have any action."""
+        expect = self.breaches.expect
+        low, high = self.problem.action_bounds
+        margin = 1e-5 * (high - low)
         expect(bool(action.isfinite().all()), NOT_FINITE)
-        beyond = (action < low - slack) | (action > high + slack)
+        is_beyond = (action < low - margin) | (action > high + margin)
         expect(
-            not bool(beyond.any()),
+            not bool(is_beyond.any()),
             "Expected actions within the robot's bounds, got some beyond them.",
         )
-        known = (plan.status >= min(PlanStatus)) & (plan.status <= max(PlanStatus))
+        status = plan.status
+        is_valid = (status >= min(PlanStatus)) & (status <= max(PlanStatus))
         expect(
-            bool(known.all()),
+            bool(is_valid.all()),
             f"Expected `Plan.status` in 0–{int(max(PlanStatus))}, got other numbers.",
         )
         self.check_layers(plan)
 
     def check_layers(self, plan: Plan) -> None:
+        """Note invalid layers of a plan."""
         for fault in find_layer_faults(plan, self.problem):
             self.breaches.expect(False, fault)
 
 
 def _with_other_prediction(problem: Problem) -> Problem:
-    """Firm ground for soft and soft for firm, in all inputs."""
+    """Return the problem with 1 − λ for λ in map and distribution."""
     return _with_other(_with_other(problem, "risk_map"), "distribution")
 
 
 def _with_other(problem: Problem, name: str) -> Problem:
-    """The problem with other values of one of `INPUTS`, and with the free space that
-    comes from it.
+    """Return the problem with other values of an input and of derived free space.
+
+    Args:
+        problem: the problem.
+        name: name of the input, one of `INPUTS`.
     """
     mixture = problem.distribution
-    assert isinstance(mixture, TraversabilityMixture)  # of `_make_problem`
+    assert isinstance(mixture, TraversabilityMixture)  # of `_create_problem`
+    inverted = replace(mixture, means=1 - mixture.means)
     others: dict[str, Any] = {
         "risk_map": 1 - problem.risk_map,
-        "distribution": replace(mixture, means=1 - mixture.means),
-        "fields": _fields_of(replace(mixture, means=1 - mixture.means), problem.grid),
+        "distribution": inverted,
+        "fields": _fields_of(inverted, problem.grid),
     }
     is_source = problem.task.rules.free_space.source == name
     return replace(problem, free=problem.free ^ is_source, **{name: others[name]})
 
 
+def _first_step(problem: Problem) -> Step:
+    unobserved = torch.full_like(problem.start[:, 0], torch.nan)
+    return Step(state=problem.start, traversability=unobserved, time_s=0.0)
+
+
+def _moved(problem: Problem, step: Step, action: Tensor) -> Step:
+    """Return the step after an action."""
+    observed = problem.traversability_at(step.state)
+    command = action.clamp(*problem.action_bounds)
+    state = problem.robot(step.state, command, observed)
+    return replace(step, state=state, traversability=observed)
+
+
 def _step(problem: Problem, step: Step, ended: Tensor, number: int) -> Step:
-    """The step of a number; of the ended robots one has left the map, the others have
-    arrived.
-    """
-    places = problem.goal_m.index_fill(0, ended.nonzero()[:1, 0], -0.3)
+    """Return a step by number; one ended robot is off the map, others at the goal."""
+    position_m = problem.goal_m.index_fill(0, ended.nonzero()[:1, 0], -0.3)
     state = step.state.clone()
-    state[ended, :2] = places[ended]
+    state[ended, :2] = position_m[ended]
     return replace(
         step, state=state, time_s=number * problem.dt_s, draw=number % 2 == 1
     )
 
 
-def _make_problem(
+def _create_problem(
     task: Task, height: int, width: int, device: torch.device, known: bool
 ) -> Problem:
-    """Poses four problems: free ground, a closed wall, a start on ground predicted 0, a
-    wall with a gap.
+    """Return a problem on four maps.
 
-    Where λ is known the prediction is certain.
+    They are free terrain, a closed wall, a start on terrain predicted 0, and a wall
+    with a gap.
+
+    Args:
+        task: task of all episodes.
+        height: number of rows.
+        width: number of columns.
+        device: device of the problem.
+        known: whether λ is known, so that the prediction is certain.
     """
-    rows, columns = (
-        torch.arange(height, device=device)[:, None],
-        torch.arange(width, device=device),
-    )
-    # Waves, so that no two cells are quite alike.
-    ground = (0.8 + 0.1 * torch.sin(0.7 * rows + 1.3 * columns)).repeat(4, 1, 1)
+    rows = torch.arange(height, device=device)[:, None]
+    columns = torch.arange(width, device=device)
+    # Waves, so that all cells differ.
+    waves = 0.8 + 0.1 * torch.sin(0.7 * rows + 1.3 * columns)
+    traversability = waves.repeat(4, 1, 1)
     wall = slice(height // 2, height // 2 + 2)
-    ground[1, wall] = 0.1
-    ground[2, :5, :5] = 0
-    ground[3, wall, : width - 7] = ground[3, wall, width - 3 :] = 0
-    elevation = (0.2 * torch.sin(0.4 * rows) * torch.cos(0.3 * columns)).repeat(4, 1, 1)
-    rgb = (255 * ground).to(torch.uint8)[:, None].repeat(1, 3, 1, 1)
-    doubt = 0.0 if known else 1.0
-    means = torch.stack((ground - 0.05 * doubt, ground + 0.05 * doubt), dim=1)
-    mixture = TraversabilityMixture(
-        torch.full_like(means, 0.5), means, torch.full_like(means, 0.1 * doubt)
-    )
+    traversability[1, wall] = 0.1
+    traversability[2, :5, :5] = 0
+    traversability[3, wall, : width - 7] = 0
+    traversability[3, wall, width - 3 :] = 0
+    hills = 0.2 * torch.sin(0.4 * rows) * torch.cos(0.3 * columns)
+    elevation = hills.repeat(4, 1, 1)
+    rgb = (255 * traversability).to(torch.uint8)[:, None].repeat(1, 3, 1, 1)
+    spread = 0.0 if known else 1.0
+    half_gap = 0.05 * spread
+    means = torch.stack((traversability - half_gap, traversability + half_gap), dim=1)
+    weights = torch.full_like(means, 0.5)
+    stds = torch.full_like(means, 0.1 * spread)
+    mixture = TraversabilityMixture(weights, means, stds)
     grid = Grid(height, width, _RESOLUTION_M)
-    seen = Observation(rgb, elevation, 10 * elevation.abs(), grid)
-    start = ground.new_tensor([1.2, 1.3]).repeat(4, 1)
-    goal = (ground.new_tensor(grid.extent_m) - ground.new_tensor([1.7, 1.4])).repeat(
-        4, 1
-    )
+    observation = Observation(rgb, elevation, 10 * elevation.abs(), grid)
+    start = means.new_tensor([1.2, 1.3]).repeat(4, 1)
+    corner = means.new_tensor(grid.extent_m)
+    goal = (corner - means.new_tensor([1.7, 1.4])).repeat(4, 1)
     fields = _fields_of(mixture, grid)
-    return pose_problem(
-        task, Prediction(seen, mixture, ground, fields=fields), start, goal, 60.0
-    )
+    prediction = Prediction(observation, mixture, traversability, fields=fields)
+    return pose_problem(task, prediction, start, goal, 60.0)
 
 
 def _fields_of(mixture: TraversabilityMixture, grid: Grid) -> Fields:
-    """Fields of a prediction, correlated over a metre."""
-    believed = Static().init(mixture, CovarianceModel(grid=grid, correlation_m=1.0))
-    return Fields(Static(), believed, tuple(range(mixture.shape[0])))
+    """Return joint samples of a prediction, with a correlation length of 1 m."""
+    state = Static().init(mixture, CovarianceModel(grid=grid, correlation_m=1.0))
+    return Fields(Static(), state, tuple(range(mixture.shape[0])))

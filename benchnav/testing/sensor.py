@@ -1,7 +1,6 @@
-"""The contract of sensors, of appearance and of the ground, tried on small hills made
-on the spot.
+"""The check of appearance and traversability sensors on small generated hills.
 
-Letters in shapes: B episodes, S state dimensions, H×W cells, N cells.
+Letters in shapes: B episodes; S state dimensions; H×W cells.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,59 +36,60 @@ def check_sensor(
     sinks: bool = True,
     tolerance: float = 1e-5,
 ) -> None:
-    """Tries whether a sensor of appearance or of the ground keeps the contract, by
-    letting it sense on four hills.
+    """Check that an appearance or traversability sensor fulfils its contract.
 
-    The robots: one in the middle of the map, two at its borders, one off it.
-    The contract: some cell is sensed or seen; a `Measurement` of the field's shape, dtype
-    and device; λ in [0, 1], NaN where it is not sensed, with a standard deviation of at
-    least `MIN_STD`; of an `Appearance` the terrain's own layers, with elevation and a
-    doubt ≥ 0 in every cell that is seen; the arguments left as they were, and with them
-    the global generators of Python, NumPy and PyTorch; the same answer when asked
-    again, and for some episodes alone and in another order what it is in the batch;
-    noise, where there is any, that is another in each episode and in each step.
+    One robot is in the middle of the map, two are at its borders, one is off the map.
+    The contract:
 
-    It shows nothing that it should not. Nothing that it reports changes when the truth
-    elsewhere is replaced: λ, its distribution and its class in all cells but those
-    whose λ is sensed; colour, slope and layers in all cells but those that are sensed
-    or seen. The elevation of those cells is sunk by 1 to 3 m, not raised, as ground
-    that rises into view is rightly seen; the ground under the robot stays, since it
-    carries the sensor.
+    - at least one cell is observed;
+    - the measurement has the shape, dtype and device of the λ field;
+    - λ is in [0, 1], or NaN without a measurement, with a standard deviation of at
+      least `MIN_STD`;
+    - an `Appearance` has the layers of the terrain, and in observed cells an elevation
+      and a noise level ≥ 0;
+    - arguments and the global generators of Python, NumPy and PyTorch are unchanged;
+    - the measurement is the same when repeated, and for selected episodes in any order
+      as in the batch;
+    - noise, if any, differs between episodes and steps.
+
+    The measurement must not depend on unobserved truth. It is the same when λ, its
+    distribution and its class are replaced in cells without measured λ, and when
+    colour, slope and layers are replaced in unobserved cells. The elevation of
+    unobserved cells is lowered by 1 to 3 m, since raised terrain may come into view;
+    that under the robot stays, since it carries the sensor.
 
     Args:
-        sensor: any sensor, or the name, file or mapping of one as suites have it.
-        shapes: (H, W) of the maps to try.
-        device: where the maps are.
-        sinks: elevation is replaced too; False for a line of sight that may be barred
-            by ground that is not seen itself, as where single rays are cast to the
-            centres of cells.
-        tolerance: by how much numbers may differ where the same is expected of other
-            arguments.
+        sensor: a sensor, or its name, file or mapping as in suites.
+        shapes: (H, W) of the maps.
+        device: device of the maps.
+        sinks: whether elevation is lowered too; False for a line of sight that
+            unobserved terrain may block, such as single rays to the centres of cells.
+        tolerance: tolerance between values that should be equal for other arguments.
 
     Raises:
-        ConfigError: the sensor breaks the contract; every breach is named.
+        ConfigError: If the sensor breaks the contract; the message lists all breaches.
     """
     name = sensor.get("part") if isinstance(sensor, Mapping) else sensor
-    is_ground = isinstance(name, str) and name.partition(":")[0] in registry.names(
-        "ground"
-    )
-    made = registry.take("ground" if is_ground else "sensor", sensor)
-    breaches = Breaches("sensor", type(made).__name__)
+    kind = "sensor"
+    if isinstance(name, str) and name.partition(":")[0] in registry.names("ground"):
+        kind = "ground"
+    new_sensor = registry.take(kind, sensor)
+    breaches = Breaches("sensor", type(new_sensor).__name__)
     breaches.expect(
-        isinstance(made.sees_all, bool),
-        f"Expected `sees_all` of type bool, got {made.sees_all!r}.",
+        isinstance(new_sensor.sees_all, bool),
+        f"Expected `sees_all` of type bool, got {new_sensor.sees_all!r}.",
     )
     for height, width in shapes:
-        hills = _make_hills(height, width, torch.device(device))
+        hills = _create_hills(height, width, torch.device(device))
         for step in _STEPS:
-            breaches.place = f"{height}×{width} in step {step}"
-            _Trial(made, hills, step, sinks, breaches, tolerance).run()
-    breaches.refuse()
+            breaches.location = f"{height}×{width} in step {step}"
+            _SensorCheck(new_sensor, hills, step, sinks, breaches, tolerance).run()
+    breaches.raise_any()
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Truth(Batch):
-    """What a sensor is given, but for its noise."""
+    """The arguments of a sensor, except for the key of its noise."""
 
     terrain: Terrain
     field: Tensor
@@ -97,8 +97,8 @@ class _Truth(Batch):
 
 
 @dataclass(frozen=True)
-class _Trial:
-    """A sensor in one step of four episodes, and where its breaches are noted."""
+class _SensorCheck:
+    """The check of a sensor in one step of four episodes."""
 
     sensor: Sensor
     truth: _Truth
@@ -108,51 +108,48 @@ class _Trial:
     tolerance: float
 
     def run(self) -> None:
-        """Senses, then anew under what should change nothing, or the noise alone."""
+        """Sense, then again in ways that should change nothing or only the noise."""
         sensed = self.ask(self.truth)
         if sensed is NOTHING:
             return
-        look = sensed.appearance
+        appearance = sensed.appearance
+        has_seen = appearance is not None and bool(appearance.seen.any())
         self.breaches.expect(
-            bool(sensed.mask.any()) or (look is not None and bool(look.seen.any())),
+            bool(sensed.mask.any()) or has_seen,
             "Expected a robot in the middle of a map to sense or see some cell, got "
             "none.",
         )
-        shown = _shown(sensed)
+        reported = _reported(sensed)
         is_same = self.breaches.expect(
-            self.is_alike(self.ask(self.truth), shown, 0),
+            self.is_alike(self.ask(self.truth), reported, 0),
             "Expected the same when asked again, got another.",
         )
-        for members in ([3], [2, 0]):
-            some = torch.tensor(members, device=self.truth.field.device)
-            alone = self.ask(self.truth.select(some), [_KEYS[own] for own in members])
+        for indices in ([3], [2, 0]):
+            members = torch.tensor(indices, device=self.truth.field.device)
+            keys = [_KEYS[index] for index in indices]
+            of_members = self.ask(self.truth.select(members), keys)
+            expected = tuple(values[members] for values in reported)
             self.breaches.expect(
-                self.is_alike(
-                    alone, tuple(values[some] for values in shown), self.tolerance
-                ),
+                self.is_alike(of_members, expected, self.tolerance),
                 "Expected for episodes alone and in another order what they got in "
-                "the batch, got another. Draw noise "
-                "by `NoiseKey.normal`.",
+                "the batch, got another. Draw noise by `NoiseKey.normal`.",
             )
         if not is_same:
-            return  # or everything would seem to hang on everything
+            return  # the following comparisons would all fail
         for what, changed in _replaced(self.truth, sensed, self.sinks):
             self.breaches.expect(
-                self.is_alike(self.ask(changed), shown, self.tolerance),
+                self.is_alike(self.ask(changed), reported, self.tolerance),
                 f"Expected the same whatever {what}, got another. Look at no cell "
                 "that is not reported.",
             )
         self.try_noise(sensed)
 
     def try_noise(self, sensed: Measurement) -> None:
-        """Expects noise that is another in each episode and in each step."""
-        by_key, by_step = (
-            other is not NOTHING and _differ(sensed, other)
-            for other in (
-                self.ask(self.truth, _OTHER_KEYS),
-                self.ask(self.truth, step=self.step + 1),
-            )
-        )
+        """Expect noise to differ between episodes and steps."""
+        with_keys = self.ask(self.truth, _OTHER_KEYS)
+        with_step = self.ask(self.truth, step=self.step + 1)
+        by_key = with_keys is not NOTHING and _differ(sensed, with_keys)
+        by_step = with_step is not NOTHING and _differ(sensed, with_step)
         self.breaches.expect(
             by_step or not by_key,
             "Expected other noise in another step, got the same. Draw it by "
@@ -161,24 +158,19 @@ class _Trial:
         self.breaches.expect(
             by_key or not by_step,
             "Expected other noise under another key of the episode, got the same "
-            "though it differs from step to step. "
-            "Draw it by `NoiseKey.normal`.",
+            "though it differs from step to step. Draw it by `NoiseKey.normal`.",
         )
 
     def ask(
         self, truth: _Truth, keys: Sequence[int] = _KEYS, step: int | None = None
     ) -> Any:
-        """Lets the sensor sense; `NOTHING` where what came is of no use."""
-        given, noise_key = (
-            vars(truth),
-            NoiseKey(tuple(keys), self.step if step is None else step),
-        )
+        """Return the sensor's answer, or `NOTHING` if it is not usable."""
+        noise_key = NoiseKey(tuple(keys), self.step if step is None else step)
+        arguments = vars(truth)
         answer = self.breaches.watch(
             "sense",
-            lambda: self.sensor.sense(
-                truth.terrain, truth.field, truth.robot_state, noise_key
-            ),
-            **given,
+            lambda: self.sensor.sense(*arguments.values(), noise_key),
+            **arguments,
         )
         faults = [] if answer is NOTHING else list(_faults(answer, truth))
         for fault in faults:
@@ -186,32 +178,28 @@ class _Trial:
         return NOTHING if faults else answer
 
     def is_alike(
-        self, sensed: Any, shown: tuple[Tensor, ...], tolerance: float
+        self, sensed: Any, expected: tuple[Tensor, ...], tolerance: float
     ) -> bool:
-        return sensed is NOTHING or same(
-            _shown(sensed), shown, tolerance
-        )  # what raised is noted
+        """Return whether an answer is as expected; an exception is noted elsewhere."""
+        return sensed is NOTHING or same(_reported(sensed), expected, tolerance)
 
 
 def _faults(sensed: Any, truth: _Truth) -> Iterator[str]:
-    """Tells what is wrong with the form of an answer, a line each."""
+    """Yield a message for each fault of an answer's form."""
     like = truth.field
     if not isinstance(sensed, Measurement):
         yield f"Expected a Measurement from `sense`, got {type(sensed).__name__}."
         return
-    maps = {
-        "`Measurement.traversability`": sensed.traversability,
-        "`Measurement.std`": sensed.std,
-    }
-    if wrong := [
-        fault
-        for what, values in maps.items()
-        if (fault := _tensor_fault(what, values, like))
-    ]:
-        yield from wrong
+    faults = [
+        _tensor_fault("`Measurement.traversability`", sensed.traversability, like),
+        _tensor_fault("`Measurement.std`", sensed.std, like),
+    ]
+    if any(faults):
+        yield from filter(None, faults)
         return
-    found, std = sensed.traversability[sensed.mask], sensed.std[sensed.mask]
-    if not bool(((found >= 0) & (found <= 1)).all()):
+    traversability = sensed.traversability[sensed.mask]
+    std = sensed.std[sensed.mask]
+    if not bool(((traversability >= 0) & (traversability <= 1)).all()):
         yield "Expected λ in [0, 1], or NaN where it is not sensed, got other numbers."
     if not bool(((std >= MIN_STD) & std.isfinite()).all()):
         yield (
@@ -219,47 +207,47 @@ def _faults(sensed: Any, truth: _Truth) -> Iterator[str]:
             "is sensed, got others."
         )
     if sensed.appearance is not None:
-        yield from _faults_of_look(sensed.appearance, truth)
+        yield from _appearance_faults(sensed.appearance, truth)
 
 
-def _faults_of_look(look: Any, truth: _Truth) -> Iterator[str]:
-    like, known = truth.field, truth.terrain.observe()
-    if not isinstance(look, Appearance) or not isinstance(
-        look.observation, Observation
-    ):
+def _appearance_faults(appearance: Any, truth: _Truth) -> Iterator[str]:
+    is_appearance = isinstance(appearance, Appearance)
+    if not is_appearance or not isinstance(appearance.observation, Observation):
         yield (
             "Expected `Measurement.appearance` as an Appearance with an Observation, "
-            "got "
-            "something else."
+            "got something else."
         )
         return
-    given = look.observation
-    if given.layers.keys() != known.layers.keys() or given.grid != known.grid:
+    like = truth.field
+    expected = truth.terrain.observe()
+    observation = appearance.observation
+    layers = observation.layers
+    has_layers = layers.keys() == expected.layers.keys()
+    if not has_layers or observation.grid != expected.grid:
         yield (
             "Expected the terrain's own grid and layers in `Appearance.observation`, "
-            f"{', '.join(known.layers)}, got "
-            f"{given.grid} and {', '.join(given.layers) or 'none'}."
+            f"{', '.join(expected.layers)}, got "
+            f"{observation.grid} and {', '.join(layers) or 'no layers'}."
         )
         return
     pairs = {
-        "seen": (look.seen, like.bool()),
-        "noise_level": (look.noise_level, like),
-        "observation.rgb": (given.rgb, known.rgb),
-        "observation.elevation_m": (given.elevation_m, known.elevation_m),
+        "seen": (appearance.seen, like.bool()),
+        "noise_level": (appearance.noise_level, like),
+        "observation.rgb": (observation.rgb, expected.rgb),
+        "observation.elevation_m": (observation.elevation_m, expected.elevation_m),
     }
-    pairs |= {
-        f"observation.layers[{name!r}]": (given.layers[name], own)
-        for name, own in known.layers.items()
-    }
+    for name, layer in expected.layers.items():
+        pairs[f"observation.layers[{name!r}]"] = (layers[name], layer)
     faults = [
         _tensor_fault(f"`Appearance.{name}`", *pair) for name, pair in pairs.items()
     ]
     yield from filter(None, faults)
     if any(faults):
         return
-    if not bool((look.noise_level[look.seen] >= 0).all()):
+    seen = appearance.seen
+    if not bool((appearance.noise_level[seen] >= 0).all()):
         yield "Expected `Appearance.noise_level` ≥ 0 where a cell is seen, got others."
-    if not bool(given.elevation_m[look.seen].isfinite().all()):
+    if not bool(observation.elevation_m[seen].isfinite().all()):
         yield "Expected finite elevation where a cell is seen, got others."
 
 
@@ -267,78 +255,72 @@ def _tensor_fault(what: str, values: Any, like: Tensor) -> str:
     return find_tensor_fault(what, values, like.dtype, tuple(like.shape), like.device)
 
 
-def _shown(sensed: Measurement) -> tuple[Tensor, ...]:
-    """What is reported, without what means nothing; the first of each tensor's
-    dimensions is B.
-    """
-    own = (sensed.traversability, sensed.std.where(sensed.mask, torch.nan))
-    if sensed.appearance is None:
-        return own
-    look, seen = sensed.appearance, sensed.appearance.seen
-    return (
-        *own,
-        seen,
-        *(
-            values.where(seen, torch.nan)
-            for values in (look.noise_level, *_looks(look))
-        ),
-    )
+def _reported(sensed: Measurement) -> tuple[Tensor, ...]:
+    """Return the reported values with NaN elsewhere, each of shape [B, H, W]."""
+    std = sensed.std.where(sensed.mask, torch.nan)
+    appearance = sensed.appearance
+    if appearance is None:
+        return sensed.traversability, std
+    seen = appearance.seen
+    maps = (appearance.noise_level, *_channels(appearance))
+    observed = [values.where(seen, torch.nan) for values in maps]
+    return (sensed.traversability, std, seen, *observed)
 
 
-def _looks(look: Appearance) -> tuple[Tensor, ...]:
-    """Colours, elevation and layers, each of shape [B, H, W]."""
-    known = look.observation
-    return (*known.rgb.float().unbind(1), known.elevation_m, *known.layers.values())
+def _channels(appearance: Appearance) -> tuple[Tensor, ...]:
+    """Return colours, elevation and layers, each of shape [B, H, W]."""
+    observation = appearance.observation
+    colours = observation.rgb.float().unbind(1)
+    return (*colours, observation.elevation_m, *observation.layers.values())
 
 
 def _differ(first: Measurement, second: Measurement) -> bool:
-    """Tells whether two report something else of a cell that both report."""
-    both = first.mask & second.mask
-    differ = bool((first.traversability != second.traversability)[both].any())
-    if first.appearance is None or second.appearance is None:
+    """Return whether two measurements differ in a cell that both report."""
+    common = first.mask & second.mask
+    differ = bool((first.traversability != second.traversability)[common].any())
+    if differ or first.appearance is None or second.appearance is None:
         return differ
-    both = first.appearance.seen & second.appearance.seen
-    pairs = zip(_looks(first.appearance), _looks(second.appearance), strict=True)
-    return differ or not all(same(one[both], other[both]) for one, other in pairs)
+    common = first.appearance.seen & second.appearance.seen
+    pairs = zip(_channels(first.appearance), _channels(second.appearance), strict=True)
+    return not all(same(a[common], b[common]) for a, b in pairs)
 
 
 def _replaced(
     truth: _Truth, sensed: Measurement, sinks: bool
 ) -> Iterator[tuple[str, _Truth]]:
-    """Truths that differ in what is not reported, and what that is."""
-    terrain, look, mask = truth.terrain, sensed.appearance, sensed.mask
-    reported = mask if look is None else mask | look.seen
-    # Others in each cell, and in all that sums them up, such as a map's mean and
-    # greatest.
-    mixture = replace(
-        terrain.truth,
-        weights=terrain.truth.weights.where(
-            mask[:, None], terrain.truth.weights.flip(1, 2)
-        ),
-        means=terrain.truth.means.where(mask[:, None], 0.4 * (1 - terrain.truth.means)),
-        stds=terrain.truth.stds.where(mask[:, None], 0.5 * terrain.truth.stds),
+    """Yield what is replaced where it is not reported, and the resulting truth."""
+    terrain = truth.terrain
+    mask = sensed.mask
+    reported = mask if sensed.appearance is None else mask | sensed.appearance.seen
+    # The new values differ in each cell, and in summaries such as mean and maximum.
+    mixture = terrain.truth
+    is_fixed = mask[:, None]
+    distribution = replace(
+        mixture,
+        weights=mixture.weights.where(is_fixed, mixture.weights.flip(1, 2)),
+        means=mixture.means.where(is_fixed, 0.4 * (1 - mixture.means)),
+        stds=mixture.stds.where(is_fixed, 0.5 * mixture.stds),
     )
+    traversability = terrain.traversability
     other = replace(
         terrain,
         class_id=terrain.class_id.where(mask, terrain.class_id + 1),
-        truth=mixture,
-        traversability=terrain.traversability.where(
-            mask, 0.4 * (1 - terrain.traversability)
-        ),
+        truth=distribution,
+        traversability=traversability.where(mask, 0.4 * (1 - traversability)),
     )
     field = truth.field.where(mask, 0.4 * (1 - truth.field))
     yield (
         "λ, its distribution and its class are where λ is not sensed",
         replace(truth, terrain=other, field=field),
     )
+    layers = {
+        name: layer.where(reported, layer + 1) for name, layer in terrain.layers.items()
+    }
     other = replace(
         terrain,
         rgb=terrain.rgb.where(reported[:, None], (255 - terrain.rgb) // 2),
         slope_deg=terrain.slope_deg.where(reported, terrain.slope_deg + 5),
-        layers={
-            name: layer.where(reported, layer + 1)
-            for name, layer in terrain.layers.items()
-        },
+        layers=layers,
     )
     yield (
         "colour, slope and layers are where nothing is sensed or seen",
@@ -346,57 +328,56 @@ def _replaced(
     )
     if not sinks:
         return
-    under = terrain.grid.cell_of(truth.robot_state[:, 0], truth.robot_state[:, 1])
-    stays, height = reported.clone(), terrain.elevation_m
-    stays[torch.arange(len(stays), device=stays.device), under[0], under[1]] = True
-    other = replace(
-        terrain, elevation_m=height.where(stays, height - 2 - (7 * height).sin())
-    )
+    x, y = truth.robot_state[:, 0], truth.robot_state[:, 1]
+    rows, columns = terrain.grid.cell_of(x, y)
+    is_kept = reported.clone()
+    is_kept[torch.arange(len(is_kept), device=is_kept.device), rows, columns] = True
+    height = terrain.elevation_m
+    lowered = height.where(is_kept, height - 2 - (7 * height).sin())
     yield (
         "the elevation is where nothing is sensed or seen",
-        replace(truth, terrain=other),
+        replace(truth, terrain=replace(terrain, elevation_m=lowered)),
     )
 
 
-def _make_hills(height: int, width: int, device: torch.device) -> _Truth:
-    """Four maps of waves that hide one another, with two classes, a layer, λ of 0 and 1
-    here and there.
+def _create_hills(height: int, width: int, device: torch.device) -> _Truth:
+    """Return four maps of hills that occlude each other, with some λ of 0 and 1.
+
+    They have two classes and a layer.
+
+    Args:
+        height: number of rows.
+        width: number of columns.
+        device: device of the maps.
     """
     generator = torch.Generator().manual_seed(SEED)
-    shape, grid = (4, height, width), Grid(height, width, _RESOLUTION_M)
-    drawn = torch.rand(8, *shape, generator=generator).to(device)
-    rows, columns = (
-        torch.arange(height, device=device)[:, None],
-        torch.arange(width, device=device),
-    )
-    waves = (0.7 * torch.sin(0.9 * rows + 0.3) + 0.7 * torch.sin(0.8 * columns)).repeat(
-        4, 1, 1
-    )
-    means = torch.stack((0.1 + 0.1 * drawn[0], 0.5 + 0.3 * drawn[1]), dim=1)
-    share = 0.1 + 0.2 * drawn[2]
-    truth = TraversabilityMixture(
-        torch.stack((share, 1 - share), dim=1),
-        means,
-        torch.full_like(means, 0.1),
-        (0, 0),
-    )
-    field = truth.from_normal(0.2 + 2 * (drawn[3] - 0.5))
+    grid = Grid(height, width, _RESOLUTION_M)
+    uniform = torch.rand(8, 4, height, width, generator=generator).to(device)
+    rows = torch.arange(height, device=device)[:, None]
+    columns = torch.arange(width, device=device)
+    waves = 0.7 * torch.sin(0.9 * rows + 0.3) + 0.7 * torch.sin(0.8 * columns)
+    means = torch.stack((0.1 + 0.1 * uniform[0], 0.5 + 0.3 * uniform[1]), dim=1)
+    weight = 0.1 + 0.2 * uniform[2]
+    weights = torch.stack((weight, 1 - weight), dim=1)
+    truth = TraversabilityMixture(weights, means, torch.full_like(means, 0.1), (0, 0))
+    field = truth.from_normal(0.2 + 2 * (uniform[3] - 0.5))
     terrain = Terrain(
-        rgb=(255 * drawn[4:7]).to(torch.uint8).movedim(0, 1).contiguous(),
-        class_id=(drawn[0] > 0.5).long(),
-        elevation_m=waves + 0.1 * drawn[7],
-        slope_deg=20 * drawn[2],
+        rgb=(255 * uniform[4:7]).to(torch.uint8).movedim(0, 1).contiguous(),
+        class_id=(uniform[0] > 0.5).long(),
+        elevation_m=waves.repeat(4, 1, 1) + 0.1 * uniform[7],
+        slope_deg=20 * uniform[2],
         truth=truth,
         traversability=field.flip(1),
         grid=grid,
-        layers={"vegetation_m": drawn[1]},
+        layers={"vegetation_m": uniform[1]},
     )
     x, y = grid.extent_m
-    places = [
-        [0.52 * x, 0.47 * y, 0.6],
-        [0.3, 0.2, 0.9],
-        [0.6 * x, y - 0.1, -2.5],
-        [-0.3, 2.0, 0.0],
+    speed = 0.5
+    states = [
+        [0.52 * x, 0.47 * y, 0.6, speed],
+        [0.3, 0.2, 0.9, speed],
+        [0.6 * x, y - 0.1, -2.5, speed],
+        [-0.3, 2.0, 0.0, speed],
     ]
-    state = torch.tensor([[*place, 0.5] for place in places], device=device)
-    return _Truth(terrain=terrain, field=field, robot_state=state)
+    robot_state = torch.tensor(states, device=device)
+    return _Truth(terrain=terrain, field=field, robot_state=robot_state)

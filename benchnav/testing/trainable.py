@@ -1,6 +1,4 @@
-"""The contract of trainable models: that their hooks fit, that a step trains them, and
-that tensors give them back.
-"""
+"""The check of trainable models: hooks, a training step, and restoring from tensors."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -22,9 +20,7 @@ from benchnav.testing.breaches import SEED, Breaches, same
 
 
 def untrained(model: Any) -> TrainableModel | None:
-    """Makes a trainable model that has not been built, of a class or of what names one;
-    None of any other model.
-    """
+    """Return an unbuilt trainable model of a class or name; None for other models."""
     options: Mapping[str, Any] = {}
     if isinstance(model, str | Mapping | registry.Part):
         try:
@@ -35,13 +31,14 @@ def untrained(model: Any) -> TrainableModel | None:
     if not (isinstance(model, type) and issubclass(model, TrainableModel)):
         return None
     kind = config_class(model)
-    return model(read(kind, dict(options), of(model.__name__))) if kind else model()  # type: ignore[call-arg]
+    if not kind:
+        return model()
+    settings = read(kind, dict(options), of(model.__name__))
+    return model(settings)  # type: ignore[call-arg]
 
 
 def with_inputs(terrain: Terrain, model: TrainableModel) -> Terrain:
-    """Adds the layers that a model asks for and maps of a recipe do not have, at
-    random, a tenth of them missing.
-    """
+    """Add random layers that a model requires and a recipe lacks, a tenth missing."""
     generator = torch.Generator().manual_seed(SEED)
     layers = dict(terrain.layers)
     for name in model.inputs:
@@ -59,8 +56,16 @@ def try_training(
     classes: tuple[str, ...],
     breaches: Breaches,
 ) -> bool:
-    """Builds a model, tries its hooks and takes a step; tells what breaks the contract,
-    and whether it can predict.
+    """Build a model, and check its hooks and a training step.
+
+    Args:
+        model: unbuilt model.
+        terrain: maps to train on.
+        classes: names of the classes.
+        breaches: collection of breaches.
+
+    Returns:
+        Whether the model can predict.
     """
     try:
         maps = _maps(model, terrain)
@@ -68,14 +73,11 @@ def try_training(
             terrain.rgb.device
         )
         try_network(model, maps)
-        hidden = maps | {model.target: torch.full_like(maps[model.target], torch.nan)}
-        some = maps | {
-            model.target: torch.where(
-                maps["slope_deg"] > 5, torch.nan, maps[model.target]
-            )
-        }
-        for what, batch in (("in part", some), ("anywhere", hidden)):
-            loss, _ = model.train().assess(batch)
+        target = maps[model.target]
+        partial = torch.where(maps["slope_deg"] > 5, torch.nan, target)
+        missing = torch.full_like(target, torch.nan)
+        for what, values in (("in part", partial), ("anywhere", missing)):
+            loss, _ = model.train().assess(maps | {model.target: values})
             breaches.expect(
                 bool(loss.isfinite()),
                 f"Expected a finite loss where λ is not observed {what}, got "
@@ -85,50 +87,50 @@ def try_training(
         loss, _ = model.train().assess(maps)
         loss.backward()
         torch.optim.SGD(model.parameters(), 1e-4).step()
-        moved = any(
+        is_changed = any(
             not torch.equal(before[name], value)
             for name, value in model.named_parameters()
         )
         breaches.expect(
-            moved,
+            is_changed,
             "Expected weights that a step of training changes, got them as they were.",
         )
         model.eval().zero_grad()
-        rebuilt = type(model).from_tensors(
+        restored = type(model).from_tensors(
             model.settings(), classes, model.state_dict()
         )
         layers = layers_of(terrain.observe(), model.inputs)
-        means = [
-            one.to(terrain.rgb.device).predict_raw(layers).mean()
-            for one in (model, rebuilt)
-        ]
+        device = terrain.rgb.device
+        mean = model.to(device).predict_raw(layers).mean()
+        restored_mean = restored.to(device).predict_raw(layers).mean()
         breaches.expect(
-            same(means[1], means[0], 1e-5),
+            same(restored_mean, mean, 1e-5),
             "Expected the same prediction from settings and tensors, as a checkpoint "
             "keeps them, got another.",
         )
     except Exception as error:
-        told = str(error) if isinstance(error, BenchnavError) else one_line(error)
+        text = str(error) if isinstance(error, BenchnavError) else one_line(error)
         return breaches.expect(
-            False, f"Expected a model that can be trained, got: {told}"
+            False, f"Expected a model that can be trained, got: {text}"
         )
     return True
 
 
 def _maps(model: TrainableModel, terrain: Terrain) -> dict[str, Tensor]:
-    """A batch as training gives it: the inputs, the slope and what is learned."""
-    known = layers_of(terrain.observe(), (*model.inputs, "slope_deg"))
+    """Return a batch as in training: inputs, slope and targets."""
+    inputs = layers_of(terrain.observe(), (*model.inputs, "slope_deg"))
     return {
-        **known,
+        **inputs,
         "traversability": terrain.traversability,
         "class_id": terrain.class_id,
     }
 
 
 def _scale(name: str) -> LayerScale:
-    """Some scale of a layer."""
-    count = 3 if name == "rgb" else 1 + is_azimuth(name)
-    mean, std = (128.0, 64.0) if name == "rgb" else (0.0, 1.0)
-    return LayerScale(
-        torch.full((count,), mean), torch.full((count,), std), torch.tensor(10.0)
-    )
+    """Return an arbitrary scale of a layer."""
+    if name == "rgb":
+        mean, std = torch.full((3,), 128.0), torch.full((3,), 64.0)
+    else:
+        n_channels = 1 + is_azimuth(name)
+        mean, std = torch.zeros(n_channels), torch.ones(n_channels)
+    return LayerScale(mean, std, torch.tensor(10.0))

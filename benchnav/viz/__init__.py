@@ -1,6 +1,4 @@
-"""Drawing: the base class of figures, and the sizes, colours, names, maps and panels
-that all of them share.
-"""
+"""Drawing: the base class of figures; shared sizes, colours, names, maps and panels."""
 
 from benchnav.core.public_names import face
 

@@ -1,8 +1,7 @@
-"""The base class of figures: an object that says what it needs, what it shows, and
-draws it.
+"""The base class of figures: an object with requirements, a caption and a drawing.
 
-A figure knows no path and writes nothing. `data` is one value for all figures of a
-kind; for those of runs it is `benchnav.eval.figures.RunData`.
+A figure does not write files. `data` is a single value for all figures of a kind; for
+those of runs it is `benchnav.eval.figures.RunData`.
 """
 
 from abc import ABC, abstractmethod
@@ -22,10 +21,10 @@ class Figure(Specified, ABC):
     """A figure.
 
     Attributes:
-        name: of its files.
-        title: heading over it on a page; if empty, none.
-        text: what it shows, in sentences, where that is the same for all data.
-        trim: whether white borders are cut away, as of maps, which keep their shape.
+        name: name of its files.
+        title: heading above it on a page; if empty, none.
+        text: caption in sentences, if it does not depend on the data.
+        trim: whether white borders are cut, as for maps, whose aspect ratio is fixed.
     """
 
     name: str = ""
@@ -34,44 +33,41 @@ class Figure(Specified, ABC):
     trim: bool = False
 
     def variants(self, data: Any) -> Sequence[Self]:
-        """Return the figures to draw, each with a name of its own: itself where `needs`
-        is met, else none.
-        """
+        """Return the figures to draw, with distinct names; by default only itself."""
         return [self] if self.needs(data) else []
 
     def variant(self, **changes: Any) -> Self:
         """Return a copy with other attributes, such as its `name`."""
-        made = copy(self)
-        vars(made).update(changes)
-        return made
+        variant = copy(self)
+        vars(variant).update(changes)
+        return variant
 
     def numbered(self, count: int) -> list[Self]:
-        """Return so many variants with their `place`, named with a number from 1 where
-        there are several.
+        """Return `count` variants with their `index`, from 0.
+
+        If there are several, their names end in a number, from 1.
         """
-        names = (
-            [self.name]
-            if count == 1
-            else [f"{self.name}-{number}" for number in range(1, count + 1)]
-        )
+        if count == 1:
+            return [self.variant(index=0)]
         return [
-            self.variant(place=place, name=name) for place, name in enumerate(names)
+            self.variant(index=index, name=f"{self.name}-{index + 1}")
+            for index in range(count)
         ]
 
     def needs(self, data: Any) -> bool:
-        """Return whether the data hold what it draws."""
+        """Return whether the data contain what the figure shows."""
         return True
 
     def caption(self, data: Any) -> str:
-        """Return what it shows, in sentences; `text` unless it depends on the data."""
+        """Return the caption in sentences; `text` unless it depends on the data."""
         return self.text
 
     @abstractmethod
     def draw(self, data: Any) -> "matplotlib.figure.Figure":
-        """Return the drawing; sizes, colours and names are in `benchnav.viz`."""
+        """Draw the figure; sizes, colours and names are in `benchnav.viz`."""
 
     def __call__(self, data: Any) -> "matplotlib.figure.Figure":
-        """Draw it in the style of all figures."""
+        """Draw the figure in the common style."""
         from benchnav.viz.style import styled
 
         with styled():
@@ -88,5 +84,5 @@ def _png(drawing: "matplotlib.figure.Figure") -> bytes:
 
 
 def applicable(figures: Sequence[Figure], data: Any) -> list[Figure]:
-    """List the figures whose needs the data meet, in all their variants."""
+    """Return all variants of the figures that the data allow."""
     return [variant for figure in figures for variant in figure.variants(data)]

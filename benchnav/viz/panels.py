@@ -1,7 +1,6 @@
-"""Panels of numbers: grids of panels, curves over a swept value, and rows of estimates
-with their intervals.
-"""
+"""Panels of numbers: grids of panels, curves over a swept value, and intervals."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -21,34 +20,31 @@ from benchnav.viz.style import (
 )
 
 Looks = Mapping[str, Mapping[str, Any]]
-GRID = "0.9"  # colour of the lines of a grid
+GRID = "0.9"  # colour of grid lines
 
 
 def line_looks(
     names: Sequence[str], colours: Sequence[Any] = (), dashed: bool = False
 ) -> dict[str, dict[str, Any]]:
-    """Return how the line of each name is drawn, as keywords of `Axes.plot`.
+    """Return the style of each line, as keywords of `Axes.plot`.
 
     Args:
-        names: of the lines; equal names have one look.
-        colours: of each name; if empty, those of `LINE_COLOURS` in turn.
-        dashed: whether lines differ in their dashes, else in their markers, beside
-            their colours.
+        names: names of the lines; equal names have the same style.
+        colours: colour of each name; if empty, `LINE_COLOURS` in turn.
+        dashed: whether lines also differ in their dashes instead of their markers.
     """
-    looks = {}
-    for place, name in enumerate(dict.fromkeys(names)):
-        turn, rest = divmod(place, len(LINE_COLOURS))
-        colour = colours[place] if colours else LINE_COLOURS[rest]
-        marked = {
-            "marker": MARKERS[place % len(MARKERS)],
-            "ms": 3.5,
-            "ls": line_style(turn),
-        }
-        looks[name] = {
-            "color": colour,
-            "lw": 1.1,
-            **({"ls": line_style(place)} if dashed else marked),
-        }
+    looks: dict[str, dict[str, Any]] = {}
+    for index, name in enumerate(dict.fromkeys(names)):
+        turn, colour_index = divmod(index, len(LINE_COLOURS))
+        colour = colours[index] if colours else LINE_COLOURS[colour_index]
+        look = {"color": colour, "lw": 1.1}
+        if dashed:
+            look["ls"] = line_style(index)
+        else:
+            look["marker"] = MARKERS[index % len(MARKERS)]
+            look["ms"] = 3.5
+            look["ls"] = line_style(turn)
+        looks[name] = look
     return looks
 
 
@@ -61,31 +57,30 @@ def panel_grid(
     layers: int = 1,
     **shared: Any,
 ) -> tuple[Figure, list[list[Axes]]]:
-    """Make a figure with a titled place for each of several things, row by row.
+    """Create a figure with a titled stack of panels for each title, row by row.
 
     Args:
-        titles: of the places.
-        across: places side by side, at most.
-        high_in: height of a place in inches.
-        rest_in: height of what else there is, such as the legend.
-        width_in: width of the figure; 0 for a column of a page for one place across,
-            and else both columns.
-        layers: panels of a place, stacked.
+        titles: titles of the stacks.
+        across: maximum number of stacks next to each other.
+        high_in: height of a stack in inches.
+        rest_in: height of everything else, such as the legend, in inches.
+        width_in: width of the figure in inches; if 0, one column of a page for a single
+            stack across, else both columns.
+        layers: panels of a stack.
         **shared: as in `Figure.subplots`.
 
     Returns:
-        The figure, and the panels of each place, downward.
+        The figure, and the panels of each stack, downward.
     """
     across = max(1, min(across, len(titles)))
     width = width_in or (ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN)
-    figure = Figure(
-        figsize=(width, high_in * -(-len(titles) // across) + rest_in),
-        layout="constrained",
-    )
-    places = stack_panels(figure, len(titles), across, layers, **shared)
-    for (panel, *_), title in zip(places, titles, strict=True):
+    n_rows = -(-len(titles) // across)
+    size = (width, high_in * n_rows + rest_in)
+    figure = Figure(figsize=size, layout="constrained")
+    stacks = stack_panels(figure, len(titles), across, layers, **shared)
+    for (panel, *_), title in zip(stacks, titles, strict=True):
         panel.set_title(title, parse_math=False)
-    return figure, places
+    return figure, stacks
 
 
 def draw_estimates(
@@ -101,14 +96,14 @@ def draw_estimates(
     """Draw estimates as a line with the band of their intervals.
 
     Args:
-        panel: where.
-        x: shape [N].
-        y: shape [N].
-        low: lower ends of the intervals, shape [N]; NaN for none.
-        high: upper ends.
+        panel: panel to draw on.
+        x: swept values, shape [N].
+        y: estimates, shape [N].
+        low: lower ends of the intervals, NaN for no interval, shape [N].
+        high: upper ends of the intervals, shape [N].
         look: keywords of `Axes.plot`.
-        label: of the line in a legend; if empty, none.
-        bars: whether intervals are bars in place of a band.
+        label: entry of the legend; if empty, there is none.
+        bars: whether intervals are bars instead of a band.
     """
     if bars:
         panel.vlines(x, low, high, color=look["color"], lw=0.7)
@@ -120,34 +115,26 @@ def draw_estimates(
 def draw_interval(
     panel: Axes, low: float, high: float, height: float, colour: Any, width: float = 1.2
 ) -> None:
-    """Draw an interval as a horizontal line, `width` points thick, at a height of a
-    panel.
-    """
-    panel.plot(
-        [low, high],
-        [height, height],
-        color=colour,
-        lw=width,
-        solid_capstyle="butt",
-        zorder=2,
-    )
+    """Draw an interval as a horizontal line at a height, `width` points thick."""
+    style: dict[str, Any] = {"color": colour, "lw": width, "zorder": 2}
+    panel.plot([low, high], [height, height], solid_capstyle="butt", **style)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Curves:
-    """Curves over a swept value, a panel for each group of lines and measure.
+    """Curves over a swept value, with a panel for each group of lines and measure.
 
     Args:
-        table: a row a point: `panel`, the title of its group; `line`, its name; `x`; of
-            each measure its column, and where it has an interval those that end in
-            `_low` and `_high`.
-        measures: by column its label.
-        looks: by line.
-        x_label: of the axis.
-        across: groups side by side, at most.
+        table: one row per point: `panel`, the title of its group; `line`, its name;
+            `x`; and a column for each measure, with columns that end in `_low` and
+            `_high` if it has an interval.
+        measures: label by column.
+        looks: style by line, as from `line_looks`.
+        x_label: label of the x-axis.
+        across: maximum number of groups next to each other.
         high_in: height of a panel in inches.
-        width_in: of the figure, as in `panel_grid`.
-        bars: whether intervals are bars in place of bands.
+        width_in: width of the figure in inches, as in `panel_grid`.
+        bars: whether intervals are bars instead of bands.
     """
 
     table: pd.DataFrame
@@ -160,47 +147,46 @@ class Curves:
     bars: bool = False
 
     def draw(self) -> tuple[Figure, dict[tuple[str, str], Axes]]:
-        """Draw them: measures of a single group side by side with their labels as
-        titles, else stacked.
+        """Draw the curves.
+
+        Measures of a single group stand next to each other with their labels as titles;
+        those of several groups are stacked.
 
         Returns:
             The figure, without a legend, and its panels by group and measure.
         """
-        groups, labels = (
-            list(dict.fromkeys(self.table["panel"])),
-            list(self.measures.values()),
-        )
+        groups = list(dict.fromkeys(self.table["panel"]))
+        labels = list(self.measures.values())
         is_single = len(groups) == 1 and self.across > 1
-        titles, layers = (labels, 1) if is_single else (groups, len(labels))
+        titles = labels if is_single else groups
+        layers = 1 if is_single else len(labels)
         high_in = self.high_in * layers
-        figure, places = panel_grid(
+        figure, stacks = panel_grid(
             titles, self.across, high_in, 0.5, self.width_in, layers, sharex=True
         )
         across = min(self.across, len(titles))
-        for index, stack in enumerate(places):
+        for index, stack in enumerate(stacks):
             stack[-1].set_xlabel(self.x_label)
             stack[-1].tick_params(labelbottom=True)
-            for panel, first, label in zip(
-                stack, places[0], () if is_single else labels, strict=not is_single
-            ):
+            if is_single:
+                continue
+            for panel, first, label in zip(stack, stacks[0], labels, strict=True):
                 if index:
                     panel.sharey(first)
-                panel.tick_params(labelleft=index % across == 0)
-                panel.set_ylabel("" if index % across else label)
-        keys = [(group, name) for group in groups for name in self.measures]
-        panels = dict(
-            zip(keys, [panel for stack in places for panel in stack], strict=True)
-        )
+                is_leftmost = index % across == 0
+                panel.tick_params(labelleft=is_leftmost)
+                panel.set_ylabel(label if is_leftmost else "")
+        keys = itertools.product(groups, self.measures)
+        panels = dict(zip(keys, itertools.chain(*stacks), strict=True))
         for (group, measure), panel in panels.items():
-            own = self.table[self.table["panel"] == group]
-            for line, points in own.groupby("line", sort=False):
-                x, y = points["x"], points[measure]
-                low, high = (
-                    points.get(f"{measure}_{end}", y) for end in ("low", "high")
-                )
-                draw_estimates(
-                    panel, x, y, low, high, self.looks[line], str(line), self.bars
-                )
+            rows = self.table[self.table["panel"] == group]
+            for line, points in rows.groupby("line", sort=False):
+                y = points[measure]
+                low = points.get(f"{measure}_low", y)
+                high = points.get(f"{measure}_high", y)
+                look = self.looks[line]
+                x = points["x"]
+                draw_estimates(panel, x, y, low, high, look, str(line), self.bars)
             panel.grid(axis="y", color=GRID)
         return figure, panels
 
@@ -208,22 +194,22 @@ class Curves:
 def draw_baseline(
     panel: Axes, value: float, label: str, horizontal: bool = True
 ) -> None:
-    """Draw the value of a calibrated model, or another that all else is seen against,
-    as a dashed line.
-    """
+    """Draw a reference value, such as that of a calibrated model, as a dashed line."""
     line = panel.axhline if horizontal else panel.axvline
     line(value, color="0.4", lw=0.8, ls="--", zorder=1, label=label)
 
 
-def ticks_of(panel: Axes, axis: Literal["x", "y"], most: int = 4) -> None:
-    """Limit the intervals between the ticks of an axis, which are at 1, 2 and 5 times
-    powers of ten.
+def ticks_of(panel: Axes, axis: Literal["x", "y"], max_intervals: int = 4) -> None:
+    """Place ticks of an axis at multiples of 1, 2 or 5 times a power of ten.
+
+    Args:
+        panel: panel of the axis.
+        axis: axis.
+        max_intervals: maximum number of intervals between ticks.
     """
-    panel.locator_params(axis=axis, nbins=most, steps=[1, 2, 5, 10])
+    panel.locator_params(axis=axis, nbins=max_intervals, steps=[1, 2, 5, 10])
 
 
 def jitter(count: int, width: float) -> np.ndarray:
-    """Return the same offsets for a count at each call, uniform within a width to
-    either side.
-    """
+    """Return `count` fixed pseudo-random offsets, uniform in [−width, width]."""
     return np.random.default_rng(0).uniform(-width, width, count)

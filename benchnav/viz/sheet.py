@@ -1,8 +1,7 @@
-"""Sheets of maps for a page: a row a map and a column a layer.
+"""Sheets of maps for a page: one row per map and one column per layer.
 
-Lengths are in inches from the upper left corner and text is in points, as printed over
-the two columns of a page.
-Letters in shapes: R rows, C classes, H×W cells.
+Lengths are in inches and text sizes in points, as printed over both columns of a page.
+Letters in shapes: R rows; C classes; H×W cells.
 """
 
 import textwrap
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
@@ -26,10 +26,12 @@ from benchnav.viz.maps import (
 )
 from benchnav.viz.style import TEXT, TWO_COLUMNS_IN, legend_outside, styled
 
-_PAGE, _DPI = 9.4, 300.0
-_SIDES, _ENDS = 0.7, 1.5  # what is not maps of a sheet's width and height
-LINE, LETTER, _COLUMN = 0.135, 0.054, 1.15
-_TITLE_LETTERS = 20  # of a layer's name in a line, which a column has room for
+_PAGE = 9.4  # maximum height
+_DPI = 300.0
+_SIDES, _ENDS = 0.7, 1.5  # width and height of a sheet without its maps
+LINE, LETTER = 0.135, 0.054  # height of a line and mean width of a letter
+_COLUMN = 1.15  # minimum width of a column
+_TITLE_LETTERS = 20  # of a layer's name per line, which fit in a column
 SHARES: dict[str, Any] = {**LAMBDA, "cmap": with_lacking("viridis")}
 
 
@@ -37,13 +39,13 @@ class SheetColumn(NamedTuple):
     """A column of a sheet of maps.
 
     Args:
-        name: its panels have the label `NAME ROW`, and its colour bar `NAME bar`.
-        title: over the column.
-        layers: a map a row, shape [R, H, W], or [R, H, W, 3] of colours.
+        name: prefix of its panels' labels, `NAME ROW`, and of its bar's, `NAME bar`.
+        title: heading of the column.
+        layers: map of each row, shape [R, H, W], or colours of shape [R, H, W, 3].
         shades: keywords of `imshow`.
-        unit: what stands under the colour bar; None where there is no bar.
-        extend: at which ends the bar goes on: neither, max or both.
-        most: intervals of the bar.
+        unit: label below the colour bar; if None, there is no bar.
+        extend: ends at which values may exceed the bar: neither, max or both.
+        max_intervals: maximum number of intervals between the bar's ticks.
     """
 
     name: str
@@ -52,20 +54,24 @@ class SheetColumn(NamedTuple):
     shades: Mapping[str, Any] = {}
     unit: str | None = None
     extend: str = "neither"
-    most: int = 4
+    max_intervals: int = 4
 
 
 def layer_column(name: str, values: np.ndarray, unit: str) -> SheetColumn:
-    """A layer as a column of a sheet, of shape [R, H, W]."""
+    """Return a column of a sheet for a layer.
+
+    Args:
+        name: name of the layer.
+        values: values of the layer, shape [R, H, W].
+        unit: unit of the values, `1` if there is none.
+    """
     words = name.removesuffix(f"_{unit}").replace("_", " ")
-    title = (
-        words[:1].upper() + words[1:] + {"1": "", "deg": " [°]"}.get(unit, f" [{unit}]")
-    )
+    unit_text = {"1": "", "deg": " [°]"}.get(unit, f" [{unit}]")
+    title = words[:1].upper() + words[1:] + unit_text
     title = textwrap.fill(title, _TITLE_LETTERS, break_long_words=False)
     shown = values % 360 if is_azimuth(name) else values
-    return SheetColumn(
-        name, title, np.ma.masked_invalid(shown), layer_scale(name, values), ""
-    )
+    layers = np.ma.masked_invalid(shown)
+    return SheetColumn(name, title, layers, layer_scale(name, values), "")
 
 
 @styled()
@@ -77,24 +83,24 @@ def sheet_of_maps(
     classes: Sequence[Artist],
     marks: Sequence[Artist] = (),
 ) -> Figure:
-    """Draws maps side by side, a row a map and a column a layer, for the page of a
-    paper.
+    """Draw a sheet of maps: one row per map and one column per layer.
 
     Args:
-        columns: of R rows each.
+        columns: columns of R rows each.
         rows: names of the R rows.
-        extent_m: size of a map along x and y.
-        heading: over everything.
-        classes: entries of the legend under everything.
-        marks: entries of a legend beside the heading.
+        extent_m: size of a map along x and y, in metres.
+        heading: heading of the sheet.
+        classes: entries of the legend below the maps.
+        marks: entries of a legend next to the heading.
 
     Returns:
-        A figure as wide as a page; narrower where panels shrink to fit one, wider where
-        columns are many.
+        A figure as wide as a page; narrower if panels shrink to fit its height, wider
+        if there are many columns.
     """
-    ratio, across = extent_m[1] / extent_m[0], len(columns)
-    widest = max((TWO_COLUMNS_IN - _SIDES) / across, _COLUMN)
-    high = min(widest * ratio, 2.0, max((_PAGE - _ENDS) / len(rows), 0.8))
+    ratio = extent_m[1] / extent_m[0]
+    across = len(columns)
+    max_width = max((TWO_COLUMNS_IN - _SIDES) / across, _COLUMN)
+    high = min(max_width * ratio, 2.0, max((_PAGE - _ENDS) / len(rows), 0.8))
     width = across * max(high / ratio, _COLUMN) + _SIDES
     letters = max((len(str(patch.get_label())) for patch in classes), default=0)
     legend_columns = max(1, int(width / (0.4 + LETTER * letters)))
@@ -109,6 +115,7 @@ def sheet_of_maps(
             frame_map(panel)
         below[0].set_title(column.title)
         if column.unit is not None:
+            ticks = MaxNLocator(column.max_intervals, steps=[1, 2, 2.5, 5, 10])
             bar = figure.colorbar(
                 image,
                 ax=list(below),
@@ -116,47 +123,54 @@ def sheet_of_maps(
                 extend=column.extend,
                 aspect=14,
                 panchor=False,
-                ticks=MaxNLocator(column.most, steps=[1, 2, 2.5, 5, 10]),
+                ticks=ticks,
                 format="%g",
             )
             bar.set_label(column.unit, size=TEXT)
             bar.ax.set_label(f"{column.name} bar")
-    for axis, inches in (
-        (panels[0, 0].xaxis, high / ratio),
-        (panels[0, 0].yaxis, high),
-    ):
-        # A tick at the very end is left out, as its number would touch the next panel's
-        # first.
-        most = min(max(int(inches / 0.2), 1), 4)
-        axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10], prune="upper"))
+    _set_ticks(panels[0, 0].xaxis, high / ratio)
+    _set_ticks(panels[0, 0].yaxis, high)
     for panel, name in zip(panels[:, 0], rows, strict=True):
         panel.set_ylabel(name, size=TEXT)
     panels[-1, across // 2].set_xlabel("x [m]", size=TEXT)
     figure.supylabel("y [m]", size=TEXT, y=0.5 + (ends / 2 - 0.45) / height)
     figure.suptitle(heading, x=0.01, ha="left", parse_math=False)
-    for handles, count, side in (
-        (marks, len(marks), "upper right"),
-        (classes, legend_columns, "lower left"),
-    ):
-        if handles:
-            for text in legend_outside(figure, handles, count, side).get_texts():
-                text.set_parse_math(False)
+    if marks:
+        _add_legend(figure, marks, len(marks), "upper right")
+    if classes:
+        _add_legend(figure, classes, legend_columns, "lower left")
     return figure
 
 
+def _set_ticks(axis: Axis, length_in: float) -> None:
+    """Place the ticks of an axis with a length in inches."""
+    max_intervals = min(max(int(length_in / 0.2), 1), 4)
+    # Without a tick at the end: its number would touch the first of the next panel.
+    locator = MaxNLocator(max_intervals, steps=[1, 2, 5, 10], prune="upper")
+    axis.set_major_locator(locator)
+
+
+def _add_legend(
+    figure: Figure, handles: Sequence[Artist], columns: int, side: str
+) -> None:
+    for text in legend_outside(figure, handles, columns, side).get_texts():
+        text.set_parse_math(False)
+
+
 def class_patches(names: Sequence[str], colours: np.ndarray) -> list[Artist]:
-    """Entries of a legend for classes, whose colours are of shape [C, 3]."""
+    """Return entries of a legend for classes with colours of shape [C, 3]."""
     return [
-        Patch(facecolor=c, ec="0.3", lw=0.4, label=n)
-        for c, n in zip(colours, names, strict=True)
+        Patch(facecolor=colour, ec="0.3", lw=0.4, label=name)
+        for colour, name in zip(colours, names, strict=True)
     ]
 
 
 def class_scale(colours: np.ndarray) -> dict[str, Any]:
-    """Return how class ids are coloured, as keywords of `imshow`; masked cells have no
-    class.
+    """Return the colour scale of class ids, as keywords of `imshow`.
+
+    Masked cells have no class.
 
     Args:
-        colours: of the classes, shape [C, 3].
+        colours: colours of the classes, shape [C, 3].
     """
     return {"cmap": with_lacking(colours), "vmin": -0.5, "vmax": len(colours) - 0.5}

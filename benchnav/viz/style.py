@@ -1,7 +1,6 @@
-"""One style for the figures of datasets, models, runs and pages: sizes, colours, names,
-layout, and saving.
+"""Common style of all figures: sizes, colours, names, layout, and saving.
 
-Sizes are in inches and points as printed. Colours are distinct to every kind of colour
+Sizes are in inches and points as printed. Colours are distinct for all kinds of colour
 vision. Source: Okabe and Ito (2008), "Color universal design".
 """
 
@@ -45,25 +44,23 @@ _STYLE: dict[Any, Any] = {
     "legend.handlelength": 2.2,
     "legend.columnspacing": 1.4,
 }
-# Type 42 embeds whole fonts, as publishers ask; composed images would be sampled anew
-# in a PDF.
+# Type 42 embeds whole fonts, which publishers require; composed images would be
+# resampled in a PDF.
 _SAVED: dict[Any, Any] = {"pdf.fonttype": 42, "image.composite_image": False}
 
-BLUE, ORANGE, GREEN, PINK, AMBER, SKY = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#E69F00",
-    "#56B4E9",
-)
-# Yellow, the last, is lost on white: lines on white have the others alone.
+BLUE = "#0072B2"
+ORANGE = "#D55E00"
+GREEN = "#009E73"
+PINK = "#CC79A7"
+AMBER = "#E69F00"
+SKY = "#56B4E9"
+# The last, yellow, is invisible as a line on white.
 COLOURS = (BLUE, ORANGE, GREEN, PINK, AMBER, SKY, "#000000", "#F0E442")
 LINE_COLOURS = COLOURS[:-1]
 BLIND = "0.45"
 
 MARKERS = "osD^vP*X<"
-# Of paths and curves that lie over each other, which grey tells apart by these.
+# Dashes distinguish overlapping paths and curves in greyscale.
 LINE_STYLES: tuple[Any, ...] = (
     "-",
     (0, (3.2, 1.2)),
@@ -81,7 +78,7 @@ _PLANNERS = {
     "straight": ("straight", BLIND),
 }
 
-# Of each shipped risk measure its name without a number, and with one.
+# Name of each shipped risk measure without and with a number.
 _RISKS = {
     "mean": ("mean", "mean:{}"),
     "cvar": ("CVaR", "CVaR{lowered}"),
@@ -96,108 +93,100 @@ _LOWERED = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
 def styled() -> Any:
-    """The style of all figures, as a context or as the decorator of a function that
-    draws one.
-    """
+    """Return the common style, as a context manager or decorator of a function."""
     return matplotlib.rc_context(_STYLE)
 
 
 def planner_name(planner: str) -> str:
-    """What figures call a planner, from its label: the name, and its options as they
-    are.
-    """
+    """Return a planner's name in figures, from its label; options are unchanged."""
     name = re.split("[ :]", planner)[0]
-    return _PLANNERS[name][0] + planner[len(name) :] if name in _PLANNERS else planner
+    if name not in _PLANNERS:
+        return planner
+    return _PLANNERS[name][0] + planner[len(name) :]
 
 
 def risk_name(risk: str) -> str:
-    """What tables, figures and videos call a risk setting, from its label: `cvar:0.95`
-    is CVaR₀.₉₅.
+    """Return the displayed name of a risk setting: `cvar:0.95` becomes CVaR₀.₉₅.
 
     Args:
-        risk: a label. One that is not of a shipped measure with at most a number stays
-            as it is.
+        risk: label of a risk setting. Labels other than a shipped measure with at most
+            one number are unchanged.
     """
     measure, colon, number = risk.partition(":")
     if colon and not _NUMBER.fullmatch(number):
         return risk
-    named, with_number = _RISKS.get(measure, (measure, f"{measure}:{{}}"))
-    return (
-        with_number.format(number, lowered=number.translate(_LOWERED))
-        if colon
-        else named
-    )
+    plain, with_number = _RISKS.get(measure, (measure, f"{measure}:{{}}"))
+    if not colon:
+        return plain
+    return with_number.format(number, lowered=number.translate(_LOWERED))
 
 
 def planner_colours(planners: Sequence[str]) -> dict[str, str]:
-    """Colours of planners by their labels: a shipped planner has the same one in every
-    figure.
+    """Return colours of planners by label; shipped planners have fixed colours.
 
     Args:
-        planners: labels; others than the shipped take colours that are left.
+        planners: labels; custom planners have the remaining colours in turn.
     """
-    own = {
+    colours = {
         planner: _PLANNERS[planner][1] for planner in planners if planner in _PLANNERS
     }
-    left = [colour for colour in LINE_COLOURS if colour not in own.values()]
-    others = [planner for planner in dict.fromkeys(planners) if planner not in own]
-    return own | {
-        planner: left[place % len(left)] for place, planner in enumerate(others)
-    }
+    unused = [colour for colour in LINE_COLOURS if colour not in colours.values()]
+    custom = [planner for planner in dict.fromkeys(planners) if planner not in colours]
+    return colours | dict(zip(custom, itertools.cycle(unused), strict=False))
 
 
 def condition_colours(
     planners: Sequence[str], palette: Sequence[str] = COLOURS
 ) -> list[str]:
-    """Colours of conditions that are shown together.
+    """Return the colour of each condition of a figure.
 
     Args:
-        planners: of each condition; where no two are alike, each has its planner's
-            colour. Else the conditions take those of the palette in turn, but for the
-            blind baseline, which is grey.
-        palette: begun anew where it is used up.
+        planners: planner of each condition. If all differ, each condition has its
+            planner's colour. Otherwise conditions have colours of the palette in turn,
+            except for the blind baseline, which is grey.
+        palette: colours, which repeat if there are too few.
     """
-    own, turn = planner_colours(planners), itertools.cycle(palette)
-    alike = len(own) < len(planners)
+    by_planner = planner_colours(planners)
+    if len(by_planner) == len(planners):
+        return [by_planner[planner] for planner in planners]
+    turn = itertools.cycle(palette)
     return [
-        own[planner] if not alike or own[planner] == BLIND else next(turn)
-        for planner in planners
+        BLIND if by_planner[planner] == BLIND else next(turn) for planner in planners
     ]
 
 
 def bytes_of(colour: Any) -> tuple[int, ...]:
-    """Red, green, blue and opacity of a colour, in [0, 255]."""
+    """Return red, green, blue and opacity of a colour, in [0, 255]."""
     return tuple(round(255 * value) for value in to_rgba(colour))
 
 
-def line_style(place: int) -> Any:
-    """The style of the line that is drawn in this place among others."""
-    return LINE_STYLES[place % len(LINE_STYLES)]
+def line_style(index: int) -> Any:
+    """Return the dashes of a line by its index among several."""
+    return LINE_STYLES[index % len(LINE_STYLES)]
 
 
 def stack_panels(
     figure: Figure, count: int, across: int, layers: int = 1, **shared: Any
 ) -> list[Any]:
-    """Divides a figure into places, row by row, each with panels under each other; what
-    is left over is removed.
+    """Divide a figure into stacks of panels, row by row; remove surplus panels.
 
     Args:
-        figure: empty.
-        count: number of places.
-        across: places side by side, at most `count`.
-        layers: panels of a place.
+        figure: empty figure.
+        count: number of stacks.
+        across: number of stacks next to each other, at most `count`.
+        layers: panels of a stack.
         **shared: as in `Figure.subplots`.
 
     Returns:
-        Of each place its panels, downward.
+        The panels of each stack, downward.
     """
-    down = -(-count // across)
-    panels = figure.subplots(layers * down, across, squeeze=False, **shared)
-    stacks = [list(stack) for row in np.split(panels, down) for stack in row.T]
-    for place in range(count, len(stacks)):
-        for panel in stacks[place]:
+    n_rows = -(-count // across)
+    panels = figure.subplots(layers * n_rows, across, squeeze=False, **shared)
+    stacks = [list(stack) for row in np.split(panels, n_rows) for stack in row.T]
+    for index in range(count, len(stacks)):
+        for panel in stacks[index]:
             panel.remove()
-        stacks[place - across][-1].tick_params(labelbottom=True)
+        stacks[index - across][-1].tick_params(labelbottom=True)
     return stacks[:count]
 
 
@@ -207,18 +196,17 @@ def legend_outside(
     columns: int = 4,
     side: Any = "lower center",
 ) -> Legend:
-    """Lay a legend next to the panels: what has a label in them, once each, then the
-    handles.
+    """Add a legend outside the panels: each label of the panels once, then `handles`.
 
-    A figure that has a label of all its x-axes has its legend over the panels, as both
-    would be in one place.
+    If the figure has a common label of its x-axes, choose a side above the panels;
+    below them, the two would overlap.
 
     Args:
-        figure: with all its panels.
+        figure: figure with all its panels.
         handles: further entries.
-        columns: of the legend of a figure that is as wide as a page; a narrower one has
+        columns: columns of the legend of a figure as wide as a page; a narrower one has
             half of them.
-        side: of the figure.
+        side: side of the figure, as in Matplotlib's `loc`.
     """
     labelled: dict[str, Artist] = {}
     for panel in figure.axes:
@@ -232,9 +220,7 @@ def legend_outside(
 
 
 def page_width(count: int, across: int) -> float:
-    """Return the width in inches of a figure with some places, of which so many fill
-    both columns of a page.
-    """
+    """Return a figure's width in inches for `count` panels, `across` per page width."""
     return max(TWO_COLUMNS_IN * (min(count, across) / across), _MIN_WIDTH_IN)
 
 
@@ -246,60 +232,51 @@ def save(
     trim: bool = False,
     strip_in: float = 0.0,
 ) -> None:
-    """Writes a figure with its fonts embedded.
+    """Write a figure with embedded fonts.
 
     Args:
-        figure: what was drawn.
-        path: file to write.
-        kind: png, pdf, svg or jpg.
-        dpi: dots an inch; those of the figure where not given.
-        trim: cut white borders away.
-        strip_in: height of a strip over the figure that is written too.
+        figure: figure to write.
+        path: path of the file.
+        kind: format: png, pdf, svg or jpg.
+        dpi: dots per inch; by default, those of the figure.
+        trim: whether to cut white borders.
+        strip_in: height of a strip above the figure to include, in inches.
     """
     box: Any = "tight" if trim else None
+    padding_in = 0.05 if trim else 0
     if strip_in and not trim:
-        box = Bbox.from_extents(
-            0, 0, figure.get_figwidth(), figure.get_figheight() + strip_in
-        )
+        width_in = figure.get_figwidth()
+        height_in = figure.get_figheight() + strip_in
+        box = Bbox.from_extents(0, 0, width_in, height_in)
     with matplotlib.rc_context(_SAVED):
         figure.savefig(
-            path, format=kind, dpi=dpi, bbox_inches=box, pad_inches=0.05 if trim else 0
+            path, format=kind, dpi=dpi, bbox_inches=box, pad_inches=padding_in
         )
 
 
 def save_twice(
     figure: Figure, path: Path, trim: bool = False, dpi: float = DPI, mark: str = ""
 ) -> None:
-    """Writes a figure as PNG and, beside it, as PDF; each whole or not at all.
+    """Write a figure as PNG and as PDF next to it, each atomically.
 
     Args:
-        figure: what was drawn.
-        path: of the PNG; its folder is made.
-        trim: cut white borders away; a figure made for a column keeps its width
-            without.
-        dpi: dots an inch.
-        mark: a line that is drawn in a strip over the figure; none where empty.
+        figure: figure to write.
+        path: path of the PNG; its folder is created.
+        trim: whether to cut white borders; without it, the figure keeps its width.
+        dpi: dots per inch.
+        mark: line in a strip above the figure; if empty, there is none.
     """
-    # Laid out for good, so that both files are drawn alike and no layout is made twice.
+    # Fix the layout, so that it is computed once and both files are identical.
     figure.set_dpi(dpi)
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)
     if mark:
-        over = figure.dpi_scale_trans + ScaledTranslation(
-            0, figure.get_figheight(), figure.dpi_scale_trans
-        )
-        figure.text(
-            0.05,
-            0.04,
-            mark,
-            transform=over,
-            fontsize=TITLE,
-            color=ORANGE,
-            weight="bold",
-            va="bottom",
-        )
+        scale = figure.dpi_scale_trans
+        above = scale + ScaledTranslation(0, figure.get_figheight(), scale)
+        style: dict[str, Any] = {"fontsize": TITLE, "color": ORANGE, "weight": "bold"}
+        figure.text(0.05, 0.04, mark, transform=above, va="bottom", **style)
     for suffix in (".png", ".pdf"):
         with replacing(path.with_suffix(suffix)) as partial:
             save(figure, partial, suffix[1:], dpi, trim, _STRIP_IN if mark else 0.0)

@@ -195,7 +195,7 @@ def test_what_a_cdf_alone_cannot_tell_is_not_a_number_or_refused_by_name() -> No
 def test_levels_and_floors_out_of_range_are_refused(value: float) -> None:
     with pytest.raises(ConfigError, match="level"):
         Hidden(mixture(1, 0.1, 0.2)).cvar(value)
-    with pytest.raises(ConfigError, match="least speed"):
+    with pytest.raises(ConfigError, match="minimum speed"):
         Hidden(mixture(1, 0.1, 0.2)).expected_time(value + 0.5 if value == 1 else value)
 
 

@@ -37,7 +37,7 @@ def test_the_mixture_is_the_same_in_every_cell() -> None:
         ("{", "JSONDecodeError"),
         ("[]", "TypeError"),
         ('{"format": "other"}', "'other'"),
-        ('{"format": "benchnav-ground-1"}', "'weights'"),
+        ('{"format": "benchnav-ground-1"}', "'layer_means'"),
         (json.dumps(json.loads(GROUND.to_json()) | {"stds": [1.0]}), "2, 2 and 1"),
         (
             json.dumps(json.loads(GROUND.to_json()) | {"stds": [1.0, -1.0]}),
@@ -49,7 +49,7 @@ def test_the_mixture_is_the_same_in_every_cell() -> None:
         ),
         (
             json.dumps(json.loads(GROUND.to_json()) | {"layer_means": {"rgb": [1.0]}}),
-            "so many channels",
+            "numbers of channels",
         ),
     ],
 )

@@ -562,9 +562,9 @@ def test_the_expected_time_of_a_mixture_is_that_of_its_components_in_the_mean() 
 
 @pytest.mark.parametrize("floor", [0.0, -0.1, 1.1, math.nan])
 def test_a_least_speed_out_of_range_is_refused(floor: float) -> None:
-    with pytest.raises(ConfigError, match="least speed"):
+    with pytest.raises(ConfigError, match="minimum speed"):
         random_mixture().expected_time(floor)
-    with pytest.raises(ConfigError, match="least speed"):
+    with pytest.raises(ConfigError, match="minimum speed"):
         random_mixture().time_cvar(0.5, floor)
 
 

@@ -126,7 +126,7 @@ def test_members_count_by_their_weights_in_each_cell() -> None:
         )
     breaches = Breaches("distribution", "pooled")
     check_functions(law, 1e-4, breaches)
-    breaches.refuse()
+    breaches.raise_any()
     which = OBSERVED > 0
     which[0] = False
     assert torch.equal(law.at(which).cdf(0.4), law.cdf(0.4)[which][None])

@@ -17,7 +17,7 @@ from benchnav.eval.recording import (
     thinned,
 )
 from benchnav.planning.planners.planner import Plan
-from benchnav.viz.maps import STYLES
+from benchnav.viz.plans import STYLES
 from tests.eval.report import made
 
 

@@ -12,7 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchnav.core import registry
-from benchnav.metrics import SHIPPED, Energy, Episode, Learnt, Metric, MetricError
+from benchnav.metrics import (
+    SHIPPED,
+    Energy,
+    Episode,
+    LearningRecord,
+    Metric,
+    MetricError,
+)
 from benchnav.metrics.base import measure
 from benchnav.metrics.check import attribute_faults, sample_episodes
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
@@ -22,7 +29,9 @@ from tests.metrics.made import episode
 ROOT = Path(__file__).parents[2]
 BY_COLUMN = {metric.column: metric for metric in SHIPPED}
 AHEAD = np.array([[0.2, -1.0], [np.nan, np.nan], [0.4, 0.5], [np.nan, np.nan]])
-LEARNT = Learnt(revisions=3, seen_cells=40, sensed_cells=7, ahead=AHEAD, step_s=0.02)
+LEARNING = LearningRecord(
+    revisions=3, seen_cells=40, sensed_cells=7, ahead=AHEAD, step_s=0.02
+)
 NAN = math.nan
 
 
@@ -57,7 +66,7 @@ def test_a_shipped_metric_is_its_closed_form(
 ) -> None:
     turning = np.array([0.0, 0.5, 0.0, 0.5])
     changes: dict[str, Any] = {
-        "turn_rate_radps": turning, "learnt": LEARNT, "rejected_draws": 2, "lower_bound_s": 0.3,
+        "turn_rate_radps": turning, "learning": LEARNING, "rejected_draws": 2, "lower_bound_s": 0.3,
     }  # fmt: skip
     drive = episode([0.2, 0.8, 0.3, 0.7], **changes)
     values = [
@@ -75,7 +84,7 @@ def test_a_shipped_metric_is_its_closed_form(
 
 @pytest.mark.filterwarnings("error")
 def test_an_episode_of_one_step_gives_no_warning() -> None:
-    short = episode([0.5], learnt=replace(LEARNT, ahead=AHEAD[1:2]))
+    short = episode([0.5], learning=replace(LEARNING, ahead=AHEAD[1:2]))
     values = {column: metric.value(short) for column, metric in BY_COLUMN.items()}
     undefined = {column for column, value in values.items() if math.isnan(value)}
     assert {
@@ -268,8 +277,8 @@ def test_a_failure_is_one_line_with_the_remedy() -> None:
     with pytest.raises(MetricError) as raised:
         measure(changing(lambda self, episode: {}["speed"]), episode([1]))
     assert str(raised.value) == (
-        "Expected a finite number or NaN from metric 'fine', got KeyError: 'speed'. Return NaN for an episode that has "
-        "no such value."
+        "Expected a finite number or NaN from metric 'fine', got KeyError: 'speed'. Return NaN where the value is "
+        "undefined."
     )
 
 
@@ -295,7 +304,7 @@ def test_sample_episodes_are_drives_of_the_robot(robot: Any) -> None:
     assert success.states.shape[0] == 13
     assert success.actions.shape == (12, len(robot.action_names))
     assert np.allclose(stuck.positions_m, stuck.positions_m[0])  # λ = 0 moves nothing
-    assert success.learnt is not None
+    assert success.learning is not None
     assert (success.speed_mps <= robot.top_speed_mps + 1e-5).all()
 
 

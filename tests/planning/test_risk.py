@@ -105,7 +105,7 @@ def test_a_measure_changes_nothing_that_it_is_given(name: str) -> None:
     ("text", "word"),
     [
         ("chance:1.5", "bound"),
-        ("expected-time:0", "least speed"),
+        ("expected-time:0", "minimum speed"),
         ("time-cvar:1", "level"),
     ],
 )

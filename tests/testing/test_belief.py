@@ -186,9 +186,9 @@ BAD: dict[str, tuple[Any, str]] = {
     "what was begun on self": (LastBegun(), "Expected the same after other maps were begun"),
     "tells episodes of each other": (giving("update", shared), "an episode in which nothing was sensed"),
     "changed no map": (giving("changed", lambda c, *_: c[0]), "Expected a bool map of shape [4, 6, 8] from `changed`"),
-    "changed too little": (giving("changed", lambda c, *_: c & False), "Expected `changed` to name all cells"),
+    "changed too little": (giving("changed", lambda c, *_: c & False), "Expected `changed` to mark all cells"),
     "changed by scores alone": (
-        giving("changed", lambda _, a, b: (a.score != b.score) | (a.std != b.std)), "Expected `changed` to name all"
+        giving("changed", lambda _, a, b: (a.score != b.score) | (a.std != b.std)), "Expected `changed` to mark all"
     ),
     "counts again what it knows": (
         giving("update", lambda new, old, s, *_: replace(new, std=torch.where(s.mask, 0.5 * old.std, new.std))),
@@ -198,22 +198,22 @@ BAD: dict[str, tuple[Any, str]] = {
         giving("update", lambda new, old, s, *_: replace(
             new, std=torch.where(s.mask.flatten(1).any(1)[:, None, None] & ~s.mask, 1.3 * old.std, new.std)
         )),
-        "to make it surer on average",
+        "to reduce the variance on average",
     ),
     "learns though it says no": (having(learns=False), "a belief that does not learn (`learns`)"),
     "keeps the old prediction": (
-        giving("update", lambda new, old, *_: replace(new, prior=old.prior)), "to take the old one's place"
+        giving("update", lambda new, old, *_: replace(new, prior=old.prior)), "to replace the old one"
     ),
     "at of all": (giving("at", lambda _, s, __: s.prior), "from `at`, got [4, 6, 8]"),
     "at of the prediction": (giving("at", lambda _, s, cells: s.prior.at(cells)), "Expected mean and CVaR of `at`"),
     "too few fields": (giving("sample_fields", lambda f, *_: f[:, 0]), "Expected fields of shape [4, 50, 6, 8]"),
     "fields of no λ": (giving("sample_fields", lambda f, *_: f + 1), "Expected fields of λ in [0, 1]"),
     "fields without keys": (giving("sample_fields", unkeyed), "Expected other fields under other keys"),
-    "fields by place": (giving("sample_fields", in_turn), "fields to be those of its own key"),
+    "fields by place": (giving("sample_fields", in_turn), "fields to depend only on its key"),
     "fields of the prediction": (giving("sample_fields", of_the_prior), "the distribution that is believed"),
     "selects others": (having(select=lambda _, s, m: s.select(m.sort().values)), "episodes that `select` keeps"),
-    "puts nothing": (having(put=lambda _, s, m, o: s), "`put` puts in the places of others"),
-    "puts elsewhere": (having(put=lambda b, s, m, o: s.put(m.flip(0), o)), "`put` puts in the places of others"),
+    "puts nothing": (having(put=lambda _, s, m, o: s), "`put` inserts"),
+    "puts elsewhere": (having(put=lambda b, s, m, o: s.put(m.flip(0), o)), "`put` inserts"),
     "selects nothing": (having(select=lambda _, s, m: s), "shape [2, 6, 8] of episodes that `select` keeps"),
 }  # fmt: skip
 
@@ -222,7 +222,7 @@ BAD: dict[str, tuple[Any, str]] = {
 def test_a_breach_is_caught_and_named(
     belief: Any, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("benchnav.testing.belief._FIELDS", FEW)
+    monkeypatch.setattr("benchnav.testing.belief_fields._FIELDS", FEW)
     assert expected in refusal(lambda one: check_belief(one, SMALL), belief)
 
 

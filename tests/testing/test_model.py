@@ -211,7 +211,7 @@ BAD = {
     ),
     "components of a class without a name": (
         changed(lambda mixture, _: replace(mixture, group=(0, 2))),
-        "classes in `group` under 2, the number of `class_names`, got 2",
+        "classes in `group` below 2, the number of `class_names`, got 2",
     ),
     "members whose soft spots are summed up wrongly": (with_soft_spots(0), "order of the average"),
     "members that raise": (with_members(lambda weights: weights[9]), "IndexError"),
@@ -373,7 +373,7 @@ class Named(Quantiles):
 
 BAD_DISTRIBUTIONS = {
     "of descending quantiles": (lambda d: replace(d, values=d.values.flip(1)), "`quantile` to ascend"),
-    "beyond 1": (lambda d: replace(d, values=d.values + 1), "`cdf` to ascend from 0 under λ = 0 to 1 at λ = 1"),
+    "beyond 1": (lambda d: replace(d, values=d.values + 1), "`cdf` to ascend from 0 below λ = 0 to 1 at λ = 1"),
     "under 0": (lambda d: replace(d, values=d.values - 0.3), "`quantile` to ascend within [0, 1]"),
     "with a hole": (
         lambda d: replace(d, values=d.values.where(d.values < d.values.max(), torch.nan)),

@@ -87,8 +87,8 @@ BAD: dict[str, tuple[Any, str]] = {
     "no robot": (object(), "Expected the robot to be a subclass of benchnav.planning.Robot, got object"),
     "no time step": (having(dt_s=0.0), "Expected `dt_s` > 0 and finite, got 0.0"),
     "no speed": (having(top_speed_mps=0.0), "Expected `top_speed_mps` > 0 and finite, got 0.0"),
-    "bounds the wrong way round": (having(action_low=(1.0, 1.0)), "low under high, of 2 actions"),
-    "too few bounds": (having(action_high=(1.0,)), "low under high, of 2 actions"),
+    "bounds the wrong way round": (having(action_low=(1.0, 1.0)), "low below high, of 2 actions"),
+    "too few bounds": (having(action_high=(1.0,)), "low below high, of 2 actions"),
     "an infinite bound": (having(action_high=(1.0, float("inf"))), "Expected finite bounds"),
     "too few names": (having(action_names=("speed_mps",)), "of 1 actions"),
     "a rate for one": (having(action_rates=(1.0,)), "Expected `action_rates` > 0 of 2 actions"),
@@ -114,7 +114,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "faster than it says after a while": (Gathering(), "than `top_speed_mps` allows"),
     "drives on ground of 0": (
         moving(lambda m, state, action, _: torch.cat((m[..., :1] + 0.01 * action[..., :1], m[..., 1:]), -1)),
-        "no way made on ground of λ = 0",
+        "no motion on terrain of λ = 0",
     ),
 }  # fmt: skip
 

@@ -22,11 +22,11 @@ class Failures(Figure):
     """Failures of the best setting of a block and of the worst, a line a condition.
 
     Attributes:
-        place: of the sheet among those of the run.
+        index: index of the sheet among those of the run.
     """
 
     name = "failures"
-    place = 0
+    index = 0
 
     def variants(self, data: RunData) -> Sequence[Self]:
         """Return a figure a block."""
@@ -34,7 +34,7 @@ class Failures(Figure):
 
     def caption(self, data: RunData) -> str:
         """Return which failures are shown."""
-        title, _ = data.sheets.shown[self.place]
+        title, _ = data.sheets.shown[self.index]
         return (
             "Failures of the settings with the highest and the lowest success rate, "
             f"{title}: predicted λ̂ (colour), "
@@ -44,7 +44,7 @@ class Failures(Figure):
 
     def draw(self, data: RunData) -> Drawing:
         """Draw a line a condition, a panel a failure."""
-        _, lines = data.sheets.shown[self.place]
+        _, lines = data.sheets.shown[self.index]
         across = max(len(line.recordings) for line in lines)
         height, width = lines[0].recordings[0].grid.shape
         page = TWO_COLUMNS_IN if across > 2 else ONE_COLUMN_IN

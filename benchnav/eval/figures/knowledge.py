@@ -28,12 +28,12 @@ class KnowledgeMaps(Figure):
     most four conditions.
 
     Attributes:
-        place: of the recording among those that are shown.
+        index: index of the recording among those that are shown.
     """
 
     name = "knowledge"
     trim = True
-    place = 0
+    index = 0
 
     def variants(self, data: RunData) -> Sequence[Self]:
         """Return a figure a condition."""
@@ -42,8 +42,8 @@ class KnowledgeMaps(Figure):
     def caption(self, data: RunData) -> str:
         """Return whose knowledge it is."""
         shown = _learners(data)
-        about = shown[self.place].about
-        name = contender_names([own.about for own in shown])[self.place]
+        about = shown[self.index].about
+        name = contender_names([own.about for own in shown])[self.index]
         return (
             f"What a robot knew of {about['scenario']}, map {about['map']}, during "
             f"its episode ({name}): E[λ] of its "
@@ -53,7 +53,7 @@ class KnowledgeMaps(Figure):
 
     def draw(self, data: RunData) -> Drawing:
         """Draw the recording."""
-        return draw_knowledge(_learners(data)[self.place])
+        return draw_knowledge(_learners(data)[self.index])
 
 
 def _learners(data: RunData) -> list[Recording]:

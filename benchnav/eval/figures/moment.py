@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
-from benchnav.viz import maps
+from benchnav.viz import maps, plans
 from benchnav.viz.style import bytes_of
 
 _SEEN_COLOURS = np.array(
@@ -74,7 +74,7 @@ def show_known(
             panel, "not seen", fc=maps.UNSEEN, ec="black", hatch="////", lw=0
         )
     if known.outlines:
-        maps.draw_reach(panel, known.outline)
+        plans.draw_reach(panel, known.outline)
 
 
 def known_in_words(recording: Recording) -> str:
@@ -105,7 +105,7 @@ def show_truth(panel: Axes, recording: Recording) -> None:
 def draw_plan(panel: Axes, recording: Recording, step: int) -> None:
     """Draw what was planned at a step; nothing once the episode has ended."""
     if not has_ended(recording, step):
-        maps.draw_plan(panel, recording.plan_at(step * recording.dt_s).lines)
+        plans.draw_plan(panel, recording.plan_at(step * recording.dt_s).lines)
 
 
 def drive_at(recording: Recording, step: int) -> maps.Drive:

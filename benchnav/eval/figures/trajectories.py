@@ -14,7 +14,7 @@ from benchnav.eval.figures import moment
 from benchnav.eval.figures.data import RunData, choose_recordings
 from benchnav.eval.recording import Recording
 from benchnav.eval.words import chosen_in_words, episode_names
-from benchnav.viz import maps
+from benchnav.viz import maps, plans
 from benchnav.viz.figure import Figure
 from benchnav.viz.style import (
     ONE_COLUMN_IN,
@@ -143,7 +143,7 @@ def _draw_terrain(panel: Axes, recording: Recording, title: str) -> None:
     moment.draw_plan(panel, recording, recording.now)
     drive = moment.drive_at(recording, recording.now)
     maps.draw_drive(panel, drive, 2)
-    panel.add_collection(maps.driven_colours(drive.track, recording.traversability, 2))
+    panel.add_collection(plans.driven_colours(drive.track, recording.traversability, 2))
     panel.set_title(title)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.steps import AHEAD_COLUMNS, LAST_COLUMN
 from benchnav.eval.run.rollout import Episodes
-from benchnav.metrics.base import Episode, Learnt, MetricError, measure
+from benchnav.metrics.base import Episode, LearningRecord, MetricError, measure
 from benchnav.metrics.shipped import SHIPPED
 from benchnav.planning.problem import Problem, Task, heading_to
 from benchnav.planning.world.outcome import Outcome
@@ -74,7 +74,7 @@ def finished_episodes(
                 robot=problem.robot,
                 planning_s=_own(planning_s[:steps]),
                 preparing_s=episodes.begin_s / len(episodes.steps),
-                learnt=_learnt(episodes, b),
+                learning=_learning(episodes, b),
                 rejected_draws=draws.rejected_draws[b],
                 lower_bound_s=draws.lower_bound_s[b]
                 if len(draws.lower_bound_s)
@@ -128,7 +128,7 @@ def _own(values: Tensor) -> np.ndarray:
     return np.array(values.cpu().double().numpy())
 
 
-def _learnt(episodes: Episodes, member: int) -> Learnt | None:
+def _learning(episodes: Episodes, member: int) -> LearningRecord | None:
     if (
         episodes.ahead is None
         or episodes.seen_cells is None
@@ -136,7 +136,7 @@ def _learnt(episodes: Episodes, member: int) -> Learnt | None:
     ):
         return None
     planned = int(episodes.planned.sum())
-    return Learnt(
+    return LearningRecord(
         revisions=int(episodes.revisions[member]),
         seen_cells=int(episodes.seen_cells[member]),
         sensed_cells=int(episodes.sensed_cells[member]),

@@ -34,7 +34,7 @@ _SPREAD: tuple[Metric, ...] = (
     shipped.TIME_RATIO,
     shipped.SCORE,
 )
-_SPREAD += (shipped.PATH_LENGTH, shipped.STUCK_SHARE, shipped.ROUGHNESS)
+_SPREAD += (shipped.PATH_LENGTH, shipped.STUCK_FRACTION, shipped.ROUGHNESS)
 _MEDIANS: tuple[Metric, ...] = shipped.PLANNING
 _LEARNT: tuple[Metric, ...] = (
     shipped.SEEN_CELLS,

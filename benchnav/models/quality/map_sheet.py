@@ -170,7 +170,7 @@ def map_sheet_figure(
                 unit=unit or None,
                 # λ ends at 0 and 1.
                 extend="neither" if unit == "λ" else "both" if is_error else "max",
-                most=2 if is_error else 4,
+                max_intervals=2 if is_error else 4,
             )
         )
     kinds = [

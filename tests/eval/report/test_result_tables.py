@@ -12,7 +12,7 @@ from benchnav.eval.stats.comparison import compare, compare_by
 from benchnav.eval.stats.pairs import Compared, Pair
 from benchnav.eval.stats.summary import summarise
 from benchnav.metrics import Energy
-from benchnav.metrics.shipped import STUCK_SHARE
+from benchnav.metrics.shipped import STUCK_FRACTION
 from tests.eval.report import made
 from tests.eval.stats.test_comparison import A, B, pair
 
@@ -516,7 +516,7 @@ def test_a_further_metric_has_a_column_in_its_unit_with_its_meaning() -> None:
         made.row(made.condition(), i, energy_j=np.nan if i == 9 else 100.0 * i)
         for i in range(10)
     )
-    further = [Energy().quantity, STUCK_SHARE.quantity]
+    further = [Energy().quantity, STUCK_FRACTION.quantity]
     worlds = {str(episodes["condition"][0]): made.PAPER["world"]}
     summary = made.summary(episodes).drop(
         columns=["stuck_share_mean", "stuck_share_std", "stuck_share_n"]

@@ -22,11 +22,11 @@ from benchnav.viz.maps import (
     MARKS,
     REACH,
     SOFT,
-    STYLES,
     hatching,
     layer_colours,
     shades,
 )
+from benchnav.viz.plans import STYLES
 from benchnav.viz.style import bytes_of
 
 TIMELINE = "time"

@@ -1,0 +1,107 @@
+"""Plans, driven paths and the sensors' range on a map in metres.
+
+Letters in shapes: N positions.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.patheffects import AbstractPathEffect, Normal, withStroke
+
+from benchnav.viz.maps import REACH, TRAVERSABILITY_COLOURS
+
+_LINE_WIDTH = 0.4  # of the thinnest line of a plan
+
+
+class LayerStyle(NamedTuple):
+    """Style of a layer of a plan.
+
+    Args:
+        label: entry of the legend.
+        colour: red, green, blue and opacity, in hexadecimal digits.
+        width: width relative to the thinnest line.
+        dashes: dashes of the line, where the format supports them.
+        effects: effects of the line, where the format supports them, such as a white
+            edge on dark terrain.
+    """
+
+    label: str
+    colour: str
+    width: float
+    dashes: str = "solid"
+    effects: Sequence[AbstractPathEffect] = ()
+
+
+_EDGED = (withStroke(linewidth=2.2, foreground="white"), Normal())
+# From the bottom layer to the top one.
+STYLES: Mapping[str, LayerStyle] = {
+    "tree": LayerStyle("tree", "#3c3c3c8c", 1),
+    "samples": LayerStyle("samples", "#78b4ff6e", 1),
+    "reference": LayerStyle("reference path", "#285affff", 3, "dashed", _EDGED),
+    "path": LayerStyle("planned", "#00008cff", 3, "solid", _EDGED),
+}
+
+
+def draw_plan(panel: Axes, lines: Mapping[str, Sequence[np.ndarray]]) -> None:
+    """Draw a plan on a map.
+
+    Args:
+        panel: panel in metres.
+        lines: lines of each layer of `STYLES`, each of shape [N, 2].
+    """
+    for name, style in STYLES.items():
+        if len(lines.get(name, ())):
+            layer = LineCollection(
+                list(lines[name]),
+                colors=[style.colour],
+                linewidths=_LINE_WIDTH * style.width,
+                linestyles=style.dashes,
+                label=style.label,
+                path_effects=list(style.effects),
+            )
+            panel.add_collection(layer)
+
+
+def driven_colours(
+    track: np.ndarray, traversability: np.ndarray, width: float
+) -> LineCollection:
+    """Return a driven path in the colours of observed λ, for a map and a colour bar.
+
+    Args:
+        track: positions in metres, shape [N, 2].
+        traversability: λ between positions, shape [N − 1] or longer.
+        width: width in points.
+    """
+    segments = list(np.stack((track[:-1], track[1:]), axis=1))
+    path = LineCollection(
+        segments,
+        cmap=TRAVERSABILITY_COLOURS,
+        linewidths=width,
+        capstyle="round",
+        zorder=2.5,
+    )
+    path.set_clim(0, 1)
+    path.set_array(traversability[: len(segments)])
+    return path
+
+
+def draw_reach(panel: Axes, outline_m: np.ndarray) -> None:
+    """Draw the outline of the sensors' range on a map.
+
+    Args:
+        panel: panel in metres.
+        outline_m: lines in metres, separated by NaN, shape [N, 2].
+    """
+    edge = [withStroke(linewidth=1.1, foreground="black"), Normal()]
+    # A single line with gaps, so that no segment's edge covers another segment.
+    panel.plot(
+        *outline_m.T,
+        color=REACH,
+        lw=0.6,
+        path_effects=edge,
+        label="reach of the sensors",
+        zorder=2.2,
+    )
