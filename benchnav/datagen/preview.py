@@ -23,7 +23,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.datagen.synth.appearance import light_direction, shade
-from benchnav.datagen.synth.elevation import framed, horn_gradient
+from benchnav.datagen.synth.elevation import horn_gradient, pad_missing
 from benchnav.viz.maps import (
     draw_lines,
     hatching,
@@ -298,7 +298,7 @@ def _hillshade(
         0.8 / np.tan(np.radians(np.percentile(slope_deg, 95) + 1e-3)), 0.1, 30
     )
     light = light_direction(np.array([0.75 * np.pi]), np.array([0.7]))
-    ground_m = framed(lift * elevation_m.astype(np.float64))
+    ground_m = pad_missing(lift * elevation_m.astype(np.float64))
     lit = shade(*horn_gradient(ground_m, resolution_m), light, 0.0) - light[0, 2]
     white = lit > 0
     return np.stack([white, white, white, 0.7 * np.abs(lit)], axis=-1)

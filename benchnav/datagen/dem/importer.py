@@ -31,7 +31,13 @@ from benchnav.datagen.dem.raster import Cut, Rasters, load_rasterio
 from benchnav.datagen.dem.survey import Survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import SHARD_CELLS
-from benchnav.datagen.files.hdf5 import Contents, ShardFile, assemble, held, pack
+from benchnav.datagen.files.hdf5 import (
+    Contents,
+    ShardFile,
+    assemble,
+    exclusive_output,
+    pack,
+)
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.schema import (
@@ -126,7 +132,7 @@ def import_dem(
     }
     recipe = replace(recipe, splits=splits)
     with ExitStack() as stack:
-        stack.enter_context(held(out, overwrite))
+        stack.enter_context(exclusive_output(out, overwrite))
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
         survey = Survey(stack, dem, rasters, recipe, cut, drives, announce)
         folder = stack.enter_context(building(out))

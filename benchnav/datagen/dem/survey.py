@@ -283,16 +283,16 @@ class Survey:
                 )
         for name, kind in self.fields.items():
             low, high = _range(f"layer {name}", framed)
-            if low < kind.least or high > kind.most:
+            if low < kind.minimum or high > kind.maximum:
                 expected = (
-                    f"values of `layer {name}` in [{kind.least:g}, {kind.most:g}]"
+                    f"values of `layer {name}` in [{kind.minimum:g}, {kind.maximum:g}]"
                 )
                 raise self._out_of_range(
                     f"layer {name}",
                     expected,
                     low,
                     high,
-                    low if low < kind.least else high,
+                    low if low < kind.minimum else high,
                 )
             if low > high:
                 continue
