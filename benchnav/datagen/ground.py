@@ -231,7 +231,7 @@ def ground_file(path: Path) -> Path:
 
 
 def find_ground(dataset: TerrainDataset) -> GroundStatistics | None:
-    """Return terrain statistics for a dataset, or None if there are none.
+    """Return terrain statistics for a dataset; None if no file fits.
 
     The file next to the dataset is used first, then those of the shipped recipe with
     the same terrain.

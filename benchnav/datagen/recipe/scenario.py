@@ -38,7 +38,7 @@ class Tint:
     Args:
         classes: names of the tinted classes; if empty, all.
         colour: RGB of the tint in full light, 0–255.
-        share: weight of the tint in (0, 1); 1 − share is that of the class's colour.
+        share: weight of the tint, in (0, 1); 1 − share is that of the class's colour.
     """
 
     classes: tuple[str, ...] = ()

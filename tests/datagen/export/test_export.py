@@ -81,7 +81,7 @@ def test_values_are_the_datasets_bit_for_bit(
 ) -> None:
     # Few maps at a time, so that files begin within what is read at once and row groups
     # end within files.
-    monkeypatch.setattr(parquet, "_CELLS_A_ROW_GROUP", 4 * 32 * 32)
+    monkeypatch.setattr(parquet, "_CELLS_PER_ROW_GROUP", 4 * 32 * 32)
     out = exported(dataset_path, tmp_path / "out", maps_per_file=maps_per_file)
     dataset = TerrainDataset(dataset_path)
     for split, name in parquet.split_names(dataset.splits).items():
