@@ -108,7 +108,7 @@ def test_a_damaged_scale_is_found(dataset_path: Path, tmp_path: Path) -> None:
 
 
 def test_foreign_newer_and_missing_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="not there"):
+    with pytest.raises(DatasetError, match="does not exist"):
         TerrainDataset(tmp_path / "none.h5")
     (tmp_path / "text.h5").write_text("hello")
     with pytest.raises(DatasetError, match="not a readable HDF5"):
