@@ -156,7 +156,7 @@ def test_shards_made_apart_are_one_dataset(datagen: Call, capsys) -> None:  # ty
     shard.unlink()
     assert datagen("validate", "big") == 1
     assert (
-        f"remove {shard.name} in big and give the command that made it again"
+        f"remove {shard.name} in big and run the command that made it again"
         in capsys.readouterr().out
     )
     assert datagen("create", "tiny-v1", *SMALL, "--out", "big") == 0
@@ -188,7 +188,7 @@ def test_options_of_create_reach_it(
 def test_a_large_dataset_is_a_folder(
     datagen: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli, "_MOST_CELLS_OF_A_FILE", 32 * 32 * 4)
+    monkeypatch.setattr(cli, "_MAX_CELLS_PER_FILE", 32 * 32 * 4)
     Path("datasets").mkdir()
     assert (
         datagen("create", "tiny-v1", "--first", "2", "--splits", "[train,valid]") == 0
